@@ -37,7 +37,7 @@ from known_systems import (
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
 from siq.networks.decomposition import TrainedNetworks, TrainingOptions
-from siq.quasipotential.certificate import HARMLESS
+from siq.quasipotential.certificate import MIN_DIFFERENCE
 from siq.quasipotential.certificate_tests import (
     Candidate,
     CertificateOptions,
@@ -127,7 +127,7 @@ def judged(
         for candidate in (one, two):
             solve &= check_hamilton_jacobi(candidate, found, LIMITS).passed
         errors = (stated_error(candidate, found) for candidate in (one, two))
-        limit = HARMLESS + sum(min(error, LIMITS.error) for error in errors)
+        limit = MIN_DIFFERENCE + sum(min(error, LIMITS.error) for error in errors)
         agree &= difference(one, two.values, x) <= limit
         wrong |= difference(one, lambda y: potential_values(known, y), x) > WRONG
     said += ["solve"] * solve + ["agree"] * agree + ["wrong"] * wrong

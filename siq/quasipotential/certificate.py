@@ -8,7 +8,7 @@ fit but f and D: `INDEPENDENT` names those.
 That test is by characteristics of the Hamilton–Jacobi equation, which leave an attractor along its
 linearisation: no ansatz of V, no network, no recorded state enters (`siq.quasipotential.characteristics`).
 Along each V is integrated, and on the lowest sheet it is the quasipotential. Recorded states only say where
-to compare: within the box of the recordings, among states that lead to the attractor, and up to `SHARE` of
+to compare: within the box of the recordings, among states that lead to the attractor, and up to a share of
 the level at which the first characteristic leaves these.
 """
 
@@ -27,9 +27,9 @@ from siq.inference.field_estimate import AnyField, GivenField, Verdict
 from siq.numerics.least_squares import representative_subset
 from siq.quasipotential.certificate_tests import (
     ERROR_POINTS,
-    FEWEST,
-    SHARE,
-    STATED,
+    LEVEL_SHARE,
+    MIN_POINTS,
+    STATED_SIGMAS,
     Candidate,
     CertificateOptions,
     Function,
@@ -58,8 +58,8 @@ from siq.systems.phase_portrait import PhasePortrait, RecordedRegion
 
 INDEPENDENT = ("characteristics",)  # tests of V that share nothing with a fit of V but f and D
 ALONE = "only one of the two routes that the study names led to a formula"
-HARMLESS = 1e-6  # a difference of the routes that no error needs to explain
-LEAST_CLAIMED = 0.5  # of the states in a well: a formula that holds at fewer is none of the well (a choice)
+MIN_DIFFERENCE = 1e-6  # a difference of the routes that no error needs to explain
+MIN_CLAIMED_SHARE = 0.5  # of the states in a well: a formula that holds at fewer is none of it (a choice)
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ def certify(
     error = own_error = 0.0 if candidates else np.inf
     from_field = 0.0
     for number, candidate in enumerate(candidates):
-        if candidate.claimed < LEAST_CLAIMED:
+        if candidate.claimed < MIN_CLAIMED_SHARE:
             advice = "" if isinstance(found, GivenField) else "record more there, or "
             reason = (
                 f"V claims to hold at {candidate.claimed:.0%} of the held-out states in the well about"
@@ -196,12 +196,12 @@ def certify(
         made, its = check_candidate(candidate, found, options, seed=seed)
         for name, verdict in made.items():
             verdicts.setdefault(name, []).append(verdict)
-        uncertain = STATED * candidate.relative_error
+        uncertain = STATED_SIGMAS * candidate.relative_error
         own_error = max(own_error, its - uncertain)
         if wells:
             well, generator, count = wells[number], np.random.default_rng(seed), len(candidate.points)
             x = candidate.points[generator.choice(count, min(ERROR_POINTS, count), replace=False)]
-            uncertain = STATED * field_error(found, well.gradients, well.attractor, x, well.values(x))
+            uncertain = STATED_SIGMAS * field_error(found, well.gradients, well.attractor, x, well.values(x))
             its += uncertain
         error, from_field = max(error, its), max(from_field, uncertain)
     tests = {name: Verdict.worst(made) for name, made in verdicts.items()}
@@ -229,7 +229,9 @@ def certify(
             agreement = []
             for values, two, erring in compare:
                 its = max(_error_of_well(one, evidence) for one in erring)
-                limit = HARMLESS + min(error, options.error) + min(its, options.error) + 6 * relative_error
+                limit = (
+                    MIN_DIFFERENCE + min(error, options.error) + min(its, options.error) + 6 * relative_error
+                )
                 agreement.append(check_agreement(values, two, limit=limit))
             tests["agreement"] = Verdict.worst(agreement)
         elif compared:
@@ -265,10 +267,10 @@ def _candidate_of_region(
 
 
 def _candidate_in_well(well: Well, evidence: Evidence) -> Candidate:
-    """V about an attractor, to be tested on what lies in its well below `SHARE` of its level.
+    """V about an attractor, to be tested on what lies in its well below `LEVEL_SHARE` of its level.
 
     It makes no claim where its own residual is large, as at a caustic: `claimed` has the share of the states
-    where it claims to hold. Where fewer than `FEWEST` held-out states lie in the well, points of
+    where it claims to hold. Where fewer than `MIN_POINTS` held-out states lie in the well, points of
     characteristics are added, which no fit saw either. Pairs count by their first sample: to ask where the
     second one lies would be to choose the noise.
     """
@@ -278,12 +280,12 @@ def _candidate_in_well(well: Well, evidence: Evidence) -> Candidate:
     references = [one for one in evidence.references if np.array_equal(one.attractor, well.attractor)]
 
     def inside(x: np.ndarray) -> np.ndarray:
-        mask = (well.values(x) < SHARE * well.level) & well.reaches(x)
+        mask = (well.values(x) < LEVEL_SHARE * well.level) & well.reaches(x)
         mask[mask] = ~region.across(x[mask])
         return np.asarray(mask)
 
     points, further = evidence.points[inside(evidence.points)], ", all held out"
-    if len(points) < FEWEST and references:
+    if len(points) < MIN_POINTS and references:
         further = (
             f", {len(points)} of them held out and, as these are few, the others reached by characteristics"
         )
@@ -315,7 +317,7 @@ def _position_text(position: np.ndarray) -> str:
     return np.array2string(position, precision=4, suppress_small=True, separator=", ")
 
 
-NOTICEABLE = 1e-3  # a stated error above this is worth an explanation
+MIN_EXPLAINED_ERROR = 1e-3  # a stated error above this is worth an explanation
 # Curves in search of a caustic; what is said of one has four digits.
 CAUSTIC_FAN: dict[str, Any] = {"most": 512, "tolerance": 1e-7, "spacing": 0.1}
 
@@ -328,7 +330,7 @@ def caustics_below(
     Only sought where the stated error leaves room for one. A kink of V is no fault of the method, but no
     polynomial follows it, and the error that is stated comes from there.
     """
-    if not error > NOTICEABLE:
+    if not error > MIN_EXPLAINED_ERROR:
         return ()
     notes = []
     width = portrait.box[:, 1] - portrait.box[:, 0]
@@ -348,19 +350,22 @@ def caustics_below(
     return tuple(notes)
 
 
-REACHED = 0.8  # of what was asked for, up to which a curve has to come where most end before
-SCOUTS = {"count": 32, "most": 64, "rounds": 2, "tolerance": 1e-5}  # curves in search of the level
-CURVES = {"count": 64, "most": 128, "rounds": 3}  # and for the comparison: cost, not accuracy
-GAP = 0.15  # of the ends of neighbours, the level being at 1
+REACHED_SHARE = 0.8  # of what was asked for, up to which a curve has to come where most end before
+LEVEL_FAN = {"count": 32, "most": 64, "rounds": 2, "tolerance": 1e-5}  # curves in search of the level
+REFERENCE_FAN = {"count": 64, "most": 128, "rounds": 3}  # and for the comparison: cost, not accuracy
+END_GAP = 0.15  # of the ends of neighbours, the level being at 1
 TOLERANCE = 1e-7  # of the integrator's steps, relative; by so much V may err in each
-START, START_DEGREE = 1e-3, 6  # of the level: the series errs by 10⁻³ to the power 5/2; closer, curves bundle
-MOST_STEPS = 1500  # of a curve, where 30 to 130 are usual; stiff systems take as many as their rates differ
-SHEETS = 2e-3  # of the level: the margin with which `lowest_sheet` tells sheets apart
-DOUBLINGS = 8  # of the level in search of the saddle
-CLOSE = 0.6  # of a saddle to a curve, the level being at 1: close enough for a first estimate of V there
-BEYOND = 1.2  # of the level of the fan: what lies higher was not reached
-AGAIN = 1.5  # of the level found: a fan up to more than that has to be followed again, up to less
-STARTS = 0.9  # share of the recorded starts below the first level where no saddle is known
+START_LEVEL, START_DEGREE = (
+    1e-3,
+    6,
+)  # of the level: the series errs by 10⁻³ to the 5/2; closer, curves bundle
+MAX_STEPS = 1500  # of a curve, where 30 to 130 are usual; stiff systems take as many as their rates differ
+SHEET_MARGIN = 2e-3  # of the level: the margin with which `lowest_sheet` tells sheets apart
+LEVEL_DOUBLINGS = 8  # of the level in search of the saddle
+SADDLE_DISTANCE = 0.6  # of a saddle to a curve, the level being at 1: close enough for an estimate of V
+OVERSHOOT = 1.2  # of the level of the fan: what lies higher was not reached
+REPEAT_RATIO = 1.5  # of the level found: a fan up to more than that has to be followed again, up to less
+START_QUANTILE = 0.9  # share of the recorded starts below the first level where no saddle is known
 
 
 def references_about(
@@ -403,7 +408,7 @@ def _follow_well(
 
     try:
         level = min(_level(dynamics, portrait, index, region, seed), depth)
-        fan = _fan(dynamics, portrait, attractor, SHARE * level, seed, **CURVES)
+        fan = _fan(dynamics, portrait, attractor, LEVEL_SHARE * level, seed, **REFERENCE_FAN)
     except (NumericalFailure, ValueError, np.linalg.LinAlgError) as failure:
         return without(f"characteristics cannot be followed from the attractor {name}: {failure}")
     lowest = lowest_sheet(fan)
@@ -414,9 +419,9 @@ def _follow_well(
     distance = _spacing(len(attractor))
     kept = kept[representative_subset(scaled, distance=distance, generator=np.random.default_rng(seed))]
     x, values, ends = fan.points[kept], fan.values[kept], fan.ends
-    error = TOLERANCE * int(np.bincount(fan.curve).max()) + (0.0 if lowest.all() else SHEETS)
+    error = TOLERANCE * int(np.bincount(fan.curve).max()) + (0.0 if lowest.all() else SHEET_MARGIN)
     stopped = np.isin(ends, (End.STALLED, End.TIME, End.CAUSTIC)).mean() > 0.5
-    if len(values) >= FEWEST and (values.max() >= REACHED * fan.level or not stopped):
+    if len(values) >= MIN_POINTS and (values.max() >= REACHED_SHARE * fan.level or not stopped):
         return Reference(attractor, x, values, level, error)
     if np.isin(ends, (End.STALLED, End.TIME)).mean() > 0.5:
         why = "they are too stiff: leave out the fastest states, or record their slow motion alone"
@@ -437,7 +442,7 @@ def _level(
     """V at which the first characteristic comes to another basin, or to rest at a saddle.
 
     Where there is neither, 1.1 times as much as most recorded starts have of V in the quadratic
-    approximation, so that `SHARE` of it is about that.
+    approximation, so that `LEVEL_SHARE` of it is about that.
     """
     attractor = portrait.attractors[index].position
     hessian = hessian_at(dynamics, attractor)
@@ -447,27 +452,30 @@ def _level(
 
     tops = np.array([one.position for one in portrait.saddles[index]]).reshape(-1, len(attractor))
     starts = portrait.descents.paths[portrait.descents.ends == index][:, 0]
-    first = float(np.quantile(quadratic(starts), STARTS))
+    first = float(np.quantile(quadratic(starts), START_QUANTILE))
     level = min(first, float(quadratic(tops).min(initial=np.inf)))
     known: float | None = None
-    for _ in range(DOUBLINGS):
-        fan = _fan(dynamics, portrait, attractor, level, seed, **SCOUTS)
+    for _ in range(LEVEL_DOUBLINGS):
+        fan = _fan(dynamics, portrait, attractor, level, seed, **LEVEL_FAN)
         across = region.across(fan.points) & (fan.values > 0)
         # One state on the wrong side may be a gap between recorded ones: the next has to lie there too.
         across[:-1] &= across[1:] & (fan.curve[:-1] == fan.curve[1:])
         across[-1] = False
         ends = fan.values[fan.last]
         left = np.concatenate([fan.values[across], ends[fan.ends == End.REST], _heights(fan, tops)])
-        if len(left) and left.min() <= BEYOND * level:
+        if len(left) and left.min() <= OVERSHOOT * level:
             lowest = float(left.min())
-            if level <= AGAIN * lowest:
+            if level <= REPEAT_RATIO * lowest:
                 return lowest
-            known, level = lowest, BEYOND * lowest  # the same again, where curves lie closer together
+            known, level = (
+                lowest,
+                OVERSHOOT * lowest,
+            )  # the same again, where curves lie closer together
             continue
         if known is not None:
             return known
         if not len(tops):
-            return level / SHARE
+            return level / LEVEL_SHARE
         if not (fan.ends == End.LEVEL).any():
             return float(ends.max())
         level *= 2
@@ -479,8 +487,8 @@ def _heights(fan: Fan, tops: np.ndarray) -> np.ndarray:
     lowest = lowest_sheet(fan)
     tree = cKDTree((fan.points[lowest] - fan.attractor) @ fan.metric.T)
     distance, nearest = tree.query((tops - fan.attractor) @ fan.metric.T)
-    nearest = np.flatnonzero(lowest)[nearest[distance < CLOSE]]
-    offset = tops[distance < CLOSE] - fan.points[nearest]
+    nearest = np.flatnonzero(lowest)[nearest[distance < SADDLE_DISTANCE]]
+    offset = tops[distance < SADDLE_DISTANCE] - fan.points[nearest]
     slope = np.sum(offset * fan.momenta[nearest], axis=1)
     bend = np.einsum("ni,nij,nj->n", offset, fan.hessians[nearest], offset) / 2
     return np.maximum(fan.values[nearest] + slope + bend, fan.values[nearest] / 2)
@@ -496,7 +504,7 @@ def _fan(
 ) -> Fan:
     return adapted_fan(
         dynamics, attractor, level=level, box=portrait.box, generator=np.random.default_rng(seed),
-        gap=GAP, spacing=_spacing(len(attractor)), most_steps=MOST_STEPS, start=START,
+        gap=END_GAP, spacing=_spacing(len(attractor)), most_steps=MAX_STEPS, start=START_LEVEL,
         start_degree=START_DEGREE if len(attractor) <= 4 else 4, **{"tolerance": TOLERANCE} | options,
     )  # fmt: skip
 

@@ -54,15 +54,15 @@ from siq.systems.phase_portrait import PhasePortrait
 
 Function = Callable[[np.ndarray], np.ndarray]
 
-SHARE = 0.9  # of the level of a well: at the saddle itself V is stationary, and curves hardly get on
-FEWEST = 30  # points or pairs: their mean is normal enough, their root mean square known to 13 %
+LEVEL_SHARE = 0.9  # of the level of a well: at the saddle itself V is stationary, and curves hardly get on
+MIN_POINTS = 30  # points or pairs: their mean is normal enough, their root mean square known to 13 %
 ERROR_POINTS = 300
-SAFETY = 2.0  # factor of the integral of the residual
-FEWEST_STEPS = 400  # of an ascending path
-FINEST_ERROR = 1e-9  # relative, of V
-LARGEST_FROM_FIELD = 0.5  # of V: half of it, with 95 % confidence, is more than a first order can tell
-STATED = 2.0  # standard errors of V from f: kept in 95 of 100 times
-DRAWS = 40  # of f from its distribution, for the error of M
+SAFETY_FACTOR = 2.0  # factor of the integral of the residual
+MIN_PATH_STEPS = 400  # of an ascending path
+MIN_ERROR = 1e-9  # relative, of V
+MAX_ERROR_FROM_FIELD = 0.5  # of V: half of it, with 95 % confidence, is more than a first order can tell
+STATED_SIGMAS = 2.0  # standard errors of V from f: kept in 95 of 100 times
+FIELD_DRAWS = 40  # of f from its distribution, for the error of M
 STANDARD_ERRORS = 4.0  # exceeded by chance once in 16 000 times
 
 
@@ -120,8 +120,8 @@ class Reference:
     fault: str = ""
 
     def below(self, level: float) -> tuple[np.ndarray, np.ndarray]:
-        """Points and values up to `SHARE` of a level that a formula claims, which may be the lower one."""
-        kept = self.values <= SHARE * level
+        """Points and values up to `LEVEL_SHARE` of a level that a formula claims, if it is the lower one."""
+        kept = self.values <= LEVEL_SHARE * level
         return self.points[kept], self.values[kept]
 
 
@@ -232,7 +232,9 @@ def _check_branch(
         bound = options.branch
         if not isinstance(found, GivenField) and not found.noise_free:
             # The standard deviation of M over draws of f, whose attractor is found again by Newton's method.
-            draws = normal_draws(found.values, found.covariance, DRAWS, generator=np.random.default_rng(seed))
+            draws = normal_draws(
+                found.values, found.covariance, FIELD_DRAWS, generator=np.random.default_rng(seed)
+            )
             spread = []
             for draw in draws:
                 dynamics, position = found.dynamics.with_values(draw), one.position.copy()
@@ -264,7 +266,7 @@ def _residual_integral(
         gradient, dynamics, x,
         lambda _, slope, flow, push: np.abs((slope * (flow + push)).sum(axis=1))[:, None],
         middle=box.mean(axis=1), width=box[:, 1] - box[:, 0], slowest=slowest, fastest=fastest,
-        fewest_steps=FEWEST_STEPS,
+        fewest_steps=MIN_PATH_STEPS,
     )  # fmt: skip
     return np.where(lost, np.inf, total[:, 0])
 
@@ -293,8 +295,8 @@ def stated_error(candidate: Candidate, found: AnyField, *, seed: int = 0) -> flo
     if reached.mean() < 0.9:
         return np.inf
     size = np.linalg.norm(values[reached] - lowest)
-    error = SAFETY * float(np.linalg.norm(integral[reached]) / size) if size > 0 else np.inf
-    return max(error + STATED * candidate.relative_error, FINEST_ERROR)
+    error = SAFETY_FACTOR * float(np.linalg.norm(integral[reached]) / size) if size > 0 else np.inf
+    return max(error + STATED_SIGMAS * candidate.relative_error, MIN_ERROR)
 
 
 def check_error(own: float, from_field: float, options: CertificateOptions) -> Verdict:
@@ -302,18 +304,18 @@ def check_error(own: float, from_field: float, options: CertificateOptions) -> V
 
     A formula is no solution if the relative error that its own residual leaves open is larger than the limit.
     What the uncertainty of f adds is no fault of the formula and is stated, whatever its size, as long as it
-    is known; from `LARGEST_FROM_FIELD` on its first order says nothing any more.
+    is known; from `MAX_ERROR_FROM_FIELD` on its first order says nothing any more.
     """
-    passed = bool(own <= options.error and from_field <= LARGEST_FROM_FIELD)
+    passed = bool(own <= options.error and from_field <= MAX_ERROR_FROM_FIELD)
     reason = "" if passed else "the error of V that its residual leaves open is too large"
     if own <= options.error and not passed:
         reason = "f is not known well enough to tell V: record more"
-    return Verdict(own if from_field <= LARGEST_FROM_FIELD else from_field, options.error, passed, reason)
+    return Verdict(own if from_field <= MAX_ERROR_FROM_FIELD else from_field, options.error, passed, reason)
 
 
 def sublevel_points(well: Well) -> np.ndarray:
     """Points of the fit of a well below a share of its level: where two routes are compared."""
-    return np.asarray(well.points[well.values(well.points) < SHARE * well.level])
+    return np.asarray(well.points[well.values(well.points) < LEVEL_SHARE * well.level])
 
 
 def check_agreement(first: Function, wells: Sequence[Well], *, limit: float) -> Verdict:
@@ -348,7 +350,7 @@ def _check_characteristics(
     for one in candidate.references:
         x, expected = one.below(candidate.level)
         fault = one.fault
-        if not fault and len(x) < FEWEST:
+        if not fault and len(x) < MIN_POINTS:
             fault = f"only {len(x)} points of characteristics lie below the level of V: the level is too low"
         if fault:
             verdicts.append(Verdict.refused(fault))
@@ -358,7 +360,7 @@ def _check_characteristics(
         if not value <= error + one.error:  # a mean over a region says little of its deepest part
             error = max(error, stated_error(replace(candidate, points=x), found, seed=seed))
         # An error that cannot be stated explains nothing: a false solution, whose ascending paths run away.
-        from_field = STATED * candidate.relative_error  # of a formula that was fitted together with f
+        from_field = STATED_SIGMAS * candidate.relative_error  # of a formula that was fitted together with f
         own = error - from_field
         limit = (
             (own if own <= options.error else 0.0) + (from_field if np.isfinite(error) else 0.0) + one.error
@@ -389,11 +391,11 @@ def check_candidate(
     return tests, error
 
 
-MOST_PAIRS = 10_000  # evenly taken: memory, not accuracy
-BINS = 8  # in V, of equally many pairs; a choice, by which the limit is made stricter
-LOWEST = 1e-3  # of the range of V: closer to its minimum a fall cannot be told from rounding
-ROUNDING = 1e-12  # of the largest V: that of formulas of many terms
-BELOW = 0.02  # of the range of V: so far below the attractors nothing may lie
+MAX_PAIRS = 10_000  # evenly taken: memory, not accuracy
+DESCENT_BINS = 8  # in V, of equally many pairs; a choice, by which the limit is made stricter
+MIN_DEPTH_SHARE = 1e-3  # of the range of V: closer to its minimum a fall cannot be told from rounding
+VALUE_ROUNDING = 1e-12  # of the largest V: that of formulas of many terms
+MAX_DEPTH_BELOW = 0.02  # of the range of V: so far below the attractors nothing may lie
 FLAT = "V does not vary on the held-out points"
 RISES = "V does not fall along the recordings"
 
@@ -414,9 +416,9 @@ def _check_descent(
     """
     pairs = candidate.pairs
     assert pairs is not None
-    rows = np.unique(np.linspace(0, max(len(pairs.h) - 1, 0), MOST_PAIRS).astype(int))[: len(pairs.h)]
+    rows = np.unique(np.linspace(0, max(len(pairs.h) - 1, 0), MAX_PAIRS).astype(int))[: len(pairs.h)]
     x0, xh, h = pairs.x0[rows], pairs.xh[rows], pairs.h[rows]
-    if len(h) < FEWEST:
+    if len(h) < MIN_POINTS:
         reason = f"only {len(h)} pairs of held-out samples start where V claims to hold: record more there"
         return Verdict(1.0, 0.0, False, reason)
     values = candidate.values(x0)
@@ -424,16 +426,16 @@ def _check_descent(
     lowest, size = min(bottoms, default=float(values.min())), float(np.ptp(values))
     if not size > 0:
         return Verdict(1.0, 0.0, False, FLAT)
-    below = (candidate.values(candidate.points) < lowest - BELOW * size).mean() if bottoms else 0.0
+    below = (candidate.values(candidate.points) < lowest - MAX_DEPTH_BELOW * size).mean() if bottoms else 0.0
     if below > options.descent:
         return Verdict(float(below), options.descent, False, RISES)
     slope = candidate.gradients(x0)
     if not found.noise_rate.any() or found.noise_free:
-        counts = values - lowest > LOWEST * size
+        counts = values - lowest > MIN_DEPTH_SHARE * size
         if not counts.any():
             return Verdict(1.0, options.descent, False, FLAT)
         unexplained = np.sqrt(np.einsum("ni,ij,nj->n", slope, found.noise_rate, slope) * h)
-        allowed = STANDARD_ERRORS * unexplained + ROUNDING * np.abs(values).max()
+        allowed = STANDARD_ERRORS * unexplained + VALUE_ROUNDING * np.abs(values).max()
         share = max(float((candidate.values(xh) - values > allowed)[counts].mean()), float(below))
         return Verdict.of(share, options.descent, RISES)
     claimed = found.diffusion.contract(x0, slope)
@@ -446,7 +448,7 @@ def _check_descent(
     change = np.einsum("nij,nj->ni", dynamics.jacobian(x0), dynamics.drift(x0))
     change += 0.5 * np.einsum("nkij,nij->nk", dynamics.hessian(x0), forces)
     curved = (slope * change).sum(axis=1) * h / 2
-    bins = np.array_split(np.argsort(values), max(min(BINS, len(h) // FEWEST), 1))
+    bins = np.array_split(np.argsort(values), max(min(DESCENT_BINS, len(h) // MIN_POINTS), 1))
     limit = float(-scipy.special.ndtri(options.false_alarms / (2 * len(bins))))
     worst = 0.0
     for rows in bins:
@@ -463,11 +465,11 @@ def _check_descent(
 
 EXISTENCE_DRAWS = 200  # of f: a share of one in twenty is then known to ±0.015
 EXISTENCE_STEPS = 10  # from the identified f to a drawn one
-NEWTON = 6  # steps of Newton's method at each
-SAME_EQUILIBRIUM = 1e-3  # of the recorded box: closer equilibria are one
-SETTLED = 1e-6  # of the recorded box, by which Newton's last step may still move
-SINGULAR = 1e-13  # of a Jacobian: one that is singular to rounding need not stop the others
-LARGEST_SHARE = 0.05  # of the draws in which an equilibrium may be lost: what is claimed is claimed at 95 %
+NEWTON_STEPS = 6  # steps of Newton's method at each
+EQUILIBRIUM_MERGE_TOLERANCE = 1e-3  # of the recorded box: closer equilibria are one
+NEWTON_TOLERANCE = 1e-6  # of the recorded box, by which Newton's last step may still move
+SINGULAR_SHIFT = 1e-13  # of a Jacobian: one that is singular to rounding need not stop the others
+MAX_LOST_SHARE = 0.05  # of the draws in which an equilibrium may be lost: what is claimed is claimed at 95 %
 
 
 def _lost_shares(
@@ -496,7 +498,7 @@ def _lost_shares(
     )
     met = np.zeros_like(lost)
     for one, two in itertools.combinations(range(len(equilibria)), 2):
-        same = np.abs((places[one] - places[two]) / width).max(axis=1) < SAME_EQUILIBRIUM
+        same = np.abs((places[one] - places[two]) / width).max(axis=1) < EQUILIBRIUM_MERGE_TOLERANCE
         same &= ~lost[one] & ~lost[two]
         # Whichever came from afar has jumped; both have where they come from equally far.
         met[one] |= same & (far[one] > far[two] / 2)
@@ -521,16 +523,16 @@ def _followed(
     for step in range(1, EXISTENCE_STEPS + 1):
         coefficients = found.coefficients + changes * step / EXISTENCE_STEPS
         moved = np.full(len(x), np.inf)
-        for _ in range(NEWTON):
+        for _ in range(NEWTON_STEPS):
             value = np.einsum("nq,nqi->ni", library.evaluate(x), coefficients)
             matrix = jacobians(x, coefficients)
-            matrix = matrix + SINGULAR * np.abs(matrix).max(axis=(1, 2), keepdims=True) * np.eye(d)
+            matrix = matrix + SINGULAR_SHIFT * np.abs(matrix).max(axis=(1, 2), keepdims=True) * np.eye(d)
             change = np.linalg.solve(matrix, value[..., None])[..., 0]
             moved = np.abs(change / width).max(axis=1)
             lost |= ~(moved < 1.0)
             x = np.where(lost[:, None], one.position, x - change)
         unstable = (np.linalg.eigvals(jacobians(x, coefficients)).real > 0).sum(axis=1)
-        lost |= (moved > SETTLED) | (unstable != one.unstable)
+        lost |= (moved > NEWTON_TOLERANCE) | (unstable != one.unstable)
         x = np.where(lost[:, None], one.position, x)
     return x, lost
 
@@ -541,12 +543,12 @@ def check_existence(found: FieldEstimate, portrait: PhasePortrait, *, seed: int 
     claimed = [*portrait.attractors, *saddles.values()]
     shares = _lost_shares(found, claimed, box=portrait.box, seed=seed)
     if not len(shares):
-        return Verdict(0.0, LARGEST_SHARE, True)
+        return Verdict(0.0, MAX_LOST_SHARE, True)
     worst = int(np.argmax(shares))
     value, one = float(shares[worst]), claimed[worst]
     kind = "stable state" if one.kind == "attractor" else "saddle"
     return Verdict.of(
-        value, LARGEST_SHARE,
+        value, MAX_LOST_SHARE,
         f"the recordings do not tell whether there is a {kind} at {place_text(one.position)}: it is missing"
         f" in {percent(value)} of the f that they allow for; record more about it",
     )  # fmt: skip

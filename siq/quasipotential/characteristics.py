@@ -149,11 +149,11 @@ class HamiltonianFlow:
         return np.concatenate([y, q, v[:, None], flat], axis=1)
 
 
-MOST_STEPS = 20_000  # numerical, a guard: a curve that takes more is stiff, or circles
+MAX_STEPS = 20_000  # numerical, a guard: a curve that takes more is stiff, or circles
 HALVINGS = 26  # of the last step, to find where a curve ends
-LONGEST_TIME = 60.0  # in units of the slowest relaxation time of the attractor
-RESTING = 1e-3  # p to x - A, in units in which both are equal near A
-STRAIGHT = 1e-3  # imaginary to real part, below which an eigenvalue counts as negative and not as turning
+MAX_RELAXATION_TIMES = 60.0  # in units of the slowest relaxation time of the attractor
+REST_RATIO = 1e-3  # p to x - A, in units in which both are equal near A
+REAL_RATIO = 1e-3  # imaginary to real part, below which an eigenvalue counts as negative and not as turning
 
 
 class End(IntEnum):
@@ -224,7 +224,7 @@ def characteristics(
     spacing: float = 0.05,
     time_limit: float | None = None,
     tolerance: float = 1e-10,
-    most_steps: int = MOST_STEPS,
+    most_steps: int = MAX_STEPS,
 ) -> Fan:
     """Follow characteristics until V reaches a level, a caustic is met, or a box or a time limit is left.
 
@@ -261,7 +261,7 @@ def characteristics(
     x = flow.center + np.sqrt(start) * directions @ flow.units.T
     initial = flow.pack(x, series.gradients(x), series.values(x), series.hessians(x))
     if time_limit is None:
-        time_limit = LONGEST_TIME / np.abs(np.linalg.eigvals(flow.jacobian).real).min()
+        time_limit = MAX_RELAXATION_TIMES / np.abs(np.linalg.eigvals(flow.jacobian).real).min()
     box = np.asarray(box, dtype=float)
 
     def relative(error: np.ndarray, state: np.ndarray) -> np.ndarray:
@@ -312,7 +312,7 @@ def characteristics(
         ends[running[late]] = End.TIME
         # To stay longer would be wrong as well as slow: from there on errors of p grow instead of decay.
         y, q, *_ = flow.parts(states[running])
-        resting = norm(q) < RESTING * norm(y)
+        resting = norm(q) < REST_RATIO * norm(y)
         ends[running[resting]] = End.REST
         stalled = steps[running] < 1e-13 * time_limit
         running = running[~(ended | late | resting | stalled)]
@@ -357,14 +357,14 @@ def crossed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     if not len(before):
         return np.zeros(0, dtype=bool)
     eigenvalues = np.linalg.eigvals(np.linalg.solve(before.transpose(0, 2, 1), after.transpose(0, 2, 1)))
-    negative = (eigenvalues.real <= 0) & (np.abs(eigenvalues.imag) <= STRAIGHT * np.abs(eigenvalues.real))
+    negative = (eigenvalues.real <= 0) & (np.abs(eigenvalues.imag) <= REAL_RATIO * np.abs(eigenvalues.real))
     return negative.any(axis=1) | (np.linalg.det(after) * np.linalg.det(before) <= 0)
 
 
-CLOSEST = 1e-12  # of directions: what cannot be told apart is not divided further
+MIN_DIRECTION_DISTANCE = 1e-12  # of directions: what cannot be told apart is not divided further
 CHUNK = 2048  # numerical: curves followed together, as fit into the cache
-MOST_PARTS = 8  # into which a gap is divided at once
-BENT = 0.03  # of the level: a larger term of second order is no correction
+MAX_GAP_PARTS = 8  # into which a gap is divided at once
+MAX_SECOND_ORDER = 0.03  # of the level: a larger term of second order is no correction
 
 
 def _even_directions(dimension: int, count: int, *, generator: np.random.Generator) -> np.ndarray:
@@ -486,7 +486,7 @@ def value_near(fan: Fan, x: np.ndarray, *, sheet: np.ndarray, distance: float = 
     values = fan.values[sheet][nearest] + np.sum(offset * fan.momenta[sheet][nearest], axis=1)
     bend = np.einsum("ni,nij,nj->n", offset, fan.hessians[sheet][nearest], offset) / 2
     # Towards a caustic ∇²V grows without bound, and two terms no longer tell V.
-    known = (found <= distance) & (np.abs(bend) <= BENT * fan.level)
+    known = (found <= distance) & (np.abs(bend) <= MAX_SECOND_ORDER * fan.level)
     return np.where(known, values + bend, np.nan)
 
 
@@ -496,14 +496,14 @@ def _between(fan: Fan, gap: float) -> np.ndarray:
     ends = (fan.points[fan.last] - fan.attractor) @ fan.metric.T
     width = np.linalg.norm(ends[pairs[:, 0]] - ends[pairs[:, 1]], axis=1)
     apart = np.linalg.norm(fan.directions[pairs[:, 0]] - fan.directions[pairs[:, 1]], axis=1)
-    wide = np.flatnonzero((width > gap) & (apart > CLOSEST))
+    wide = np.flatnonzero((width > gap) & (apart > MIN_DIRECTION_DISTANCE))
     wide = wide[np.argsort(-width[wide], kind="stable")]
     # Several at once in a very wide gap: a pass takes as long for one curve as for a hundred.
-    parts = np.clip(np.ceil(width[wide] / gap), 2, MOST_PARTS).astype(int)
+    parts = np.clip(np.ceil(width[wide] / gap), 2, MAX_GAP_PARTS).astype(int)
     first, second = (np.repeat(fan.directions[pairs[wide, side]], parts - 1, axis=0) for side in (0, 1))
     share = np.concatenate([np.arange(1, number) / number for number in parts] or [np.zeros(0)])[:, None]
     middle = (1 - share) * first + share * second
-    return middle / np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), CLOSEST)
+    return middle / np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), MIN_DIRECTION_DISTANCE)
 
 
 def _neighbours(directions: np.ndarray) -> np.ndarray:
@@ -521,10 +521,10 @@ def _neighbours(directions: np.ndarray) -> np.ndarray:
 
 RELAXATIONS = 12.0  # times 1/slowest rate: e^-12 of V is left at the beginning of an ascending path
 HEUN_STEP = 0.3  # of 1/fastest rate: Heun's rule is then good to some per cent of an error
-FEWEST_STEPS, MOST_HEUN_STEPS = 200, 4000  # numerical
-FAR = 3.0  # of the box's width from its middle: a path so far out does not come from the attractor
-ARRIVED = 0.02  # of the box's width: as far from the attractor a path may begin, V being known by its square
-UNKNOWN = 0.1  # share of the points whose error may stay unknown, at the rim of a well
+MIN_PATH_STEPS, MAX_PATH_STEPS = 200, 4000  # numerical
+RUNAWAY_WIDTHS = 3.0  # of the box's width from its middle: a path so far out does not come from the attractor
+ARRIVAL_DISTANCE = 0.02  # of the box's width from the attractor: as far a path may begin
+MAX_UNKNOWN_SHARE = 0.1  # share of the points whose error may stay unknown, at the rim of a well
 
 
 def fastest_rate(dynamics: Dynamics, x: np.ndarray, width: np.ndarray) -> float:
@@ -544,7 +544,7 @@ def ascending_integrals(
     width: np.ndarray,
     slowest: float,
     fastest: float,
-    fewest_steps: int = FEWEST_STEPS,
+    fewest_steps: int = MIN_PATH_STEPS,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Integrals over time along the paths ``dx/dt = f + 2D∇V`` that end at points, by Heun's rule.
 
@@ -557,8 +557,8 @@ def ascending_integrals(
     integrand
         Of points, ∇V, f and D∇V there: to ``(n, k)``.
     middle, width
-        Of the box of the states, shape ``(d,)``: a path that leaves it by `FAR` times its width in any state
-        has run away, whatever the units.
+        Of the box of the states, shape ``(d,)``: a path that leaves it by `RUNAWAY_WIDTHS` times its width in
+        any state has run away, whatever the units.
     slowest, fastest, fewest_steps
         Rates, and a number of steps, that set how long, and how finely, the paths are followed back.
 
@@ -567,9 +567,9 @@ def ascending_integrals(
     integrals, beginnings, lost
         Shapes ``(n, k)``, ``(n, d)`` and ``(n,)``: the last is a mask of the paths that run away.
     """
-    steps = int(np.clip(RELAXATIONS / slowest * fastest / HEUN_STEP, fewest_steps, MOST_HEUN_STEPS))
+    steps = int(np.clip(RELAXATIONS / slowest * fastest / HEUN_STEP, fewest_steps, MAX_PATH_STEPS))
     step = RELAXATIONS / slowest / steps
-    far = FAR * np.where(width > 0, width, 1.0)
+    far = RUNAWAY_WIDTHS * np.where(width > 0, width, 1.0)
 
     def terms(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         slope = gradient(points)
@@ -618,7 +618,7 @@ def _potential_slopes(
         gradient, dynamics, x, by_coefficients, middle=(places.max(axis=0) + places.min(axis=0)) / 2,
         width=width, slowest=rates.min(), fastest=fastest_rate(dynamics, x, width),
     )  # fmt: skip
-    lost |= ~(np.abs(beginnings - attractor) < ARRIVED * width).all(axis=1)
+    lost |= ~(np.abs(beginnings - attractor) < ARRIVAL_DISTANCE * width).all(axis=1)
     total = np.where(lost[:, None], np.nan, -total)
     return total[:, : q * d].reshape(-1, q, d), total[:, q * d :]
 
@@ -659,6 +659,6 @@ def relative_error(
         return 0.0
     errors = potential_errors(found, gradient, attractor, x)
     known = np.isfinite(errors)
-    if known.mean() < 1 - UNKNOWN:
+    if known.mean() < 1 - MAX_UNKNOWN_SHARE:
         return np.inf
     return float(np.linalg.norm(errors[known]) / np.linalg.norm(values[known]))

@@ -22,7 +22,7 @@ from siq.errors import InputError, NumericalFailure
 from siq.inference.library import CandidateLibrary, linear_combination
 from siq.numerics.files import whole_file
 from siq.quasipotential.hamilton_jacobi import LibraryBasis, PowerBasis
-from siq.quasipotential.wells import TOLERANCE, DegreeTrial, Well
+from siq.quasipotential.wells import RESIDUAL_TOLERANCE, DegreeTrial, Well
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import FormulaError, compile_formulas, parse_formula
@@ -283,7 +283,7 @@ def _wells_from_data(method: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...
             np.array(one["V"]["coefficients"], dtype=float), float(one["level"]),
             None if one.get("saddle") is None else np.array(one["saddle"]),
             float(one.get("residual", np.nan)), np.zeros((0, d)), float(one.get("reach", one["level"])),
-            float(one.get("tolerance", TOLERANCE)), None,
+            float(one.get("tolerance", RESIDUAL_TOLERANCE)), None,
             tuple(DegreeTrial(**trial) for trial in one.get("degrees", ())),
         )
         for one in method["wells"]

@@ -31,10 +31,10 @@ from siq.quasipotential.hamilton_jacobi import (
 from siq.quasipotential.wells import Well
 
 LOWER_PARTS = (0.7, 0.5, 0.3)  # of the points, by V
-IMPLAUSIBLE = 1e-4  # a probability below which no orthogonal fit is believed
+MIN_PROBABILITY = 1e-4  # a probability below which no orthogonal fit is believed
 FIT_POINTS = 400  # where ∇V·g is asked to vanish in a joint fit
-STEPS = 50  # of it
-RANK = 1e-7  # singular values below this share of the largest are no constraint of their own
+MAX_STEPS = 50  # of it
+RANK_TOLERANCE = 1e-7  # singular values below this share of the largest are no constraint of their own
 
 
 @dataclass(frozen=True)
@@ -305,7 +305,7 @@ def with_circulation(
     if not found.noise_free:
         rows = np.unique(np.linspace(0, len(points) - 1, FIT_POINTS).astype(int))
         fit = _fit_orthogonal(found, best.coefficients, circulatory, points[rows])
-        if fit is not None and fit.probability >= IMPLAUSIBLE:
+        if fit is not None and fit.probability >= MIN_PROBABILITY:
             return fit
         if best.residual >= single_formula:
             return None
@@ -374,10 +374,10 @@ def _fit_orthogonal(
     design = whiten @ whole[components, functions] / scale
     tangent = np.zeros((len(theta), 0))
     rank = 0
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         violation, slope = constraints(theta)
         left, singular, right = np.linalg.svd(slope / scale, full_matrices=True)
-        rank = int((singular > RANK * singular[0]).sum()) if len(singular) else 0
+        rank = int((singular > RANK_TOLERANCE * singular[0]).sum()) if len(singular) else 0
         restore = -right[:rank].T @ ((left[:, :rank].T @ violation) / singular[:rank])
         tangent = right[rank:].T
         wanted = whiten @ found.values - design @ (theta * scale + restore)

@@ -26,11 +26,11 @@ from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import measure_at
 from siq.systems.formulas import compile_formulas
 
-MOST_POWERS = 260  # more make every Gauss–Newton step take seconds
-VANISHING = 1e-8  # of f: where D∇V is smaller, Gauss–Newton is on its way to V = 0, which is a solution, too
-INDEPENDENT = 1e-5  # diagonal of a triangular factor: below this share columns are not independent enough
-STEEP = 3.0  # of the median residual: what is larger counts less and less
-UNDETERMINED = 1e-10  # of the largest singular value: combinations of functions that the points leave open
+MAX_POWERS = 260  # more make every Gauss–Newton step take seconds
+MIN_SLOPE = 1e-8  # of f: where D∇V is smaller, Gauss–Newton is on its way to V = 0, which is a solution, too
+DIAGONAL_RATIO = 1e-5  # diagonal of a triangular factor: below this share columns are not independent enough
+OUTLIER_SCALE = 3.0  # of the median residual: what is larger counts less and less
+SINGULAR_RATIO = 1e-10  # of the largest singular value: combinations of functions that the points leave open
 
 
 class Basis(Protocol):
@@ -207,8 +207,8 @@ class Expansion:
 
 
 def affordable_degree(dimension: int, degree: int) -> int:
-    """The highest degree up to `degree`, but at least 2, with no more than `MOST_POWERS` powers."""
-    while degree > 2 and math.comb(dimension + degree, degree) > MOST_POWERS:
+    """The highest degree up to `degree`, but at least 2, with no more than `MAX_POWERS` powers."""
+    while degree > 2 and math.comb(dimension + degree, degree) > MAX_POWERS:
         degree -= 1
     return degree
 
@@ -392,7 +392,7 @@ def _least_squares(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
         pass
     else:
         diagonal = np.diag(factor)
-        if diagonal.min() > INDEPENDENT * diagonal.max():
+        if diagonal.min() > DIAGONAL_RATIO * diagonal.max():
             found: np.ndarray = scipy.linalg.cho_solve((factor, lower), matrix.T @ right, check_finite=False)
             return found
     return np.linalg.lstsq(matrix, right, rcond=1e-11)[0]
@@ -402,7 +402,7 @@ def _relative_residual(equation: HamiltonJacobi, coefficients: np.ndarray) -> fl
     """Rms of the weighted residual over rms of ∇V; infinite for V = 0, or all but 0."""
     gradient = equation.slopes(coefficients)
     squared = equation.measure.contract(equation.points, gradient)
-    if not np.sqrt((equation.weight**2 * squared).mean()) > VANISHING:
+    if not np.sqrt((equation.weight**2 * squared).mean()) > MIN_SLOPE:
         return np.inf
     return float(np.sqrt((equation.residual(coefficients) ** 2).mean() / squared.mean()))
 
@@ -450,7 +450,7 @@ def robust_fit(
         theta[~moving] = start[~free]
     for _ in range(rounds):
         rest = relative_residuals(equation, theta)
-        scale = max(STEEP * float(np.median(rest)), finest)
+        scale = max(OUTLIER_SCALE * float(np.median(rest)), finest)
         weighted = replace(equation, weight=equation.weight / np.sqrt(1 + (rest / scale) ** 2))
         theta = gauss_newton(weighted, theta, free=moving, steps=steps).coefficients
     return np.asarray(turned @ theta) if orthonormal else theta
@@ -470,7 +470,7 @@ def _orthonormalised(equation: HamiltonJacobi, free: np.ndarray) -> tuple[Hamilt
     scale = np.where(scale > 0, scale, 1.0)
     upper = np.linalg.qr((stacked / scale).reshape(-1, stacked.shape[2]), mode="r")
     _, sizes, right = np.linalg.svd(upper)
-    determined = sizes > UNDETERMINED * sizes[0]
+    determined = sizes > SINGULAR_RATIO * sizes[0]
     combined = right[determined].T / sizes[determined] / scale[:, None] * np.sqrt(len(equation.points))
     m, k, stay = len(free), int(determined.sum()), np.flatnonzero(~free)
     turned = np.zeros((m, k + len(stay)))

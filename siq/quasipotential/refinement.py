@@ -36,7 +36,7 @@ from siq.inference.selection import ModelAverage
 from siq.networks.decomposition import CheckOptions, TrainedNetworks, shuffled
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.certificate import (
-    HARMLESS,
+    MIN_DIFFERENCE,
     Certificate,
     Evidence,
     caustics_below,
@@ -45,8 +45,8 @@ from siq.quasipotential.certificate import (
     uncertified,
 )
 from siq.quasipotential.certificate_tests import (
-    FEWEST,
-    MOST_PAIRS,
+    MAX_PAIRS,
+    MIN_POINTS,
     CertificateOptions,
     Function,
     Reference,
@@ -424,11 +424,11 @@ def _every_well_held_out(portrait: PhasePortrait, pairs: SnapshotPairs, mask: np
     to go by. They are chosen by where they are, not by where they go: the fit of V knows no increments.
     """
     mask = mask.copy()
-    some = pairs.take(np.arange(0, len(pairs.h), max(len(pairs.h) // MOST_PAIRS, 1)))
+    some = pairs.take(np.arange(0, len(pairs.h), max(len(pairs.h) // MAX_PAIRS, 1)))
     for index in range(len(portrait.attractors)):
         there = some.recording[RecordedRegion.of_basin(portrait, index).recorded(some.x0)]
         counts = np.bincount(there, minlength=len(mask))
-        while counts[mask].sum() < FEWEST and counts[~mask].any():
+        while counts[mask].sum() < MIN_POINTS and counts[~mask].any():
             mask[int(np.argmax(np.where(mask, -1, counts)))] = True
     return mask
 
@@ -555,7 +555,7 @@ def control(
     if refined is None or certificate is None:
         return data
     difference = _difference(formulas, refined, context.evidence.references)
-    explained = HARMLESS + sum(one.error for one in (made, certificate) if np.isfinite(one.error))
+    explained = MIN_DIFFERENCE + sum(one.error for one in (made, certificate) if np.isfinite(one.error))
     verdict = Verdict.of(difference, explained, "it is another V than the refined one")
     if made.certified:
         data["reason"] = (
@@ -587,7 +587,7 @@ def _difference(
     return worst
 
 
-WELL_STEPS = 15  # of Gauss–Newton: what does not converge quickly is not ready
+CHECK_STEPS = 15  # of Gauss–Newton: what does not converge quickly is not ready
 CHECK_DEGREES = (4, 6, 8)  # of the wells with which networks are compared, to some per cent
 CHECK_SHARE = 0.75  # of the recorded points, the lowest in V, on which one formula is tried
 
@@ -634,7 +634,7 @@ class TrainingCheck:
             try:
                 well = fit_well(
                     self.found.dynamics, one, self.portrait.basins[index], self.portrait.saddles[index],
-                    potential, degree=local.degree, generator=np.random.default_rng(0), steps=WELL_STEPS,
+                    potential, degree=local.degree, generator=np.random.default_rng(0), steps=CHECK_STEPS,
                 )  # fmt: skip
             except NumericalFailure:
                 return False

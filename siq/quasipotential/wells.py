@@ -30,7 +30,7 @@ from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
 from siq.quasipotential.hamilton_jacobi import (
-    UNDETERMINED,
+    SINGULAR_RATIO,
     Expansion,
     PowerBasis,
     affordable_degree,
@@ -57,10 +57,10 @@ from siq.systems.formulas import (
 )
 from siq.systems.phase_portrait import PhasePortrait, RecordedRegion, states_elsewhere
 
-TOLERANCE = 0.05  # residual at a point up to which a formula is believed: V is then off by some per cent
-ROUNDING = 1e-16  # of what is usual: |∇V| |f| so close to the attractor says nothing
-NEGATIVE = 1e-9  # of the level: V so far below zero is rounding
-NOTHING = 1e-14  # of the largest coefficient, or of the size of a well: rounding of the fit
+RESIDUAL_TOLERANCE = 0.05  # residual up to which a formula is believed: V is then off by some per cent
+ROUNDING_SHARE = 1e-16  # of what is usual: |∇V| |f| so close to the attractor says nothing
+NEGATIVE_VALUE_TOLERANCE = 1e-9  # of the level: V so far below zero is rounding
+NEGLIGIBLE_COEFFICIENT = 1e-14  # of the largest coefficient, or of the size of a well: rounding of the fit
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class Well(Expansion):
     residual: float
     points: np.ndarray
     reach: float = 0.0
-    tolerance: float = TOLERANCE
+    tolerance: float = RESIDUAL_TOLERANCE
     elsewhere: np.ndarray | None = None
     trials: tuple[DegreeTrial, ...] = ()
 
@@ -152,7 +152,7 @@ class Well(Expansion):
         """
         numerator, size = self._terms(x)
         # At the attractor both vanish, and what is left of them is rounding.
-        return np.asarray(numerator / np.maximum(size, ROUNDING * self._size))
+        return np.asarray(numerator / np.maximum(size, ROUNDING_SHARE * self._size))
 
     def reaches(self, x: np.ndarray) -> np.ndarray:
         """Mask of the points below `reach`, and among recorded states that lead to the attractor.
@@ -162,7 +162,7 @@ class Well(Expansion):
         the saddle, to which they lead as close as recordings do.
         """
         values = self.values(x)
-        reached: np.ndarray = (values <= self.reach) & (values >= -NEGATIVE * self.reach)
+        reached: np.ndarray = (values <= self.reach) & (values >= -NEGATIVE_VALUE_TOLERANCE * self.reach)
         if not len(self.points):
             return reached
         if x.shape[1] == 1:
@@ -183,7 +183,7 @@ class Well(Expansion):
     @cached_property
     def _size(self) -> float:
         size = float(np.median(self._terms(self.points)[1])) if len(self.points) else 0.0
-        return size if size > 0 else float(np.finfo(float).tiny) / ROUNDING
+        return size if size > 0 else float(np.finfo(float).tiny) / ROUNDING_SHARE
 
     @cached_property
     def _region(self) -> RecordedRegion:
@@ -196,8 +196,8 @@ class Well(Expansion):
         size, basis = np.abs(self.coefficients), self.basis
         return Formula.of_powers(
             "V", basis.symbols, scale=basis.scale, exponents=basis.exponents,
-            center=np.where(np.abs(basis.center) > NOTHING * basis.scale, basis.center, 0.0),
-            coefficients=np.where(size > NOTHING * size.max(), self.coefficients, 0.0),
+            center=np.where(np.abs(basis.center) > NEGLIGIBLE_COEFFICIENT * basis.scale, basis.center, 0.0),
+            coefficients=np.where(size > NEGLIGIBLE_COEFFICIENT * size.max(), self.coefficients, 0.0),
             units=self.dynamics.units, title=f"U = 2V is the quasipotential, known up to V = {self.reach!r}",
         )  # fmt: skip
 
@@ -245,33 +245,33 @@ class Depth:
         return float(self.values[-1])
 
 
-FIRST_SHARE = 0.05  # of a known depth: the first level
-GROWTH = 1.5  # of the level, from one fit to the next
-REACH = 0.25  # of the distance at which the level lies: how far new points may be from those of the last fit
-MOST_POINTS = 6000  # of one fit
-HIGHEST = 0.9  # share of the recorded starts below the level, where no saddle limits it
-SETTLED = 0.01  # change of the level, and of the number of points, with which growing ends
-REPEATED = 1e-4  # of a level: one that was tried before, and from which the next would follow again
-AT_LEVEL = 0.05  # of a level: by so much V of the saddle that set it may change with the next fit
-MOST_ROUNDS = 80  # of growing
-ON_THE_WAY = 1e-6  # relative change of the coefficients with which Gauss–Newton ends before the last level
-STARTS = (0.5, 0.25, 1.0)  # of the networks' level: where the network route starts, one after the other
-LOW = 4  # powers up to this one are fitted to a network's V, and those above begin at zero
-NO_SOLUTION = 0.2  # relative residual from which on a start has led nowhere
-FLAT = 1e-6  # of the largest curvature at an attractor: V with a smaller one has no minimum there
-CLOSE = 0.1  # of the recorded box: a saddle so close to the points of the fit has been reached
-STEP = 1.06  # of the level, from one robust fit to the next
-FINEST = 1e-5  # residual below which nothing is an outlier
-ROBUST_FIT: dict[str, Any] = {"finest": FINEST, "steps": 6}
+FIRST_LEVEL_SHARE = 0.05  # of a known depth: the first level
+LEVEL_GROWTH = 1.5  # of the level, from one fit to the next
+POINT_REACH = 0.25  # of the distance at which the level lies: of new points from those of the last fit
+MAX_POINTS = 6000  # of one fit
+RECORDED_QUANTILE = 0.9  # share of the recorded starts below the level, where no saddle limits it
+LEVEL_TOLERANCE = 0.01  # change of the level, and of the number of points, with which growing ends
+REPEAT_TOLERANCE = 1e-4  # of a level: one that was tried before, from which the next would follow again
+SADDLE_TOLERANCE = 0.05  # of a level: by so much V of the saddle that set it may change with the next fit
+MAX_ROUNDS = 80  # of growing
+COARSE_TOLERANCE = 1e-6  # relative change of coefficients with which Gauss–Newton ends on the way
+START_SHARES = (0.5, 0.25, 1.0)  # of the networks' level: where the network route starts, one after the other
+START_DEGREE = 4  # powers up to this one are fitted to a network's V, and those above begin at zero
+MAX_RESIDUAL = 0.2  # relative residual from which on a start has led nowhere
+MIN_CURVATURE = 1e-6  # of the largest curvature at an attractor: V with a smaller one has no minimum there
+SADDLE_DISTANCE = 0.1  # of the recorded box: a saddle so close to the points of the fit has been reached
+ROBUST_GROWTH = 1.06  # of the level, from one robust fit to the next
+MIN_OUTLIER_RESIDUAL = 1e-5  # residual below which nothing is an outlier
+ROBUST_FIT: dict[str, Any] = {"finest": MIN_OUTLIER_RESIDUAL, "steps": 6}
 # Few points lie where a well is narrow.
 FIT_TO_KNOWN_DEPTH: dict[str, Any] = {"finest": 0.01, "steps": 8, "orthonormal": True}
-BESIDE = 0.05  # of the extent of the well: states so close to the path are below a level where the path is
+PATH_DISTANCE = 0.05  # of the extent of the well: states so close to the path are as low as it
 PATH_FROM, PATH_TO = 0.02, 0.98  # of the depth: where the path tells ∇V
-MOST_POINTS_TO_KNOWN_DEPTH = 5000  # of one fit
-RUNAWAY = 1.5  # of a level: where the formula of the degree below is higher, a lower V is an extrapolation
-WORSE = 3.0  # times the residual of the degree below: a higher one that is worse by that has run away
-ENDED = 2  # higher degrees in a row that do not improve: there is nothing more to be had
-HELD_OUT = 4  # every so manieth point is kept for choosing the degree
+MAX_POINTS_TO_KNOWN_DEPTH = 5000  # of one fit
+RUNAWAY_LEVEL = 1.5  # of a level: where the lower degree's formula is higher, a lower V is an extrapolation
+RUNAWAY_RATIO = 3.0  # times the residual of the degree below: a higher one so much worse has run away
+MAX_IDLE_DEGREES = 2  # higher degrees in a row that do not improve: there is nothing more to be had
+HELD_OUT_STRIDE = 4  # every so manieth point is kept for choosing the degree
 
 
 Degree = Annotated[int, Field(ge=2, le=16)]
@@ -294,9 +294,9 @@ class WellOptions:
     """
 
     degrees: Annotated[tuple[Degree, ...], Field(min_length=1)] = (4, 6, 8, 10, 12)
-    accuracy: Annotated[float, Field(gt=0)] = FINEST
+    accuracy: Annotated[float, Field(gt=0)] = MIN_OUTLIER_RESIDUAL
     reach: Annotated[float, Field(gt=0, le=3)] = 1.2
-    tolerance: Annotated[float, Field(gt=0, lt=1)] = TOLERANCE
+    tolerance: Annotated[float, Field(gt=0, lt=1)] = RESIDUAL_TOLERANCE
 
 
 def local_well(
@@ -330,7 +330,7 @@ def local_well(
     attractor, basin = portrait.attractors[index], portrait.basins[index]
     saddles = portrait.saddles[index] if depth is None else [depth.saddle]
     rows = np.arange(len(basin.chosen))
-    kept = rows[rows % HELD_OUT != 0]
+    kept = rows[rows % HELD_OUT_STRIDE != 0]
     wells: list[Well] = []
     failure, idle = NumericalFailure("no degree is affordable"), 0
     for degree in options.degrees:
@@ -353,7 +353,9 @@ def local_well(
                 start, goal = well, options.reach * depth.value
                 told = {"goal": goal, "rows": kept, "depth": depth, "generator": generator}
                 well = _extend_well(start, basin, **told)
-                if wells and not well.residual < WORSE * wells[-1].residual:  # the path may start it far off
+                if (
+                    wells and not well.residual < RUNAWAY_RATIO * wells[-1].residual
+                ):  # by the path it began far off
                     again = _extend_well(start, basin, by_path=False, **told)
                     well = min(well, again, key=lambda one: one.residual)
         except NumericalFailure as error:  # of one degree: another may do
@@ -361,7 +363,7 @@ def local_well(
             continue
         if depth is not None and wells and not well.residual < wells[-1].residual:
             idle += 1
-            if idle == ENDED or not well.residual < WORSE * wells[-1].residual:
+            if idle == MAX_IDLE_DEGREES or not well.residual < RUNAWAY_RATIO * wells[-1].residual:
                 break
             continue
         wells.append(well)
@@ -376,7 +378,7 @@ def local_well(
         wells = [_extend_well(well, basin, goal=goal, rows=kept) for well in wells]
     elsewhere = states_elsewhere(portrait, index)
     wells = [replace(well, tolerance=options.tolerance, elsewhere=elsewhere) for well in wells]
-    x = basin.points(rows[rows % HELD_OUT == 0])
+    x = basin.points(rows[rows % HELD_OUT_STRIDE == 0])
     reached = [well.reaches(x) for well in wells]
     most = max(int(mask.sum()) for mask in reached)
     trials = []
@@ -393,7 +395,7 @@ def best_trial(trials: Sequence[DegreeTrial]) -> int:
     coverage = max(trial.covered for trial in trials)
     good = [index for index, trial in enumerate(trials) if trial.covered >= coverage - 0.005]
     finest = min(trials[index].residual for index in good)
-    return next(index for index in good if trials[index].residual <= max(2 * finest, FINEST))
+    return next(index for index in good if trials[index].residual <= max(2 * finest, MIN_OUTLIER_RESIDUAL))
 
 
 def _grow_well(
@@ -432,7 +434,7 @@ def _grow_well(
     reached = np.sort(basin.highest(values.reshape(basin.states.shape[:2]))[tuple(basin.chosen.T)])
     level = float(reached[min(4 * basis.size, len(reached) - 1)])
     if depth is not None:
-        level = min(level, FIRST_SHARE * depth)
+        level = min(level, FIRST_LEVEL_SHARE * depth)
     return _grown(
         dynamics, basin, saddles, basis, coefficients, free=free, metric=hessian, level=level,
         fitted=np.zeros(0, dtype=int), generator=generator, depth=depth,
@@ -473,22 +475,22 @@ def _grown(
     def close(points: np.ndarray) -> np.ndarray:
         """Mask of the saddles that points of a fit have reached."""
         distances = [np.abs((points - top) / width).max(axis=1).min() for top in tops]
-        return np.array(distances) < CLOSE
+        return np.array(distances) < SADDLE_DISTANCE
 
     values = along(coefficients)
     residual, points, last, recorded = np.inf, np.zeros((0, len(attractor))), False, 0.0
     places = basin.points(np.arange(len(basin.chosen))) @ np.linalg.cholesky(metric)
     spacing = cKDTree(places).query(places, k=2)[0][:, 1]
     ends: list[float] = []
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         rows = basin.below(values, level)
         before = len(fitted)
         if before:  # far from the last fit V is an extrapolation, and may be low by mistake
             away = cKDTree(places[fitted]).query(places[rows])[0]
-            rows = rows[away < REACH * np.sqrt(2 * level) + 2 * spacing[rows]]
+            rows = rows[away < POINT_REACH * np.sqrt(2 * level) + 2 * spacing[rows]]
         fitted = rows
-        if len(rows) > MOST_POINTS:
-            rows = np.sort(generator.choice(rows, MOST_POINTS, replace=False))
+        if len(rows) > MAX_POINTS:
+            rows = np.sort(generator.choice(rows, MAX_POINTS, replace=False))
         points = basin.points(rows)
         if len(points) < 2 * basis.size:
             if not before:
@@ -498,7 +500,7 @@ def _grown(
                 f" needs {2 * basis.size}"
             )
         equation = equation_at(basis, points, dynamics, attractor=attractor)
-        steps, tolerance = (40, 1e-13) if last else (8, ON_THE_WAY)
+        steps, tolerance = (40, 1e-13) if last else (8, COARSE_TOLERANCE)
         solution = gauss_newton(equation, coefficients, free=free, steps=steps, tolerance=tolerance)
         coefficients, residual = solution.coefficients, solution.residual
         values = along(coefficients)
@@ -506,26 +508,32 @@ def _grown(
         # Far from the points of the fit V is an extrapolation: a saddle that seems to lie lower than points
         # already reached does not count, unless they are close to it.
         heights = at_tops @ coefficients
-        believed = (heights > (1 - AT_LEVEL) * level) | close(points)
+        believed = (heights > (1 - SADDLE_TOLERANCE) * level) | close(points)
         limit = depth or min(float(heights[believed & (heights > 0)].min(initial=np.inf)), recorded)
-        if last and abs(limit - level) < SETTLED * level and len(fitted) <= (1 + SETTLED) * before:
+        if (
+            last
+            and abs(limit - level) < LEVEL_TOLERANCE * level
+            and len(fitted) <= (1 + LEVEL_TOLERANCE) * before
+        ):
             break
-        if any(abs(limit - one) < REPEATED * level for one in ends):  # from here on in circles
+        if any(abs(limit - one) < REPEAT_TOLERANCE * level for one in ends):  # from here on in circles
             break
         if last:
             ends.append(level)
-        last = GROWTH * level >= limit
-        level = limit if last else GROWTH * level
+        last = LEVEL_GROWTH * level >= limit
+        level = limit if last else LEVEL_GROWTH * level
     saddle = None
     if depth is not None:
-        saddle = tops[0] if level == depth and residual < NO_SOLUTION else None
+        saddle = tops[0] if level == depth and residual < MAX_RESIDUAL else None
     elif len(tops):
         heights = at_tops @ coefficients
         nearest = int(np.argmin(np.abs(heights - level)))
-        if abs(heights[nearest] - level) < (4 if close(points)[nearest] else 1) * AT_LEVEL * level:
+        if abs(heights[nearest] - level) < (4 if close(points)[nearest] else 1) * SADDLE_TOLERANCE * level:
             saddle, level = tops[nearest], float(heights[nearest])
     # A V that vanishes is a solution too, and the end of what starts far from any other.
-    if not (np.isfinite(residual) and level > 0) or (saddle is None and level < (1 - SETTLED) * recorded):
+    if not (np.isfinite(residual) and level > 0) or (
+        saddle is None and level < (1 - LEVEL_TOLERANCE) * recorded
+    ):
         degree = int(basis.exponents.sum(axis=1).max())
         raise NumericalFailure(f"powers of degree {degree} do not follow V from {place} up to a saddle")
     return Well(dynamics, attractor, basis, coefficients, level, saddle, residual, points)
@@ -534,7 +542,7 @@ def _grown(
 def _recorded(starts: np.ndarray, dimension: int) -> float:
     """The level that recordings reach, of V at the starts of descents, shape ``(n,)``."""
     # Of one state whatever lies below its highest start lies on the way down from it.
-    return float(np.quantile(starts, HIGHEST if dimension > 1 else 1.0))
+    return float(np.quantile(starts, RECORDED_QUANTILE if dimension > 1 else 1.0))
 
 
 def fit_well(
@@ -564,10 +572,10 @@ def fit_well(
     highest = _recorded(basin.starts(along), flat.shape[1])
     level = min(float((potential(tops) - lowest).min(initial=np.inf)), highest)
     failure: NumericalFailure | None = None
-    for share in STARTS:
+    for share in START_SHARES:
         rows = basin.below(along, share * level)
-        if len(rows) > MOST_POINTS:
-            rows = np.sort(generator.choice(rows, MOST_POINTS, replace=False))
+        if len(rows) > MAX_POINTS:
+            rows = np.sort(generator.choice(rows, MAX_POINTS, replace=False))
         points = basin.points(rows)
         scale = np.abs(points - attractor.position).max(axis=0, initial=0.0)
         basis = power_basis(
@@ -580,7 +588,7 @@ def fit_well(
             )
             continue
         # The low powers first: what points on slow manifolds leave open of the high ones would run away.
-        low = basis.exponents.sum(axis=1) <= LOW
+        low = basis.exponents.sum(axis=1) <= START_DEGREE
         start = np.zeros(basis.size)
         start[low] = np.linalg.lstsq(basis.values(points)[:, low], potential(points) - lowest, rcond=1e-10)[0]
         equation = equation_at(basis, points, dynamics)
@@ -594,9 +602,13 @@ def fit_well(
         ways = basin.highest((basis.values(flat) @ start).reshape(along.shape))
         heights = np.sort(ways[tuple(basin.chosen[rows].T)])
         enough = max(len(heights) // 2, 2 * basis.size)
-        first = float(heights[min(enough, len(heights) - 1)]) * (1 + ON_THE_WAY)
+        first = float(heights[min(enough, len(heights) - 1)]) * (1 + COARSE_TOLERANCE)
         # V = 0 is a solution too, and what tends to it has a residual as large as itself.
-        if not solution.residual < NO_SOLUTION or curvature[0] <= FLAT * curvature[-1] or first <= 0:
+        if (
+            not solution.residual < MAX_RESIDUAL
+            or curvature[0] <= MIN_CURVATURE * curvature[-1]
+            or first <= 0
+        ):
             failure = NumericalFailure(
                 f"the networks' V leads to none with a minimum at the attractor near"
                 f" {attractor.position.round(4)}"
@@ -641,21 +653,21 @@ def _extend_well(
         fitted = basin.below(lower, level)
         # Where the well narrows towards its saddle, V in lower powers may be far off, and few states below.
         distance, nearest = cKDTree(depth.points @ metric).query(places)
-        beside = np.where(distance < BESIDE * np.sqrt(2 * depth.value), depth.values[nearest], np.inf)
+        beside = np.where(distance < PATH_DISTANCE * np.sqrt(2 * depth.value), depth.values[nearest], np.inf)
         if by_path:
             coefficients = _towards_path(well, basin.points(fitted), depth, free)
     while True:
         chosen = basin.below((functions @ coefficients).reshape(shape), level)
         if depth is not None:
-            chosen = np.intersect1d(chosen, basin.below(lower, RUNAWAY * level))
+            chosen = np.intersect1d(chosen, basin.below(lower, RUNAWAY_LEVEL * level))
             if len(fitted) and len(chosen):
                 away = cKDTree(places[fitted]).query(places[chosen])[0]
-                chosen = chosen[away < REACH * np.sqrt(2 * level)]
+                chosen = chosen[away < POINT_REACH * np.sqrt(2 * level)]
             fitted = chosen = np.union1d(chosen, np.flatnonzero(beside < level))
         chosen = used = np.intersect1d(chosen, allowed)
-        if depth is not None and len(used) > MOST_POINTS_TO_KNOWN_DEPTH:
+        if depth is not None and len(used) > MAX_POINTS_TO_KNOWN_DEPTH:
             assert generator is not None
-            used = np.sort(generator.choice(used, MOST_POINTS_TO_KNOWN_DEPTH, replace=False))
+            used = np.sort(generator.choice(used, MAX_POINTS_TO_KNOWN_DEPTH, replace=False))
         if depth is not None and len(used) < 2 * well.basis.size:
             raise NumericalFailure(
                 f"V about the attractor near {well.attractor.round(4)} is told by {len(used)} states alone"
@@ -666,7 +678,7 @@ def _extend_well(
         coefficients = robust_fit(equation, coefficients, free, rounds=rounds if last else 1, **options)
         if last:
             break
-        level = min(goal, STEP * level)
+        level = min(goal, ROBUST_GROWTH * level)
     residual = float(np.median(relative_residuals(equation, coefficients)))
     if depth is not None and not np.isfinite(residual):
         raise NumericalFailure(f"powers of degree {well.degree} do not follow V to its saddle")
@@ -706,7 +718,7 @@ def _towards_path(well: Well, x: np.ndarray, depth: Depth, free: np.ndarray) -> 
     scale = np.linalg.norm(matrix, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     coefficients = well.coefficients.copy()
-    coefficients[free] += np.linalg.lstsq(matrix / scale, right, rcond=UNDETERMINED)[0] / scale
+    coefficients[free] += np.linalg.lstsq(matrix / scale, right, rcond=SINGULAR_RATIO)[0] / scale
     return coefficients
 
 

@@ -46,7 +46,7 @@ from siq.quasipotential.certificate import (
     references_about,
 )
 from siq.quasipotential.certificate_tests import (
-    FEWEST,
+    MIN_POINTS,
     Candidate,
     CertificateOptions,
     Reference,
@@ -707,7 +707,7 @@ def test_they_are_held_out_states_of_the_well_and_of_no_other(well: Well, refere
     given = evidence_in_well(400, reference)
     part = _candidate_in_well(well, given)
     rows = {tuple(row) for row in given.points}
-    assert len(part.points) >= FEWEST and all(tuple(row) in rows for row in part.points)
+    assert len(part.points) >= MIN_POINTS and all(tuple(row) in rows for row in part.points)
     assert (part.points[:, 0] * well.attractor[0] > 0).all()
     assert (well.values(part.points) < 0.9 * well.level).all()
     assert part.claimed == 1.0 and "all held out" in part.tested_on
@@ -720,10 +720,10 @@ def test_where_they_are_few_characteristics_give_more_and_it_is_said(
     well: Well, reference: Reference
 ) -> None:
     part = _candidate_in_well(well, evidence_in_well(40, reference))
-    assert len(part.points) > FEWEST
+    assert len(part.points) > MIN_POINTS
     assert "reached by characteristics" in part.tested_on
     alone = _candidate_in_well(well, evidence_in_well(40, None))
-    assert 0 < len(alone.points) < FEWEST and "characteristics" not in alone.tested_on
+    assert 0 < len(alone.points) < MIN_POINTS and "characteristics" not in alone.tested_on
 
 
 def test_a_formula_answers_where_it_claims_to_hold(well: Well, reference: Reference) -> None:

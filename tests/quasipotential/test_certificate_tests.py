@@ -28,9 +28,9 @@ from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.inference.selection import ModelAverage
 from siq.quasipotential.certificate import Certificate, _follow_well
 from siq.quasipotential.certificate_tests import (
-    FEWEST,
-    SAFETY,
-    SHARE,
+    LEVEL_SHARE,
+    MIN_POINTS,
+    SAFETY_FACTOR,
     Candidate,
     CertificateOptions,
     Reference,
@@ -78,10 +78,10 @@ def test_they_carry_the_exact_v_to_within_their_own_error(name: str) -> None:
     known = SYSTEMS[name]
     found = reference_of_name(name)
     exact = potential_values(known, found.points) - potential_values(known, found.attractor[None])
-    assert not found.fault and len(found.values) >= FEWEST
+    assert not found.fault and len(found.values) >= MIN_POINTS
     assert np.linalg.norm(found.values - exact) < found.error * np.linalg.norm(exact)
     assert found.error < 2e-5
-    assert (found.values <= SHARE * found.level * (1 + 1e-9)).all()
+    assert (found.values <= LEVEL_SHARE * found.level * (1 + 1e-9)).all()
 
 
 @pytest.mark.parametrize("name", SADDLES)
@@ -112,7 +112,7 @@ def test_an_error_that_a_region_hides_is_stated() -> None:
 def test_a_formula_answers_up_to_the_level_that_it_claims() -> None:
     known = maier_stein(1)
     low = reference_of_name("Maier-Stein").below(0.1)[1]
-    assert len(low) and low.max() <= SHARE * 0.1
+    assert len(low) and low.max() <= LEVEL_SHARE * 0.1
     candidate = candidate_of(known, reference_of_name("Maier-Stein"), level=1e-9)
     verdict, _ = _check_characteristics(candidate, exact_field(known, 3), OPTIONS, error=1e-6)
     assert not verdict.passed and "the level is too low" in verdict.reason
@@ -337,7 +337,7 @@ def test_the_bound_lies_above_the_true_error(known: KnownSystem, size: float) ->
 
     y = x - known.attractors[1]
     error = size * np.abs(np.sin(2 * y[:, 0]) - 2 * y[:, 0] + y[:, 0] ** 2 * y[:, 1])
-    bound = SAFETY * integral(known, wrong, x)
+    bound = SAFETY_FACTOR * integral(known, wrong, x)
     assert np.linalg.norm(bound) > np.linalg.norm(error)
     assert (bound > 0.9 * error).mean() > 0.9
     assert np.linalg.norm(bound) < 40 * np.linalg.norm(error)
@@ -347,7 +347,7 @@ def test_the_bound_lies_above_the_true_error(known: KnownSystem, size: float) ->
 @pytest.mark.parametrize("known", [linear_system(2), archetype(3)], ids=["linear", "archetype"])
 def test_a_v_that_is_wrong_by_a_factor_is_bounded(known: KnownSystem, factor: float) -> None:
     x = right_well(known) if len(known.attractors) == 2 else uniform_points(known, 150)
-    bound = SAFETY * integral(known, lambda points: factor * potential_gradient(known, points), x)
+    bound = SAFETY_FACTOR * integral(known, lambda points: factor * potential_gradient(known, points), x)
     error = np.abs(factor - 1) * potential_values(known, x)
     assert np.linalg.norm(bound) > np.linalg.norm(error)
     assert np.linalg.norm(bound) < 20 * np.linalg.norm(error)
