@@ -56,7 +56,7 @@ AVERAGED_PAIRS = 500  # the mean of a smooth function of the state, to a few per
 SERIES_TERMS = 24  # of the exponential series, which then is exact to ten digits
 
 
-def all_places(d: int, functions: int) -> np.ndarray:
+def _all_places(d: int, functions: int) -> np.ndarray:
     """Row, column and function of every coefficient that εD(x) may have, shape ``(p, 3)``."""
     # Of many states the correlations are constant: their formulas would be most of all coefficients.
     whole = d <= MAX_STATES
@@ -65,7 +65,7 @@ def all_places(d: int, functions: int) -> np.ndarray:
     )
 
 
-class DiffusionLikelihood:
+class _DiffusionLikelihood:
     """How likely recordings are under ``εD(x) = Σ_k S_k φ_k(x)``, and what follows: base of both likelihoods.
 
     A coefficient is a row ``(i, j, k)`` of places: of the entry ``i ≤ j`` of εD, and of the function φ_k.
@@ -175,7 +175,7 @@ class DiffusionLikelihood:
     @cached_property
     def constant(self) -> tuple[NoiseFormula, np.ndarray]:
         """εD that is the same everywhere, and the sensors with it."""
-        places = all_places(len(self.symbols), 1)
+        places = _all_places(len(self.symbols), 1)
         values, sensor, covariance = self.scored(places, np.array([self.start[i, j] for i, j, _ in places]))
         return self.formula(places, values, covariance, 1.0), sensor
 
@@ -187,9 +187,9 @@ class DiffusionLikelihood:
         Parameters
         ----------
         places
-            Of the coefficients that are asked for; by default `all_places`.
+            Of the coefficients that are asked for; by default `_all_places`.
         """
-        places = all_places(len(self.symbols), len(self.terms)) if places is None else places
+        places = _all_places(len(self.symbols), len(self.terms)) if places is None else places
         constant = places[:, 2] == 0
         formula, sensor = self.constant
         values = np.zeros(len(places))
@@ -237,7 +237,7 @@ class DiffusionLikelihood:
             When no formula of this kind is positive at all recorded states.
         """
         start = self.start
-        places = all_places(len(start), len(self.terms))
+        places = _all_places(len(start), len(self.terms))
         values = np.array([start[i, j] if k == 0 else 0.0 for i, j, k in places])
         critical = float(-scipy.special.ndtri(false_terms / (2 * len(places))))
         while True:
@@ -297,7 +297,7 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.pinv(_scaled(matrix), hermitian=True) / np.outer(size, size))
 
 
-class ResidualLikelihood(DiffusionLikelihood):
+class _ResidualLikelihood(_DiffusionLikelihood):
     """The likelihood of residuals of pairs; no sensor is noisy.
 
     Parameters
@@ -383,7 +383,7 @@ def constant_noise_probability(found: FieldEstimate, pairs: SnapshotPairs, rest:
     float
         1 where the residuals are too few to tell, or the change that they speak for is harmless.
     """
-    data = ResidualLikelihood(found, pairs, rest)
+    data = _ResidualLikelihood(found, pairs, rest)
     (n, d), m = data.rest.shape, len(data.terms)
     if n < MIN_RESIDUALS * d * (d + 1) // 2 * m:
         return 1.0
@@ -394,8 +394,8 @@ def constant_noise_probability(found: FieldEstimate, pairs: SnapshotPairs, rest:
 def fitted_noise(
     found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray, *, false_terms: float, probability: float
 ) -> NoiseFormula:
-    """εD(x) of residuals; see `constant_noise_probability` and `DiffusionLikelihood.selected`."""
-    data = ResidualLikelihood(found, pairs, rest)
+    """εD(x) of residuals; see `constant_noise_probability` and `_DiffusionLikelihood.selected`."""
+    data = _ResidualLikelihood(found, pairs, rest)
     return data.selected(false_terms=false_terms, probability=probability)[0]
 
 
@@ -466,7 +466,7 @@ def with_process_noise_rate(found: FieldEstimate, pairs: SnapshotPairs) -> Field
     return replace(found, noise_rate=rate)
 
 
-class InnovationLikelihood(DiffusionLikelihood):
+class InnovationLikelihood(_DiffusionLikelihood):
     """The likelihood of a filter's innovations, the sensors' variances with the coefficients of D.
 
     Parameters

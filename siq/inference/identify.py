@@ -195,7 +195,7 @@ class _Case:
         if not carries_noise(self.library, training, options=self.options, integrator_step=step):
             return self._finished_by_pairs(regress(training))
         if step is None and (memory := markov_lag(joined(self.recordings))).remembers:
-            for exposure in possible_exposures(memory):
+            for exposure in _possible_exposures(memory):
                 unit = Diffusion.identity(self.library.dimension)
                 found = self.by_exposure(ObservationModel(self.library, unit, exposure))
                 if found is not None:
@@ -275,7 +275,7 @@ class _Case:
         if found.hidden_velocities:
             source = DiffusionSource.OF_VELOCITIES if forced else DiffusionSource.UNIT_OF_VELOCITIES
             if not forced:
-                check_velocity_units(self.units)
+                _check_velocity_units(self.units)
         else:
             first = found
             found, source = self._with_diffusion(found, pairs)
@@ -462,7 +462,7 @@ class _Case:
         return f"{said}: leave 'identification.hidden_velocities' out, the position alone is the state"
 
 
-def check_velocity_units(units: Sequence[str | None]) -> None:
+def _check_velocity_units(units: Sequence[str | None]) -> None:
     """Refuse the unit matrix for D of hidden velocities where positions have different units.
 
     Raises
@@ -477,7 +477,7 @@ def check_velocity_units(units: Sequence[str | None]) -> None:
         )
 
 
-def possible_exposures(found: MarkovLag) -> list[float]:
+def _possible_exposures(found: MarkovLag) -> list[float]:
     """Exposures that samples may be means over, the likeliest first; none where they are no such means.
 
     A camera is mostly exposed for a whole number of steps: where the correlation time is near one, that is

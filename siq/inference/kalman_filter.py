@@ -61,12 +61,12 @@ class ClosedFunctions:
             model, equations=tuple(equations), inputs=(*model.inputs, *further), covariance=None
         )
 
-    def at(self, spread: np.ndarray) -> FunctionsAtSpread:
+    def at(self, spread: np.ndarray) -> _FunctionsAtSpread:
         """The functions for one covariance at each interval, shape ``(n, d, d)``."""
-        return FunctionsAtSpread(self._closed, np.stack([spread[:, j, k] for j, k in self._pairs]))
+        return _FunctionsAtSpread(self._closed, np.stack([spread[:, j, k] for j, k in self._pairs]))
 
 
-class FunctionsAtSpread:
+class _FunctionsAtSpread:
     """`ClosedFunctions` with the covariances inserted."""
 
     def __init__(self, closed: Dynamics, spread: np.ndarray) -> None:
@@ -80,9 +80,9 @@ class FunctionsAtSpread:
         """Its derivatives by states and by free parameters: ``(d, d, n)`` and ``(d, p, n)``."""
         return self._closed.functions.slopes(x, self._with_spread(signals), values)
 
-    def at_intervals(self, chosen: np.ndarray) -> FunctionsAtSpread:
+    def at_intervals(self, chosen: np.ndarray) -> _FunctionsAtSpread:
         """Those of some of the intervals, by their places."""
-        return FunctionsAtSpread(self._closed, self._spread[:, chosen])
+        return _FunctionsAtSpread(self._closed, self._spread[:, chosen])
 
     def _with_spread(self, signals: Signals) -> Signals:
         return replace(signals, inputs=np.concatenate([signals.inputs, self._spread]))
@@ -265,7 +265,7 @@ def linearise(
     x: np.ndarray,
     *,
     columns: Columns | None = None,
-    drift: FunctionsAtSpread | None = None,
+    drift: _FunctionsAtSpread | None = None,
 ) -> Linearisation:
     """Integrate every interval from the state in hand, with the derivatives.
 
@@ -326,7 +326,7 @@ def _carried(
     grid: Grid,
     values: np.ndarray,
     state: np.ndarray,
-    drift: ParametricFunctions | FunctionsAtSpread,
+    drift: ParametricFunctions | _FunctionsAtSpread,
     *,
     columns: Columns | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -391,7 +391,7 @@ def substeps_needed(
 
 
 def _runge_kutta(
-    drift: ParametricFunctions | FunctionsAtSpread,
+    drift: ParametricFunctions | _FunctionsAtSpread,
     grid: Grid,
     values: np.ndarray,
     x: np.ndarray,
@@ -415,18 +415,8 @@ def middle_spread(spread: np.ndarray, intensity: np.ndarray, step: np.ndarray) -
     return np.asarray(spread + intensity * step[:, None, None] / 2)
 
 
-def mean_intensity(noise: Diffusion, x: np.ndarray, spread: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Mean of εD(x) over intervals, and over what a filter knows of the state: shape ``(n, d, d)``.
-
-    Parameters
-    ----------
-    noise
-        εD, of the first states of a model; the others are not driven.
-    x, spread
-        Mean state in the middle of each interval, ``(n, d)``, and its covariance at the begin, ``(n, d, d)``.
-    step
-        Their lengths, shape ``(n,)``.
-    """
+def _mean_intensity(noise: Diffusion, x: np.ndarray, spread: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Mean of εD(x) over intervals, and over what a filter knows of the state: shape ``(n, d, d)``."""
     d = noise.dimension
     matrices = noise.at(x[:, :d])
     wide = middle_spread(spread[:, :d, :d], matrices, step)
@@ -462,11 +452,11 @@ class Noise:
     field: Diffusion | None = None
 
     def along(self, x: np.ndarray, spread: np.ndarray | None, step: np.ndarray) -> Noise:
-        """The same noise with the shape that its field has at states; see `mean_intensity`."""
+        """The same noise with the shape that its field has at states; see `_mean_intensity`."""
         if self.field is None:
             return self
         spread = np.zeros((*x.shape, x.shape[1])) if spread is None else spread
-        return replace(self, shape=mean_intensity(self.field, x, spread, step))
+        return replace(self, shape=_mean_intensity(self.field, x, spread, step))
 
     def without_process(self) -> Noise:
         """The same measurement noise, and states that follow their equations exactly."""

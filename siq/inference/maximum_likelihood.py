@@ -128,7 +128,7 @@ class NoiseCoordinates:
         return replace(result, shape=shape)
 
 
-def estimate_noise(
+def _estimate_noise(
     linearisation: Linearisation,
     data: Measurements,
     start: Noise,
@@ -141,19 +141,6 @@ def estimate_noise(
 
     The parameters are those that are best for the noise that the search begins with: they depend little on
     it, and a fit returns here once they have settled.
-
-    Parameters
-    ----------
-    linearisation, data
-        Along the trajectories.
-    start
-        Where the search begins. A process noise that is zero stays so.
-    expected
-        What is expected of changes of the free parameters.
-    charge
-        Called before each evaluation of the likelihood, with the share of the samples that it is for.
-    coarse
-        Whether some thousand samples are enough, where there are many more.
     """
     coordinates = NoiseCoordinates(start, data.known_sensors)
     driven, outputs = coordinates.driven, len(start.measurement)
@@ -277,7 +264,7 @@ def _noise_along(
     """The noise along the trajectories in hand, the process noise only where it is to be estimated, too."""
     driven = bool((noise.process > 0).any())
     if estimate_process and driven:
-        return estimate_noise(linearisation, data, noise, expected=expected, charge=charge, coarse=coarse)
+        return _estimate_noise(linearisation, data, noise, expected=expected, charge=charge, coarse=coarse)
     if driven and data.sensor_noise is not None:
         return noise
     white = whiten(linearisation, data, noise)
@@ -295,7 +282,7 @@ def _noise_along(
 
 
 @dataclass(frozen=True)
-class Iterate:
+class _Iterate:
     """Where a fit stands.
 
     Attributes
@@ -321,7 +308,7 @@ class Iterate:
 
 
 @dataclass(frozen=True)
-class Shooting:
+class _Shooting:
     """What is fitted.
 
     Attributes
@@ -373,7 +360,7 @@ class Shooting:
         drift = self.closed.at(middle_spread(spread[rows], intensity, data.step[rows]))
         return linearise(self.model, self.grid, values, x, drift=drift)
 
-    def noise_at(self, now: Iterate, noise: Noise) -> Noise:
+    def noise_at(self, now: _Iterate, noise: Noise) -> Noise:
         """The noise where a fit stands: process noise may depend on the state."""
         if noise.field is None:
             return noise
@@ -381,7 +368,7 @@ class Shooting:
         middle[rows] += (now.x[rows + 1] + now.along.gap[rows] - now.x[rows]) / 2
         return noise.along(middle, now.spread, self.grid.data.step)
 
-    def stepped(self, now: Iterate, change: np.ndarray, noise: Noise) -> tuple[Iterate, float] | None:
+    def stepped(self, now: _Iterate, change: np.ndarray, noise: Noise) -> tuple[_Iterate, float] | None:
         """The step that the linearisation suggests, shortened until it does about what was foreseen.
 
         Parameters
@@ -395,7 +382,7 @@ class Shooting:
 
         Returns
         -------
-        Iterate, float
+        _Iterate, float
             Where it leads, and the share of it that was taken; None where not even a short one does as
             foreseen.
         """
@@ -418,7 +405,7 @@ class Shooting:
                 expected = (1 - length) * now.along.gap[rows] + length * foreseen
                 unforeseen = np.sqrt(np.mean(((along.gap[rows] - expected) / scale) ** 2))
                 if unforeseen <= NONLINEAR * length * effect + HARMLESS * usual + 1e-9:
-                    return Iterate(values, x, along, now.x + length * smoothed, spread), length
+                    return _Iterate(values, x, along, now.x + length * smoothed, spread), length
             length /= 2
         return None
 
@@ -521,7 +508,7 @@ def fit_of_states(
     noise
         To begin with; the measurement noise is estimated.
     """
-    at = Iterate(model.values, x, linearise(model, Grid(data, substeps), model.values, x), x)
+    at = _Iterate(model.values, x, linearise(model, Grid(data, substeps), model.values, x), x)
     if not at.along.finite:
         return _failed_fit(model, at, noise, substeps, RUNS_AWAY)
     try:
@@ -536,7 +523,7 @@ def fit_of_states(
 def _fit_at(
     model: Dynamics,
     data: Measurements,
-    at: Iterate,
+    at: _Iterate,
     *,
     noise: Noise,
     substeps: int,
@@ -567,7 +554,7 @@ def _fit_at(
     )
 
 
-def _failed_fit(model: Dynamics, at: Iterate, noise: Noise, substeps: int, fault: str) -> Fit:
+def _failed_fit(model: Dynamics, at: _Iterate, noise: Noise, substeps: int, fault: str) -> Fit:
     """A fit that has no result, and the reason; see `Fit.fault`."""
     free = len(model.free)
     return Fit(
@@ -634,8 +621,8 @@ def fit_by_multiple_shooting(
         if substeps is None:
             substeps = substeps_needed(model, data, model.values, x, tolerance=SUBSTEP_ERROR)
         grid = Grid(data, substeps)
-        begin = Iterate(model.values, x, linearise(model, grid, model.values, x), x)
-        shooting = Shooting(model, grid, _sizes(model, x), budget=budget)
+        begin = _Iterate(model.values, x, linearise(model, grid, model.values, x), x)
+        shooting = _Shooting(model, grid, _sizes(model, x), budget=budget)
         fit = _gauss_newton(shooting, begin, noise, estimate_process=estimate_process, most=iterations)
     if not (fit.converged and fit.has_process_noise):
         return fit
@@ -680,15 +667,15 @@ def fit_by_filter(
         closed = ClosedFunctions(model) if closure else None
         if not estimate_sensor:
             data = replace(data, sensor_noise=noise.measurement)
-        shooting = Shooting(
+        shooting = _Shooting(
             model, Grid(data, substeps), _sizes(model, x), filtered=True, closed=closed, budget=budget
         )
-        begin = Iterate(model.values, x, shooting.linearised(model.values, x, None, noise), x)
+        begin = _Iterate(model.values, x, shooting.linearised(model.values, x, None, noise), x)
         return _gauss_newton(shooting, begin, noise, estimate_process=estimate_process, most=iterations)
 
 
 def _gauss_newton(
-    shooting: Shooting, begin: Iterate, noise: Noise, *, estimate_process: bool, most: int
+    shooting: _Shooting, begin: _Iterate, noise: Noise, *, estimate_process: bool, most: int
 ) -> Fit:
     """Gauss–Newton steps from a begin; what leads to no number is a fit with a fault."""
     if not begin.along.finite:
@@ -699,7 +686,7 @@ def _gauss_newton(
         return _failed_fit(shooting.model, begin, noise, shooting.grid.substeps, str(error))
 
 
-def _descended(shooting: Shooting, now: Iterate, noise: Noise, *, estimate_process: bool, most: int) -> Fit:
+def _descended(shooting: _Shooting, now: _Iterate, noise: Noise, *, estimate_process: bool, most: int) -> Fit:
     data, model = shooting.grid.data, shooting.model
     before: np.ndarray | None = None
     totals: list[float] = []

@@ -207,13 +207,13 @@ def fit_with_process_noise_as_needed(
     jumps of the fit without them are followed more finely.
     """
     loose, strict = fit_with_and_without_process_noise(model, data, begin, level=level, x=x, budget=budget)
-    chosen = simpler_fit(loose, strict)
+    chosen = _simpler_fit(loose, strict)
     if chosen is loose and strict.converged and strict.model.edges:
-        chosen = simpler_fit(loose, sharpened(strict, data, budget=budget))
+        chosen = _simpler_fit(loose, sharpened(strict, data, budget=budget))
     return chosen
 
 
-def simpler_fit(loose: Fit | None, strict: Fit) -> Fit:
+def _simpler_fit(loose: Fit | None, strict: Fit) -> Fit:
     """The fit without process noise, unless the data speak against it."""
     return strict if loose is None or not process_noise_needed(loose, strict) else loose
 
@@ -363,7 +363,7 @@ def recalibrate(model: Dynamics, data: Measurements, *, budget: Budget | None = 
             loose.model, data, loose, settled=True, budget=budget
         )
         if not (own.converged and own.log_likelihood > strict.log_likelihood + BETTER):
-            return simpler_fit(known, strict), strict
+            return _simpler_fit(known, strict), strict
     # Where process noise on a hidden state could explain anything, the fit has no end, or one far off. The
     # card's own simulation is then the better start.
     strict = own
@@ -381,4 +381,4 @@ def recalibrate(model: Dynamics, data: Measurements, *, budget: Budget | None = 
         strict = strict if idle is None else preferred_fit(idle, strict)
     loosened = [each for each in (known, again) if each is not None and each.converged]
     best = max(loosened, key=lambda each: each.log_likelihood, default=None)
-    return simpler_fit(best, strict), strict
+    return _simpler_fit(best, strict), strict

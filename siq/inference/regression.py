@@ -154,7 +154,7 @@ def lost_time(found: FieldEstimate, given: LaggedPairs) -> float:
     return share * float(np.median(given.h))
 
 
-class PairRegression:
+class _PairRegression:
     """Pairs with the active library functions at X0, and what the current f makes of them.
 
     Parameters
@@ -281,7 +281,7 @@ def copies(pairs: SnapshotPairs) -> float:
 
 
 def _fit_everything(
-    regression: PairRegression, *, integrator_step: float | None
+    regression: _PairRegression, *, integrator_step: float | None
 ) -> tuple[np.ndarray, np.ndarray, float, FlowMap]:
     """Least squares over all functions, each round with the correction by the last f.
 
@@ -311,8 +311,8 @@ def _fit_everything(
     return triangle, rate, ratio, flow
 
 
-def evenly(count: int, most: int) -> np.ndarray:
-    """At most so many of `count` rows, evenly spread."""
+def _evenly(count: int, most: int) -> np.ndarray:
+    """At most so many of `count` rows, _evenly spread."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
 
 
@@ -332,8 +332,8 @@ def carries_noise(
             f"only {len(pairs.h)} pairs for {library.size} candidate functions of f;"
             " lower identification.degree or record more"
         )
-    some = pairs.take(evenly(len(pairs.h), max(options.pairs // 4, 4 * library.size)))
-    return _fit_everything(PairRegression(library, some), integrator_step=integrator_step)[2] >= NOISE_FREE
+    some = pairs.take(_evenly(len(pairs.h), max(options.pairs // 4, 4 * library.size)))
+    return _fit_everything(_PairRegression(library, some), integrator_step=integrator_step)[2] >= NOISE_FREE
 
 
 def identify_vector_field(
@@ -376,10 +376,10 @@ def identify_vector_field(
     if isinstance(pairs, LaggedPairs):
         return _identify_by_instruments(library, pairs, options, noise)
     if not carries_noise(library, pairs, options=options, integrator_step=integrator_step):
-        pairs = pairs.take(evenly(len(pairs.h), options.pairs))
+        pairs = pairs.take(_evenly(len(pairs.h), options.pairs))
     n = len(pairs.h)
     triangle, rate, ratio, flow = _fit_everything(
-        PairRegression(library, pairs), integrator_step=integrator_step
+        _PairRegression(library, pairs), integrator_step=integrator_step
     )
     noise_free = ratio < NOISE_FREE
     critical = critical_values(library, false_terms=options.false_terms)
@@ -396,7 +396,7 @@ def identify_vector_field(
 
     def fit(support: np.ndarray) -> tuple[FieldEstimate, np.ndarray]:
         nonlocal found
-        regression = PairRegression(library, pairs, support)
+        regression = _PairRegression(library, pairs, support)
         values = np.array([problems[i].solve(support[support[:, 0] == i, 1])[k] for i, k in support])
         found = _fit_support(found.with_values(support, values), regression)
         if noise_free:
@@ -434,7 +434,7 @@ def _contributing(problem: LinearProblem, precision: float) -> tuple[int, ...]:
     return tuple(active.tolist())
 
 
-def _fit_support(found: FieldEstimate, regression: PairRegression) -> FieldEstimate:
+def _fit_support(found: FieldEstimate, regression: _PairRegression) -> FieldEstimate:
     """Generalised least squares on a support, with flow, noise and covariance brought up to date."""
     d, n, active = found.library.dimension, len(regression.h), len(regression.active)
     values, rate, flow = found.values, found.noise_rate, found.flow
@@ -470,7 +470,7 @@ def refit(found: FieldEstimate, pairs: SnapshotPairs) -> FieldEstimate:
 
     With the weights of a D that depends on the state the noise stays as it is.
     """
-    regression = PairRegression(found.library, pairs, found.support)
+    regression = _PairRegression(found.library, pairs, found.support)
     if isinstance(pairs, LaggedPairs):
         return _fit_by_instruments(regression, instruments(found.library, pairs), found.diffusion)
     if found.diffusion.constant:
@@ -486,7 +486,7 @@ def refit(found: FieldEstimate, pairs: SnapshotPairs) -> FieldEstimate:
 
 def residuals(found: FieldEstimate, pairs: SnapshotPairs) -> np.ndarray:
     """``Xh - E[Xh | X0]`` of pairs, shape ``(n, d)``; correlated noise shifts no mean within a step."""
-    regression = PairRegression(found.library, pairs, found.support)
+    regression = _PairRegression(found.library, pairs, found.support)
     rate = None if isinstance(pairs, LaggedPairs) else found.noise_rate
     velocity = regression.corrected(found.values, found.flow, rate)
     return (velocity - regression.predicted(found.values)) * pairs.h[:, None]
@@ -512,7 +512,7 @@ def with_stability(
     generator
         Draws the recordings.
     """
-    regression = PairRegression(found.library, pairs)
+    regression = _PairRegression(found.library, pairs)
     velocity = regression.corrected(found.coefficients.T.ravel(), found.flow, found.noise_rate)
     weight = np.sqrt(pairs.h)[:, None]
     order = np.argsort(pairs.recording, kind="stable")
@@ -613,7 +613,7 @@ def weighted_triangle(
     of_rest
         Whether the goal is what f leaves of the velocities, rather than these.
     """
-    regression = PairRegression(found.library, pairs, found.support)
+    regression = _PairRegression(found.library, pairs, found.support)
     velocity = regression.corrected(found.values, found.flow, found.noise_rate)
     left = velocity - regression.predicted(found.values)
     if places is None:
@@ -656,7 +656,7 @@ def _identify_by_instruments(
             f"only {pairs.independent:.0f} independent pairs for {q} candidate functions of f;"
             " lower identification.degree or record more"
         )
-    regression = PairRegression(library, pairs)
+    regression = _PairRegression(library, pairs)
     directions = instruments(library, pairs)
     # Of some function nothing may be known from an earlier state. Its coefficient would be chance, as large
     # as the error of its own instrument is small, and so would be all that is said of what is left.
@@ -685,7 +685,7 @@ def _identify_by_instruments(
         )
 
     def fit(support: np.ndarray) -> tuple[FieldEstimate, np.ndarray]:
-        found = _fit_by_instruments(PairRegression(library, pairs, support), directions, diffusion)
+        found = _fit_by_instruments(_PairRegression(library, pairs, support), directions, diffusion)
         return found, np.abs(found.values) / np.sqrt(np.diag(found.covariance)) / critical[support[:, 1]]
 
     found, support = fit_significant(fit, np.array(chosen))
@@ -693,7 +693,7 @@ def _identify_by_instruments(
 
 
 def _fit_by_instruments(
-    regression: PairRegression, directions: np.ndarray, diffusion: Diffusion
+    regression: _PairRegression, directions: np.ndarray, diffusion: Diffusion
 ) -> FieldEstimate:
     """Generalised least squares of the projected problem on a support."""
     pairs = regression.pairs

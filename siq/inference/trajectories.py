@@ -27,7 +27,7 @@ from siq.systems.formulas import compile_values
 
 
 @machine_code
-def run_tape(
+def _run_tape(
     operations: np.ndarray,
     registers: np.ndarray,
     base: int,
@@ -38,21 +38,7 @@ def run_tape(
     step: np.ndarray,
     states: np.ndarray,
 ) -> None:
-    """Integrate recordings by the Runge–Kutta rule, sample after sample, into `states`.
-
-    Parameters
-    ----------
-    operations, registers, base, results
-        The tape of the rates: its arguments are states, then signals, then parameters, which are filled in.
-    first
-        Row at which each recording begins, and the number of rows; shape ``(recordings + 1,)``.
-    begin, signals, step
-        Initial states ``(recordings, d)``; signals at begin, middle and end of every substep,
-        ``(3 substeps, s, intervals)``; and the length of a substep of each interval.
-    states
-        Shape ``(n, d)``, not a number to begin with: a recording in which the simulation runs away is left
-        so from there on.
-    """
+    """Integrate recordings by the Runge–Kutta rule, sample after sample, into `states`."""
     dimension = begin.shape[1]
     known = signals.shape[1]
     substeps = signals.shape[0] // 3
@@ -184,7 +170,7 @@ def run_along(
     known = begin.shape[1] + signals.shape[1]
     registers[known : known + len(values)] = values
     with np.errstate(all="ignore"):
-        run_tape(
+        _run_tape(
             tape.operations, registers, tape.base, tape.results, grid.data.first,
             np.ascontiguousarray(begin, dtype=float), signals, grid.step, states,
         )  # fmt: skip
@@ -270,7 +256,7 @@ def fit_trajectories(
                 budget.charge(work * (RUN if normal is not None else 1.0 + RUN))
             if normal is None:
                 along = linearise(model, grid, values, states)
-                normal = normal_equations(along, data, noise.measurement, Expectations.of(model, values))
+                normal = _normal_equations(along, data, noise.measurement, Expectations.of(model, values))
             change, moved, foreseen = normal.step(damping)
             new = values.copy()
             new[free] += change
@@ -295,7 +281,7 @@ def fit_trajectories(
 
 
 @dataclass(frozen=True)
-class NormalEquations:
+class _NormalEquations:
     """Least squares of parameters and the initial states of every recording.
 
     Attributes
@@ -340,12 +326,12 @@ class NormalEquations:
         return change / scale, begin / own_scale, linear + damping * length
 
 
-def normal_equations(
+def _normal_equations(
     linearisation: Linearisation,
     data: Measurements,
     variance: np.ndarray,
     expected: Expectations | None = None,
-) -> NormalEquations:
+) -> _NormalEquations:
     """The normal equations along trajectories without gaps, at the sensors' variances ``(m,)``."""
     along = replace(linearisation, gap=np.zeros_like(linearisation.gap))
     still = np.zeros((1, *along.transition.shape[1:]))
@@ -368,7 +354,7 @@ def normal_equations(
     if expected is not None:
         shared += expected.rows.T @ expected.rows
         shared_target += expected.rows.T @ expected.deviations
-    return NormalEquations(shared, own, between, shared_target, own_target)
+    return _NormalEquations(shared, own, between, shared_target, own_target)
 
 
 def _sizes(squares: np.ndarray) -> np.ndarray:
@@ -444,7 +430,7 @@ def free_run(
     rows = np.maximum((PREFIX * lengths).astype(int), SHORTEST_PREFIX) if told is None else told
     rows = np.minimum(rows, lengths - 1)
     prefix = data.until(np.maximum(rows, 2))
-    x = initial_states(model, prefix, noise=noise, substeps=substeps, usual=usual)
+    x = _initial_states(model, prefix, noise=noise, substeps=substeps, usual=usual)
     states = run(model, Grid(data, substeps), x)
     signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
     within = np.arange(len(data.t)) - data.first[data.recording]
@@ -454,7 +440,7 @@ def free_run(
     )
 
 
-def initial_states(
+def _initial_states(
     model: Dynamics,
     data: Measurements,
     *,

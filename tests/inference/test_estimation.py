@@ -11,7 +11,7 @@ import scipy.linalg
 from siq.inference.kalman_filter import Grid, Noise, linearise, whiten, with_parameters_changed
 from siq.inference.maximum_likelihood import (
     Fit,
-    estimate_noise,
+    _estimate_noise,
     first_noise,
     fit_by_multiple_shooting,
     log_likelihood,
@@ -233,7 +233,7 @@ def test_random_forces_are_measured_and_do_not_bias_the_parameters() -> None:
 def test_the_search_for_noise_ends_where_the_likelihood_is_highest() -> None:
     data = oscillations(recordings=6, samples=60, noise=0.03, seed=4, drive=0.02)
     found = fitted(data, estimate_process=True)
-    best = estimate_noise(found.linearisation, data, found.noise)
+    best = _estimate_noise(found.linearisation, data, found.noise)
     top = log_likelihood(found.linearisation, data, best)
     for factor in (0.7, 1.4):
         assert log_likelihood(found.linearisation, data, best.scaled(factor)) < top
@@ -247,8 +247,8 @@ def test_of_many_samples_some_tell_the_noise_and_all_correct_it() -> None:
     x = first_states(model, data)
     line, start = linearise(model, Grid(data, 1), model.values, x), first_noise(model, data, x)
     work: list[float] = []
-    best = estimate_noise(line, data, start, charge=work.append)
-    rough = estimate_noise(line, data, start, coarse=True)
+    best = _estimate_noise(line, data, start, charge=work.append)
+    rough = _estimate_noise(line, data, start, coarse=True)
     top = log_likelihood(line, data, best)
     assert log_likelihood(line, data, rough) < top
     assert rough.measurement == pytest.approx(best.measurement, rel=0.1)

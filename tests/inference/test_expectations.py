@@ -12,7 +12,13 @@ from siq.inference.budget import Budget, BudgetSpent
 from siq.inference.kalman_filter import Noise
 from siq.inference.measurements import Expectations, Measurements, with_expectations
 from siq.inference.recalibration import recalibrate
-from siq.inference.trajectories import UsualStates, fit_trajectories, free_run, initial_states, normalised_rms
+from siq.inference.trajectories import (
+    UsualStates,
+    _initial_states,
+    fit_trajectories,
+    free_run,
+    normalised_rms,
+)
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter
 
@@ -91,7 +97,7 @@ def test_a_hidden_state_begins_where_it_usually_is_unless_the_prefix_tells() -> 
     noise = Noise(np.array([1e-4]), np.zeros(2))
     usual = UsualStates(np.array([0.0, 0.8]), np.array([2.0, 0.4]))
     # Nothing tells z where it does nothing.
-    begin = initial_states(model(b=0.0), data, noise=noise, substeps=2, usual=usual)
+    begin = _initial_states(model(b=0.0), data, noise=noise, substeps=2, usual=usual)
     np.testing.assert_allclose(begin[:, 1], 0.8, atol=1e-3)
     # Where the prefix does tell it, a wrong expectation as wide as that does no harm.
     known = free_run(model(), data, noise=noise, substeps=2)

@@ -20,7 +20,7 @@ from siq.data.recordings import Recordings, SnapshotPairs, select_recordings, sn
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate, FlowMap
 from siq.inference.library import IdentificationOptions, candidate_library, field_library
-from siq.inference.regression import copies, evenly, identify_vector_field, refit, residuals
+from siq.inference.regression import _evenly, copies, identify_vector_field, refit, residuals
 from siq.numerics.integration import dormand_prince_step
 from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
@@ -325,7 +325,7 @@ def test_an_equation_without_a_significant_term_is_a_numerical_failure() -> None
 
 def test_noise_free_pairs_beyond_the_limit_are_not_used_and_noisy_ones_are() -> None:
     pairs = flow_pairs(TURNING, 400, h=(0.01, 0.02))
-    chosen = evenly(400, 150)
+    chosen = _evenly(400, 150)
     assert len(chosen) == 150
     assert (chosen[0], chosen[-1]) == (0, 399)
     some = SnapshotPairs(pairs.x0[chosen], pairs.xh[chosen], pairs.h[chosen], pairs.recording[chosen])

@@ -14,10 +14,10 @@ from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import (
+    _simpler_fit,
     drop_insignificant_process_noise,
     fit_with_and_without_process_noise,
     recalibrate,
-    simpler_fit,
 )
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter
@@ -66,5 +66,5 @@ def test_idle_forces_are_not_believed_where_another_way_of_fitting_ends_lower() 
     fit = fitted(data)
     idle = replace(fit, noise=Noise(fit.noise.measurement, np.array([1e-22])))
     loose, strict = fit_with_and_without_process_noise(fit.model, data, idle, settled=True)
-    assert loose is idle and not simpler_fit(loose, strict).has_process_noise
+    assert loose is idle and not _simpler_fit(loose, strict).has_process_noise
     assert strict.log_likelihood >= idle.log_likelihood - 1e-3

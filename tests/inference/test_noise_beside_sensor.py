@@ -7,8 +7,8 @@ import pytest
 import sympy
 
 from siq.data.recordings import Recordings
-from siq.inference.diffusion_model import InnovationLikelihood, all_places
-from siq.inference.kalman_filter import Noise, mean_intensity
+from siq.inference.diffusion_model import InnovationLikelihood, _all_places
+from siq.inference.kalman_filter import Noise, _mean_intensity
 from siq.inference.library import candidate_library
 from siq.inference.maximum_likelihood import Fit, fit_by_filter
 from siq.inference.measurements import Measurements
@@ -52,7 +52,7 @@ def followed(recordings: Recordings) -> tuple[Fit, Measurements, InnovationLikel
 
 def test_scores_are_the_derivatives_of_the_likelihood() -> None:
     _, _, seen = followed(records(1, slope=0.4, samples=200))
-    chosen = all_places(1, len(seen.terms))
+    chosen = _all_places(1, len(seen.terms))
     values, sensor = np.array([0.3, 0.02, 0.05]), np.array([0.012])
     _, score, _, _ = seen.reached(chosen, values, sensor)
     for place in range(4):
@@ -90,18 +90,18 @@ def test_the_field_is_the_mean_over_what_is_known_of_the_state() -> None:
     x, y = sympy.symbols("x y", real=True)
     field = Diffusion.of_formulas((x, y), [[1 + x**2, x * y], [x * y, 2 + y**2]])
     point, spread = np.array([[0.3, -0.2]]), np.array([[[0.05, 0.01], [0.01, 0.08]]])
-    found = mean_intensity(field, point, spread, np.zeros(1))[0]
+    found = _mean_intensity(field, point, spread, np.zeros(1))[0]
     assert found == pytest.approx(np.array([[1.09 + 0.05, -0.06 + 0.01], [-0.06 + 0.01, 2.04 + 0.08]]))
     # Forces of half an interval are a part of the spread in its middle; a third state is not driven.
     wider = np.zeros((1, 3, 3))
-    found = mean_intensity(field, np.array([[0.3, -0.2, 9.0]]), wider, np.array([0.1]))[0]
+    found = _mean_intensity(field, np.array([[0.3, -0.2, 9.0]]), wider, np.array([0.1]))[0]
     assert found[0, 0] == pytest.approx(1.09 + 1.09 * 0.05) and not found[2].any()
 
 
 def test_a_formula_that_is_no_covariance_somewhere_drives_nothing_there() -> None:
     x = sympy.Symbol("x", real=True)
     field = Diffusion.of_formulas((x,), [[1 + x]])
-    assert mean_intensity(
+    assert _mean_intensity(
         field, np.array([[-1.5], [1.0]]), np.zeros((2, 1, 1)), np.zeros(2)
     ).ravel() == pytest.approx([0, 2])
 

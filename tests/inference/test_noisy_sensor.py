@@ -12,7 +12,7 @@ from remembering import double_wells
 from siq.data.correlation import markov_lag
 from siq.data.recordings import Recordings, select_recordings, snapshot_pairs
 from siq.inference.field_estimate import FieldEstimate
-from siq.inference.identify import identify, possible_exposures
+from siq.inference.identify import _possible_exposures, identify
 from siq.inference.kalman_filter import Noise
 from siq.inference.kalman_identification import (
     filtered_recordings,
@@ -212,7 +212,7 @@ def test_means_over_an_exposure_of_another_length_are_treated_as_such(steps: flo
 
 def test_exposures_that_are_tried_are_those_that_residuals_show() -> None:
     memory = markov_lag(recorded(double_wells(1, exposure=10.0, samples=6_000)))
-    first, second = possible_exposures(memory)
+    first, second = _possible_exposures(memory)
     assert first == pytest.approx(0.1) and second == memory.memory == pytest.approx(0.1, rel=0.03)
-    assert possible_exposures(replace(memory, kind="either")) == [memory.step]
-    assert possible_exposures(replace(memory, kind="coloured")) == []
+    assert _possible_exposures(replace(memory, kind="either")) == [memory.step]
+    assert _possible_exposures(replace(memory, kind="coloured")) == []

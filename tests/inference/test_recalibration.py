@@ -13,7 +13,7 @@ import sympy
 from siq.diagnosis.study import measurements_of
 from siq.inference import maximum_likelihood, recalibration
 from siq.inference.kalman_filter import Noise
-from siq.inference.maximum_likelihood import Fit, Iterate, Shooting, fit_by_multiple_shooting
+from siq.inference.maximum_likelihood import Fit, _Iterate, _Shooting, fit_by_multiple_shooting
 from siq.inference.measurements import Measurements
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter
@@ -73,11 +73,11 @@ def test_a_fit_has_not_settled_while_it_foresees_more_than_it_has() -> None:
     fit = fit_by_multiple_shooting(decay, data, x=x, noise=noise, estimate_process=False)
     assert fit.converged
 
-    def idle(self: Shooting, now: Iterate, change: np.ndarray, noise: Noise) -> tuple[Iterate, float]:
+    def idle(self: _Shooting, now: _Iterate, change: np.ndarray, noise: Noise) -> tuple[_Iterate, float]:
         return now, 1.0  # a whole step that does nothing of what it promised
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Shooting, "stepped", idle)
+        patch.setattr(_Shooting, "stepped", idle)
         patch.setattr(maximum_likelihood, "_stands_still", lambda totals: False)
         stuck = fit_by_multiple_shooting(decay, data, x=x, noise=noise, estimate_process=False)
         settled = fit_by_multiple_shooting(fit.model, data, x=fit.x, noise=noise, estimate_process=False)
