@@ -35,7 +35,7 @@ from siq.errors import NumericalFailure
 from siq.inference.budget import UNLIMITED, Account, Budget
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, with_expectations
-from siq.inference.recalibration import covariance_with_unknown_forces, recalibrate
+from siq.inference.recalibration import covariance_with_unknown_process_noise, recalibrate
 from siq.inference.trajectories import FreeRun, squared_errors
 from siq.remarks import Remark
 from siq.systems.dynamics import Dynamics
@@ -225,7 +225,7 @@ def investigate(
         models = fit_unnamed_models(found, context)
     budget.says("working out how well parameters are known")
     with budget.exempt():
-        covariance = covariance_with_unknown_forces(found.fit, data, budget=budget)
+        covariance = covariance_with_unknown_process_noise(found.fit, data, budget=budget)
     found = replace(found, fit=replace(found.fit, covariance=covariance))
     return Investigation(
         verdict=verdict,

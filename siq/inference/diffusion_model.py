@@ -217,7 +217,7 @@ class _DiffusionLikelihood:
     def selected(
         self, *, false_terms: float, probability: float
     ) -> tuple[NoiseFormula, np.ndarray, np.ndarray]:
-        """εD(x) of the largest likelihood, of the terms that differ from zero, with the sensors beside it.
+        """εD(x) of the largest likelihood, of the terms that differ from zero, together with the sensors.
 
         Parameters
         ----------
@@ -313,7 +313,7 @@ class _ResidualLikelihood(_DiffusionLikelihood):
         rows = np.unique(np.linspace(0, n - 1, min(n, int(MAX_NUMBERS / (m * d * (d + 1))))).astype(int))
         if len(rows) < n:
             pairs, rest = pairs.take(rows), rest[rows]
-        x, share = pairs.x0, _remembered(found)
+        x, share = pairs.x0, _response_share(found)
         self.rest = process_noise_increments(found, pairs, rest)
         first = [term.diff(one) for term in self.terms for one in symbols]
         second = [term.diff(one, other) for term in self.terms for one in symbols for other in symbols]
@@ -399,7 +399,7 @@ def fitted_noise(
     return data.selected(false_terms=false_terms, probability=probability)[0]
 
 
-def _remembered(found: FieldEstimate) -> float:
+def _response_share(found: FieldEstimate) -> float:
     """The mean time, as a share of a step, for which the system goes on after a kick within the step."""
     return (1 - 1 / found.flow.steps) / 2 if found.flow.euler else 0.5
 
@@ -409,7 +409,7 @@ def process_noise_increments(found: FieldEstimate, pairs: SnapshotPairs, rest: n
 
     ``∫₀ʰ e^{Js} D e^{Jᵀs} ds`` is ``h e^{Jh/2} D e^{Jᵀh/2}`` but for the second order in Jh.
     """
-    step = found.dynamics.jacobian(pairs.x0) * (_remembered(found) * pairs.h)[:, None, None]
+    step = found.dynamics.jacobian(pairs.x0) * (_response_share(found) * pairs.h)[:, None, None]
     if not np.isfinite(step).all() or np.abs(step).max(initial=0.0) > MAX_RELAXATION:
         step = np.zeros_like(step)
     back = np.eye(rest.shape[1]) - step + step @ step / 2

@@ -52,7 +52,6 @@ from siq.inference.field_estimate import (
     NoiseDiagnosis,
     Verdict,
 )
-from siq.inference.inertia import inertia_test, seen_inertia
 from siq.inference.kalman_filter import Noise
 from siq.inference.kalman_identification import (
     filtered_recordings,
@@ -60,7 +59,7 @@ from siq.inference.kalman_identification import (
     identify_by_likelihood,
 )
 from siq.inference.library import CandidateLibrary, IdentificationOptions, check_origin, field_library
-from siq.inference.observation import ObservationModel, moved_by, velocity_names
+from siq.inference.observation import ObservationModel, inertia_test, moved_by, seen_inertia, velocity_names
 from siq.inference.regression import (
     carries_noise,
     identify_vector_field,

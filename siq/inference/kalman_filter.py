@@ -89,7 +89,7 @@ class _FunctionsAtSpread:
 
 
 class Columns(Protocol):
-    """Right-hand sides of candidates, whose response is wanted beside that of the parameters."""
+    """Right-hand sides of candidates, whose response is wanted behind that of the parameters."""
 
     def rates(self, x: np.ndarray, values: np.ndarray, node: int) -> np.ndarray:
         """In the equations, at states ``(d, k)`` of a node: shape ``(d, q, k)``."""

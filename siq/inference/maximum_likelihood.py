@@ -145,7 +145,7 @@ def _estimate_noise(
     coordinates = NoiseCoordinates(start, data.known_sensors)
     driven, outputs = coordinates.driven, len(start.measurement)
     white = whiten(linearisation, data, start)
-    columns, innovations = (expected or Expectations.none()).beside(white.columns, white.innovations)
+    columns, innovations = (expected or Expectations.none()).stacked_on(white.columns, white.innovations)
     whole = with_parameters_changed(linearisation, solve(columns, innovations)[0])
     count = len(data.t)
     # Pieces spread over all recordings, where there are many more samples than are needed.
@@ -268,7 +268,7 @@ def _noise_along(
     if driven and data.sensor_noise is not None:
         return noise
     white = whiten(linearisation, data, noise)
-    change, covariance = solve(*expected.beside(white.columns, white.innovations))
+    change, covariance = solve(*expected.stacked_on(white.columns, white.innovations))
     determined = len(change) - float(np.einsum("rp,pq,rq->", expected.rows, covariance, expected.rows))
     left = (white.innovations - white.columns @ change).reshape(len(data.t), -1)
     known = white.known.reshape(left.shape)
@@ -533,7 +533,7 @@ def _fit_at(
     """What is known of a fit whose iteration ended at parameters, states and noise."""
     white = whiten(at.along, data, noise)
     expected = Expectations.of(model, at.values)
-    columns, innovations = expected.beside(white.columns, white.innovations)
+    columns, innovations = expected.stacked_on(white.columns, white.innovations)
     change, covariance = solve(columns, innovations, least=resolution)
     # The last change is below the errors. The likelihood is that of the states in hand, not of a forecast.
     total = float(innovations @ innovations)
@@ -701,7 +701,7 @@ def _descended(shooting: _Shooting, now: _Iterate, noise: Noise, *, estimate_pro
             )  # fmt: skip
         shooting.charge()
         white = whiten(now.along, data, noise)
-        columns, innovations = expected.beside(white.columns, white.innovations)
+        columns, innovations = expected.stacked_on(white.columns, white.innovations)
         change, _ = solve(columns, innovations, least=shooting.resolution)
         explained = white.columns @ change
         left = white.innovations - explained

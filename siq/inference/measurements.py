@@ -387,7 +387,7 @@ class Expectations:
         together = np.concatenate(rows)
         return cls(together, np.concatenate(middle) - together @ now)
 
-    def beside(self, columns: np.ndarray, innovations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def stacked_on(self, columns: np.ndarray, innovations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Columns ``(n, p)`` and innovations ``(n,)`` with one row more for each expectation."""
         if not len(self.rows):
             return columns, innovations

@@ -105,7 +105,7 @@ def noise_uncertainty(fit: Fit, data: Measurements) -> tuple[np.ndarray, np.ndar
     return errors[:outputs], process, covariance
 
 
-def covariance_with_unknown_forces(
+def covariance_with_unknown_process_noise(
     fit: Fit, data: Measurements, *, budget: Budget | None = None
 ) -> np.ndarray:
     """Covariance of the free parameters of a fit, shape ``(p, p)``, whatever the strength of process noise.
@@ -113,8 +113,8 @@ def covariance_with_unknown_forces(
     The strength is one factor on the process noise of the fit; on such as would make the motion of each state
     where it has none. Beforehand every standard deviation of them is as probable (Gelman 2006, Bayesian
     Analysis 1, 515); the scale of all noise and the parameters are integrated out as linear. A fit without
-    random forces is made once more with those of the average, since its trajectories may be far from those
-    that random forces made.
+    process noise is made once more with that of the average, since its trajectories may be far from those
+    that process noise made.
 
     Parameters
     ----------

@@ -82,7 +82,7 @@ def test_nothing_is_expected_of_fixed_parameters_and_of_zeros() -> None:
     np.testing.assert_array_equal(expected.rows, [[1.0, 0.0, 0.0], [0.0, 0.0, 0.5]])
     np.testing.assert_array_equal(expected.deviations, [1.0, -1.0])
     columns, innovations = np.ones((5, 3)), np.ones(5)
-    assert Expectations.of(model()).beside(columns, innovations) == (columns, innovations)
+    assert Expectations.of(model()).stacked_on(columns, innovations) == (columns, innovations)
 
 
 def test_expectations_do_not_depend_on_units() -> None:

@@ -8,8 +8,8 @@ from particles import particle
 
 from siq.data.recordings import Recordings
 from siq.errors import NumericalFailure
-from siq.inference.inertia import inertia_test
 from siq.inference.library import IdentificationOptions
+from siq.inference.observation import inertia_test
 from siq.workflow import results
 from siq.workflow.pipeline import PipelineSettings
 from siq.workflow.tables import Status

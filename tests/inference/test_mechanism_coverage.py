@@ -9,7 +9,7 @@ import sympy
 from siq.data.recordings import Recordings
 from siq.inference.measurements import measurements
 from siq.inference.recalibration import (
-    covariance_with_unknown_forces,
+    covariance_with_unknown_process_noise,
     fit_with_and_without_process_noise,
     fit_with_process_noise_as_needed,
     recalibrate,
@@ -68,7 +68,7 @@ def covered(seeds: range, *, ratio: float, samples: int, records: int) -> np.nda
         recalibrated, _ = recalibrate(oscillator(mechanism=False), data)
         model = oscillator(mechanism=True).with_values(np.append(recalibrated.model.values, 0.0))
         fit = fit_with_process_noise_as_needed(model, data, recalibrated)
-        errors = np.sqrt(np.diag(covariance_with_unknown_forces(fit, data)))
+        errors = np.sqrt(np.diag(covariance_with_unknown_process_noise(fit, data)))
         inside.append(np.abs(fit.model.values - [STIFFNESS, DAMPING, CUBIC]) < 1.96 * errors)
     return np.array(inside)
 
@@ -81,7 +81,7 @@ def test_what_few_samples_do_not_rule_out_belongs_to_the_errors() -> None:
     model = oscillator(mechanism=True).with_values(np.append(recalibrated.model.values, 0.0))
     _, strict = fit_with_and_without_process_noise(model, data, recalibrated)
     assert not strict.has_process_noise
-    errors = np.sqrt(np.diag(covariance_with_unknown_forces(strict, data)))
+    errors = np.sqrt(np.diag(covariance_with_unknown_process_noise(strict, data)))
     assert (errors > 1.3 * strict.standard_errors).all()
 
 
@@ -90,7 +90,7 @@ def test_without_random_forces_many_samples_leave_the_errors_nearly_as_they_are(
     data = measurements(recordings, oscillator(mechanism=True))
     fit, _ = recalibrate(oscillator(mechanism=True), data)
     assert not fit.has_process_noise
-    errors = np.sqrt(np.diag(covariance_with_unknown_forces(fit, data)))
+    errors = np.sqrt(np.diag(covariance_with_unknown_process_noise(fit, data)))
     assert (errors < 1.5 * fit.standard_errors).all()
 
 
