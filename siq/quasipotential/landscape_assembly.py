@@ -158,8 +158,8 @@ def landscape_from_equations(
     fault, points = portrait.fault(), len(portrait.attractors)
     if not (portrait.attractors or portrait.cycles):
         raise NoLandscape(fault or "f has no stable equilibrium in the domain", None, system)
-    reasons = [*([] if fault is None else [fault]), *portrait.notes]
-    remarks = [Remark("quasipotential.reason", {"reason": one}) for one in reasons]
+    remarks = [] if fault is None else [Remark("quasipotential.reason", {"reason": fault})]
+    remarks += portrait.remarks
     if portrait.cycles:
         beside_points = Remark("quasipotential.cycle_beside_formulas")
         remarks.append(beside_points if points else Remark("quasipotential.cycles_alone"))

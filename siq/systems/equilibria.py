@@ -31,6 +31,7 @@ import scipy.linalg
 from scipy.stats import qmc
 
 from siq.errors import NumericalFailure
+from siq.remarks import Remark
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 
@@ -335,7 +336,7 @@ def spread_evenly(box: np.ndarray, count: int, *, generator: np.random.Generator
 
 def all_equilibria(
     dynamics: Dynamics, *, generator: np.random.Generator
-) -> tuple[tuple[Equilibrium, ...], tuple[str, ...]]:
+) -> tuple[tuple[Equilibrium, ...], list[Remark]]:
     """Equilibria in the domain of a system.
 
     Parameters
@@ -348,8 +349,7 @@ def all_equilibria(
     Returns
     -------
     tuple
-        The equilibria, by their position along the first state; and what speaks against their being all, in
-        words.
+        The equilibria, by their position along the first state; and what speaks against their being all.
     """
     box, d = dynamics.box, dynamics.dimension
     width = np.ptp(box, axis=1)
@@ -376,12 +376,8 @@ def all_equilibria(
     degree = _boundary_degree(dynamics, equilibria)
     indices = [np.sign(np.linalg.det(dynamics.jacobian(one.position[None])[0])) for one in equilibria]
     if degree is None or degree == int(sum(indices)):
-        return equilibria, ()
-    note = (
-        "an equilibrium of the domain was missed: the directions of f along the boundary of the domain turn"
-        f" {degree} times, which the {len(equilibria)} that were found do not explain"
-    )
-    return equilibria, (note,)
+        return equilibria, []
+    return equilibria, [Remark("systems.equilibrium_missed", {"degree": degree, "count": len(equilibria)})]
 
 
 def _boundary_degree(dynamics: Dynamics, equilibria: tuple[Equilibrium, ...]) -> int | None:

@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
 from siq.numerics.least_squares import representative_subset
+from siq.remarks import Remark
 from siq.systems.basins import Basin, Descents, basin_of, edge_saddle, follow, neighbours
 from siq.systems.cycles import (
     Cycle,
@@ -62,10 +63,6 @@ DIAGONAL_STARTS = 33  # with every state at the same share of its range
 EDGES_PER_PAIR = 2  # of attractors, from different first ways
 MAX_PAIRS = 15  # of attractors
 MERGE_TOLERANCE = 1e-6  # of the domain
-SEARCHED = (
-    "in so many states equilibria were not searched for over the whole domain: attractors are those to which"
-    " f leads from {starts} states, and saddles those at which edges between each two of their basins end"
-)
 
 
 @dataclass(frozen=True)
@@ -92,8 +89,8 @@ class PhasePortrait:
         Where those lead that come to rest nowhere; None where they are few.
     harmless
         Degenerate equilibria that take no part in the landscape.
-    notes
-        What is not known, in words.
+    remarks
+        What is not known.
     cycles
         Stable cycles that states of the domain lead to. In `descents` their numbers follow on those of the
         attractors.
@@ -110,7 +107,7 @@ class PhasePortrait:
     descents: Descents
     recurrence: Recurrence | None = None
     harmless: tuple[Equilibrium, ...] = ()
-    notes: tuple[str, ...] = ()
+    remarks: tuple[Remark, ...] = ()
     cycles: tuple[Cycle, ...] = ()
     parting: tuple[Cycle, ...] = ()
 
@@ -187,14 +184,13 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
         raise NumericalFailure("f has no value in a part of the domain: choose one in which it has")
     rate = float(np.median(np.linalg.norm(flow / width, axis=1)))
 
-    starts, notes = points, list[str]()
+    starts, remarks = points, list[Remark]()
     if recorded:
         few = generator.permutation(len(points))
         equilibria = tuple(find_equilibria(dynamics, points[few[:NEWTON_STARTS]]))
         starts = points[few[:RECORDED_STARTS]]
     elif searched:
-        equilibria, missing = all_equilibria(dynamics, generator=generator)
-        notes = [*missing]
+        equilibria, remarks = all_equilibria(dynamics, generator=generator)
     else:
         resting = follow(dynamics, points, [], box=box, states=2).paths[:, -1]
         roots = distinct_roots(dynamics, resting, box=box, margin=MERGE_TOLERANCE)
@@ -224,7 +220,7 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
     elif not recorded:
         saddles, further = _edge_saddles(dynamics, attractors, box, generator)
         equilibria = (*attractors, *saddles)
-        notes = [SEARCHED.format(starts=len(points)), *further]
+        remarks = [Remark("systems.domain_not_searched", {"states": len(points)}), *further]
     around: list[list[Equilibrium]] = [[] for _ in (*attractors, *cycles)]
     for one in equilibria:
         # Over a saddle of a domain with several unstable directions no way is lowest.
@@ -250,10 +246,12 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
     harmless: tuple[Equilibrium, ...] = ()
     if searched:
         harmless, further = _harmless(dynamics, equilibria, attractors, box, generator)
-        notes += further
-        notes += [
-            f"fewer than one in {len(points)} states of the domain lead to the stable equilibrium"
-            f" {one.position.round(4).tolist()}: it is left out"
+        remarks += further
+        remarks += [
+            Remark(
+                "systems.attractor_left_out",
+                {"states": len(points), "place": one.position.round(4).tolist()},
+            )
             for one in stable
             if all(one is not other for other in attractors)
         ]
@@ -263,13 +261,13 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
         recurrence = recurrence_of(dynamics, descents.paths[unsettled, -1], box=box, rate=rate)
     return PhasePortrait(
         points, box, equilibria, tuple(attractors), tuple(map(tuple, around)), tuple(basins), descents,
-        recurrence, harmless, tuple(notes), cycles, unstable_cycles,
+        recurrence, harmless, tuple(remarks), cycles, unstable_cycles,
     )  # fmt: skip
 
 
 def _edge_saddles(
     dynamics: Dynamics, attractors: Sequence[Equilibrium], box: np.ndarray, generator: np.random.Generator
-) -> tuple[list[Equilibrium], list[str]]:
+) -> tuple[list[Equilibrium], list[Remark]]:
     """Saddles on the edges between each two basins, and what is not known."""
     width = np.ptp(box, axis=1)
     saddles: list[Equilibrium] = []
@@ -280,12 +278,12 @@ def _edge_saddles(
             np.abs((top.position - other.position) / width).max() > MERGE_TOLERANCE for other in saddles
         ):
             saddles.append(top)
-    notes = []
+    remarks = []
     if len(attractors) > 1 and not saddles:
-        notes.append("edges between the basins were followed, and led to no saddle: there are no barriers")
+        remarks.append(Remark("systems.no_saddle_on_edges"))
     if len(pairs) > MAX_PAIRS:
-        notes.append(f"saddles were sought between {MAX_PAIRS} of {len(pairs)} pairs of attractors")
-    return saddles, notes
+        remarks.append(Remark("systems.pairs_without_edges", {"some": MAX_PAIRS, "pairs": len(pairs)}))
+    return saddles, remarks
 
 
 def _harmless(
@@ -294,9 +292,9 @@ def _harmless(
     attractors: Sequence[Equilibrium],
     box: np.ndarray,
     generator: np.random.Generator,
-) -> tuple[tuple[Equilibrium, ...], list[str]]:
+) -> tuple[tuple[Equilibrium, ...], list[Remark]]:
     """Degenerate equilibria from all about which f leads to one attractor: they part no wells."""
-    found, notes, width = [], [], np.ptp(box, axis=1)
+    found, remarks, width = [], [], np.ptp(box, axis=1)
     for one in equilibria:
         if one.kind != "degenerate" or not attractors:
             continue
@@ -311,12 +309,12 @@ def _harmless(
         ends = ways.ends[(ways.ends >= 0) | ~creeping]
         if len(ends) > MIN_DECIDED_SHARE * len(starts) and ends[0] >= 0 and (ends == ends[0]).all():
             found.append(one)
-            notes.append(
-                f"the equilibrium {one.position.round(4).tolist()} is neither stable nor unstable to first"
-                f" order; all states about it lead to the attractor"
-                f" {attractors[ends[0]].position.round(4).tolist()}, and it takes no part in the landscape"
-            )
-    return tuple(found), notes
+            values = {
+                "place": one.position.round(4).tolist(),
+                "attractor": attractors[ends[0]].position.round(4).tolist(),
+            }
+            remarks.append(Remark("systems.degenerate_equilibrium_without_part", values))
+    return tuple(found), remarks
 
 
 class RecordedRegion:

@@ -21,9 +21,9 @@ def found(system: Dynamics, seed: int = 0):
 
 
 def test_all_of_a_lattice_are_found() -> None:
-    equilibria, notes = found(LATTICE)
+    equilibria, remarks = found(LATTICE)
     kinds = [one.kind for one in equilibria]
-    assert len(kinds) == 25 and kinds.count("attractor") == 9 and not notes
+    assert len(kinds) == 25 and kinds.count("attractor") == 9 and not remarks
     assert _boundary_degree(LATTICE, equilibria) == 1  # nine wells, four tops, twelve saddles
 
 
@@ -63,7 +63,7 @@ def test_a_degenerate_equilibrium_at_the_edge_takes_no_part_and_is_named() -> No
     system = Dynamics.of((X, Y), (X**2 * (1 - X) * (2 - X), -Y), domain=[(0, 1.5), (-1, 1)])
     portrait = phase_portrait(system)
     assert portrait.fault() is None and len(portrait.harmless) == 1
-    assert "takes no part" in portrait.notes[0]
+    assert portrait.remarks[0].code == "systems.degenerate_equilibrium_without_part"
     between = Dynamics.of((X, Y), (-(X**3) * (X - 1) * (X + 1), -Y), domain=[(-1.5, 1.5), (-1, 1)])
     fault = phase_portrait(between).fault()  # here it parts two wells
     assert fault is not None and "neither stable nor unstable" in fault
