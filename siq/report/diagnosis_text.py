@@ -7,23 +7,17 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-import jinja2
-
 from siq.diagnosis.mechanisms import GENERIC, PROCESS_NOISE
 from siq.diagnosis.residual_structure import DOUBTFUL
 from siq.diagnosis.statement import Location, Recalibrated, Statement
 from siq.numerics.text import (
     LARGEST_PLAIN_NUMBER,
     SMALLEST_SHARE,
-    capital,
-    listed,
     number_text,
     p_equation,
-    p_text,
-    percent,
-    unit_text,
     value_text,
 )
+from siq.report.formatting import environment
 from siq.report.remarks import sentence
 
 SENTENCE_END = "¶"
@@ -32,29 +26,21 @@ SENTENCE_END = "¶"
 @cache
 def _templates() -> Any:
     """The macros of the templates, each of which writes sentences."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("siq.report", "templates"), undefined=jinja2.StrictUndefined,
-        autoescape=False, trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    environment.globals |= {"GENERIC": GENERIC, "PROCESS_NOISE": PROCESS_NOISE, "DOUBTFUL": DOUBTFUL}
-    environment.globals |= {"SMALLEST_SHARE": SMALLEST_SHARE}
-    environment.filters |= {
-        "capitalised": capital,
-        "listed": lambda names, word="and": listed(list(names), word),
-        "p": p_text,
+    made = environment()
+    made.globals |= {"GENERIC": GENERIC, "PROCESS_NOISE": PROCESS_NOISE, "DOUBTFUL": DOUBTFUL}
+    made.globals |= {"SMALLEST_SHARE": SMALLEST_SHARE}
+    further: dict[str, Any] = {
         "p_equation": p_equation,
-        "share": percent,
         "error": _error_text,
-        "value": lambda entry, digits=4: value_text(
+        "estimate": lambda entry, digits=4: value_text(
             entry.estimate, entry.standard_error, unit=entry.unit, digits=digits
         ),
         "after": lambda each: value_text(each.after, each.standard_error, unit=each.unit),
         "before": lambda each: _card_value(each.before),
-        "limit": lambda value: value_text(value, digits=3),
-        "unit": unit_text,
         "changes": _changes,
     }
-    return environment.get_template("diagnosis.j2").module
+    made.filters |= further
+    return made.get_template("diagnosis.j2").module
 
 
 def _written(text: str) -> list[str]:

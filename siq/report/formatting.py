@@ -151,7 +151,7 @@ def environment() -> Environment:
         "p": p_text,
         "range": lambda ends, **options: range_text(*ends, **options),
         "unit": unit_text,
-        "listed": listed,
+        "listed": lambda names, word="and": listed(list(names), word),
         "capital": capital,
         "lower_first": lambda text: text[:1].lower() + text[1:],
         "count_word": lambda count: COUNTS[count] if count < len(COUNTS) else str(count),
