@@ -15,7 +15,7 @@ import time
 import numpy as np
 
 from siq.numerics.integration import runge_kutta_step
-from siq.numerics.least_squares import representative_subset
+from siq.numerics.randomness import representative_subset
 from siq.systems.cards import load_system
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
 

@@ -39,7 +39,7 @@ from siq.inference.field_estimate import (
 )
 from siq.inference.regression import LaggedPairs, copies, instruments, refit, residuals, weighted_triangle
 from siq.numerics.integration import runge_kutta_step
-from siq.numerics.least_squares import positive
+from siq.numerics.randomness import positive
 from siq.remarks import Remark
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics

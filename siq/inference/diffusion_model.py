@@ -38,7 +38,7 @@ from siq.inference.kalman_filter import Noise, middle_spread, solve, whiten, wit
 from siq.inference.library import monomial_exponents
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
-from siq.numerics.least_squares import positive
+from siq.numerics.randomness import positive
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import compile_formulas

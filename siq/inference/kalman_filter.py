@@ -24,7 +24,7 @@ import sympy
 from siq.errors import NumericalFailure
 from siq.inference.filter_kernels import carry_linearly, filter_recursion, projected_sums, smooth_backwards
 from siq.inference.measurements import Measurements
-from siq.numerics.least_squares import triangle_of
+from siq.inference.selection import triangle_of
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Input, ParametricFunctions, Signals, symbol
 

@@ -42,7 +42,7 @@ from siq.inference.selection import (
     stability,
     triangles,
 )
-from siq.numerics.least_squares import positive
+from siq.numerics.randomness import positive
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 

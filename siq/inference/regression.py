@@ -46,7 +46,7 @@ from siq.inference.selection import (
     stability,
     triangles,
 )
-from siq.numerics.least_squares import positive
+from siq.numerics.randomness import positive
 from siq.systems.diffusion import Diffusion
 from siq.systems.formulas import compile_formulas
 

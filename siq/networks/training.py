@@ -42,8 +42,7 @@ from siq.networks.networks import (
     select_run,
     side_by_side,
 )
-from siq.numerics.least_squares import representative_subset
-from siq.numerics.randomness import Purpose, seed_sequence
+from siq.numerics.randomness import Purpose, representative_subset, seed_sequence
 from siq.systems.diffusion import Diffusion
 
 with needs_extra("networks"):

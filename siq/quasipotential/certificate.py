@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from siq.data.recordings import SnapshotPairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import AnyField, GivenField, Verdict
-from siq.numerics.least_squares import representative_subset
+from siq.numerics.randomness import representative_subset
 from siq.quasipotential.certificate_tests import (
     ERROR_POINTS,
     LEVEL_SHARE,

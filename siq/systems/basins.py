@@ -21,7 +21,7 @@ import scipy.optimize
 
 from siq.errors import NumericalFailure
 from siq.numerics.integration import dormand_prince_step, next_step
-from siq.numerics.least_squares import representative_subset
+from siq.numerics.randomness import representative_subset
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, classify, distinct_roots, hessian_at
 

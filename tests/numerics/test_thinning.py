@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 
-from siq.numerics.least_squares import representative_subset
-from siq.numerics.randomness import generator
+from siq.numerics.randomness import generator, representative_subset
 
 pytestmark = pytest.mark.portable
 

@@ -36,7 +36,7 @@ from siq.inference.field_estimate import FieldEstimate, GivenField, Verdict
 from siq.inference.library import candidate_library, monomial_exponents
 from siq.networks.decomposition import shuffled
 from siq.networks.networks import Networks, at_rest, initial_layers
-from siq.numerics.least_squares import representative_subset
+from siq.numerics.randomness import representative_subset
 from siq.quasipotential.certificate import (
     Certificate,
     Evidence,

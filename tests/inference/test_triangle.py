@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from siq.numerics import least_squares
-from siq.numerics.least_squares import triangle_of
+from siq.inference import selection
+from siq.inference.selection import triangle_of
 
 
 @pytest.mark.parametrize("goals", [(), (2,)])
@@ -13,7 +13,7 @@ def test_rows_taken_some_at_a_time_make_the_same_triangle(
 ) -> None:
     draw = np.random.default_rng(0)
     columns, wanted = draw.standard_normal((500, 3)), draw.standard_normal((500, *goals))
-    monkeypatch.setattr(least_squares, "ROWS", 32)
+    monkeypatch.setattr(selection, "ROWS_AT_ONCE", 32)
     found = triangle_of(columns, wanted)
     together = np.column_stack([columns, wanted])
     assert found.shape == (together.shape[1],) * 2
