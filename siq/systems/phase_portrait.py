@@ -19,12 +19,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
-<<<<<<< HEAD
-from siq.numerics.least_squares import representative_subset
-from siq.remarks import Remark
-=======
 from siq.numerics.randomness import representative_subset
->>>>>>> 6804dd3 (A triangle stands where problems are selected; draws and subsets are one module of randomness)
+from siq.remarks import Remark
 from siq.systems.basins import Basin, Descents, basin_of, edge_saddle, follow, neighbours
 from siq.systems.cycles import (
     Cycle,
