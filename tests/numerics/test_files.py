@@ -1,3 +1,5 @@
+"""Files appear whole or not at all; documents are read as data, with the line of every fault."""
+
 from __future__ import annotations
 
 import signal
@@ -8,7 +10,7 @@ import pytest
 from pydantic import BaseModel, ConfigDict
 
 from siq.errors import InputError
-from siq.numerics.files import read_document, validate
+from siq.numerics.files import read_document, validate, whole_file
 
 Write = Callable[..., Path]
 
@@ -137,3 +139,23 @@ def test_aliases_that_multiply_are_read_at_once_or_refused(write: Write) -> None
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, before)
+
+
+def test_a_file_takes_its_place_when_the_block_has_ended(tmp_path: Path) -> None:
+    path = tmp_path / "new folder" / "table.csv"
+    with whole_file(path) as partial:
+        partial.write_text("1", encoding="utf-8")
+        assert partial.suffix == ".csv"
+        assert not path.exists()
+    assert path.read_text(encoding="utf-8") == "1"
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_after_an_error_the_old_file_is_there_and_no_other(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("old", encoding="utf-8")
+    with pytest.raises(ZeroDivisionError), whole_file(path) as partial:
+        partial.write_text("half", encoding="utf-8")
+        _ = 1 / 0
+    assert path.read_text(encoding="utf-8") == "old"
+    assert list(tmp_path.iterdir()) == [path]

@@ -1,3 +1,5 @@
+from __future__ import annotations
+
 import math
 
 import pytest
@@ -70,3 +72,21 @@ def test_a_range_has_two_digits_at_both_ends():
 def test_what_rounding_left_of_zero_is_written_as_zero():
     assert number_text(4.94066e-324) == "0.000"
     assert number_text(1e-30) == "1.000 × 10⁻³⁰"
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (1.0, "1.000"),
+        (-2.0012, "−2.001"),
+        (0.0, "0.000"),
+        (0.0123, "0.012"),
+        (0.00999999, "1.000 × 10⁻²"),
+        (8.87e-4, "8.870 × 10⁻⁴"),
+        (-1.5e12, "−1.500 × 10¹²"),
+        (float("nan"), "—"),
+        (float("-inf"), "−∞"),
+    ],
+)
+def test_number_text(value: float, text: str) -> None:
+    assert number_text(value) == text
