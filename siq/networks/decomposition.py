@@ -138,7 +138,7 @@ class TrainingOptions:
     precision: Literal["float32", "float64"] = "float32"
 
     def attempt(self, number: int) -> TrainingOptions:
-        """What a training is told that comes after `number` trainings that failed.
+        """Options of a training that comes after `number` trainings that failed.
 
         What failed once is likelier to succeed in another way than once more: every second training has a λ
         ten times as large, starts V as steep as f descends, leaves out the faster half of the states, and,
@@ -236,7 +236,7 @@ class TrainedNetworks:
 
 
 def shuffled(networks: TrainedNetworks, *, generator: np.random.Generator) -> TrainedNetworks:
-    """The same weights in random order: a network that knows nothing, for comparison."""
+    """Networks with the same weights in random order, as a null model for comparison."""
 
     def mixed(array: np.ndarray) -> np.ndarray:
         return array.ravel()[generator.permutation(array.size)].reshape(array.shape)

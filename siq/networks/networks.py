@@ -204,7 +204,7 @@ def side_by_side(runs: Sequence[TrainedNetworks]) -> Networks:
 
 
 def move(networks: Networks, device: torch.device | str) -> Networks:
-    """The same networks on another device, detached from any gradient."""
+    """A copy of the networks on another device, detached from any gradient."""
 
     def there(tensor: Tensor) -> Tensor:
         return tensor.detach().to(device, copy=True)

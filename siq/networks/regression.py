@@ -30,7 +30,7 @@ LOWER_SHARE = 0.75
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class RegressionOptions:
-    """What formulas are sought, and how sparse they shall be.
+    """Options of the sparse regression.
 
     Attributes
     ----------

@@ -548,7 +548,7 @@ MOST_STEPS_BETWEEN_CHECKPOINTS = 1000  # steps between two checkpoints, at most
 
 @dataclass(frozen=True)
 class Checkpoints:
-    """What a killed training leaves behind for the one that goes on from it.
+    """Files from which a killed training is resumed.
 
     Attributes
     ----------

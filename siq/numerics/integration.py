@@ -1,7 +1,12 @@
-"""Integration of many trajectories at once, and loops as machine code.
+"""Steps in time for many states at once, and loops as machine code.
 
-Library integrators take one trajectory, or many with the step that the most difficult of them needs. Here
-every row of a state array has its own step, so that a whole fan costs hardly more than one trajectory.
+Library integrators take one trajectory, or many with the step that the most difficult of them needs. In
+`dormand_prince_step` every row of a state array has its own step, so that a whole fan costs hardly more than
+one trajectory. The rules for simulations take components first, ``(d, n)``, so that each is contiguous:
+
+- `runge_kutta_step`: the classical rule of order 4, without noise;
+- `euler_maruyama_step`: ``x + f(x) Δt + ξ``, of weak order 1;
+- `heun_step`: ``x̂ = x + f(x) Δt + ξ``, ``x + (f(x) + f(x̂)) Δt/2 + ξ``, of weak order 2 for additive noise ξ.
 """
 
 from __future__ import annotations

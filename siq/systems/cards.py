@@ -321,7 +321,7 @@ def load_exact(path: str | Path) -> sympy.Expr | None:
 
 
 def _parser(document: Document, card: SystemCard) -> Callable[[tuple[str, ...], Formula], sympy.Expr]:
-    """What reads the formulas of a card, and refuses them with their line."""
+    """Parser of the formulas of a card, which refuses them with their line."""
     names = {name: symbol(name) for name in (*card.states, *card.inputs, *card.parameters)} | {"t": TIME}
     numbers = names | {name: exact_number(entry.value) for name, entry in card.parameters.items()}
 

@@ -429,7 +429,7 @@ def _edge_cycle(
     box: np.ndarray,
     generator: np.random.Generator,
 ) -> Cycle | None:
-    """What a boundary is tracked to, if it is a cycle."""
+    """The cycle that a boundary is tracked to; None where it is something else."""
     width = np.ptp(box, axis=1)
     pair = bisected(*places, one, ends, width=width, generator=generator)
     times, states = [0.0], [pair.mean(axis=0)]
@@ -489,7 +489,7 @@ Kind = Literal["cycle", "chaos", "aperiodic", "none"]
 
 @dataclass(frozen=True)
 class Recurrence:
-    """What becomes of a trajectory that comes to rest nowhere.
+    """The long-term behaviour of a trajectory that comes to rest nowhere.
 
     Attributes
     ----------
@@ -525,7 +525,7 @@ class Recurrence:
 
 
 def recurrence_of(dynamics: Dynamics, starts: np.ndarray, *, box: np.ndarray, rate: float) -> Recurrence:
-    """What becomes of the first of some trajectories that returns.
+    """The long-term behaviour of the first of some trajectories that returns.
 
     Parameters
     ----------

@@ -237,7 +237,7 @@ class Diffusion:
         raise NotImplementedError
 
     def extended(self, count: int) -> Diffusion:
-        """The same noise in a system of `count` further states, which it does not reach."""
+        """D in a system of `count` further states, on which this noise does not act."""
         raise NotImplementedError
 
     def in_units(self, center: np.ndarray, units: np.ndarray, factor: float) -> Diffusion:

@@ -55,7 +55,7 @@ class Signals:
 
 
 class _Operation(IntEnum):
-    """What a step of a tape does with one register, or two."""
+    """Operations of a tape, on one register or two."""
 
     ADD = 0
     MULTIPLY = 1
@@ -337,7 +337,7 @@ class Parameter:
 
 @dataclass(frozen=True, eq=False)
 class JointExpectation:
-    """What is expected of several parameters together: ``roots @ values`` are standard normal.
+    """A joint prior of several parameters: ``roots @ values`` are standard normal.
 
     Attributes
     ----------
@@ -356,7 +356,7 @@ class JointExpectation:
 
 
 COMPILED = ("functions", "delays", "_lags")
-"""What a dynamics works out once, and what does not depend on its parameters' values."""
+"""Cached properties that do not depend on the values of the parameters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -533,20 +533,20 @@ class Dynamics:
 
     @property
     def names(self) -> dict[str, sympy.Symbol]:
-        """What the names in its formulas stand for."""
+        """Symbols by the names that stand in formulas."""
         known = [*self.states, *(each.name for each in self.inputs), *(each.name for each in self.parameters)]
         return {name: symbol(name) for name in known} | {"t": TIME}
 
     @property
     def kinematic(self) -> tuple[bool, ...]:
-        """Which equations only define a state as the derivative of another, ``dx/dt = v``.
+        """Mask of the equations that only define a state as the derivative of another, ``dx/dt = v``.
 
         Such an equation holds by definition: no physics can be missing in it, and no noise drives it.
         """
         return tuple(equation in self.symbols for equation in self.equations)
 
     def with_values(self, values: np.ndarray) -> Dynamics:
-        """The same dynamics with other parameters' values, shape ``(p,)``."""
+        """The dynamics with other values of its parameters, shape ``(p,)``."""
         changed = (
             replace(parameter, value=float(value))
             for parameter, value in zip(self.parameters, values, strict=True)
@@ -559,7 +559,7 @@ class Dynamics:
         return result
 
     def with_diffusion(self, diffusion: Diffusion) -> Dynamics:
-        """The same drift under another noise."""
+        """The dynamics with another diffusion."""
         return replace(self, diffusion=diffusion)
 
     def to_card(self) -> str:
@@ -646,7 +646,7 @@ class Dynamics:
 
     @cached_property
     def _second(self) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-        """The same of second derivatives: places (i, j, k), k not below j."""
+        """Places (i, j, k), k ≥ j, of second derivatives that do not vanish, and these as a function."""
         found = {
             (i, j, k): second
             for (i, j), first in self._derivatives.items()

@@ -489,7 +489,7 @@ def as_latex(formula: Formula, *, digits: int = DIGITS) -> str:
 
 
 class _Names:
-    """What the states and their offsets are called in a program, and the lines that say so."""
+    """Names of the states and their offsets in a program, and the lines that define them."""
 
     def __init__(self, formula: Formula) -> None:
         self._formula = formula
@@ -508,7 +508,7 @@ class _Names:
 
     @property
     def header(self) -> list[str]:
-        """What stands above the source: the function, and states with their units."""
+        """Comment above the source: the function, and the states with their units."""
         formula = self._formula
         title = f": {formula.title}" if formula.title else ""
         lines = [f"{formula.name}({', '.join(self.arguments)}){title}"]

@@ -67,7 +67,7 @@ MERGE_TOLERANCE = 1e-6  # of the domain
 
 @dataclass(frozen=True)
 class PhasePortrait:
-    """What f says of the recorded region.
+    """Attractors, saddles, cycles and basins of f in a region.
 
     Attributes
     ----------

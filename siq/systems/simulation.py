@@ -33,7 +33,7 @@ Drift = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class SimulationOptions:
-    """What is sampled from a simulated system; the defaults are the paper's (its Table B1).
+    """Sampling of a simulated system; the defaults are the paper's (its Table B1).
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ def _sampling_stride(options: SimulationOptions) -> int:
 def noise_source(
     diffusion: Diffusion, *, intensity: float, step: float, generator: np.random.Generator
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """What draws the noise over one step of states: ``sqrt(ε) σ(x) ΔW``, in the sense of Itô.
+    """Generator of the noise over one step of states: ``sqrt(ε) σ(x) ΔW``, in the sense of Itô.
 
     Parameters
     ----------
@@ -263,7 +263,7 @@ MOST_STEPS = 100  # of a pair, between pairs: beyond, a slow system would cost m
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class SimulationEntry:
-    """What a study says of its simulation; what it leaves out follows from the system, see `complete`.
+    """Sampling as a study gives it; values left out follow from the system, see `complete`.
 
     The fields are those of `SimulationOptions`.
 
@@ -293,7 +293,7 @@ class SimulationEntry:
     noise_intensity: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
 
     def options(self) -> SimulationOptions:
-        """The same, once nothing is left out.
+        """The options of the simulation, once nothing is left out.
 
         Raises
         ------
@@ -310,7 +310,7 @@ class SimulationEntry:
 
 
 def complete(entry: SimulationEntry, dynamics: Dynamics) -> SimulationEntry:
-    """What a study says, and what follows from the system where the study says nothing.
+    """Sampling of a study, with values from the system's own rates where the study gives none.
 
     Parameters
     ----------

@@ -55,7 +55,7 @@ class Neighbourhood:
 
 @dataclass(frozen=True)
 class EscapeTimes:
-    """What a simulation says of the time of escape, which at weak noise is distributed exponentially.
+    """Simulated times of escape, which at weak noise are distributed exponentially.
 
     Attributes
     ----------

@@ -202,7 +202,7 @@ STOPS: tuple[Stop, ...] = ("boundary", "level", "everywhere")
 
 
 class _Mesh(NamedTuple):
-    """What the compiled functions work on; displacements are in mesh widths.
+    """The state of the march, for the compiled functions; displacements are in mesh widths.
 
     Attributes
     ----------

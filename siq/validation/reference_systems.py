@@ -361,7 +361,7 @@ def _point_and_cycle() -> ReferenceSystem:
 
 
 def reference_table(*, points: int = 100) -> pd.DataFrame:
-    """What is known of the reference systems, as a table that other codes can read.
+    """Known values of the reference systems, as a table that other codes can read.
 
     Parameters
     ----------
