@@ -67,7 +67,7 @@ class Project:
         return subprocess.Popen(
             command,
             cwd=self.folder,
-            env=os.environ | {"PYTHONPATH": str(self.folder)},
+            env=os.environ | {"PYTHONPATH": f"{self.folder}{os.pathsep}{ROOT}"},
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -92,7 +92,8 @@ def copy_project(folder: Path) -> Project:
     folder.mkdir(parents=True)
     for name in ("Snakefile", "pyproject.toml"):  # the latter has the version that the page tells
         shutil.copy(ROOT / name, folder)
-    for name in ("workflow", "profiles", "siq", "config"):
+    # The library is that of the checkout, whose compiled loops are there already.
+    for name in ("workflow", "profiles", "config"):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     return Project(folder)
 

@@ -5,11 +5,14 @@ import os
 import shutil
 import signal
 import time
+from pathlib import Path
 
 import pandas as pd
 import pytest
 
 pytestmark = pytest.mark.workflow
+
+ROOT = Path(__file__).resolve().parents[2]
 
 DATA = "results/mini/runs/000/recordings.parquet"
 NETWORKS = "results/mini/training/000-000/networks.npz"
@@ -34,6 +37,7 @@ def would_run(project, *paths, change):
 
 def test_only_what_depends_on_a_change_runs_again(finished, tmp_path):
     project = finished.copied(tmp_path / "project")
+    shutil.copytree(ROOT / "siq", project.path("siq"))
     study, card = project.path("study.yaml"), project.path("config/systems/archetype3d.yaml")
     versions = project.path("workflow/versions.json")
     regression = project.path("siq/networks/regression.py")
