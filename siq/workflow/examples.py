@@ -101,11 +101,11 @@ def init_study(path: Path, *, output: Path | None = None, replace: bool = False)
             study, "", "the file is there already", "name another by -o, or replace it by --force"
         )
     with whole_file(study) as partial:
-        partial.write_text(commented_study(found, path, study), encoding="utf-8")
+        partial.write_text(_commented_study(found, path, study), encoding="utf-8")
     return study
 
 
-def commented_study(found: Inspection, path: Path, study: Path) -> str:
+def _commented_study(found: Inspection, path: Path, study: Path) -> str:
     """The text of a study that runs as it is; what is commented out can be used by taking the # away."""
     states = [state.name for state in found.states]
     unit = found.recordings.time_unit or "in the unit of t"
@@ -218,7 +218,7 @@ def write_example(name: str, folder: Path, *, replace: bool = False) -> tuple[li
         command = f"siq run {study}"
     else:
         case = folder / "spring"
-        makers = {case / "recordings.csv": spring_recordings, case / "system.yaml": lambda: SPRING}
+        makers = {case / "recordings.csv": _spring_recordings, case / "system.yaml": lambda: SPRING}
         command = f"siq diagnose {case}"
     for file in makers:
         if file.exists() and not replace:
@@ -249,7 +249,7 @@ def double_well_recordings(recordings: int = 4, samples: int = 20_000, *, seed: 
     )
 
 
-def spring_recordings(recordings: int = 8, samples: int = 120, *, seed: int = 3) -> str:
+def _spring_recordings(recordings: int = 8, samples: int = 120, *, seed: int = 3) -> str:
     """Recordings of a spring that hardens as a CSV file, with the noise of a sensor."""
     generator, step, within = np.random.default_rng(seed), 0.1, 50
     parts = []

@@ -51,7 +51,7 @@ EVERY = 15.0
 
 
 @dataclass
-class Progress:
+class _Progress:
     """Where a workflow stands, from its events.
 
     Attributes
@@ -217,7 +217,7 @@ class Screen:
         self._stream.flush()
 
 
-def follow(lines: Iterable[str], screen: Screen, progress: Progress) -> list[str]:
+def follow(lines: Iterable[str], screen: Screen, progress: _Progress) -> list[str]:
     """Read what a workflow writes, show where it stands, and pass on what its jobs say.
 
     The traceback of a job is not passed on: it stands in the job's log, which `faults` names.
@@ -251,7 +251,7 @@ def follow(lines: Iterable[str], screen: Screen, progress: Progress) -> list[str
     return passed_on
 
 
-def faults(progress: Progress, passed_on: list[str]) -> list[str]:
+def faults(progress: _Progress, passed_on: list[str]) -> list[str]:
     """Sentences on why a workflow stopped, where its jobs did not say so themselves.
 
     Parameters
@@ -270,7 +270,7 @@ def faults(progress: Progress, passed_on: list[str]) -> list[str]:
     return progress.errors[:1] or ["The workflow did not end; `siq run --verbose` shows what Snakemake says."]
 
 
-def screen_of(stream: TextIO = sys.stderr, *, columns: int = 80) -> Screen:
+def _screen_of(stream: TextIO = sys.stderr, *, columns: int = 80) -> Screen:
     """A screen on a stream, rewritten in place where it is a terminal."""
     return Screen(stream, columns=columns if stream.isatty() else None)
 
@@ -280,7 +280,7 @@ PLUGINS = Path("workflow", "plugins")
 TICK = 1.0  # seconds after which the time left is shown anew
 
 
-def workflow_folder() -> Path:
+def _workflow_folder() -> Path:
     """The folder of the Snakefile: the checkout that this package lies in, or what the wheel brought."""
     here = Path(__file__).resolve()
     checkout, shipped = here.parents[2], here.parent / "shipped"
@@ -288,7 +288,7 @@ def workflow_folder() -> Path:
     return checkout if in_checkout else shipped
 
 
-def need_workflow() -> None:
+def _need_workflow() -> None:
     """Say what to install where the workflow cannot run.
 
     Raises
@@ -333,7 +333,7 @@ class Request:
 
     def command(self) -> list[str]:
         """The command line; what it has to make stands behind ``--``, where no option can take it."""
-        base = workflow_folder()
+        base = _workflow_folder()
         # -P: a folder `workflow` of yours, where you work, is not mistaken for ours.
         words = [sys.executable, "-P", "-m", "snakemake", "--snakefile", str(base / "Snakefile")]
         words += ["--directory", str(Path.cwd()), "--cores", self.cores]
@@ -354,7 +354,7 @@ FOLLOWED = "SIQ_FOLLOWED"
 
 
 @dataclass(frozen=True)
-class Ended:
+class _Ended:
     """How a workflow ended.
 
     Attributes
@@ -378,7 +378,7 @@ class Ended:
     interrupted: bool = False
 
 
-def run_workflow(request: Request) -> Ended:
+def _run_workflow(request: Request) -> _Ended:
     """Run the workflow in the folder in which you work, with one line of progress on standard error.
 
     Raises
@@ -386,7 +386,7 @@ def run_workflow(request: Request) -> Ended:
     MissingExtra
         Where it is not installed.
     """
-    need_workflow()
+    _need_workflow()
     process = subprocess.Popen(
         request.command(),
         env=_environment() | ({} if request.verbose else {FOLLOWED: "1"}),
@@ -396,26 +396,26 @@ def run_workflow(request: Request) -> Ended:
         encoding=None if request.verbose else "utf-8",
         errors=None if request.verbose else "replace",
     )
-    progress, said = Progress(), []
+    progress, said = _Progress(), []
     try:
         if process.stdout is not None:
-            screen = screen_of(columns=shutil.get_terminal_size().columns)
+            screen = _screen_of(columns=shutil.get_terminal_size().columns)
             said = follow(_lines(process.stdout), screen, progress)
         code = process.wait()
     except KeyboardInterrupt:  # Snakemake has been told, too, and lets no half of a file stand
         _wait_once_more(process)
         print(file=sys.stderr)
-        return Ended(process.returncode, interrupted=True)
+        return _Ended(process.returncode, interrupted=True)
     if code and not request.verbose:
         said += (more := faults(progress, said))
         for line in more:
             print(line, file=sys.stderr)
-    return Ended(code, tuple(said), progress.total, tuple(progress.planned))
+    return _Ended(code, tuple(said), progress.total, tuple(progress.planned))
 
 
 def _environment() -> dict[str, str]:
     """What Snakemake is started with: our logger, and in a checkout our sources."""
-    base = workflow_folder()
+    base = _workflow_folder()
     paths = [str(base / PLUGINS)]
     if (base / "siq").is_dir():
         paths.append(str(base))
@@ -453,9 +453,9 @@ def _wait_once_more(process: subprocess.Popen[str] | subprocess.Popen[bytes], pa
         process.wait()
 
 
-def known_studies() -> Sequence[str]:
+def _known_studies() -> Sequence[str]:
     """The names of the studies that come with the workflow."""
-    return sorted(path.stem for path in (workflow_folder() / "config" / "studies").glob("*.yaml"))
+    return sorted(path.stem for path in (_workflow_folder() / "config" / "studies").glob("*.yaml"))
 
 
 RESULTS = Path("results")
@@ -479,11 +479,11 @@ def run_study(given: str, asked: Request) -> Exit:
     MissingExtra
         When the workflow is not installed.
     """
-    need_workflow()
+    _need_workflow()
     path = Path(given).expanduser()
     settings: tuple[str, ...] = ()
     study: Path | None = None
-    if not path.exists() and given in known_studies():
+    if not path.exists() and given in _known_studies():
         name = given
     elif not path.exists():
         raise _not_there(given)
@@ -504,7 +504,7 @@ def run_study(given: str, asked: Request) -> Exit:
         study, settings = write_generated(path, name), (f"origin={own_path(path)}",)
     page = RESULTS / name / "report.html"
     request = replace(asked, targets=(page.as_posix(),), study=study, settings=settings)
-    return _told(run_workflow(request), request, [page])
+    return _told(_run_workflow(request), request, [page])
 
 
 def diagnose_cases(folder: str, asked: Request) -> Exit:
@@ -524,7 +524,7 @@ def diagnose_cases(folder: str, asked: Request) -> Exit:
     MissingExtra
         When the workflow is not installed.
     """
-    need_workflow()
+    _need_workflow()
     place = Path(folder).expanduser()
     if place.name == CARD and place.is_file():
         place = place.parent
@@ -532,7 +532,7 @@ def diagnose_cases(folder: str, asked: Request) -> Exit:
         raise _not_there(folder)
     pages = [RESULTS / "mismatch" / name / "report.html" for name in case_folders(place)]
     request = replace(asked, targets=("diagnose",), settings=(f"cases={place.as_posix()}",))
-    return _told(run_workflow(request), request, pages)
+    return _told(_run_workflow(request), request, pages)
 
 
 def _refuse_card(path: Path) -> None:
@@ -549,14 +549,14 @@ def _not_there(given: str) -> InputError:
     """A wrong path, with where it was looked for and what is there of a similar name."""
     place = Path(given).expanduser().absolute()
     beside = [entry.name for entry in place.parent.iterdir()] if place.parent.is_dir() else []
-    otherwise = suggestion(given, known_studies(), otherwise="correct the path")
+    otherwise = suggestion(given, _known_studies(), otherwise="correct the path")
     remedy = suggestion(place.name, beside, otherwise=otherwise)
     if not place.parent.is_dir():
         return InputError(given, "", f"there is no folder {place.parent}", remedy)
     return InputError(given, "", f"there is no file or folder of that name in {place.parent}", remedy)
 
 
-def _told(ended: Ended, request: Request, pages: Sequence[Path]) -> Exit:
+def _told(ended: _Ended, request: Request, pages: Sequence[Path]) -> Exit:
     """Say how it ended, and name the pages."""
     if ended.interrupted:
         print("Stopped. Give the same command again to go on from here.", file=sys.stderr)

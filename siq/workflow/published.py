@@ -79,7 +79,7 @@ def load_published(path: str | Path) -> PublishedFigures:
     return validate(read_document(path), PublishedFigures)
 
 
-def component_terms(figures: Mapping[str, PublishedFigure], component: str) -> dict[str, PublishedFigure]:
+def _component_terms(figures: Mapping[str, PublishedFigure], component: str) -> dict[str, PublishedFigure]:
     """The published coefficients of a component (``U``, ``g_x``) by term."""
     begin = f"{component}:"
     return {key.removeprefix(begin): one for key, one in figures.items() if key.startswith(begin)}
@@ -89,7 +89,7 @@ def published_formula(
     figures: Mapping[str, PublishedFigure], component: str, symbols: Sequence[sympy.Symbol]
 ) -> sympy.Expr | None:
     """A published formula from its printed coefficients, None where none was published."""
-    terms = component_terms(figures, component)
+    terms = _component_terms(figures, component)
     names = {symbol.name: symbol for symbol in symbols}
     if not terms:
         return None
@@ -139,7 +139,7 @@ def published_potentials(
     list of functions
         ``1 + draws`` of them, the printed one first; none where no U was published.
     """
-    terms = component_terms(figures, "U")
+    terms = _component_terms(figures, "U")
     if not terms:
         return []
     names = {symbol.name: symbol for symbol in symbols}

@@ -35,12 +35,7 @@ from siq.quasipotential.landscape import Landscape, NoLandscape
 from siq.quasipotential.landscape_assembly import EquationSettings, find_landscape, landscape_from_equations
 from siq.quasipotential.occupancy import OccupancyCheck, VisitTest
 from siq.quasipotential.rates import MeanTime, NoiseStrength, mean_exit_time, mean_residence_time
-from siq.quasipotential.refinement import (
-    Refinement,
-    RefinementContext,
-    control,
-    refine_and_certify,
-)
+from siq.quasipotential.refinement import Refinement, RefinementContext, control, refine_and_certify
 from siq.quasipotential.wells import Well, best_trial
 from siq.remarks import Remark
 from siq.report.remarks import sentence
@@ -414,7 +409,7 @@ def place(position: np.ndarray) -> str:
     return "(" + ", ".join(f"{value:.6g}" for value in position) + ")"
 
 
-def landscape_rows(run: int, found: Landscape, remark: str | None = None) -> pd.DataFrame:
+def _landscape_rows(run: int, found: Landscape, remark: str | None = None) -> pd.DataFrame:
     """One row for each equilibrium, cycle and way out; `remark` is of what all barriers hang on.
 
     Mean times are for the noise of the landscape: of an attractor the time in its well, of a transition that
@@ -495,7 +490,7 @@ def _time(found: Landscape, mean: MeanTime | None) -> dict[str, object]:
     return {"noise": noise, "mean_time": mean.value, "mean_time_error": mean.value * mean.error}
 
 
-def degree_rows(run: int, found: Landscape) -> pd.DataFrame:
+def _degree_rows(run: int, found: Landscape) -> pd.DataFrame:
     """Accuracy against number of terms, about each attractor."""
     rows = [
         {
@@ -523,8 +518,8 @@ class FoundLandscape:
         rows, accuracy = as_table("landscape", []), as_table("degrees", [])
         if self.landscape is not None and self.record is not None:
             stored = self.landscape
-            rows = landscape_rows(number, self.landscape, self.record.diffusion_source.note)
-            accuracy = degree_rows(number, self.landscape)
+            rows = _landscape_rows(number, self.landscape, self.record.diffusion_source.note)
+            accuracy = _degree_rows(number, self.landscape)
         return {
             "quasipotential": stored, "landscape": rows, "degrees": accuracy,
             "landscape_outcome": [self.outcome],
@@ -596,7 +591,7 @@ def units_of(recordings: Recordings, space: StateSpace) -> tuple[tuple[str, ...]
 
 
 @plain_dataclass(frozen=True)
-class FoundOfEquations:
+class _FoundOfEquations:
     """The landscape of a study of equations, None where there is none, and what became of the step."""
 
     landscape: Landscape | None
@@ -609,8 +604,8 @@ class FoundOfEquations:
             certificate = self.landscape.certificate
             tests = {} if certificate is None else certificate.tests
             rows = {
-                "landscape": landscape_rows(0, self.landscape),
-                "degrees": degree_rows(0, self.landscape),
+                "landscape": _landscape_rows(0, self.landscape),
+                "degrees": _degree_rows(0, self.landscape),
                 "certificates": as_table(
                     "certificates",
                     [
@@ -623,13 +618,13 @@ class FoundOfEquations:
         return {"quasipotential": self.landscape, "outcomes": as_table("outcomes", [outcome])} | rows
 
 
-def landscape_of_equations(settings: EquationSettings, system: Dynamics) -> FoundOfEquations:
+def landscape_of_equations(settings: EquationSettings, system: Dynamics) -> _FoundOfEquations:
     """The landscape of a system; where it has none, the outcome says why."""
     try:
         found = landscape_from_equations(system, settings)
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         reason = error.reason if isinstance(error, NoLandscape) else str(error)
-        return FoundOfEquations(None, Outcome(0, Step.LANDSCAPE, Status.FAILED, reason))
+        return _FoundOfEquations(None, Outcome(0, Step.LANDSCAPE, Status.FAILED, reason))
     whole = found.global_quasipotential is not None
     outcome = Outcome(0, Step.LANDSCAPE, Status.OK if whole else Status.WARNING, "; ".join(found.notes))
-    return FoundOfEquations(found, outcome)
+    return _FoundOfEquations(found, outcome)

@@ -57,12 +57,12 @@ def exact_answer(card: str | Path) -> SymbolicDecomposition | None:
     return None if quasipotential is None else exact_decomposition(load_system(card), quasipotential)
 
 
-def exact_values(exact: SymbolicDecomposition, components: np.ndarray) -> np.ndarray:
+def _exact_values(exact: SymbolicDecomposition, components: np.ndarray) -> np.ndarray:
     """The exact U at points, components ``(d, ...)`` to ``(...)``."""
     return compile_formulas([exact.quasipotential], exact.symbols)(components)[0]
 
 
-def coefficient_table(
+def _coefficient_table(
     run: int,
     method: str,
     identified: SymbolicDecomposition,
@@ -108,7 +108,7 @@ def coefficient_table(
     return as_table("coefficients", rows)
 
 
-def relative_root_mean_square_error(coefficients: pd.DataFrame) -> float:
+def _relative_root_mean_square_error(coefficients: pd.DataFrame) -> float:
     """‖ξ - ξ*‖/‖ξ*‖ over the non-trivial terms of U, those whose exact coefficient is not zero.
 
     This is the paper's measure (section 3.1). It does not see false terms: see `support_is_correct`.
@@ -121,7 +121,7 @@ def relative_root_mean_square_error(coefficients: pd.DataFrame) -> float:
     return float(np.linalg.norm(difference) / np.linalg.norm(nontrivial["exact"]))
 
 
-def support_is_correct(coefficients: pd.DataFrame) -> bool | None:
+def _support_is_correct(coefficients: pd.DataFrame) -> bool | None:
     """Whether U has exactly the terms of the exact one; None where that is not known.
 
     The constant is left out: it follows from U being zero at its minimum.
@@ -132,7 +132,7 @@ def support_is_correct(coefficients: pd.DataFrame) -> bool | None:
     return bool(((quasipotential["estimate"] != 0) == (quasipotential["exact"] != 0)).all())
 
 
-def domain_grid(domain: np.ndarray, *, points: int = GRID_POINTS) -> np.ndarray:
+def _domain_grid(domain: np.ndarray, *, points: int = GRID_POINTS) -> np.ndarray:
     """A regular grid over the domain Ω, as components ``(d, n)`` with n about `points`."""
     along = max(round(points ** (1 / len(domain))), 2)
     axes = [np.linspace(lower, upper, along) for lower, upper in domain]
@@ -229,7 +229,7 @@ class RunToScore:
 
 
 @plain_dataclass(frozen=True)
-class Scored:
+class _Scored:
     """The tables of a run, see `siq.workflow.tables.COLUMNS`, and the outcome."""
 
     coefficients: pd.DataFrame
@@ -244,7 +244,7 @@ class Scored:
         return {name: getattr(self, name) for name in names} | {"score_outcome": [self.outcome]}
 
 
-def score_run(settings: PipelineSettings, given: RunToScore) -> Scored:
+def score_run(settings: PipelineSettings, given: RunToScore) -> _Scored:
     """Scores of one run."""
     number, system, exact = given.trained.outcome.run, given.system, given.exact
     options, tables = settings.regression, []
@@ -260,11 +260,11 @@ def score_run(settings: PipelineSettings, given: RunToScore) -> Scored:
         library = candidate_library(
             [symbol.name for symbol in identified.symbols], degree=options.degree, further=options.functions
         )
-        table = coefficient_table(number, method, identified, exact, terms=library.names)
+        table = _coefficient_table(number, method, identified, exact, terms=library.names)
         tables.append(table)
         errors[method] |= {
-            "rrmse": relative_root_mean_square_error(table),
-            "support_correct": support_is_correct(table),
+            "rrmse": _relative_root_mean_square_error(table),
+            "support_correct": _support_is_correct(table),
         }
     if exact is not None and system is not None and given.trained.networks is not None:
         draw = generator(settings.seed, number, Purpose.SHUFFLE)
@@ -274,7 +274,7 @@ def score_run(settings: PipelineSettings, given: RunToScore) -> Scored:
     predicted = as_table("prediction", [])
     if system is not None and settings.simulation is not None and given.formulas:
         predicted = _predictions(system, given.formulas, number, settings.simulation, settings.seed)
-    return Scored(
+    return _Scored(
         coefficients=concatenate("coefficients", tables),
         rrmse=as_table("rrmse", list(errors.values())),
         prediction=predicted,
@@ -298,10 +298,10 @@ def _network_errors(
     randomised = shuffled(trained, generator=draw)
 
     def error_of(networks: TrainedNetworks, grid: np.ndarray) -> float:
-        return relative_error(2 * networks.potential_at(grid.T), exact_values(exact, grid))
+        return relative_error(2 * networks.potential_at(grid.T), _exact_values(exact, grid))
 
-    error = error_of(trained, domain_grid(box))
-    chance = error_of(randomised, domain_grid(box, points=COARSE))
+    error = error_of(trained, _domain_grid(box))
+    chance = error_of(randomised, _domain_grid(box, points=COARSE))
     return dict.fromkeys(map(str, METHODS), error) | {str(Method.CONTROL): chance}
 
 

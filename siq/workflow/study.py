@@ -370,7 +370,7 @@ def load_study_system(study: Study, *, file: str, systems: Path) -> Dynamics | N
     directly = study.entrance != "equations"
     system = None
     if study.system is not None:
-        system = _with_landscape(system_path(study.system, systems=systems), directly=directly)
+        system = _with_landscape(_system_path(study.system, systems=systems), directly=directly)
     states = system.states if system is not None else None
     if study.recordings is not None and study.recordings.states is not None:
         if system is not None and study.recordings.states != system.states:
@@ -382,11 +382,11 @@ def load_study_system(study: Study, *, file: str, systems: Path) -> Dynamics | N
     if states is not None:
         check_states(study, states, file=file)
     if study.sweep is not None and system is not None:
-        check_sweep(study.sweep, system, file=file)
+        _check_sweep(study.sweep, system, file=file)
     return system
 
 
-def check_sweep(sweep: SweepOptions, system: Dynamics, *, file: str) -> None:
+def _check_sweep(sweep: SweepOptions, system: Dynamics, *, file: str) -> None:
     """Whether a system has the parameters that a study sweeps.
 
     Raises
@@ -441,7 +441,7 @@ def check_states(study: Study, states: Sequence[str], *, file: str) -> None:
             raise InputError(file, f"{step}.functions", error.fault, error.remedy) from None
 
 
-def system_path(system: str, *, systems: Path) -> Path:
+def _system_path(system: str, *, systems: Path) -> Path:
     """The card that a study means: a path as it stands, a name within the folder of cards."""
     if system.endswith((".yaml", ".yml")):
         return Path(system)

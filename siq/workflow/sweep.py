@@ -61,7 +61,7 @@ PLAIN = ConfigDict(extra="forbid", ser_json_inf_nan="constants")
 
 
 @pydantic_dataclass(frozen=True, config=PLAIN)
-class SweptWell:
+class _SweptWell:
     """An attractor at a point: its state, and the slowest rate at which f leads back to it."""
 
     state: tuple[float, ...]
@@ -69,7 +69,7 @@ class SweptWell:
 
 
 @pydantic_dataclass(frozen=True, config=PLAIN)
-class SweptWay:
+class _SweptWay:
     """A way out: wells by their place, `end` None where it leads out of the domain; barrier and prefactor."""
 
     start: int
@@ -106,14 +106,14 @@ class SweptPoint:
 
     values: tuple[float, ...]
     equilibria: tuple[tuple[float, ...], ...]
-    wells: tuple[SweptWell, ...] = ()
-    ways: tuple[SweptWay, ...] = ()
+    wells: tuple[_SweptWell, ...] = ()
+    ways: tuple[_SweptWay, ...] = ()
     settled: float = 0.0
     reason: str = ""
     notes: tuple[str, ...] = ()
 
 
-def check_noise(system: Dynamics, names: Iterable[str]) -> None:
+def _check_noise(system: Dynamics, names: Iterable[str]) -> None:
     """Refuse parameters on which D depends: a dynamics has it with their values inserted.
 
     Raises
@@ -174,7 +174,7 @@ def point_at(
         values,
         tuple(tuple(map(float, one.position)) for one in found.equilibria),
         tuple(
-            SweptWell(tuple(map(float, one.position)), float(-one.eigenvalues.real.max()))
+            _SweptWell(tuple(map(float, one.position)), float(-one.eigenvalues.real.max()))
             for one in found.attractors
         ),
         tuple(map(_as_way, found.transitions)),
@@ -195,10 +195,10 @@ def _resting(system: Dynamics, seed: int) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(map(float, one.position)) for one in found)
 
 
-def _as_way(way: Transition) -> SweptWay:
+def _as_way(way: Transition) -> _SweptWay:
     barrier = float(way.barrier) if np.isfinite(way.barrier) else None
     prefactor = None if way.rate is None else float(way.rate.prefactor)
-    return SweptWay(way.start, way.end, barrier, prefactor, "; ".join(way.notes))
+    return _SweptWay(way.start, way.end, barrier, prefactor, "; ".join(way.notes))
 
 
 DIGITS = 10  # of positions in tables
@@ -280,7 +280,7 @@ class Wells:
         ]
 
 
-def bifurcation_rows(found: Branches) -> list[dict[str, object]]:
+def _bifurcation_rows(found: Branches) -> list[dict[str, object]]:
     """The table of bifurcations."""
     return [
         {
@@ -300,7 +300,7 @@ def position_text(state: np.ndarray | Sequence[float]) -> str:
     return str([float(f"{one:.{DIGITS}g}") for one in state])
 
 
-def curves_of_map(
+def _curves_of_map(
     system: Dynamics, names: tuple[str, ...], points: Sequence[SweptPoint]
 ) -> list[BifurcationCurve]:
     """Curves of folds and of Hopf points within the ranges of a map.
@@ -353,7 +353,7 @@ def _seeds(
                 yield one.kind, place, one.state
 
 
-def curve_rows(curves: Sequence[BifurcationCurve]) -> list[dict[str, object]]:
+def _curve_rows(curves: Sequence[BifurcationCurve]) -> list[dict[str, object]]:
     """The table of curves, a row for each of their points."""
     return [
         {
@@ -371,17 +371,17 @@ def curve_rows(curves: Sequence[BifurcationCurve]) -> list[dict[str, object]]:
     ]
 
 
-def curve_notes(names: Sequence[str], curves: Sequence[BifurcationCurve]) -> list[str]:
+def _curve_notes(names: Sequence[str], curves: Sequence[BifurcationCurve]) -> list[str]:
     """Which curves could not be followed to their ends, in words."""
     return [
-        f"the curve of {curve_name(curve.kind)} through {names[0]} = {curve.values[0, 0]:g},"
+        f"the curve of {_curve_name(curve.kind)} through {names[0]} = {curve.values[0, 0]:g},"
         f" {names[1]} = {curve.values[0, 1]:g} {curve.fault}"
         for curve in curves
         if curve.fault
     ]
 
 
-def curve_name(kind: str) -> str:
+def _curve_name(kind: str) -> str:
     """What lies along a curve."""
     return "folds" if kind == "fold" else "Hopf points"
 
@@ -390,7 +390,7 @@ ALONE = "it is the only stable state, and no way leads out of it"
 UNKNOWN = "no way out was found"
 
 
-def well_rows(point: SweptPoint, number: Sequence[int], noise: float | None) -> list[dict[str, object]]:
+def _well_rows(point: SweptPoint, number: Sequence[int], noise: float | None) -> list[dict[str, object]]:
     """One row for every well of a point; one that says why where there is none.
 
     Parameters
@@ -414,7 +414,7 @@ def well_rows(point: SweptPoint, number: Sequence[int], noise: float | None) -> 
     ]
 
 
-def way_rows(point: SweptPoint, number: Sequence[int]) -> list[dict[str, object]]:
+def _way_rows(point: SweptPoint, number: Sequence[int]) -> list[dict[str, object]]:
     """One row for every way out of a well, the arguments as `well_rows` has them."""
     return [
         _place(point)
@@ -599,16 +599,16 @@ def sweep(
         if given.ndim != 1 or not len(given) or not np.isfinite(given).all():
             raise ValueError(f"the values of {name} have to be finite numbers, at least one")
     base = system if isinstance(system, Dynamics) else load_system(system)
-    check_names(base, named)
+    _check_names(base, named)
     if isinstance(system, Dynamics):
-        check_noise(system, named)
+        _check_noise(system, named)
     grid = np.stack(np.meshgrid(*named.values(), indexing="ij"), axis=-1).reshape(-1, len(named))
     names = tuple(named)
     points = [point_at(system, names, tuple(map(float, one)), seed=seed) for one in grid]
     return collected(base, names, points, noise=noise)
 
 
-def check_names(system: Dynamics, names: Iterable[str]) -> None:
+def _check_names(system: Dynamics, names: Iterable[str]) -> None:
     """Refuse parameters that a system has not.
 
     Raises
@@ -657,17 +657,17 @@ def collected(
     else:
         numbers = [tuple(range(len(point.wells))) for point in points]
     if len(names) == MOST_PARAMETERS:
-        curves = curves_of_map(system, names, points)
-        notes += curve_notes(names, curves)
+        curves = _curves_of_map(system, names, points)
+        notes += _curve_notes(names, curves)
     rows, ways = [], []
     for point, number in zip(points, numbers, strict=True):
-        rows += well_rows(point, number, noise)
-        ways += way_rows(point, number)
+        rows += _well_rows(point, number, noise)
+        ways += _way_rows(point, number)
     units = dict(zip(system.states, system.units, strict=True)) | {"t": system.time_unit}
     units |= {each.name: each.unit for each in system.parameters if each.name in names}
     return Sweep(
         names, system.states, as_table("sweep", rows), as_table("sweep_ways", ways),
         as_table("branches", [] if branches is None else wells.branch_rows()),
-        as_table("bifurcations", [] if branches is None else bifurcation_rows(branches)),
-        tuple(dict.fromkeys(notes)), units, as_table("bifurcation_curves", curve_rows(curves)),
+        as_table("bifurcations", [] if branches is None else _bifurcation_rows(branches)),
+        tuple(dict.fromkeys(notes)), units, as_table("bifurcation_curves", _curve_rows(curves)),
     )  # fmt: skip

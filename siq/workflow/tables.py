@@ -94,7 +94,7 @@ class Outcome:
         return plain | dict(self.details)
 
 
-def outcome_of_data(data: Mapping[str, Any]) -> Outcome:
+def _outcome_of_data(data: Mapping[str, Any]) -> Outcome:
     """The outcome that `Outcome.as_data` gave."""
     details = {key: value for key, value in data.items() if key not in ("run", "step", "status", "reason")}
     return Outcome(int(data["run"]), Step(data["step"]), Status(data["status"]), data["reason"], details)
@@ -122,7 +122,7 @@ def write_outcomes(path: str | Path, outcomes: Sequence[Outcome]) -> None:
 
 def read_outcomes(path: str | Path) -> list[Outcome]:
     """Read what `write_outcomes` wrote."""
-    return [outcome_of_data(one) for one in json.loads(Path(path).read_text(encoding="utf-8"))]
+    return [_outcome_of_data(one) for one in json.loads(Path(path).read_text(encoding="utf-8"))]
 
 
 COLUMNS: Mapping[str, Mapping[str, str]] = {

@@ -54,7 +54,7 @@ def task(*needs: str, options: Sequence[str] = ()) -> Callable[[Callable[..., An
     return register
 
 
-class Stored(Sequence[Any]):
+class _Stored(Sequence[Any]):
     """Files of one kind, such as one of each run; each is read when it is asked for."""
 
     def __init__(self, name: str, paths: Sequence[str]) -> None:
@@ -117,7 +117,7 @@ class Given:
 
             path = self.files.get(name) or None
             several = path is not None and not isinstance(path, str)
-            self.values[name] = Stored(name, path or ()) if several else path and read(name, path)
+            self.values[name] = _Stored(name, path or ()) if several else path and read(name, path)
         return self.values[name]
 
     def path(self, name: str) -> str | None:

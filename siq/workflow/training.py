@@ -45,7 +45,7 @@ class TrainedRun:
         return f"the training gave no networks ({self.outcome.reason})"
 
 
-def not_trained(number: int) -> TrainedRun:
+def _not_trained(number: int) -> TrainedRun:
     """A run for which no networks were asked."""
     return TrainedRun(None, Outcome(number, Step.TRAIN, Status.SKIPPED, "no networks were asked for"))
 
@@ -55,7 +55,7 @@ def trained_run(
 ) -> TrainedRun:
     """The networks of run `number` from those of its block by position; None where none were asked for."""
     if networks is None or outcomes is None:
-        return not_trained(number)
+        return _not_trained(number)
     mine = next(one for one in outcomes if one.run == number)
     return TrainedRun(networks[mine.details[POSITION]] if mine.usable else None, mine)
 
@@ -72,7 +72,7 @@ class RunToTrain:
 
 
 @plain_dataclass(frozen=True)
-class Trained:
+class _Trained:
     """The networks of a block.
 
     Attributes
@@ -109,7 +109,7 @@ def train_block(
     *,
     folder: Path | None = None,
     device: str = "auto",
-) -> Trained:
+) -> _Trained:
     """Train the networks of a block of runs.
 
     Parameters
@@ -126,7 +126,7 @@ def train_block(
     assert settings.training is not None  # networks are asked for
     data, outcomes = _training_data(settings, runs)
     if not data:
-        return Trained({}, as_table("training", []), tuple(outcomes))
+        return _Trained({}, as_table("training", []), tuple(outcomes))
 
     checks = _checks(settings, runs, data)
     block = Block(
@@ -140,12 +140,12 @@ def train_block(
         faults=checks.faults,
     )
     block.train()
-    outcomes += [outcome_of(block, number) for number in data]
+    outcomes += [_outcome_of(block, number) for number in data]
     networks = {number: block.last[number] for number in data}
-    return Trained(networks, as_table("training", block.history()), tuple(outcomes))
+    return _Trained(networks, as_table("training", block.history()), tuple(outcomes))
 
 
-def outcome_of(block: Block, run: int) -> Outcome:
+def _outcome_of(block: Block, run: int) -> Outcome:
     """What became of a run."""
     details = {POSITION: list(block.data).index(run)}
     if run in block.failures:

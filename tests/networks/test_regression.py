@@ -11,7 +11,7 @@ from siq.inference.library import CandidateLibrary, candidate_library
 from siq.networks.regression import RegressionOptions, RegressionResult, points_below, sparse_decomposition
 from siq.quasipotential.formulas import term_coefficients
 from siq.systems.diffusion import Diffusion
-from siq.workflow.scoring import exact_values
+from siq.workflow.scoring import _exact_values
 
 pytestmark = pytest.mark.portable
 
@@ -55,7 +55,7 @@ def archetype_values(x: np.ndarray) -> Values:
 
 def below_two(count: int = 600) -> np.ndarray:
     x = np.random.default_rng(0).uniform(-1.6, 1.6, size=(count, 3))
-    return x[points_below(exact_values(exact_archetype(), x.T) / 2, level=2.0)]
+    return x[points_below(_exact_values(exact_archetype(), x.T) / 2, level=2.0)]
 
 
 def planar(

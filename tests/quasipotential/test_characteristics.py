@@ -40,7 +40,7 @@ from siq.quasipotential.characteristics import (
 )
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
-from siq.workflow.scoring import exact_values
+from siq.workflow.scoring import _exact_values
 
 WELL = np.array([[-2.0, 0.0], [-1.5, 1.5]])  # of Maier–Stein's system, up to the separatrix
 SADDLE_LEVEL = 0.25  # of V along the axis; the barrier itself is lower for β > 4
@@ -95,7 +95,7 @@ def test_the_archetype_has_its_exact_values(archetype: Dynamics) -> None:
         most=120,
         rounds=1,
     )
-    np.testing.assert_allclose(2 * fan.values, exact_values(exact_archetype(), fan.points.T), atol=2e-7)
+    np.testing.assert_allclose(2 * fan.values, _exact_values(exact_archetype(), fan.points.T), atol=2e-7)
     assert first_caustic(fan) is None
     assert lowest_sheet(fan).all()
 

@@ -18,7 +18,7 @@ from siq.report.page import LEADING, OF_NETWORKS, OF_RUNS, ReportContent, Report
 from siq.report.study_page import StudyResults, study_page
 from siq.report.summary import summarise
 from siq.systems.dynamics import Dynamics
-from siq.workflow.scoring import ModelFiles, coefficient_table, shown_formula, summary_table
+from siq.workflow.scoring import ModelFiles, _coefficient_table, shown_formula, summary_table
 from siq.workflow.study import Study
 from siq.workflow.tables import COLUMNS, Method, as_table
 
@@ -71,7 +71,7 @@ def page_of(
         paths.append(str(path))
         for name, one in found.items():
             coefficients.append(
-                coefficient_table(run, name, one, exact, terms=("1", "x", "x**2", "x**3", "x**4"))
+                _coefficient_table(run, name, one, exact, terms=("1", "x", "x**2", "x**3", "x**4"))
             )
             rrmse.append({"run": run, "method": name, "certified": certificates[name]["certified"]})
             tests.append({"run": run, "method": name, "test": "characteristics", "reason": ""}

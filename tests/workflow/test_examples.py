@@ -12,10 +12,10 @@ from siq.diagnosis.study import read_case
 from siq.errors import InputError
 from siq.systems.cards import load_system
 from siq.workflow.examples import (
+    _spring_recordings,
     double_well_recordings,
     init_study,
     name_for,
-    spring_recordings,
     write_example,
     write_generated,
 )
@@ -45,7 +45,7 @@ def test_the_shortest_study_names_the_file_from_its_own_folder(
 def test_a_study_that_was_begun_runs_as_it_is_and_with_every_comment_taken_away(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "spring.csv").write_text(spring_recordings(2, 20))
+    (tmp_path / "spring.csv").write_text(_spring_recordings(2, 20))
     monkeypatch.chdir(tmp_path)
     study = init_study(Path("spring.csv"))
     text = study.read_text(encoding="utf-8")

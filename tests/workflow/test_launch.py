@@ -9,14 +9,14 @@ from types import ModuleType
 import pytest
 
 from siq.numerics.files import case_folders
-from siq.workflow.launch import PLUGINS, Request, known_studies, workflow_folder
+from siq.workflow.launch import PLUGINS, Request, _known_studies, _workflow_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_a_checkout_uses_its_own_workflow() -> None:
-    assert workflow_folder() == ROOT
-    assert "archetype3d" in known_studies()
+    assert _workflow_folder() == ROOT
+    assert "archetype3d" in _known_studies()
 
 
 def test_no_option_can_take_the_target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

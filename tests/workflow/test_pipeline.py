@@ -20,7 +20,7 @@ from siq.workflow import results, scoring, training
 from siq.workflow.pipeline import Analysis, PipelineSettings, analyse
 from siq.workflow.study import Sampling, StateSpace
 from siq.workflow.tables import COLUMNS, Method, Outcome, Status, Step
-from siq.workflow.training import TrainedRun, not_trained
+from siq.workflow.training import TrainedRun, _not_trained
 
 KNOWN = double_well(2)
 SYSTEM = as_system(KNOWN)
@@ -222,7 +222,7 @@ def test_scores_are_in_the_columns_of_the_contract(analysis: Analysis) -> None:
     formulas = {str(name): one for name, one in analysis.refined.formulas.items()}
     assert KNOWN.potential is not None
     exact = exact_decomposition(SYSTEM, 2 * KNOWN.potential)
-    given = scoring.RunToScore(formulas, certificates, not_trained(0), SYSTEM, exact)
+    given = scoring.RunToScore(formulas, certificates, _not_trained(0), SYSTEM, exact)
     found = scoring.score_run(settings, given)
     assert found.outcome == Outcome(0, Step.SCORE)
     for name in ("coefficients", "rrmse", "prediction", "certificates"):

@@ -6,7 +6,7 @@ import io
 import json
 from typing import Any
 
-from siq.workflow.launch import MARK, Progress, Screen, faults, follow
+from siq.workflow.launch import MARK, Screen, _Progress, faults, follow
 
 EVENTS: list[dict[str, Any]] = [
     {"event": "run_info", "stats": {"draw": 1, "refine": 1, "page": 1, "total": 3}},
@@ -32,7 +32,7 @@ def line(event: dict[str, Any]) -> str:
 
 
 def test_the_line_says_what_runs_how_many_of_how_many_and_the_time_left() -> None:
-    progress = Progress(clock=Clock())
+    progress = _Progress(clock=Clock())
     assert progress.line() == "reading and checking your files"
     for event in EVENTS:
         progress.take(event)
@@ -42,7 +42,7 @@ def test_the_line_says_what_runs_how_many_of_how_many_and_the_time_left() -> Non
 
 def test_a_job_that_takes_longer_than_was_thought_promises_no_end() -> None:
     clock = Clock()
-    progress = Progress(clock=clock)
+    progress = _Progress(clock=clock)
     for event in EVENTS:
         progress.take(event)
     clock.now += 10_000
@@ -51,7 +51,7 @@ def test_a_job_that_takes_longer_than_was_thought_promises_no_end() -> None:
 
 
 def test_a_job_says_what_it_is_doing() -> None:
-    progress = Progress(clock=Clock())
+    progress = _Progress(clock=Clock())
     for event in EVENTS:
         progress.take(event)
     progress.take({"event": "doing", "of": "bead", "text": "candidate 2 of 6: dry friction"})
@@ -61,7 +61,7 @@ def test_a_job_says_what_it_is_doing() -> None:
 
 def test_on_a_terminal_the_line_is_rewritten_and_fits() -> None:
     stream = io.StringIO()
-    follow(map(line, EVENTS), Screen(stream, columns=30), Progress(clock=Clock()))
+    follow(map(line, EVENTS), Screen(stream, columns=30), _Progress(clock=Clock()))
     shown = stream.getvalue()
     assert "\n" not in shown and max(map(len, shown.split("\r"))) <= 30
     assert shown.endswith("\r")  # nothing of it stays
@@ -69,12 +69,12 @@ def test_on_a_terminal_the_line_is_rewritten_and_fits() -> None:
 
 def test_in_a_log_a_line_stands_now_and_then() -> None:
     stream = io.StringIO()
-    follow(map(line, EVENTS * 10), Screen(stream, columns=None, clock=Clock()), Progress(clock=Clock()))
+    follow(map(line, EVENTS * 10), Screen(stream, columns=None, clock=Clock()), _Progress(clock=Clock()))
     assert 2 <= stream.getvalue().count("\n") <= 5 and "\r" not in stream.getvalue()
 
 
 def test_the_sentence_of_a_job_comes_through_and_its_traceback_does_not() -> None:
-    stream, progress = io.StringIO(), Progress(clock=Clock())
+    stream, progress = io.StringIO(), _Progress(clock=Clock())
     lines = [
         *map(line, EVENTS),
         "bead.csv, row 3: it is empty; remove it.\n",
@@ -91,8 +91,8 @@ def test_the_sentence_of_a_job_comes_through_and_its_traceback_does_not() -> Non
 
 
 def test_a_sentence_that_was_passed_on_is_enough() -> None:
-    assert faults(Progress(), ["study.yaml, line 2: no; yes."]) == []
-    said = Progress()
+    assert faults(_Progress(), ["study.yaml, line 2: no; yes."]) == []
+    said = _Progress()
     said.take(
         {"event": "error", "text": "MissingInputException: x.csv", "exception": "MissingInputException"}
     )

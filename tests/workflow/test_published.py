@@ -14,7 +14,7 @@ from siq.systems.diffusion import Diffusion
 from siq.workflow.published import (
     PublishedFigure,
     PublishedMesh,
-    component_terms,
+    _component_terms,
     load_published,
     mesh_potential,
     own_equations,
@@ -38,7 +38,7 @@ FIGURES = {
 def test_a_formula_is_the_sum_of_its_printed_terms() -> None:
     assert sympy.simplify(published_formula(FIGURES, "U", (X, Y)) - (2 * X**2 - X * Y + 0.5)) == 0
     assert published_formula(FIGURES, "g_z", (X, Y)) is None
-    assert list(component_terms(FIGURES, "U")) == ["1", "x**2", "x*y"]
+    assert list(_component_terms(FIGURES, "U")) == ["1", "x**2", "x*y"]
 
 
 def test_the_vector_field_follows_from_u_and_g() -> None:
@@ -98,7 +98,7 @@ def test_the_published_formula_of_the_resonator_has_the_paper_s_wells() -> None:
     draws = published_potentials(
         published.figures, system.symbols, draws=50, generator=np.random.default_rng(0)
     )
-    terms = component_terms(published.figures, "U")
+    terms = _component_terms(published.figures, "U")
     assert len(terms) == 15 and all(one.rounding > 0 for one in terms.values())
     wells = np.array([[-0.00710, -0.01090], [0.00411, -0.00117]])
     saddle = np.array([[0.00769, -0.00667]])

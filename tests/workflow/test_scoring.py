@@ -14,14 +14,14 @@ from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.systems.dynamics import Dynamics
 from siq.workflow.published import PublishedFigure
 from siq.workflow.scoring import (
-    coefficient_table,
-    domain_grid,
+    _coefficient_table,
+    _domain_grid,
+    _exact_values,
+    _relative_root_mean_square_error,
+    _support_is_correct,
     exact_answer,
-    exact_values,
     relative_error,
-    relative_root_mean_square_error,
     summary_table,
-    support_is_correct,
 )
 from siq.workflow.tables import as_table, concatenate
 
@@ -34,7 +34,7 @@ def perturbed(archetype: Dynamics, addition: object) -> SymbolicDecomposition:
 
 def score(archetype: Dynamics, identified: SymbolicDecomposition, run: int = 0) -> pd.DataFrame:
     terms = candidate_library(archetype.states, degree=5).names
-    return coefficient_table(run, "regression", identified, exact_archetype(), terms=terms)
+    return _coefficient_table(run, "regression", identified, exact_archetype(), terms=terms)
 
 
 def test_the_error_is_that_of_the_paper_worked_out_by_hand(archetype: Dynamics) -> None:
@@ -43,14 +43,14 @@ def test_the_error_is_that_of_the_paper_worked_out_by_hand(archetype: Dynamics) 
     identified = perturbed(archetype, 0.01 - 0.02 * x**2 + 0.01 * z**2)
     table = score(archetype, identified)
     expected = np.sqrt(0.02**2 + 0.04**2 + 0.02**2) / np.sqrt(1 + 4 + 1 + 1 + 1)
-    assert relative_root_mean_square_error(table) == pytest.approx(expected, rel=1e-12)
-    assert support_is_correct(table) is True
+    assert _relative_root_mean_square_error(table) == pytest.approx(expected, rel=1e-12)
+    assert _support_is_correct(table) is True
 
 
 def test_exact_formulas_have_no_error_and_all_terms_are_listed(archetype: Dynamics) -> None:
     table = score(archetype, exact_archetype())
-    assert relative_root_mean_square_error(table) == 0
-    assert support_is_correct(table) is True
+    assert _relative_root_mean_square_error(table) == 0
+    assert _support_is_correct(table) is True
     assert len(table) == 8 * 56
     assert list(table.columns) == [
         "run",
@@ -70,20 +70,20 @@ def test_exact_formulas_have_no_error_and_all_terms_are_listed(archetype: Dynami
 def test_a_false_term_shows_in_the_support_but_not_in_the_error(archetype: Dynamics) -> None:
     x, y, _ = archetype.symbols
     table = score(archetype, perturbed(archetype, 0.3 * x * y))
-    assert relative_root_mean_square_error(table) == 0
-    assert support_is_correct(table) is False
+    assert _relative_root_mean_square_error(table) == 0
+    assert _support_is_correct(table) is False
 
 
 def test_a_missing_term_shows_in_both(archetype: Dynamics) -> None:
     _, y, _ = archetype.symbols
     table = score(archetype, perturbed(archetype, -(y**2) / 2))
-    assert relative_root_mean_square_error(table) == pytest.approx(1 / np.sqrt(8))
-    assert support_is_correct(table) is False
+    assert _relative_root_mean_square_error(table) == pytest.approx(1 / np.sqrt(8))
+    assert _support_is_correct(table) is False
 
 
 def test_the_constant_does_not_count_for_the_support(archetype: Dynamics) -> None:
     table = score(archetype, perturbed(archetype, sympy.Rational(-1, 2)))
-    assert support_is_correct(table) is True
+    assert _support_is_correct(table) is True
 
 
 def test_a_term_outside_the_library_is_listed_too(archetype: Dynamics) -> None:
@@ -91,7 +91,7 @@ def test_a_term_outside_the_library_is_listed_too(archetype: Dynamics) -> None:
     table = score(archetype, perturbed(archetype, sympy.sin(x)))
     row = table[(table["component"] == "U") & (table["term"] == "sin(x)")].iloc[0]
     assert (row["estimate"], row["exact"]) == (2.0, 0.0)
-    assert support_is_correct(table) is False
+    assert _support_is_correct(table) is False
 
 
 def test_a_card_that_does_not_know_u_has_no_exact_answer() -> None:
@@ -101,15 +101,15 @@ def test_a_card_that_does_not_know_u_has_no_exact_answer() -> None:
     assert found is not None
     x, y, z = np.random.default_rng(0).uniform(-2, 2, size=(3, 20))
     np.testing.assert_allclose(
-        exact_values(found, np.stack([x, y, z])), x**4 - 2 * x**2 + y**2 + z**2 + 1, rtol=1e-12
+        _exact_values(found, np.stack([x, y, z])), x**4 - 2 * x**2 + y**2 + z**2 + 1, rtol=1e-12
     )
 
 
 def test_without_an_exact_answer_nothing_is_claimed() -> None:
-    table = coefficient_table(0, "regression", exact_archetype(), None, terms=("1", "x"))
+    table = _coefficient_table(0, "regression", exact_archetype(), None, terms=("1", "x"))
     assert table["exact"].isna().all()
-    assert np.isnan(relative_root_mean_square_error(table))
-    assert support_is_correct(table) is None
+    assert np.isnan(_relative_root_mean_square_error(table))
+    assert _support_is_correct(table) is None
 
 
 def test_the_error_on_a_grid_does_not_depend_on_the_constant_of_u() -> None:
@@ -119,12 +119,12 @@ def test_the_error_on_a_grid_does_not_depend_on_the_constant_of_u() -> None:
 
 
 def test_the_grid_covers_the_domain_evenly() -> None:
-    grid = domain_grid(np.array([[-1.0, 1.0], [0.0, 3.0], [5.0, 6.0]]), points=1000)
+    grid = _domain_grid(np.array([[-1.0, 1.0], [0.0, 3.0], [5.0, 6.0]]), points=1000)
     assert grid.shape == (3, 1000)
     np.testing.assert_array_equal(grid.min(axis=1), [-1, 0, 5])
     np.testing.assert_array_equal(grid.max(axis=1), [1, 3, 6])
     assert [len(np.unique(axis)) for axis in grid] == [10, 10, 10]
-    assert domain_grid(np.array([[0.0, 1.0]])).shape == (1, 1_000_000)
+    assert _domain_grid(np.array([[0.0, 1.0]])).shape == (1, 1_000_000)
 
 
 # Summaries

@@ -15,7 +15,7 @@ from siq.networks.decomposition import CheckOptions, TrainedNetworks, pack
 from siq.networks.training import Block, Checkpoints, prepare_data
 from siq.systems.diffusion import Diffusion
 from siq.workflow.tables import Status
-from siq.workflow.training import clean, outcome_of
+from siq.workflow.training import _outcome_of, clean
 
 TRAINING = replace(
     PAPER,
@@ -67,8 +67,8 @@ def test_each_run_stops_where_its_check_passed_and_only_the_others_start_afresh(
     one = block(tmp_path, {0: Check(2), 1: Check(5)})  # run 1 passes in its second training
     one.train()
     assert set(one.passed) == {0, 1}
-    assert outcome_of(one, 0).status == outcome_of(one, 1).status == Status.OK
-    assert [outcome_of(one, run).details["position"] for run in (0, 1)] == [0, 1]
+    assert _outcome_of(one, 0).status == _outcome_of(one, 1).status == Status.OK
+    assert [_outcome_of(one, run).details["position"] for run in (0, 1)] == [0, 1]
     history = one.history()
     assert set(history["run"]) == {0, 1}
     assert list(tmp_path.glob("kept-*"))
@@ -79,15 +79,15 @@ def test_each_run_stops_where_its_check_passed_and_only_the_others_start_afresh(
 def test_a_run_whose_check_never_passes_is_shown_as_such(tmp_path: Path) -> None:
     one = block(tmp_path, {0: Check(1), 1: Check(99)})
     one.train()
-    said = outcome_of(one, 1)
+    said = _outcome_of(one, 1)
     assert said.status == Status.WARNING and "passed in none of 2 trainings" in said.reason
 
 
 def test_why_a_run_has_no_check_is_said() -> None:
     one = block(None, {0: Check(1)}, faults={1: "the check could not be prepared: no attractor"})
     one.train()
-    assert outcome_of(one, 0).status == Status.OK
-    said = outcome_of(one, 1)
+    assert _outcome_of(one, 0).status == Status.OK
+    said = _outcome_of(one, 1)
     assert (said.status, said.reason) == (Status.WARNING, "the check could not be prepared: no attractor")
 
 
