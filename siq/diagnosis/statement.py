@@ -32,7 +32,7 @@ Number = Annotated[float, BeforeValidator(lambda value: float("nan") if value is
 class Estimate:
     """A parameter's value with its standard error, None where it has none, and its unit."""
 
-    estimate: float
+    estimate: Number
     standard_error: float | None
     unit: str
 
@@ -144,8 +144,8 @@ class DescribedCurve:
 
     coordinate: str
     at: tuple[float, ...]
-    value: tuple[float, ...]
-    standard_error: tuple[float, ...]
+    value: tuple[Number, ...]
+    standard_error: tuple[Number, ...]
 
 
 @dataclass(frozen=True)
@@ -164,8 +164,8 @@ class DescribedSurface:
 
     coordinates: tuple[str, str]
     at: tuple[tuple[float, ...], tuple[float, ...]]
-    value: tuple[tuple[float, ...], ...]
-    standard_error: tuple[tuple[float, ...], ...]
+    value: tuple[tuple[Number, ...], ...]
+    standard_error: tuple[tuple[Number, ...], ...]
 
 
 @dataclass(frozen=True)
