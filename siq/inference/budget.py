@@ -1,4 +1,4 @@
-"""How much work may a case take, and what was spent of it?
+"""Budgets: the work that a case may take, and an account of what it took.
 
 Work is counted, not timed, so that the same case gives the same answer on every machine. The unit is what the
 likelihood takes for one sample, one state and one column of its derivatives; evaluations of f between samples
@@ -24,12 +24,12 @@ COMPILATION = 5e6  # what it takes to derive and compile the formulas of a model
 
 
 class BudgetSpent(Exception):
-    """What was allowed is spent; what was found so far is the answer, and is said to be partial."""
+    """The budget is spent; what was found so far is the answer, and is said to be partial."""
 
 
 @dataclass(frozen=True)
 class Account:
-    """What a case took.
+    """The work and the time that a case took.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class Budget:
 
     @property
     def exhausted_by(self) -> Literal["work", "clock"] | None:
-        """What ran out, if something did."""
+        """Work or time, if either ran out."""
         if self.spent >= min(self.work * (1 - self._kept), self._limit):
             return "work"
         return "clock" if self.elapsed >= self.seconds else None
@@ -150,7 +150,7 @@ class Budget:
             self._limit = before
 
     def account(self) -> Account:
-        """What was spent until now, as a verdict records it."""
+        """An account until now, as a verdict records it."""
         return Account(self.work, self.spent, self.elapsed, self.stopped_by)
 
     def says(self, what: str) -> None:

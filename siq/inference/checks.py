@@ -246,7 +246,7 @@ def rounding_bias(found: FieldEstimate, pairs: SnapshotPairs, rounding: np.ndarr
 
 
 def rounding_text(recordings: Recordings, *, coarse: bool = False) -> str | None:
-    """How the recordings were written and what error that means, in words; None where no rounding is seen.
+    """The rounding of recordings and the error that it means, in words; None where no rounding is seen.
 
     Parameters
     ----------

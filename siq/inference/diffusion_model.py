@@ -66,7 +66,7 @@ def _all_places(d: int, functions: int) -> np.ndarray:
 
 
 class _DiffusionLikelihood:
-    """How likely recordings are under ``εD(x) = Σ_k S_k φ_k(x)``, and what follows: base of both likelihoods.
+    """Likelihood of recordings under ``εD(x) = Σ_k S_k φ_k(x)``, its scoring and tests: base of both kinds.
 
     A coefficient is a row ``(i, j, k)`` of places: of the entry ``i ≤ j`` of εD, and of the function φ_k.
 
@@ -417,7 +417,7 @@ def process_noise_increments(found: FieldEstimate, pairs: SnapshotPairs, rest: n
 
 
 def with_process_noise_rate(found: FieldEstimate, pairs: SnapshotPairs) -> FieldEstimate:
-    """The same field, its `noise_rate` that of the process noise and no longer that of the residuals.
+    """An estimate whose `noise_rate` is that of the process noise and no longer that of the residuals.
 
     Along a step the system forgets a part of what kicked it: a residual has the covariance
     ``∫₀ʰ e^{Js} εD e^{Jᵀs} ds`` with the Jacobian J of f, and not hεD. Per time that is less than εD, by the
@@ -521,7 +521,7 @@ class InnovationLikelihood(_DiffusionLikelihood):
     def parameter_covariance(
         self, formula: NoiseFormula, sensor: np.ndarray, covariance: np.ndarray, fit: Fit
     ) -> np.ndarray:
-        """What the errors of a formula and its sensors add to the covariance of the coefficients of f."""
+        """Covariance of the coefficients of f by the errors of a formula and its sensors."""
         d, whole, count = len(self.symbols), len(self._begin), len(formula.values)
         places = np.column_stack([formula.places, [self.terms.index(term) for term in formula.terms]])
         levels, axes = np.linalg.eigh(covariance)

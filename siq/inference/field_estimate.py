@@ -49,7 +49,7 @@ HARMLESS_BIAS = 0.5  # of a standard error: with such a bias an error bar holds 
 
 @dataclass(frozen=True)
 class FlowMap:
-    """How a state is carried over the step of a pair.
+    """The map of a state over the step of a pair.
 
     Attributes
     ----------
@@ -190,7 +190,7 @@ class NoiseFormula:
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any], symbols: Sequence[sympy.Symbol]) -> NoiseFormula:
-        """What `as_data` gave."""
+        """A formula as `as_data` stored it."""
         names = {each.name: each for each in symbols}
         place = {each.name: index for index, each in enumerate(symbols)}
         rows = data["terms"]
@@ -253,7 +253,7 @@ class DiffusionSource(StrEnum):
 
     @property
     def note(self) -> str | None:
-        """What a reader of U has to know; nothing where D was given."""
+        """A remark for the reader of U; none where D was given."""
         return {
             DiffusionSource.GIVEN: None,
             DiffusionSource.ESTIMATED: "D is estimated from the noise of the recordings, since none was"
@@ -455,7 +455,7 @@ class FieldEstimate:
         return cls(library, _spread_out(library, support, values), support, *args, **fields)
 
     def with_values(self, support: np.ndarray, values: np.ndarray, **changes: Any) -> FieldEstimate:
-        """The same with other coefficients, those of a support, and other changes."""
+        """This estimate with other coefficients, those of a support, and other changes."""
         coefficients = _spread_out(self.library, support, values)
         return replace(self, coefficients=coefficients, support=support, **changes)
 

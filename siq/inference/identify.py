@@ -164,7 +164,7 @@ def identify(
 
 
 class _Case:
-    """What an identification is of; the arguments are those of `identify`."""
+    """An identification of recordings; the arguments are those of `identify`."""
 
     def __init__(
         self,
@@ -441,7 +441,7 @@ class _Case:
         return replace(found, prediction=verdict)
 
     def advice(self, *, hidden: bool) -> str | None:
-        """What to do where a recorded position has inertia, or hidden velocities are not needed."""
+        """Advice where a recorded position has inertia, or hidden velocities are not needed."""
         if len(self.recordings.names) != 1:
             return None
         try:

@@ -198,7 +198,7 @@ class Linearisation:
         places: np.ndarray | None = None,
         kept: bool = False,
     ) -> tuple[Any, ...]:
-        """What the filter makes of it; see `siq.inference.filter_kernels.filter_recursion`.
+        """Innovations of the filter along it; see `siq.inference.filter_kernels.filter_recursion`.
 
         Parameters
         ----------
@@ -452,25 +452,25 @@ class Noise:
     field: Diffusion | None = None
 
     def along(self, x: np.ndarray, spread: np.ndarray | None, step: np.ndarray) -> Noise:
-        """The same noise with the shape that its field has at states; see `_mean_intensity`."""
+        """This noise with the shape that its field has at states; see `_mean_intensity`."""
         if self.field is None:
             return self
         spread = np.zeros((*x.shape, x.shape[1])) if spread is None else spread
         return replace(self, shape=_mean_intensity(self.field, x, spread, step))
 
     def without_process(self) -> Noise:
-        """The same measurement noise, and states that follow their equations exactly."""
+        """This measurement noise, and states that follow their equations exactly."""
         return replace(self, process=np.zeros_like(self.process))
 
     def of_states(self, dimension: int) -> Noise:
-        """The same noise where there are more states, or fewer: what is added has none of its own."""
+        """This noise where there are more states, or fewer: those added are not driven."""
         if len(self.process) == dimension:
             return self
         driven = self.process[:dimension]
         return replace(self, process=np.append(driven, np.zeros(dimension - len(driven))))
 
     def scaled(self, factor: float) -> Noise:
-        """The same measurement noise, with the process noise multiplied."""
+        """This measurement noise, with the process noise multiplied."""
         return replace(self, process=self.process * factor)
 
     @property

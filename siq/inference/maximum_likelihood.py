@@ -309,7 +309,7 @@ class _Iterate:
 
 @dataclass(frozen=True)
 class _Shooting:
-    """What is fitted.
+    """A model to be fitted, on the grid of its measurements.
 
     Attributes
     ----------
@@ -334,7 +334,7 @@ class _Shooting:
 
     @property
     def resolution(self) -> float:
-        """How unlike the effects of parameters have to be for the data to tell them apart; see `solve`."""
+        """Least relative singular value with which effects of parameters are distinct; see `solve`."""
         return RANK if self.filtered else INEXACT
 
     def charge(self, evaluations: float = 1.0) -> None:
@@ -413,7 +413,7 @@ class _Shooting:
 def _state_changes(
     linearisation: Linearisation, data: Measurements, noise: Noise, change: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How the most probable states follow a change of the free parameters, see `Linearisation.smoothed`."""
+    """Most probable states after a change of the free parameters, see `Linearisation.smoothed`."""
     still = with_parameters_changed(linearisation, change)
     innovations, _, initial = still.filtered(data.first, data.step, noise.measurement, noise.intensity)[:3]
     begin = np.empty((len(data.labels), still.gap.shape[1]))
@@ -495,7 +495,7 @@ class Fit:
 def fit_of_states(
     model: Dynamics, data: Measurements, *, x: np.ndarray, noise: Noise, substeps: int, converged: bool
 ) -> Fit:
-    """What is known of a fit that was made otherwise: without process noise, its states follow the equations.
+    """A fit that was made otherwise: without process noise, its states follow the equations.
 
     Parameters
     ----------
@@ -530,7 +530,7 @@ def _fit_at(
     converged: bool,
     resolution: float,
 ) -> Fit:
-    """What is known of a fit whose iteration ended at parameters, states and noise."""
+    """The fit whose iteration ended at parameters, states and noise."""
     white = whiten(at.along, data, noise)
     expected = Expectations.of(model, at.values)
     columns, innovations = expected.stacked_on(white.columns, white.innovations)

@@ -337,7 +337,7 @@ def _filled(data: Measurements, column: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Expectations:
-    """What is expected of changes of the free parameters: combinations of them are normal, of unit width.
+    """Priors of changes of the free parameters: combinations of them are normal, of unit width.
 
     Attributes
     ----------

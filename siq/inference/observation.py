@@ -148,7 +148,7 @@ def smoothed_motion(data: Measurements, names: Sequence[str]) -> tuple[np.ndarra
 
 @dataclass(frozen=True)
 class ObservationModel:
-    """How samples show the states of f.
+    """The relation of samples to the states of f.
 
     Attributes
     ----------
@@ -172,7 +172,7 @@ class ObservationModel:
 
     @property
     def measured_states(self) -> int:
-        """How many states are measured."""
+        """Number of states that are measured."""
         return self.library.dimension // 2 if self.hidden else self.library.dimension
 
     @property
@@ -352,7 +352,7 @@ def unbroken(recordings: Recordings, *, pair_step: float | None = None, every: i
 
 @dataclass(frozen=True)
 class InertiaTest:
-    """What recordings of one position say of its inertia.
+    """The test of the inertia of one recorded position.
 
     Attributes
     ----------

@@ -466,7 +466,7 @@ def _fit_support(found: FieldEstimate, regression: _PairRegression) -> FieldEsti
 
 
 def refit(found: FieldEstimate, pairs: SnapshotPairs) -> FieldEstimate:
-    """The same terms fitted to other pairs, such as those of the training recordings alone.
+    """The terms of an estimate fitted to other pairs, such as those of the training recordings alone.
 
     With the weights of a D that depends on the state the noise stays as it is.
     """
@@ -499,7 +499,7 @@ def with_stability(
     options: IdentificationOptions,
     generator: np.random.Generator,
 ) -> FieldEstimate:
-    """The same field, with the share of resampled recordings in which each of its terms is chosen.
+    """An estimate with the share of resampled recordings in which each of its terms is chosen.
 
     Parameters
     ----------
@@ -531,7 +531,7 @@ def with_stability(
 def with_noise_formula(
     found: FieldEstimate, pairs: SnapshotPairs, *, false_terms: float
 ) -> FieldEstimate | None:
-    """The same identification for a noise that depends on the state; None where a constant one can be held.
+    """f and D for a noise that depends on the state; None where a constant one can be held.
 
     Parameters
     ----------
@@ -572,7 +572,7 @@ def with_noise_formula(
 def with_given_noise(
     found: FieldEstimate, pairs: SnapshotPairs, diffusion: Diffusion, *, false_terms: float
 ) -> FieldEstimate:
-    """The same identification with the weights of a given D; see `with_noise_formula`."""
+    """f with the weights of a given D; see `with_noise_formula`."""
     found = replace(found, diffusion=diffusion)
     if found.noise_free or diffusion.constant:
         return found

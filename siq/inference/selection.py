@@ -60,7 +60,7 @@ NEGLIGIBLE_VARIANCE = 1e-6  # of the largest, in units in which all functions ha
 
 
 def critical_values(library: CandidateLibrary, *, false_terms: float) -> np.ndarray:
-    """How many standard errors each function has to be from zero, in any equation: shape ``(q,)``.
+    """Number of standard errors that each function has to be from zero, in any equation: shape ``(q,)``.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ def all_coefficients(components: Sequence[int], functions: int) -> np.ndarray:
 
 
 def _strong_terms(problem: LinearProblem, *, among: np.ndarray | None = None) -> tuple[int, ...]:
-    """What backward elimination leaves of all functions, or of some of them, shape ``(q,)``."""
+    """Backward elimination from all functions, or from some of them, shape ``(q,)``."""
     present = np.linalg.norm(problem.columns, axis=0) > 0
     active = np.flatnonzero(present if among is None else present & among)
     while len(active):
@@ -356,7 +356,7 @@ def stability(
 
 @dataclass(frozen=True)
 class ModelAverage:
-    """What the mean over supports adds to the f of the chosen one.
+    """Bias and spread that the mean over supports adds to the f of the chosen one.
 
     Attributes
     ----------

@@ -523,7 +523,7 @@ EDGE = 0.05  # width of a jump, in what its argument passes in a substep
 
 
 def jumps_of(model: Dynamics) -> list[sympy.Expr]:
-    """What changes its sign where f jumps, each once, in an order that does not change."""
+    """Arguments that change sign where f jumps, each once, in an order that does not change."""
     signs = {each for formula in model.equations for each in formula.atoms(sympy.sign)}
     return sorted((each.args[0] for each in signs), key=str)
 
