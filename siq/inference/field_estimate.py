@@ -455,7 +455,7 @@ class FieldEstimate:
         return cls(library, _spread_out(library, support, values), support, *args, **fields)
 
     def with_values(self, support: np.ndarray, values: np.ndarray, **changes: Any) -> FieldEstimate:
-        """This estimate with other coefficients, those of a support, and other changes."""
+        """An estimate with other coefficients, those of a support, and other changes."""
         coefficients = _spread_out(self.library, support, values)
         return replace(self, coefficients=coefficients, support=support, **changes)
 

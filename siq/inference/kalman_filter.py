@@ -452,25 +452,25 @@ class Noise:
     field: Diffusion | None = None
 
     def along(self, x: np.ndarray, spread: np.ndarray | None, step: np.ndarray) -> Noise:
-        """This noise with the shape that its field has at states; see `_mean_intensity`."""
+        """A noise with the shape that its field has at states; see `_mean_intensity`."""
         if self.field is None:
             return self
         spread = np.zeros((*x.shape, x.shape[1])) if spread is None else spread
         return replace(self, shape=_mean_intensity(self.field, x, spread, step))
 
     def without_process(self) -> Noise:
-        """This measurement noise, and states that follow their equations exactly."""
+        """Only the measurement noise, with states that follow their equations exactly."""
         return replace(self, process=np.zeros_like(self.process))
 
     def of_states(self, dimension: int) -> Noise:
-        """This noise where there are more states, or fewer: those added are not driven."""
+        """A noise where there are more states, or fewer: those added are not driven."""
         if len(self.process) == dimension:
             return self
         driven = self.process[:dimension]
         return replace(self, process=np.append(driven, np.zeros(dimension - len(driven))))
 
     def scaled(self, factor: float) -> Noise:
-        """This measurement noise, with the process noise multiplied."""
+        """A noise with the process noise multiplied."""
         return replace(self, process=self.process * factor)
 
     @property
