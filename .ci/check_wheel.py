@@ -8,17 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import sympy
-from siq.identify.identification import IdentificationOptions, identify_vector_field
-from siq.identify.library import candidate_library
 
 import siq
 from siq.data.recordings import snapshot_pairs
+from siq.inference.library import IdentificationOptions
+from siq.inference.regression import identify_vector_field
 
 installed = Path(siq.__file__).resolve()
 assert not installed.is_relative_to(Path(sys.argv[1]).resolve()), f"{installed} is not the installed one"
 assert siq.__version__ == metadata.version("quasipotential")
 for package, name in (
-    ("mismatch", "mechanisms.yaml"),
+    ("diagnosis", "mechanisms.yaml"),
     ("report", "templates/base.html.j2"),
     (".", "py.typed"),
     ("workflow/shipped", "Snakefile"),
@@ -37,7 +37,7 @@ made = siq.simulate_snapshots(well, options=options, generator=np.random.default
 rows = np.column_stack([made.recording, made.t, made.values])
 np.savetxt("trajectories.csv", rows, delimiter=",", header="recording,t,x,y", comments="", fmt="%.17g")
 pairs = snapshot_pairs(siq.read_recordings("trajectories.csv"), pair_step=options.pair_step)
-library = candidate_library(["x", "y"], degree=3)
+library = siq.candidate_library(["x", "y"], degree=3)
 found = identify_vector_field(library, pairs, options=IdentificationOptions(degree=3))
 terms = {library.names[k]: round(float(found.coefficients[k, i]), 5) for i, k in found.support if i == 0}
 assert terms == {"x": 1.0, "x**3": -1.0}, terms
