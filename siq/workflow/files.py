@@ -2,18 +2,18 @@
 
 What has nothing to say is None, and an empty file. Every file is whole or not there at all.
 
-====================================  ========================================================================
-``recordings``                        trajectories, Parquet
-``field``                             the identified f, `siq.inference.identification.FieldRecord`
-``model``, ``regression``             formulas and certificates by method
-``networks``                          networks of a block of runs, by position
-``quasipotential``                    a landscape; read as plain data
-``card``, ``system``, ``recalibrated``  a system
-``published``, ``reference``          published figures; a reference landscape
-``..._outcome``                       outcomes of steps
-tables                                Parquet, with a CSV beside it
-others                                JSON, text, or a folder of figures and files by name
-====================================  ========================================================================
+=======================================  =====================================================================
+``recordings``                           trajectories, Parquet
+``field``                                the identified f, `siq.inference.field_estimate.FieldEstimate`
+``model``, ``regression``                formulas and certificates by method
+``networks``                             networks of a block of runs, by position
+``quasipotential``                       a landscape
+``card``, ``system``, ``recalibrated``   a system
+``published``, ``reference``             published figures; a reference landscape
+``..._outcome``                          outcomes of steps
+tables                                   Parquet, with a CSV beside it
+others                                   JSON, text, or a folder of figures and files by name
+=======================================  =====================================================================
 """
 
 from __future__ import annotations
