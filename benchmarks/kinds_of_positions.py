@@ -3,8 +3,8 @@
     python -m benchmarks.kinds_of_positions [--kinds NAME ...] [--seed 5]
 
 One laboratory of each kind: weak and strong damping, a single record, coarse steps, a force that is no
-polynomial, other units, two positions, and ring-downs without random forces. Barriers are compared with
-``2γ ΔΦ``, and as ΔU/ε with ΔΦ/T where random forces are seen, in stated errors. One laboratory says little of
+polynomial, other units, two positions, and ring-downs without process noise. Barriers are compared with
+``2γ ΔΦ``, and as ΔU/ε with ΔΦ/T where process noise are seen, in stated errors. One laboratory says little of
 an error; `benchmarks.hidden_velocities` asks a hundred.
 """
 

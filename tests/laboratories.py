@@ -56,7 +56,7 @@ def ring_downs(
 
 
 def hopping(*, intensity: float, samples: int, step: float, traces: int, seed: int) -> pd.DataFrame:
-    """Long traces of one state in the double well ``x' = x - x**3`` with random forces."""
+    """Long traces of one state in the double well ``x' = x - x**3`` with process noise."""
     draw = np.random.default_rng(seed)
     within = 5
     state = np.sign(draw.standard_normal(traces))

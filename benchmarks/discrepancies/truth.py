@@ -32,10 +32,10 @@ class TrueCase:
     noise
         Deviation of each output's noise, shape ``(m,)``.
     model
-        The oracle's simulation: the true one, fitted; where random forces are concealed, the card's with true
+        The oracle's simulation: the true one, fitted; where process noise are concealed, the card's with true
         parameters.
     delta_chi2
-        What the concealed effect gains it; NaN where nothing is concealed, or random forces are.
+        What the concealed effect gains it; NaN where nothing is concealed, or process noise are.
     terms
         The effect as products of powers up to the degree of the library; None where it is no such sum.
     """

@@ -2,7 +2,7 @@
 
     python -m benchmarks.laboratories.coverage [--seeds 200] [--estimator NAME ...]
 
-The ratio is R/(Qh): the variance of the sensor over that of the random forces within a step. A linear system
+The ratio is R/(Qh): the variance of the sensor over that of the process noise within a step. A linear system
 and a double well, of which f has free coefficients, and both noises are unknown. The bar is 90 to 98 % of all
 coefficients within 1.96 of their standard errors. What has not converged counts as no fit.
 """

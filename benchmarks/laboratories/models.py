@@ -16,7 +16,7 @@ Monomial = tuple[int, ...]  # exponents, one for each state
 
 @dataclass(frozen=True)
 class Laboratory:
-    """A system with random forces, and the instrument that records it.
+    """A system with process noise, and the instrument that records it.
 
     Attributes
     ----------

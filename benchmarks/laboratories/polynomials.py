@@ -97,7 +97,7 @@ def jacobian(system: Polynomials, x: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True)
 def intensity(system: Polynomials, x: np.ndarray) -> float:
-    """Q at a state: variance per unit of time of the random forces on each state."""
+    """Q at a state: variance per unit of time of the process noise on each state."""
     value = 0.0
     for term in range(len(system.noise_coefficients)):
         value += system.noise_coefficients[term] * monomial(system.noise_powers[term], x)

@@ -2,7 +2,7 @@
 
     python -m benchmarks.laboratories.supports [--seeds 100] [--systems NAME ...] [--cores 2]
 
-Records of random forces, with a noisy sensor or without, through the step *identify* as `siq run` takes it. A
+Records of process noise, with a noisy sensor or without, through the step *identify* as `siq run` takes it. A
 record counts where every true term exceeds five of its standard errors when the true terms alone are fitted:
 in others the evidence is not there. The bar is 93 of 100; `false_terms` alone may cost five.
 """

@@ -66,7 +66,7 @@ def changes(form: Form) -> str:
         for name, state in form.states.items()
     ]
     if form.noise:
-        said.append(f"random forces on `{form.noise}`")
+        said.append(f"process noise on `{form.noise}`")
     words = "; ".join(said)
     return f"{words} ({form.variant})" if form.variant else words
 

@@ -83,8 +83,8 @@ class MarkovLag:
     Attributes
     ----------
     kind
-        ``none``: no noise. ``white``: random forces without a memory. ``sensor``: errors of the sensor, new
-        in each sample. ``blur``: each sample is a mean over an exposure. ``coloured``: the random forces
+        ``none``: no noise. ``white``: white process noise. ``sensor``: measurement noise, new
+        in each sample. ``blur``: each sample is a mean over an exposure. ``coloured``: the process noise
         have a memory, or the sensor is slow. ``either`` of these two. ``memory``: it remembers in another
         way, such as by an oscillation of its own. ``hidden``: it remembers longer than
         it takes to relax, as where a state is not recorded. ``unknown``: too few samples, or uneven ones.
@@ -431,7 +431,7 @@ class NoiseFloor:
     sensor
         Standard deviation of the sensor's error, in the state's unit; 0 where none is seen.
     process
-        Variance that random forces add per unit of time; 0 where none is seen.
+        Variance that process noise adds per unit of time; 0 where none is seen.
     sensor_error, process_error
         Their standard errors.
     """

@@ -33,7 +33,7 @@ MOST_STRETCHES = 40  # more make no error better known
 STRETCH_LENGTH = 10  # correlation times: what is left of its first sample at its end is then nothing
 _STRETCH_LABEL = re.compile(r"(?P<label>.*) \((?P<number>\d+) of (?P<of>\d+)\)")
 SINGLE_RECORDING = (
-    "there is one recording, and it shows no random forces: it leads into one stable state and tells nothing"
+    "there is one recording, and it shows no process noise: it leads into one stable state and tells nothing"
     " of others, nor of barriers"
 )
 
@@ -96,7 +96,7 @@ def _checked_for_learning(
     chosen
         Whether somebody named the states: then none is left out.
     hidden_velocities
-        Whether they are positions: these are smooth, however strong the random forces on velocities are.
+        Whether they are positions: these are smooth, however strong the process noise on velocities is.
 
     Raises
     ------
@@ -161,14 +161,14 @@ def in_stretches(recordings: Recordings, *, hidden_velocities: bool = False) -> 
 
     Stretches are ten correlation times long, hops included, where this makes between ten and forty of them.
     Several recordings come back as they are, and so does one of too few pairs, or without
-    random forces: a system that settles once is not seen again in another stretch.
+    process noise: a system that settles once is not seen again in another stretch.
 
     Parameters
     ----------
     recordings
         Trajectories.
     hidden_velocities
-        Whether they are positions: these are smooth, however strong the random forces on velocities are, and
+        Whether they are positions: these are smooth, however strong the process noise on velocities is, and
         whether there are any is found together with f.
     """
     count = len(recordings.t)
@@ -222,7 +222,7 @@ def without_slow_drift(recordings: Recordings) -> Recordings:
 
     Of a record that supports two states the drift is what both levels have in common; of any other, what slow
     cosines explain. Several recordings come back as they are: how they begin may be a part of what they show.
-    So does one without random forces, in which nothing but the system itself moves.
+    So does one without process noise, in which nothing but the system itself moves.
     """
     floors = noise_floors(recordings) if len(recordings.labels) == 1 else None
     if floors is None or any(floor.process == 0 for floor in floors):

@@ -446,7 +446,7 @@ def held_out_recordings(
     names = np.unique(groups)
     if len(names) < 2:
         raise NumericalFailure(
-            "there is only one recording, and it shows no random forces or is too short to be divided, so"
+            "there is only one recording, and it shows no process noise or is too short to be divided, so"
             f" that none can be held out; {SINGLE_RECORDING_REMEDY}"
         )
     count = min(max(round(share * len(names)), 1), len(names) - 1)

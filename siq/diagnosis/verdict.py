@@ -146,7 +146,7 @@ def _explanations(
     correlated = correlation_time_left([fit for _, fit in fits], data)
     for what, fit in fits:
         if np.isfinite(fit.log_likelihood):
-            forces = " and random forces" if fit.has_process_noise else ""
+            forces = " and process noise" if fit.has_process_noise else ""
             evidence[f"{what}{forces}"] = log_evidence_of(fit, data, correlated=correlated)
     best = max(evidence.values(), default=0.0)
     ranked = sorted(evidence.items(), key=lambda each: -each[1])

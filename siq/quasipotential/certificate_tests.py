@@ -17,7 +17,7 @@ without it.
                    route are trained again: a test of consistency, and no evidence from elsewhere
 `prediction`       f predicts held-out recordings, and its residuals are white
 `record`           held-out recordings hop, and are spread, as f and D say (`occupancy`). Only
-                   where they show random forces and two states, and where they hop or should
+                   where they show process noise and two states, and where they hop or should
 =================  ===========================================================================================
 
 The error of a V with ``R = ∇V·(f + D∇V)``, V* being the true one and both zero at an attractor: following

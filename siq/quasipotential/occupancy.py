@@ -585,9 +585,9 @@ def check_occupancy(
         Decides the draws of f.
     """
     if found.noise_free:
-        return OccupancyCheck(missing="the recordings show no random forces, so that nothing hops")
+        return OccupancyCheck(missing="the recordings show no process noise, so that nothing hops")
     if noise is None:
-        return OccupancyCheck(missing="the strength of the random forces is not known")
+        return OccupancyCheck(missing="the strength of the process noise is not known")
     if len(portrait.attractors) < 2:
         seen = switching(joined(recordings)) if found.dynamics.dimension == 1 else None
         if seen is None or not seen.supported:

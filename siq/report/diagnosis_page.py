@@ -74,8 +74,8 @@ class Findings:
 
     @property
     def kind(self) -> str:
-        """The verdict in two words, random forces being a kind of their own."""
-        return "random forces" if self.statement.random_forces else str(self.statement.verdict)
+        """The verdict in two words, process noise being a kind of their own."""
+        return "process noise" if self.statement.random_forces else str(self.statement.verdict)
 
     @property
     def final(self) -> str:
@@ -214,7 +214,7 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str]) ->
         largest=largest,
         off=off,
         mechanism_sentences=[
-            (each.name, entry.sentence) for each, entry in named if findings.kind != "random forces"
+            (each.name, entry.sentence) for each, entry in named if findings.kind != "process noise"
         ],
         errors=_errors_table(findings, of_outputs),
         formulas=_formulas(findings),
@@ -250,7 +250,7 @@ def _errors_table(findings: Findings, units: Mapping[str, str]) -> pd.DataFrame 
     if floor is None:
         return None
     shown = ["before", "recalibrated", "augmented"]
-    if not (findings.named or statement.described) or findings.kind == "random forces":
+    if not (findings.named or statement.described) or findings.kind == "process noise":
         shown.remove("augmented")
     if errors.before == errors.recalibrated:  # no parameter was free, or none changed
         shown.remove("recalibrated")

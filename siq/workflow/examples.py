@@ -114,7 +114,7 @@ def _commented_study(found: Inspection, path: Path, study: Path) -> str:
     diffusion = ", ".join("1.0" for _ in states)
     looked_at = "".join(f"# {line}".rstrip() + "\n" for line in found.text().splitlines())
     needed = (
-        "\n  # Your states have different units: where no random forces are seen, D has to be given."
+        "\n  # Your states have different units: where no process noise is seen, D has to be given."
         if len(units) > 1
         else ""
     )

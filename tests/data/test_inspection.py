@@ -37,7 +37,7 @@ def test_memory_transitions_coverage_and_prospects_are_said(blurred: Inspection)
         "Two states are supported",
         "transitions seen",
         "of the range of x was visited",
-        "Random forces are seen",
+        "Process noise is seen",
         "seen from a sample 4 steps earlier",
     ):
         assert words in text
@@ -61,7 +61,7 @@ def test_relaxations_without_noise_are_not_asked_for_transitions() -> None:
     found = siq.inspect(Recordings.from_arrays(t, (starts * np.exp(-t))[:, :, None], names=["x"]))
     assert found.memory.kind == "none"
     assert found.switching is None
-    assert "No random forces are seen" in found.text()
+    assert "No process noise is seen" in found.text()
 
 
 def test_three_panels_show_it(blurred: Inspection) -> None:

@@ -349,7 +349,7 @@ def test_one_relaxation_is_refused_before_anything_runs_and_one_hopping_record_i
     text = csv(pd.DataFrame({"recording": "a", "t": t, "x": np.exp(-t)}))
     path = put(tmp_path, "settling.csv", text)
     with pytest.raises(
-        InputError, match=r"there is one recording, and it shows no random forces.*many starting"
+        InputError, match=r"there is one recording, and it shows no process noise.*many starting"
     ):
         read_pairs(path, states=None, units=None, pair_step=None)
     hopping = noisy(0.0, 0.1)
@@ -414,5 +414,5 @@ def test_an_inspection_says_what_is_there(tmp_path: Path) -> None:
     codes = [remark.code for remark in found.remarks()]
     assert codes[-3:] == ["data.noise_seen", "data.sensor_noise", "data.no_time_unit"]
     lines = found.lines()
-    assert "Random forces are seen" in lines[-3] and "noise of the sensor" in lines[-2]
+    assert "Process noise is seen" in lines[-3] and "Measurement noise" in lines[-2]
     assert "unit the time is" in lines[-1]

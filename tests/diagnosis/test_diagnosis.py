@@ -58,7 +58,7 @@ def recordings_of(
     fading: bool = False,
     seed: int = 1,
 ) -> pd.DataFrame:
-    """Driven oscillators of different strength, by Heun's rule; random forces may follow their motion."""
+    """Driven oscillators of different strength, by Heun's rule; process noise may follow their motion."""
     generator = np.random.default_rng(seed)
     t = np.arange(SAMPLES) * STEP
     strength = np.geomspace(0.4, 2.0, count)[:, None]
@@ -182,16 +182,16 @@ def test_the_later_part_of_a_single_recording_is_not_called_independent(tmp_path
 
 @pytest.mark.parametrize("drag", [0.005, 0.5])
 def test_drag_is_named_from_one_drop_of_45_heights(drag: float, tmp_path: Path) -> None:
-    """Free fall is off by a tenth, or by nearly all; random forces could explain any 45 heights."""
+    """Free fall is off by a tenth, or by nearly all; process noise could explain any 45 heights."""
     diagnosis = solve_case(falling_ball(drag).read(tmp_path))
     (found,) = said(diagnosis)["mechanisms"]
     assert found["name"] == "quadratic drag"
     (parameter,) = found["parameters"].values()
     assert abs(parameter["estimate"] - drag) < 3 * parameter["standard_error"]
-    # Random forces explain more than free fall alone, and drag without any explains more than they do.
+    # Process noise explains more than free fall alone, and drag without any explains more than it does.
     said_of = {each["what"]: each["log_evidence"] for each in said(diagnosis)["explanations"]}
     assert said_of["quadratic drag in w"] == 0
-    assert said_of["other parameters"] < said_of["other parameters and random forces"] < -10
+    assert said_of["other parameters"] < said_of["other parameters and process noise"] < -10
 
 
 def test_dry_friction_is_told_from_other_friction(tmp_path: Path) -> None:
@@ -216,7 +216,7 @@ def test_random_forces_are_no_noise_where_a_function_beside_them_is_likelier(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def models(search: Search, _: FitContext) -> tuple[AugmentedModel, ...]:
-        # A function of a sensor that leaves random forces, and is likelier than forces alone.
+        # A function of a sensor that leaves process noise, and is likelier than noise alone.
         assert search.recalibrated.has_process_noise
         candidate = next(each.candidate for each, _ in search.screened if not each.candidate.equations)
         part = Term(FittedCandidate(candidate, search.recalibrated, 50.0, 40.0, 0.0, 0.0), MECHANISM, 0.0)
@@ -472,7 +472,7 @@ def test_where_nothing_speaks_of_a_mismatch_but_a_refuted_name_there_is_none(tmp
     again = withdrawn(refuted, diagnosis.case, Budget())
     assert str(again.verdict) == "no mismatch" and not again.withdrawn and not again.search.found
     assert has_code(again.remarks, "diagnosis.refuted")
-    # Random forces that are needed speak of one by themselves.
+    # Process noise that is needed speaks of one by itself.
     fit = found.search.recalibrated
     forced = replace(fit, noise=replace(fit.noise, process=np.array([0.0, 1e-3])))
     search = replace(found.search, recalibrated=forced)

@@ -38,7 +38,7 @@ LARGE: dict[str, Callable[[], ForeignCase]] = {
     "double pendulum": double_pendulum,
     "double pendulum, fast camera": lambda: double_pendulum(rate_of_camera=400.0),
     "eight states, 10⁵ samples": chain_of_masses,
-    "random forces, 10⁵ samples": long_relaxation,
+    "process noise, 10⁵ samples": long_relaxation,
 }
 
 

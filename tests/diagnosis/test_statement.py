@@ -254,7 +254,7 @@ def test_random_forces_are_a_verdict_of_their_own():
     text = said(statement_from(1, MismatchVerdict.MISSING_PHYSICS, mechanisms=(forces,))).replace(
         "\u00a0", " "
     )
-    assert "driven by random forces" in text and "0.0200 m²/s³ on v" in text
+    assert "driven by process noise" in text and "0.0200 m²/s³ on v" in text
     assert "lacks" not in text and "falls from" not in text and "explains" not in text
 
 

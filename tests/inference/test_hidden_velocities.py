@@ -149,7 +149,7 @@ def test_what_cannot_be_done_is_said() -> None:
 
 
 def test_one_record_of_smooth_positions_is_enough(tmp_path: Path) -> None:
-    """Random forces on velocities leave positions smooth, so that sample by sample none are seen."""
+    """Process noise on velocities leaves positions smooth, so that sample by sample none are seen."""
     recordings, _ = particle(7, records=1, samples=12_000, step=0.02)
     floors = noise_floors(recordings)
     assert floors is not None and floors[0].process == 0
@@ -169,7 +169,7 @@ def test_one_record_of_smooth_positions_is_enough(tmp_path: Path) -> None:
 
 
 def ring_downs(positions: int = 1) -> Recordings:
-    """Damped Duffing particles that run down, seen by a sensor, without random forces."""
+    """Damped Duffing particles that run down, seen by a sensor, without process noise."""
     draw = np.random.default_rng(12)
     t = 0.05 * np.arange(500)
     seen = []

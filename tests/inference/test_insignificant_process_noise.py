@@ -1,4 +1,4 @@
-"""Random forces whose intensities have gone towards zero are none."""
+"""Process noise whose intensity has gone towards zero is none."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RATE, STEP = 0.7, 0.1
 
 
 def relaxations(*, driven: float) -> Measurements:
-    """Ten relaxations with a noisy sensor, driven by random forces or not."""
+    """Ten relaxations with a noisy sensor, driven by process noise or not."""
     rng = np.random.default_rng(3)
     x, frames = rng.uniform(1, 3, size=10), []
     for row in range(60):

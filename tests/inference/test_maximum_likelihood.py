@@ -49,7 +49,7 @@ def oscillations(
     k: float = 1.0,
     d: float = 0.1,
 ) -> Measurements:
-    """Free decays of a linear oscillator, sampled exactly; with random forces of the intensity `drive`."""
+    """Free decays of a linear oscillator, sampled exactly; with process noise of the intensity `drive`."""
     generator = np.random.default_rng(seed)
     matrix = np.array([[0.0, 1.0], [-k, -d]])
     carry = scipy.linalg.expm(matrix * STEP)
@@ -178,7 +178,7 @@ def test_smoothed_states_are_the_conditional_means(linearised) -> None:
     process = process_covariance(line.transition, data.step, noise.intensity)
     still = with_parameters_changed(line, np.zeros(2))
     found, _, _ = still.smoothed(data.first, data.step, noise, begin)
-    # The same minimum, written as least squares over all random forces.
+    # The same minimum, written as least squares over all realisations of the process noise.
     rows = len(data.t)
     for place, (first, end) in enumerate(zip(data.first[:-1], data.first[1:], strict=True)):
         roots = [np.linalg.cholesky(process[k] + 1e-18 * np.eye(2)) for k in range(first, end - 1)]

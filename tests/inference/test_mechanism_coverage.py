@@ -32,7 +32,7 @@ def oscillator(*, mechanism: bool) -> Dynamics:
 
 
 def recorded(seed: int, *, forces: float, sensor: float, samples: int, records: int) -> Recordings:
-    """Both states of hardening oscillators under random forces, each with a sensor's variance."""
+    """Both states of hardening oscillators under process noise, each with a sensor's variance."""
     generator = np.random.default_rng(seed)
     within = 40
     h = STEP / within

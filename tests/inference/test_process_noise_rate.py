@@ -1,4 +1,4 @@
-"""The strength of random forces from residuals of a whole step, against linear systems, where it is exact."""
+"""The strength of process noise from residuals of a whole step, against linear systems, where it is exact."""
 
 from __future__ import annotations
 

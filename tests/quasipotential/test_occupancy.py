@@ -80,7 +80,7 @@ def test_a_wrong_depth_is_refused(recorded: RECORDED) -> None:
 def test_without_noise_there_is_no_test(recorded: RECORDED) -> None:
     recordings, record, portrait, held_out = recorded
     found = check_occupancy(record, portrait, None, recordings, held_out)
-    assert found.verdict(false_alarms=1e-4) is None and "strength of the random forces" in str(found.missing)
+    assert found.verdict(false_alarms=1e-4) is None and "strength of the process noise" in str(found.missing)
 
 
 def test_a_record_too_short_to_hop_is_no_test(recorded: RECORDED) -> None:

@@ -327,7 +327,7 @@ def functional_error(
 
 
 def intensity_ratio(key: CaseKey, parameters: Mapping[str, Mapping[str, Any]]) -> float:
-    """Estimated over true intensity of random forces, σ² per time."""
+    """Estimated over true intensity of process noise, σ² per time."""
     ratios = []
     for name, text in key.effect.noise.items():
         sigma = float(
