@@ -15,7 +15,7 @@ import pandas as pd
 
 from siq.diagnosis.dictionary import roles_of, standard_dictionary
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
-from siq.diagnosis.study import measurements_of
+from siq.diagnosis.study import _measurements_of
 from siq.inference.kalman_filter import Grid
 from siq.inference.measurements import Measurements
 from siq.numerics.files import Document, validate
@@ -431,7 +431,7 @@ def recorded(resident: Resident, *, seed: int = 1) -> Measurements:
         )
         for place in range(home.recordings)
     ]
-    empty = measurements_of(pd.concat(tables), before)
+    empty = _measurements_of(pd.concat(tables), before)
     begin = np.stack([home.begin(rng) for _ in range(home.recordings)], axis=1)
     states = simulated(truth, empty, begin)
     known, signals = before.dimension, empty.signals(empty.t, empty.recording, delays=())

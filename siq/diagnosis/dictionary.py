@@ -216,7 +216,7 @@ class Mechanism(_Part):
     reference: str = ""
 
 
-class Dictionary(BaseModel):
+class _Dictionary(BaseModel):
     """The schema of a file of mechanisms."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -233,7 +233,7 @@ def standard_dictionary() -> tuple[Mechanism, ...]:
 def _read_dictionary(path: str | Path) -> tuple[Mechanism, ...]:
     """Read a file ``mechanisms: [...]``."""
     document = read_document(path)
-    return validate(document, Dictionary).mechanisms
+    return validate(document, _Dictionary).mechanisms
 
 
 def dictionary_of(

@@ -178,7 +178,7 @@ def load_mismatch_study(path: str | Path) -> MismatchStudy:
     return validate(read_document(path), MismatchStudy)
 
 
-def measurements_of(recordings: Recordings | pd.DataFrame | str | Path, system: Dynamics) -> Measurements:
+def _measurements_of(recordings: Recordings | pd.DataFrame | str | Path, system: Dynamics) -> Measurements:
     """The recordings that a simulation is to be compared with, laid out for fitting."""
     file = str(recordings) if isinstance(recordings, str | Path) else "the recordings"
     columns, states = columns_of(system), dict(zip(system.states, system.units, strict=True))
@@ -268,7 +268,7 @@ def comparison_of(
         For the first thing that cannot be used, with its file, place and remedy.
     """
     settings = MismatchStudy() if settings is None else settings
-    data = measurements_of(recordings, system)
+    data = _measurements_of(recordings, system)
     for name in settings.noise:
         if name not in system.output_names:
             remedy = f"use one of {', '.join(system.output_names)}"

@@ -176,7 +176,7 @@ class Measurements:
         )
 
 
-def course_of_input(t: np.ndarray, u: np.ndarray, interpolation: str) -> scipy.interpolate.PPoly:
+def _course_of_input(t: np.ndarray, u: np.ndarray, interpolation: str) -> scipy.interpolate.PPoly:
     """An input as a function of time, from its samples.
 
     Parameters
@@ -254,7 +254,7 @@ def columns_of(model: Dynamics) -> tuple[str, ...]:
 
 def _course(recordings: Recordings, rows: slice, column: int, entry: Input) -> scipy.interpolate.PPoly:
     try:
-        return course_of_input(recordings.t[rows], recordings.values[rows, column], entry.interpolation)
+        return _course_of_input(recordings.t[rows], recordings.values[rows, column], entry.interpolation)
     except Fault as error:
         raise Fault(f"input {entry.name}: {error.fault}", error.remedy) from None
 

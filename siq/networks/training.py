@@ -118,7 +118,7 @@ def prepare_data(
     return TrainingData(training, held_out, rows)
 
 
-def slowest_part(data: TrainingData, share: float) -> TrainingData:
+def _slowest_part(data: TrainingData, share: float) -> TrainingData:
     """Representative points without the fastest ones.
 
     Far out f is often many times faster than about the attractors, and none of what is asked there matters
@@ -335,7 +335,7 @@ def start(
     return TrainingState(0, networks, zeros, zeros, pd.DataFrame(columns=list(HISTORY)))
 
 
-def failed_runs(state: TrainingState) -> dict[int, str]:
+def _failed_runs(state: TrainingState) -> dict[int, str]:
     """Runs whose networks are of no use, with the reason in words."""
     failures = {}
     for run in range(state.networks.runs):
@@ -446,14 +446,14 @@ def train(
                 "step %d of %d, held-out loss %.3e, %.0f s left",
                 done, options.steps, float(total.mean()), left,
             )  # fmt: skip
-        if finished is not None and is_check(done, options) and finished(done, move(networks, "cpu")):
+        if finished is not None and _is_check(done, options) and finished(done, move(networks, "cpu")):
             return snapshot(done)
         if checkpoint is not None and done % checkpoint_every == 0 and done < options.steps:
             checkpoint(snapshot(done))
     return snapshot(max(options.steps, state.step))
 
 
-def is_check(step: int, options: TrainingOptions) -> bool:
+def _is_check(step: int, options: TrainingOptions) -> bool:
     """Whether training pauses at a step to see whether it may end."""
     check = options.check
     return check is not None and step >= check.first and (step - check.first) % check.every == 0
@@ -507,7 +507,7 @@ class _Objective:
         return dynamics, orthogonality
 
 
-def save_checkpoint(path: str | Path, state: TrainingState, *, fingerprint: str) -> None:
+def _save_checkpoint(path: str | Path, state: TrainingState, *, fingerprint: str) -> None:
     """Write the state of a training, with a fingerprint of the data and options that it belongs to."""
     arrays = pack([at_rest(state.networks, run) for run in range(state.networks.runs)])
     for name, moments in (("first", state.first_moments), ("second", state.second_moments)):
@@ -518,7 +518,7 @@ def save_checkpoint(path: str | Path, state: TrainingState, *, fingerprint: str)
     write_archive(path, arrays)
 
 
-def load_checkpoint(path: str | Path, *, fingerprint: str) -> TrainingState | None:
+def _load_checkpoint(path: str | Path, *, fingerprint: str) -> TrainingState | None:
     """Read the state of an interrupted training, or None where there is none that can be continued.
 
     A checkpoint of other data or options has another fingerprint and is passed over, and so is one that
@@ -567,12 +567,12 @@ class Checkpoints:
     def state(self, attempt: int) -> TrainingState | None:
         """How far an attempt had come."""
         file = self._file(f"attempt{attempt}")
-        return None if file is None else load_checkpoint(file, fingerprint=self.mark)
+        return None if file is None else _load_checkpoint(file, fingerprint=self.mark)
 
     def keep_state(self, attempt: int, state: TrainingState) -> None:
         """Keep how far an attempt has come."""
         if (file := self._file(f"attempt{attempt}")) is not None:
-            save_checkpoint(file, state, fingerprint=self.mark)
+            _save_checkpoint(file, state, fingerprint=self.mark)
 
     def passed(self, attempt: int, run: int) -> TrainedNetworks | None:
         """Networks of a run that had passed the check in an attempt."""
@@ -656,7 +656,7 @@ class Block:
         options = self.options.attempt(attempt)
         purpose = Purpose.TRAINING if attempt == 0 else f"{Purpose.TRAINING} {attempt}"
         seeds = [seed_sequence(self.seed, run, purpose) for run in runs]
-        data = [slowest_part(self.data[run], options.slowest_share) for run in runs]
+        data = [_slowest_part(self.data[run], options.slowest_share) for run in runs]
         state = self.checkpoints.state(attempt)
         if state is None:
             state = start(data, options=options, diffusion=self.diffusion, seeds=seeds)
@@ -685,7 +685,7 @@ class Block:
         # Checkpoints until all attempts are over: a killed job must not train this one again.
         self.checkpoints.keep_state(attempt, state)
         self.passed |= early
-        lost = failed_runs(state)
+        lost = _failed_runs(state)
         for position, run in enumerate(runs):
             self.last[run] = early.get(run, at_rest(state.networks, position))
             self.failures.pop(run, None)

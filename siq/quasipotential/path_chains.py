@@ -485,7 +485,7 @@ def descended(
         return DiscretisedPath(y, problem.action(y), True)
     action, shift, spacings, kicks = problem.action(y), 1.0, 0, 0
     for _ in range(MOST_STEPS):
-        across = Across(problem, y)
+        across = _Across(problem, y)
         resting = (COARSE if first else fine) * action + np.finfo(float).eps * across.effort
         gained, expected = 0.0, np.inf
         while shift < LARGEST_SHIFT:
@@ -523,7 +523,7 @@ def descended(
     return DiscretisedPath(y, action, False)
 
 
-class Across:
+class _Across:
     """Moves of a chain across itself: slope and second derivatives of S, in banded form.
 
     A chain may slide along itself without any change of S but that of its error, which must not matter. The

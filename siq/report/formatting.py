@@ -80,7 +80,7 @@ def time_text(mean: MeanTime | None, unit: str = "") -> str:
     return text if mean.complete else f"at most {text}"
 
 
-def position_text(well: WellSummary, summary: LandscapeSummary) -> str:
+def _position_text(well: WellSummary, summary: LandscapeSummary) -> str:
     """Where a well is: ``x = −0.996 ± 0.005 nm``, ``(x, y) = (−0.50, 0.00) µm``."""
     names, units = summary.names, summary.units
     if len(names) > MOST_STATES_IN_A_SENTENCE:
@@ -160,7 +160,7 @@ def environment() -> Environment:
         "time": lambda mean, unit: time_text(mean, _named(unit)),
         "counted": counted_text,
         "predicted": predicted_text,
-        "place": position_text,
+        "place": _position_text,
     }
     made.tests["finite"] = lambda value: bool(np.isfinite(value))
     made.globals["law_from"] = MIN_BARRIER_OVER_NOISE
@@ -184,7 +184,7 @@ def texts(name: str) -> Any:
     return yaml.safe_load((files("siq.report") / "templates" / f"{name}.yaml").read_text(encoding="utf-8"))
 
 
-def formula_text(expression: sympy.Expr, *, decimals: int = 3) -> str:
+def _formula_text(expression: sympy.Expr, *, decimals: int = 3) -> str:
     """Write a formula in one line of plain text.
 
     Parameters
@@ -211,7 +211,7 @@ def term_text(term: str) -> str:
     ('x² y', '1')
     """
     names = set(re.findall(r"[^\W\d]\w*", term)) - {*FUNCTIONS, *CONSTANTS}
-    return formula_text(parse_formula(term, {name: sympy.Symbol(name, real=True) for name in names}))
+    return _formula_text(parse_formula(term, {name: sympy.Symbol(name, real=True) for name in names}))
 
 
 def formula_mathml(expression: sympy.Expr, *, decimals: int = 3) -> Markup:
@@ -254,7 +254,7 @@ def _typeset(
         nodes.append([])
         for entry in row:
             if isinstance(entry, sympy.Basic):
-                spoken[-1].append(formula_text(entry, decimals=decimals))
+                spoken[-1].append(_formula_text(entry, decimals=decimals))
                 nodes[-1].append(printer.lines(_with_integer_exponents(entry)))
             else:
                 whole = float(entry).is_integer()

@@ -28,14 +28,7 @@ from siq.numerics.text import unit_text, value_text
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import sentences_without_landscape
 from siq.quasipotential.wells import Well
-from siq.report.formatting import (
-    formula_mathml,
-    matrix_mathml,
-    paragraphs,
-    term_text,
-    texts,
-    vector_mathml,
-)
+from siq.report.formatting import formula_mathml, matrix_mathml, paragraphs, term_text, texts, vector_mathml
 from siq.report.landscape import (
     answer_lines,
     comparison_table,
@@ -323,7 +316,7 @@ def answer_data(page: ReportContent, study: Study, results: StudyResults) -> dic
     }  # fmt: skip
 
 
-def write_answer(path: str | Path, answer: Mapping[str, Any]) -> None:
+def _write_answer(path: str | Path, answer: Mapping[str, Any]) -> None:
     """Write `answer.json` whole or not at all."""
     with whole_file(path) as partial:
         partial.write_text(json.dumps(answer, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

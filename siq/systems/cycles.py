@@ -117,7 +117,7 @@ class Cycle:
         return np.asarray(np.linalg.norm(offset - share[:, :, None] * along, axis=2).min(axis=1))
 
 
-def closed_orbit(dynamics: Dynamics, guess: np.ndarray, period: float, *, scale: np.ndarray) -> Cycle:
+def _closed_orbit(dynamics: Dynamics, guess: np.ndarray, period: float, *, scale: np.ndarray) -> Cycle:
     """The periodic orbit next to a guess, stable or not.
 
     Parameters
@@ -335,7 +335,7 @@ def stable_cycles(
         if not around.success:
             continue
         try:
-            cycle = closed_orbit(dynamics, around.y.T * width, found.period, scale=width)
+            cycle = _closed_orbit(dynamics, around.y.T * width, found.period, scale=width)
         except NumericalFailure:
             continue
         index = _place_among(cycles, cycle, box)
@@ -383,7 +383,7 @@ def unstable_cycles_of_plane(
     except NumericalFailure:
         return ()
     inside = [one for one in found if ((one.points > box[:, 0]) & (one.points < box[:, 1])).all()]
-    return tuple(closed_orbit(dynamics, one.points[::-1], one.period, scale=width) for one in inside)
+    return tuple(_closed_orbit(dynamics, one.points[::-1], one.period, scale=width) for one in inside)
 
 
 def separatrix_cycles(
@@ -465,7 +465,7 @@ def _closed(dynamics: Dynamics, times: np.ndarray, states: np.ndarray, box: np.n
     at = begin + np.linspace(0, period, PARTS, endpoint=False)
     guess = np.stack([np.interp(at, times, column) for column in states.T], axis=1)
     try:
-        return closed_orbit(dynamics, guess, period, scale=width)
+        return _closed_orbit(dynamics, guess, period, scale=width)
     except NumericalFailure:
         return None
 

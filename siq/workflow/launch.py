@@ -251,7 +251,7 @@ def follow(lines: Iterable[str], screen: Screen, progress: _Progress) -> list[st
     return passed_on
 
 
-def faults(progress: _Progress, passed_on: list[str]) -> list[str]:
+def _faults(progress: _Progress, passed_on: list[str]) -> list[str]:
     """Sentences on why a workflow stopped, where its jobs did not say so themselves.
 
     Parameters
@@ -407,7 +407,7 @@ def _run_workflow(request: Request) -> _Ended:
         print(file=sys.stderr)
         return _Ended(process.returncode, interrupted=True)
     if code and not request.verbose:
-        said += (more := faults(progress, said))
+        said += (more := _faults(progress, said))
         for line in more:
             print(line, file=sys.stderr)
     return _Ended(code, tuple(said), progress.total, tuple(progress.planned))

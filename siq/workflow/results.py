@@ -554,7 +554,7 @@ def landscape_of_run(
         portrait = phase_portrait(record.dynamics, points, seed=number)
         found = find_landscape(
             record, portrait, wells=wells if wells or not seek_wells else None, certificate=certificate,
-            options=settings.refinement, noise=noise_strength(settings, record), seed=number,
+            options=settings.refinement, noise=_noise_strength(settings, record), seed=number,
         )  # fmt: skip
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         return FoundLandscape(None, record, Outcome(number, Step.LANDSCAPE, Status.FAILED, str(error)))
@@ -568,12 +568,12 @@ def landscape_of_run(
     # The attractors of both steps are those of one f: where they differ in number, indices mean nothing.
     if visits and max(one.well for one in visits) < len(found.attractors):
         found = replace(found, visits=visits)
-    units, time = units_of(recordings, settings.space)
+    units, time = _units_of(recordings, settings.space)
     found = found.in_units(units, time=time)
     return FoundLandscape(found, record, outcome)
 
 
-def noise_strength(settings: PipelineSettings, record: FieldEstimate) -> NoiseStrength | None:
+def _noise_strength(settings: PipelineSettings, record: FieldEstimate) -> NoiseStrength | None:
     """The noise that the recordings show, or else the first that the study gives."""
     if (shown := record.noise_strength) is not None:
         return NoiseStrength(*shown, source="estimated")
@@ -581,7 +581,7 @@ def noise_strength(settings: PipelineSettings, record: FieldEstimate) -> NoiseSt
     return NoiseStrength(given[0]) if given else None
 
 
-def units_of(recordings: Recordings, space: StateSpace) -> tuple[tuple[str, ...], str]:
+def _units_of(recordings: Recordings, space: StateSpace) -> tuple[tuple[str, ...], str]:
     """Units of the states and of the time: as the recordings say, or else the card; ``1`` where none does."""
     states = tuple(
         unit or space.unit(name, unknown="1")

@@ -129,7 +129,9 @@ def _check_noise(system: Dynamics, names: Iterable[str]) -> None:
         )  # fmt: skip
 
 
-def with_parameters(system: str | Path | Dynamics, names: Sequence[str], values: Sequence[float]) -> Dynamics:
+def _with_parameters(
+    system: str | Path | Dynamics, names: Sequence[str], values: Sequence[float]
+) -> Dynamics:
     """A system with other values of some parameters, those in D included.
 
     Raises
@@ -162,7 +164,7 @@ def point_at(
 ) -> SweptPoint:
     """The landscape at values of the parameters; where there is none, or f has no value, the reason."""
     try:
-        system = with_parameters(system, names, values)
+        system = _with_parameters(system, names, values)
     except InputError as error:
         return SweptPoint(values, (), reason=f"{error.fault}; {error.remedy}")
     try:
@@ -270,7 +272,7 @@ class Wells:
                 "branch": index,
                 "well": int(number[k]),
                 "value": branch.values[k],
-                "position": position_text(branch.states[k]),
+                "position": _position_text(branch.states[k]),
                 "unstable": int(branch.unstable[k]),
                 "growth": branch.eigenvalues[k, 0].real,
                 "frequency": abs(branch.eigenvalues[k, 0].imag),
@@ -286,7 +288,7 @@ def _bifurcation_rows(found: Branches) -> list[dict[str, object]]:
         {
             "kind": one.kind,
             "value": one.value,
-            "position": position_text(one.state),
+            "position": _position_text(one.state),
             "branch": one.branch,
             "frequency": one.frequency,
             "residual": one.residual,
@@ -295,7 +297,7 @@ def _bifurcation_rows(found: Branches) -> list[dict[str, object]]:
     ]
 
 
-def position_text(state: np.ndarray | Sequence[float]) -> str:
+def _position_text(state: np.ndarray | Sequence[float]) -> str:
     """A state as tables have it."""
     return str([float(f"{one:.{DIGITS}g}") for one in state])
 
@@ -361,7 +363,7 @@ def _curve_rows(curves: Sequence[BifurcationCurve]) -> list[dict[str, object]]:
             "kind": curve.kind,
             "value": value,
             "second_value": second,
-            "position": position_text(state),
+            "position": _position_text(state),
             "frequency": frequency,
         }
         for index, curve in enumerate(curves)
@@ -407,7 +409,7 @@ def _well_rows(point: SweptPoint, number: Sequence[int], noise: float | None) ->
     weights = _weights(point, noise)
     return [
         _place(point)
-        | {"well": number[index], "attractor": position_text(well.state), "relaxation": well.relaxation}
+        | {"well": number[index], "attractor": _position_text(well.state), "relaxation": well.relaxation}
         | _exits(point, index, number, noise)
         | {"noise": noise, "weight": weights[index]}
         for index, well in enumerate(point.wells)

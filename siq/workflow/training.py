@@ -96,7 +96,7 @@ class _Trained:
 
 
 @plain_dataclass(frozen=True)
-class Checks:
+class _Checks:
     """When the training of each run may end; of those that have no check, why not."""
 
     ready: Mapping[int, TrainingCheck]
@@ -200,7 +200,7 @@ def _training_data(
 
 def _checks(
     settings: PipelineSettings, runs: Mapping[int, RunToTrain], data: Mapping[int, TrainingData]
-) -> Checks:
+) -> _Checks:
     """The check of every run whose vector field is known; the others train for all their steps."""
     from siq.quasipotential.refinement import TrainingCheck
 
@@ -215,7 +215,7 @@ def _checks(
             ready[number] = TrainingCheck(record, x, options=options, seed=number)
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             faults[number] = f"the check of the training could not be prepared: {error}"
-    return Checks(ready, faults)
+    return _Checks(ready, faults)
 
 
 def _fingerprint(

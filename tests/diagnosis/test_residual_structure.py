@@ -15,7 +15,7 @@ from siq.diagnosis.residual_structure import (
     _quantisation_steps,
     explained_by_quantisation,
 )
-from siq.diagnosis.study import MismatchVerdict, measurements_of
+from siq.diagnosis.study import MismatchVerdict, _measurements_of
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, with_expectations
 from siq.inference.recalibration import recalibrate
@@ -54,7 +54,7 @@ def asked(model: Dynamics, data: Measurements) -> tuple[Fit, Remainder, tuple[st
 
 def test_values_before_rounding_are_means_of_a_normal_distribution_cut_off() -> None:
     model = decaying(quadratic=0.0)
-    data = measurements_of(readings(quadratic=0.0), model)
+    data = _measurements_of(readings(quadratic=0.0), model)
     assert _quantisation_steps(data) == pytest.approx([STEP])
     exact = np.concatenate(
         [b * np.exp(-0.7 * np.arange(0, 4, 0.05)) for b in (1.1, 1.43, 1.78, 2.05, 2.49, 2.9)]
@@ -73,15 +73,15 @@ def test_values_before_rounding_are_means_of_a_normal_distribution_cut_off() -> 
 
 def test_the_right_simulation_is_cleared_and_a_wrong_one_is_not() -> None:
     model = decaying(quadratic=0.0)
-    cleared = asked(model, measurements_of(readings(quadratic=0.0), model))
+    cleared = asked(model, _measurements_of(readings(quadratic=0.0), model))
     assert cleared is not None and cleared[2] == ("x",)
     assert cleared[0].model.values == pytest.approx([0.7], abs=0.005)
-    assert asked(model, measurements_of(readings(quadratic=0.1), model)) is None
+    assert asked(model, _measurements_of(readings(quadratic=0.1), model)) is None
 
 
 def test_without_steps_there_is_nothing_to_explain() -> None:
     model = decaying(quadratic=0.0)
-    assert asked(model, measurements_of(readings(quadratic=0.0, step=0.0), model)) is None
+    assert asked(model, _measurements_of(readings(quadratic=0.0, step=0.0), model)) is None
 
 
 def test_a_diagnosis_raises_no_alarm_where_sensors_round() -> None:

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import sympy
 
-from siq.diagnosis.study import measurements_of
+from siq.diagnosis.study import _measurements_of
 from siq.inference import maximum_likelihood, recalibration
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit, _Iterate, _Shooting, fit_by_multiple_shooting
@@ -24,7 +24,7 @@ def decays() -> tuple[Dynamics, Measurements]:
     n, r = sympy.symbols("n r", real=True)
     decay = Dynamics(("n",), (-r * n,), Diffusion.identity(1), parameters=(Parameter("r", 1.0),))
     t, generator = np.arange(0, 4, 0.1), np.random.default_rng(3)
-    data = measurements_of(
+    data = _measurements_of(
         pd.concat(
             pd.DataFrame(
                 {"recording": str(k), "t": t, "n": k * np.exp(-0.7 * t) + generator.normal(0, 0.01, len(t))}

@@ -19,11 +19,11 @@ from siq.networks.training import (
     TrainingData,
     TrainingState,
     _Batches,
-    failed_runs,
-    load_checkpoint,
+    _failed_runs,
+    _load_checkpoint,
+    _save_checkpoint,
+    _slowest_part,
     prepare_data,
-    save_checkpoint,
-    slowest_part,
     start,
     train,
 )
@@ -125,13 +125,13 @@ def test_an_interrupted_training_ends_as_the_uninterrupted_one_to_the_last_bit(
     path = tmp_path / "folder" / "checkpoint.npz"
 
     def keep_and_die(state: TrainingState) -> None:
-        save_checkpoint(path, state, fingerprint="mine")
+        _save_checkpoint(path, state, fingerprint="mine")
         raise Killed
 
     whole = trained([0, 2])
     with pytest.raises(Killed):
         trained([0, 2], checkpoint=keep_and_die, checkpoint_every=stop)
-    state = load_checkpoint(path, fingerprint="mine")
+    state = _load_checkpoint(path, fingerprint="mine")
     assert state is not None
     assert state.step == stop
     resumed = trained([0, 2], state=state)
@@ -155,34 +155,34 @@ def test_training_leaves_the_state_it_started_from_alone() -> None:
 
 def test_a_checkpoint_of_other_data_is_passed_over(tmp_path: Path) -> None:
     state = trained([0], options=dataclasses.replace(OPTIONS, steps=2))
-    save_checkpoint(tmp_path / "c", state, fingerprint="mine")
-    assert load_checkpoint(tmp_path / "c", fingerprint="mine") is not None
-    assert load_checkpoint(tmp_path / "c", fingerprint="other") is None
-    assert load_checkpoint(tmp_path / "missing", fingerprint="mine") is None
+    _save_checkpoint(tmp_path / "c", state, fingerprint="mine")
+    assert _load_checkpoint(tmp_path / "c", fingerprint="mine") is not None
+    assert _load_checkpoint(tmp_path / "c", fingerprint="other") is None
+    assert _load_checkpoint(tmp_path / "missing", fingerprint="mine") is None
 
 
 def test_a_damaged_checkpoint_is_passed_over(tmp_path: Path) -> None:
     state = trained([0], options=dataclasses.replace(OPTIONS, steps=2))
     path = tmp_path / "c"
-    save_checkpoint(path, state, fingerprint="mine")
+    _save_checkpoint(path, state, fingerprint="mine")
     whole = path.read_bytes()
     for length in [*range(0, len(whole), 501), len(whole) - 1]:
         path.write_bytes(whole[:length])
-        assert load_checkpoint(path, fingerprint="mine") is None
+        assert _load_checkpoint(path, fingerprint="mine") is None
     for place in range(0, len(whole), 97):  # a flipped byte is noticed, or lies where nothing is read
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
-        found = load_checkpoint(path, fingerprint="mine")
+        found = _load_checkpoint(path, fingerprint="mine")
         if found is not None:
             assert_same_networks(found, state)
     path.write_bytes(b"")
-    assert load_checkpoint(path, fingerprint="mine") is None
+    assert _load_checkpoint(path, fingerprint="mine") is None
 
 
 def test_archives_contain_no_pickles_and_come_back_equal(tmp_path: Path) -> None:
     state = trained([0, 1], options=dataclasses.replace(OPTIONS, steps=2), diffusion=FULL)
     runs = [at_rest(state.networks, run) for run in range(2)]
     save_networks(tmp_path / "n.npz", runs)
-    save_checkpoint(tmp_path / "c.npz", state, fingerprint="mine")
+    _save_checkpoint(tmp_path / "c.npz", state, fingerprint="mine")
     for name in ("n.npz", "c.npz"):
         with np.load(tmp_path / name, allow_pickle=False) as archive:
             assert all(archive[key].dtype.kind in "fiU" for key in archive.files)
@@ -198,7 +198,7 @@ def test_an_archive_of_pickles_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "evil.npz", sizes=np.array([{"a": 1}], dtype=object), fingerprint=np.array("mine"))
     with pytest.raises(InputError):
         load_networks(tmp_path / "evil.npz")
-    assert load_checkpoint(tmp_path / "evil.npz", fingerprint="mine") is None
+    assert _load_checkpoint(tmp_path / "evil.npz", fingerprint="mine") is None
 
 
 def test_an_archive_of_something_else_is_refused_as_input(tmp_path: Path) -> None:
@@ -214,13 +214,13 @@ def test_a_run_whose_loss_is_lost_is_reported_and_harms_no_neighbour() -> None:
     parts, seeds = [bad, good], [SEEDS[1], SEEDS[0]]
     state = start(parts, options=options, diffusion=Diffusion.identity(2), seeds=seeds)
     state = train(state, parts, options=options, seeds=seeds, log_every=30)
-    failures = failed_runs(state)
+    failures = _failed_runs(state)
     assert list(failures) == [0]
     assert "no longer finite at step 30" in failures[0]
     alone = trained([0], options=options)
     for left, right in zip(state.networks.parameters(), alone.networks.parameters(), strict=True):
         torch.testing.assert_close(left[1], right[0], rtol=1e-8, atol=1e-10)
-    assert failed_runs(alone) == {}
+    assert _failed_runs(alone) == {}
 
 
 # Data
@@ -419,7 +419,7 @@ def test_a_slow_speed_makes_training_the_same_in_any_units() -> None:
 
 def test_the_slowest_part_leaves_out_the_fastest_points_in_any_units() -> None:
     whole = data(0)
-    part = slowest_part(whole, 0.5)
+    part = _slowest_part(whole, 0.5)
     speed = np.linalg.norm((whole.training.xh - whole.training.x0) / whole.training.x0.std(axis=0), axis=1)
     kept, dropped = (
         part.representative_rows,
@@ -427,8 +427,8 @@ def test_the_slowest_part_leaves_out_the_fastest_points_in_any_units() -> None:
     )
     assert len(kept) == pytest.approx(len(whole.representative_rows) / 2, abs=1)
     assert speed[kept].max() <= speed[dropped].min()
-    assert slowest_part(whole, 1.0) is whole
+    assert _slowest_part(whole, 1.0) is whole
     units = np.array([1e-3, 50.0])
     scaled = dataclasses.replace(whole.training, x0=whole.training.x0 * units, xh=whole.training.xh * units)
-    again = slowest_part(dataclasses.replace(whole, training=scaled), 0.5)
+    again = _slowest_part(dataclasses.replace(whole, training=scaled), 0.5)
     np.testing.assert_array_equal(again.representative_rows, kept)

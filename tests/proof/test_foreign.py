@@ -16,7 +16,7 @@ import sympy
 import yaml
 from scipy.integrate import solve_ivp
 
-from siq.diagnosis.study import Comparison, measurements_of, read_case
+from siq.diagnosis.study import Comparison, _measurements_of, read_case
 from siq.systems.cards import load_system
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, Signals, symbol
@@ -333,7 +333,7 @@ def test_the_integrator_knows_the_time() -> None:
     )  # fmt: skip
     t = 5 + np.arange(0, 4, 0.1)
     table = pd.DataFrame({"recording": "r01", "t": t, "y": np.zeros(len(t))})
-    integrator = Integrator(model, measurements_of(table, model))
+    integrator = Integrator(model, _measurements_of(table, model))
     states = integrator.run(model.values, np.sin(t[:1])[:, None])
     np.testing.assert_allclose(states[:, 0], np.sin(t), atol=1e-6)
     measured = integrator.outputs(states, model.values)[:, 0]

@@ -9,7 +9,7 @@ from known_systems import KnownSystem, portrait_of, potential_gradient, potentia
 
 from siq.quasipotential.cell_density import known_density, lowest_possible, sample_potential
 from siq.quasipotential.landscape import GlobalQuasipotential
-from siq.quasipotential.path_chains import Across, PathProblem
+from siq.quasipotential.path_chains import PathProblem, _Across
 from siq.quasipotential.paths import minimum_action_path
 from siq.quasipotential.rates import escape_rate
 from siq.quasipotential.wells import WellOptions, local_well
@@ -31,7 +31,7 @@ def test_moves_of_a_chain_have_the_slope_and_the_curvature_of_its_action(dimensi
     problem = PathProblem(known.dynamics, known.attractors[0], known.attractors[1])
     draw = np.random.default_rng(1)
     y = np.linspace(0.1, 1.0, 6)[:, None] * problem.end + 0.05 * draw.normal(size=(6, dimension))
-    across, size = Across(problem, y), (5 * (dimension - 1),)
+    across, size = _Across(problem, y), (5 * (dimension - 1),)
     band, matrix = across.exact, np.zeros(size * 2)
     for offset, diagonal in enumerate(band):
         for column in range(size[0] - offset):

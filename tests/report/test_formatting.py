@@ -3,7 +3,7 @@ from xml.etree import ElementTree
 import pytest
 import sympy
 
-from siq.report.formatting import formula_mathml, formula_text, matrix_mathml, vector_mathml
+from siq.report.formatting import _formula_text, formula_mathml, matrix_mathml, vector_mathml
 
 x, y, z = sympy.symbols("x y z", real=True)
 IDENTIFIED = 0.9991 * y**2 + 1.0009 - 2.0012 * x**2 + 0.9991 * z**2 + 1.0001 * x**4
@@ -15,7 +15,7 @@ def shown(markup: str) -> str:
 
 
 def test_the_papers_formula_reads_as_in_the_paper() -> None:
-    assert formula_text(IDENTIFIED) == "1.000 x⁴ − 2.001 x² + 0.999 y² + 0.999 z² + 1.001"
+    assert _formula_text(IDENTIFIED) == "1.000 x⁴ − 2.001 x² + 0.999 y² + 0.999 z² + 1.001"
     assert shown(formula_mathml(IDENTIFIED)) == "1.000x4−2.001x2+0.999y2+0.999z2+1.001"
 
 
@@ -36,7 +36,7 @@ def test_the_papers_formula_reads_as_in_the_paper() -> None:
     ],
 )
 def test_formula_text(expression: sympy.Expr, text: str) -> None:
-    assert formula_text(expression) == text
+    assert _formula_text(expression) == text
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import io
 import json
 from typing import Any
 
-from siq.workflow.launch import MARK, Screen, _Progress, faults, follow
+from siq.workflow.launch import MARK, Screen, _faults, _Progress, follow
 
 EVENTS: list[dict[str, Any]] = [
     {"event": "run_info", "stats": {"draw": 1, "refine": 1, "page": 1, "total": 3}},
@@ -86,14 +86,14 @@ def test_the_sentence_of_a_job_comes_through_and_its_traceback_does_not() -> Non
     passed_on = follow(lines, Screen(stream, columns=None, clock=Clock()), progress)
     assert passed_on == ["bead.csv, row 3: it is empty; remove it."]
     assert "KeyError" not in stream.getvalue() and "row 3" in stream.getvalue()
-    (fault,) = faults(progress, passed_on)
+    (fault,) = _faults(progress, passed_on)
     assert "refining (bead)" in fault and "results/refine.log" in fault
 
 
 def test_a_sentence_that_was_passed_on_is_enough() -> None:
-    assert faults(_Progress(), ["study.yaml, line 2: no; yes."]) == []
+    assert _faults(_Progress(), ["study.yaml, line 2: no; yes."]) == []
     said = _Progress()
     said.take(
         {"event": "error", "text": "MissingInputException: x.csv", "exception": "MissingInputException"}
     )
-    assert faults(said, []) == ["MissingInputException: x.csv"]
+    assert _faults(said, []) == ["MissingInputException: x.csv"]

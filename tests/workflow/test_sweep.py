@@ -11,7 +11,7 @@ from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
 from siq.workflow.files import write
 from siq.workflow.study import PipelineSettings
-from siq.workflow.sweep import ALONE, Sweep, SweptPoint, collected, point_at, sweep, with_parameters
+from siq.workflow.sweep import ALONE, Sweep, SweptPoint, _with_parameters, collected, point_at, sweep
 
 h, a, x, y = sympy.symbols("h a x y", real=True)
 FOLD = 2 / (3 * np.sqrt(3))
@@ -66,7 +66,7 @@ def test_a_well_keeps_its_number_until_it_folds(found):
 
 
 def test_a_point_is_the_landscape_at_its_value(found):
-    alone = Landscape.from_equations(with_parameters(cusp(), ["h"], [0.2]))
+    alone = Landscape.from_equations(_with_parameters(cusp(), ["h"], [0.2]))
     row = found.table[(found.table["value"] == 0.2) & (found.table["well"] == 0)].iloc[0]
     assert row["barrier"] == alone.barriers()["barrier"].min()
 
