@@ -1,7 +1,7 @@
 """Draw the pictures of the page on what is in recordings: `python docs/make/inspection.py`.
 
 Each is of the same two wells: with white forces, with forces that have a memory, seen through an exposure,
-and with an error of the sensor. So nobody has to guess what such a record looks like.
+and with measurement noise. So nobody has to guess what such a record looks like.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ CASES = {
     "white forces": {},
     "forces with a memory of 5 steps": {"memory": 5.0},
     "an exposure of 3 steps": {"exposure": 3.0},
-    "an error of the sensor": {"sensor": 0.03},
+    "measurement noise": {"sensor": 0.03},
 }
 BLUE, BAND = "#3d5a80", "0.85"
 

@@ -93,7 +93,7 @@ class StateFacts:
     values: int | None = None
 
     def sensor_dominates(self, step: float) -> bool:
-        """Whether noise of the sensor, other than rounding, is more than an identification takes."""
+        """Whether measurement noise, other than rounding, is more than an identification takes."""
         if self.noise is None:
             return False
         variance = self.noise.sensor**2

@@ -126,7 +126,7 @@ def _correlated(values: np.ndarray, begins: np.ndarray, length: int) -> float | 
     width = 2 * length
     power = np.mean(np.abs(np.fft.rfft(parts, n=width, axis=1)) ** 2, axis=0)
     correlation = np.fft.irfft(power, n=width)[: length // 2] / np.arange(length, length - length // 2, -1)
-    # Noise of the sensor falls into lag 0 alone: what is left of it at lag 1 is what relaxes.
+    # Measurement noise falls into lag 0 alone: what is left of it at lag 1 is what relaxes.
     if correlation[1] <= WHITE_CORRELATION * correlation[0]:
         return 0.0
     below = np.flatnonzero(correlation < correlation[1] / np.e)

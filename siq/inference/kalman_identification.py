@@ -63,7 +63,7 @@ def identify_by_likelihood(
     generator: np.random.Generator,
     pair_step: float | None = None,
 ) -> FieldEstimate:
-    """f, the process noise and the noise of the sensors together.
+    """f, the process noise and measurement noise together.
 
     Parameters
     ----------

@@ -652,7 +652,7 @@ def fit_by_filter(
     model, data, x, noise, estimate_process, substeps, iterations, budget
         See there; process noise has to drive the states.
     estimate_sensor
-        Whether the noise of the sensors is estimated; if not, the process noise is as given, too.
+        Whether measurement noise is estimated; if not, the process noise is as given, too.
     closure
         Whether the spread of what the filter knows acts on the mean of f (`siq.inference.kalman_filter`).
 

@@ -13,11 +13,11 @@ the time in which it relaxes.
 
 Or samples show positions, and the second half of the states are velocities of which they show nothing.
 ``dx/dt = v`` holds by definition, process noise acts on velocities, and what is sought is the force in
-``dv/dt = f(x, v)``. Differences of positions are no velocities: the noise of the sensor is divided by the
+``dv/dt = f(x, v)``. Differences of positions are no velocities: measurement noise is divided by the
 step in them, and what they leave is coloured.
 
 Whether a recorded position has inertia, so that it alone is not the state, is asked of two models with the
-same functions F and a noise of the sensor each:
+same functions F and measurement noise of their own:
 
     dx = F(x) dt + noise                               overdamped
     dx = v dt,  dv = γ (F(x) - v) dt + noise           with inertia; the first is its limit γ → ∞

@@ -346,8 +346,8 @@ class JointExpectation:
     roots
         Shape ``(r, k)``; the inverse of their covariance is ``roots.T @ roots``.
     weight
-        How often it counts against the data: of errors that hang together over τ samples, n count as n/τ, and
-        a fit that takes them for independent has to count what it expects τ times.
+        How often it counts against the data: of errors that are correlated over τ samples, n count as n/τ,
+        and a fit that takes them for independent has to count what it expects τ times.
     """
 
     names: tuple[str, ...]

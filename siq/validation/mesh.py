@@ -65,7 +65,7 @@ class MeshQuasipotential:
     attractor
         A, shape ``(2,)``, where V is zero.
     level
-        The highest V reached. Unless a boundary was passed over, all states of lower V that hang together
+        The highest V reached. Unless a boundary was passed over, all states of lower V that are connected
         with A have been reached.
     stop
         Why the work ended: the boundary of the mesh was next, or a value above the level asked for, or

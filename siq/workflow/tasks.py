@@ -32,16 +32,14 @@ class Task:
         Parts of the settings that it depends on, see `siq.workflow.study.PipelineSettings.parts`.
     run
         The function: of what is given and of settings, its results by the names of the rule's outputs, or an
-        object with the method ``files()`` that gives them.
-    version
-        Raised when results may change, which makes them anew (``python -m workflow.versions``).
+        object with the method ``files()`` that gives them. When they may change for the same input, its
+        version is raised (``python -m workflow.versions --raise TASK``), which makes them anew.
     """
 
     name: str
     needs: tuple[str, ...]
     options: tuple[str, ...]
     run: Callable[[Given, PipelineSettings], Any]
-    version: int = 0
 
 
 def task(*needs: str, options: Sequence[str] = ()) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

@@ -176,7 +176,7 @@ def test_the_step_asks_the_likelihood_where_sensors_are_noisy() -> None:
     assert done.record is not None and done.outcome.status == Status.OK
     assert done.record.sensor_variance is not None
     assert np.sqrt(done.record.sensor_variance[0]) == pytest.approx(SENSOR, rel=0.1)
-    assert "the noise of the sensor" in done.outcome.reason
+    assert "measurement noise" in done.outcome.reason
 
 
 @pytest.mark.parametrize(("steps", "kept", "rows"), [(0.4, 1, 2), (1.0, 1, 1), (1.5, 2, 2), (10.0, 10, 1)])
