@@ -19,7 +19,7 @@ import numpy as np
 import sympy
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from siq.errors import InputError
+from siq.errors import Fault, InputError
 from siq.numerics.files import read_document, validate
 from siq.systems.cards import Formula, Name
 from siq.systems.dynamics import Dynamics, Signals, arguments_of, evaluable, symbol
@@ -82,7 +82,7 @@ class Shape(_Part):
             self.top_of, self.bottom_of, self.frequencies,
         )  # fmt: skip
         if sum(each is not None for each in given) + self.samples != 1:
-            raise ValueError("a shape is looked for in one way; give one of scale_of, quantiles_of, ...")
+            raise Fault("a shape is looked for in one way", "give one of scale_of, quantiles_of, ...")
         return self
 
     @property
@@ -182,10 +182,10 @@ class Form(_Part):
             *(name for put in self.within.values() for name in put), *([self.noise] if self.noise else []),
         ]  # fmt: skip
         if not changed:
-            raise ValueError("a form changes nothing; give terms, replace, within, outputs or noise")
+            raise Fault("a form changes nothing", "give terms, replace, within, outputs or noise")
         for name in changed:
             if name not in self.roles:
-                raise ValueError(f"'{name}' has no role; add 'roles: {{{name}: state}}' or another role")
+                raise Fault(f"'{name}' has no role", f"add 'roles: {{{name}: state}}' or another role")
         return self
 
 

@@ -25,7 +25,7 @@ from typing import Any, Literal
 import numpy as np
 import sympy
 
-from siq.errors import InputError, NumericalFailure
+from siq.errors import Fault, InputError, NumericalFailure
 from siq.inference.library import CandidateLibrary, IdentificationOptions, field_library
 from siq.inference.selection import ModelAverage
 from siq.numerics.files import whole_file
@@ -595,7 +595,7 @@ class FieldEstimate:
     def intensity(self) -> float:
         """ε of the formula of εD, where there is one: ``εD = ε D``."""
         if self.noise is None:
-            raise ValueError("D does not depend on the state; ε is that of the residuals")
+            raise Fault("D does not depend on the state", "ε is that of the residuals")
         place = int(np.flatnonzero(self.noise.places[:, 0] == self.noise.places[:, 1])[0])
         (i, _), term = self.noise.places[place], self.noise.terms[place]
         own = sympy.Poly(self.diffusion.formulas[i][i], *self.library.symbols).coeff_monomial(term)

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from siq.errors import needs_extra
+from siq.errors import Fault, needs_extra
 from siq.networks.decomposition import MatchingRule, Order, TrainedNetworks
 
 with needs_extra("networks"):
@@ -354,4 +354,4 @@ def mean_velocity(
             start, end = vector_field(x0), vector_field(xh)
             middle = vector_field((x0 + xh) / 2 + h / 8 * (start - end))
             return (start + 4 * middle + end) / 6
-    raise ValueError(f"there is no {kind} matching rule of order {order}; use order 2 or 4")
+    raise Fault(f"there is no {kind} matching rule of order {order}", "use order 2 or 4")

@@ -20,7 +20,7 @@ import scipy.linalg
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from siq.errors import NumericalFailure, needs_extra
+from siq.errors import Fault, NumericalFailure, needs_extra
 from siq.inference.library import CandidateLibrary, constraint_matrix
 from siq.systems.diffusion import Diffusion
 
@@ -76,9 +76,9 @@ class RegressionOptions:
     @model_validator(mode="after")
     def _consistent(self) -> RegressionOptions:
         if self.scaling == "none" and self.threshold_on == "contribution":
-            raise ValueError(
-                "contributions can be judged in scaled columns only; write 'scaling: columns', or"
-                " 'threshold_on: coefficient'"
+            raise Fault(
+                "contributions can be judged in scaled columns only",
+                "write 'scaling: columns', or 'threshold_on: coefficient'",
             )
         return self
 

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from siq.errors import InputError, suggestion
+from siq.errors import Fault, InputError, suggestion
 
 
 @contextmanager
@@ -157,11 +157,11 @@ def _explain(error: Any, keys: Keys, model: type[BaseModel]) -> tuple[str, str]:
         return f"the key '{name}' is unknown", suggestion(str(name), known, otherwise=otherwise)
     if kind in ("missing", "missing_argument"):
         return f"the key '{name}' is missing", f"add '{name}: ...'"
+    cause = error.get("ctx", {}).get("error")
+    if isinstance(cause, Fault):  # a validator of ours
+        return cause.fault, cause.remedy
     message = error["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")
     message = message[:1].lower() + message[1:]
-    if "; " in message:  # a validator of ours: fault and remedy in one sentence
-        fault, remedy = message.split("; ", 1)
-        return fault, remedy.rstrip(".")
     return f"the value {error['input']!r} cannot be used", message.rstrip(".")
 
 

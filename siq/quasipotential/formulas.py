@@ -18,7 +18,7 @@ import numpy as np
 import scipy.optimize
 import sympy
 
-from siq.errors import InputError, NumericalFailure
+from siq.errors import Fault, InputError, NumericalFailure
 from siq.inference.library import CandidateLibrary, linear_combination
 from siq.numerics.files import whole_file
 from siq.quasipotential.hamilton_jacobi import LibraryBasis, PowerBasis
@@ -65,7 +65,7 @@ class SymbolicDecomposition:
 
     def _potential(self) -> sympy.Expr:
         if self.potential is None:
-            raise ValueError("no single formula of V was found; each well has its own")
+            raise Fault("no single formula of V was found", "each well has its own")
         return self.potential
 
     @cached_property

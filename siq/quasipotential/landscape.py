@@ -29,7 +29,7 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from siq.data.recordings import Recordings
 from siq.data.two_states import RecordStates
-from siq.errors import NumericalFailure
+from siq.errors import Fault, NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
 from siq.quasipotential.certificate import Certificate
 from siq.quasipotential.characteristics import potential_errors
@@ -360,7 +360,7 @@ class Landscape:
         """U at points ``(n, d)``, zero at the deepest attractor: shape ``(n,)``, NaN where not known."""
         x = np.asarray(points, dtype=float)
         if x.ndim != 2 or x.shape[1] != self.dynamics.dimension:
-            raise ValueError(f"the points have the shape {x.shape}; give (n, {self.dynamics.dimension})")
+            raise Fault(f"the points have the shape {x.shape}", f"give (n, {self.dynamics.dimension})")
         whole = self.global_quasipotential
         return np.full(len(x), np.nan) if whole is None else whole(x)
 
@@ -443,7 +443,7 @@ class Landscape:
         """
         strength = self.noise if noise is None else NoiseStrength(noise)
         if strength is None:
-            raise ValueError("no noise is known, and how long a well lasts follows from it; give 'noise'")
+            raise Fault("no noise is known, and how long a well lasts follows from it", "give 'noise'")
         rows = []
         for index in range(len(self.attractors)):
             found = mean_residence_time(self.exits(index), strength)

@@ -31,6 +31,7 @@ import scipy.linalg
 import scipy.special
 import sympy
 
+from siq.errors import Fault
 from siq.inference.library import monomial_exponents
 from siq.quasipotential.hamilton_jacobi import Expansion, PowerBasis
 from siq.systems.dynamics import Dynamics
@@ -110,7 +111,7 @@ def quasipotential_series(dynamics: Dynamics, attractor: np.ndarray, *, degree: 
         When A is no stable equilibrium, or f has no finite derivatives there.
     """
     if degree < 2:
-        raise ValueError(f"a series of degree {degree} was asked for; V begins with degree 2")
+        raise Fault(f"a series of degree {degree} was asked for", "V begins with degree 2")
     center = np.asarray(attractor, dtype=float)
     basis = _Homogeneous(dynamics.dimension, degree)
     force = _expanded("f", dynamics.formulas, dynamics.symbols, center, basis, degree - 1)

@@ -492,8 +492,9 @@ def _troubled(study: Study, results: StudyResults) -> pd.DataFrame | None:
     outcomes, rrmse = results.tables["outcomes"], results.tables["rrmse"]
     certificates = results.tables["certificates"]
     troubled = outcomes[outcomes["status"].isin([Status.FAILED, Status.WARNING])]
-    # Which tests refused a formula is said once.
-    troubled = troubled[~troubled["reason"].fillna("").str.startswith("not certified")]
+    # A warning of `refine` is a formula that is not certified: which tests refused it is said once, below.
+    uncertified = (troubled["step"] == Step.REFINE) & (troubled["status"] == Status.WARNING)
+    troubled = troubled[~uncertified]
     refused = certificates[(certificates["method"] == Method.REFINED) & ~certificates["passed"]]
     reasons = refused.groupby("run")["reason"].agg(lambda texts: "; ".join(dict.fromkeys(texts)))
     runs = rrmse[(rrmse["method"] == Method.REFINED) & ~rrmse["certified"]]["run"]

@@ -18,7 +18,7 @@ import sympy
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from siq.errors import InputError
+from siq.errors import Fault, InputError
 from siq.numerics.files import Document, read_document, validate
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import TIME, Dynamics, Input, Parameter, symbol
@@ -28,9 +28,9 @@ from siq.systems.formulas import CONSTANTS, FUNCTIONS, FormulaError, exact_numbe
 def check_name(text: str) -> str:
     """Return a name that formulas can use; raises ValueError for any other."""
     if not text.isidentifier() or keyword.iskeyword(text):
-        raise ValueError(f"'{text}' cannot be a name in a formula; use letters, digits and underscores")
+        raise Fault(f"'{text}' cannot be a name in a formula", "use letters, digits and underscores")
     if text in FUNCTIONS or text in CONSTANTS or text in ("recording", "t", "delay"):
-        raise ValueError(f"the name '{text}' is reserved; choose another")
+        raise Fault(f"the name '{text}' is reserved", "choose another")
     return text
 
 
@@ -65,7 +65,7 @@ class StateEntry(_CardPart):
     @classmethod
     def _ordered(cls, domain: tuple[float, float] | None) -> tuple[float, float] | None:
         if domain is not None and not domain[0] < domain[1]:
-            raise ValueError("the domain is empty; write it as [lower, upper] with lower < upper")
+            raise Fault("the domain is empty", "write it as [lower, upper] with lower < upper")
         return domain
 
 
@@ -165,16 +165,16 @@ class SystemCard(_CardPart):
     def _consistent(self) -> SystemCard:
         for name in self.states:
             if name not in self.equations:
-                raise ValueError(f"the state '{name}' has no equation; add 'equations: {{{name}: ...}}'")
+                raise Fault(f"the state '{name}' has no equation", f"add 'equations: {{{name}: ...}}'")
             if name in self.parameters:
-                raise ValueError(f"'{name}' is both a state and a parameter; rename one of them")
+                raise Fault(f"'{name}' is both a state and a parameter", "rename one of them")
         for name in self.inputs:
             if name in self.states or name in self.parameters:
                 kind = "a state" if name in self.states else "a parameter"
-                raise ValueError(f"'{name}' is both an input and {kind}; rename one of them")
+                raise Fault(f"'{name}' is both an input and {kind}", "rename one of them")
         for name in self.equations:
             if name not in self.states:
-                raise ValueError(f"the equation of '{name}' belongs to no state; declare it under states")
+                raise Fault(f"the equation of '{name}' belongs to no state", "declare it under states")
         diffusion_rows(self.diffusion, len(self.states))
         return self
 
@@ -198,7 +198,7 @@ def diffusion_rows(diffusion: DiffusionEntry, dimension: int) -> list[list[Formu
         return [[float(i == j) for j in range(dimension)] for i in range(dimension)]
     lengths = {len(row) for row in diffusion if isinstance(row, list)}
     if len(diffusion) != dimension or (lengths and lengths != {dimension}):
-        raise ValueError(f"the diffusion does not fit {dimension} states; give a diagonal or a square matrix")
+        raise Fault(f"the diffusion does not fit {dimension} states", "give a diagonal or a square matrix")
     rows = [
         row if isinstance(row, list) else [row if i == j else 0.0 for j in range(dimension)]
         for i, row in enumerate(diffusion)
@@ -280,9 +280,8 @@ def build_system(document: Document, card: SystemCard) -> Dynamics:
 
     try:
         diffusion = read_diffusion(card.diffusion, [symbol(name) for name in card.states], inserted)
-    except ValueError as error:
-        fault, remedy = str(error).split("; ", 1)
-        raise InputError(document.file, document.place(("diffusion",)), fault, remedy) from None
+    except Fault as error:
+        raise error.at(document.file, document.place(("diffusion",))) from None
     return Dynamics(
         name=card.name,
         title=card.title or card.name,

@@ -39,6 +39,7 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import brentq
 
+from siq.errors import Fault
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, symbol
 from siq.systems.formulas import exact_number
@@ -683,7 +684,7 @@ def follow_curves(
     True
     """
     if len(limits) != 2:
-        raise ValueError(f"a curve lies in the plane of two parameters; {len(limits)} are named")
+        raise Fault("a curve lies in the plane of two parameters", f"{len(limits)} are named")
     family = ParameterFamily(dynamics, limits)
     followed: list[tuple[CurveKind, _Equilibria, np.ndarray]] = []
     curves = []

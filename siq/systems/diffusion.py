@@ -19,7 +19,7 @@ import numpy as np
 import sympy
 from scipy.linalg import solve_triangular
 
-from siq.errors import NumericalFailure
+from siq.errors import Fault, NumericalFailure
 from siq.systems.formulas import compile_formulas, exact_number, parse_formula
 
 ROUNDING = 1e-12  # of numbers of size one, and some products of them
@@ -251,13 +251,13 @@ class _Constant(Diffusion):
     def __init__(self, matrix: np.ndarray) -> None:
         matrix = np.asarray(matrix, dtype=float)
         if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
-            raise ValueError("the diffusion is not a square matrix; give one row and one column a state")
+            raise Fault("the diffusion is not a square matrix", "give one row and one column a state")
         scale = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
         scaled = matrix / np.outer(scale, scale)
         if not np.isfinite(scaled).all() or np.abs(scaled - scaled.T).max() > ROUNDING:
-            raise ValueError("the diffusion is not symmetric; correct the matrix")
+            raise Fault("the diffusion is not symmetric", "correct the matrix")
         if np.linalg.eigvalsh(scaled)[0] < -ROUNDING:
-            raise ValueError("the diffusion is not positive semi-definite; correct the matrix")
+            raise Fault("the diffusion is not positive semi-definite", "correct the matrix")
         self._matrix = (matrix + matrix.T) / 2
         self.dimension = len(matrix)
 
@@ -307,14 +307,14 @@ class _Formulas(Diffusion):
         d = len(symbols)
         formulas = tuple(tuple(sympy.sympify(entry) for entry in row) for row in rows)
         if len(formulas) != d or any(len(row) != d for row in formulas):
-            raise ValueError("the diffusion is not a square matrix; give one row and one column a state")
+            raise Fault("the diffusion is not a square matrix", "give one row and one column a state")
         apart = [formulas[i][j] - formulas[j][i] for i in range(d) for j in range(i)]
         if any(each != 0 and sympy.simplify(each) != 0 for each in apart):
-            raise ValueError("the diffusion is not symmetric; correct the matrix")
+            raise Fault("the diffusion is not symmetric", "correct the matrix")
         unknown = set().union(*(entry.free_symbols for row in formulas for entry in row)) - set(symbols)
         if unknown:
             names = ", ".join(sorted(map(str, unknown)))
-            raise ValueError(f"the diffusion depends on {names}; let it depend on the states alone")
+            raise Fault(f"the diffusion depends on {names}", "let it depend on the states alone")
         self.symbols, self.formulas, self.dimension = tuple(symbols), formulas, d
         self.regular = all(any(entry != 0 for entry in row) for row in formulas)
         self._compiled: dict[int, Callable[[np.ndarray], np.ndarray]] = {}

@@ -21,6 +21,7 @@ from functools import cached_property
 import numpy as np
 import sympy
 
+from siq.errors import Fault
 from siq.systems.diffusion import Diffusion
 from siq.systems.formulas import compile_formulas, compile_values, delay, exact_number
 
@@ -440,11 +441,11 @@ class Dynamics:
         for what, count in (("equations", len(self.equations)), ("units", len(self.units)),
                             ("rows of D", self.diffusion.dimension)):  # fmt: skip
             if count != d:
-                raise ValueError(f"there are {count} {what} for {d} states; give one for each")
+                raise Fault(f"there are {count} {what} for {d} states", "give one for each")
         if self.diffusion.symbols not in ((), self.symbols):
-            raise ValueError("D is one of other states; give it with these in their order")
+            raise Fault("D is one of other states", "give it with these in their order")
         if self.domain is not None and np.shape(self.domain) != (d, 2):
-            raise ValueError(f"the domain has the shape {np.shape(self.domain)}; give two limits a state")
+            raise Fault(f"the domain has the shape {np.shape(self.domain)}", "give two limits a state")
 
     @classmethod
     def of(
@@ -503,7 +504,7 @@ class Dynamics:
         """
         unknown = [name for name, ends in zip(self.states, self.limits, strict=True) if np.isnan(ends).any()]
         if unknown:
-            raise ValueError(f"no domain of {', '.join(unknown)} is known; give the limits of each state")
+            raise Fault(f"no domain of {', '.join(unknown)} is known", "give the limits of each state")
         return self.limits
 
     @property

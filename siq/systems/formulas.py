@@ -29,7 +29,7 @@ from sympy.printing.latex import LatexPrinter
 from sympy.printing.numpy import NumPyPrinter
 from sympy.printing.str import StrPrinter
 
-from siq.errors import suggestion
+from siq.errors import Fault, suggestion
 
 FUNCTIONS: Mapping[str, Callable[..., sympy.Expr]] = {
     "sin": sympy.sin,
@@ -76,19 +76,8 @@ _OPERATORS: Mapping[type[ast.operator], Callable[[sympy.Expr, sympy.Expr], sympy
 }
 
 
-class FormulaError(ValueError):
-    """A formula that the whitelist refuses; the message names the offending part and the remedy.
-
-    Attributes
-    ----------
-    fault, remedy
-        The two halves of the message, for `siq.errors.InputError`.
-    """
-
-    def __init__(self, fault: str, remedy: str) -> None:
-        super().__init__(f"{fault}; {remedy}")
-        self.fault = fault
-        self.remedy = remedy
+class FormulaError(Fault):
+    """A formula that the whitelist refuses; the fault names the offending part."""
 
 
 def parse_formula(
@@ -382,11 +371,11 @@ class Formula:
     def __post_init__(self) -> None:
         for name in (self.name, *(symbol.name for symbol in self.symbols)):
             if not name.isidentifier():
-                raise ValueError(f"'{name}' cannot be a name in a program; use letters, digits and _")
+                raise Fault(f"'{name}' cannot be a name in a program", "use letters, digits and _")
         unknown = self.expression.free_symbols - set(self.symbols)
         if unknown:
             names = ", ".join(sorted(map(str, unknown)))
-            raise ValueError(f"{names} in {self.name} is no state; insert a value")
+            raise Fault(f"{names} in {self.name} is no state", "insert a value")
         if self.expression.has(sympy.nan, sympy.zoo, sympy.oo, -sympy.oo):
             raise ValueError(f"{self.name} is not finite: there is nothing to write")
         for what, values in (("coordinates of a center", self.center), ("units", self.units)):

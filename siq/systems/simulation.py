@@ -20,7 +20,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from siq.data.recordings import Recordings
-from siq.errors import NumericalFailure
+from siq.errors import Fault, NumericalFailure
 from siq.numerics.integration import euler_maruyama_step, runge_kutta_step
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -72,9 +72,10 @@ def _sampling_stride(options: SimulationOptions) -> int:
     step = options.pair_step / options.substeps
     stride = round(options.interval / step)
     if abs(stride * step - options.interval) > 1e-9 * options.interval or stride <= options.substeps:
-        raise ValueError(
+        raise Fault(
             f"simulation.interval ({options.interval}) is not a multiple of the step"
-            f" pair_step/substeps ({step}) that exceeds pair_step; change one of them"
+            f" pair_step/substeps ({step}) that exceeds pair_step",
+            "change one of them",
         )
     return stride
 

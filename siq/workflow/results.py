@@ -341,7 +341,7 @@ def refine_run(settings: PipelineSettings, given: RunToRefine) -> RefinedRun:
                 "notes": [*lost, *refinement.notes], "no_record_test": refinement.record.missing or ""
             }  # fmt: skip
             status = Status.OK if certificate.certified else Status.WARNING
-            reason = [] if certificate.certified else [*lost, f"not certified: {certificate.reason}"]
+            reason = [] if certificate.certified else [*lost, certificate.reason]
             outcome = Outcome(number, Step.REFINE, status, "; ".join(reason))
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             outcome = Outcome(number, Step.REFINE, Status.FAILED, "; ".join([*lost, str(error)]))

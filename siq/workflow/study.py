@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator,
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from siq.data.layout import read_heading, usable_name
-from siq.errors import InputError, NumericalFailure, suggestion
+from siq.errors import Fault, InputError, NumericalFailure, suggestion
 from siq.inference.checks import PredictionLimits
 from siq.inference.library import IdentificationOptions, candidate_library
 from siq.inference.observation import velocity_names
@@ -72,18 +72,18 @@ class SweptParameter(BaseModel):
     def _said_once(self) -> SweptParameter:
         ends = (self.first, self.last, self.step)
         if self.values is not None and any(one is not None for one in ends):
-            raise ValueError("values are given twice; write either 'values' or 'from', 'to' and 'step'")
+            raise Fault("values are given twice", "write either 'values' or 'from', 'to' and 'step'")
         if self.values is None and any(one is None for one in ends):
-            raise ValueError(
-                f"the values of {self.parameter} are not known; write 'from', 'to' and 'step', or 'values'"
+            raise Fault(
+                f"the values of {self.parameter} are not known", "write 'from', 'to' and 'step', or 'values'"
             )
         if self.first is not None and self.last is not None and not self.first < self.last:
-            raise ValueError("'from' does not lie below 'to'; exchange them")
+            raise Fault("'from' does not lie below 'to'", "exchange them")
         if self.first is not None and self.last is not None and self.step is not None:
             if self.step > self.last - self.first:
-                raise ValueError("the step is longer than the range; shorten it")
+                raise Fault("the step is longer than the range", "shorten it")
             if (self.last - self.first) / self.step > MOST_POINTS:
-                raise ValueError(f"these are more than {MOST_POINTS} values; lengthen the step")
+                raise Fault(f"these are more than {MOST_POINTS} values", "lengthen the step")
         return self
 
     @property
@@ -112,9 +112,9 @@ class SweepOptions(SweptParameter):
         if self.second is None:
             return self
         if self.second.parameter == self.parameter:
-            raise ValueError(f"'{self.parameter}' is swept twice; name another parameter as the second")
+            raise Fault(f"'{self.parameter}' is swept twice", "name another parameter as the second")
         if len(self.numbers) * len(self.second.numbers) > MOST_POINTS:
-            raise ValueError(f"the map has more than {MOST_POINTS} points; lengthen a step")
+            raise Fault(f"the map has more than {MOST_POINTS} points", "lengthen a step")
         return self
 
     @property
@@ -197,7 +197,7 @@ class RecordingsOptions(BaseModel):
     @classmethod
     def _distinct(cls, states: tuple[str, ...] | None) -> tuple[str, ...] | None:
         if states is not None and len(set(states)) < len(states):
-            raise ValueError("a state is named twice; name each once")
+            raise Fault("a state is named twice", "name each once")
         return states
 
 
@@ -283,35 +283,36 @@ class Study(BaseModel):
         if value is None or value.endswith((".yaml", ".yml")):
             return value
         if not value.replace("-", "").replace("_", "").isalnum():
-            raise ValueError(f"'{value}' is no name of published figures; use letters, digits, '-' and '_'")
+            raise Fault(f"'{value}' is no name of published figures", "use letters, digits, '-' and '_'")
         return value
 
     @model_validator(mode="after")
     def _has_data(self) -> Study:
         if self.system is None and self.recordings is None:
-            raise ValueError("the study names no data; add 'system: NAME' or 'recordings: {file: ...}'")
+            raise Fault("the study names no data", "add 'system: NAME' or 'recordings: {file: ...}'")
         if self.system is not None and self.recordings is not None and self.recordings.diffusion is not None:
-            raise ValueError("the diffusion is the system's; remove 'recordings.diffusion'")
+            raise Fault("the diffusion is the system's", "remove 'recordings.diffusion'")
         if self.identification.hidden_velocities and (self.recordings is None or self.training is not None):
-            raise ValueError(
-                "'identification.hidden_velocities' is of recordings, and networks know recorded states only;"
-                " remove it, or give 'recordings' and leave 'training' out"
+            raise Fault(
+                "'identification.hidden_velocities' is of recordings, and networks know recorded states only",
+                "remove it, or give 'recordings' and leave 'training' out",
             )
         if self.training is None and "network" in (self.refinement.routes or ()):
-            raise ValueError(
-                "'refinement.routes' names the network route, but no networks are asked for; add"
-                " 'training: {}', or leave the routes out"
+            raise Fault(
+                "'refinement.routes' names the network route, but no networks are asked for",
+                "add 'training: {}', or leave the routes out",
             )
         if self.beside_equations and (self.system is None or self.landscape is None):
             remedy = "add 'system: NAME'" if self.system is None else "remove 'landscape: false'"
-            raise ValueError(
+            raise Fault(
                 "'beside_equations' compares the landscape of every run with that of the equations, and one"
-                f" of both is missing; {remedy}, or remove it"
+                " of both is missing",
+                f"{remedy}, or remove it",
             )
         if self.entrance == "equations":
             self._check_equations()
         elif self.sweep is not None:
-            raise ValueError("'sweep' belongs to studies of equations; add 'from: equations', or remove it")
+            raise Fault("'sweep' belongs to studies of equations", "add 'from: equations', or remove it")
         if self.simulation.pair_step is not None and self.simulation.interval is not None:
             self.simulation.options()
         return self
@@ -319,16 +320,12 @@ class Study(BaseModel):
     def _check_equations(self) -> None:
         """Whether a study of equations asks for what only trajectories can give."""
         if self.system is None:
-            raise ValueError("'from: equations' needs equations; add 'system: NAME'")
+            raise Fault("'from: equations' needs equations", "add 'system: NAME'")
         if self.landscape is None:
-            raise ValueError(
-                "'from: equations' finds a landscape and nothing else; remove 'landscape: false'"
-            )
+            raise Fault("'from: equations' finds a landscape and nothing else", "remove 'landscape: false'")
         for key in OF_TRAJECTORIES:
             if getattr(self, key) != type(self).model_fields[key].get_default():
-                raise ValueError(
-                    f"'{key}' belongs to studies of trajectories; remove it, or 'from: equations'"
-                )
+                raise Fault(f"'{key}' belongs to studies of trajectories", "remove it, or 'from: equations'")
 
 
 def completed(study: Study, system: Dynamics | None) -> Study:
@@ -425,10 +422,9 @@ def check_states(study: Study, states: Sequence[str], *, file: str) -> None:
         if study.recordings is not None and study.recordings.diffusion is not None:
             noise = read_diffusion(study.recordings.diffusion, [symbol(name) for name in states], None)
             if not noise.regular:
-                raise ValueError("the noise does not reach every state; give a positive definite matrix")
-    except ValueError as error:
-        fault, remedy = str(error).split("; ", 1)
-        raise InputError(file, "recordings.diffusion", fault, remedy) from None
+                raise Fault("the noise does not reach every state", "give a positive definite matrix")
+    except Fault as error:
+        raise error.at(file, "recordings.diffusion") from None
     for step, functions in (
         ("identification", study.identification.functions),
         ("regression", study.regression.functions),
@@ -560,8 +556,8 @@ class PipelineSettings:
 
     def __post_init__(self) -> None:
         if self.training is not None and self.identification.hidden_velocities:
-            raise ValueError(
-                "networks know recorded states only, and velocities are hidden; leave 'training' out"
+            raise Fault(
+                "networks know recorded states only, and velocities are hidden", "leave 'training' out"
             )
 
     @property

@@ -106,7 +106,7 @@ def why_no_landscape(outcomes: Iterable[Outcome]) -> str:
     for status in (Status.FAILED, Status.WARNING, Status.SKIPPED):
         mine = [one for one in outcomes if one.status == status]
         for one in sorted(mine, key=lambda each: each.step != Step.LANDSCAPE):
-            return one.reason.removeprefix("not certified: ").rstrip(".")
+            return one.reason.rstrip(".")
     return "the recorded states lead to no stable state"
 
 

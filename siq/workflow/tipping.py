@@ -30,6 +30,7 @@ import pandas as pd
 from scipy.integrate import cumulative_simpson
 from scipy.interpolate import PchipInterpolator
 
+from siq.errors import Fault
 from siq.quasipotential.rates import MIN_BARRIER_OVER_NOISE
 from siq.workflow.sweep import ALONE, Sweep
 
@@ -90,7 +91,7 @@ def probability_of_tipping(
     2   0.60        1.000  False
     """
     if not noise > 0:
-        raise ValueError(f"the noise is {noise:g}; give the positive ε of √ε dW")
+        raise Fault(f"the noise is {noise:g}", "give the positive ε of √ε dW")
     times = np.asarray(times, dtype=float)
     if times.ndim != 1 or len(times) < 2 or not (np.diff(times) > 0).all():
         raise ValueError("the times have to rise, and there have to be two of them at least")
