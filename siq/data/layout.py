@@ -82,8 +82,8 @@ def read_heading(heading: str) -> _Heading:
 
     Examples
     --------
-    >>> read_heading("bead x (µm)"), read_heading("x(t)"), read_heading("time_ms")
-    (Heading(title='bead x', unit='µm'), Heading(title='x', unit=None), Heading(title='time', unit='ms'))
+    >>> [tuple(read_heading(text)) for text in ("bead x (µm)", "x(t)", "time_ms")]
+    [('bead x', 'µm'), ('x', None), ('time', 'ms')]
     """
     text = heading.strip()
     if match := re.fullmatch(r"(.*?)\s*\[\s*(.*?)\s*\]", text):

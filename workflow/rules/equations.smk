@@ -97,6 +97,7 @@ rule equations_page:
         "../envs/siq.yaml"
     params:
         **task("equations_page"),
+        captions=CAPTIONS,  # of Snakemake's own report
     message:
         "{wildcards.study}: writing the page"
     script:

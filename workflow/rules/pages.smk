@@ -84,6 +84,7 @@ rule page:
         "../envs/siq.yaml"
     params:
         **task("page"),
+        captions=CAPTIONS,  # of Snakemake's own report
     message:
         "{wildcards.study}: writing the page"
     script:
