@@ -1,14 +1,22 @@
-"""Remarks: what a result has to say about itself, as a code with values.
+"""Remarks: what a result has to say about itself, as a code with values, and the sentences of codes.
 
-`siq.report.remarks.sentence` makes the sentence that a reader sees from the code. Code that wants to know
-whether something was remarked asks for the code, never for words.
+`sentence` makes what a reader sees from the code, by one template for each code in
+`siq/report/templates/remarks/`. Code that wants to know whether something was remarked asks for the code,
+never for words.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
+from importlib.resources import files
 from typing import Any
+
+import jinja2
+import yaml
+
+from siq.numerics.text import number_text, p_equation, percent, range_text, span_text, unit_text, value_text
 
 
 @dataclass(frozen=True)
@@ -45,3 +53,35 @@ class Remark:
 def has_code(remarks: Iterable[Remark], code: str) -> bool:
     """Whether any of these remarks has a code."""
     return any(remark.code == code for remark in remarks)
+
+
+@cache
+def templates() -> dict[str, jinja2.Template]:
+    """The templates of all remarks, by code, from the files of all packages.
+
+    In a template ``{{ value | number }}`` writes a number for readers, ``{{ value | share }}`` a share in
+    per cent, ``{{ value | p_equation }}`` a p-value, ``{{ value | value(digits=2) }}`` a number to so many
+    digits, ``{{ limits | range }}`` an interval, ``{{ three | span }}`` the least, usual and greatest of
+    something, ``{{ text | unit }}`` a unit. A value that a template names and a remark lacks is an error.
+    """
+    environment = jinja2.Environment(undefined=jinja2.StrictUndefined, autoescape=False)
+    environment.filters |= {
+        "number": number_text, "share": percent, "p_equation": p_equation, "value": value_text,
+        "range": lambda limits: range_text(*limits), "span": span_text, "unit": unit_text,
+    }  # fmt: skip
+    found: dict[str, jinja2.Template] = {}
+    for file in files("siq.report").joinpath("templates", "remarks").iterdir():
+        entries = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
+        found |= {code: environment.from_string(str(text)) for code, text in entries.items()}
+    return found
+
+
+def sentence(remark: Remark) -> str:
+    """A remark as a sentence.
+
+    Raises
+    ------
+    KeyError
+        If no template has its code.
+    """
+    return templates()[remark.code].render(remark.values)

@@ -128,6 +128,11 @@ def test_the_readme_is_filled_in_by_the_script() -> None:
     assert figures.filled("so <!--=a.b-->old<!--/-->!", {"a.b": "new"}) == "so <!--=a.b-->new<!--/-->!"
 
 
+def test_the_picture_of_the_packages_is_that_of_the_imports() -> None:
+    drawn = loaded(DOCS / "make" / "architecture.py")
+    assert drawn.PICTURE.read_text(encoding="utf-8") == drawn.picture(), "run docs/make/architecture.py"
+
+
 # Examples and notebooks that were run.
 
 

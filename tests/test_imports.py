@@ -96,8 +96,7 @@ ARROWS = {
 
 
 def package(module: str) -> str:
-    """The package of a module; the sentences of remarks belong to these, and anyone may ask for one."""
-    return "remarks" if module == "siq.report.remarks" else module.split(".")[1]
+    return module.split(".")[1]
 
 
 def test_the_order_names_every_package() -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 PICTURE = ROOT / "docs" / "images" / "architecture.svg"
 # From the top down, as tests/test_imports.py has them from the ground up.
-PACKAGES = ("cli", "report", "workflow", "diagnosis", "quasipotential", "networks", "inference", "systems",
+PACKAGES = ("report", "workflow", "diagnosis", "quasipotential", "networks", "inference", "systems",
             "data", "numerics", "validation")  # fmt: skip
 ROW, BOX, LEFT, TEXT = 46, 34, 12, 168
 

@@ -33,8 +33,7 @@ from siq.data.recordings import (
     recordings_of,
 )
 from siq.data.two_states import RecordStates, Switching, states_of_record, switching
-from siq.remarks import Remark
-from siq.report.remarks import sentence
+from siq.remarks import Remark, sentence
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -37,8 +37,7 @@ from siq.quasipotential.occupancy import VisitTest
 from siq.quasipotential.rates import EscapeRate, NoiseStrength, mean_residence_time
 from siq.quasipotential.transitions import Transition, missing_diffusion
 from siq.quasipotential.wells import Well
-from siq.remarks import Remark
-from siq.report.remarks import sentence
+from siq.remarks import Remark, sentence
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium

@@ -31,8 +31,7 @@ from siq.quasipotential.landscape import Landscape, heights_of_attractors, least
 from siq.quasipotential.paths import minimum_action_path
 from siq.quasipotential.rates import NoiseStrength, mean_residence_time
 from siq.quasipotential.wells import Well
-from siq.remarks import Remark
-from siq.report.remarks import sentence
+from siq.remarks import Remark, sentence
 from siq.systems.cycles import Cycle
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics

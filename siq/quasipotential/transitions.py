@@ -33,8 +33,7 @@ from siq.quasipotential.paths import (
 )
 from siq.quasipotential.rates import EscapeRate, escape_rate, prefactor_error
 from siq.quasipotential.wells import Well
-from siq.remarks import Remark
-from siq.report.remarks import sentence
+from siq.remarks import Remark, sentence
 from siq.systems.basins import leads_back, neighbours
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics

@@ -22,10 +22,10 @@ from siq.diagnosis.dictionary import Mechanism
 from siq.diagnosis.statement import METRIC, StatedFunction, StatedMechanism, Statement
 from siq.diagnosis.study import MismatchVerdict
 from siq.numerics.text import p_text, unit_text, value_text
+from siq.remarks import sentence
 from siq.report.diagnosis_text import location_sentence, sentence_of, words_of
 from siq.report.formatting import environment, formula_mathml, texts
 from siq.report.page import FormulaRow, ReportFigure, compose, render_report
-from siq.report.remarks import sentence
 from siq.systems.dynamics import Dynamics, symbol
 from siq.systems.formulas import FormulaError, parse_formula
 

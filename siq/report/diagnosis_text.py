@@ -17,8 +17,8 @@ from siq.numerics.text import (
     p_equation,
     value_text,
 )
+from siq.remarks import sentence
 from siq.report.formatting import environment
-from siq.report.remarks import sentence
 
 SENTENCE_END = "¶"
 

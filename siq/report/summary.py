@@ -26,7 +26,7 @@ from siq.quasipotential.landscape import Landscape, least_over_wells
 from siq.quasipotential.occupancy import VisitTest
 from siq.quasipotential.rates import EscapeRate, MeanTime, NoiseStrength, mean_residence_time
 from siq.quasipotential.wells import Well
-from siq.report.remarks import sentence
+from siq.remarks import sentence
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics, symbol
 from siq.systems.formulas import compile_formulas

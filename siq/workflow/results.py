@@ -37,8 +37,7 @@ from siq.quasipotential.occupancy import OccupancyCheck, VisitTest
 from siq.quasipotential.rates import MeanTime, NoiseStrength, mean_exit_time, mean_residence_time
 from siq.quasipotential.refinement import Refinement, RefinementContext, control, refine_and_certify
 from siq.quasipotential.wells import Well, best_trial
-from siq.remarks import Remark
-from siq.report.remarks import sentence
+from siq.remarks import Remark, sentence
 from siq.systems.cards import load_system
 from siq.systems.cycles import Cycle
 from siq.systems.diffusion import Diffusion

@@ -12,9 +12,8 @@ from siq.quasipotential.landscape import Landscape, LandscapeOptions
 from siq.quasipotential.landscape_assembly import EquationSettings, landscape_from_equations
 from siq.quasipotential.landscape_comparison import _check_same_noise, differences
 from siq.quasipotential.landscape_files import landscape_data
-from siq.remarks import Remark
+from siq.remarks import Remark, sentence
 from siq.report.landscape import comparison_table
-from siq.report.remarks import sentence
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.workflow import comparison

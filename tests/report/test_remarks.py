@@ -8,8 +8,8 @@ from pathlib import Path
 import jinja2
 import pytest
 
+from siq import remarks
 from siq.remarks import Remark, has_code
-from siq.report import remarks
 
 ROOT = Path(__file__).parents[2]
 CODES = {
