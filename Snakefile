@@ -16,7 +16,9 @@ include: "workflow/rules/statistics.smk"
 include: "workflow/rules/landscape.smk"
 include: "workflow/rules/pages.smk"
 include: "workflow/rules/equations.smk"
+include: "workflow/rules/cases.smk"
 include: "workflow/rules/mismatch.smk"
+include: "workflow/rules/proof_common.smk"
 include: "workflow/rules/proof.smk"
 
 

@@ -1,0 +1,67 @@
+# What the rules of the proofs share: sets of cases, their batches and keys.
+from workflow.proof.sets import FOREIGN, load_proofs
+
+try:
+    PROOF_SETS = load_proofs(config_path("proof.yaml"))
+except InputError as error:
+    say_and_stop(error)
+
+PROOF_TITLES = {
+    "proof": "Proof of the diagnosis",
+    "proof_full": "Proof of the diagnosis, all cases",
+    "proof_foreign": "Proof of the diagnosis on random systems",
+    "proof_foreign_small": "Proof of the diagnosis on random systems, a few cases",
+}
+
+
+def proof_settings(wildcards):
+    """Params function: everything that a set of cases follows from, its seed included."""
+    return PROOF_SETS[wildcards.proof].model_dump(mode="json")
+
+
+def is_foreign(wildcards):
+    """Params function: whether a set is of the second generator."""
+    return wildcards.proof in FOREIGN
+
+
+def all_batches(pattern):
+    """Input function: one file for every batch of the set."""
+    return lambda wildcards: expand(
+        pattern,
+        proof=wildcards.proof,
+        batch=PROOF_SETS[wildcards.proof].batch_names(),
+    )
+
+
+def blind_names():
+    """Names of the cases that somebody else made."""
+    try:
+        return CASES.in_folder()
+    except InputError as error:
+        say_and_stop(error)
+
+
+def key_of(wildcards):
+    """Input function: the key of a case that somebody else made, with its arrays where there are any."""
+    folder = config.get("keys")
+    if folder is None:
+        say_and_stop(
+            "--config, keys: no folder is given; write --config cases=DIR keys=DIR."
+        )
+    names = (Path(folder) / f"{wildcards.case}.{kind}" for kind in ("json", "npz"))
+    found = [str(path) for path in names if path.is_file()]
+    if not found or not found[0].endswith(".json"):
+        say_and_stop(
+            f"{folder}, {wildcards.case}.json: the case has no key; add it, or take the case away."
+        )
+    return found
+
+
+def all_blind_scores(wildcards):
+    """Input function: the score of every case of the folder."""
+    return expand("results/blind-test/scores/{case}.parquet", case=blind_names())
+
+
+wildcard_constraints:
+    proof="|".join(PROOF_SETS),
+    batch="[0-9]+",
