@@ -55,7 +55,7 @@ def diagnosed(folder: Path) -> dict[str, Any]:
         "verdict": said["verdict"],
         "partial": said["partial"],
         "work": said["budget"]["spent"],
-        "held_out": {name: one for name, one in said["fit"].items() if name != "metric"},
+        "held_out": {name: one for name, one in said["fit"].items() if name not in ("metric", "squares")},
         "recalibrated": [one["after"] for one in refitted.values()],
         "recalibrated_errors": [one["standard_error"] for one in refitted.values()],
         "excluded": len(said["excluded"]),
