@@ -34,7 +34,7 @@ import sympy
 from siq.data.recordings import SnapshotPairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import STANDARD_ERRORS, FieldEstimate, NoiseFormula
-from siq.inference.kalman_filter import Noise, middle_spread, solve, whiten, with_parameters_changed
+from siq.inference.kalman_filter import Noise, solve, whiten
 from siq.inference.library import monomial_exponents
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
@@ -482,13 +482,13 @@ class InnovationLikelihood(_DiffusionLikelihood):
     def __init__(self, symbols: tuple[sympy.Symbol, ...], fit: Fit, data: Measurements) -> None:
         super().__init__(symbols)
         white = whiten(fit.linearisation, data, fit.noise)
-        still = with_parameters_changed(fit.linearisation, solve(white.columns, white.innovations)[0])
+        still = fit.linearisation.with_parameters_changed(solve(white.columns, white.innovations)[0])
         d, rows, x = len(symbols), data.begins, fit.linearised_at
         middle = x[:, :d].copy()
         middle[rows] += (x[rows + 1, :d] + still.gap[rows, :d] - x[rows, :d]) / 2
         intensity = np.broadcast_to(fit.noise.intensity, (len(x), *fit.noise.intensity.shape[1:]))[:, :d, :d]
         spread = np.zeros_like(intensity) if fit.spread is None else fit.spread[:, :d, :d]
-        wide = middle_spread(spread, intensity, data.step)
+        wide = spread + intensity * data.step[:, None, None] / 2
         second = [term.diff(one, other) for term in self.terms for one in symbols for other in symbols]
         components = np.ascontiguousarray(middle.T)
         bends = compile_formulas(second, symbols)(components).reshape(len(self.terms), d, d, -1)

@@ -14,6 +14,7 @@ explains of them, the unknown initial states projected out, are all that estimat
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -60,31 +61,30 @@ class ClosedFunctions:
         self._closed = replace(
             model, equations=tuple(equations), inputs=(*model.inputs, *further), covariance=None
         )
+        self._spread = np.zeros((len(names), 0))
 
-    def at(self, spread: np.ndarray) -> _FunctionsAtSpread:
+    def at(self, spread: np.ndarray) -> ClosedFunctions:
         """The functions for one covariance at each interval, shape ``(n, d, d)``."""
-        return _FunctionsAtSpread(self._closed, np.stack([spread[:, j, k] for j, k in self._pairs]))
+        return self._with(np.stack([spread[:, j, k] for j, k in self._pairs]))
 
-
-class _FunctionsAtSpread:
-    """`ClosedFunctions` with the covariances inserted."""
-
-    def __init__(self, closed: Dynamics, spread: np.ndarray) -> None:
-        self._closed, self._spread = closed, spread
+    def at_intervals(self, chosen: np.ndarray) -> ClosedFunctions:
+        """Those of some of the intervals, by their places."""
+        return self._with(self._spread[:, chosen])
 
     def rates(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
         """Mean of f at mean states ``(d, n)``: shape ``(d, n)``."""
-        return self._closed.functions.rates(x, self._with_spread(signals), values)
+        return self._closed.functions.rates(x, self._joined(signals), values)
 
     def slopes(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Its derivatives by states and by free parameters: ``(d, d, n)`` and ``(d, p, n)``."""
-        return self._closed.functions.slopes(x, self._with_spread(signals), values)
+        return self._closed.functions.slopes(x, self._joined(signals), values)
 
-    def at_intervals(self, chosen: np.ndarray) -> _FunctionsAtSpread:
-        """Those of some of the intervals, by their places."""
-        return _FunctionsAtSpread(self._closed, self._spread[:, chosen])
+    def _with(self, spread: np.ndarray) -> ClosedFunctions:
+        found = copy(self)
+        found._spread = spread
+        return found
 
-    def _with_spread(self, signals: Signals) -> Signals:
+    def _joined(self, signals: Signals) -> Signals:
         return replace(signals, inputs=np.concatenate([signals.inputs, self._spread]))
 
 
@@ -173,13 +173,8 @@ class Linearisation:
     @property
     def finite(self) -> bool:
         """Whether every number is one."""
-        return bool(
-            np.isfinite(self.gap).all()
-            and np.isfinite(self.transition).all()
-            and np.isfinite(self.response).all()
-            and np.isfinite(self.measured).all()
-            and not np.isinf(self.residual).any()
-        )
+        numbers = self.gap, self.transition, self.response, self.measured
+        return all(np.isfinite(each).all() for each in numbers) and not np.isinf(self.residual).any()
 
     def at_rows(self, rows: np.ndarray | slice) -> Linearisation:
         """That of some of the samples."""
@@ -247,6 +242,21 @@ class Linearisation:
         total, logarithm, removed = projected_sums(first, *found[:3])
         return total, found[3] + logarithm, int((~np.isnan(self.residual)).sum()) - removed
 
+    def log_likelihood(self, first: np.ndarray, step: np.ndarray, noise: Noise) -> float:
+        """The restricted one, the parameters at their best."""
+        total, log_determinant, freedom = self.sums(first, step, noise)
+        return -0.5 * (total + log_determinant + freedom * np.log(2 * np.pi))
+
+    def with_parameters_changed(self, change: np.ndarray) -> Linearisation:
+        """The linearisation after a change of the parameters, which are then no longer free."""
+        return replace(
+            self,
+            gap=self.gap + self.response @ change,
+            residual=self.residual - self.measured_response @ change,
+            response=np.zeros((*self.gap.shape, 0)),
+            measured_response=np.zeros((*self.residual.shape, 0)),
+        )
+
 
 def integrate_intervals(model: Dynamics, grid: Grid, values: np.ndarray, x: np.ndarray) -> np.ndarray:
     """The states at the ends of all intervals: from states ``(d, k)`` at their begins to ``(d, k)``."""
@@ -265,7 +275,7 @@ def linearise(
     x: np.ndarray,
     *,
     columns: Columns | None = None,
-    drift: _FunctionsAtSpread | None = None,
+    drift: ClosedFunctions | None = None,
 ) -> Linearisation:
     """Integrate every interval from the state in hand, with the derivatives.
 
@@ -326,7 +336,7 @@ def _carried(
     grid: Grid,
     values: np.ndarray,
     state: np.ndarray,
-    drift: ParametricFunctions | _FunctionsAtSpread,
+    drift: ParametricFunctions | ClosedFunctions,
     *,
     columns: Columns | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -391,7 +401,7 @@ def substeps_needed(
 
 
 def _runge_kutta(
-    drift: ParametricFunctions | _FunctionsAtSpread,
+    drift: ParametricFunctions | ClosedFunctions,
     grid: Grid,
     values: np.ndarray,
     x: np.ndarray,
@@ -410,16 +420,12 @@ def _runge_kutta(
     return after, k1, rates(after, end, values)
 
 
-def middle_spread(spread: np.ndarray, intensity: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Covariance of the state in the middle of an interval: noise of half of it is added."""
-    return np.asarray(spread + intensity * step[:, None, None] / 2)
-
-
 def _mean_intensity(noise: Diffusion, x: np.ndarray, spread: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Mean of εD(x) over intervals, and over what a filter knows of the state: shape ``(n, d, d)``."""
     d = noise.dimension
     matrices = noise.at(x[:, :d])
-    wide = middle_spread(spread[:, :d, :d], matrices, step)
+    # In the middle of an interval noise of half of it is added.
+    wide = spread[:, :d, :d] + matrices * step[:, None, None] / 2
     bends = noise.derivatives(x[:, :d], 2)
     matrices = matrices + np.einsum("nijkl,nkl->nij", bends, wide) / 2
     # On its way a fit may come where the formula is no covariance.
@@ -584,17 +590,6 @@ def solve(columns: np.ndarray, target: np.ndarray, *, least: float = RANK) -> tu
     kept = values > least * values[0] if values[0] > 0 else np.zeros(len(values), dtype=bool)
     inverse = right[kept].T / values[kept] / scale[:, None]
     return inverse @ (left[:, kept].T @ triangle[:, -1]), inverse @ inverse.T
-
-
-def with_parameters_changed(linearisation: Linearisation, change: np.ndarray) -> Linearisation:
-    """The linearisation after a change of the parameters, which are then no longer free."""
-    return replace(
-        linearisation,
-        gap=linearisation.gap + linearisation.response @ change,
-        residual=linearisation.residual - linearisation.measured_response @ change,
-        response=np.zeros((*linearisation.gap.shape, 0)),
-        measured_response=np.zeros((*linearisation.residual.shape, 0)),
-    )
 
 
 def _orthonormal(columns: np.ndarray) -> np.ndarray:

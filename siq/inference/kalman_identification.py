@@ -15,6 +15,7 @@ process noise depends on the state, f and D are fitted in turn (`siq.inference.d
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -24,14 +25,10 @@ from siq.inference.checks import unexplained_probability
 from siq.inference.diffusion_model import InnovationLikelihood
 from siq.inference.field_estimate import FieldEstimate, FlowMap, NoiseDiagnosis
 from siq.inference.kalman_filter import Grid, Noise, Whitened, linearise, solve, whiten
-from siq.inference.maximum_likelihood import Fit, fit_by_filter, log_likelihood
+from siq.inference.maximum_likelihood import Fit, fit_by_filter, noise_uncertainty
 from siq.inference.measurements import Measurements
 from siq.inference.observation import ObservationModel, kept_rows, moved_by, settled, smoothed_motion
-from siq.inference.recalibration import (
-    drop_insignificant_process_noise,
-    noise_uncertainty,
-    process_noise_needed,
-)
+from siq.inference.recalibration import drop_insignificant_process_noise, process_noise_needed
 from siq.inference.selection import (
     LinearProblem,
     ModelAverage,
@@ -202,10 +199,10 @@ def _estimate(
         strength = diffusion.intensity(rate) if diffusion.constant else 0.0
         ratio = float(np.sqrt(((np.diag(rate) * step + 2 * sensor) / positive(moved)).mean()))
         without = replace(fit.noise, measurement=sensor * NO_SENSOR_NOISE)
-        alone = replace(data, sensor_noise=None)
         factors = 1 + np.linspace(0, 2, 21) * sensor.max() / max(rate.max() * step, 1e-300)
-        base = max(log_likelihood(fit.linearisation, alone, without.scaled(factor)) for factor in factors)
-        evidence = 2 * (log_likelihood(fit.linearisation, alone, fit.noise) - base)
+        likelihood = partial(fit.linearisation.log_likelihood, data.first, data.step)
+        base = max(likelihood(without.scaled(factor)) for factor in factors)
+        evidence = 2 * (likelihood(fit.noise) - base)
     known = observation.definitions
     whole = np.zeros((len(known) + len(support),) * 2)
     whole[len(known) :, len(known) :] = covariance

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy.optimize
@@ -29,11 +30,9 @@ from siq.inference.kalman_filter import (
     Linearisation,
     Noise,
     linearise,
-    middle_spread,
     solve,
     substeps_needed,
     whiten,
-    with_parameters_changed,
 )
 from siq.inference.measurements import Expectations, Measurements
 from siq.systems.dynamics import Dynamics
@@ -41,7 +40,10 @@ from siq.systems.dynamics import Dynamics
 PIECE = 500  # samples in one stretch, so that its unknown first state hardly matters
 MIN_ROUGHNESS_SHARE = 1e-4  # least measurement noise, as a share of what third differences show
 COARSE_SAMPLES = 8000  # whose noise is known to 2 %: enough to begin with
-LOGARITHM_STEP = 0.05  # numerical: for differences of the likelihood
+LOGARITHM_STEP = 0.05  # numerical: of the logarithm of a variance, for differences of the likelihood
+MAX_ERROR = (
+    1.0  # standard error of a logarithm beyond which the likelihood is no parabola: a bound is far off
+)
 MIN_CURVATURE = 1.0  # along a logarithm, from which on its standard error is below one
 MAX_CORRECTION = 0.5  # of a logarithm, within which the likelihood is a parabola
 NO_PROCESS_NOISE = np.exp(-23.0)  # relative to where the search began; below it there is none
@@ -75,16 +77,8 @@ def first_noise(model: Dynamics, data: Measurements, x: np.ndarray) -> Noise:
 
 
 @dataclass(frozen=True)
-class NoiseCoordinates:
-    """The parameters of a noise as one vector: logarithms of variances, then correlations of process noise.
-
-    Attributes
-    ----------
-    origin
-        The noise at zero. A process noise that is zero there stays so.
-    known
-        Which variances of the measurement are known, and stay as they are; shape ``(m,)``.
-    """
+class _NoiseCoordinates:
+    """A noise as one vector, zero at its origin: logarithms of variances, then correlations."""
 
     origin: Noise
     known: np.ndarray
@@ -103,8 +97,7 @@ class NoiseCoordinates:
     def size(self) -> int:
         """Number of parameters."""
         count = len(self.driven)
-        pairs = count * (count - 1) // 2 if self.correlates else 0
-        return len(self.known) + count + pairs
+        return len(self.known) + count + (count * (count - 1) // 2 if self.correlates else 0)
 
     def noise_at(self, vector: np.ndarray) -> Noise:
         """The noise for a vector, shape ``(size,)``."""
@@ -133,20 +126,18 @@ def _estimate_noise(
     data: Measurements,
     start: Noise,
     *,
-    expected: Expectations | None = None,
+    expected: Expectations,
     charge: Callable[[float], None] | None = None,
     coarse: bool = False,
 ) -> Noise:
-    """The noise of highest restricted likelihood along the trajectories in hand.
-
-    The parameters are those that are best for the noise that the search begins with: they depend little on
-    it, and a fit returns here once they have settled.
-    """
-    coordinates = NoiseCoordinates(start, data.known_sensors)
+    """The noise of highest restricted likelihood along the trajectories in hand."""
+    # The parameters are those that are best for the noise that the search begins with: they depend little on
+    # it, and a fit returns here once they have settled.
+    coordinates = _NoiseCoordinates(start, data.known_sensors)
     driven, outputs = coordinates.driven, len(start.measurement)
     white = whiten(linearisation, data, start)
-    columns, innovations = (expected or Expectations.none()).stacked_on(white.columns, white.innovations)
-    whole = with_parameters_changed(linearisation, solve(columns, innovations)[0])
+    columns, innovations = expected.stacked_on(white.columns, white.innovations)
+    whole = linearisation.with_parameters_changed(solve(columns, innovations)[0])
     count = len(data.t)
     # Pieces spread over all recordings, where there are many more samples than are needed.
     rows, first = np.arange(count), data.first
@@ -169,8 +160,7 @@ def _estimate_noise(
             noise = coordinates.noise_at(vector)
             if len(rows) < count and noise.shape is not None and len(noise.shape) > 1:
                 noise = replace(noise, shape=noise.shape[rows])
-            total, log_determinant, freedom = part.sums(first, step, noise)
-            value = 0.5 * (total + log_determinant + freedom * np.log(2 * np.pi))
+            value = -part.log_likelihood(first, step, noise)
             return value if np.isfinite(value) else 1e300
 
         return cost
@@ -216,12 +206,10 @@ def _corrected(
     ratio: float,
     bounds: Sequence[tuple[float, float]],
 ) -> np.ndarray:
-    """The minimum of a cost from that of a part of it, by one Newton step with the curvature of the part.
-
-    What is left is of second order in the difference of the two, which many samples make small; where they
-    differ so much that the step leads upwards all is searched. The whole is larger by the ratio, and a
-    coordinate at one of its bounds stays there.
-    """
+    """The minimum of a cost from that of a part of it, by one Newton step with the curvature of the part."""
+    # What is left is of second order in the difference of the two, which many samples make small; where they
+    # differ so much that the step leads upwards all is searched. The whole is larger by the ratio, and a
+    # coordinate at one of its bounds stays there.
     lower, upper = np.array(bounds).T
     inside = np.flatnonzero((vector > lower + LOGARITHM_STEP) & (vector < upper - LOGARITHM_STEP))
     unit = LOGARITHM_STEP * np.eye(len(vector))[inside]
@@ -245,10 +233,62 @@ def _corrected(
     return moved if whole(moved) <= middle else _lowest(whole, vector, bounds)
 
 
-def log_likelihood(linearisation: Linearisation, data: Measurements, noise: Noise) -> float:
-    """Restricted log-likelihood along the trajectories in hand, the parameters at their best."""
-    total, log_determinant, freedom = linearisation.sums(data.first, data.step, noise)
-    return -0.5 * (total + log_determinant + freedom * np.log(2 * np.pi))
+def noise_uncertainty(fit: Fit, data: Measurements) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Errors of the noise of a fit, by the curvature of the likelihood along its trajectories.
+
+    Returns
+    -------
+    measurement, process
+        Standard errors of the logarithms of the sensors' variances ``(m,)``, and of the intensities of the
+        process noise ``(d,)``: infinite where one is only bounded from above, zero where it was given.
+    covariance
+        Of the free parameters, with what the noise leaves open in them, shape ``(p, p)``.
+    """
+    coordinates = _NoiseCoordinates(fit.noise, data.known_sensors)
+    line = fit.linearisation
+    white = whiten(line, data, fit.noise)
+    still = line.with_parameters_changed(solve(white.columns, white.innovations)[0])
+    outputs = len(coordinates.known)
+    places = [k for k in range(coordinates.size) if k >= outputs or not coordinates.known[k]]
+
+    def moved(*changes: tuple[int, float]) -> Noise:
+        vector = np.zeros(coordinates.size)
+        for place, change in changes:
+            vector[place] += change
+        return coordinates.noise_at(vector)
+
+    def value(*changes: tuple[int, float]) -> float:
+        return still.log_likelihood(data.first, data.step, moved(*changes))
+
+    middle, h = value(), LOGARITHM_STEP
+    single = {k: (value((k, h)), value((k, -h))) for k in places}
+    curvature = np.diag([(2 * middle - single[k][0] - single[k][1]) / h**2 for k in places])
+    for row, one in enumerate(places):
+        for column, other in enumerate(places[:row]):
+            both = value((one, h), (other, h)) + value((one, -h), (other, -h))
+            apart = value((one, h), (other, -h)) + value((one, -h), (other, h))
+            curvature[row, column] = curvature[column, row] = (apart - both) / (4 * h**2)
+    told = np.diag(curvature) > 1 / MAX_ERROR**2
+    errors = np.full(coordinates.size, np.inf)
+    errors[:outputs][coordinates.known] = 0.0
+    inside = [place for place, known in zip(places, told, strict=True) if known]
+    covariance = fit.covariance
+    if inside:
+        of_noise = np.linalg.pinv(curvature[np.ix_(told, told)], hermitian=True)
+        errors[inside] = np.sqrt(np.maximum(np.diag(of_noise), 0.0))
+        changes = []
+        for place in inside:
+            ends = []
+            for sign in (1, -1):
+                white = whiten(line, data, moved((place, sign * h)))
+                ends.append(solve(white.columns, white.innovations)[0])
+            changes.append((ends[0] - ends[1]) / (2 * h))
+        slope = np.stack(changes, axis=1)
+        covariance = covariance + slope @ of_noise @ slope.T
+    driven = coordinates.driven
+    process = np.zeros_like(fit.noise.process)
+    process[driven] = errors[outputs : outputs + len(driven)]
+    return errors[:outputs], process, covariance
 
 
 def _noise_along(
@@ -279,155 +319,6 @@ def _noise_along(
         factor = np.full_like(factor, (left**2).sum() / (known.sum() * share))
         return replace(noise, measurement=noise.measurement * factor, process=noise.process * factor[0])
     return replace(noise, measurement=data.with_known_noise(noise.measurement * np.maximum(factor, 1e-12)))
-
-
-@dataclass(frozen=True)
-class _Iterate:
-    """Where a fit stands.
-
-    Attributes
-    ----------
-    values
-        All parameters, shape ``(p,)``.
-    x
-        The states at which f is taken, shape ``(n, d)``.
-    along
-        The linearisation there.
-    smoothed
-        The states given all measurements, shape ``(n, d)``.
-    spread
-        Covariance of what a filter knows at each sample, shape ``(n, d, d)``; None where nothing drives the
-        states.
-    """
-
-    values: np.ndarray
-    x: np.ndarray
-    along: Linearisation
-    smoothed: np.ndarray
-    spread: np.ndarray | None = None
-
-
-@dataclass(frozen=True)
-class _Shooting:
-    """A model to be fitted, on the grid of its measurements.
-
-    Attributes
-    ----------
-    model, grid
-        The dynamics, on the grid of the measurements.
-    scale
-        The size of each state, shape ``(d,)``.
-    filtered
-        Whether f is taken at what a filter knows, rather than at smoothed states.
-    closed
-        f with the effect of the filter's spread on it, where that is wanted.
-    budget
-        Charged for every evaluation; None where nobody counts.
-    """
-
-    model: Dynamics
-    grid: Grid
-    scale: np.ndarray
-    filtered: bool = False
-    closed: ClosedFunctions | None = None
-    budget: Budget | None = None
-
-    @property
-    def resolution(self) -> float:
-        """Least relative singular value with which effects of parameters are distinct; see `solve`."""
-        return RANK if self.filtered else INEXACT
-
-    def charge(self, evaluations: float = 1.0) -> None:
-        """Count evaluations of the likelihood.
-
-        Raises
-        ------
-        BudgetSpent
-            When nothing is left of what is allowed.
-        """
-        if self.budget is not None:
-            self.budget.charge(evaluations * evaluation(self.model, self.grid.data))
-
-    def linearised(
-        self, values: np.ndarray, x: np.ndarray, spread: np.ndarray | None, noise: Noise
-    ) -> Linearisation:
-        """At parameters ``(p,)`` and states ``(n, d)``."""
-        self.charge(self.grid.substeps)
-        if self.closed is None or spread is None:
-            return linearise(self.model, self.grid, values, x)
-        rows, data = self.grid.rows, self.grid.data
-        intensity = noise.intensity if len(noise.intensity) == 1 else noise.intensity[rows]
-        drift = self.closed.at(middle_spread(spread[rows], intensity, data.step[rows]))
-        return linearise(self.model, self.grid, values, x, drift=drift)
-
-    def noise_at(self, now: _Iterate, noise: Noise) -> Noise:
-        """The noise where a fit stands: process noise may depend on the state."""
-        if noise.field is None:
-            return noise
-        rows, middle = self.grid.rows, now.x.copy()
-        middle[rows] += (now.x[rows + 1] + now.along.gap[rows] - now.x[rows]) / 2
-        return noise.along(middle, now.spread, self.grid.data.step)
-
-    def stepped(self, now: _Iterate, change: np.ndarray, noise: Noise) -> tuple[_Iterate, float] | None:
-        """The step that the linearisation suggests, shortened until it does about what was foreseen.
-
-        Parameters
-        ----------
-        now
-            Where the fit stands.
-        change
-            Of the free parameters, shape ``(p,)``.
-        noise
-            Decides how the states follow.
-
-        Returns
-        -------
-        _Iterate, float
-            Where it leads, and the share of it that was taken; None where not even a short one does as
-            foreseen.
-        """
-        smoothed, known, covariance = _state_changes(now.along, self.grid.data, noise, change)
-        deviation = known if self.filtered else smoothed
-        spread = covariance if noise.process.any() else None
-        rows, scale = self.grid.rows, self.scale
-        moved = np.einsum("kij,kj->ki", now.along.transition[rows], deviation[rows])
-        moved += now.along.response[rows] @ change
-        foreseen = now.along.gap[rows] + moved - deviation[rows + 1]
-        effect = np.sqrt(np.mean(((np.abs(moved) + np.abs(deviation[rows + 1])) / scale) ** 2))
-        # A filter's gaps are its corrections at each sample, which both kinds of noise ask for anyway.
-        usual = np.sqrt(np.mean((now.along.gap[rows] / scale) ** 2)) if self.filtered else 0.0
-        length = 1.0
-        while length >= SHORTEST_STEP:
-            values = _changed(self.model, now.values, length * change)
-            x = now.x + length * deviation
-            along = self.linearised(values, x, spread, noise)
-            if along.finite:
-                expected = (1 - length) * now.along.gap[rows] + length * foreseen
-                unforeseen = np.sqrt(np.mean(((along.gap[rows] - expected) / scale) ** 2))
-                if unforeseen <= NONLINEAR * length * effect + HARMLESS * usual + 1e-9:
-                    return _Iterate(values, x, along, now.x + length * smoothed, spread), length
-            length /= 2
-        return None
-
-
-def _state_changes(
-    linearisation: Linearisation, data: Measurements, noise: Noise, change: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Most probable states after a change of the free parameters, see `Linearisation.smoothed`."""
-    still = with_parameters_changed(linearisation, change)
-    innovations, _, initial = still.filtered(data.first, data.step, noise.measurement, noise.intensity)[:3]
-    begin = np.empty((len(data.labels), still.gap.shape[1]))
-    for place, (start, end) in enumerate(zip(data.first[:-1], data.first[1:], strict=True)):
-        columns = initial[start:end].reshape(-1, begin.shape[1])
-        begin[place] = solve(columns, innovations[start:end].ravel(), least=INEXACT)[0]
-    return still.smoothed(data.first, data.step, noise, begin)
-
-
-def _changed(model: Dynamics, values: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Parameters' values after a change of the free ones."""
-    result = values.copy()
-    result[list(model.free)] += change
-    return result
 
 
 @dataclass(frozen=True)
@@ -492,6 +383,17 @@ class Fit:
         return bool((self.noise.process > 0).any())
 
 
+@dataclass(frozen=True)
+class _Iterate:
+    """Where a fit stands: parameters, states where f is taken, smoothed ones; covariance of a filter."""
+
+    values: np.ndarray
+    x: np.ndarray
+    along: Linearisation
+    smoothed: np.ndarray
+    spread: np.ndarray | None = None
+
+
 def fit_of_states(
     model: Dynamics, data: Measurements, *, x: np.ndarray, noise: Noise, substeps: int, converged: bool
 ) -> Fit:
@@ -509,24 +411,21 @@ def fit_of_states(
         To begin with; the measurement noise is estimated.
     """
     at = _Iterate(model.values, x, linearise(model, Grid(data, substeps), model.values, x), x)
-    if not at.along.finite:
-        return _failed_fit(model, at, noise, substeps, RUNS_AWAY)
-    try:
-        noise = _noise_along(at.along, data, noise, False, expected=Expectations.of(model))
-        return _fit_at(
-            model, data, at, noise=noise, substeps=substeps, converged=converged, resolution=INEXACT
-        )
-    except (ArithmeticError, np.linalg.LinAlgError) as error:
-        return _failed_fit(model, at, noise, substeps, str(error))
+
+    def fit() -> Fit:
+        known = _noise_along(at.along, data, noise, False, expected=Expectations.of(model))
+        return _fit_at(model, data, at, known, substeps, converged=converged, resolution=INEXACT)
+
+    return _or_fault(model, at, noise, substeps, fit)
 
 
 def _fit_at(
     model: Dynamics,
     data: Measurements,
     at: _Iterate,
-    *,
     noise: Noise,
     substeps: int,
+    *,
     converged: bool,
     resolution: float,
 ) -> Fit:
@@ -539,39 +438,173 @@ def _fit_at(
     total = float(innovations @ innovations)
     together = sum(len(each.roots) for each in model.expected_together)
     return Fit(
-        model=model.with_values(_changed(model, at.values, change if converged else 0 * change)),
-        covariance=covariance,
-        x=at.smoothed,
-        linearised_at=at.x,
-        spread=at.spread,
-        noise=noise,
-        linearisation=at.along,
-        log_likelihood=white.log_likelihood(total),
-        sum_of_squares=total,
-        degrees_of_freedom=white.degrees_of_freedom + together - len(model.free),
-        substeps=substeps,
-        converged=converged,
-    )
+        model.with_values(_changed(model, at.values, change if converged else 0 * change)), covariance,
+        at.smoothed, at.x, at.spread, noise, at.along, white.log_likelihood(total), total,
+        white.degrees_of_freedom + together - len(model.free), substeps, converged,
+    )  # fmt: skip
 
 
-def _failed_fit(model: Dynamics, at: _Iterate, noise: Noise, substeps: int, fault: str) -> Fit:
-    """A fit that has no result, and the reason; see `Fit.fault`."""
-    free = len(model.free)
+def _or_fault(model: Dynamics, begin: _Iterate, noise: Noise, substeps: int, fit: Callable[[], Fit]) -> Fit:
+    """A fit from a begin; what leads to no number is a fit with a fault."""
+    fault = "" if begin.along.finite else RUNS_AWAY
+    if not fault:
+        try:
+            return fit()
+        except (ArithmeticError, np.linalg.LinAlgError) as error:
+            fault = str(error)
     return Fit(
-        model=model,
-        covariance=np.full((free, free), np.nan),
-        x=at.smoothed,
-        linearised_at=at.x,
-        spread=at.spread,
-        noise=noise,
-        linearisation=at.along,
-        log_likelihood=-np.inf,
-        sum_of_squares=np.inf,
-        degrees_of_freedom=1,
-        substeps=substeps,
-        converged=False,
-        fault=fault,
-    )
+        model, np.full((len(model.free),) * 2, np.nan), begin.smoothed, begin.x, begin.spread, noise,
+        begin.along, -np.inf, np.inf, 1, substeps, False, fault,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Shooting:
+    """A model to be fitted, on the grid of its measurements.
+
+    Attributes
+    ----------
+    scale
+        The size of each state, shape ``(d,)``.
+    filtered
+        Whether f is taken at what a filter knows, rather than at smoothed states.
+    closed
+        f with the effect of the filter's spread on it, where that is wanted.
+    """
+
+    model: Dynamics
+    grid: Grid
+    scale: np.ndarray
+    filtered: bool = False
+    closed: ClosedFunctions | None = None
+    budget: Budget | None = None
+
+    @classmethod
+    def of(
+        cls, model: Dynamics, data: Measurements, x: np.ndarray, substeps: int | None, **options: Any
+    ) -> _Shooting:
+        """With as many substeps as the accuracy needs, where it is not said how many."""
+        if substeps is None:
+            substeps = substeps_needed(model, data, model.values, x, tolerance=SUBSTEP_ERROR)
+        about_zero = 2 * np.where(x.any(axis=0), np.abs(x).max(axis=0), 1.0)
+        wide = np.ptp(model.limits, axis=1)
+        resting = RESTING * np.where(np.isfinite(wide), wide, about_zero)
+        return cls(model, Grid(data, substeps), np.maximum(x.std(axis=0), resting), **options)
+
+    @property
+    def resolution(self) -> float:
+        """Least relative singular value with which effects of parameters are distinct; see `solve`."""
+        return RANK if self.filtered else INEXACT
+
+    def charge(self, evaluations: float = 1.0) -> None:
+        """Count evaluations of the likelihood."""
+        if self.budget is not None:
+            self.budget.charge(evaluations * evaluation(self.model, self.grid.data))
+
+    def linearised(
+        self, values: np.ndarray, x: np.ndarray, spread: np.ndarray | None, noise: Noise
+    ) -> Linearisation:
+        """At parameters ``(p,)`` and states ``(n, d)``."""
+        self.charge(self.grid.substeps)
+        if self.closed is None or spread is None:
+            return linearise(self.model, self.grid, values, x)
+        rows, data = self.grid.rows, self.grid.data
+        intensity = noise.intensity if len(noise.intensity) == 1 else noise.intensity[rows]
+        # In the middle of an interval noise of half of it is added.
+        drift = self.closed.at(spread[rows] + intensity * data.step[rows][:, None, None] / 2)
+        return linearise(self.model, self.grid, values, x, drift=drift)
+
+    def noise_at(self, now: _Iterate, noise: Noise) -> Noise:
+        """The noise where a fit stands: process noise may depend on the state."""
+        if noise.field is None:
+            return noise
+        rows, middle = self.grid.rows, now.x.copy()
+        middle[rows] += (now.x[rows + 1] + now.along.gap[rows] - now.x[rows]) / 2
+        return noise.along(middle, now.spread, self.grid.data.step)
+
+    def stepped(self, now: _Iterate, change: np.ndarray, noise: Noise) -> tuple[_Iterate, float] | None:
+        """The step suggested, shortened until it does about what was foreseen, and the share taken."""
+        data = self.grid.data
+        still = now.along.with_parameters_changed(change)
+        innovations, _, initial = still.filtered(data.first, data.step, noise.measurement, noise.intensity)[
+            :3
+        ]
+        begin = np.empty((len(data.labels), still.gap.shape[1]))
+        for place, (start, end) in enumerate(zip(data.first[:-1], data.first[1:], strict=True)):
+            columns = initial[start:end].reshape(-1, begin.shape[1])
+            begin[place] = solve(columns, innovations[start:end].ravel(), least=INEXACT)[0]
+        smoothed, known, covariance = still.smoothed(data.first, data.step, noise, begin)
+        deviation = known if self.filtered else smoothed
+        spread = covariance if noise.process.any() else None
+        rows, scale = self.grid.rows, self.scale
+        moved = np.einsum("kij,kj->ki", now.along.transition[rows], deviation[rows])
+        moved += now.along.response[rows] @ change
+        foreseen = now.along.gap[rows] + moved - deviation[rows + 1]
+        effect = np.sqrt(np.mean(((np.abs(moved) + np.abs(deviation[rows + 1])) / scale) ** 2))
+        # A filter's gaps are its corrections at each sample, which both kinds of noise ask for anyway.
+        usual = np.sqrt(np.mean((now.along.gap[rows] / scale) ** 2)) if self.filtered else 0.0
+        length = 1.0
+        while length >= SHORTEST_STEP:
+            values = _changed(self.model, now.values, length * change)
+            x = now.x + length * deviation
+            along = self.linearised(values, x, spread, noise)
+            if along.finite:
+                expected = (1 - length) * now.along.gap[rows] + length * foreseen
+                unforeseen = np.sqrt(np.mean(((along.gap[rows] - expected) / scale) ** 2))
+                if unforeseen <= NONLINEAR * length * effect + HARMLESS * usual + 1e-9:
+                    return _Iterate(values, x, along, now.x + length * smoothed, spread), length
+            length /= 2
+        return None
+
+    def descended(self, now: _Iterate, noise: Noise, *, estimate_process: bool, most: int) -> Fit:
+        """Gauss–Newton steps from a begin, at most so many."""
+        data, model = self.grid.data, self.model
+        before: np.ndarray | None = None
+        totals: list[float] = []
+        converged, settled_noise, whole = False, False, False
+        for iteration in range(most):
+            noise = self.noise_at(now, noise)
+            expected = Expectations.of(model, now.values)
+            if iteration in (0, 2) or settled_noise:
+                noise = _noise_along(
+                    now.along, data, noise, estimate_process, expected=expected, charge=self.charge,
+                    coarse=not settled_noise,
+                )  # fmt: skip
+            self.charge()
+            white = whiten(now.along, data, noise)
+            columns, innovations = expected.stacked_on(white.columns, white.innovations)
+            change, _ = solve(columns, innovations, least=self.resolution)
+            explained = white.columns @ change
+            left = white.innovations - explained
+            settled = SETTLED * len(left) * max(1.0, (left**2).sum() / len(left))
+            # A shortened step leaves much of what is foreseen undone, and the forecast unchanged. So does a
+            # whole one where effects are so curved that steps go to and fro: the states in hand have to be as
+            # likely as the forecast is, since it is they that the likelihood is of.
+            if (
+                before is not None
+                and whole
+                and ((left - before) ** 2).sum() < settled
+                and explained @ explained < (FINE if self.filtered else settled)
+            ):
+                if settled_noise:
+                    converged = True
+                    break
+                settled_noise = True
+            before = left
+            totals.append(float(white.innovations @ white.innovations))
+            if len(totals) > PATIENCE and settled_noise is False and _stands_still(totals):
+                settled_noise = True
+            elif len(totals) > 2 * PATIENCE and _stands_still(totals):
+                converged = True
+                break
+            step = self.stepped(now, change, noise)
+            if step is None:
+                break
+            now, length = step
+            whole = length == 1.0
+        return _fit_at(
+            model, data, now, noise, self.grid.substeps, converged=converged, resolution=self.resolution
+        )
 
 
 def fit_by_multiple_shooting(
@@ -618,16 +651,16 @@ def fit_by_multiple_shooting(
         When nothing is left of what is allowed.
     """
     with np.errstate(all="ignore"):  # what runs away is told as a fault
-        if substeps is None:
-            substeps = substeps_needed(model, data, model.values, x, tolerance=SUBSTEP_ERROR)
-        grid = Grid(data, substeps)
-        begin = _Iterate(model.values, x, linearise(model, grid, model.values, x), x)
-        shooting = _Shooting(model, grid, _sizes(model, x), budget=budget)
-        fit = _gauss_newton(shooting, begin, noise, estimate_process=estimate_process, most=iterations)
+        shooting = _Shooting.of(model, data, x, substeps, budget=budget)
+        begin = _Iterate(model.values, x, linearise(model, shooting.grid, model.values, x), x)
+        fit = _or_fault(
+            model, begin, noise, shooting.grid.substeps,
+            lambda: shooting.descended(begin, noise, estimate_process=estimate_process, most=iterations),
+        )  # fmt: skip
     if not (fit.converged and fit.has_process_noise):
         return fit
     return fit_by_filter(
-        fit.model, data, x=fit.x, noise=fit.noise, estimate_process=estimate_process, substeps=substeps,
+        fit.model, data, x=fit.x, noise=fit.noise, estimate_process=estimate_process, substeps=fit.substeps,
         iterations=iterations, closure=False, budget=budget,
     )  # fmt: skip
 
@@ -662,79 +695,15 @@ def fit_by_filter(
         See there.
     """
     with np.errstate(all="ignore"):  # what runs away is told as a fault
-        if substeps is None:
-            substeps = substeps_needed(model, data, model.values, x, tolerance=SUBSTEP_ERROR)
-        closed = ClosedFunctions(model) if closure else None
         if not estimate_sensor:
             data = replace(data, sensor_noise=noise.measurement)
-        shooting = _Shooting(
-            model, Grid(data, substeps), _sizes(model, x), filtered=True, closed=closed, budget=budget
-        )
+        closed = ClosedFunctions(model) if closure else None
+        shooting = _Shooting.of(model, data, x, substeps, filtered=True, closed=closed, budget=budget)
         begin = _Iterate(model.values, x, shooting.linearised(model.values, x, None, noise), x)
-        return _gauss_newton(shooting, begin, noise, estimate_process=estimate_process, most=iterations)
-
-
-def _gauss_newton(
-    shooting: _Shooting, begin: _Iterate, noise: Noise, *, estimate_process: bool, most: int
-) -> Fit:
-    """Gauss–Newton steps from a begin; what leads to no number is a fit with a fault."""
-    if not begin.along.finite:
-        return _failed_fit(shooting.model, begin, noise, shooting.grid.substeps, RUNS_AWAY)
-    try:
-        return _descended(shooting, begin, noise, estimate_process=estimate_process, most=most)
-    except (ArithmeticError, np.linalg.LinAlgError) as error:
-        return _failed_fit(shooting.model, begin, noise, shooting.grid.substeps, str(error))
-
-
-def _descended(shooting: _Shooting, now: _Iterate, noise: Noise, *, estimate_process: bool, most: int) -> Fit:
-    data, model = shooting.grid.data, shooting.model
-    before: np.ndarray | None = None
-    totals: list[float] = []
-    converged, settled_noise, whole = False, False, False
-    for iteration in range(most):
-        noise = shooting.noise_at(now, noise)
-        expected = Expectations.of(model, now.values)
-        if iteration in (0, 2) or settled_noise:
-            noise = _noise_along(
-                now.along, data, noise, estimate_process, expected=expected, charge=shooting.charge,
-                coarse=not settled_noise,
-            )  # fmt: skip
-        shooting.charge()
-        white = whiten(now.along, data, noise)
-        columns, innovations = expected.stacked_on(white.columns, white.innovations)
-        change, _ = solve(columns, innovations, least=shooting.resolution)
-        explained = white.columns @ change
-        left = white.innovations - explained
-        settled = SETTLED * len(left) * max(1.0, (left**2).sum() / len(left))
-        # A shortened step leaves much of what is foreseen undone, and the forecast unchanged. So does a whole
-        # one where effects are so curved that steps go to and fro: the states in hand have to be as likely
-        # as the forecast is, since it is they that the likelihood is of.
-        if (
-            before is not None
-            and whole
-            and ((left - before) ** 2).sum() < settled
-            and explained @ explained < (FINE if shooting.filtered else settled)
-        ):
-            if settled_noise:
-                converged = True
-                break
-            settled_noise = True
-        before = left
-        totals.append(float(white.innovations @ white.innovations))
-        if len(totals) > PATIENCE and settled_noise is False and _stands_still(totals):
-            settled_noise = True
-        elif len(totals) > 2 * PATIENCE and _stands_still(totals):
-            converged = True
-            break
-        step = shooting.stepped(now, change, noise)
-        if step is None:
-            break
-        now, length = step
-        whole = length == 1.0
-    return _fit_at(
-        model, data, now, noise=noise, substeps=shooting.grid.substeps, converged=converged,
-        resolution=shooting.resolution,
-    )  # fmt: skip
+        return _or_fault(
+            model, begin, noise, shooting.grid.substeps,
+            lambda: shooting.descended(begin, noise, estimate_process=estimate_process, most=iterations),
+        )  # fmt: skip
 
 
 def _stands_still(totals: list[float]) -> bool:
@@ -743,8 +712,8 @@ def _stands_still(totals: list[float]) -> bool:
     return max(recent) - min(recent) < STANDSTILL * max(recent)
 
 
-def _sizes(model: Dynamics, x: np.ndarray) -> np.ndarray:
-    """By how much each state varies, shape ``(d,)``; not zero where one rests."""
-    about_zero = 2 * np.where(x.any(axis=0), np.abs(x).max(axis=0), 1.0)
-    wide = np.ptp(model.limits, axis=1)
-    return np.maximum(x.std(axis=0), RESTING * np.where(np.isfinite(wide), wide, about_zero))
+def _changed(model: Dynamics, values: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Parameters' values after a change of the free ones."""
+    result = values.copy()
+    result[list(model.free)] += change
+    return result

@@ -351,11 +351,6 @@ class Expectations:
     deviations: np.ndarray
 
     @classmethod
-    def none(cls) -> Expectations:
-        """Of parameters of which nothing is expected."""
-        return cls(np.zeros((0, 0)), np.zeros(0))
-
-    @classmethod
     def of(cls, model: Dynamics, values: np.ndarray | None = None) -> Expectations:
         """Those of a model's free parameters, each by itself, and of several together.
 

@@ -16,93 +16,18 @@ import scipy.stats
 
 from siq.errors import NumericalFailure
 from siq.inference.budget import COMPILATION, Budget, evaluation
-from siq.inference.kalman_filter import (
-    Grid,
-    Noise,
-    profile_likelihood,
-    solve,
-    whiten,
-    with_parameters_changed,
-)
-from siq.inference.maximum_likelihood import (
-    Fit,
-    NoiseCoordinates,
-    first_noise,
-    fit_by_multiple_shooting,
-    log_likelihood,
-)
+from siq.inference.kalman_filter import Grid, Noise, profile_likelihood, solve, whiten
+from siq.inference.maximum_likelihood import Fit, first_noise, fit_by_multiple_shooting
 from siq.inference.measurements import Measurements, first_states
 from siq.inference.trajectories import EDGE_SUBSTEPS, fit_trajectories, jumps_of, run, sharpened, spread_edges
 from siq.systems.dynamics import Dynamics
 
-LOGARITHM_STEP = 0.05  # numerical: of the logarithm of a variance, for differences of the likelihood
-MAX_ERROR = (
-    1.0  # standard error of a logarithm beyond which the likelihood is no parabola: a bound is far off
-)
 DECADES = 14  # of strengths that are looked through, downwards from noise that would make all of the motion
 POINTS = 16  # of the average
 UNLIKELY = 8.0  # logarithm of a likelihood, relative to the largest, that adds nothing to an average
 THRESHOLD = 1e-4  # probability by chance, below which process noise is believed
 FAINT = 1e-4  # process noise, relative to the motion, from which a fit without any is loosened
 BETTER = 0.5  # of a log-likelihood: what half a parameter gains by chance, below which two fits are one
-
-
-def noise_uncertainty(fit: Fit, data: Measurements) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Errors of the noise of a fit, by the curvature of the likelihood along its trajectories.
-
-    Returns
-    -------
-    measurement, process
-        Standard errors of the logarithms of the sensors' variances ``(m,)``, and of the intensities of the
-        process noise ``(d,)``: infinite where one is only bounded from above, zero where it was given.
-    covariance
-        Of the free parameters, with what the noise leaves open in them, shape ``(p, p)``.
-    """
-    coordinates = NoiseCoordinates(fit.noise, data.known_sensors)
-    line = fit.linearisation
-    white = whiten(line, data, fit.noise)
-    still = with_parameters_changed(line, solve(white.columns, white.innovations)[0])
-    outputs = len(coordinates.known)
-    places = [k for k in range(coordinates.size) if k >= outputs or not coordinates.known[k]]
-
-    def moved(*changes: tuple[int, float]) -> Noise:
-        vector = np.zeros(coordinates.size)
-        for place, change in changes:
-            vector[place] += change
-        return coordinates.noise_at(vector)
-
-    def value(*changes: tuple[int, float]) -> float:
-        return log_likelihood(still, data, moved(*changes))
-
-    middle, h = value(), LOGARITHM_STEP
-    single = {k: (value((k, h)), value((k, -h))) for k in places}
-    curvature = np.diag([(2 * middle - single[k][0] - single[k][1]) / h**2 for k in places])
-    for row, one in enumerate(places):
-        for column, other in enumerate(places[:row]):
-            both = value((one, h), (other, h)) + value((one, -h), (other, -h))
-            apart = value((one, h), (other, -h)) + value((one, -h), (other, h))
-            curvature[row, column] = curvature[column, row] = (apart - both) / (4 * h**2)
-    told = np.diag(curvature) > 1 / MAX_ERROR**2
-    errors = np.full(coordinates.size, np.inf)
-    errors[:outputs][coordinates.known] = 0.0
-    inside = [place for place, known in zip(places, told, strict=True) if known]
-    covariance = fit.covariance
-    if inside:
-        of_noise = np.linalg.pinv(curvature[np.ix_(told, told)], hermitian=True)
-        errors[inside] = np.sqrt(np.maximum(np.diag(of_noise), 0.0))
-        changes = []
-        for place in inside:
-            ends = []
-            for sign in (1, -1):
-                white = whiten(line, data, moved((place, sign * h)))
-                ends.append(solve(white.columns, white.innovations)[0])
-            changes.append((ends[0] - ends[1]) / (2 * h))
-        slope = np.stack(changes, axis=1)
-        covariance = covariance + slope @ of_noise @ slope.T
-    driven = coordinates.driven
-    process = np.zeros_like(fit.noise.process)
-    process[driven] = errors[outputs : outputs + len(driven)]
-    return errors[:outputs], process, covariance
 
 
 def covariance_with_unknown_process_noise(
@@ -303,8 +228,8 @@ def drop_insignificant_process_noise(fit: Fit, data: Measurements) -> Fit | None
     likelier than the one that another way of fitting ends in.
     """
     still = fit.noise.without_process()
-    held = with_parameters_changed(fit.linearisation, np.zeros(len(fit.model.free)))
-    with_them, alone = (log_likelihood(held, data, noise) for noise in (fit.noise, still))
+    held = fit.linearisation.with_parameters_changed(np.zeros(len(fit.model.free)))
+    with_them, alone = (held.log_likelihood(data.first, data.step, noise) for noise in (fit.noise, still))
     if not 2 * (with_them - alone) <= least_to_believe(fit.noise):
         return None
     return replace(fit, noise=still, log_likelihood=fit.log_likelihood - (with_them - alone))

@@ -9,9 +9,8 @@ import sympy
 from siq.data.recordings import Recordings
 from siq.inference import kalman_filter
 from siq.inference.kalman_filter import ClosedFunctions, Noise
-from siq.inference.maximum_likelihood import Fit, fit_by_filter
+from siq.inference.maximum_likelihood import Fit, fit_by_filter, noise_uncertainty
 from siq.inference.measurements import Measurements, measurements
-from siq.inference.recalibration import noise_uncertainty
 from siq.systems.dynamics import Dynamics, Parameter, Signals
 
 pytestmark = pytest.mark.portable

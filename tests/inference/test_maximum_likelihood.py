@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from siq.inference.kalman_filter import Grid, Noise, linearise, whiten, with_parameters_changed
+from siq.inference.kalman_filter import Grid, Linearisation, Noise, linearise, whiten
 from siq.inference.maximum_likelihood import (
     Fit,
     _estimate_noise,
     first_noise,
     fit_by_multiple_shooting,
-    log_likelihood,
 )
-from siq.inference.measurements import Measurements, _course_of_input, first_states
+from siq.inference.measurements import Expectations, Measurements, _course_of_input, first_states
 from siq.numerics.files import Document, validate
 from siq.systems.cards import SystemCard, build_system
 from siq.systems.dynamics import Dynamics
@@ -32,6 +31,10 @@ OSCILLATOR = {
     "outputs": {"x": "x"},
 }
 STEP = 0.25
+
+
+def log_likelihood(line: Linearisation, data: Measurements, noise: Noise) -> float:
+    return line.log_likelihood(data.first, data.step, noise)
 
 
 def model_of(card: dict) -> Dynamics:
@@ -176,7 +179,7 @@ def test_smoothed_states_are_the_conditional_means(linearised) -> None:
     data, line, noise = linearised
     begin = np.array([[0.1, -0.2], [0.0, 0.3]])
     process = process_covariance(line.transition, data.step, noise.intensity)
-    still = with_parameters_changed(line, np.zeros(2))
+    still = line.with_parameters_changed(np.zeros(2))
     found, _, _ = still.smoothed(data.first, data.step, noise, begin)
     # The same minimum, written as least squares over all realisations of the process noise.
     rows = len(data.t)
@@ -233,7 +236,7 @@ def test_random_forces_are_measured_and_do_not_bias_the_parameters() -> None:
 def test_the_search_for_noise_ends_where_the_likelihood_is_highest() -> None:
     data = oscillations(recordings=6, samples=60, noise=0.03, seed=4, drive=0.02)
     found = fitted(data, estimate_process=True)
-    best = _estimate_noise(found.linearisation, data, found.noise)
+    best = _estimate_noise(found.linearisation, data, found.noise, expected=Expectations.of(found.model))
     top = log_likelihood(found.linearisation, data, best)
     for factor in (0.7, 1.4):
         assert log_likelihood(found.linearisation, data, best.scaled(factor)) < top
@@ -247,8 +250,9 @@ def test_of_many_samples_some_tell_the_noise_and_all_correct_it() -> None:
     x = first_states(model, data)
     line, start = linearise(model, Grid(data, 1), model.values, x), first_noise(model, data, x)
     work: list[float] = []
-    best = _estimate_noise(line, data, start, charge=work.append)
-    rough = _estimate_noise(line, data, start, coarse=True)
+    expected = Expectations.of(model)
+    best = _estimate_noise(line, data, start, expected=expected, charge=work.append)
+    rough = _estimate_noise(line, data, start, expected=expected, coarse=True)
     top = log_likelihood(line, data, best)
     assert log_likelihood(line, data, rough) < top
     assert rough.measurement == pytest.approx(best.measurement, rel=0.1)
