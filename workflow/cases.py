@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.publication.public_recordings import BENCHMARKS
 from siq.errors import InputError
 from siq.numerics.files import CARD, RECORDINGS, Document, case_folders, read_document, validate
 from siq.systems.cards import SystemCard
 from workflow.places import config_path, find_file, needed_file, system_card
-from workflow.reproduction.public_recordings import BENCHMARKS
 
 MADE = "results/recordings"
 STUDY = "study.yaml"

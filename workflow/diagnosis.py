@@ -21,14 +21,6 @@ COMPARED = {"missing physics": ("recalibrated", "augmented"), "parameter shift":
 """Which two simulations have landscapes to be compared, by the verdict."""
 
 
-@task("file")
-def benchmark_recordings(given: Given, settings: PipelineSettings) -> Any:
-    """The recordings of a public benchmark, from its file as downloaded."""
-    from workflow.reproduction.public_recordings import BENCHMARKS
-
-    return {"recordings": BENCHMARKS[given.wildcards["benchmark"]].read(given.files["file"])}
-
-
 @task("card", "recordings", "study")
 def diagnosis(given: Given, settings: PipelineSettings) -> Any:
     """Where a simulation and recordings differ, and what was left out; no fit is a verdict, too."""
@@ -214,41 +206,3 @@ def mismatch_page(given: Given, settings: PipelineSettings) -> Any:
     found = f"# the simulation with what was found, a system card like any other: {given.files['system']}"
     html = rendered(findings, title=title, commands=[given.options["command"], found])
     return {"html": html, "answer": mismatch_answer(findings.statement, title=title)}
-
-
-@task("card", "recordings", "study", "recalibrated", "system", "noise")
-def official_tests(given: Given, settings: PipelineSettings) -> Any:
-    """How far simulations of a public benchmark are off in its official tests, in its own units."""
-    from siq.diagnosis.study import read_case
-    from workflow.reproduction.official_scores import official_tables
-    from workflow.reproduction.public_recordings import BENCHMARKS
-
-    case = read_case(given.files["card"], given.files["recordings"], given.path("study"))
-    noise = given.noise
-    own = noise[(noise["stage"] == "recalibrated") & (noise["kind"] == "measurement")]
-    errors, runs = official_tables(
-        BENCHMARKS[given.options["benchmark"]],
-        {"recalibrated": given.recalibrated, "augmented": given.system},
-        case.kept,
-        variance=own["variance"].to_numpy(float),
-    )
-    return {"table": errors, "runs": runs}
-
-
-@task("tables", "runs", "verdict", "system")
-def official_summary(given: Given, settings: PipelineSettings) -> Any:
-    """The official tests of all benchmarks: one table, and a figure of each."""
-    import pandas as pd
-
-    from workflow.reproduction.official_tests import official_page, official_rows
-    from workflow.reproduction.plots import plot_official_tests
-    from workflow.reproduction.public_recordings import BENCHMARKS
-
-    names, drawn = given.options["benchmarks"], {}
-    for name, runs, system in zip(names, given.runs, given.system, strict=True):
-        unit = BENCHMARKS[name].unit if BENCHMARKS[name].factor == 1 else system.units[0]
-        drawn[name] = plot_official_tests(runs, unit=unit, time_unit=system.time_unit)
-    rows = [official_rows(name, table) for name, table in zip(names, given.tables, strict=True)]
-    table = pd.concat(rows, ignore_index=True)
-    verdicts = dict(zip(names, given.verdict, strict=True))
-    return {"table": table, "page": official_page(table, verdicts), "figures": drawn}

@@ -269,29 +269,3 @@ def equations_page(given: Given, settings: PipelineSettings) -> Any:
     content = study_page(study, results, command=command, versions=versions)
     answer = answer_data(content, study, results)
     return {"html": render_report(content), "answer": answer, "figures": gathered}
-
-
-@task("summaries", "reports", "published", "card", "contents", "parameters", "contradictions")
-def reproduction(given: Given, settings: PipelineSettings) -> Any:
-    """Everything in the paper on one page, with ours beside it."""
-    import yaml
-    from pydantic import TypeAdapter
-
-    from workflow.reproduction import ReproductionSettings
-    from workflow.reproduction.page import Paper, Results, render_reproduction, reproduction_page
-    from workflow.reproduction.publication import load_contents, load_parameters
-
-    source = given.files
-    told = TypeAdapter(dict[str, ReproductionSettings]).validate_python(given.options["studies"])
-    rows = zip(given.options["names"], source["summaries"], given.published, given.card, strict=True)
-    studies = {
-        name: Results(name, Path(summary).parents[1], told[name], published.figures, system)
-        for name, summary, published, system in rows
-    }
-    paper = Paper(
-        load_contents(source["contents"]).places,
-        load_parameters(source["parameters"]),
-        yaml.safe_load(Path(source["contradictions"]).read_text(encoding="utf-8")),
-    )
-    content, table = reproduction_page(paper, studies, told, command="snakemake --cores 2 reproduce")
-    return {"html": render_reproduction(content), "csv": table.to_csv(index=False)}

@@ -16,15 +16,16 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from benchmarks.proof import tasks as proof
+from benchmarks.publication import tasks as publication
 from siq.errors import InputError
 from siq.workflow import steps
 from siq.workflow.tasks import TASKS, Given, outputs_of
 from workflow import diagnosis, pages
-from workflow.proof import tasks as proof
 
 __all__ = ["TASKS", "Job", "run"]
 
-MODULES = (steps, pages, diagnosis, proof)
+MODULES = (steps, pages, diagnosis, proof, publication)
 """Whose tasks there are."""
 
 FOLLOWED = "SIQ_FOLLOWED"

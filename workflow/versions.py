@@ -150,7 +150,7 @@ def _named_code(file: Path) -> str:
 def _files(module: str) -> list[Path]:
     """The files of a module of this project, and of the packages that it lies in."""
     parts, files = module.split("."), []
-    if parts[0] not in ("siq", "workflow"):
+    if parts[0] not in ("siq", "workflow", "benchmarks"):
         return []
     folder = LIBRARY if parts[0] == "siq" else BASE
     for length in range(1, len(parts) + 1):

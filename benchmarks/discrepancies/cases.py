@@ -13,12 +13,12 @@ from tempfile import TemporaryDirectory
 
 from pydantic import BaseModel, ConfigDict
 
+from benchmarks.proof.batches import Generator, check_digests, read_digests, write_batch
+from benchmarks.proof.concealment import cases as concealment
+from benchmarks.proof.foreign import cases as foreign
+from benchmarks.proof.sets import ProofSet
 from siq.diagnosis.study import Comparison, read_case
 from siq.numerics.files import read_document, validate, whole_file
-from workflow.proof.batches import Generator, check_digests, read_digests, write_batch
-from workflow.proof.concealment import cases as concealment
-from workflow.proof.foreign import cases as foreign
-from workflow.proof.sets import ProofSet
 
 GENERATORS: Mapping[str, Generator] = {"concealment": concealment, "foreign": foreign}
 

@@ -6,12 +6,12 @@ import time
 from dataclasses import replace
 
 from benchmarks.discrepancies.answers import Answer
+from benchmarks.proof.foreign_scores.rulers import said_place
+from benchmarks.proof.scoring import NOTHING
 from siq.diagnosis.diagnosis import solve_case
 from siq.diagnosis.study import Allowance, Comparison
 from siq.diagnosis.verdict import statement_of_failure
 from siq.errors import NumericalFailure
-from workflow.proof.foreign_scores.rulers import said_place
-from workflow.proof.scoring import NOTHING
 
 SEARCHING = 0.6  # of the time allowed: what follows the search is not cut short
 

@@ -14,16 +14,16 @@ from benchmarks.discrepancies.added import Added
 from benchmarks.discrepancies.answers import Answer, Term, answer_file, read_answer
 from benchmarks.discrepancies.cases import CaseFiles
 from benchmarks.discrepancies.truth import TrueCase, true_case
+from benchmarks.proof.foreign_scores.rulers import NEAR, name_error, true_place, unreal_names
+from benchmarks.proof.foreign_scores.scores import first_states
+from benchmarks.proof.keys import CaseKey, read_key, read_truth
+from benchmarks.proof.scoring import NOISE, NOTHING_CONCEALED, judgement, model_of
+from benchmarks.proof.scoring import Answer as ProofAnswer
 from siq.diagnosis.study import Comparison
 from siq.errors import NumericalFailure
 from siq.inference.recalibration import recalibrate
 from siq.systems.dynamics import Dynamics
 from siq.workflow.tables import write_table
-from workflow.proof.foreign_scores.rulers import NEAR, name_error, true_place, unreal_names
-from workflow.proof.foreign_scores.scores import first_states
-from workflow.proof.keys import CaseKey, read_key, read_truth
-from workflow.proof.scoring import NOISE, NOTHING_CONCEALED, judgement, model_of
-from workflow.proof.scoring import Answer as ProofAnswer
 
 CARD = "card alone"
 """The row of the recalibrated card, to which nothing was added."""

@@ -13,7 +13,7 @@ INSIDE = 1e-9  # of a step, by which an input is read within it: it may jump at 
 
 
 class Simulation:
-    """A simulation of recordings by any mended card; see `workflow.proof.foreign_scores.oracle.Simulator`.
+    """A simulation of recordings by any mended card; see `benchmarks.proof.foreign_scores.oracle.Simulator`.
 
     Parameters
     ----------

@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.discrepancies.scores import CARD, CONCEALING
+from benchmarks.proof.scoring import NOISE, NOTHING_CONCEALED
 from siq.workflow.tables import read_table, write_table
-from workflow.proof.scoring import NOISE, NOTHING_CONCEALED
 
 GENERATORS = {"concealment": "named physics", "foreign": "drawn functions"}
 

@@ -11,11 +11,11 @@ import sympy
 from benchmarks.discrepancies.added import Added
 from benchmarks.discrepancies.regression import DEGREE
 from benchmarks.discrepancies.simulation import Simulation
+from benchmarks.proof.foreign_scores.oracle import free_errors, true_simulation
+from benchmarks.proof.keys import CaseKey, Truth
+from benchmarks.proof.oracle import oracle_of, true_model
 from siq.diagnosis.study import Comparison
 from siq.systems.dynamics import Dynamics, symbol
-from workflow.proof.foreign_scores.oracle import free_errors, true_simulation
-from workflow.proof.keys import CaseKey, Truth
-from workflow.proof.oracle import oracle_of, true_model
 
 Terms = frozenset[tuple[str, tuple[int, ...]]]
 FAINT = 1e-9  # of a coefficient in the largest, below which it is rounding

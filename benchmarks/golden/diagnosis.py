@@ -9,9 +9,9 @@ from typing import Any
 
 import siq
 from benchmarks.golden.table import tolerated
-from workflow.proof.batches import write_batch
-from workflow.proof.concealment import cases as concealment
-from workflow.proof.foreign import cases as foreign
+from benchmarks.proof.batches import write_batch
+from benchmarks.proof.concealment import cases as concealment
+from benchmarks.proof.foreign import cases as foreign
 
 SEED = 20261124
 WORK = 6e8  # allowed, a dozen seconds of a core: that of some cases is cut short, always at the same place

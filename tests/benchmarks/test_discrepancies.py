@@ -21,10 +21,10 @@ from benchmarks.discrepancies.scores import COLUMNS, judged, place_right, write_
 from benchmarks.discrepancies.segments import segments_of
 from benchmarks.discrepancies.simulation import Simulation
 from benchmarks.discrepancies.truth import TrueCase, effect_terms
+from benchmarks.proof.foreign_scores.integrator import Integrator
+from benchmarks.proof.keys import CaseKey, KeyEffect, KeySensors, Truth
 from siq.diagnosis.study import Comparison, MismatchStudy, comparison_of
 from siq.systems.dynamics import Parameter
-from workflow.proof.foreign_scores.integrator import Integrator
-from workflow.proof.keys import CaseKey, KeyEffect, KeySensors, Truth
 
 STIFFENING, STIFF, DAMPED = 25.0, 20.0, 0.4
 STEP, SAMPLES, NOISE = 0.06, 120, 0.01

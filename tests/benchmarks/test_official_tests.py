@@ -6,13 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from benchmarks.publication.official_scores import official_tables, scored_run
+from benchmarks.publication.official_tests import official_page, official_rows
+from benchmarks.publication.public_recordings import Benchmark, OfficialTest, PublishedError
 from siq.data.recordings import Recordings
 from siq.inference.measurements import Measurements, measurements
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
-from workflow.reproduction.official_scores import official_tables, scored_run
-from workflow.reproduction.official_tests import official_page, official_rows
-from workflow.reproduction.public_recordings import Benchmark, OfficialTest, PublishedError
 
 CARD = """\
 name: decay
@@ -93,7 +93,7 @@ def test_one_table_says_whose_figure_is_whose_and_how_it_was_scored(decay):
 
 
 def test_runs_are_drawn_with_few_points_and_lose_no_extreme():
-    from workflow.reproduction.plots import FINE, envelope, plot_official_tests
+    from benchmarks.publication.plots import FINE, envelope, plot_official_tests
 
     values = np.zeros(50_000)
     values[31_234] = 3.0

@@ -8,8 +8,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from benchmarks.publication.public_recordings import (
+    BENCHMARKS,
+    SILVERBOX_TRAINING,
+    read_silverbox,
+    read_tanks,
+)
 from siq.errors import InputError
-from workflow.reproduction.public_recordings import BENCHMARKS, SILVERBOX_TRAINING, read_silverbox, read_tanks
 
 REST = 0.006  # V that the generator gives while it is silent
 

@@ -11,6 +11,7 @@ import pytest
 import sympy
 from markupsafe import Markup
 
+from benchmarks.publication.page import ReproductionContent, ReproductionSection, render_reproduction
 from siq.report.formatting import formula_mathml
 from siq.report.page import (
     Badge,
@@ -21,7 +22,6 @@ from siq.report.page import (
     ReportTable,
     render_report,
 )
-from workflow.reproduction.page import ReproductionContent, ReproductionSection, render_reproduction
 
 HOSTILE = "<script>alert('x')</script> & \"quoted\""
 EMPTY_ELEMENTS = {"meta", "img"}

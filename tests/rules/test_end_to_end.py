@@ -6,14 +6,14 @@ import re
 import pandas as pd
 import pytest
 
+from benchmarks.publication import ReproductionSettings
+from benchmarks.publication.page import Paper, Results, render_reproduction, reproduction_page
+from benchmarks.publication.publication import Parameters, Place
 from siq.quasipotential.formulas import read_model
 from siq.systems.cards import load_system
 from siq.workflow.published import load_published
 from siq.workflow.study import completed, load_study, settings_of
 from siq.workflow.tables import COLUMNS
-from workflow.reproduction import ReproductionSettings
-from workflow.reproduction.page import Paper, Results, render_reproduction, reproduction_page
-from workflow.reproduction.publication import Parameters, Place
 
 pytestmark = pytest.mark.workflow
 

@@ -3,7 +3,7 @@
 import pandas as pd
 import pytest
 
-from workflow.proof.foreign_scores.scores import COLUMNS
+from benchmarks.proof.foreign_scores.scores import COLUMNS
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 

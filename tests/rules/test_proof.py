@@ -5,8 +5,8 @@ import json
 import pandas as pd
 import pytest
 
-from workflow.proof.concealment.cases import CaseDesign, make_case
-from workflow.proof.scoring import COLUMNS
+from benchmarks.proof.concealment.cases import CaseDesign, make_case
+from benchmarks.proof.scoring import COLUMNS
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 

@@ -1,5 +1,5 @@
 # What the rules of a diagnosis share: cases and their files.
-from workflow.reproduction.public_recordings import BENCHMARKS
+from benchmarks.publication.public_recordings import BENCHMARKS
 from workflow.cases import Cases
 
 MISMATCH_TABLES = ["curves", "candidates", "held_out", "forces", "noise"]

@@ -1,5 +1,5 @@
 # What the rules of the proofs share: sets of cases, their batches and keys.
-from workflow.proof.sets import FOREIGN, load_proofs
+from benchmarks.proof.sets import FOREIGN, load_proofs
 
 try:
     PROOF_SETS = load_proofs(config_path("proof.yaml"))
