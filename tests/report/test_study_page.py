@@ -145,7 +145,7 @@ def test_every_figure_that_makes_sense_is_shown_once(tmp_path: Path, runs: int, 
     shown = [figure.alternative for section in content.sections for figure in section.figures]
     assert content.figure is not None
     shown.append(content.figure.alternative)
-    absent = {LEADING[1], "landscape_published", "record", "sweep"}  # records and sweeps have tables
+    absent = {LEADING[1], "landscape_published", "sweep"}  # sweeps have tables
     absent |= set(OF_RUNS) if runs == 1 else set()
     absent |= set() if regressed else set(OF_NETWORKS)
     texts = CAPTIONS | {"quasipotential": OF_ONE_STATE}
@@ -251,9 +251,22 @@ def test_where_nothing_hops_it_is_said(tmp_path: Path) -> None:
     assert "Against the record itself" not in headings(page_of(tmp_path, overview=WELLS))
 
 
+def test_the_test_against_the_record_is_drawn_beside_its_table(tmp_path: Path) -> None:
+    images = ("record", "states_in_time", "visited", "memory")
+    content = page_of(
+        tmp_path, overview=WELLS, record=[never()], inspection=["the noise is white."], images=images
+    )
+    assert len(content.sections[0].figures) == 3
+    (figure,) = section_of(content, "Against the record itself").figures
+    assert figure.alternative == CAPTIONS["record"]
+    assert not set(texts("captions")["inspection"]) & set(texts("captions")["figures"])
+
+
 def test_what_is_in_the_recordings_comes_first(tmp_path: Path) -> None:
     lines = ["x: 2 recordings", "the noise is white."]
-    content = page_of(tmp_path, overview=WELLS, inspection=lines, images=("record", "visited", "memory"))
+    content = page_of(
+        tmp_path, overview=WELLS, inspection=lines, images=("states_in_time", "visited", "memory")
+    )
     first = content.sections[0]
     assert first.heading == "What is in the recordings" and len(first.figures) == 3
     assert first.text == ["x: 2 recordings.", "The noise is white."]

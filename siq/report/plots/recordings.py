@@ -50,9 +50,9 @@ def plot_inspection(found: Inspection) -> Figure:
 
 
 def inspection_figures(found: Inspection) -> dict[str, Figure]:
-    """The figures of a page by name: ``record``, ``visited``, ``memory``."""
+    """The figures of a page by name: ``states_in_time``, ``visited``, ``memory``."""
     return {
-        "record": _record_figure(found),
+        "states_in_time": _record_figure(found),
         "visited": _visited_figure(found),
         "memory": _memory_figure(found),
     }
