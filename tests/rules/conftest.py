@@ -93,7 +93,7 @@ def copy_project(folder: Path) -> Project:
     for name in ("Snakefile", "pyproject.toml"):  # the latter has the version that the page tells
         shutil.copy(ROOT / name, folder)
     # The library is that of the checkout, whose compiled loops are there already.
-    for name in ("workflow", "profiles", "config"):
+    for name in ("workflow", "benchmarks", "profiles", "config"):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     return Project(folder)
 
