@@ -28,7 +28,7 @@ from siq.data.recordings import Recordings, snapshot_pairs
 from siq.networks.decomposition import TrainingOptions
 from siq.systems.cards import load_exact, load_system
 from siq.systems.formulas import compile_formulas
-from siq.systems.simulation import complete, simulate_snapshots
+from siq.systems.simulation import simulate_snapshots
 from siq.workflow.pipeline import Analysis, PipelineSettings, analyse
 from siq.workflow.study import Sampling, SimulationEntry, StateSpace
 from siq.workflow.tables import Method
@@ -44,7 +44,7 @@ def of_card(name: str) -> tuple[Recordings, PipelineSettings, sympy.Expr | None]
     """Recordings of a card, what a study of two lines says of them, and the exact V where it is known."""
     path = ROOT / "config" / "systems" / f"{name}.yaml"
     system, exact = load_system(path), load_exact(path)
-    options = complete(SimulationEntry(), system).options()
+    options = SimulationEntry().completed(system).options()
     recordings = simulate_snapshots(system, options=options, generator=np.random.default_rng(0))
     space = StateSpace(system.states, None, system.diffusion.matrix.tolist())
     settings = PipelineSettings(space=space, sampling=Sampling(options.pair_step))

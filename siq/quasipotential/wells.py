@@ -45,16 +45,7 @@ from siq.systems.cycles import Cycle
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, hessian_at, measure_at
-from siq.systems.formulas import (
-    DIGITS,
-    Formula,
-    as_latex,
-    as_sympy,
-    as_text,
-    c_source,
-    julia_source,
-    numpy_source,
-)
+from siq.systems.formulas import DIGITS, Formula
 from siq.systems.phase_portrait import PhasePortrait, RecordedRegion, states_elsewhere
 
 RESIDUAL_TOLERANCE = 0.05  # residual up to which a formula is believed: V is then off by some per cent
@@ -203,27 +194,27 @@ class Well(Expansion):
 
     def to_text(self) -> str:
         """The formula as text, a line for each definition."""
-        return as_text(self.formula)
+        return self.formula.source("text")
 
     def to_latex(self, *, digits: int = DIGITS) -> str:
         """The formula as LaTeX, with so many significant digits."""
-        return as_latex(self.formula, digits=digits)
+        return self.formula.to_latex(digits=digits)
 
     def to_sympy(self) -> sympy.Expr:
         """The formula as a sympy expression of the states."""
-        return as_sympy(self.formula)
+        return self.formula.to_sympy()
 
     def to_numpy(self) -> str:
         """Source of the functions ``V`` and ``V_gradient`` in numpy."""
-        return numpy_source(self.formula)
+        return self.formula.source("numpy")
 
     def to_c(self) -> str:
         """Source of the functions ``V`` and ``V_gradient`` in C."""
-        return c_source(self.formula)
+        return self.formula.source("c")
 
     def to_julia(self) -> str:
         """Source of the functions ``V`` and ``V_gradient`` in Julia."""
-        return julia_source(self.formula)
+        return self.formula.source("julia")
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,10 +20,13 @@ import keyword
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
+import jinja2
 import numpy as np
 import sympy
 from sympy.printing.c import C99CodePrinter, reserved_words
+from sympy.printing.codeprinter import CodePrinter
 from sympy.printing.julia import JuliaCodePrinter
 from sympy.printing.latex import LatexPrinter
 from sympy.printing.numpy import NumPyPrinter
@@ -309,20 +312,6 @@ def _short(text: str) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-LARGEST_INTEGER = 2**31  # of a C int
-
-# _Names that a state may have in a card and may not have in a program.
-_JULIA = frozenset(
-    {"abstract", "baremodule", "begin", "catch", "const", "do", "elseif", "end", "export", "false", "finally",
-     "function", "global", "import", "let", "local", "macro", "module", "mutable", "primitive", "quote",
-     "struct", "true", "try", "type", "using"}
-)  # fmt: skip
-_TAKEN = frozenset(
-    {*keyword.kwlist, *reserved_words, *_JULIA, "inline", "restrict", *FUNCTIONS, *CONSTANTS,
-     "abs", "fabs", "fmax", "fmin", "functools", "max", "min", "numpy", "pow"}
-)  # fmt: skip
-
-
 @dataclass(frozen=True, eq=False)
 class Formula:
     """A function of the states, with what others have to know of it.
@@ -354,7 +343,7 @@ class Formula:
     Examples
     --------
     >>> x = sympy.Symbol("x", real=True)
-    >>> print(as_text(Formula("V", x**2 / 2 + x**3 / 3, (x,), center=(0.5,), units=("mm",))))
+    >>> print(Formula("V", x**2 / 2 + x**3 / 3, (x,), center=(0.5,), units=("mm",)).source("text"))
     # V(x)
     # x in mm
     dx = x - 0.5
@@ -421,121 +410,136 @@ class Formula:
     @property
     def gradient(self) -> tuple[sympy.Expr, ...]:
         """Its derivatives by the states, in the symbols of `expression`; a jump counts for nothing."""
-        return tuple(_without_jumps(self.expression.diff(symbol)) for symbol in self.symbols)
+        return tuple(
+            # No peak where it jumps, and steps as signs, which every program has.
+            self.expression.diff(symbol)
+            .replace(sympy.DiracDelta, lambda *_: sympy.S.Zero)
+            .replace(sympy.Heaviside, lambda place, *_: (1 + sympy.sign(place)) / 2)
+            for symbol in self.symbols
+        )
 
     @property
     def offsets(self) -> tuple[float, ...]:
         """The center, zero where there is none."""
         return self.center or (0.0,) * len(self.symbols)
 
+    def to_sympy(self) -> sympy.Expr:
+        """The function as a sympy expression of the states."""
+        pairs = zip(self.symbols, self.offsets, strict=True)
+        return self.expression.xreplace({symbol: symbol - exact_number(at) for symbol, at in pairs if at})
 
-def as_sympy(formula: Formula) -> sympy.Expr:
-    """The formula as a sympy expression of the states."""
-    shifted = {
-        symbol: symbol - exact_number(offset)
-        for symbol, offset in zip(formula.symbols, formula.offsets, strict=True)
-        if offset
-    }
-    return formula.expression.xreplace(shifted)
+    def to_latex(self, *, digits: int = DIGITS) -> str:
+        r"""The function as LaTeX, in an ``aligned`` environment where offsets are defined as well.
 
+        Parameters
+        ----------
+        digits
+            Significant digits of its numbers, for a page that has no room for 17.
+        """
 
-def as_text(formula: Formula) -> str:
-    """The formula as text that `siq.systems.formulas.parse_formula` reads, a line for each definition."""
-    names = _Names(formula)
-    return "\n".join(
-        [f"# {line}" for line in names.header]
-        + [f"{offset} = {definition}" for offset, definition in names.definitions(_Text().doprint)]
-        + [f"{formula.name} = {_Text().doprint(formula.expression.xreplace(names.variables))}"]
-    )
+        def latex(expression: sympy.Expr) -> str:
+            rounded = {each: sympy.Float(each, digits) for each in expression.atoms(sympy.Float)}
+            return str(LatexPrinter({"full_prec": False}).doprint(expression.xreplace(rounded)))
 
+        moved = {symbol: at for symbol, at in zip(self.symbols, self.offsets, strict=True) if at}
+        offsets = {symbol: sympy.Symbol(rf"\Delta_{{{latex(symbol)}}}") for symbol in moved}
+        left, right = latex(sympy.Symbol(self.name)), latex(self.expression.xreplace(offsets))
+        if not offsets:
+            return f"{left} = {right}"
+        lines = [
+            rf"{offsets[symbol].name} &= {latex(symbol - sympy.Float(at, DIGITS))} \\"
+            for symbol, at in moved.items()
+        ]
+        return "\n".join([r"\begin{aligned}", *lines, f"{left} &= {right}", r"\end{aligned}"])
 
-def as_latex(formula: Formula, *, digits: int = DIGITS) -> str:
-    r"""The formula as LaTeX, in an ``aligned`` environment where offsets are defined as well.
+    def source(self, language: Literal["text", "numpy", "c", "julia"]) -> str:
+        """The function for other programs.
 
-    Parameters
-    ----------
-    formula
-        The formula.
-    digits
-        Significant digits of its numbers, for a page that has no room for 17.
-    """
-    left = rf"{_latex(sympy.Symbol(formula.name), digits)}"
-    offsets = {
-        symbol: sympy.Symbol(rf"\Delta_{{{_latex(symbol, digits)}}}")
-        for symbol, offset in zip(formula.symbols, formula.offsets, strict=True)
-        if offset
-    }
-    right = _latex(formula.expression.xreplace(offsets), digits)
-    if not offsets:
-        return f"{left} = {right}"
-    lines = [
-        rf"{offsets[symbol].name} &= {_latex(symbol - sympy.Float(offset, DIGITS), digits)}"
-        for symbol, offset in zip(formula.symbols, formula.offsets, strict=True)
-        if offset
-    ]
-    return "\n".join([r"\begin{aligned}", *(f"{line} \\\\" for line in lines), f"{left} &= {right}",
-                      r"\end{aligned}"])  # fmt: skip
+        Parameters
+        ----------
+        language
+            ``text``: a line for each definition, which `parse_formula` reads. ``numpy``, ``c``, ``julia``: a
+            function of the states, and one of the same name with ``_gradient``: in numpy, where both take
+            arrays as well, components come first, shape ``(d, ...)``; in C they go to the last argument.
+        """
+        printer = _PRINTERS[language]()
+        taken = {*_TAKEN, self.name, f"{self.name}_gradient"}
 
+        def free(name: str) -> str:
+            while name in taken:
+                name += "_"
+            taken.add(name)
+            return name
 
-class _Names:
-    """Names of the states and their offsets in a program, and the lines that define them."""
-
-    def __init__(self, formula: Formula) -> None:
-        self._formula = formula
-        taken = {*_TAKEN, formula.name, f"{formula.name}_gradient"}
-        self.arguments = [_free(symbol.name, taken) for symbol in formula.symbols]
-        self.result = _free("gradient", taken)
-        self.variables: dict[sympy.Symbol, sympy.Symbol] = {}
-        self._defined: list[tuple[str, sympy.Expr]] = []
-        for symbol, name, offset in zip(formula.symbols, self.arguments, formula.offsets, strict=True):
-            argument = sympy.Symbol(name, real=True)
-            if offset:
-                shifted = _free(f"d{name}", taken)
-                self._defined.append((shifted, argument - exact_number(offset)))
-                argument = sympy.Symbol(shifted, real=True)
-            self.variables[symbol] = argument
-
-    @property
-    def header(self) -> list[str]:
-        """Comment above the source: the function, and the states with their units."""
-        formula = self._formula
-        title = f": {formula.title}" if formula.title else ""
-        lines = [f"{formula.name}({', '.join(self.arguments)}){title}"]
-        units = formula.units or ("1",) * len(self.arguments)
-        lines += [f"{name} in {unit}" for name, unit in zip(self.arguments, units, strict=True)]
-        # A unit is the user's text: nothing of it may end a comment.
-        return [re.sub(r"[^\S ]+|[\\\x00-\x1f\x7f\x85\u2028\u2029]", " ", line) for line in lines]
-
-    @property
-    def ignored(self) -> list[str]:
-        """Variables that the function or its derivatives do not contain."""
-        formula = self._formula
-        common = set(formula.symbols).intersection(*(each.free_symbols for each in (
-            formula.expression, *formula.gradient)))  # fmt: skip
-        return [str(variable) for symbol, variable in self.variables.items() if symbol not in common]
-
-    def definitions(self, written: Callable[[sympy.Expr], str]) -> list[tuple[str, str]]:
-        """Offsets by name, with what they are."""
-        return [(name, written(value)) for name, value in self._defined]
+        arguments, result = [free(symbol.name) for symbol in self.symbols], free("gradient")
+        offsets: list[tuple[str, str]] = []
+        variables: dict[sympy.Symbol, sympy.Symbol] = {}
+        for symbol, name, at in zip(self.symbols, arguments, self.offsets, strict=True):
+            variable = sympy.Symbol(name, real=True)
+            if at:
+                offsets.append((free(f"d{name}"), printer.doprint(variable - exact_number(at))))
+                variable = sympy.Symbol(offsets[-1][0], real=True)
+            variables[symbol] = variable
+        functions = (self.expression, *self.gradient)
+        common = set.intersection(*(each.free_symbols for each in functions))
+        units = self.units or ("1",) * len(arguments)
+        header = [
+            f"{self.name}({', '.join(arguments)})" + (f": {self.title}" if self.title else ""),
+            *(f"{name} in {unit}" for name, unit in zip(arguments, units, strict=True)),
+        ]
+        # A sum of powers by Horner's rule, for programs that evaluate it.
+        written = functions[:1] if language == "text" else [_horner(each, self.symbols) for each in functions]
+        value, *slopes = (printer.doprint(each.xreplace(variables)) for each in written)
+        environment = jinja2.Environment(
+            loader=jinja2.PackageLoader("siq.systems"), undefined=jinja2.StrictUndefined, trim_blocks=True,
+            autoescape=False,
+        )  # fmt: skip
+        environment.filters["wrapped"] = _wrapped
+        return environment.get_template(f"formula.{language}.j2").render(
+            name=self.name, arguments=arguments, result=result, offsets=offsets, value=value, slopes=slopes,
+            # A unit is the user's text: nothing of it may end a comment.
+            header=[re.sub(r"[^\S ]+|[\\\x00-\x1f\x7f\x85\u2028\u2029]", " ", line) for line in header],
+            ignored=[str(variables[symbol]) for symbol in self.symbols if symbol not in common],
+        )  # fmt: skip
 
 
-def _free(name: str, taken: set[str]) -> str:
-    while name in taken:
-        name += "_"
-    taken.add(name)
-    return name
+LARGEST_INTEGER = 2**31  # of a C int
+
+# Names that a state may have in a card and may not have in a program.
+_JULIA = frozenset(
+    {"abstract", "baremodule", "begin", "catch", "const", "do", "elseif", "end", "export", "false", "finally",
+     "function", "global", "import", "let", "local", "macro", "module", "mutable", "primitive", "quote",
+     "struct", "true", "try", "type", "using"}
+)  # fmt: skip
+_TAKEN = frozenset(
+    {*keyword.kwlist, *reserved_words, *_JULIA, "inline", "restrict", *FUNCTIONS, *CONSTANTS,
+     "abs", "fabs", "fmax", "fmin", "functools", "max", "min", "numpy", "pow"}
+)  # fmt: skip
 
 
-def _without_jumps(expression: sympy.Expr) -> sympy.Expr:
-    """A derivative away from where it jumps: no peak there, and steps as signs, which every program has."""
-    return expression.replace(sympy.DiracDelta, lambda *_: sympy.S.Zero).replace(
-        sympy.Heaviside, lambda place, *_: (1 + sympy.sign(place)) / 2
-    )
+SOURCE_WIDTH = 100  # characters after which source goes on in the next line
 
 
-def _latex(expression: sympy.Expr, digits: int) -> str:
-    rounded = {each: sympy.Float(each, digits) for each in expression.atoms(sympy.Float)}
-    return str(LatexPrinter({"full_prec": False}).doprint(expression.xreplace(rounded)))
+def _horner(expression: sympy.Expr, symbols: Sequence[sympy.Symbol]) -> sympy.Expr:
+    """A sum of powers, as it stands, by Horner's rule; anything else with numbers in the place of π."""
+    constants = expression.atoms(sympy.NumberSymbol)
+    plain = expression.xreplace({each: sympy.Float(each, DIGITS) for each in constants})
+    powers = plain.as_poly(*symbols) if symbols else None
+    # Of a product as many terms as it has factors would be a coincidence.
+    if powers is None or len(powers.terms()) != len(sympy.Add.make_args(plain)):
+        return plain
+    return sympy.horner(powers, wrt=symbols)
+
+
+def _wrapped(source: str, indent: int) -> str:
+    """Source in lines of bearable length, each but the last ending with an operator."""
+    lines, line = [], " " * indent
+    for piece in re.split(r"(?<= [-+*/]) ", source):
+        if line.strip() and len(line) + len(piece) > SOURCE_WIDTH:
+            lines.append(line.rstrip())
+            line = " " * indent
+        line += piece + " "
+    return "\n".join([*lines, line.rstrip()])
 
 
 class _Doubles:
@@ -552,145 +556,6 @@ class _Text(_Doubles, StrPrinter):
     pass
 
 
-SOURCE_WIDTH = 100  # characters after which source goes on in the next line
-
-
-def numpy_source(formula: Formula, *, gradient: bool = True) -> str:
-    """A module of Python with the function ``V(x, y)`` of numbers or arrays, which numpy broadcasts.
-
-    Parameters
-    ----------
-    formula
-        The formula.
-    gradient
-        Whether ``V_gradient(x, y)`` is written as well: components first, shape ``(d, ...)``.
-    """
-    names = _Names(formula)
-    printer = _NumPy({"fully_qualified_modules": True, "user_functions": {}})
-    offsets = [f"    {name} = {text}" for name, text in names.definitions(printer.doprint)]
-    value, *slopes = _written(formula, names, printer.doprint)
-    arguments = ", ".join(names.arguments)
-    lines = [f"# {line}" for line in names.header]
-    lines += ["import functools", ""] if any("functools." in each for each in (value, *slopes)) else []
-    lines += ["import numpy", "", "", f"def {formula.name}({arguments}):", *offsets]
-    lines += ["    return (", *_wrapped(value, 8), "    )"]
-    if gradient:
-        lines += ["", "", f"def {formula.name}_gradient({arguments}):", *offsets]
-        lines += ["    return numpy.stack(numpy.broadcast_arrays("]
-        for slope in (*slopes, *(f"0.0*{name}" for name in names.arguments)):
-            lines += _wrapped(f"{slope},", 8)
-        lines += [f"    )[:{len(slopes)}])"]
-    return "\n".join(lines) + "\n"
-
-
-def c_source(formula: Formula, *, gradient: bool = True) -> str:
-    """C99 with the function ``double V(double x, double y)``.
-
-    Parameters
-    ----------
-    formula
-        The formula.
-    gradient
-        Whether ``void V_gradient(double x, double y, double gradient[2])`` is written as well.
-    """
-    names = _Names(formula)
-    printer = _C()
-    offsets = [f"    const double {name} = {text};" for name, text in names.definitions(printer.doprint)]
-    value, *slopes = _written(formula, names, printer.doprint)
-    arguments = ", ".join(f"double {name}" for name in names.arguments)
-    # A compiler would warn of what a formula does not contain.
-    ignored = [f"    (void){name};" for name in names.ignored]
-    lines = [f"// {line}" for line in names.header]
-    lines += ["#include <math.h>", "", f"double {formula.name}({arguments})", "{", *offsets, *ignored]
-    lines += ["    return", *_wrapped(f"{value};", 8), "}"]
-    if gradient:
-        lines += ["", f"void {formula.name}_gradient({arguments}, double {names.result}[{len(slopes)}])"]
-        lines += ["{", *offsets, *ignored]
-        for place, slope in enumerate(slopes):
-            lines += [f"    {names.result}[{place}] =", *_wrapped(f"{slope};", 8)]
-        lines += ["}"]
-    return "\n".join(lines) + "\n"
-
-
-def julia_source(formula: Formula, *, gradient: bool = True) -> str:
-    """Julia with the function ``V(x, y)`` of numbers; ``V.(x, y)`` takes arrays.
-
-    Parameters
-    ----------
-    formula
-        The formula.
-    gradient
-        Whether ``V_gradient(x, y)`` is written as well, which returns a vector.
-    """
-    names = _Names(formula)
-    printer = _Julia()
-    offsets = [f"    {name} = {text}" for name, text in names.definitions(printer.doprint)]
-    value, *slopes = _written(formula, names, printer.doprint)
-    arguments = ", ".join(names.arguments)
-    lines = [f"# {line}" for line in names.header]
-    lines += [f"function {formula.name}({arguments})", *offsets, "    return (", *_wrapped(value, 8)]
-    lines += ["    )", "end"]
-    if gradient:
-        lines += ["", f"function {formula.name}_gradient({arguments})", *offsets, "    return ["]
-        for slope in slopes:
-            lines += ["        (", *_wrapped(slope, 12), "        ),"]
-        lines += ["    ]", "end"]
-    return "\n".join(lines) + "\n"
-
-
-def _written(formula: Formula, names: _Names, written: Callable[[sympy.Expr], str]) -> list[str]:
-    """The function and its derivatives, a sum of powers by Horner's rule, and a number in the place of π."""
-    texts = []
-    for each in (formula.expression, *formula.gradient):
-        powers = _powers(each, formula.symbols)
-        if powers is not None:
-            each = _horner(powers, formula.symbols)
-        else:
-            each = each.xreplace({one: sympy.Float(one, DIGITS) for one in each.atoms(sympy.NumberSymbol)})
-        texts.append(written(each.xreplace(names.variables)))
-    return texts
-
-
-def _powers(
-    expression: sympy.Expr, symbols: Sequence[sympy.Symbol]
-) -> Mapping[tuple[int, ...], sympy.Expr] | None:
-    """Coefficients by exponents of a sum of powers as it stands, None of anything else."""
-    found: dict[tuple[int, ...], sympy.Expr] = {}
-    for term in sympy.Add.make_args(expression):
-        coefficient, function = term.as_independent(*symbols, as_Add=False)
-        parts = function.as_powers_dict()
-        parts.pop(sympy.S.One, None)
-        if not set(parts) <= set(symbols) or not all(e.is_Integer and e > 0 for e in parts.values()):
-            return None
-        exponents = tuple(int(parts.get(symbol, 0)) for symbol in symbols)
-        if exponents in found:
-            return None
-        found[exponents] = coefficient if coefficient.is_Rational else sympy.Float(float(coefficient), DIGITS)
-    return found
-
-
-def _horner(powers: Mapping[tuple[int, ...], sympy.Expr], symbols: Sequence[sympy.Symbol]) -> sympy.Expr:
-    if not symbols:
-        return sympy.Add(*powers.values())
-    highest = max((exponents[0] for exponents in powers), default=0)
-    total = sympy.S.Zero
-    for power in range(highest, -1, -1):
-        rest = {exponents[1:]: value for exponents, value in powers.items() if exponents[0] == power}
-        total = _horner(rest, symbols[1:]) + symbols[0] * total
-    return total
-
-
-def _wrapped(source: str, indent: int) -> list[str]:
-    """Source in lines of bearable length, each but the last ending with an operator."""
-    lines, line = [], " " * indent
-    for piece in re.split(r"(?<= [-+*/]) ", source):
-        if line.strip() and len(line) + len(piece) > SOURCE_WIDTH:
-            lines.append(line.rstrip())
-            line = " " * indent
-        line += piece + " "
-    return [*lines, line.rstrip()]
-
-
 class _NumPy(_Doubles, NumPyPrinter):
     pass
 
@@ -705,3 +570,8 @@ class _Julia(_Doubles, JuliaCodePrinter):
 
     def _print_Min(self, expr: sympy.Expr) -> str:  # noqa: N802
         return f"min({', '.join(map(self._print, expr.args))})"
+
+
+_PRINTERS: Mapping[str, type[CodePrinter | StrPrinter]] = {
+    "text": _Text, "numpy": _NumPy, "c": _C, "julia": _Julia
+}  # fmt: skip

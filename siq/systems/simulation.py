@@ -31,44 +31,90 @@ Drift = Callable[[np.ndarray], np.ndarray]
 """F of components: ``(d, n)`` to ``(d, n)``."""
 
 
+TRAJECTORIES = 1000  # enough for every state of a box in three dimensions, and simulated in seconds
+STATES = 400  # of the domain, at which rates are asked for
+TURNED = 0.1  # of a time constant in the step of a pair: the flow differs from f by so much, and is known
+FASTEST = 0.9  # quantile of the rates: the corners of a domain are left at once
+RELAXED = 3.0  # slowest time constants that a trajectory lasts: then 95 % of the way is done
+MOST_STEPS = 100  # of a pair, between pairs: beyond, a slow system would cost minutes
+
+
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class SimulationOptions:
-    """Sampling of a simulated system; the defaults are the paper's (its Table B1).
+class SimulationEntry:
+    """Sampling as a study gives it; values left out follow from the system, see `completed`.
 
     Attributes
     ----------
     trajectories
-        N, the number of trajectories, with initial states uniform over the card's domain Ω.
+        How many trajectories are simulated.
     pairs
-        M, the number of snapshot pairs along each trajectory.
+        Pairs along each trajectory.
     pair_step
-        h, the time between the two snapshots of a pair, in the card's time unit.
+        h, the time between the two states of a pair, in the card's unit of time; by default a tenth of the
+        fastest time constant, rounded down.
     interval
-        The time between pairs: they start at t_j = interval·j, j = 1 … M.
+        Time between the starts of pairs; by default such that a trajectory lasts three of the slowest time
+        constants at an attractor.
     substeps
-        Steps of the fourth-order Runge–Kutta rule within h; the paper has 5. With noise they are steps of
-        the Euler–Maruyama rule, whose drift is that of the continuous process but for O(h/substeps).
+        Runge–Kutta steps within h; with noise, steps of Euler and Maruyama.
     noise_intensity
-        ε of ``dx = f dt + sqrt(ε) D^(1/2) dW``; 0 is the equation without noise. The paper's section 3.1.1
-        has another convention, ``⟨ξ_j(t) ξ_k(0)⟩ = 2ε δ_jk δ(t)`` with ε = 0.01: that is 0.02 here.
+        ε of ``√ε D^(1/2) dW``. The paper's ε = 0.01 in section 3.1.1 is 0.02 here.
     """
 
-    trajectories: Annotated[int, Field(ge=2)] = 5000
+    trajectories: Annotated[int, Field(ge=2)] = TRAJECTORIES
     pairs: Annotated[int, Field(ge=1)] = 50
-    pair_step: Annotated[float, Field(gt=0)] = 0.01
-    interval: Annotated[float, Field(gt=0)] = 0.1
+    pair_step: Annotated[float, Field(gt=0)] | None = None
+    interval: Annotated[float, Field(gt=0)] | None = None
     substeps: Annotated[int, Field(ge=1)] = 5
     noise_intensity: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
 
+    def completed(self, dynamics: Dynamics) -> SimulationEntry:
+        """The same with values from the rates of what is simulated, over its domain, where it has none."""
+        if self.pair_step is not None and self.interval is not None:
+            return self
+        fastest, slowest = _rates(dynamics)
+        step = self.pair_step
+        if step is None:
+            step = _round_down(TURNED / fastest)
+            if self.interval is not None:
+                step = self.interval / max(math.ceil(self.interval / step), 2)
+        interval = self.interval
+        if interval is None:
+            steps = RELAXED / slowest / self.pairs / step
+            interval = step * round(min(max(steps, 2.0), float(MOST_STEPS)))
+        return replace(self, pair_step=step, interval=interval)
+
+    def options(self) -> SimulationOptions:
+        """The options of the simulation, once nothing is left out.
+
+        Raises
+        ------
+        ValueError
+            When something is left out, or the interval does not fit the step.
+        """
+        if self.pair_step is None or self.interval is None:
+            raise ValueError("the step and the interval of the pairs are not known without the system")
+        options = SimulationOptions(**vars(self))
+        _sampling_stride(options)
+        return options
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class SimulationOptions(SimulationEntry):
+    """Sampling of a simulated system, with the fields of `SimulationEntry`; defaults of the paper's Table B1.
+
+    Initial states are uniform over the card's domain Ω, and pairs start at t_j = interval·j, j = 1 … pairs.
+    The drift of the Euler–Maruyama rule is that of the continuous process but for O(h/substeps). The paper's
+    section 3.1.1 writes the noise as ``⟨ξ_j(t) ξ_k(0)⟩ = 2ε δ_jk δ(t)``, so that its ε is half of ours.
+    """
+
+    trajectories: Annotated[int, Field(ge=2)] = 5000
+    pair_step: Annotated[float, Field(gt=0)] = 0.01
+    interval: Annotated[float, Field(gt=0)] = 0.1
+
 
 def _sampling_stride(options: SimulationOptions) -> int:
-    """Number of integrator steps between the starts of two pairs.
-
-    Raises
-    ------
-    ValueError
-        When the interval is not a multiple of the integrator's step, or does not exceed h.
-    """
+    """Number of integrator steps between the starts of two pairs; raises Fault where it is not whole."""
     step = options.pair_step / options.substeps
     stride = round(options.interval / step)
     if abs(stride * step - options.interval) > 1e-9 * options.interval or stride <= options.substeps:
@@ -252,87 +298,6 @@ def simulate_stationary(
     if lost:
         raise NumericalFailure(f"{lost} of {x.shape[1]} walkers run to infinity; take a smaller step")
     return samples
-
-
-TRAJECTORIES = 1000  # enough for every state of a box in three dimensions, and simulated in seconds
-STATES = 400  # of the domain, at which rates are asked for
-TURNED = 0.1  # of a time constant in the step of a pair: the flow differs from f by so much, and is known
-FASTEST = 0.9  # quantile of the rates: the corners of a domain are left at once
-RELAXED = 3.0  # slowest time constants that a trajectory lasts: then 95 % of the way is done
-MOST_STEPS = 100  # of a pair, between pairs: beyond, a slow system would cost minutes
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class SimulationEntry:
-    """Sampling as a study gives it; values left out follow from the system, see `complete`.
-
-    The fields are those of `SimulationOptions`.
-
-    Attributes
-    ----------
-    trajectories
-        How many trajectories are simulated.
-    pairs
-        Pairs along each trajectory.
-    pair_step
-        h, the time between the two states of a pair, in the card's unit of time; by default a tenth of the
-        fastest time constant, rounded down.
-    interval
-        Time between the starts of pairs; by default such that a trajectory lasts three of the slowest time
-        constants at an attractor.
-    substeps
-        Runge–Kutta steps within h; with noise, steps of Euler and Maruyama.
-    noise_intensity
-        ε of ``√ε D^(1/2) dW``. The paper's ε = 0.01 in section 3.1.1 is 0.02 here.
-    """
-
-    trajectories: Annotated[int, Field(ge=2)] = TRAJECTORIES
-    pairs: Annotated[int, Field(ge=1)] = 50
-    pair_step: Annotated[float, Field(gt=0)] | None = None
-    interval: Annotated[float, Field(gt=0)] | None = None
-    substeps: Annotated[int, Field(ge=1)] = 5
-    noise_intensity: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
-
-    def options(self) -> SimulationOptions:
-        """The options of the simulation, once nothing is left out.
-
-        Raises
-        ------
-        ValueError
-            When something is left out, or the interval does not fit the step.
-        """
-        if self.pair_step is None or self.interval is None:
-            raise ValueError("the step and the interval of the pairs are not known without the system")
-        options = SimulationOptions(
-            self.trajectories, self.pairs, self.pair_step, self.interval, self.substeps, self.noise_intensity
-        )
-        _sampling_stride(options)
-        return options
-
-
-def complete(entry: SimulationEntry, dynamics: Dynamics) -> SimulationEntry:
-    """Sampling of a study, with values from the system's own rates where the study gives none.
-
-    Parameters
-    ----------
-    entry
-        What the study says.
-    dynamics
-        What is simulated, from its domain.
-    """
-    if entry.pair_step is not None and entry.interval is not None:
-        return entry
-    fastest, slowest = _rates(dynamics)
-    step = entry.pair_step
-    if step is None:
-        step = _round_down(TURNED / fastest)
-        if entry.interval is not None:
-            step = entry.interval / max(math.ceil(entry.interval / step), 2)
-    interval = entry.interval
-    if interval is None:
-        steps = RELAXED / slowest / entry.pairs / step
-        interval = step * round(min(max(steps, 2.0), float(MOST_STEPS)))
-    return replace(entry, pair_step=step, interval=interval)
 
 
 def _rates(dynamics: Dynamics) -> tuple[float, float]:

@@ -41,7 +41,7 @@ from siq.systems.cards import (
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, symbol
 from siq.systems.formulas import FormulaError
-from siq.systems.simulation import SimulationEntry, SimulationOptions, complete
+from siq.systems.simulation import SimulationEntry, SimulationOptions
 from siq.workflow.tables import METHODS, Method
 
 MOST_POINTS = 10_000  # values of one parameter, or of two together: a slip of the step would ask for more
@@ -332,7 +332,7 @@ def completed(study: Study, system: Dynamics | None) -> Study:
     """A study with what follows from its system where it says nothing: how this is simulated."""
     if system is None or study.recordings is not None or study.entrance == "equations":
         return study
-    return study.model_copy(update={"simulation": complete(study.simulation, system)})
+    return study.model_copy(update={"simulation": study.simulation.completed(system)})
 
 
 def load_study(path: str | Path) -> Study:
@@ -594,7 +594,7 @@ def settings_of(study: Study, system: Dynamics | None) -> PipelineSettings:
     if recordings is not None:
         sampling = Sampling(recordings.pair_step, recordings.integrator_step)
     elif system is not None and study.entrance == "trajectories":
-        simulation = complete(study.simulation, system).options()
+        simulation = study.simulation.completed(system).options()
         noisy = simulation.noise_intensity > 0
         step = simulation.pair_step
         sampling = Sampling(step, step / simulation.substeps if noisy else None)

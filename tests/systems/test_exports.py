@@ -13,18 +13,7 @@ import pytest
 import sympy
 
 from siq.inference.library import monomial_exponents
-from siq.systems.formulas import (
-    FUNCTIONS,
-    Formula,
-    as_latex,
-    as_sympy,
-    as_text,
-    c_source,
-    compile_formulas,
-    julia_source,
-    numpy_source,
-    parse_formula,
-)
+from siq.systems.formulas import FUNCTIONS, Formula, compile_formulas, parse_formula
 
 POINTS = 10_000
 ACCURACY = 1e-12  # of the sum of absolute terms
@@ -106,7 +95,7 @@ def case(request: pytest.FixtureRequest) -> Case:
 
 def test_numpy_source_gives_the_same(case: Case) -> None:
     module: dict[str, object] = {}
-    exec(numpy_source(case.formula), module)
+    exec(case.formula.source("numpy"), module)
     name = case.formula.name
     value, gradient = module[name], module[f"{name}_gradient"]
     assert callable(value) and callable(gradient)
@@ -121,7 +110,7 @@ def test_c_source_gives_the_same(case: Case, tmp_path: Path) -> None:
     if compiler is None:
         pytest.skip("there is no C compiler called cc")
     source, library = tmp_path / "formula.c", tmp_path / "formula.so"
-    source.write_text(c_source(case.formula), encoding="utf-8")
+    source.write_text(case.formula.source("c"), encoding="utf-8")
     warnings = ["-Wall", "-Wextra", "-Werror"]
     subprocess.run(
         [compiler, "-std=c99", *warnings, "-shared", "-fPIC", "-o", library, source, "-lm"], check=True
@@ -147,7 +136,7 @@ def test_julia_source_gives_the_same(case: Case, tmp_path: Path) -> None:
     name = case.formula.name
     np.savetxt(tmp_path / "points.txt", case.points.T, fmt="%.17g")
     (tmp_path / "run.jl").write_text(
-        julia_source(case.formula)
+        case.formula.source("julia")
         + 'for line in eachline("points.txt")\n'
         + "    p = parse.(Float64, split(line))\n"
         + f'    println(join([{name}(p...); {name}_gradient(p...)], " "))\nend\n',
@@ -158,18 +147,17 @@ def test_julia_source_gives_the_same(case: Case, tmp_path: Path) -> None:
 
 
 def test_julia_source_is_whole(case: Case) -> None:
-    source = julia_source(case.formula)
+    source = case.formula.source("julia")
     assert source.count("(") == source.count(")") and source.count("[") == source.count("]")
     assert "Not supported" not in source and "?" not in source
     assert source.count("function ") == source.count("\nend\n") == 2
-    assert "gradient" not in julia_source(case.formula, gradient=False)
 
 
 def test_text_is_read_back_by_our_own_parser(case: Case) -> None:
     names = {symbol.name: symbol for symbol in case.formula.symbols}
     names |= {f"{name}_": symbol for name, symbol in names.items()}  # for those that programs do not allow
     variables, values = list(case.formula.symbols), case.points
-    for line in as_text(case.formula).splitlines():
+    for line in case.formula.source("text").splitlines():
         if not line.startswith("#"):
             name, text = line.split(" = ")
             last = compile_formulas([parse_formula(text, names)], variables)(values)
@@ -179,12 +167,12 @@ def test_text_is_read_back_by_our_own_parser(case: Case) -> None:
 
 
 def test_the_sympy_expression_gives_the_same(case: Case) -> None:
-    case.check(compile_formulas([as_sympy(case.formula)], case.formula.symbols)(case.points))
+    case.check(compile_formulas([case.formula.to_sympy()], case.formula.symbols)(case.points))
 
 
 def test_latex_has_every_term_and_balanced_braces(case: Case) -> None:
     for digits in (4, 17):
-        text = as_latex(case.formula, digits=digits)
+        text = case.formula.to_latex(digits=digits)
         assert text.count("{") == text.count("}")
         assert text.count(r"\left") == text.count(r"\right")
         assert text.count(r"\begin{aligned}") == text.count(r"\end{aligned}") == any(case.formula.offsets)
@@ -197,14 +185,15 @@ def test_latex_has_every_term_and_balanced_braces(case: Case) -> None:
 
 
 def test_every_function_of_the_formula_language_is_exported() -> None:
-    text = as_text(CASES["functions"].formula)
+    text = CASES["functions"].formula.source("text")
     assert all(name in text for name in FUNCTIONS)
 
 
 def test_what_a_unit_contains_cannot_leave_the_comment() -> None:
     x = sympy.Symbol("x", real=True)
     formula = Formula("V", x**2, (x,), units=("m\nimport os\u2028\r#\\",), title="of\n\n1/0 \\")
-    for source, mark in ((numpy_source(formula), "#"), (c_source(formula), "//"), (as_text(formula), "#")):
+    for language, mark in (("numpy", "#"), ("c", "//"), ("text", "#")):
+        source = formula.source(language)
         header = source[: source.index("V(x)", 8) if source.count("V(x)") > 1 else None].splitlines()
         assert [line for line in header if "import os" in line or "1/0" in line] == [
             line for line in header if line.startswith(mark) and ("import os" in line or "1/0" in line)

@@ -10,7 +10,7 @@ import sympy
 from known_systems import archetype, as_system, limit_cycle
 
 from siq.systems.dynamics import Dynamics
-from siq.systems.simulation import MOST_STEPS, SimulationEntry, _rates, _round_down, complete
+from siq.systems.simulation import MOST_STEPS, SimulationEntry, _rates, _round_down
 
 X, Y = sympy.symbols("x y", real=True)
 
@@ -27,35 +27,35 @@ def test_the_rates_of_a_linear_system_are_its_eigenvalues_in_any_unit() -> None:
 
 
 def test_step_and_length_follow_from_the_rates() -> None:
-    entry = complete(SimulationEntry(pairs=30), two_rates(8.0, 0.5))
+    entry = SimulationEntry(pairs=30).completed(two_rates(8.0, 0.5))
     assert entry.pair_step == 0.01  # a tenth of 1/8, rounded down
     assert entry.interval == pytest.approx(0.2)  # 30 of them are three times 1/0.5
     assert entry.options().pairs == 30
 
 
 def test_a_system_in_other_units_of_time_is_sampled_alike() -> None:
-    one, other = (complete(SimulationEntry(), two_rates(8.0 * c, 0.5 * c)) for c in (1.0, 1e-3))
+    one, other = (SimulationEntry().completed(two_rates(8.0 * c, 0.5 * c)) for c in (1.0, 1e-3))
     assert other.pair_step == 1000 * one.pair_step and other.interval == pytest.approx(1000 * one.interval)
 
 
 def test_what_a_study_says_stays() -> None:
     said = SimulationEntry(pair_step=0.03)
-    assert complete(said, two_rates(8.0, 0.5)).pair_step == 0.03
+    assert said.completed(two_rates(8.0, 0.5)).pair_step == 0.03
     said = SimulationEntry(interval=0.05)
-    entry = complete(said, two_rates(8.0, 0.5))
+    entry = said.completed(two_rates(8.0, 0.5))
     assert entry.interval == 0.05 and entry.options().pair_step == pytest.approx(0.01)
     said = SimulationEntry(pair_step=0.01, interval=0.1)
-    assert complete(said, two_rates(8.0, 0.5)) is said
+    assert said.completed(two_rates(8.0, 0.5)) is said
 
 
 def test_a_very_slow_system_takes_no_more_than_so_many_steps() -> None:
-    entry = complete(SimulationEntry(), two_rates(8.0, 1e-4))
+    entry = SimulationEntry().completed(two_rates(8.0, 1e-4))
     assert entry.interval == pytest.approx(MOST_STEPS * entry.pair_step)
 
 
 @pytest.mark.parametrize("known", [archetype(3), limit_cycle()], ids=["two wells", "no attractor"])
 def test_every_system_can_be_sampled(known) -> None:
-    options = complete(SimulationEntry(), as_system(known)).options()
+    options = SimulationEntry().completed(as_system(known)).options()
     assert 2 * options.pair_step <= options.interval
 
 
