@@ -37,7 +37,7 @@ from siq.inference.field_estimate import (
     NoiseKind,
     Verdict,
 )
-from siq.inference.regression import LaggedPairs, copies, instruments, refit, residuals, weighted_triangle
+from siq.inference.regression import LaggedPairs, copies, refit, residuals, weighted_triangle
 from siq.numerics.integration import runge_kutta_step
 from siq.numerics.randomness import positive
 from siq.remarks import Remark
@@ -108,12 +108,12 @@ def residual_noise(
     if diffusion.constant:
         intensity = diffusion.intensity(found.noise_rate)
         covariance = found.noise_rate / intensity if intensity > 0 else diffusion.matrix
-        excess = np.abs(diffusion.whitening @ covariance @ diffusion.whitening.T - unit)
+        whole = diffusion.whitening @ covariance @ diffusion.whitening.T
     else:
         forces = _whitened(found, pairs, residuals(found, pairs))
         whole = forces.T @ forces / len(forces)
         intensity = float(np.trace(whole)) / d
-        excess = np.abs(whole / intensity - unit)
+        whole = whole / intensity
         if found.noise is not None:  # its own formula says ε without the chance of the residuals
             intensity = found.intensity
         covariance = found.noise_rate / intensity
@@ -139,9 +139,16 @@ def residual_noise(
                 remarks=(remark,) if bias <= HARMLESS_BIAS else (),
             )  # fmt: skip
     return NoiseDiagnosis(
-        kind, intensity, covariance, correlation, score, measurement, deviation=float(excess.max()),
-        deviation_score=float((excess / np.sqrt((1 + unit) / len(pairs.h))).max()),
-    )  # fmt: skip
+        kind, intensity, covariance, correlation, score, measurement, **deviations(whole, len(pairs.h))
+    )
+
+
+def deviations(whitened: np.ndarray, samples: int) -> dict[str, float]:
+    """Those of `NoiseDiagnosis`, of the covariance ``(d, d)`` of so many residuals in units of D."""
+    unit = np.eye(len(whitened))
+    excess = np.abs(whitened - unit)
+    score = float((excess / np.sqrt((1 + unit) / samples)).max())
+    return {"deviation": float(excess.max()), "deviation_score": score}
 
 
 def neighbour_correlations(found: FieldEstimate, sample: SnapshotPairs) -> tuple[np.ndarray, np.ndarray]:
@@ -156,11 +163,14 @@ def neighbour_correlations(found: FieldEstimate, sample: SnapshotPairs) -> tuple
     joined = _joined(sample, rest)
     if not joined.any():  # every recording has two samples
         return np.zeros(rest.shape[1]), np.zeros(rest.shape[1])
-    first, second = rest[:-1][joined], rest[1:][joined]
+    return correlations_between(rest[:-1][joined], rest[1:][joined])
+
+
+def correlations_between(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Correlations of two residuals ``(n, d)`` without a mean, and in standard errors: ``(d,)`` each."""
     product = first * second
     size = np.sqrt((first**2).mean(axis=0) * (second**2).mean(axis=0))
-    scores = product.sum(axis=0) / np.sqrt((product**2).sum(axis=0))
-    return product.mean(axis=0) / size, scores
+    return product.mean(axis=0) / size, product.sum(axis=0) / np.sqrt((product**2).sum(axis=0))
 
 
 def _whitened(found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray) -> np.ndarray:
@@ -327,8 +337,9 @@ def mean_residual_probability(found: FieldEstimate, pairs: SnapshotPairs, *, see
     if isinstance(pairs, LaggedPairs):
         rest = residuals(found, pairs)
         spread = np.diag(found.noise_rate) * float(np.median(pairs.h)) * copies(pairs)
-        directions = instruments(library, pairs)
-        return unexplained_probability(directions, rest, variance=spread * (1 + len(rest) / seen))
+        return unexplained_probability(
+            pairs.directions(library), rest, variance=spread * (1 + len(rest) / seen)
+        )
     # Copies of resampled recordings would count as evidence that there is not.
     _, single = np.unique(np.column_stack([pairs.x0, pairs.xh]), axis=0, return_index=True)
     pairs = pairs.take(single)

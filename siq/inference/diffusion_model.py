@@ -56,10 +56,10 @@ AVERAGED_PAIRS = 500  # the mean of a smooth function of the state, to a few per
 SERIES_TERMS = 24  # of the exponential series, which then is exact to ten digits
 
 
-def _all_places(d: int, functions: int) -> np.ndarray:
+def _all_places(d: int, functions: int, most: int = MAX_STATES) -> np.ndarray:
     """Row, column and function of every coefficient that εD(x) may have, shape ``(p, 3)``."""
     # Of many states the correlations are constant: their formulas would be most of all coefficients.
-    whole = d <= MAX_STATES
+    whole = d <= most
     return np.array(
         [(i, j, k) for i in range(d) for j in range(i, d) for k in range(functions if i == j or whole else 1)]
     )
@@ -179,17 +179,15 @@ class _DiffusionLikelihood:
         values, sensor, covariance = self.scored(places, np.array([self.start[i, j] for i, j, _ in places]))
         return self.formula(places, values, covariance, 1.0), sensor
 
-    def constant_probability(self, places: np.ndarray | None = None) -> float:
+    def constant_probability(self) -> float:
         """Probability that recordings with a constant D speak as much for one that depends on the state.
 
         1 where the change that they speak for is harmless.
-
-        Parameters
-        ----------
-        places
-            Of the coefficients that are asked for; by default `_all_places`.
         """
-        places = _all_places(len(self.symbols), len(self.terms)) if places is None else places
+        return self.probability_of_constant(_all_places(len(self.symbols), len(self.terms)))
+
+    def probability_of_constant(self, places: np.ndarray) -> float:
+        """The same for some of the coefficients, by their places."""
         constant = places[:, 2] == 0
         formula, sensor = self.constant
         values = np.zeros(len(places))
@@ -297,14 +295,14 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.pinv(_scaled(matrix), hermitian=True) / np.outer(size, size))
 
 
-class _ResidualLikelihood(_DiffusionLikelihood):
+class ResidualLikelihood(_DiffusionLikelihood):
     """The likelihood of residuals of pairs; no sensor is noisy.
 
     Parameters
     ----------
     found, pairs, rest
-        f, the pairs and their residuals ``(n, d)``, which are evenly thinned where there are more than memory
-        has room for.
+        f, the pairs and their residuals ``(n, d)`` (`siq.inference.regression.residuals`), which are evenly
+        thinned where there are more than memory has room for.
     """
 
     def __init__(self, found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray) -> None:
@@ -326,6 +324,13 @@ class _ResidualLikelihood(_DiffusionLikelihood):
         self.functions, self.at_states = (values + share * pairs.h * moved).T, values.T
         self.start = np.asarray(self.rest.T @ self.rest / len(self.rest))
         self.sensor, self.free = np.zeros(0), np.zeros(0, dtype=bool)
+
+    def constant_probability(self) -> float:
+        """See `_DiffusionLikelihood.constant_probability`; 1 where the residuals are too few to tell."""
+        (n, d), m = self.rest.shape, len(self.terms)
+        if n < MIN_RESIDUALS * d * (d + 1) // 2 * m:
+            return 1.0
+        return self.probability_of_constant(_all_places(d, m, most=d))
 
     def relative_change(self, change: np.ndarray) -> np.ndarray:
         """Changes of εD ``(n, d, d)`` where its start is the unit matrix."""
@@ -368,35 +373,6 @@ class _ResidualLikelihood(_DiffusionLikelihood):
                 left = self.functions[:, places[rows, 2]] * weight[:, None]
                 information[np.ix_(rows, columns)] = left.T @ self.functions[:, places[columns, 2]]
         return logarithm, score.sum(axis=0), information, score.T @ score
-
-
-def constant_noise_probability(found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray) -> float:
-    """The probability that residuals under a constant D speak as much for one that depends on the state.
-
-    Parameters
-    ----------
-    found, pairs, rest
-        f, and the residuals of pairs ``(n, d)``; see `siq.inference.regression.residuals`.
-
-    Returns
-    -------
-    float
-        1 where the residuals are too few to tell, or the change that they speak for is harmless.
-    """
-    data = _ResidualLikelihood(found, pairs, rest)
-    (n, d), m = data.rest.shape, len(data.terms)
-    if n < MIN_RESIDUALS * d * (d + 1) // 2 * m:
-        return 1.0
-    places = np.array([(i, j, k) for i in range(d) for j in range(i, d) for k in range(m)])
-    return data.constant_probability(places)
-
-
-def fitted_noise(
-    found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray, *, false_terms: float, probability: float
-) -> NoiseFormula:
-    """εD(x) of residuals; see `constant_noise_probability` and `_DiffusionLikelihood.selected`."""
-    data = _ResidualLikelihood(found, pairs, rest)
-    return data.selected(false_terms=false_terms, probability=probability)[0]
 
 
 def _response_share(found: FieldEstimate) -> float:

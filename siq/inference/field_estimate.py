@@ -72,6 +72,38 @@ class FlowMap:
                 x = x + step * field(x) if self.euler else runge_kutta_step(field, x, step)
         return x
 
+    @classmethod
+    def of(
+        cls, field: Field, x0: np.ndarray, h: np.ndarray, *, integrator_step: float | None, tolerance: float
+    ) -> FlowMap:
+        """The map that fits the data: as many steps as the accuracy needs, or as the simulation made.
+
+        Parameters
+        ----------
+        field
+            An estimate of f.
+        x0, h
+            States ``(d, n)`` and the steps of their pairs ``(n,)``.
+        integrator_step
+            Step of the Euler–Maruyama simulation that made the data; None for everything else.
+        tolerance
+            Accuracy of the increments wanted, relative to their root mean square, state by state.
+        """
+        if integrator_step is not None:
+            return cls(steps=max(round(float(np.median(h)) / integrator_step), 1), euler=True)
+        steps = 1
+        coarse = cls(steps)(field, x0, h)
+        while steps < MAX_REFINEMENT:
+            fine = cls(2 * steps)(field, x0, h)
+            with np.errstate(over="ignore", invalid="ignore"):  # a trial f may run away
+                size = np.sqrt(((fine - x0) ** 2).mean(axis=1))
+                error = np.sqrt(((fine - coarse) ** 2).mean(axis=1))
+            # The error of the coarse result; that of the fine one is sixteen times smaller.
+            if not (error > tolerance * size).any():
+                break
+            steps, coarse = 2 * steps, fine
+        return cls(steps)
+
     @property
     def curvature_weight(self) -> float:
         """Share of h²/4 by which noise shifts the mean: ``E Xh - Φ(X0) = w h²/4 ΣD_jk ∂²f/∂x_j∂x_k ε``.
@@ -79,38 +111,6 @@ class FlowMap:
         The variance grows from zero within the pair; Euler's rule sees it only after each step.
         """
         return 1 - 1 / self.steps if self.euler else 1.0
-
-
-def flow_map(
-    field: Field, x0: np.ndarray, h: np.ndarray, *, integrator_step: float | None, tolerance: float
-) -> FlowMap:
-    """The map that fits the data: as many steps as the accuracy needs, or as the simulation made.
-
-    Parameters
-    ----------
-    field
-        An estimate of f.
-    x0, h
-        States ``(d, n)`` and the steps of their pairs ``(n,)``.
-    integrator_step
-        Step of the Euler–Maruyama simulation that made the data; None for everything else.
-    tolerance
-        Accuracy of the increments wanted, relative to their root mean square, state by state.
-    """
-    if integrator_step is not None:
-        return FlowMap(steps=max(round(float(np.median(h)) / integrator_step), 1), euler=True)
-    steps = 1
-    coarse = FlowMap(steps)(field, x0, h)
-    while steps < MAX_REFINEMENT:
-        fine = FlowMap(2 * steps)(field, x0, h)
-        with np.errstate(over="ignore", invalid="ignore"):  # a trial f may run away
-            size = np.sqrt(((fine - x0) ** 2).mean(axis=1))
-            error = np.sqrt(((fine - coarse) ** 2).mean(axis=1))
-        # The error of the coarse result; that of the fine one is sixteen times smaller.
-        if not (error > tolerance * size).any():
-            break
-        steps, coarse = 2 * steps, fine
-    return FlowMap(steps)
 
 
 @dataclass(frozen=True)

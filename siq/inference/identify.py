@@ -22,11 +22,18 @@ import numpy as np
 
 from siq.data.correlation import MarkovLag, markov_lag
 from siq.data.preparation import joined
-from siq.data.recordings import Recordings, held_out_recordings, select_recordings, snapshot_pairs
+from siq.data.recordings import (
+    Recordings,
+    SnapshotPairs,
+    held_out_recordings,
+    select_recordings,
+    snapshot_pairs,
+)
 from siq.errors import NumericalFailure
 from siq.inference.checks import (
     PredictionLimits,
     check_prediction,
+    deviations,
     is_rounding,
     mean_residual_probability,
     neighbour_correlations,
@@ -37,9 +44,9 @@ from siq.inference.checks import (
     rounding_text,
 )
 from siq.inference.diffusion_model import (
+    ResidualLikelihood,
     check_units,
     constant_noise,
-    constant_noise_probability,
     estimated_diffusion,
     with_process_noise_rate,
 )
@@ -343,12 +350,13 @@ class _Case:
             lagged_pairs(part, memory.lag) for part in (self.recordings, self.training, self.held_out)
         )
         found = identify_vector_field(self.library, pairs, options=self.options)
-        fitted, independent = refit(found, training), int(pairs.independent)
+        independent = int(pairs.independent)
         found, source = self._with_diffusion(with_process_noise_rate(found, pairs), independent)
-        diffusion, unit = found.diffusion, np.eye(self.library.dimension)
-        intensity = diffusion.intensity(found.noise_rate)
+        intensity = found.diffusion.intensity(found.noise_rate)
         covariance = found.noise_rate / intensity
-        excess = np.abs(diffusion.whitening @ covariance @ diffusion.whitening.T - unit)
+        deviation = deviations(
+            found.diffusion.whitening @ covariance @ found.diffusion.whitening.T, independent
+        )
         state = int(np.argmax(np.abs(memory.correlations[0])))
         correlation = float(memory.correlations[0, state])
         values = {
@@ -357,60 +365,59 @@ class _Case:
         }  # fmt: skip
         noise = NoiseDiagnosis(
             "process", intensity, covariance, correlation, correlation / float(memory.errors[0, state]),
-            np.zeros(len(unit)), pairs=independent, diffusion=source, lag=memory.lag,
-            lost_time=lost_time(found, pairs), deviation=float(excess.max()),
-            deviation_score=float((excess / np.sqrt((1 + unit) / independent)).max()),
-            remarks=(Remark("inference.correlated", values),),
+            np.zeros(len(covariance)), pairs=independent, diffusion=source, lag=memory.lag,
+            lost_time=lost_time(found, pairs), **deviation, remarks=(Remark("inference.correlated", values),),
         )  # fmt: skip
-        squares = [
-            float((residuals(fitted, part) ** 2 / part.h[:, None]).mean()) for part in (unseen, training)
-        ]
-        return self._tested(
-            replace(found, diagnosis=noise), held_out_ratio=squares[0] / squares[1],
-            mean_probability=mean_residual_probability(fitted, unseen, seen=len(training.h)),
-        )  # fmt: skip
+        return self._tested_by_pairs(replace(found, diagnosis=noise), training, unseen)
 
     def _finished_by_pairs(self, found: FieldEstimate) -> FieldEstimate:
         """An estimate by pairs with its D, the noise of its residuals, and its test.
 
         f does not depend on D, and whether noise is white does not either: so D can come last.
         """
-        training, unseen = (
-            snapshot_pairs(part, pair_step=self.pair_step) for part in (self.training, self.held_out)
+        everything, training, unseen = (
+            snapshot_pairs(part, pair_step=self.pair_step)
+            for part in (self.recordings, self.training, self.held_out)
         )
-        everything, count = snapshot_pairs(self.recordings, pair_step=self.pair_step), len(training.h)
-        count += len(unseen.h)
-        false_terms, source = self.options.false_terms, DiffusionSource.GIVEN
-        if self.given is not None:
-            found = with_given_noise(found, everything, self.given, false_terms=false_terms)
+        count, false_terms = len(training.h) + len(unseen.h), self.options.false_terms
+
+        def diagnosed(found: FieldEstimate, source: DiffusionSource) -> FieldEstimate:
             noise = residual_noise(found, self.recordings, pair_step=self.pair_step)
+            return replace(found, diagnosis=replace(noise, diffusion=source, pairs=count))
+
+        if self.given is not None:
+            given = with_given_noise(found, everything, self.given, false_terms=false_terms)
+            found = diagnosed(given, DiffusionSource.GIVEN)
         else:
-            first = found
             estimated = None if found.noise_free else estimated_diffusion(found, pairs=count)
-            if estimated is not None:
-                found, source = self._with_diffusion(found, count)
-                noise = residual_noise(found, self.recordings, pair_step=self.pair_step)
-            if estimated is None or noise.kind != "process":
+            whole = None if estimated is None else diagnosed(*self._with_diffusion(found, count))
+            if whole is None or whole.diagnosis is None or whole.diagnosis.kind != "process":
                 check_units(self.recordings.names, self.units)
-                found, source = first, DiffusionSource.UNIT
-                noise = residual_noise(found, self.recordings, pair_step=self.pair_step)
-            elif (by_state := with_noise_formula(found, everything, false_terms=false_terms)) is not None:
-                found = by_state
-                noise = residual_noise(found, self.recordings, pair_step=self.pair_step)
-        remarks = noise.remarks
-        if source == DiffusionSource.GIVEN and noise.kind == "process" and found.diffusion.constant:
+                found = diagnosed(found, DiffusionSource.UNIT)
+            else:
+                by_state = with_noise_formula(whole, everything, false_terms=false_terms)
+                found = whole if by_state is None else diagnosed(by_state, DiffusionSource.ESTIMATED)
+        noise = found.diagnosis
+        assert noise is not None
+        if self.given is not None and noise.kind == "process" and found.diffusion.constant:
             # A constant D that was given, where the recordings speak for another.
-            rest = residuals(found, everything)
-            if constant_noise_probability(found, everything, rest) < false_terms:
-                remarks = (*remarks, Remark("inference.noise_depends_on_state"))
-        noise = replace(noise, diffusion=source, pairs=count, remarks=remarks)
+            likelihood = ResidualLikelihood(found, everything, residuals(found, everything))
+            if likelihood.constant_probability() < false_terms:
+                remarks = (*noise.remarks, Remark("inference.noise_depends_on_state"))
+                found = replace(found, diagnosis=replace(noise, remarks=remarks))
         if found.noise_free:
             chosen = np.arange(min(len(self.held_out.labels), PREDICTED_RECORDINGS))
             errors = prediction_errors(found.dynamics, select_recordings(self.held_out, chosen))
-            return self._tested(replace(found, diagnosis=noise), errors=errors)
+            return self._tested(found, errors=errors)
         if found.diffusion.constant:
             generator = self.draw(Purpose.STABILITY)
             found = with_stability(found, everything, options=self.options, generator=generator)
+        return self._tested_by_pairs(found, training, unseen)
+
+    def _tested_by_pairs(
+        self, found: FieldEstimate, training: SnapshotPairs, unseen: SnapshotPairs
+    ) -> FieldEstimate:
+        """With the test on the residuals of pairs that its terms, fitted to the others, leave."""
         fitted, squares = refit(found, training), []
         for pairs in (unseen, training):
             rest = residuals(fitted, pairs)
@@ -419,10 +426,8 @@ class _Case:
             else:
                 speeds = rest / np.sqrt(pairs.h)[:, None]
                 squares.append(float(fitted.diffusion.squared_speed(pairs.x0, speeds).mean()))
-        return self._tested(
-            replace(found, diagnosis=noise), held_out_ratio=squares[0] / squares[1],
-            mean_probability=mean_residual_probability(fitted, unseen),
-        )  # fmt: skip
+        probability = mean_residual_probability(fitted, unseen, seen=len(training.h))
+        return self._tested(found, held_out_ratio=squares[0] / squares[1], mean_probability=probability)
 
     def _tested(
         self,

@@ -21,7 +21,7 @@ import numpy as np
 
 from siq.data.recordings import Recordings, parent_recordings
 from siq.errors import NumericalFailure
-from siq.inference.checks import unexplained_probability
+from siq.inference.checks import correlations_between, unexplained_probability
 from siq.inference.diffusion_model import InnovationLikelihood
 from siq.inference.field_estimate import FieldEstimate, FlowMap, NoiseDiagnosis
 from siq.inference.kalman_filter import Grid, Noise, Whitened, linearise, solve, whiten
@@ -32,8 +32,8 @@ from siq.inference.recalibration import drop_insignificant_process_noise, proces
 from siq.inference.selection import (
     LinearProblem,
     ModelAverage,
-    best_support,
     blocks_of,
+    chosen_terms,
     critical_values,
     fit_significant,
     stability,
@@ -127,12 +127,7 @@ def identify_by_likelihood(
         return LinearProblem(triangle[:, :-1], triangle[:, -1], 1.0, critical, everything)
 
     problem = problem_of(np.asarray(np.linalg.qr(np.concatenate(parts), mode="r")))
-    support = everything[list(best_support(problem))]
-    for component in np.unique(everything[:, 0]):
-        if component not in support[:, 0]:
-            name = library.states[component]
-            raise NumericalFailure(f"no term of the equation of {name} is significant; record longer")
-    fit = whole
+    support, fit = chosen_terms([problem], library), whole
 
     def fit_terms(support: np.ndarray) -> tuple[Fit, np.ndarray]:
         nonlocal fit
@@ -267,11 +262,8 @@ def _strongest_correlation(white: Whitened, data: Measurements) -> tuple[float, 
     found: list[tuple[float, float, float]] = []
     for lag in LAGS:
         rows = np.flatnonzero(recording[lag:] == recording[:-lag])
-        first, second = innovations[rows], innovations[rows + lag]
-        product = first * second
-        size = np.sqrt((first**2).mean(axis=0) * (second**2).mean(axis=0))
-        scores = product.sum(axis=0) / np.sqrt((product**2).sum(axis=0))
-        found += zip(np.abs(scores), product.mean(axis=0) / size, scores, strict=True)
+        correlations, scores = correlations_between(innovations[rows], innovations[rows + lag])
+        found += zip(np.abs(scores), correlations, scores, strict=True)
     _, correlation, score = max(found)
     return float(correlation), float(score)
 

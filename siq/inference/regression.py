@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy.linalg
@@ -32,8 +33,8 @@ import scipy.linalg
 from siq.data.recordings import Recordings, SnapshotPairs, parent_recordings
 from siq.data.stationarity import even_stretches, lagged_covariances, long_run_covariance
 from siq.errors import NumericalFailure
-from siq.inference.diffusion_model import constant_noise_probability, fitted_noise
-from siq.inference.field_estimate import NOISE_FREE, FieldEstimate, FlowMap, flow_map
+from siq.inference.diffusion_model import ResidualLikelihood
+from siq.inference.field_estimate import NOISE_FREE, FieldEstimate, FlowMap
 from siq.inference.library import CandidateLibrary, IdentificationOptions
 from siq.inference.selection import (
     LinearProblem,
@@ -41,6 +42,7 @@ from siq.inference.selection import (
     all_coefficients,
     best_support,
     blocks_of,
+    chosen_terms,
     critical_values,
     fit_significant,
     stability,
@@ -81,6 +83,13 @@ class LaggedPairs(SnapshotPairs):
         """Number of pairs that tell as much as all of these, whose residuals are correlated."""
         return len(self.h) / (2 * self.lag + 1)
 
+    def directions(self, library: CandidateLibrary) -> np.ndarray:
+        """An orthonormal basis of the functions of earlier states, which are the instruments: ``(n, q)``."""
+        values = library.evaluate(self.earlier)
+        if not np.isfinite(values).all():
+            raise NumericalFailure("a library function of the vector field is not finite on some pairs")
+        return np.linalg.qr(values / positive(np.linalg.norm(values, axis=0)))[0]
+
     def long_run(self, rest: np.ndarray) -> np.ndarray:
         """Ω of residuals ``(n, d)``: positive definite."""
         covariances = lagged_covariances(rest - rest.mean(axis=0), self.number, self.lag)
@@ -120,10 +129,8 @@ def coarse_pairs(recordings: Recordings, lag: int, *, lost: float) -> SnapshotPa
 
     Parameters
     ----------
-    recordings
-        Trajectories that are not Markovian from sample to sample.
-    lag
-        Number of steps from which on they are.
+    recordings, lag
+        Trajectories that are Markovian from so many steps on.
     lost
         See `lost_time`. By so much less than the pairs are apart is their `h`: given where a pair begins, its
         mean and its variance are those of white noise in that shorter time, but for what circulates.
@@ -155,20 +162,7 @@ def lost_time(found: FieldEstimate, given: LaggedPairs) -> float:
 
 
 class _PairRegression:
-    """Pairs with the active library functions at X0, and what the current f makes of them.
-
-    Parameters
-    ----------
-    library, pairs
-        The q functions, and n pairs.
-    support
-        Component and function of each coefficient, shape ``(p, 2)``; by default all.
-
-    Raises
-    ------
-    NumericalFailure
-        When a function is not finite on some pairs.
-    """
+    """Pairs with the functions of a support, by default all, at X0, and what the current f makes of them."""
 
     def __init__(
         self, library: CandidateLibrary, pairs: SnapshotPairs, support: np.ndarray | None = None
@@ -195,9 +189,9 @@ class _PairRegression:
         return (self.matrix(values) @ self.theta).T
 
     def flow(self, values: np.ndarray, *, tolerance: float, integrator_step: float | None = None) -> FlowMap:
-        """The map over a step that is accurate enough, see `siq.inference.field_estimate.flow_map`."""
+        """The map over a step that is accurate enough, see `FlowMap.of`."""
         matrix, some = self.matrix(values), slice(None, None, max(len(self.h) // FLOW_SAMPLE, 1))
-        return flow_map(
+        return FlowMap.of(
             lambda x: matrix @ self._terms(x), self.x0[:, some], self.h[some],
             integrator_step=integrator_step, tolerance=tolerance,
         )  # fmt: skip
@@ -249,12 +243,7 @@ class _PairRegression:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Generalised least squares of all components: values ``(p,)``, pseudoinverse, and sizes of columns.
 
-        Parameters
-        ----------
-        columns, goals
-            Of the active functions ``(m, active)``, and of what they explain ``(m, d)``.
-        spread
-            Covariance of a row of residuals, ``(d, d)``.
+        Columns ``(m, active)`` explain goals ``(m, d)``; `spread` is the covariance of a row of residuals.
         """
         whiten = scipy.linalg.solve_triangular(np.linalg.cholesky(spread), np.eye(len(spread)), lower=True)
         design = np.stack(
@@ -283,10 +272,7 @@ def copies(pairs: SnapshotPairs) -> float:
 def _fit_everything(
     regression: _PairRegression, *, integrator_step: float | None
 ) -> tuple[np.ndarray, np.ndarray, float, FlowMap]:
-    """Least squares over all functions, each round with the correction by the last f.
-
-    Its triangle, the covariance of the residuals per time, their ratio to the increments, and the flow.
-    """
+    """Least squares of all functions: triangle, the residuals' covariance per time and their ratio, flow."""
     q, d, n = regression.library.size, regression.library.dimension, len(regression.h)
     flow, rate, values = None, None, np.zeros(d * q)
     for done in range(CORRECTION_ROUNDS):
@@ -312,7 +298,7 @@ def _fit_everything(
 
 
 def _evenly(count: int, most: int) -> np.ndarray:
-    """At most so many of `count` rows, _evenly spread."""
+    """At most so many of `count` rows, evenly spread."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
 
 
@@ -385,13 +371,10 @@ def identify_vector_field(
     critical = critical_values(library, false_terms=options.false_terms)
     repeated = 1.0 if noise_free else copies(pairs)
     problems = LinearProblem.of_components(triangle, samples=n / repeated, critical=critical)
-    chosen = []
-    for i, problem in enumerate(problems):
-        kept = _contributing(problem, options.precision) if noise_free else best_support(problem)
-        _check_significant(library, i, kept)
-        chosen += [(i, k) for k in kept]
+    choose = partial(_contributing, precision=options.precision) if noise_free else best_support
+    chosen = chosen_terms(problems, library, choose)
     found = FieldEstimate.on_support(
-        library, np.array(chosen), np.zeros(len(chosen)), np.eye(len(chosen)), rate, ratio, flow, noise
+        library, chosen, np.zeros(len(chosen)), np.eye(len(chosen)), rate, ratio, flow, noise
     )
 
     def fit(support: np.ndarray) -> tuple[FieldEstimate, np.ndarray]:
@@ -406,15 +389,8 @@ def identify_vector_field(
         return found, np.abs(found.values) / np.sqrt(np.diag(found.covariance)) / critical[support[:, 1]]
 
     # With the final support and flow a term may turn out to be superfluous after all.
-    found, support = fit_significant(fit, np.array(chosen))
+    found, support = fit_significant(fit, chosen)
     return found if noise_free else replace(found, alternatives=ModelAverage.of(problems, support, library))
-
-
-def _check_significant(library: CandidateLibrary, component: int, kept: tuple[int, ...]) -> None:
-    if not kept:
-        raise NumericalFailure(
-            f"no term of the equation of {library.states[component]} is significant; record longer"
-        )
 
 
 def _contributing(problem: LinearProblem, precision: float) -> tuple[int, ...]:
@@ -472,7 +448,7 @@ def refit(found: FieldEstimate, pairs: SnapshotPairs) -> FieldEstimate:
     """
     regression = _PairRegression(found.library, pairs, found.support)
     if isinstance(pairs, LaggedPairs):
-        return _fit_by_instruments(regression, instruments(found.library, pairs), found.diffusion)
+        return _fit_by_instruments(regression, pairs, found.diffusion)
     if found.diffusion.constant:
         return _fit_support(found, regression)
     for _ in range(WEIGHT_ROUNDS + 1):  # each brings the flow up to date
@@ -499,19 +475,7 @@ def with_stability(
     options: IdentificationOptions,
     generator: np.random.Generator,
 ) -> FieldEstimate:
-    """An estimate with the share of resampled recordings in which each of its terms is chosen.
-
-    Parameters
-    ----------
-    found
-        f from noisy pairs.
-    pairs
-        Those that it was fitted to.
-    options
-        What makes a term significant.
-    generator
-        Draws the recordings.
-    """
+    """An estimate of noisy pairs with the share of resampled recordings in which each term is chosen."""
     regression = _PairRegression(found.library, pairs)
     velocity = regression.corrected(found.coefficients.T.ravel(), found.flow, found.noise_rate)
     weight = np.sqrt(pairs.h)[:, None]
@@ -535,10 +499,8 @@ def with_noise_formula(
 
     Parameters
     ----------
-    found
-        f as it was found with one weight for all.
-    pairs
-        The pairs that it was fitted to.
+    found, pairs
+        f as it was found with one weight for all, and the pairs that it was fitted to.
     false_terms
         Probability that a constant D is given up by chance; and that chance brings any false term into f, or
         into D.
@@ -556,17 +518,18 @@ def with_noise_formula(
     """
     if found.noise_free:
         return None
-    rest = residuals(found, pairs)
-    probability = constant_noise_probability(found, pairs, rest)
+    likelihood = ResidualLikelihood(found, pairs, residuals(found, pairs))
+    probability = likelihood.constant_probability()
     if probability >= false_terms:
         return None
-    formula = fitted_noise(found, pairs, rest, false_terms=false_terms, probability=probability)
-    for _ in range(WEIGHT_ROUNDS):
-        found = _identify_weighted(found.with_formula(formula, pairs.x0), pairs, false_terms=false_terms)
-        formula = fitted_noise(
-            found, pairs, residuals(found, pairs), false_terms=false_terms, probability=probability
-        )
-    return refit(found.with_formula(formula, pairs.x0), pairs)
+    for done in range(WEIGHT_ROUNDS + 1):
+        if done:
+            likelihood = ResidualLikelihood(found, pairs, residuals(found, pairs))
+        formula = likelihood.selected(false_terms=false_terms, probability=probability)[0]
+        found = found.with_formula(formula, pairs.x0)
+        if done < WEIGHT_ROUNDS:
+            found = _identify_weighted(found, pairs, false_terms=false_terms)
+    return refit(found, pairs)
 
 
 def with_given_noise(
@@ -588,10 +551,8 @@ def _identify_weighted(found: FieldEstimate, pairs: SnapshotPairs, *, false_term
     problem = LinearProblem(
         triangle[:, :-1], triangle[:, -1], intensity * copies(pairs), critical, everything
     )
-    kept = list(best_support(problem))
-    support = everything[kept]
-    for i in range(library.dimension):
-        _check_significant(library, i, tuple(support[support[:, 0] == i, 1]))
+    support = chosen_terms([problem], library)
+    kept = problem.places(support)
     start = np.linalg.lstsq(triangle[:, kept], triangle[:, -1], rcond=None)[0]
     found = refit(found.with_values(support, start, covariance=np.eye(len(support))), pairs)
     return replace(found, alternatives=ModelAverage.of([problem], support, library))
@@ -604,10 +565,8 @@ def weighted_triangle(
 
     Parameters
     ----------
-    found
-        Whose f says how the flow differs from a straight step, and whose D says the weights.
-    pairs
-        The pairs.
+    found, pairs
+        f says how the flow differs from a straight step, and D says the weights.
     places
         Component and function of each column, shape ``(p, 2)``; None for all of them.
     of_rest
@@ -635,21 +594,10 @@ def weighted_triangle(
     return triangle, squares / (len(pairs.h) * d)
 
 
-def instruments(library: CandidateLibrary, pairs: LaggedPairs) -> np.ndarray:
-    """An orthonormal basis of the functions of earlier states, shape ``(n, q)``."""
-    values = library.evaluate(pairs.earlier)
-    if not np.isfinite(values).all():
-        raise NumericalFailure("a library function of the vector field is not finite on some pairs")
-    return np.linalg.qr(values / positive(np.linalg.norm(values, axis=0)))[0]
-
-
 def _identify_by_instruments(
     library: CandidateLibrary, pairs: LaggedPairs, options: IdentificationOptions, diffusion: Diffusion
 ) -> FieldEstimate:
-    """Two-stage least squares: functions and increments are projected on the instruments, and fitted there.
-
-    The terms of each equation are chosen there (`siq.inference.selection`).
-    """
+    """Two-stage least squares: functions and increments are projected on instruments, and fitted there."""
     q, h = library.size, pairs.h[:, None]
     if pairs.independent < 2 * q:
         raise NumericalFailure(
@@ -657,7 +605,7 @@ def _identify_by_instruments(
             " lower identification.degree or record more"
         )
     regression = _PairRegression(library, pairs)
-    directions = instruments(library, pairs)
+    directions = pairs.directions(library)
     # Of some function nothing may be known from an earlier state. Its coefficient would be chance, as large
     # as the error of its own instrument is small, and so would be all that is said of what is left.
     orthogonal, upper = np.linalg.qr(regression.theta.T * h)
@@ -676,29 +624,25 @@ def _identify_by_instruments(
         LinearProblem(columns, goals[:, i], float(variance), critical, all_coefficients([i], q))
         for i, variance in enumerate(variances)
     ]
-    chosen = [(i, k) for i, problem in enumerate(problems) for k in best_support(problem)]
-    if missing := sorted(set(range(library.dimension)) - {i for i, _ in chosen}):
-        raise NumericalFailure(
-            f"no term of the equation of {library.states[missing[0]]} is significant: the recordings are"
-            f" correlated over {pairs.lag} steps, and states so much earlier tell too little of its motion;"
-            " record longer, or a quantity that fluctuates less"
-        )
+    reason = (
+        f": the recordings are correlated over {pairs.lag} steps, and states so much earlier tell too little"
+        " of its motion; record longer, or a quantity that fluctuates less"
+    )
+    chosen = chosen_terms(problems, library, reason=reason)
 
     def fit(support: np.ndarray) -> tuple[FieldEstimate, np.ndarray]:
-        found = _fit_by_instruments(_PairRegression(library, pairs, support), directions, diffusion)
+        found = _fit_by_instruments(_PairRegression(library, pairs, support), pairs, diffusion)
         return found, np.abs(found.values) / np.sqrt(np.diag(found.covariance)) / critical[support[:, 1]]
 
-    found, support = fit_significant(fit, np.array(chosen))
+    found, support = fit_significant(fit, chosen)
     return replace(found, alternatives=ModelAverage.of(problems, support, library))
 
 
 def _fit_by_instruments(
-    regression: _PairRegression, directions: np.ndarray, diffusion: Diffusion
+    regression: _PairRegression, pairs: LaggedPairs, diffusion: Diffusion
 ) -> FieldEstimate:
     """Generalised least squares of the projected problem on a support."""
-    pairs = regression.pairs
-    assert isinstance(pairs, LaggedPairs)
-    h = pairs.h[:, None]
+    directions, h = pairs.directions(regression.library), pairs.h[:, None]
     columns = directions.T @ (regression.theta.T * h)
     spread, values, flow = np.eye(regression.library.dimension), np.zeros(len(regression.support)), None
     for _ in range(INSTRUMENT_ROUNDS):

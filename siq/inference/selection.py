@@ -41,6 +41,7 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 
+from siq.errors import NumericalFailure
 from siq.inference.library import CandidateLibrary, total_degree
 
 Result = TypeVar("Result")
@@ -97,14 +98,14 @@ class LinearProblem:
     critical
         Standard errors that each coefficient has to be from zero, shape ``(q,)``.
     labels
-        Component of f and function of each column, shape ``(q, 2)``; None where nobody asks.
+        Component of f and function of each column, shape ``(q, 2)``.
     """
 
     columns: np.ndarray
     goal: np.ndarray
     variance: float
     critical: np.ndarray
-    labels: np.ndarray | None = None
+    labels: np.ndarray
 
     @classmethod
     def of_components(
@@ -134,7 +135,6 @@ class LinearProblem:
 
     def places(self, support: np.ndarray) -> list[int]:
         """Places of the columns of a support ``(p, 2)``, those that the problem has."""
-        assert self.labels is not None
         known = {tuple(label): place for place, label in enumerate(self.labels.tolist())}
         return [known[label] for label in map(tuple, support.tolist()) if label in known]
 
@@ -229,6 +229,28 @@ def best_support(problem: LinearProblem) -> tuple[int, ...]:
     ranked = sorted({*scores, *ends}, key=problem.score)
     best = next((one for one in ranked if not _lacks_terms(problem, one)), ranked[0])
     return best or min((one for one in ends if one), key=problem.score, default=())
+
+
+def chosen_terms(
+    problems: Sequence[LinearProblem],
+    library: CandidateLibrary,
+    choose: Callable[[LinearProblem], Sequence[int]] = best_support,
+    *,
+    reason: str = "; record longer",
+) -> np.ndarray:
+    """The support ``(p, 2)`` of problems that are independent of each other.
+
+    Raises
+    ------
+    NumericalFailure
+        Where an equation has no term, with the reason.
+    """
+    chosen = np.concatenate([problem.labels[list(choose(problem))] for problem in problems])
+    for component in np.unique(np.concatenate([problem.labels[:, 0] for problem in problems])):
+        if component not in chosen[:, 0]:
+            name = library.states[component]
+            raise NumericalFailure(f"no term of the equation of {name} is significant{reason}")
+    return chosen
 
 
 def _lacks_terms(problem: LinearProblem, support: Sequence[int]) -> bool:
@@ -348,7 +370,6 @@ def stability(
         drawn = generator.integers(len(parts), size=len(parts))
         triangle = np.asarray(np.linalg.qr(np.concatenate([parts[place] for place in drawn]), mode="r"))
         for problem in problems_of(triangle):
-            assert problem.labels is not None
             again = problem.labels[list(_improved_support(problem, problem.places(support)))]
             counts += (support[:, None] == again).all(axis=2).any(axis=1)
     return counts / DRAWS
@@ -377,7 +398,6 @@ class ModelAverage:
         """The mean over supports of problems that are independent of each other, about a chosen support."""
         bias, spread = np.zeros((library.size, library.dimension)), []
         for problem in problems:
-            assert problem.labels is not None
             i, k = problem.labels.T
             bias[k, i], changes = _mean_over_supports(
                 problem, problem.places(support), further=1 / len(problems)

@@ -9,7 +9,7 @@ import sympy
 
 from siq.data.recordings import SnapshotPairs
 from siq.inference.checks import mean_residual_probability
-from siq.inference.diffusion_model import constant_noise_probability, with_process_noise_rate
+from siq.inference.diffusion_model import ResidualLikelihood, with_process_noise_rate
 from siq.inference.field_estimate import FieldEstimate, read_field, write_field
 from siq.inference.library import IdentificationOptions, candidate_library
 from siq.inference.regression import identify_vector_field, residuals, with_given_noise, with_noise_formula
@@ -142,7 +142,7 @@ def test_a_constant_noise_is_given_up_as_rarely_as_asked(dynamics: Dynamics, see
     for seed in range(seeds):
         pairs = recorded(dynamics, seed=seed, samples=250)
         one = identified(dynamics, pairs)
-        given_up += constant_noise_probability(one, pairs, residuals(one, pairs)) < FALSE
+        given_up += ResidualLikelihood(one, pairs, residuals(one, pairs)).constant_probability() < FALSE
     assert given_up <= most
 
 
@@ -151,4 +151,4 @@ def test_what_forgetting_does_to_residuals_is_no_noise_that_depends_on_the_state
     dynamics = Dynamics.of((X,), (-3 * X - 6 * X**3,))
     pairs = recorded(dynamics, seed=0, samples=4000)
     one = identified(dynamics, pairs)
-    assert constant_noise_probability(one, pairs, residuals(one, pairs)) > FALSE
+    assert ResidualLikelihood(one, pairs, residuals(one, pairs)).constant_probability() > FALSE
