@@ -27,7 +27,7 @@ from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import fit_with_process_noise_as_needed
-from siq.inference.trajectories import FreeRun, UsualStates, free_run, squared_errors
+from siq.inference.trajectories import FreeRun, free_run
 
 LOGGER = logging.getLogger(__name__)
 Change = Literal["better", "same", "worse", "unknown"]
@@ -57,11 +57,11 @@ class SimulationProtocol:
     def run(self, fit: Fit, data: Measurements) -> FreeRun:
         """A fit's simulation of recordings, told how they begin and where it usually is."""
         finer = max(self.substeps, fit.substeps)
-        return free_run(fit.model, data, noise=self.noise, substeps=finer, usual=UsualStates.along(fit.x))
+        return free_run(fit.model, data, noise=self.noise, substeps=finer, usual=fit.x)
 
     def errors(self, fit: Fit, data: Measurements) -> np.ndarray | None:
         """Normalised squared errors of that run, shape ``(values,)``; None where it ran away."""
-        return squared_errors(data.outputs, self.run(fit, data))
+        return self.run(fit, data).squared_errors(data.outputs)
 
     def nearest(self, fits: list[Fit], data: Measurements) -> Fit:
         """The fit that runs nearest to recordings; the first of those that are as near, or run away."""
@@ -112,7 +112,7 @@ class HeldOutErrors:
         ----------
         runs
             By their names above: normalised squared errors of the same values, sample by sample, shape
-            ``(values,)``; None where the simulation ran away (`siq.inference.trajectories.squared_errors`).
+            ``(values,)``; None where the simulation ran away (`FreeRun.squared_errors`).
         noise_floor
             See above.
         """

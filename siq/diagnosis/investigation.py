@@ -36,7 +36,7 @@ from siq.inference.budget import UNLIMITED, Account, Budget
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, with_expectations
 from siq.inference.recalibration import covariance_with_unknown_process_noise, recalibrate
-from siq.inference.trajectories import FreeRun, squared_errors
+from siq.inference.trajectories import FreeRun
 from siq.remarks import Remark
 from siq.systems.dynamics import Dynamics
 
@@ -374,9 +374,9 @@ def held_out_runs(
         described, fit = choices[adopted]
     before, refitted, run = (runs.run(each, data) for each in (card, recalibrated, fit))
     squares = {
-        "before": squared_errors(data.outputs, before),
-        "recalibrated": squared_errors(data.outputs, refitted),
-        "augmented": squared_errors(data.outputs, run),
+        "before": before.squared_errors(data.outputs),
+        "recalibrated": refitted.squared_errors(data.outputs),
+        "augmented": run.squared_errors(data.outputs),
         "named": runs.errors(plain, data) if named and adopted is not None else None,
     }
     # What a fit leaves may be more than noise; the one that leaves least is nearest to it.

@@ -67,7 +67,7 @@ from siq.inference.recalibration import (
     fit_with_process_noise_as_needed,
     preferred_fit,
 )
-from siq.inference.trajectories import UsualStates, fit_trajectories, free_run, normalised_rms
+from siq.inference.trajectories import fit_trajectories, free_run
 from siq.systems.dynamics import Dynamics, symbol
 
 LOGGER = logging.getLogger(__name__)
@@ -172,9 +172,8 @@ def runs_freely(fit: Fit, alone: Fit, data: Measurements) -> bool:
     errors = []
     for each in (fit, alone):
         # Steps twice as fine: what depends on them is no property of the simulation.
-        usual = UsualStates.along(each.x)
-        run = free_run(each.model, data, noise=each.noise, substeps=2 * each.substeps, usual=usual)
-        errors.append(normalised_rms(data.outputs, run))
+        run = free_run(each.model, data, noise=each.noise, substeps=2 * each.substeps, usual=each.x)
+        errors.append(run.normalised_rms(data.outputs))
     one, other = errors
     return one is not None and (other is None or one < other)
 

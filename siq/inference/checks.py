@@ -17,7 +17,7 @@ P being the projection on the q functions, if f misses no term. Without noise re
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import scipy.special
@@ -40,7 +40,7 @@ from siq.inference.field_estimate import (
 from siq.inference.regression import LaggedPairs, copies, refit, residuals, weighted_triangle
 from siq.numerics.integration import runge_kutta_step
 from siq.numerics.randomness import positive
-from siq.remarks import Remark
+from siq.remarks import Remark, sentence
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import compile_formulas
@@ -265,22 +265,17 @@ def rounding_text(recordings: Recordings, *, coarse: bool = False) -> str | None
     coarse
         Whether only rounding counts that is not small beside the steps from sample to sample.
     """
-    alike: dict[tuple[float, str | None], list[str]] = {}
+    alike: dict[tuple[float, str], dict[str, Any]] = {}
     for name, unit, values in zip(recordings.titles, recordings.units, recordings.values.T, strict=True):
         step = resolution_step(values)
         if step is None:
             continue
-        if coarse and rounding_error(step) < COARSE_ROUNDING * np.sqrt(np.mean(np.diff(values) ** 2)):
+        error, behind = rounding_error(step), f" {unit}" if unit else ""
+        if coarse and error < COARSE_ROUNDING * np.sqrt(np.mean(np.diff(values) ** 2)):
             continue
-        alike.setdefault((step, unit), []).append(f"'{name}'")
-    said = []
-    for (step, unit), names in alike.items():
-        decimals, behind = decimals_of(step), f" {unit}" if unit else ""
-        how = f"to {decimals} decimal{'s' if decimals > 1 else ''}" if decimals else None
-        how = how or f"in steps of {step:.3g}{behind}"
-        them = f"{', '.join(names[:-1])} and {names[-1]} are" if len(names) > 1 else f"{names[0]} is"
-        said.append(f"{them} written {how}, an error of {rounding_error(step):.1g}{behind} in each value")
-    return ", and ".join(said) or None
+        new = {"names": [], "step": step, "unit": behind, "decimals": decimals_of(step), "error": error}
+        alike.setdefault((step, behind), new)["names"].append(f"'{name}'")
+    return sentence(Remark("inference.written", {"steps": list(alike.values())})) if alike else None
 
 
 def unexplained_probability(

@@ -30,7 +30,7 @@ from siq.inference.library import CandidateLibrary, IdentificationOptions, field
 from siq.inference.selection import ModelAverage
 from siq.numerics.files import whole_file
 from siq.numerics.integration import runge_kutta_step
-from siq.remarks import Remark
+from siq.remarks import Remark, sentence
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, symbol
 from siq.systems.formulas import compile_formulas, parse_formula
@@ -254,19 +254,9 @@ class DiffusionSource(StrEnum):
     @property
     def note(self) -> str | None:
         """A remark for the reader of U; none where D was given."""
-        return {
-            DiffusionSource.GIVEN: None,
-            DiffusionSource.ESTIMATED: "D is estimated from the noise of the recordings, since none was"
-            " given, and scaled to the determinant 1: ε has the size of the noise, and U is in the unit of ε",
-            DiffusionSource.OF_VELOCITIES: "D is estimated from the recorded positions, and its part that"
-            " acts on the velocities, the only one there is, scaled to the determinant 1: ε has the size of"
-            " the process noise, and U is in the unit of ε",
-            DiffusionSource.UNIT: "D is taken as the unit matrix, since none was given and the recordings do"
-            " not show it: U, barriers and times follow from it",
-            DiffusionSource.UNIT_OF_VELOCITIES: "D is taken as the unit matrix of the velocities, since the"
-            " recordings show no process noise: U and barriers follow from it, and times need the strength of"
-            " the noise",
-        }[self]
+        if self == DiffusionSource.GIVEN:
+            return None
+        return sentence(Remark("inference.diffusion_source", {"source": str(self)}))
 
 
 @dataclass(frozen=True)
@@ -340,37 +330,19 @@ class NoiseDiagnosis:
 
     def fault(self, states: Sequence[str]) -> str | None:
         """Why formulas from these recordings would be biased, in words; None where they are not."""
-        if self.kind == "measurement":
-            worst = int(np.argmax(self.measurement))
-            return (
-                f"the recordings carry measurement noise, of about {self.measurement[worst]:.2g} in"
-                f" {states[worst]}: residuals of neighbouring pairs are anticorrelated"
-                f" ({self.correlation:.2f}); smooth or average the recordings first"
-            )
-        if self.kind == "rounding" and self.rounding_bias > HARMLESS_BIAS:
-            return (
-                f"{self.rounding}: that is too much for the formulas, which it biases by"
-                f" {self.rounding_bias:.1f} standard errors; write at least {self.decimals} decimals"
-            )
-        if self.kind == "coloured" and self.measurement_error is None:
-            return (
-                f"the residuals of neighbouring pairs are correlated ({self.correlation:.2f}): the noise has"
-                " a memory, or a state is missing from the recordings"
-            )
-        if self.kind == "coloured":
-            return (
-                f"the innovations of neighbouring samples are correlated ({self.correlation:.2f}) though"
-                " measurement noise is allowed for: the process noise is coloured, or a state is missing;"
-                " record that state, or keep every few samples only"
-            )
         deviates = self.deviation_score > SIGNIFICANT_SCORE and self.deviation > HARMLESS_CORRELATION
-        if self.kind == "process" and deviates:
-            shown = np.array2string(self.covariance, precision=3, separator=", ").replace("\n", "")
-            return (
-                f"the noise in the recordings has the covariance {shown} (times {self.intensity:.3g}), which"
-                " is not the D of the study; state this D"
-            )
-        return None
+        faulty = {"rounding": self.rounding_bias > HARMLESS_BIAS, "process": deviates}
+        if not faulty.get(self.kind, self.kind in ("measurement", "coloured")):
+            return None
+        worst = int(np.argmax(self.measurement))
+        shown = np.array2string(self.covariance, precision=3, separator=", ").replace("\n", "")
+        values = {
+            "kind": self.kind, "noise": self.measurement[worst], "state": states[worst],
+            "correlation": self.correlation, "rounding": self.rounding, "bias": self.rounding_bias,
+            "decimals": self.decimals, "covariance": shown, "intensity": self.intensity,
+            "allowed_for": self.measurement_error is not None,
+        }  # fmt: skip
+        return sentence(Remark("inference.noise_fault", values))
 
     def as_data(self) -> dict[str, Any]:
         """As it is stored in `vector_field.json`."""

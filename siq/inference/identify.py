@@ -66,7 +66,7 @@ from siq.inference.kalman_identification import (
     identify_by_likelihood,
 )
 from siq.inference.library import CandidateLibrary, IdentificationOptions, check_origin, field_library
-from siq.inference.observation import ObservationModel, inertia_test, moved_by, seen_inertia, velocity_names
+from siq.inference.observation import ObservationModel, inertia_test, moved_by, velocity_names
 from siq.inference.regression import (
     carries_noise,
     identify_vector_field,
@@ -450,7 +450,7 @@ class _Case:
         if len(self.recordings.names) != 1:
             return None
         try:
-            test = (inertia_test if hidden else seen_inertia)(self.recordings, pair_step=self.pair_step)
+            test = inertia_test(self.recordings, pair_step=self.pair_step, limit=hidden)
         except (NumericalFailure, np.linalg.LinAlgError):
             return None
         if test is None or test.needs_velocity == hidden:

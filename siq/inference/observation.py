@@ -47,6 +47,7 @@ from siq.inference.library import CandidateLibrary, candidate_library
 from siq.inference.maximum_likelihood import Fit, fit_by_filter
 from siq.inference.measurements import Measurements
 from siq.inference.selection import all_coefficients
+from siq.remarks import Remark, sentence
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, symbol
 
@@ -400,34 +401,14 @@ class InertiaTest:
 
     def sentence(self, unit: str = "") -> str:
         """The answer in words, with its figures."""
-        time = f" {unit}" if unit else ""
-        rate = f" per {unit}" if unit else ""
-        if self.seen:
-            damped = self.friction / (2 * self.frequency) if self.frequency > 0 else np.inf
-            kind = "it swings in its well" if damped < 1 else "it creeps back into its well without a swing"
-            assert self.friction_error is not None
-            swing = f", ω = {self.frequency:.3g} ± {self.frequency_error:.1g}" if self.frequency > 0 else ""
-            return (
-                f"the position has inertia: the log-likelihood with a velocity is larger by {self.gain:.0f} ±"
-                f" {self.gain_error:.0f}, γ = {self.friction:.3g} ± {self.friction_error:.1g}{swing}{rate}"
-                f" (γΔt = {self.friction * self.step:.2g}); {kind}"
-            )
-        if self.overdamped:
-            return (
-                f"no inertia is seen: with a velocity the log-likelihood changes by {self.gain:.0f} ±"
-                f" {self.gain_error:.0f}, and γ is above {self.friction:.3g}{rate}, while wells relax with"
-                f" {self.relaxation:.3g}{rate}"
-            )
         needed = 1 / max(self.relaxation / SLIGHT, 1e-300)
-        return (
-            "whether the position has inertia cannot be told: with a velocity the log-likelihood changes by"
-            f" {self.gain:.0f} ± {self.gain_error:.0f}, and γ may be anything above"
-            f" {self.friction:.3g}{rate}, while wells relax with {self.relaxation:.3g}{rate}; a step of at"
-            f" most {needed:.2g}{time}, or a less noisy sensor at a short step, would tell"
-        )
+        verdict = {"seen": self.seen, "overdamped": self.overdamped, "needed": needed, "unit": unit}
+        return sentence(Remark("inference.inertia", vars(self) | verdict))
 
 
-def inertia_test(recordings: Recordings, *, degree: int = 5, pair_step: float | None = None) -> InertiaTest:
+def inertia_test(
+    recordings: Recordings, *, degree: int = 5, pair_step: float | None = None, limit: bool = True
+) -> InertiaTest | None:
     """Ask recordings of one position whether it has inertia.
 
     Parameters
@@ -438,6 +419,8 @@ def inertia_test(recordings: Recordings, *, degree: int = 5, pair_step: float | 
         Highest power of x in F.
     pair_step
         Longest time between samples that still belong together.
+    limit
+        Whether a limit of γ is searched for where no inertia is seen; if not, the answer is None there.
 
     Raises
     ------
@@ -446,26 +429,15 @@ def inertia_test(recordings: Recordings, *, degree: int = 5, pair_step: float | 
     """
     models = _InertialModels(recordings, degree, pair_step)
     test = models.test()
-    if test is not None and test.seen:
-        return test
+    if (test is not None and test.seen) or not limit:
+        return test if test is not None and test.seen else None
     if test is None:  # the samples show no γ
         fastest = MAX_FRICTION / models.step
         fit = models.with_friction(fastest)
-        limit = models.least_friction(fit.log_likelihood, fastest)
-        return InertiaTest(*models.compared(fit), limit, None, models.relaxation, np.nan, np.nan, models.step)
+        least = models.least_friction(fit.log_likelihood, fastest)
+        return InertiaTest(*models.compared(fit), least, None, models.relaxation, np.nan, np.nan, models.step)
     best = models.without.log_likelihood + test.gain + models.price
     return replace(test, friction=models.least_friction(best, test.friction), friction_error=None)
-
-
-def seen_inertia(
-    recordings: Recordings, *, degree: int = 5, pair_step: float | None = None
-) -> InertiaTest | None:
-    """The test where inertia is seen, and None elsewhere: without the search for a limit of γ.
-
-    The arguments, and what is raised, are those of `inertia_test`.
-    """
-    test = _InertialModels(recordings, degree, pair_step).test()
-    return test if test is not None and test.seen else None
 
 
 class _InertialModels:

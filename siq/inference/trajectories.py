@@ -256,7 +256,8 @@ def fit_trajectories(
                 budget.charge(work * (RUN if normal is not None else 1.0 + RUN))
             if normal is None:
                 along = linearise(model, grid, values, states)
-                normal = _normal_equations(along, data, noise.measurement, Expectations.of(model, values))
+                expected = Expectations.of(model, values)
+                normal = _NormalEquations(along, data, noise.measurement, expected)
             change, moved, foreseen = normal.step(damping)
             new = values.copy()
             new[free] += change
@@ -280,27 +281,39 @@ def fit_trajectories(
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
 class _NormalEquations:
-    """Least squares of parameters and the initial states of every recording.
+    """Least squares of parameters and the initial states of every recording, along trajectories without gaps.
 
-    Attributes
-    ----------
-    shared
-        Products of the parameters' columns, summed over the recordings, shape ``(p, p)``.
-    own
-        The same of each recording's initial state, shape ``(r, d, d)``.
-    between
-        Of parameters and initial states, shape ``(r, p, d)``.
-    shared_target, own_target
-        With the residuals: shapes ``(p,)`` and ``(r, d)``.
+    `shared` are the products of the parameters' columns, `own` those of each recording's initial state, and
+    `between` those of both; the variances ``(m,)`` are the sensors'.
     """
 
-    shared: np.ndarray
-    own: np.ndarray
-    between: np.ndarray
-    shared_target: np.ndarray
-    own_target: np.ndarray
+    def __init__(
+        self, along: Linearisation, data: Measurements, variance: np.ndarray, expected: Expectations
+    ) -> None:
+        along = replace(along, gap=np.zeros_like(along.gap))
+        still = np.zeros((1, *along.transition.shape[1:]))
+        innovations, by_parameters, by_initial = along.filtered(data.first, data.step, variance, still)[:3]
+        dimension, parameters, recordings = by_initial.shape[2], by_parameters.shape[2], len(data.labels)
+        self.shared, self.shared_target = np.zeros((parameters, parameters)), np.zeros(parameters)
+        self.own, self.own_target = (
+            np.zeros((recordings, dimension, dimension)),
+            np.zeros((recordings, dimension)),
+        )
+        self.between = np.zeros((recordings, parameters, dimension))
+        for place, (first, end) in enumerate(zip(data.first[:-1], data.first[1:], strict=True)):
+            # As of a root at zero: where a derivative is no number, no direction is known.
+            columns, states = (
+                np.nan_to_num(each[first:end].reshape(-1, each.shape[2]), posinf=0.0, neginf=0.0)
+                for each in (by_parameters, by_initial)
+            )
+            left = innovations[first:end].ravel()
+            self.shared += columns.T @ columns
+            self.shared_target += columns.T @ left
+            self.between[place], self.own[place] = columns.T @ states, states.T @ states
+            self.own_target[place] = states.T @ left
+        self.shared += expected.rows.T @ expected.rows
+        self.shared_target += expected.rows.T @ expected.deviations
 
     def step(self, damping: float) -> tuple[np.ndarray, np.ndarray, float]:
         """Changes of parameters ``(p,)`` and initial states ``(r, d)``, and what they gain if all is linear.
@@ -326,37 +339,6 @@ class _NormalEquations:
         return change / scale, begin / own_scale, linear + damping * length
 
 
-def _normal_equations(
-    linearisation: Linearisation,
-    data: Measurements,
-    variance: np.ndarray,
-    expected: Expectations | None = None,
-) -> _NormalEquations:
-    """The normal equations along trajectories without gaps, at the sensors' variances ``(m,)``."""
-    along = replace(linearisation, gap=np.zeros_like(linearisation.gap))
-    still = np.zeros((1, *along.transition.shape[1:]))
-    innovations, by_parameters, by_initial = along.filtered(data.first, data.step, variance, still)[:3]
-    dimension, parameters = by_initial.shape[2], by_parameters.shape[2]
-    recordings = len(data.labels)
-    shared, shared_target = np.zeros((parameters, parameters)), np.zeros(parameters)
-    own, own_target = np.zeros((recordings, dimension, dimension)), np.zeros((recordings, dimension))
-    between = np.zeros((recordings, parameters, dimension))
-    for place, (first, end) in enumerate(zip(data.first[:-1], data.first[1:], strict=True)):
-        # As of a root at zero: where a derivative is no number, no direction is known.
-        values = (end - first) * innovations.shape[1]
-        columns = by_parameters[first:end].reshape(values, parameters)
-        columns = np.nan_to_num(columns, posinf=0.0, neginf=0.0)
-        states = np.nan_to_num(by_initial[first:end].reshape(values, dimension), posinf=0.0, neginf=0.0)
-        left = innovations[first:end].ravel()
-        shared += columns.T @ columns
-        shared_target += columns.T @ left
-        between[place], own[place], own_target[place] = columns.T @ states, states.T @ states, states.T @ left
-    if expected is not None:
-        shared += expected.rows.T @ expected.rows
-        shared_target += expected.rows.T @ expected.deviations
-    return _NormalEquations(shared, own, between, shared_target, own_target)
-
-
 def _sizes(squares: np.ndarray) -> np.ndarray:
     return np.sqrt(np.where(squares > 0, squares, 1.0))
 
@@ -380,24 +362,24 @@ class FreeRun:
     outputs: np.ndarray
     scored: np.ndarray
 
+    def squared_errors(self, outputs: np.ndarray) -> np.ndarray | None:
+        """Squared errors of all scored values over the variance of each of the measured outputs ``(n, m)``.
 
-@dataclass(frozen=True)
-class UsualStates:
-    """Where a system usually is: what a prefix does not tell of a state that nobody measures.
+        Shape ``(values,)``, sample by sample; what was not measured is left out. None where a simulation ran
+        away.
+        """
+        measured = outputs[self.scored]
+        error = self.outputs[self.scored] - measured
+        known = np.isfinite(measured)
+        if not np.isfinite(error[known]).all():
+            return None
+        spread = np.nanvar(measured, axis=0)
+        return np.asarray((error**2 / np.where(spread > 0, spread, 1.0))[known])
 
-    Attributes
-    ----------
-    mean, width
-        Of each state: its mean, and how far from there it may well begin; shape ``(d,)``.
-    """
-
-    mean: np.ndarray
-    width: np.ndarray
-
-    @classmethod
-    def along(cls, x: np.ndarray) -> UsualStates:
-        """Of states ``(n, d)`` along recordings: anywhere within their range, as many begin at its ends."""
-        return cls(x.mean(axis=0), np.ptp(x, axis=0))
+    def normalised_rms(self, outputs: np.ndarray) -> float | None:
+        """Root mean square error over that of the outputs about their mean, see `squared_errors`."""
+        squares = self.squared_errors(outputs)
+        return None if squares is None else float(np.sqrt(squares.mean()))
 
 
 def free_run(
@@ -407,7 +389,7 @@ def free_run(
     noise: Noise,
     substeps: int,
     told: int | None = None,
-    usual: UsualStates | None = None,
+    usual: np.ndarray | None = None,
 ) -> FreeRun:
     """Simulate recordings from states that their prefixes tell.
 
@@ -424,7 +406,8 @@ def free_run(
     told
         Samples of each prefix; by default a fifth of the recording, and `SHORTEST_PREFIX` at least.
     usual
-        Where the states are expected beforehand; by default nothing is.
+        States along other recordings, shape ``(k, d)``: what a prefix does not tell is expected about their
+        mean, anywhere within their range, as many recordings begin at its ends. By default nothing is.
     """
     lengths = np.diff(data.first)
     rows = np.maximum((PREFIX * lengths).astype(int), SHORTEST_PREFIX) if told is None else told
@@ -446,7 +429,7 @@ def _initial_states(
     *,
     noise: Noise,
     substeps: int,
-    usual: UsualStates | None = None,
+    usual: np.ndarray | None = None,
 ) -> np.ndarray:
     """The states in which recordings begin, shape ``(recordings, d)``, with all parameters as they are."""
     still = replace(model, parameters=tuple(replace(each, fixed=True) for each in model.parameters))
@@ -455,11 +438,12 @@ def _initial_states(
     start = first_states(still, data)
     if usual is not None:
         # What is expected of first states, as if it were measured: once, and as inaccurately as it is known.
-        moving = np.flatnonzero(usual.width > 0)
+        mean, width = usual.mean(axis=0), np.ptp(usual, axis=0)
+        moving = np.flatnonzero(width > 0)
         names = [still.states[place] for place in moving]
         expected = np.full((len(data.t), len(names)), np.nan)
-        expected[data.first[:-1]] = usual.mean[moving]
-        variances = np.concatenate([noise.measurement, usual.width[moving] ** 2])
+        expected[data.first[:-1]] = mean[moving]
+        variances = np.concatenate([noise.measurement, width[moving] ** 2])
         further = ((f"usual_{name}", symbol(name)) for name in names)
         still = replace(still, outputs=(*still.outputs, *further))
         data = replace(data, outputs=np.hstack([data.outputs, expected]), sensor_noise=variances)
@@ -470,7 +454,7 @@ def _initial_states(
     )  # fmt: skip
     x = follow.x if np.isfinite(follow.sum_of_squares) else start
     strict = fit_by_multiple_shooting(
-        still, data, x=x, noise=Noise(noise.measurement, np.zeros(model.dimension)), estimate_process=False,
+        still, data, x=x, noise=Noise(noise.measurement, 0 * process), estimate_process=False,
         substeps=substeps,
     )  # fmt: skip
     if strict.converged:
@@ -480,39 +464,6 @@ def _initial_states(
     damped = fit_trajectories(still, data, begin=x[data.first[:-1]], noise=noise, substeps=substeps)
     best = damped.x if np.isfinite(damped.sum_of_squares) else x
     return best[data.first[:-1]]
-
-
-def normalised_rms(outputs: np.ndarray, simulated: FreeRun) -> float | None:
-    """Root mean square error over that of the outputs about their mean; None where a simulation ran away.
-
-    Parameters
-    ----------
-    outputs
-        As measured, shape ``(n, m)``.
-    simulated
-        The free run of the same recordings.
-    """
-    squares = squared_errors(outputs, simulated)
-    return None if squares is None else float(np.sqrt(squares.mean()))
-
-
-def squared_errors(outputs: np.ndarray, simulated: FreeRun) -> np.ndarray | None:
-    """Squared errors over the variance of each output, of every value that is scored; see `normalised_rms`.
-
-    Returns
-    -------
-    numpy.ndarray or None
-        Shape ``(values,)``, sample by sample; what was not measured is left out. None where a simulation ran
-        away.
-    """
-    measured = outputs[simulated.scored]
-    error = simulated.outputs[simulated.scored] - measured
-    known = np.isfinite(measured)
-    if not np.isfinite(error[known]).all():
-        return None
-    spread = np.nanvar(measured, axis=0)
-    squares: np.ndarray = (error**2 / np.where(spread > 0, spread, 1.0))[known]
-    return squares
 
 
 EDGE_SUBSTEPS = 12  # between samples, for models whose f jumps
@@ -575,14 +526,9 @@ def sharpened(rough: Fit, data: Measurements, *, budget: Budget | None = None) -
         )
         if not finer.converged:
             finer = fit_by_multiple_shooting(
-                model,
-                data,
-                x=rough.x,
-                noise=rough.noise,
-                estimate_process=False,
-                substeps=substeps,
+                model, data, x=rough.x, noise=rough.noise, estimate_process=False, substeps=substeps,
                 budget=budget,
-            )
+            )  # fmt: skip
         if not finer.converged:
             break
         gained, rough = finer.log_likelihood - rough.log_likelihood, finer

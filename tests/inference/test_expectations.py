@@ -13,11 +13,9 @@ from siq.inference.kalman_filter import Noise
 from siq.inference.measurements import Expectations, Measurements, with_expectations
 from siq.inference.recalibration import recalibrate
 from siq.inference.trajectories import (
-    UsualStates,
     _initial_states,
     fit_trajectories,
     free_run,
-    normalised_rms,
 )
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter
@@ -95,21 +93,25 @@ def test_expectations_do_not_depend_on_units() -> None:
 def test_a_hidden_state_begins_where_it_usually_is_unless_the_prefix_tells() -> None:
     data = recordings(model())
     noise = Noise(np.array([1e-4]), np.zeros(2))
-    usual = UsualStates(np.array([0.0, 0.8]), np.array([2.0, 0.4]))
+    usual = np.array([[-1.0, 0.6], [1.0, 1.0]])
     # Nothing tells z where it does nothing.
     begin = _initial_states(model(b=0.0), data, noise=noise, substeps=2, usual=usual)
     np.testing.assert_allclose(begin[:, 1], 0.8, atol=1e-3)
     # Where the prefix does tell it, a wrong expectation as wide as that does no harm.
     known = free_run(model(), data, noise=noise, substeps=2)
     expected = free_run(model(), data, noise=noise, substeps=2, usual=usual)
-    one, other = (normalised_rms(data.outputs, each) for each in (known, expected))
+    one, other = (each.normalised_rms(data.outputs) for each in (known, expected))
     assert one is not None and other == pytest.approx(one, rel=0.1)
 
 
-def test_where_states_usually_are() -> None:
-    usual = UsualStates.along(np.array([[0.0, 1.0], [4.0, 1.0], [2.0, 1.0]]))
-    np.testing.assert_array_equal(usual.mean, [2.0, 1.0])
-    np.testing.assert_array_equal(usual.width, [4.0, 0.0])
+def test_a_state_that_rests_is_expected_nowhere_else_and_does_no_harm() -> None:
+    data = recordings(model())
+    noise = Noise(np.array([1e-4]), np.zeros(2))
+    usual = np.array([[0.0, 1.0], [4.0, 1.0], [2.0, 1.0]])
+    begin, alone = (
+        _initial_states(model(), data, noise=noise, substeps=2, usual=one) for one in (usual, None)
+    )
+    np.testing.assert_allclose(begin, alone, rtol=0.05, atol=0.01)
 
 
 def test_a_part_of_the_budget_can_be_kept_for_later() -> None:
