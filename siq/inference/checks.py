@@ -85,17 +85,7 @@ class PredictionLimits:
 def residual_noise(
     found: FieldEstimate, recordings: Recordings, *, pair_step: float | None
 ) -> NoiseDiagnosis:
-    """Kind, strength and correlations of the noise in recordings, by the residuals of pairs.
-
-    Parameters
-    ----------
-    found
-        The identified f.
-    recordings
-        The trajectories, whose samples also serve between the pairs.
-    pair_step
-        Longest step of a pair.
-    """
+    """Kind, strength and correlations of the noise in recordings, by the residuals of pairs about f."""
     d, diffusion = found.library.dimension, found.diffusion
     unit = np.eye(d)
     pairs = snapshot_pairs(recordings, pair_step=pair_step)
@@ -180,10 +170,7 @@ def _whitened(found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray) -> n
 
 
 def _joined(sample: SnapshotPairs, rest: np.ndarray) -> np.ndarray:
-    """Which pairs share a sample with the next: the later state of one is the earlier one of the other.
-
-    Without the few that an inaccurate f carries far away, by which everything else would be hidden.
-    """
+    """Which pairs share a sample with the next, without the few that an inaccurate f carries far away."""
     usual = (np.abs(rest) < OUTLIER * np.median(np.abs(rest), axis=0)).all(axis=1)
     same = (sample.recording[1:] == sample.recording[:-1]) & (sample.xh[:-1] == sample.x0[1:]).all(axis=1)
     return np.asarray(same & usual[1:] & usual[:-1])
@@ -211,16 +198,9 @@ def rounding_errors(recordings: Recordings) -> np.ndarray:
 
 
 def is_rounding(measured: np.ndarray, rounding: np.ndarray, *, correlation: float) -> bool:
-    """Whether the noise of a measurement is that of rounding, and no other.
+    """Whether measured noise, by its standard deviations ``(d,)``, is that of rounding, and no other.
 
-    Parameters
-    ----------
-    measured
-        Shape ``(d,)``: standard deviations of the noise that the residuals show.
-    rounding
-        Shape ``(d,)``: of rounding.
-    correlation
-        Of neighbouring residuals: -1/2 where nothing but the measurement is noisy.
+    The correlation is that of neighbouring residuals: -1/2 where nothing but the measurement is noisy.
     """
     low, high = ROUNDING_RANGE
     own = rounding > 0
@@ -258,12 +238,7 @@ def rounding_bias(found: FieldEstimate, pairs: SnapshotPairs, rounding: np.ndarr
 def rounding_text(recordings: Recordings, *, coarse: bool = False) -> str | None:
     """The rounding of recordings and the error that it means, in words; None where no rounding is seen.
 
-    Parameters
-    ----------
-    recordings
-        Trajectories.
-    coarse
-        Whether only rounding counts that is not small beside the steps from sample to sample.
+    Where only `coarse` rounding counts, none that is small beside the steps from sample to sample.
     """
     alike: dict[tuple[float, str], dict[str, Any]] = {}
     for name, unit, values in zip(recordings.titles, recordings.units, recordings.values.T, strict=True):
@@ -292,16 +267,13 @@ def unexplained_probability(
     Parameters
     ----------
     columns, rest
-        Shapes ``(n, q)`` and ``(n, r)``, of white residuals.
+        Shapes ``(n, q)`` and ``(n, r)``, of white residuals; the smallest probability of the r counts,
+        corrected
+        for their number.
     freedom
         Degrees of freedom of the residuals, n by default.
     variance
         Of each of the r residuals, shape ``(r,)``, where it is known.
-
-    Returns
-    -------
-    float
-        The smallest of the r residuals, corrected for their number.
     """
     basis = np.linalg.qr(columns / positive(np.linalg.norm(columns, axis=0)))[0]
     explained = ((basis.T @ rest) ** 2).sum(axis=0)
@@ -320,10 +292,8 @@ def mean_residual_probability(found: FieldEstimate, pairs: SnapshotPairs, *, see
 
     Parameters
     ----------
-    found
-        f, without the held-out pairs.
-    pairs
-        These.
+    found, pairs
+        f, without the held-out pairs, and these.
     seen
         Number of pairs that f was fitted to, for `LaggedPairs`: its own error adds the share
         ``len(pairs.h)/seen`` to their residuals at most.
@@ -349,18 +319,9 @@ def mean_residual_probability(found: FieldEstimate, pairs: SnapshotPairs, *, see
 def predict(dynamics: Dynamics, recordings: Recordings) -> np.ndarray:
     """Follow f from the first sample of every recording through all its times.
 
-    Parameters
-    ----------
-    dynamics
-        f and D.
-    recordings
-        The trajectories; each keeps its own times.
-
-    Returns
-    -------
-    numpy.ndarray
-        Predicted states in the order of ``recordings.values``, shape ``(n, d)``; not finite where the
-        prediction runs away, or f is too fast to be followed from sample to sample.
+    In the order of ``recordings.values``, shape ``(n, d)``; not finite where the prediction runs away, or f
+    is too
+    fast to be followed from sample to sample.
     """
     starts = np.flatnonzero(np.diff(recordings.recording, prepend=-1))
     lengths = np.diff(np.append(starts, len(recordings.t)))

@@ -68,20 +68,10 @@ def _all_places(d: int, functions: int, most: int = MAX_STATES) -> np.ndarray:
 class _DiffusionLikelihood:
     """Likelihood of recordings under ``εD(x) = Σ_k S_k φ_k(x)``, its scoring and tests: base of both kinds.
 
-    A coefficient is a row ``(i, j, k)`` of places: of the entry ``i ≤ j`` of εD, and of the function φ_k.
-
-    Attributes
-    ----------
-    symbols, terms
-        The d states, and the functions of them, the constant first.
-    functions
-        The functions as they act over each step, shape ``(n, q)``.
-    at_states
-        The functions at recorded states, at which D has to be positive as well.
-    start
-        εD where it is the same everywhere, shape ``(d, d)``.
-    sensor, free
-        Variances of the sensors, shape ``(m,)``, and which of them are estimated with the coefficients.
+    A coefficient is a row ``(i, j, k)`` of places: of the entry ``i ≤ j`` of εD, and of the function φ_k. The
+    `functions` act over each step, those `at_states` at recorded states, shape ``(n, q)``; `start` is εD
+    where it is
+    the same everywhere; `sensor` are the sensors' variances, of which some are free.
     """
 
     functions: np.ndarray
@@ -393,20 +383,13 @@ def process_noise_increments(found: FieldEstimate, pairs: SnapshotPairs, rest: n
 
 
 def with_process_noise_rate(found: FieldEstimate, pairs: SnapshotPairs) -> FieldEstimate:
-    """An estimate whose `noise_rate` is that of the process noise and no longer that of the residuals.
+    """An estimate by pairs whose `noise_rate` is that of the process noise and no longer that of residuals.
 
     Along a step the system forgets a part of what kicked it: a residual has the covariance
     ``∫₀ʰ e^{Js} εD e^{Jᵀs} ds`` with the Jacobian J of f, and not hεD. Per time that is less than εD, by the
     share hλ for relaxation at the rate λ: by four per cent where λ = 2/s is sampled every 0.02 s. The mean of
     that map over the pairs is inverted. What is left is of second order in the step, where the noise moves J
     itself. An Euler–Maruyama simulation forgets in steps of its own, and nothing within one.
-
-    Parameters
-    ----------
-    found
-        f with the covariance of its residuals per time.
-    pairs
-        The pairs that it was fitted to.
     """
     if found.noise_free or not len(pairs.h):
         return found
@@ -445,14 +428,9 @@ def with_process_noise_rate(found: FieldEstimate, pairs: SnapshotPairs) -> Field
 class InnovationLikelihood(_DiffusionLikelihood):
     """The likelihood of a filter's innovations, the sensors' variances with the coefficients of D.
 
-    Parameters
-    ----------
-    symbols
-        The d states that noise may drive, the first ones of the model.
-    fit
-        Of f, whose trajectories and coefficients stay as they are.
-    data
-        What it was fitted to.
+    Of a fit of f, whose trajectories and coefficients stay as they are; noise may drive the first d states of
+    the
+    model, those of the symbols.
     """
 
     def __init__(self, symbols: tuple[sympy.Symbol, ...], fit: Fit, data: Measurements) -> None:
@@ -533,24 +511,16 @@ def estimated_diffusion(found: FieldEstimate, *, pairs: int) -> Diffusion | None
     """D as the residuals show it, of determinant 1; None where there is none to be shown.
 
     States whose noises show no significant correlation have none: an entry of D from chance alone would bring
-    a term into g that nothing else asks for.
+    a term into g that nothing else asks for. The correlation of so many `pairs` has the standard error
+    1/√pairs.
 
     The scale of D is a matter of convention, since a factor goes into ε. The determinant, unlike the trace
     or the largest eigenvalue, changes by a mere factor when the unit of one state does. Noise that is alike
     in all directions has the unit matrix, but for the error of the diagonal.
 
-    Parameters
-    ----------
-    found
-        f with the covariance of its residuals.
-    pairs
-        Number of independent residuals behind it: a correlation of none has the standard error 1/√pairs.
-
-    Returns
-    -------
-    Diffusion or None
-        None without noise, where noise does not reach every state, and where a state is but the derivative
-        of another: what its residuals show is the noise of the other, and depends on the step of the pairs.
+    There is none without noise, where noise does not reach every state, and where a state is but the
+    derivative
+    of another: what its residuals show is the noise of the other, and depends on the step of the pairs.
     """
     if found.noise_free or defined_states(found.dynamics):
         return None

@@ -80,10 +80,8 @@ class FlowMap:
 
         Parameters
         ----------
-        field
-            An estimate of f.
-        x0, h
-            States ``(d, n)`` and the steps of their pairs ``(n,)``.
+        field, x0, h
+            An estimate of f, states ``(d, n)`` and the steps of their pairs ``(n,)``.
         integrator_step
             Step of the Euler–Maruyama simulation that made the data; None for everything else.
         tolerance
@@ -507,18 +505,9 @@ class FieldEstimate:
     def variance(self, slopes: np.ndarray, *, of_mean: bool = False) -> np.ndarray:
         """Variance of what follows from f to first order, by its coefficients and by which terms there are.
 
-        Parameters
-        ----------
-        slopes
-            Derivatives by all coefficients, shape ``(..., q, d)``.
-        of_mean
-            Whether what follows from f has been moved by `bias`. If not, the square of that is a part of the
-            result.
-
-        Returns
-        -------
-        numpy.ndarray
-            Shape ``(...)``.
+        Derivatives by all coefficients ``(..., q, d)`` to ``(...)``. The square of `bias` is a part of it,
+        unless it is
+        that `of_mean`, which has been moved by the bias.
         """
         components, terms = self.support.T
         own = slopes[..., terms, components]
@@ -608,18 +597,7 @@ def field_dynamics(
 ) -> Dynamics:
     """Dynamics whose parameters are the coefficients of f over some terms of a library.
 
-    Parameters
-    ----------
-    library
-        The q functions of the d states.
-    support
-        Shape ``(p, 2)``: component and term of each coefficient.
-    values
-        The coefficients, shape ``(p,)``.
-    diffusion
-        D.
-    covariance
-        Of the coefficients, shape ``(p, p)``.
+    Their values ``(p,)`` and covariance ``(p, p)`` belong to a support ``(p, 2)`` of components and terms.
     """
     prefix = "c"
     while any(f"{prefix}{place}" in library.states for place in range(len(support))):

@@ -195,18 +195,9 @@ class Linearisation:
     ) -> tuple[Any, ...]:
         """Innovations of the filter along it; see `siq.inference.filter_kernels.filter_recursion`.
 
-        Parameters
-        ----------
-        first, step
-            Where recordings begin, and lengths of the intervals.
-        variance, intensity
-            Of the measurement noise, and of the process noise.
-        begin, begin_covariance
-            Of the states of recordings; by default zero.
-        functions, places
-            Of the process noise, where the likelihood is derived by it.
-        kept
-            Whether what a smoother needs is kept.
+        By default recordings begin at zero without a covariance; with functions and places of the process
+        noise the
+        likelihood is derived by it.
         """
         dimension = self.gap.shape[1]
         begin = np.zeros((len(first) - 1, dimension)) if begin is None else begin
@@ -281,14 +272,10 @@ def linearise(
 
     Parameters
     ----------
-    model
-        Its free parameters are the first columns of the response.
-    grid
-        Measurements and substeps.
-    values
-        All parameters, shape ``(p,)``.
-    x
-        The states in hand, shape ``(n, d)``.
+    model, grid
+        Its free parameters are the first columns of the response; measurements and substeps.
+    values, x
+        All parameters, shape ``(p,)``, and the states in hand, shape ``(n, d)``.
     columns
         Further right-hand sides whose response is wanted behind those of the parameters.
     drift
@@ -376,14 +363,9 @@ def substeps_needed(
 ) -> int:
     """Runge–Kutta steps in every interval, so that doubling them changes little.
 
-    Parameters
-    ----------
-    model, data, values
-        The model and what it is compared with.
-    x
-        States, shape ``(n, d)``.
-    tolerance
-        Root mean square change of the increments allowed, relative to the spread of the states.
+    The tolerance is the root mean square change of the increments from states ``(n, d)`` that is allowed,
+    relative to
+    the spread of the states.
     """
     steps = 1
     scale = x.std(axis=0) + 1e-300

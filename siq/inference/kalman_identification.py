@@ -289,23 +289,13 @@ def _follow(
 def held_out_innovations(
     found: FieldEstimate, training: Recordings, unseen: Recordings, *, pair_step: float | None = None
 ) -> tuple[float, float]:
-    """Whether f holds for recordings that it was not fitted to, by the innovations of the filter.
+    """Whether an f by likelihood holds for recordings that it was not fitted to, by the innovations.
 
-    Parameters
-    ----------
-    found
-        Fitted to all recordings by likelihood; its terms are fitted to the training recordings again.
-    training, unseen
-        The two parts.
-    pair_step
-        As for `identify_by_likelihood`.
-
-    Returns
-    -------
-    probability, ratio
-        Of the unseen innovations having no part left that any function of the library explains, see
-        `siq.inference.checks.unexplained_probability`; and of their mean square to that of the training
-        recordings.
+    Its terms are fitted to the training recordings again. Probability of the unseen innovations having no
+    part
+    left that any function of the library explains, see `unexplained_probability`; and the ratio of their mean
+    square
+    to that of the training recordings.
     """
     observation = ObservationModel.of(found)
     support, values = observation.unknown(found)
@@ -351,13 +341,6 @@ def filtered_recordings(
 
     Velocities that nobody measured are among them. Their increments have the mean of f, as those of the
     states do; those of the measured values do not.
-
-    Parameters
-    ----------
-    found
-        f and its noises, found by likelihood.
-    recordings, pair_step
-        As for `identify_by_likelihood`.
     """
     observation = ObservationModel.of(found)
     data, count = observation.measured(recordings, pair_step), observation.measured_states

@@ -160,15 +160,7 @@ def candidate_library(
 def joint_library(
     of_field: CandidateLibrary, *, degree: int, potential_degree: int, further: Sequence[str] = ()
 ) -> CandidateLibrary:
-    """A library for V that also holds every function of f's library.
-
-    Parameters
-    ----------
-    of_field
-        The functions of f.
-    degree, potential_degree, further
-        As for `candidate_library`. V may also use the functions of f that are no monomials.
-    """
+    """A library for V that also holds all of f's; V may use those functions of f that are no monomials."""
     highest, others = degree, list(further)
     for place, (name, term) in enumerate(zip(of_field.names, of_field.terms, strict=True)):
         if term.is_polynomial(*of_field.symbols):
@@ -181,21 +173,13 @@ def joint_library(
 
 
 def check_origin(library: CandidateLibrary, x: np.ndarray, *, names: Sequence[str]) -> None:
-    """Refuse states whose origin is so far from them that their powers are all the same function.
-
-    Parameters
-    ----------
-    library
-        The functions.
-    x
-        Recorded states, shape ``(n, d)``.
-    names
-        What people call them.
+    """Refuse states ``(n, d)`` whose origin is so far from them that their powers are all the same function.
 
     Raises
     ------
     NumericalFailure
-        Where errors of coefficients would be rounding. It says what to subtract.
+        Where errors of coefficients would be rounding. It says what to subtract, by the names that people
+        use.
     """
     low, high = x.min(axis=0), x.max(axis=0)
     middle, half = (low + high) / 2, (high - low) / 2

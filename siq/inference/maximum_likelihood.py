@@ -460,16 +460,11 @@ def _or_fault(model: Dynamics, begin: _Iterate, noise: Noise, substeps: int, fit
 
 @dataclass(frozen=True)
 class _Shooting:
-    """A model to be fitted, on the grid of its measurements.
+    """A model to be fitted, on the grid of its measurements; the sizes of states are ``(d,)``.
 
-    Attributes
-    ----------
-    scale
-        The size of each state, shape ``(d,)``.
-    filtered
-        Whether f is taken at what a filter knows, rather than at smoothed states.
-    closed
-        f with the effect of the filter's spread on it, where that is wanted.
+    It may be filtered: f is taken at what a filter knows, rather than at smoothed states, and closed, with
+    the effect
+    of the filter's spread on f.
     """
 
     model: Dynamics
@@ -680,19 +675,10 @@ def fit_by_filter(
 ) -> Fit:
     """The second half of `fit_by_multiple_shooting` alone, for a model that follows the data from the start.
 
-    Parameters
-    ----------
-    model, data, x, noise, estimate_process, substeps, iterations, budget
-        See there; process noise has to drive the states.
-    estimate_sensor
-        Whether measurement noise is estimated; if not, the process noise is as given, too.
-    closure
-        Whether the spread of what the filter knows acts on the mean of f (`siq.inference.kalman_filter`).
-
-    Returns
-    -------
-    Fit
-        See there.
+    Process noise has to drive the states. Where measurement noise is not estimated, the process noise is as
+    given,
+    too. With the closure the spread of what the filter knows acts on the mean of f
+    (`siq.inference.kalman_filter`).
     """
     with np.errstate(all="ignore"):  # what runs away is told as a fault
         if not estimate_sensor:

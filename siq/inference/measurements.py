@@ -8,8 +8,10 @@ What recordings do tell, they tell far better.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy.interpolate
@@ -18,7 +20,7 @@ import sympy
 
 from siq.data.recordings import Recordings
 from siq.errors import Fault
-from siq.systems.dynamics import Dynamics, Input, Signals, symbol
+from siq.systems.dynamics import Dynamics, Signals, symbol
 
 OVERSAMPLING = 16  # of band-limited inputs, between whose dense samples cubics are exact enough
 PADDING = 64  # samples by which they are continued, mirrored, so that the ends do not ring
@@ -153,44 +155,29 @@ class Measurements:
 
     def select(self, chosen: Sequence[int]) -> Measurements:
         """Some of the recordings, by their places."""
-        rows = [np.arange(self.first[place], self.first[place + 1]) for place in chosen]
-        together = np.concatenate(rows)
-        return replace(
-            self,
+        return self._part(
+            [np.arange(self.first[place], self.first[place + 1]) for place in chosen],
             labels=tuple(self.labels[place] for place in chosen),
-            first=np.concatenate([[0], np.cumsum([len(each) for each in rows])]),
-            t=self.t[together],
-            outputs=self.outputs[together],
             courses=tuple(self.courses[place] for place in chosen),
         )
 
     def until(self, rows: np.ndarray) -> Measurements:
         """The first so many rows of each recording, shape ``(recordings,)``; the inputs stay whole."""
-        kept = [np.arange(begin, begin + count) for begin, count in zip(self.first[:-1], rows, strict=True)]
-        together = np.concatenate(kept)
-        return replace(
-            self,
-            first=np.concatenate([[0], np.cumsum(rows)]),
-            t=self.t[together],
-            outputs=self.outputs[together],
+        return self._part(
+            [np.arange(begin, begin + count) for begin, count in zip(self.first[:-1], rows, strict=True)]
         )
+
+    def _part(self, rows: Sequence[np.ndarray], **changes: Any) -> Measurements:
+        at, first = np.concatenate(rows), np.cumsum([0, *map(len, rows)])
+        return replace(self, first=first, t=self.t[at], outputs=self.outputs[at], **changes)
 
 
 def _course_of_input(t: np.ndarray, u: np.ndarray, interpolation: str) -> scipy.interpolate.PPoly:
-    """An input as a function of time, from its samples.
+    """An input as a function of time, from samples ``(n,)`` of one recording.
 
-    Parameters
-    ----------
-    t, u
-        Times and samples of one recording, shape ``(n,)`` each.
-    interpolation
-        ``zero_order`` holds each sample until the next; ``linear`` joins them; ``band_limited`` takes the
-        one signal without content above half the sampling rate, which needs regular sampling.
-
-    Raises
-    ------
-    ValueError
-        For a band-limited signal that is sampled irregularly.
+    ``zero_order`` holds each sample until the next; ``linear`` joins them; ``band_limited`` takes the one
+    signal
+    without content above half the sampling rate, which needs regular sampling.
     """
     if len(t) < 2:
         return scipy.interpolate.PPoly(np.array([[u[0]]]), np.array([t[0], t[0] + 1.0]))
@@ -227,36 +214,27 @@ def measurements(recordings: Recordings, model: Dynamics) -> Measurements:
 
     Raises
     ------
-    ValueError
+    Fault
         When an input cannot be interpolated as the model says.
     """
     count = len(model.outputs)
     first = np.searchsorted(recordings.recording, np.arange(len(recordings.labels) + 1))
-    return Measurements(
-        labels=recordings.labels,
-        first=first,
-        t=recordings.t,
-        outputs=np.ascontiguousarray(recordings.values[:, :count]),
-        courses=tuple(
-            tuple(
-                _course(recordings, slice(first[place], first[place + 1]), count + k, entry)
-                for k, entry in enumerate(model.inputs)
-            )
-            for place in range(len(recordings.labels))
-        ),
-    )
+    courses = []
+    for begin, end in itertools.pairwise(first):
+        t, mine = recordings.t[begin:end], []
+        for column, entry in enumerate(model.inputs, count):
+            try:
+                mine.append(_course_of_input(t, recordings.values[begin:end, column], entry.interpolation))
+            except Fault as error:
+                raise Fault(f"input {entry.name}: {error.fault}", error.remedy) from None
+        courses.append(tuple(mine))
+    outputs = np.ascontiguousarray(recordings.values[:, :count])
+    return Measurements(recordings.labels, first, recordings.t, outputs, tuple(courses))
 
 
 def columns_of(model: Dynamics) -> tuple[str, ...]:
     """The columns of recordings that a model needs: outputs, then inputs."""
     return (*model.output_names, *(entry.name for entry in model.inputs))
-
-
-def _course(recordings: Recordings, rows: slice, column: int, entry: Input) -> scipy.interpolate.PPoly:
-    try:
-        return _course_of_input(recordings.t[rows], recordings.values[rows, column], entry.interpolation)
-    except Fault as error:
-        raise Fault(f"input {entry.name}: {error.fault}", error.remedy) from None
 
 
 def first_states(model: Dynamics, data: Measurements) -> np.ndarray:
@@ -266,29 +244,9 @@ def first_states(model: Dynamics, data: Measurements) -> np.ndarray:
     slope at zero, such as a square root.
     """
     states = np.tile(_middle(model), (len(data.t), 1))
-    from_output = _measured_states(model)
-    derivative_of = {
-        str(equation): name
-        for name, equation, is_definition in zip(model.states, model.equations, model.kinematic, strict=True)
-        if is_definition
-    }
-    for place, name in enumerate(model.states):
-        if name in from_output:
-            states[:, place] = _read_off(data, *from_output[name])
-    for place, name in enumerate(model.states):
-        if name not in from_output and derivative_of.get(name) in from_output:
-            position = _read_off(data, *from_output[derivative_of[name]])
-            for begin, end in zip(data.first[:-1], data.first[1:], strict=True):
-                if end - begin > 1:
-                    states[begin:end, place] = np.gradient(position[begin:end], data.t[begin:end])
-    return states
-
-
-def _measured_states(model: Dynamics) -> dict[str, tuple[int, float, float]]:
-    """States that an output is, up to a factor and an offset: its place, the factor and the offset."""
+    measured: dict[str, np.ndarray] = {}  # those that an output is, up to a factor and an offset
     values = {symbol(each.name): each.value for each in model.parameters}
-    found = {}
-    for place, (_, formula) in enumerate(model.outputs):
+    for column, (_, formula) in zip(data.outputs.T, model.outputs, strict=False):
         known = formula.xreplace(values)
         for name in model.states:
             slope = known.diff(symbol(name))
@@ -297,12 +255,17 @@ def _measured_states(model: Dynamics) -> dict[str, tuple[int, float, float]]:
             # Of a constant slope the rest is what is left at zero: long formulas are never multiplied out.
             rest = known.xreplace({symbol(name): sympy.S.Zero})
             if rest.is_number:
-                found[name] = (place, float(slope), float(rest))
-    return found
-
-
-def _read_off(data: Measurements, place: int, slope: float, rest: float) -> np.ndarray:
-    return (_filled(data, data.outputs[:, place]) - rest) / slope
+                measured[name] = (_filled(column) - float(rest)) / float(slope)
+    definitions = zip(model.states, model.equations, model.kinematic, strict=True)
+    derivative_of = {str(equation): name for name, equation, defined in definitions if defined}
+    for place, name in enumerate(model.states):
+        if name in measured:
+            states[:, place] = measured[name]
+        elif (position := measured.get(derivative_of.get(name, ""))) is not None:
+            for begin, end in zip(data.first[:-1], data.first[1:], strict=True):
+                if end - begin > 1:
+                    states[begin:end, place] = np.gradient(position[begin:end], data.t[begin:end])
+    return states
 
 
 def _middle(model: Dynamics) -> np.ndarray:
@@ -311,23 +274,18 @@ def _middle(model: Dynamics) -> np.ndarray:
     unknown = np.isnan(middle)
     if not unknown.any():
         return middle
+    one, delayed = np.ones((len(model.inputs), 1)), np.ones((len(model.delays), 1))
+    signals = Signals(inputs=one, delayed=delayed, slopes=delayed, t=np.ones(1))
     about = np.where(unknown, 1.0, middle)  # the others somewhere, so that only the unknown ones matter
     for place in np.flatnonzero(unknown):
         at = about.copy()
         at[place] = 0.0
-        if np.isfinite(_slopes(model, at)).all():
+        if np.isfinite(model.functions.slopes(at[:, None], signals, model.values)[0]).all():
             about = at
     return about
 
 
-def _slopes(model: Dynamics, x: np.ndarray) -> np.ndarray:
-    """Derivatives of f by the states at a point ``(d,)``, with inputs and time of one."""
-    one, delayed = np.ones((len(model.inputs), 1)), np.ones((len(model.delays), 1))
-    signals = Signals(inputs=one, delayed=delayed, slopes=delayed, t=np.ones(1))
-    return model.functions.slopes(x[:, None], signals, model.values)[0]
-
-
-def _filled(data: Measurements, column: np.ndarray) -> np.ndarray:
+def _filled(column: np.ndarray) -> np.ndarray:
     """A measured column with gaps filled linearly."""
     known = np.isfinite(column)
     if known.all() or not known.any():

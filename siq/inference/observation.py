@@ -109,17 +109,7 @@ def smoothed_motion(data: Measurements, names: Sequence[str]) -> tuple[np.ndarra
     """Positions and velocities to begin with, and both noises, when nothing but noise drives the velocities.
 
     That model is linear: its smoother is a spline through the measured positions whose stiffness follows from
-    the likelihood, and no start matters.
-
-    Parameters
-    ----------
-    data, names
-        Of positions.
-
-    Returns
-    -------
-    states, noise
-        Shape ``(n, d)``, positions before velocities.
+    the likelihood, and no start matters. The states ``(n, d)`` have positions before velocities.
 
     Raises
     ------
@@ -329,16 +319,9 @@ def kept_rows(recordings: Recordings, *, pair_step: float | None, every: int = 1
 
 
 def unbroken(recordings: Recordings, *, pair_step: float | None = None, every: int = 1) -> Measurements:
-    """Recordings as measurements of their states, a new one behind every gap.
+    """Recordings as measurements of their states, a new one behind every gap; of `every` so many samples one.
 
-    Parameters
-    ----------
-    recordings
-        Whole trajectories.
-    pair_step
-        Longest time between samples that still belong together; by default one and a half median steps.
-    every
-        Of so many samples one is kept.
+    Samples belong together up to the time `pair_step`, by default one and a half median steps.
     """
     runs = kept_rows(recordings, pair_step=pair_step, every=every)
     rows = np.concatenate(runs)
@@ -477,10 +460,7 @@ class _InertialModels:
         return self._stiffness(self.without.model.values, self.without.covariance)[0]
 
     def compared(self, fit: Fit) -> tuple[float, float]:
-        """Log-likelihood of a fit over that without inertia, at its price, and the error of that.
-
-        The error is from blocks of the record.
-        """
+        """Log-likelihood over that without inertia, at its price, and its error from blocks of the record."""
         gain, data = fit.log_likelihood - self.without.log_likelihood - self.price, self.data
         length = max(len(data.t) // BLOCKS, 2)
         differences = []

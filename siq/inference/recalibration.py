@@ -40,15 +40,6 @@ def covariance_with_unknown_process_noise(
     Analysis 1, 515); the scale of all noise and the parameters are integrated out as linear. A fit without
     process noise is made once more with that of the average, since its trajectories may be far from those
     that process noise made.
-
-    Parameters
-    ----------
-    fit
-        Whose linearisation and noise are used.
-    data
-        The recordings.
-    budget
-        Charged for the work.
     """
     if not len(fit.model.free) or not np.isfinite(fit.covariance).all():
         return fit.covariance

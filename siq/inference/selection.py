@@ -63,12 +63,7 @@ NEGLIGIBLE_VARIANCE = 1e-6  # of the largest, in units in which all functions ha
 def critical_values(library: CandidateLibrary, *, false_terms: float) -> np.ndarray:
     """Number of standard errors that each function has to be from zero, in any equation: shape ``(q,)``.
 
-    Parameters
-    ----------
-    library
-        The q functions of d states.
-    false_terms
-        Probability that noise alone brings any false term into f.
+    Then noise alone brings any false term into f with the probability `false_terms`.
     """
     degrees = np.array(
         [
@@ -254,11 +249,8 @@ def chosen_terms(
 
 
 def _lacks_terms(problem: LinearProblem, support: Sequence[int]) -> bool:
-    """Whether all functions of some degree fit better than chance would let them, once those are there.
-
-    Chance may do so a tenth as often as it may bring in a false term, which the critical values say; the
-    degrees share that.
-    """
+    """Whether all functions of some degree fit better than chance would let them, once those are there."""
+    # Chance may do so a tenth as often as it may bring in a false term; the degrees share that.
     levels = np.unique(problem.critical)
     chance = JOINT_TERMS_SHARE * 2 * scipy.special.ndtr(-problem.critical).sum() / len(levels)
     own = problem.chi_square(support)
@@ -296,12 +288,8 @@ def fit_significant(
         From a support to what was fitted, and the strength of each coefficient: below one it is not
         significant.
     support
-        Component and term of each coefficient, shape ``(p, 2)``.
-
-    Returns
-    -------
-    fitted, support
-        What `fit` gave for the support that remains.
+        Component and term of each coefficient, shape ``(p, 2)``; what remains of it is given back with the
+        fit.
     """
     while True:
         fitted, strength = fit(support)
@@ -333,15 +321,7 @@ def blocks_of(recording: np.ndarray) -> np.ndarray:
 
 
 def triangles(columns: np.ndarray, goals: np.ndarray, block: np.ndarray) -> tuple[np.ndarray, ...]:
-    """R of the QR decomposition of each block of rows, on which every fit to it depends.
-
-    Parameters
-    ----------
-    columns, goals
-        What explains, shape ``(n, c)``, and what is to be explained, shape ``(n,)`` or ``(n, g)``.
-    block
-        Of each row, shape ``(n,)``.
-    """
+    """R of the QR decomposition of each block of rows, see `triangle_of`."""
     return tuple(triangle_of(columns[block == one], goals[block == one]) for one in np.unique(block))
 
 
@@ -462,19 +442,9 @@ ROWS_AT_ONCE = 1 << 14  # numerical: worked on together, so that no second copy 
 
 
 def triangle_of(columns: np.ndarray, goals: np.ndarray) -> np.ndarray:
-    """R of the QR decomposition of columns with their goals behind them.
+    """R of the QR decomposition of columns ``(n, c)`` with their goals ``(n,)`` or ``(n, g)`` behind them.
 
-    Parameters
-    ----------
-    columns
-        Shape ``(n, c)``.
-    goals
-        Shape ``(n,)`` or ``(n, g)``.
-
-    Returns
-    -------
-    numpy.ndarray
-        Shape ``(c + g, c + g)``, or ``(n, c + g)`` of fewer rows.
+    Shape ``(c + g, c + g)``, or ``(n, c + g)`` of fewer rows.
     """
     goals = goals.reshape(len(goals), -1)
     count = columns.shape[1]

@@ -156,14 +156,8 @@ def run_along(
 ) -> np.ndarray:
     """Integrate the rates on a tape, whose arguments are states, signals and parameters, to ``(n, d)``.
 
-    Parameters
-    ----------
-    tape, grid
-        The rates; recordings and substeps.
-    signals
-        What is known at all nodes, shape ``(3 substeps, s, intervals)``.
-    values, begin
-        Of the parameters, shape ``(p,)``; and initial states, shape ``(recordings, d)``.
+    The signals are what is known at all nodes, shape ``(3 substeps, s, intervals)``; initial states are
+    ``(recordings, d)``.
     """
     states = np.full((len(grid.data.t), begin.shape[1]), np.nan)
     registers = tape.registers.copy()
@@ -211,18 +205,14 @@ def fit_trajectories(
 
     Parameters
     ----------
-    model
+    model, data
         Its parameters' values are where the fit begins.
-    data
-        The measurements.
     begin
         Initial states to begin with, shape ``(recordings, d)``.
     noise
         Of which only the measurement noise is used, for the weights of the outputs.
-    substeps
-        Runge–Kutta steps between samples.
-    budget
-        Charged for every evaluation.
+    substeps, budget
+        Runge–Kutta steps between samples; charged for every evaluation.
 
     Returns
     -------
@@ -395,10 +385,8 @@ def free_run(
 
     Parameters
     ----------
-    model
-        With the parameters' values to be used; nothing but initial states is fitted.
-    data
-        The recordings.
+    model, data
+        Nothing but initial states is fitted.
     noise
         The measurement noise weighs the outputs; the process noise lets the states follow the prefix first.
     substeps
