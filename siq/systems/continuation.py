@@ -33,13 +33,15 @@ Yu. A. Kuznetsov, Elements of Applied Bifurcation Theory (2004), chapter 10: cur
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, Self
 
 import numpy as np
 from scipy.optimize import brentq
 
 from siq.errors import Fault
+from siq.remarks import Remark
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, symbol
 from siq.systems.formulas import exact_number
@@ -56,25 +58,9 @@ MIN_TANGENT_COSINE = 0.98  # of the angle between the tangents of a step's ends:
 ON_CURVE_TOLERANCE = 1e-6
 MAX_POINTS = 20_000  # of one branch, a guard
 
-CurveKind = Literal["fold", "Hopf"]
-BifurcationKind = Literal["fold", "Hopf", "branch point"]
 
-
-class ParameterFamily:
-    """f against some of its parameters, in shares z of the domain and of their ranges.
-
-    Parameters
-    ----------
-    dynamics
-        f with its domain and parameters; those that are not named have their values.
-    limits
-        For each parameter by its name the range of its values, lower before upper.
-
-    Raises
-    ------
-    ValueError
-        When there is no such parameter, or no domain.
-    """
+class _Family:
+    """f against some of its parameters, in shares z of the domain and of their ranges."""
 
     def __init__(self, dynamics: Dynamics, limits: Mapping[str, tuple[float, float]]) -> None:
         known = [each.name for each in dynamics.parameters]
@@ -96,9 +82,9 @@ class ParameterFamily:
             diffusion=Diffusion.identity(self.count),
         )  # fmt: skip
 
-    def shares(self, states: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """States ``(n, d)`` and values, ``(n,)`` or ``(n, p)``, as shares, ``(n, d + p)``."""
-        return (np.column_stack([states, values]) - self.low) / self.width
+    def shares(self, state: np.ndarray, values: float | np.ndarray) -> np.ndarray:
+        """A state and the values of the parameters as shares, shape ``(d + p,)``."""
+        return np.asarray((np.append(state, values) - self.low) / self.width)
 
     def natural(self, z: np.ndarray) -> np.ndarray:
         """Shares as states and, last, the values."""
@@ -127,7 +113,6 @@ class ParameterFamily:
         return values[np.argsort(-values.real)]
 
 
-@dataclass(frozen=True, eq=False)
 class _Equilibria:
     """``f = 0`` for y = z, the states and parameters in shares.
 
@@ -135,7 +120,15 @@ class _Equilibria:
     them they are a curve.
     """
 
-    family: ParameterFamily
+    kind: str = "equilibrium"
+
+    def __init__(self, family: _Family) -> None:
+        self.family, self.d, self.count = family, family.d, family.count
+
+    @classmethod
+    def near(cls, family: _Family, z: np.ndarray) -> tuple[Self, np.ndarray] | None:
+        """The equations next to a point, and all unknowns there; None where there are none."""
+        return cls(family), z
 
     def residual(self, y: np.ndarray) -> np.ndarray:
         """Zero on the curve."""
@@ -145,13 +138,13 @@ class _Equilibria:
         """Derivatives of the residual."""
         return self.family.slopes(y)
 
-    def at(self, y: np.ndarray) -> _Equilibria:
+    def at(self, y: np.ndarray) -> Self:
         """The equations with what is chosen anew at a point."""
         return self
 
     def limit(self, y: np.ndarray) -> tuple[int, float] | None:
         """An unknown that is beyond its limit, with that limit; None where none is."""
-        beyond = np.abs(y[: self.family.count] - 0.5) - 0.5
+        beyond = np.abs(y[: self.count] - 0.5) - 0.5
         worst = int(beyond.argmax())
         return (worst, float(y[worst] > 0.5)) if beyond[worst] > DOMAIN_MARGIN else None
 
@@ -171,44 +164,43 @@ class _Equilibria:
 class _Folds(_Equilibria):
     """``f = 0, A q = 0, |q|² = 1`` for (z, q)."""
 
-    def start(self, z: np.ndarray) -> np.ndarray:
-        """All unknowns next to a fold."""
-        return np.append(z, np.linalg.svd(self.family.slopes(z)[:, : self.family.d])[2][-1])
+    kind = "fold"
+
+    @classmethod
+    def near(cls, family: _Family, z: np.ndarray) -> tuple[Self, np.ndarray] | None:
+        return cls(family), np.append(z, np.linalg.svd(family.slopes(z)[:, : family.d])[2][-1])
 
     def residual(self, y: np.ndarray) -> np.ndarray:
-        z, q = y[: self.family.count], y[self.family.count :]
-        slopes = self.family.slopes(z)[:, : self.family.d]
+        z, q = y[: self.count], y[self.count :]
+        slopes = self.family.slopes(z)[:, : self.d]
         return np.concatenate([self.family.flow(z), slopes @ q, [q @ q - 1]])
 
     def slope(self, y: np.ndarray) -> np.ndarray:
-        d, n = self.family.d, self.family.count
-        z, q = y[:n], y[n:]
+        d, z, q = self.d, y[: self.count], y[self.count :]
         slopes = self.family.slopes(z)
-        result = np.zeros((2 * d + 1, n + d))
-        result[:d, :n] = slopes
-        result[d : 2 * d, :n] = np.einsum("ijk,j->ik", self.family.bends(z)[:, :d], q)
-        result[d : 2 * d, n:] = slopes[:, :d]
-        result[-1, n:] = 2 * q
-        return result
+        turned = np.einsum("ijk,j->ik", self.family.bends(z)[:, :d], q)
+        none = np.zeros((d, d))
+        return np.block([[slopes, none], [turned, slopes[:, :d]], [np.zeros(self.count), 2 * q]])
 
     def resolved(self, last: np.ndarray, y: np.ndarray) -> bool:
         return True
 
 
-@dataclass(frozen=True, eq=False)
-class _HopfPoints(_Equilibria):
-    """``f = 0, A u = -ωw, A w = ωu, |u|² + |w|² = 1, c·w = 0`` for (z, u, w, ω).
+class _HopfPoints(_Folds):
+    """``f = 0, A v = iω v, |v|² = 1, c·w = 0`` with v = u + iw, for (z, u, w, ω).
 
     `scale` is the unit of ω, and `phase` is c. It is chosen anew at each point: with a fixed one the phase of
-    u + iw could come to be undetermined.
+    v could come to be undetermined.
     """
 
-    scale: float
-    phase: np.ndarray
+    kind = "Hopf"
+
+    def __init__(self, family: _Family, scale: float, phase: np.ndarray) -> None:
+        super().__init__(family)
+        self.scale, self.phase = scale, phase
 
     @classmethod
-    def near(cls, family: ParameterFamily, z: np.ndarray) -> tuple[_HopfPoints, np.ndarray] | None:
-        """The equations next to a Hopf point, and all unknowns; None where no eigenvalues are complex."""
+    def near(cls, family: _Family, z: np.ndarray) -> tuple[Self, np.ndarray] | None:
         values, vectors = np.linalg.eig(family.slopes(z)[:, : family.d])
         turning = np.flatnonzero(values.imag > 0)
         if not len(turning):
@@ -218,48 +210,68 @@ class _HopfPoints(_Equilibria):
         y = np.concatenate([z, vector.real, vector.imag, [1.0]])
         return cls(family, float(values[chosen].imag), vector.real).at(y), y
 
-    def _parts(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        d, n = self.family.d, self.family.count
-        return y[:n], y[n : n + d], y[n + d : -1], self.frequency(y)
+    def _vector(self, y: np.ndarray) -> np.ndarray:
+        return np.asarray(y[self.count : -1].reshape(2, -1).T @ [1.0, 1j])
 
     def residual(self, y: np.ndarray) -> np.ndarray:
-        z, u, w, frequency = self._parts(y)
-        a = self.family.slopes(z)[:, : self.family.d]
-        along = [a @ u + frequency * w, a @ w - frequency * u]
-        return np.concatenate([self.family.flow(z), *along, [u @ u + w @ w - 1, self.phase @ w]])
+        z, v = y[: self.count], self._vector(y)
+        rest = self.family.slopes(z)[:, : self.d] @ v - 1j * self.frequency(y) * v
+        size = (v.conj() @ v).real - 1
+        return np.concatenate([self.family.flow(z), rest.real, rest.imag, [size, self.phase @ v.imag]])
 
     def slope(self, y: np.ndarray) -> np.ndarray:
-        d, n = self.family.d, self.family.count
-        z, u, w, frequency = self._parts(y)
-        slopes, bends, unit = self.family.slopes(z), self.family.bends(z)[:, :d], np.eye(d)
-        of_u, of_w = slice(n, n + d), slice(n + d, n + 2 * d)
-        result = np.zeros((3 * d + 2, n + 2 * d + 1))
-        result[:d, :n] = slopes
-        for row, mine, turned, own, other, sign in (
-            (d, u, w, of_u, of_w, 1.0), (2 * d, w, u, of_w, of_u, -1.0),
-        ):  # fmt: skip
-            result[row : row + d, :n] = np.einsum("ijk,j->ik", bends, mine)
-            result[row : row + d, own] = slopes[:, :d]
-            result[row : row + d, other] = sign * frequency * unit
-            result[row : row + d, -1] = sign * self.scale * turned
-        result[-2, of_u], result[-2, of_w] = 2 * u, 2 * w
-        result[-1, of_w] = self.phase
-        return result
+        d, z, v = self.d, y[: self.count], self._vector(y)
+        slopes = self.family.slopes(z)
+        turned = np.einsum("ijk,j->ik", self.family.bends(z)[:, :d], v)
+        by_v = slopes[:, :d] - 1j * self.frequency(y) * np.eye(d)
+        rest = np.hstack([turned, by_v, 1j * by_v, -1j * self.scale * v[:, None]])
+        none = np.zeros(self.count)
+        return np.block([
+            [slopes, np.zeros((d, 2 * d + 1))], [rest.real], [rest.imag],
+            [none, 2 * v.real, 2 * v.imag, 0.0], [none, 0 * self.phase, self.phase, 0.0],
+        ])  # fmt: skip
 
-    def at(self, y: np.ndarray) -> _HopfPoints:
+    def at(self, y: np.ndarray) -> Self:
         # The part of u across w is c, so that the phase of this point is kept.
-        _, u, w, _ = self._parts(y)
+        u, w = self._vector(y).real, self._vector(y).imag
         across = u - (u @ w) / (w @ w) * w if w.any() else u
-        return replace(self, phase=across / np.linalg.norm(across))
+        return type(self)(self.family, self.scale, across / np.linalg.norm(across))
 
     def limit(self, y: np.ndarray) -> tuple[int, float] | None:
         return (len(y) - 1, 0.0) if y[-1] <= 0 else super().limit(y)
 
-    def resolved(self, last: np.ndarray, y: np.ndarray) -> bool:
-        return True
-
     def frequency(self, y: np.ndarray) -> float:
         return self.scale * float(y[-1])
+
+
+class _BranchPoints(_Equilibria):
+    """``f + βe = 0, ψA = 0, ψ·∂f/∂λ = 0, e·ψ = 1`` for (z, β, ψ); e is the first ψ."""
+
+    kind = "branch point"
+
+    def __init__(self, family: _Family, left: np.ndarray) -> None:
+        super().__init__(family)
+        self.left = left
+
+    @classmethod
+    def near(cls, family: _Family, z: np.ndarray) -> tuple[Self, np.ndarray] | None:
+        left = np.linalg.svd(family.slopes(z)[:, : family.d])[0][:, -1]
+        return cls(family, left), np.concatenate([z, [0.0], left])
+
+    def residual(self, y: np.ndarray) -> np.ndarray:
+        z, share, psi = y[: self.count], y[self.count], y[self.count + 1 :]
+        return np.concatenate(
+            [self.family.flow(z) + share * self.left, psi @ self.family.slopes(z), [self.left @ psi - 1]]
+        )
+
+    def slope(self, y: np.ndarray) -> np.ndarray:
+        z, psi = y[: self.count], y[self.count + 1 :]
+        slopes, turned = self.family.slopes(z), np.einsum("i,ijk->jk", psi, self.family.bends(z))
+        none = np.zeros((self.count, 1))
+        return np.block([
+            [slopes, self.left[:, None], np.zeros((self.d, self.d))],
+            [turned, none, slopes.T], [none.T, 0.0, self.left],
+        ])  # fmt: skip
 
 
 # Newton's method, and curves of one equation fewer than unknowns.
@@ -287,6 +299,13 @@ def _solved(
     return None
 
 
+def _refined(equations: _Equilibria, y: np.ndarray) -> np.ndarray | None:
+    """The solution next to a guess, where no parameter is free; None where there is none close by."""
+    found = _solved(equations.residual, equations.slope, y)
+    close = found is not None and np.linalg.norm((found - y)[: equations.count]) < NEWTON_RADIUS
+    return found if close else None
+
+
 def _across(equations: _Equilibria, guess: np.ndarray, normal: np.ndarray) -> np.ndarray | None:
     """The point of the curve in the plane through a guess across a direction."""
     return _solved(
@@ -302,18 +321,22 @@ def _tangent(equations: _Equilibria, y: np.ndarray, ahead: np.ndarray) -> np.nda
     return np.asarray(tangent if tangent @ ahead >= 0 else -tangent)
 
 
+_Stop = Literal["", "lost", "long"]
+"""What stopped a curve before its end: its points could not be found, or were too many."""
+
+
 def _followed(
     equations: _Equilibria, start: np.ndarray, ahead: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, str]:
+) -> tuple[np.ndarray, np.ndarray, _Stop]:
     """A curve from end to end through a point: points and tangents ``(n, k)``, and what stopped it.
 
     The tangent at the starting point is to the side of `ahead`.
     """
-    forwards, closed, fault = _one_way(equations, start, ahead)
+    forwards, closed, stop = _one_way(equations, start, ahead)
     backwards = [start]
     if not closed:
         backwards, _, other = _one_way(equations, start, -ahead)
-        fault = fault or other
+        stop = stop or other
     points = [*backwards[:0:-1], *forwards]
     tangents, middle = [_tangent(equations.at(start), start, ahead)], len(backwards) - 1
     for y in points[middle + 1 :]:
@@ -322,14 +345,14 @@ def _followed(
         tangents.insert(0, _tangent(equations.at(y), y, tangents[0]))
     if closed:
         tangents[-1] = tangents[0]
-    return np.array(points), np.array(tangents), fault
+    return np.array(points), np.array(tangents), stop
 
 
 def _one_way(
     equations: _Equilibria, start: np.ndarray, ahead: np.ndarray
-) -> tuple[list[np.ndarray], bool, str]:
-    """Points of a curve from one on, whether it came back to it, and what stopped it, in words."""
-    count = equations.family.count
+) -> tuple[list[np.ndarray], bool, _Stop]:
+    """Points of a curve from one on, whether it came back to it, and what stopped it."""
+    count = equations.count
     points, tangent, length = [start], ahead, LONGEST_STEP / 4
     first = _tangent(equations.at(start), start, ahead)[:count]
     while len(points) < MAX_POINTS:
@@ -345,7 +368,7 @@ def _one_way(
         ):  # fmt: skip
             length /= 2
             if length < SHORTEST_STEP:
-                return points, False, "could not be followed to its end"
+                return points, False, "lost"
             continue
         if (limit := here.limit(y)) is not None:
             component, value = limit
@@ -362,26 +385,10 @@ def _one_way(
         if len(points) > 4 and 0 < share <= 1 and beside and same:
             return [*points[:-1], start], True, ""
         length = min(1.5 * length, LONGEST_STEP)
-    return points, False, f"has more than {MAX_POINTS} points"
+    return points, False, "long"
 
 
-def _place_on(equations: _Equilibria, points: np.ndarray, z: np.ndarray) -> int | None:
-    """The point of a curve next to z; None where z, of states and parameters in shares, is not on it."""
-    distance = np.linalg.norm(points[:, : len(z)] - z, axis=1)
-    for index in np.argsort(distance)[:4]:
-        if distance[index] > 2 * LONGEST_STEP:
-            break
-        here, y = equations.at(points[index]), points[index]
-        tangent = _tangent(here, y, np.ones(len(y)))
-        pinned = int(np.abs(tangent[: len(z)]).argmax())  # the curve runs along it, and is met there once
-        guess = y + (z[pinned] - y[pinned]) / tangent[pinned] * tangent
-        met = _across(here, guess, np.eye(len(y))[pinned])
-        if met is not None and np.abs(met[: len(z)] - z).max() < ON_CURVE_TOLERANCE:
-            return int(index)
-    return None
-
-
-# Branches of equilibria, and what happens along them.
+# Branches of equilibria, and what happens along them; curves of folds and of Hopf points.
 
 
 @dataclass(frozen=True, eq=False)
@@ -404,7 +411,7 @@ class Bifurcation:
         Largest component of f there, in shares of the domain per unit of time.
     """
 
-    kind: BifurcationKind
+    kind: str
     value: float
     state: np.ndarray
     branch: int
@@ -412,50 +419,73 @@ class Bifurcation:
     residual: float = 0.0
 
 
-@dataclass(frozen=True, eq=False)
 class Branch:
-    """Equilibria along a branch.
+    """Equilibria against a parameter; or folds, or Hopf points, along a curve in the plane of two.
 
     Attributes
     ----------
-    values
-        Of the parameter, shape ``(n,)``.
+    kind
+        ``equilibrium``, ``fold`` or ``Hopf``.
     states
         Shape ``(n, d)``.
-    eigenvalues
-        Of ∂f/∂x, by falling real part, shape ``(n, d)``.
+    values
+        Of the parameter, shape ``(n,)``, or of both, ``(n, 2)``.
     tangents
-        In shares of the domain and of the range, the parameter last: shape ``(n, d + 1)``.
+        In shares of the domain and of the range, the parameter last: shape ``(n, d + 1)``. Those of curves go
+        on with their further unknowns.
     """
 
-    values: np.ndarray
-    states: np.ndarray
-    eigenvalues: np.ndarray
-    tangents: np.ndarray
+    def __init__(self, equations: _Equilibria, points: np.ndarray, tangents: np.ndarray) -> None:
+        self.kind, self.tangents = equations.kind, tangents
+        self._equations, self._points = equations, points
+        both = equations.family.natural(points[:, : equations.count])
+        self.states, values = np.split(both, [equations.d], axis=1)
+        self.values = values[:, 0] if values.shape[1] == 1 else values
+
+    @cached_property
+    def eigenvalues(self) -> np.ndarray:
+        """Of ∂f/∂x, by falling real part, shape ``(n, d)``."""
+        z = self._points[:, : self._equations.count]
+        return np.array([self._equations.family.eigenvalues(each) for each in z])
 
     @property
     def unstable(self) -> np.ndarray:
         """Number of unstable directions of each, shape ``(n,)``."""
         return np.asarray((self.eigenvalues.real > 0).sum(axis=1))
 
+    @property
+    def frequencies(self) -> np.ndarray:
+        """ω at Hopf points, in radian per unit of time; zero elsewhere. Shape ``(n,)``."""
+        return np.array([self._equations.frequency(each) for each in self._points])
 
-@dataclass(frozen=True, eq=False)
-class Branches:
-    """All branches that pass through given equilibria.
+    def index_of(self, state: np.ndarray, values: float | np.ndarray) -> int | None:
+        """The point next to a state ``(d,)`` at values of the parameters; None where it is not on it."""
+        z = self._equations.family.shares(state, values)
+        distance = np.linalg.norm(self._points[:, : len(z)] - z, axis=1)
+        for index in np.argsort(distance)[:4]:
+            if distance[index] > 2 * LONGEST_STEP:
+                break
+            here, y = self._equations.at(self._points[index]), self._points[index]
+            tangent = _tangent(here, y, np.ones(len(y)))
+            pinned = int(np.abs(tangent[: len(z)]).argmax())  # the curve runs along it, and is met there once
+            guess = y + (z[pinned] - y[pinned]) / tangent[pinned] * tangent
+            met = _across(here, guess, np.eye(len(y))[pinned])
+            if met is not None and np.abs(met[: len(z)] - z).max() < ON_CURVE_TOLERANCE:
+                return int(index)
+        return None
 
-    Attributes
-    ----------
-    branches
-        Each once.
-    bifurcations
-        By the value of the parameter.
-    notes
-        What could not be followed, in words.
-    """
 
-    branches: tuple[Branch, ...]
-    bifurcations: tuple[Bifurcation, ...]
-    notes: tuple[str, ...] = ()
+def _branch_through(
+    equations: _Equilibria, start: np.ndarray | None, ahead: np.ndarray, known: Sequence[Branch]
+) -> tuple[Branch | None, _Stop]:
+    """The branch through a point, unless it is known or lies outside; and what stopped it."""
+    if start is None or _Equilibria.limit(equations, start) is not None:
+        return None, ""
+    state, values = np.split(equations.family.natural(start[: equations.count]), [equations.d])
+    if any(each.kind == equations.kind and each.index_of(state, values) is not None for each in known):
+        return None, ""
+    points, tangents, stop = _followed(equations.at(start), start, ahead)
+    return Branch(equations, points, tangents) if len(points) > 1 else None, stop
 
 
 def follow_branches(
@@ -463,7 +493,7 @@ def follow_branches(
     parameter: str,
     limits: tuple[float, float],
     seeds: Sequence[tuple[float, np.ndarray]],
-) -> Branches:
+) -> tuple[list[Branch], list[Bifurcation], list[Remark]]:
     """Branches of equilibria within a range of a parameter and within the domain of the states.
 
     Parameters
@@ -478,6 +508,16 @@ def follow_branches(
         Known equilibria: the value of λ and the state, shape ``(d,)``. A branch through none of them is not
         found.
 
+    Returns
+    -------
+    tuple
+        Each branch once; the bifurcations, by the value of λ; and what could not be followed.
+
+    Raises
+    ------
+    ValueError
+        When there is no such parameter, or no domain.
+
     Examples
     --------
     A cusp, ``ẋ = h + x - x³``, folds at ``h = ±2/(3√3)``:
@@ -485,54 +525,41 @@ def follow_branches(
     >>> import sympy
     >>> h, x = sympy.symbols("h x", real=True)
     >>> cusp = Dynamics.of((x,), (h + x - x**3,), domain=[(-2, 2)], parameters={h: 0.0})
-    >>> found = follow_branches(cusp, "h", (-1.0, 1.0), [(0.0, np.array([1.0]))])
-    >>> [(one.kind, round(one.value, 10)) for one in found.bifurcations]
+    >>> _, found, _ = follow_branches(cusp, "h", (-1.0, 1.0), [(0.0, np.array([1.0]))])
+    >>> [(one.kind, round(one.value, 10)) for one in found]
     [('fold', -0.3849001795), ('fold', 0.3849001795)]
     """
-    family = ParameterFamily(dynamics, {parameter: limits})
+    family = _Family(dynamics, {parameter: limits})
     equations, along = _Equilibria(family), np.eye(family.count)[-1]
     branches: list[Branch] = []
     found: list[Bifurcation] = []
-    notes: list[str] = []
+    remarks: list[Remark] = []
     for value, state in seeds:
-        guess = family.shares(np.atleast_2d(state), np.array([value]))[0]
-        start = _across(equations, guess, along)
-        if start is None or equations.limit(start) is not None:
+        start = _across(equations, family.shares(state, value), along)
+        branch, stop = _branch_through(equations, start, along, branches)
+        if stop:
+            place = {"state": np.round(state, 4).tolist(), "parameter": parameter, "value": value}
+            remarks.append(Remark("systems.branch_not_followed", place | _stopped(stop)))
+        if branch is None:
             continue
-        if any(place_on(family, branch, start) is not None for branch in branches):
-            continue
-        points, tangents, fault = _followed(equations, start, along)
-        if fault:
-            notes.append(
-                f"the branch through {np.round(state, 4).tolist()} at {parameter} = {value:g} {fault}"
-            )
-        if len(points) < 2:
-            continue
-        both = family.natural(points)
-        eigenvalues = np.array([family.eigenvalues(one) for one in points])
-        branch = Branch(both[:, -1], both[:, :-1], eigenvalues, tangents)
-        for one in _bifurcations(family, points, branch, len(branches)):
+        for one in _bifurcations(equations, branch, len(branches)):
             # A branch point lies on every branch that crosses there.
-            place = family.shares(one.state[None], np.array([one.value]))
-            others = [family.shares(each.state[None], np.array([each.value]))
-                      for each in found if each.kind == one.kind]  # fmt: skip
-            if all(np.abs(place - other).max() > BIFURCATION_MERGE_TOLERANCE for other in others):
+            place_of_one = family.shares(one.state, one.value)
+            others = [family.shares(each.state, each.value) for each in found if each.kind == one.kind]
+            if all(np.abs(place_of_one - other).max() > BIFURCATION_MERGE_TOLERANCE for other in others):
                 found.append(one)
         branches.append(branch)
     found.sort(key=lambda one: one.value)
-    return Branches(tuple(branches), tuple(found), tuple(notes))
+    return branches, found, remarks
 
 
-def place_on(family: ParameterFamily, branch: Branch, z: np.ndarray) -> int | None:
-    """The point of a branch next to a state and value in shares ``(d + 1,)``; None where it is not on it."""
-    return _place_on(_Equilibria(family), family.shares(branch.states, branch.values), z)
+def _stopped(stop: _Stop) -> dict[str, int | None]:
+    return {"most": MAX_POINTS if stop == "long" else None}
 
 
-def _bifurcations(
-    family: ParameterFamily, points: np.ndarray, branch: Branch, number: int
-) -> list[Bifurcation]:
+def _bifurcations(equations: _Equilibria, branch: Branch, number: int) -> list[Bifurcation]:
     """Folds, branch points and Hopf points between the points of a branch."""
-    equations, found = _Equilibria(family), []
+    family, points, found = equations.family, branch._points, list[Bifurcation]()
 
     def determinant(z: np.ndarray) -> float:
         return float(np.linalg.det(family.slopes(z)[:, :-1]))
@@ -558,11 +585,20 @@ def _bifurcations(
             return min((last, new), key=lambda z: abs(test(z)))
         return at(float(brentq(lambda share: test(at(share)), 0.0, 1.0, xtol=1e-15, rtol=1e-14)))
 
-    def add(kind: BifurcationKind, z: np.ndarray, frequency: float = 0.0) -> None:
-        both = family.natural(z)
-        residual = float(np.abs(family.flow(z)).max())
-        found.append(Bifurcation(kind, float(both[-1]), both[:-1], number, frequency, residual))
+    def add(kind: type[_Equilibria], z: np.ndarray, *, surely: bool = True) -> bool:
+        """Add the solution of equations next to a point; `surely` takes the point where there is none."""
+        near = kind.near(family, z)
+        solved = None if near is None else _refined(*near)
+        if near is None or (solved is None and not surely):
+            return False
+        y = near[1] if solved is None else solved
+        state, value = np.split(family.natural(y[: family.count]), [family.d])
+        residual = float(np.abs(family.flow(y[: family.count])).max())
+        frequency = abs(near[0].frequency(y))
+        found.append(Bifurcation(kind.kind, float(value[0]), state, number, frequency, residual))
+        return True
 
+    unstable = branch.unstable
     for k in range(len(points) - 1):
         turns = branch.tangents[k, -1] * branch.tangents[k + 1, -1] < 0
         if turns or determinant(points[k]) * determinant(points[k + 1]) < 0:
@@ -570,85 +606,19 @@ def _bifurcations(
             z = zero(k, lambda z: float(_tangent(equations, z, ahead)[-1]) if turns else determinant(z))  # noqa: B023
             slopes = family.slopes(z)
             left = np.linalg.svd(slopes[:, :-1])[0][:, -1]
-            if turns and abs(left @ slopes[:, -1]) > FOLD_MARGIN * np.linalg.norm(slopes):
-                folds = _Folds(family)
-                solved = _solved(folds.residual, folds.slope, folds.start(z))
-                if solved is not None and np.linalg.norm(solved[: family.count] - z) < NEWTON_RADIUS:
-                    add("fold", solved[: family.count])
-                    continue
-            solved = _branch_point(family, z, left)
-            close = solved is not None and np.linalg.norm(solved - z) < NEWTON_RADIUS
-            add("branch point", solved if solved is not None and close else z)
-        elif abs(branch.unstable[k + 1] - branch.unstable[k]) == 2:
-            if not (np.isfinite(growth(points[k])) and np.isfinite(growth(points[k + 1]))):
-                continue
-            z = zero(k, growth)
-            near = _HopfPoints.near(family, z)
-            if near is None:
-                continue
-            hopf, y = near
-            solved = _solved(hopf.residual, hopf.slope, y)
-            if solved is None or np.linalg.norm(solved[: family.count] - z) > NEWTON_RADIUS:
-                solved = y
-            add("Hopf", solved[: family.count], abs(hopf.frequency(solved)))
+            fold = turns and abs(left @ slopes[:, -1]) > FOLD_MARGIN * np.linalg.norm(slopes)
+            if not (fold and add(_Folds, z, surely=False)):
+                add(_BranchPoints, z)
+        elif abs(unstable[k + 1] - unstable[k]) == 2 and np.isfinite([*map(growth, points[k : k + 2])]).all():
+            add(_HopfPoints, zero(k, growth))
     return found
-
-
-def _branch_point(family: ParameterFamily, z: np.ndarray, left: np.ndarray) -> np.ndarray | None:
-    """Newton's method on ``f + βe = 0, ψA = 0, ψ·∂f/∂λ = 0, e·ψ = 1`` for (x, λ, β, ψ); e is the first ψ."""
-    d = family.d
-
-    def residual(y: np.ndarray) -> np.ndarray:
-        z, share, psi = y[: d + 1], y[d + 1], y[d + 2 :]
-        return np.concatenate([family.flow(z) + share * left, psi @ family.slopes(z), [left @ psi - 1]])
-
-    def slope(y: np.ndarray) -> np.ndarray:
-        z, psi = y[: d + 1], y[d + 2 :]
-        slopes = family.slopes(z)
-        result = np.zeros((2 * d + 2, 2 * d + 2))
-        result[:d, : d + 1], result[:d, d + 1] = slopes, left
-        result[d:-1, : d + 1] = np.einsum("i,ijk->jk", psi, family.bends(z))
-        result[d:-1, d + 2 :] = slopes.T
-        result[-1, d + 2 :] = left
-        return result
-
-    found = _solved(residual, slope, np.concatenate([z, [0.0], left]))
-    return None if found is None else found[: d + 1]
-
-
-# Curves of folds and of Hopf points.
-
-
-@dataclass(frozen=True, eq=False)
-class BifurcationCurve:
-    """Folds, or Hopf points, along a curve in the plane of two parameters.
-
-    Attributes
-    ----------
-    kind
-        Which of both.
-    values
-        Of the two parameters, shape ``(n, 2)``.
-    states
-        Shape ``(n, d)``.
-    frequencies
-        ω, in radian per unit of time; zero along folds. Shape ``(n,)``.
-    fault
-        What stopped it before its end, in words; empty where nothing did.
-    """
-
-    kind: CurveKind
-    values: np.ndarray
-    states: np.ndarray
-    frequencies: np.ndarray
-    fault: str = ""
 
 
 def follow_curves(
     dynamics: Dynamics,
     limits: Mapping[str, tuple[float, float]],
-    seeds: Sequence[tuple[CurveKind, np.ndarray, np.ndarray]],
-) -> list[BifurcationCurve]:
+    seeds: Sequence[tuple[str, np.ndarray, np.ndarray]],
+) -> tuple[list[Branch], list[Remark]]:
     """Curves of folds and of Hopf points within the ranges of two parameters and the domain of the states.
 
     Parameters
@@ -658,13 +628,13 @@ def follow_curves(
     limits
         The range of each of the two parameters by its name, lower before upper.
     seeds
-        Known points of curves: the kind, the values of the two parameters ``(2,)``, and the state ``(d,)``. A
-        curve through none of them is not found.
+        Known points of curves: the kind, ``fold`` or ``Hopf``, the values of the two parameters ``(2,)``, and
+        the state ``(d,)``. A curve through none of them is not found.
 
     Returns
     -------
-    list of BifurcationCurve
-        Each once, in the order of the seeds.
+    tuple
+        Each curve once, in the order of the seeds; and what could not be followed.
 
     Raises
     ------
@@ -679,37 +649,28 @@ def follow_curves(
     >>> a, b, x = sympy.symbols("a b x", real=True)
     >>> cusp = Dynamics.of((x,), (a + b * x - x**3,), domain=[(-2, 2)], parameters={a: 0.0, b: 1.0})
     >>> seed = ("fold", np.array([2 / 27**0.5, 1.0]), np.array([-(3**-0.5)]))
-    >>> (curve,) = follow_curves(cusp, {"a": (-1.0, 1.0), "b": (-1.0, 2.0)}, [seed])
+    >>> (curve,), _ = follow_curves(cusp, {"a": (-1.0, 1.0), "b": (-1.0, 2.0)}, [seed])
     >>> bool(np.abs(27 * curve.values[:, 0] ** 2 - 4 * curve.values[:, 1] ** 3).max() < 1e-10)
     True
     """
     if len(limits) != 2:
         raise Fault("a curve lies in the plane of two parameters", f"{len(limits)} are named")
-    family = ParameterFamily(dynamics, limits)
-    followed: list[tuple[CurveKind, _Equilibria, np.ndarray]] = []
-    curves = []
+    family = _Family(dynamics, limits)
+    curves: list[Branch] = []
+    remarks: list[Remark] = []
     for kind, values, state in seeds:
-        guess = family.shares(state[None], values[None])[0]
-        folds = _Folds(family)
-        near = (folds, folds.start(guess)) if kind == "fold" else _HopfPoints.near(family, guess)
+        near = (_Folds if kind == "fold" else _HopfPoints).near(family, family.shares(state, values))
         if near is None:
             continue
         equations, y = near
         start = _across(equations, y, _tangent(equations, y, np.eye(len(y))[family.d]))
-        if start is None or np.linalg.norm(start[: family.count] - guess) > NEWTON_RADIUS:
+        if start is None or np.linalg.norm((start - y)[: family.count]) > NEWTON_RADIUS:
             continue
-        z = start[: family.count]
-        if _Equilibria(family).limit(z) is not None:
+        curve, stop = _branch_through(equations, start, np.ones(len(start)), curves)
+        if curve is None:
             continue
-        if any(
-            other == kind and _place_on(known, points, z) is not None for other, known, points in followed
-        ):
-            continue
-        points, _, fault = _followed(equations.at(start), start, np.ones(len(start)))
-        if len(points) < 2:
-            continue
-        followed.append((kind, equations, points))
-        both = family.natural(points[:, : family.count])
-        frequencies = np.array([equations.frequency(one) for one in points])
-        curves.append(BifurcationCurve(kind, both[:, -2:], both[:, :-2], frequencies, fault))
-    return curves
+        curves.append(curve)
+        if stop:
+            place = {"kind": kind, "names": list(limits), "values": curve.values[0].tolist()}
+            remarks.append(Remark("systems.curve_not_followed", place | _stopped(stop)))
+    return curves, remarks

@@ -41,17 +41,9 @@ from siq.quasipotential.landscape import NoLandscape
 from siq.quasipotential.landscape_assembly import EquationSettings, landscape_from_equations, usable_system
 from siq.quasipotential.rates import EscapeRate, NoiseStrength, mean_residence_time
 from siq.quasipotential.transitions import Transition
+from siq.remarks import Remark, sentence
 from siq.systems.cards import ParameterEntry, SystemCard, build_system, load_system
-from siq.systems.continuation import (
-    BifurcationCurve,
-    Branch,
-    Branches,
-    CurveKind,
-    ParameterFamily,
-    follow_branches,
-    follow_curves,
-    place_on,
-)
+from siq.systems.continuation import Bifurcation, Branch, follow_branches, follow_curves
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import all_equilibria
 from siq.systems.phase_portrait import MOST_SEARCHED, UNSETTLED
@@ -212,23 +204,20 @@ class Wells:
 
     Attributes
     ----------
-    family
-        f against the parameter.
     branches
-        Its equilibria.
+        Equilibria against the parameter.
     number
         For each branch the well that each of its points belongs to, -1 where it is unstable.
     """
 
-    family: ParameterFamily
-    branches: Branches
+    branches: Sequence[Branch]
     number: tuple[np.ndarray, ...]
 
     @classmethod
-    def along(cls, family: ParameterFamily, branches: Branches) -> Wells:
+    def along(cls, branches: Sequence[Branch]) -> Wells:
         """Each stretch that is stable and does not turn back is a well, by the first states."""
         stretches = []
-        for index, branch in enumerate(branches.branches):
+        for index, branch in enumerate(branches):
             kind = np.where(branch.unstable == 0, np.where(branch.tangents[:, -1] > 0, 1, -1), 0)
             ends = [*(np.flatnonzero(np.diff(kind)) + 1), len(kind)]
             starts = [0, *ends[:-1]]
@@ -238,23 +227,22 @@ class Wells:
 
         def place(stretch: tuple[int, int, int]) -> tuple[float, ...]:
             index, first, last = stretch
-            branch = branches.branches[index]
+            branch = branches[index]
             at = np.argmin(branch.values[first:last]) + first
             return tuple(np.round(branch.states[at], 6))
 
-        number = [np.full(len(branch.values), -1) for branch in branches.branches]
+        number = [np.full(len(branch.values), -1) for branch in branches]
         for well, (index, first, last) in enumerate(sorted(stretches, key=place)):
             number[index][first:last] = well
-        return cls(family, branches, tuple(number))
+        return cls(branches, tuple(number))
 
     def numbers(self, point: SweptPoint) -> tuple[int, ...]:
         """Which wells the attractors of a point are; -1 for one that is on no branch."""
         return tuple(self._number(np.array(well.state), point.values[0]) for well in point.wells)
 
     def _number(self, state: np.ndarray, value: float) -> int:
-        z = self.family.shares(state[None], np.array([value]))[0]
-        for branch, number in zip(self.branches.branches, self.number, strict=True):
-            place = place_on(self.family, branch, z)
+        for branch, number in zip(self.branches, self.number, strict=True):
+            place = branch.index_of(state, value)
             if place is not None:
                 return self._stable_beside(branch, number, place)
         return -1
@@ -277,12 +265,12 @@ class Wells:
                 "growth": branch.eigenvalues[k, 0].real,
                 "frequency": abs(branch.eigenvalues[k, 0].imag),
             }
-            for index, (branch, number) in enumerate(zip(self.branches.branches, self.number, strict=True))
+            for index, (branch, number) in enumerate(zip(self.branches, self.number, strict=True))
             for k in range(len(branch.values))
         ]
 
 
-def _bifurcation_rows(found: Branches) -> list[dict[str, object]]:
+def _bifurcation_rows(found: Sequence[Bifurcation]) -> list[dict[str, object]]:
     """The table of bifurcations."""
     return [
         {
@@ -293,7 +281,7 @@ def _bifurcation_rows(found: Branches) -> list[dict[str, object]]:
             "frequency": one.frequency,
             "residual": one.residual,
         }
-        for one in found.bifurcations
+        for one in found
     ]
 
 
@@ -304,7 +292,7 @@ def _position_text(state: np.ndarray | Sequence[float]) -> str:
 
 def _curves_of_map(
     system: Dynamics, names: tuple[str, ...], points: Sequence[SweptPoint]
-) -> list[BifurcationCurve]:
+) -> tuple[list[Branch], list[Remark]]:
     """Curves of folds and of Hopf points within the ranges of a map.
 
     Parameters
@@ -318,13 +306,14 @@ def _curves_of_map(
 
     Returns
     -------
-    list of BifurcationCurve
-        Empty where one of the parameters has a single value, and the map is a line.
+    tuple
+        The curves, and what could not be followed. None where one of the parameters has a single value, and
+        the map is a line.
     """
     values = np.array([point.values for point in points])
     limits = list(zip(values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True))
     if any(low == high for low, high in limits):
-        return []
+        return [], []
     seeds = [
         seed for along in range(len(names)) for seed in _seeds(system, names, points, limits[along], along)
     ]
@@ -337,7 +326,7 @@ def _seeds(
     points: Sequence[SweptPoint],
     limits: tuple[float, float],
     along: int,
-) -> Iterator[tuple[CurveKind, np.ndarray, np.ndarray]]:
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Folds and Hopf points on all lines along one parameter."""
     other = 1 - along
     for value in sorted({point.values[other] for point in points}):
@@ -349,13 +338,13 @@ def _seeds(
         ]
         changed = [value if each.name == names[other] else each.value for each in system.parameters]
         line = system.with_values(np.array(changed, dtype=float))
-        for one in follow_branches(line, names[along], limits, known).bifurcations:
+        for one in follow_branches(line, names[along], limits, known)[1]:
             if one.kind != "branch point":
                 place = np.array([one.value, value] if along == 0 else [value, one.value])
                 yield one.kind, place, one.state
 
 
-def _curve_rows(curves: Sequence[BifurcationCurve]) -> list[dict[str, object]]:
+def _curve_rows(curves: Sequence[Branch]) -> list[dict[str, object]]:
     """The table of curves, a row for each of their points."""
     return [
         {
@@ -371,21 +360,6 @@ def _curve_rows(curves: Sequence[BifurcationCurve]) -> list[dict[str, object]]:
             curve.values, curve.states, curve.frequencies, strict=True
         )
     ]
-
-
-def _curve_notes(names: Sequence[str], curves: Sequence[BifurcationCurve]) -> list[str]:
-    """Which curves could not be followed to their ends, in words."""
-    return [
-        f"the curve of {_curve_name(curve.kind)} through {names[0]} = {curve.values[0, 0]:g},"
-        f" {names[1]} = {curve.values[0, 1]:g} {curve.fault}"
-        for curve in curves
-        if curve.fault
-    ]
-
-
-def _curve_name(kind: str) -> str:
-    """What lies along a curve."""
-    return "folds" if kind == "fold" else "Hopf points"
 
 
 ALONE = "it is the only stable state, and no way leads out of it"
@@ -645,22 +619,22 @@ def collected(
         ε; None for neither times nor weights.
     """
     points = sorted(points, key=lambda point: point.values)
-    notes: list[str] = []
-    branches: Branches | None = None
-    curves: list[BifurcationCurve] = []
+    remarks: list[Remark] = []
+    wells: Wells | None = None
+    bifurcations: list[Bifurcation] = []
+    curves: list[Branch] = []
     values = [point.values[0] for point in points]
     if len(names) == 1 and min(values) < max(values):
         limits = (min(values), max(values))
         seeds = [(point.values[0], np.array(one)) for point in points for one in point.equilibria]
-        branches = follow_branches(system, names[0], limits, seeds)
-        notes += branches.notes
-        wells = Wells.along(ParameterFamily(system, {names[0]: limits}), branches)
+        branches, bifurcations, remarks = follow_branches(system, names[0], limits, seeds)
+        wells = Wells.along(branches)
         numbers = [wells.numbers(point) for point in points]
     else:
         numbers = [tuple(range(len(point.wells))) for point in points]
     if len(names) == MOST_PARAMETERS:
-        curves = _curves_of_map(system, names, points)
-        notes += _curve_notes(names, curves)
+        curves, remarks = _curves_of_map(system, names, points)
+    notes = tuple(dict.fromkeys(map(sentence, remarks)))
     rows, ways = [], []
     for point, number in zip(points, numbers, strict=True):
         rows += _well_rows(point, number, noise)
@@ -669,7 +643,7 @@ def collected(
     units |= {each.name: each.unit for each in system.parameters if each.name in names}
     return Sweep(
         names, system.states, as_table("sweep", rows), as_table("sweep_ways", ways),
-        as_table("branches", [] if branches is None else wells.branch_rows()),
-        as_table("bifurcations", [] if branches is None else _bifurcation_rows(branches)),
-        tuple(dict.fromkeys(notes)), units, as_table("bifurcation_curves", _curve_rows(curves)),
+        as_table("branches", [] if wells is None else wells.branch_rows()),
+        as_table("bifurcations", _bifurcation_rows(bifurcations)),
+        notes, units, as_table("bifurcation_curves", _curve_rows(curves)),
     )  # fmt: skip

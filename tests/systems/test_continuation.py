@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.systems.continuation import CurveKind, ParameterFamily, follow_branches, follow_curves, place_on
+from siq.remarks import sentence
+from siq.systems import continuation
+from siq.systems.continuation import follow_branches, follow_curves
 from siq.systems.dynamics import Dynamics
 
 pytestmark = pytest.mark.portable
@@ -19,20 +21,18 @@ def system(states, equations, domain, parameter=k):
 
 
 def kinds(found):
-    return [one.kind for one in found.bifurcations]
+    return [one.kind for one in found[1]]
 
 
 def test_the_folds_of_a_cusp_are_found_to_rounding():
     cusp = system((x,), (k + x - x**3,), [(-2, 2)])
     found = follow_branches(cusp, "k", (-1, 1), [(0.0, np.array([1.0]))])
-    assert kinds(found) == ["fold", "fold"] and len(found.branches) == 1
+    assert kinds(found) == ["fold", "fold"] and len(found[0]) == 1
     exact = 2 / (3 * np.sqrt(3))
-    assert [one.value for one in found.bifurcations] == pytest.approx([-exact, exact], abs=1e-12)
-    assert [one.state[0] for one in found.bifurcations] == pytest.approx(
-        [1 / np.sqrt(3), -1 / np.sqrt(3)], abs=1e-12
-    )
+    assert [one.value for one in found[1]] == pytest.approx([-exact, exact], abs=1e-12)
+    assert [one.state[0] for one in found[1]] == pytest.approx([1 / np.sqrt(3), -1 / np.sqrt(3)], abs=1e-12)
     # From one limit to the other through both folds, each point an equilibrium.
-    (branch,) = found.branches
+    (branch,) = found[0]
     assert {round(branch.values[0], 12), round(branch.values[-1], 12)} == {-1.0, 1.0}
     assert branch.values + branch.states[:, 0] - branch.states[:, 0] ** 3 == pytest.approx(0, abs=1e-11)
     assert set(branch.unstable) == {0, 1}
@@ -43,7 +43,7 @@ def test_a_fold_in_units_that_differ_by_many_orders():
     bent = system((x, y), (k / 10000 - 1 - (10**6 * x) ** 2, 3 * (x - y)), [(-3e-6, 3e-6), (-3e-6, 3e-6)])
     found = follow_branches(bent, "k", (0, 3e4), [(2e4, np.array([1e-6, 1e-6]))])
     assert kinds(found) == ["fold"]
-    assert found.bifurcations[0].value == pytest.approx(1e4, rel=1e-12)
+    assert found[1][0].value == pytest.approx(1e4, rel=1e-12)
 
 
 def test_the_hopf_point_of_the_normal_form_is_found_with_its_frequency():
@@ -54,8 +54,8 @@ def test_the_hopf_point_of_the_normal_form_is_found_with_its_frequency():
     normal = system((x, y), of(mu - sympy.Rational(1, 4)), [(-2, 2), (-2, 2)], mu)
     found = follow_branches(normal, "mu", (-1, 1), [(-1.0, np.zeros(2))])
     assert kinds(found) == ["Hopf"]
-    assert found.bifurcations[0].value == pytest.approx(0.25, abs=1e-12)
-    assert found.bifurcations[0].frequency == pytest.approx(3, abs=1e-12)
+    assert found[1][0].value == pytest.approx(0.25, abs=1e-12)
+    assert found[1][0].frequency == pytest.approx(3, abs=1e-12)
 
 
 def test_a_hopf_point_away_from_the_origin_beside_a_third_state():
@@ -65,7 +65,7 @@ def test_a_hopf_point_away_from_the_origin_beside_a_third_state():
     )
     found = follow_branches(brusselator, "k", (1, 3), [(1.0, np.array([1.0, 1.0, 0.2]))])
     assert kinds(found) == ["Hopf"]
-    (hopf,) = found.bifurcations
+    (hopf,) = found[1]
     assert hopf.value == pytest.approx(2, abs=1e-10) and hopf.frequency == pytest.approx(1, abs=1e-10)
     assert hopf.state == pytest.approx([1, 2, 0.2], abs=1e-10)
 
@@ -79,24 +79,24 @@ def test_the_folds_of_a_rational_system():
     roots = np.sort(roots[np.abs(roots.imag) < 1e-12].real)
     exact = 0.55 * roots - roots**2 / (1 + roots**2)
     assert kinds(found) == ["fold", "fold"]
-    assert [one.value for one in found.bifurcations] == pytest.approx(np.sort(exact), abs=1e-10)
+    assert [one.value for one in found[1]] == pytest.approx(np.sort(exact), abs=1e-10)
 
 
 def test_a_pitchfork_is_a_branch_point_of_two_branches_and_no_fold():
     fork = system((x, y), (k * x - x**3, -2 * y), [(-2, 2), (-1, 1)])
     seeds = [(1.0, np.array([0.0, 0.0])), (1.0, np.array([1.0, 0.0])), (1.0, np.array([-1.0, 0.0]))]
     found = follow_branches(fork, "k", (-1, 1), seeds)
-    assert kinds(found) == ["branch point"] and len(found.branches) == 2
-    assert found.bifurcations[0].value == pytest.approx(0, abs=1e-12)
-    assert found.bifurcations[0].state == pytest.approx([0, 0], abs=1e-12)
+    assert kinds(found) == ["branch point"] and len(found[0]) == 2
+    assert found[1][0].value == pytest.approx(0, abs=1e-12)
+    assert found[1][0].state == pytest.approx([0, 0], abs=1e-12)
 
 
 def test_a_transcritical_point_exchanges_stability():
     crossing = system((x,), (k * x - x**2,), [(-2, 2)])
     found = follow_branches(crossing, "k", (-1, 1.1), [(1.0, np.zeros(1)), (1.0, np.ones(1))])
-    assert kinds(found) == ["branch point"] and len(found.branches) == 2
-    assert found.bifurcations[0].value == pytest.approx(0, abs=1e-12)
-    for branch in found.branches:
+    assert kinds(found) == ["branch point"] and len(found[0]) == 2
+    assert found[1][0].value == pytest.approx(0, abs=1e-12)
+    for branch in found[0]:
         assert set(branch.unstable) == {0, 1}
 
 
@@ -105,9 +105,9 @@ def test_a_closed_branch_is_gone_round_once():
     found = follow_branches(
         ring, "k", (-2, 2), [(0.3, np.array([np.sqrt(0.91)])), (0.3, -np.array([np.sqrt(0.91)]))]
     )
-    assert len(found.branches) == 1 and kinds(found) == ["fold", "fold"]
-    assert [one.value for one in found.bifurcations] == pytest.approx([-1, 1], abs=1e-10)
-    (branch,) = found.branches
+    assert len(found[0]) == 1 and kinds(found) == ["fold", "fold"]
+    assert [one.value for one in found[1]] == pytest.approx([-1, 1], abs=1e-10)
+    (branch,) = found[0]
     assert branch.states[0] == pytest.approx(branch.states[-1], abs=1e-9)
     assert np.hypot(branch.values, branch.states[:, 0]) == pytest.approx(1, abs=1e-10)
 
@@ -115,23 +115,22 @@ def test_a_closed_branch_is_gone_round_once():
 def test_a_neutral_saddle_is_no_hopf_point():
     """Eigenvalues ±1 pass their sum of zero; nothing oscillates."""
     saddle = system((x, y), ((1 + k) * x, -y), [(-1, 1), (-1, 1)])
-    assert follow_branches(saddle, "k", (-0.5, 0.5), [(0.0, np.zeros(2))]).bifurcations == ()
+    assert follow_branches(saddle, "k", (-0.5, 0.5), [(0.0, np.zeros(2))])[1] == []
 
 
 def test_a_branch_ends_where_it_leaves_the_domain():
     straight = system((x,), (k - x,), [(0, 1)])
-    (branch,) = follow_branches(straight, "k", (-3, 3), [(0.5, np.array([0.5]))]).branches
+    (branch,) = follow_branches(straight, "k", (-3, 3), [(0.5, np.array([0.5]))])[0]
     assert [branch.values.min(), branch.values.max()] == pytest.approx([0, 1], abs=1e-9)
 
 
 def test_a_state_is_told_to_lie_on_its_branch_only():
     cusp = system((x,), (k + x - x**3,), [(-2, 2)])
-    (branch,) = follow_branches(cusp, "k", (-1, 1), [(0.0, np.array([1.0]))]).branches
-    family = ParameterFamily(cusp, {"k": (-1, 1)})
+    (branch,) = follow_branches(cusp, "k", (-1, 1), [(0.0, np.array([1.0]))])[0]
     for root in (-1.0, 0.0, 1.0):
-        place = place_on(family, branch, family.shares(np.array([[root]]), np.array([0.0]))[0])
+        place = branch.index_of(np.array([root]), 0.0)
         assert place is not None and branch.states[place, 0] == pytest.approx(root, abs=0.05)
-    assert place_on(family, branch, family.shares(np.array([[0.5]]), np.array([0.0]))[0]) is None
+    assert branch.index_of(np.array([0.5]), 0.0) is None
 
 
 def test_a_parameter_that_is_not_there_is_named():
@@ -146,14 +145,16 @@ def cusp() -> Dynamics:
     return Dynamics.of((x,), (a + b * x - x**3,), domain=[(-2, 2)], parameters={a: 0.0, b: 1.0})
 
 
-def fold(first: float, second: float, *state: float) -> tuple[CurveKind, np.ndarray, np.ndarray]:
+def fold(first: float, second: float, *state: float) -> tuple[str, np.ndarray, np.ndarray]:
     return ("fold", np.array([first, second]), np.array(state))
 
 
 def test_the_folds_of_a_cusp_lie_on_its_curve_and_pass_through_it():
     at = 2 / np.sqrt(27)
-    (curve,) = follow_curves(cusp(), LIMITS, [fold(at, 1.0, -1 / np.sqrt(3)), fold(-at, 1.0, 1 / np.sqrt(3))])
-    assert curve.kind == "fold" and curve.fault == "" and not curve.frequencies.any()
+    (curve,), remarks = follow_curves(
+        cusp(), LIMITS, [fold(at, 1.0, -1 / np.sqrt(3)), fold(-at, 1.0, 1 / np.sqrt(3))]
+    )
+    assert curve.kind == "fold" and not remarks and not curve.frequencies.any()
     assert 27 * curve.values[:, 0] ** 2 == pytest.approx(4 * curve.values[:, 1] ** 3, abs=1e-11)
     assert 3 * curve.states[:, 0] ** 2 == pytest.approx(curve.values[:, 1], abs=1e-11)
     # It ends where b does, on both sides of a cusp that a continuation in a or in b would not pass.
@@ -168,14 +169,14 @@ def test_folds_in_units_that_differ_by_many_orders():
         (x,), (1000 * (a * mass + b * x - (x / mass) ** 2 * x),), domain=[(-2e-9, 2e-9)],
         parameters={a: 0.0, b: 1.0},
     )  # fmt: skip
-    (curve,) = follow_curves(tiny, LIMITS, [fold(2 / np.sqrt(27), 1.0, -1e-9 / np.sqrt(3))])
+    (curve,), _ = follow_curves(tiny, LIMITS, [fold(2 / np.sqrt(27), 1.0, -1e-9 / np.sqrt(3))])
     assert 27 * curve.values[:, 0] ** 2 == pytest.approx(4 * curve.values[:, 1] ** 3, abs=1e-10)
 
 
 def test_a_closed_curve_of_folds_is_gone_round_once():
     # ẋ = a² + b² - 1/4 + x² folds at x = 0, on a circle.
     ring = Dynamics.of((x,), (a**2 + b**2 - 0.25 + x**2,), domain=[(-2, 2)], parameters={a: 0.5, b: 0.0})
-    (curve,) = follow_curves(ring, {"a": (-1, 1), "b": (-1, 1)}, [fold(0.5, 0, 0), fold(0, -0.5, 0)])
+    (curve,), _ = follow_curves(ring, {"a": (-1, 1), "b": (-1, 1)}, [fold(0.5, 0, 0), fold(0, -0.5, 0)])
     assert np.hypot(*curve.values.T) == pytest.approx(0.5, abs=1e-11)
     assert curve.values[0] == pytest.approx(curve.values[-1])
     turned = np.unwrap(np.arctan2(*curve.values.T))
@@ -188,7 +189,7 @@ def test_the_hopf_points_of_the_brusselator_lie_at_b_of_one_plus_a_squared():
         parameters={a: 1.0, b: 2.0},
     )  # fmt: skip
     seed = ("Hopf", np.array([1.0, 2.0]), np.array([1.0, 2.0]))
-    (curve,) = follow_curves(brusselator, {"a": (0.5, 1.5), "b": (1.0, 4.0)}, [seed])
+    (curve,), _ = follow_curves(brusselator, {"a": (0.5, 1.5), "b": (1.0, 4.0)}, [seed])
     first, second = curve.values.T
     assert second == pytest.approx(1 + first**2, abs=1e-10)
     assert curve.frequencies == pytest.approx(first, abs=1e-10)
@@ -202,7 +203,7 @@ def test_hopf_points_end_where_they_meet_the_folds():
         (x, y), (y, a + b * x + x**2 - x * y), domain=[(-2, 2), (-2, 2)], parameters={a: 0.0, b: -1.0}
     )
     seeds = [("Hopf", np.array([0.0, -0.25]), np.zeros(2)), fold(0.25, 1.0, -0.5, 0.0)]
-    hopf, folds = follow_curves(system, {"a": (-1.0, 1.0), "b": (-1.0, 1.5)}, seeds)
+    (hopf, folds), _ = follow_curves(system, {"a": (-1.0, 1.0), "b": (-1.0, 1.5)}, seeds)
     assert hopf.kind == "Hopf" and np.abs(hopf.values[:, 0]).max() < 1e-10
     assert hopf.frequencies**2 == pytest.approx(-hopf.values[:, 1], abs=1e-10)
     assert sorted(hopf.values[[0, -1], 1]) == pytest.approx([-1, 0], abs=1e-4)
@@ -216,12 +217,21 @@ def test_a_third_state_does_not_matter():
         parameters={a: 0.0, b: 1.0},
     )  # fmt: skip
     at = -1 / np.sqrt(3)
-    (curve,) = follow_curves(system, LIMITS, [fold(2 / np.sqrt(27), 1.0, at, at / 2, -at / 4)])
+    (curve,), _ = follow_curves(system, LIMITS, [fold(2 / np.sqrt(27), 1.0, at, at / 2, -at / 4)])
     assert 27 * curve.values[:, 0] ** 2 == pytest.approx(4 * curve.values[:, 1] ** 3, abs=1e-10)
 
 
 def test_what_is_no_fold_or_lies_outside_gives_no_curve():
     far = ("Hopf", np.zeros(2), np.zeros(1))
-    assert follow_curves(cusp(), LIMITS, [fold(0.9, 1.0, 0.0), fold(0, 0, 5.0), far]) == []
+    assert follow_curves(cusp(), LIMITS, [fold(0.9, 1.0, 0.0), fold(0, 0, 5.0), far])[0] == []
     with pytest.raises(ValueError, match="two parameters"):
         follow_curves(cusp(), {"a": (-1.0, 1.0)}, [])
+
+
+def test_what_could_not_be_followed_is_remarked(monkeypatch):
+    monkeypatch.setattr(continuation, "MAX_POINTS", 5)
+    _, _, (remark,) = follow_branches(cusp(), "a", (-1.0, 1.0), [(0.0, np.array([1.0]))])
+    assert sentence(remark) == "the branch through [1.0] at a = 0 has more than 5 points"
+    curves, (remark,) = follow_curves(cusp(), LIMITS, [fold(2 / np.sqrt(27), 1.0, -1 / np.sqrt(3))])
+    assert len(curves) == 1 and sentence(remark).endswith("has more than 5 points")
+    assert sentence(remark).startswith("the curve of folds through a = ")
