@@ -448,8 +448,15 @@ def _initial_states(
     if strict.converged:
         return strict.x[data.first[:-1]]
     # Where f jumps or a reading is cut off, steps of all samples at once may go to and fro. Damped steps of
-    # whole trajectories never make it worse.
-    damped = fit_trajectories(still, data, begin=x[data.first[:-1]], noise=noise, substeps=substeps)
+    # whole trajectories never make it worse. A fit that did not end may have left the states anywhere.
+    begins = [x] if follow.converged else [x, start]
+    damped = max(
+        (
+            fit_trajectories(still, data, begin=each[data.first[:-1]], noise=noise, substeps=substeps)
+            for each in begins
+        ),
+        key=lambda fit: fit.log_likelihood if np.isfinite(fit.sum_of_squares) else -np.inf,
+    )
     best = damped.x if np.isfinite(damped.sum_of_squares) else x
     return best[data.first[:-1]]
 
