@@ -83,7 +83,6 @@ def _consequences(given: Given) -> Any:
 def mismatch_figures(given: Given, settings: PipelineSettings) -> Any:
     """The fit, what is missing and where, the candidates, and escape times."""
     from siq.diagnosis.statement import Statement
-    from siq.report.diagnosis_page import final_simulation
     from siq.report.plots import diagnosis as plots
 
     verdict, before, curves = given.verdict, given.card, given.curves
@@ -95,7 +94,7 @@ def mismatch_figures(given: Given, settings: PipelineSettings) -> Any:
     drawn = {
         "before_after": plots.plot_before_after(
             given.held_out,
-            after=final_simulation(Statement.from_data(verdict)),
+            after=Statement.from_data(verdict).final_simulation,
             noise=variances,
             units=units,
             time_unit=time_unit,

@@ -370,11 +370,19 @@ class Statement:
         return [each.name for each in self.mechanisms] == [PROCESS_NOISE]
 
     @property
+    def final_simulation(self) -> str:
+        """Which simulation the verdict ends with: ``before``, ``recalibrated`` or ``augmented``."""
+        if self.verdict == MismatchVerdict.NO_MISMATCH:
+            return "before"
+        missing = self.verdict == MismatchVerdict.MISSING_PHYSICS and not self.random_forces
+        return "augmented" if self.described or missing else "recalibrated"
+
+    @property
     def sentence(self) -> str:
         """The verdict as a colleague would say it, with the numbers."""
-        from siq.report.diagnosis_text import sentence_of  # which stands above this module
+        from siq.report.diagnosis_text import sentences_of  # which stands above this module
 
-        return sentence_of(self)
+        return str(sentences_of(self)["sentence"])
 
     def as_data(self) -> dict[str, Any]:
         """The content of ``verdict.json``, sentences included; a number that is not finite is null."""
@@ -389,8 +397,9 @@ class Statement:
         data |= {"partial": self.partial, "not_tried": list(self.not_tried), "budget": data.pop("account")}
         data["remark_codes"] = data.pop("remarks")
         sentences = sentences_of(self)
+        location = sentences.pop("location")
         if self.location is not None:
-            data["location"]["sentence"] = sentences.pop("location")
+            data["location"]["sentence"] = location
         return data | sentences
 
     @classmethod

@@ -22,9 +22,8 @@ from siq.diagnosis.dictionary import Mechanism
 from siq.diagnosis.statement import METRIC, StatedFunction, StatedMechanism, Statement
 from siq.diagnosis.study import MismatchVerdict
 from siq.numerics.text import p_text, unit_text, value_text
-from siq.remarks import sentence
-from siq.report.diagnosis_text import location_sentence, sentence_of, words_of
-from siq.report.formatting import environment, formula_mathml, texts
+from siq.report.diagnosis_text import sentences_of
+from siq.report.formatting import environment, formula_mathml, percent_text, texts
 from siq.report.page import FormulaRow, ReportFigure, compose, render_report
 from siq.systems.dynamics import Dynamics, symbol
 from siq.systems.formulas import FormulaError, parse_formula
@@ -78,11 +77,6 @@ class Findings:
         return "process noise" if self.statement.random_forces else str(self.statement.verdict)
 
     @property
-    def final(self) -> str:
-        """Which of the three simulations the verdict ends with."""
-        return final_simulation(self.statement)
-
-    @property
     def named(self) -> list[StatedMechanism]:
         """What was named, or what describes a mismatch that has no name."""
         description = self.statement.description
@@ -92,23 +86,10 @@ class Findings:
         """A mechanism of the dictionary by its name."""
         return next((entry for entry in self.dictionary if entry.name == name), None)
 
-    def figure(self, name: str, caption: str) -> ReportFigure | None:
-        """A figure with its caption, None where there was nothing to draw."""
-        image = self.figures.get(name)
-        return None if image is None else ReportFigure(caption, caption, image, "svg")
-
-    def picture(self, name: str) -> list[ReportFigure]:
-        """A figure of a section; none where there was nothing to draw."""
-        found = self.figure(name, texts("captions")["diagnosis"][name])
-        return [] if found is None else [found]
-
-
-def final_simulation(statement: Statement) -> str:
-    """Which simulation a verdict ends with: ``before``, ``recalibrated`` or ``augmented``."""
-    if statement.verdict == MismatchVerdict.NO_MISMATCH:
-        return "before"
-    missing = statement.verdict == MismatchVerdict.MISSING_PHYSICS and not statement.random_forces
-    return "augmented" if statement.described or missing else "recalibrated"
+    def pictures(self, name: str, caption: str = "") -> list[ReportFigure]:
+        """A figure with its caption; none where there was nothing to draw."""
+        image, caption = self.figures.get(name), caption or texts("captions")["diagnosis"][name]
+        return [] if image is None else [ReportFigure(caption, caption, image, "svg")]
 
 
 def mismatch_answer(statement: Statement, *, title: str) -> dict[str, Any]:
@@ -132,25 +113,12 @@ def mismatch_answer(statement: Statement, *, title: str) -> dict[str, Any]:
     errors = statement.errors
     return {
         "title": title,
-        "sentence": sentence_of(statement),
+        "sentence": statement.sentence,
         "verdict": str(statement.verdict),
         "compared": errors.noise_floor is not None,
         "held_out_before": errors.before,
-        "held_out_after": getattr(errors, final_simulation(statement)),
+        "held_out_after": getattr(errors, statement.final_simulation),
         "held_out_noise": errors.noise_floor,
-    }
-
-
-def _sentences(statement: Statement) -> dict[str, Any]:
-    """What page and report say in sentences."""
-    place = statement.location
-    words = words_of(statement)
-    return {
-        "st": statement,
-        "sentence": sentence_of(statement),
-        "remarks": [sentence(remark) for remark in statement.remarks],
-        "location": "" if place is None else location_sentence(place),
-        "evidence_lines": [*words["explained"], *words["left"], *words["alternatives"]],
     }
 
 
@@ -165,9 +133,8 @@ def diagnosis_text(statement: Statement, system: Dynamics) -> str:
         The simulation that was diagnosed, for units.
     """
     units = {entry.name: entry.unit for entry in system.parameters}
-    words = _sentences(statement) | {"units": units, "metric": METRIC}
-    words["evidence_lines"] = [line for lines in words_of(statement).values() for line in lines]
-    text = environment().get_template("diagnosis_report.j2").render(words)
+    template = environment().get_template("diagnosis_report.j2")
+    text = template.render(sentences_of(statement), st=statement, units=units, metric=METRIC)
     return "\n".join(line for line in text.splitlines() if line.strip())
 
 
@@ -185,20 +152,12 @@ def diagnosis_html(statement: Statement, system: Dynamics) -> str:
 
 def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str]) -> str:
     """Write the page as HTML: the recording that differs most, the verdict, the number, and the rest."""
-    from siq.report.plots.diagnosis import largest_difference  # matplotlib
-
     statement, before = findings.statement, findings.before
     units = dict(zip(before.states, before.units, strict=True))
     of_outputs = {name: units.get(str(formula), "1") for name, formula in before.outputs}
     largest = None
     if not findings.held_out.empty:
-        largest = largest_difference(findings.held_out, after=findings.final)
-
-    def off(error: float) -> str:
-        assert largest is not None  # the template asked
-        unit = of_outputs.get(largest.output, "1")
-        return f"is off by {value_text(error, unit=unit, digits=2)}" if np.isfinite(error) else "runs away"
-
+        largest = largest_difference(findings.held_out, after=statement.final_simulation)
     known = [(each, entry) for each in findings.named if (entry := findings.entry(each.name)) is not None]
     less = {each.name: {one.name for one in each.rivals if one.standing == "less"} for each, _ in known}
     alike = [
@@ -208,11 +167,12 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str]) ->
     content = compose(
         "diagnosis_page.j2",
         title=title,
-        **_sentences(statement),
+        **sentences_of(statement),
+        st=statement,
         d=findings,
         commands=commands,
         largest=largest,
-        off=off,
+        units=of_outputs,
         mechanism_sentences=[
             (each.name, entry.sentence) for each, entry in named if findings.kind != "process noise"
         ],
@@ -239,8 +199,44 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str]) ->
     return render_report(content)
 
 
-def _percent(share: float) -> str:
-    return f"{value_text(100 * share, digits=3)} %"
+def largest_difference(table: pd.DataFrame, *, after: str) -> dict[str, Any] | None:
+    """The held-out recording to begin with; None where nothing was held out.
+
+    The output is the one in which the simulation as given is off the furthest, in units of its spread, in
+    the middle of all recordings, so that a single runaway does not decide. Of its recordings it is the one
+    in which the difference is largest.
+
+    Parameters
+    ----------
+    table
+        Columns ``recording output measured before recalibrated augmented scored``.
+    after
+        The simulation that the verdict ends with: ``"augmented"``, ``"recalibrated"``, or ``"before"``.
+
+    Returns
+    -------
+    dict or None
+        ``recording`` and ``output``; root mean square differences there, in the unit of the output,
+        ``before`` and ``after``, infinite where a simulation runs away; how many ``recordings`` there are.
+    """
+    scored = table[table["scored"].astype(bool) & table["measured"].notna()]
+    if scored.empty:
+        return None
+    squares = {
+        name: ((scored[name] - scored["measured"]) ** 2).fillna(np.inf)
+        for name in dict.fromkeys(("before", after))
+    }
+    places = [scored["output"], scored["recording"].astype(str)]
+    errors = {name: each.groupby(places, sort=False).mean() for name, each in squares.items()}
+    spread = scored.groupby("output", sort=False)["measured"].var()
+    middle = errors["before"].groupby(level="output", sort=False).median()
+    output = str((middle / spread.where(spread > 0, 1.0)).idxmax())
+    recording = str(errors["before"].loc[output].idxmax())
+    root = {name: float(np.sqrt(each.loc[output, recording])) for name, each in errors.items()}
+    return {
+        "recording": recording, "output": output, "before": root["before"], "after": root[after],
+        "recordings": scored["recording"].nunique(),
+    }  # fmt: skip
 
 
 def _errors_table(findings: Findings, units: Mapping[str, str]) -> pd.DataFrame | None:
@@ -258,7 +254,7 @@ def _errors_table(findings: Findings, units: Mapping[str, str]) -> pd.DataFrame 
 
     def row(words: str, error: float | None, **own: str) -> dict[str, str]:
         times = "" if error is None or not floor > 0 else value_text(error / floor, digits=2)
-        spread = "ran away" if error is None else _percent(error)
+        spread = "ran away" if error is None else percent_text(error, digits=3)
         return {"simulation": words, **own, "of the spread": spread, "times noise": times}
 
     table = findings.held_out
@@ -278,7 +274,7 @@ def _errors_table(findings: Findings, units: Mapping[str, str]) -> pd.DataFrame 
             rows.append(row(words["named"], errors.named))
             said = "rest"
         rows.append(row(words[said], getattr(errors, name), **own))
-    rows.append({"simulation": words["noise"], "of the spread": _percent(floor), "times noise": "1"})
+    rows.append(row(words["noise"], floor) | {"times noise": "1"})
     return pd.DataFrame(rows).fillna("")
 
 
@@ -321,17 +317,7 @@ def _meaning(name: str, entry: Mechanism | None, findings: Findings) -> str:
 
 
 def _typeset_text(text: str, model: Dynamics, further: Iterable[str] = ()) -> Markup | str:
-    """A formula of the verdict, typeset; as text where it cannot be read as one.
-
-    Parameters
-    ----------
-    text
-        The formula.
-    model
-        Whose names it may use.
-    further
-        Names that the model does not have, such as parameters of what is only described.
-    """
+    """A formula, typeset; as text where it cannot be read as one of the model's and these further names."""
     names = {**model.names, **{name: symbol(name) for name in further}}
     try:
         formula = parse_formula(text, names, inputs=tuple(entry.name for entry in model.inputs))

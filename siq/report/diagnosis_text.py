@@ -9,7 +9,7 @@ from typing import Any
 
 from siq.diagnosis.mechanisms import GENERIC, PROCESS_NOISE
 from siq.diagnosis.residual_structure import DOUBTFUL
-from siq.diagnosis.statement import Location, Recalibrated, Statement
+from siq.diagnosis.statement import Recalibrated, Statement
 from siq.numerics.text import (
     LARGEST_PLAIN_NUMBER,
     SMALLEST_SHARE,
@@ -49,39 +49,29 @@ def _written(text: str) -> list[str]:
     return [line for line in lines if line]
 
 
-def sentence_of(statement: Statement) -> str:
-    """The sentence that the page opens with: the verdict, how large, and what it does to the error."""
-    return " ".join(_written(_templates().verdict(statement)))
+def sentences_of(statement: Statement) -> dict[str, Any]:
+    """All sentences of a statement.
 
-
-def words_of(statement: Statement) -> dict[str, list[str]]:
-    """Further sentences, by what they are about.
-
-    ``alternatives``: what cannot be told apart, and whether anything else would do. ``explained``: how much
-    of the difference is explained. ``left``: what that leaves.
+    Returns
+    -------
+    dict
+        ``sentence``, with which the page opens: the verdict, how large, and what it does to the error.
+        ``words``: the ``alternatives``, what cannot be told apart, and whether anything else would do; how
+        much of the difference is ``explained``; what that leaves (``left``). ``remarks``. ``location``: in
+        which equation a mismatch sits, along which coordinate and where, in how many recordings; empty
+        where there is none.
     """
     description, templates = statement.description, _templates()
     mechanisms = statement.mechanisms if description is None else description.by
     return {
-        "alternatives": [line for each in mechanisms for line in _written(templates.alternatives(each))],
-        "explained": _written(templates.explained(mechanisms)),
-        "left": [] if description is None else _written(templates.left(description)),
-    }
-
-
-def location_sentence(location: Location) -> str:
-    """In which equation a mismatch sits, along which coordinate and where, in how many recordings."""
-    return _written(_templates().location(location))[0]
-
-
-def sentences_of(statement: Statement) -> dict[str, Any]:
-    """All sentences of a statement: ``sentence``, ``words``, ``remarks`` and ``location``."""
-    location = {} if statement.location is None else {"location": location_sentence(statement.location)}
-    return {
-        "sentence": sentence_of(statement),
-        "words": words_of(statement),
+        "sentence": " ".join(_written(templates.verdict(statement))),
+        "words": {
+            "alternatives": [line for each in mechanisms for line in _written(templates.alternatives(each))],
+            "explained": _written(templates.explained(mechanisms)),
+            "left": [] if description is None else _written(templates.left(description)),
+        },
         "remarks": [sentence(each) for each in statement.remarks],
-        **location,
+        "location": "" if statement.location is None else _written(templates.location(statement.location))[0],
     }
 
 

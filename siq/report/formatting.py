@@ -126,9 +126,9 @@ def _relative_text(share: float) -> str:
     return f"{percent:.2g} %" if percent < 99.5 else f"{percent:.0f} %"
 
 
-def percent_text(share: float) -> str:
+def percent_text(share: float, digits: int = 2) -> str:
     """A difference in per cent, empty where it is not known."""
-    return f"{value_text(100 * share, digits=2)} %" if np.isfinite(share) else ""
+    return f"{value_text(100 * share, digits=digits)} %" if np.isfinite(share) else ""
 
 
 def _named(unit: str) -> str:

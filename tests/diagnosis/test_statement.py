@@ -27,7 +27,7 @@ from siq.diagnosis.study import MismatchVerdict
 from siq.diagnosis.verdict import statement_of_failure
 from siq.numerics.text import p_text, percent
 from siq.remarks import Remark
-from siq.report.diagnosis_text import location_sentence, sentence_of, words_of
+from siq.report.diagnosis_text import sentences_of
 
 NAMES = ("dry friction", "Stribeck friction", "hysteresis", "quadratic drag", "cubic damping", "input delay")
 SAME = 10.0
@@ -107,8 +107,8 @@ def statement_from(number: int, verdict: MismatchVerdict, **changes: Any) -> Sta
 
 
 def said(statement: Statement) -> str:
-    words = words_of(statement)
-    return " ".join([sentence_of(statement), *(line for lines in words.values() for line in lines)])
+    words = sentences_of(statement)["words"]
+    return " ".join([statement.sentence, *(line for lines in words.values() for line in lines)])
 
 
 def percentages(text: str) -> list[float]:
@@ -127,7 +127,7 @@ def test_no_other_is_said_only_where_none_is_as_good(verdict):
     denied = 0
     for number in CASES:
         statement = statement_from(number, verdict)
-        lines = words_of(statement)["alternatives"]
+        lines = sentences_of(statement)["words"]["alternatives"]
         for each in mechanisms_in(statement):
             alone = any(f"as well as {own}:" in line for line in lines for own in (each.name, each.label))
             others = [m for m in mechanisms_in(statement) if m is not each and m.name == each.name]
@@ -145,7 +145,7 @@ def test_no_other_is_said_only_where_none_is_as_good(verdict):
 def test_a_class_of_equals_is_part_of_the_first_sentence():
     for number in CASES:
         statement = statement_from(number, MismatchVerdict.MISSING_PHYSICS)
-        text = sentence_of(statement)
+        text = statement.sentence
         open_ended = [m for m in statement.mechanisms if any(r.standing == "same" for r in m.rivals)]
         assert text.count("the recordings as well") == len(open_ended)
 
@@ -154,7 +154,7 @@ def test_a_class_of_equals_is_part_of_the_first_sentence():
 def test_a_gain_is_said_only_where_the_held_out_error_falls(verdict):
     for number in CASES:
         statement = statement_from(number, verdict)
-        text, errors = sentence_of(statement), statement.errors
+        text, errors = statement.sentence, statement.errors
         assert "nan" not in text and "None" not in text and "unknown" not in text
         pair = {
             MismatchVerdict.MISSING_PHYSICS: ("without", "augmented"),
@@ -179,7 +179,7 @@ def test_a_gain_is_said_only_where_the_held_out_error_falls(verdict):
 
 def test_missing_physics_without_a_gain_cannot_be_read_as_one():
     same = errors_with({"before": 0.103, "recalibrated": 0.103, "augmented": 0.103}, 0.020)
-    text = sentence_of(statement_from(3, MismatchVerdict.MISSING_PHYSICS, errors=same))
+    text = statement_from(3, MismatchVerdict.MISSING_PHYSICS, errors=same).sentence
     assert "does not improve the prediction of recordings held out" in text
     assert text.count("10.3 %") == 2
 
@@ -187,7 +187,7 @@ def test_missing_physics_without_a_gain_cannot_be_read_as_one():
 def test_a_parameter_shift_names_its_parameters_with_both_values():
     for number in CASES:
         statement = statement_from(number, MismatchVerdict.PARAMETER_SHIFT)
-        text = sentence_of(statement)
+        text = statement.sentence
         assert statement.recalibration is not None
         z = {n: abs(e.after - e.before) / e.standard_error for n, e in statement.recalibration.items()}
         certain = sorted((n for n in z if z[n] > 1.96), key=lambda n: -z[n])
@@ -220,12 +220,10 @@ def test_a_model_without_a_name_is_said_with_its_gain_or_that_nothing_was_gained
     augmented = 0.05 if described else 0.31
     errors = errors_with({"before": 0.5, "recalibrated": 0.3, "augmented": augmented}, 0.04)
     description = Description(0.0, (), 0.0, False)
-    text = sentence_of(
-        Statement(
-            MismatchVerdict.UNEXPLAINED, description=description, errors=errors,
-            described=(part,) if described else (),
-        )
-    )  # fmt: skip
+    text = Statement(
+        MismatchVerdict.UNEXPLAINED, description=description, errors=errors,
+        described=(part,) if described else (),
+    ).sentence  # fmt: skip
     if described:
         assert "A function of x in the equation of v describes it. With it, the error" in text
         assert percentages(text.split("falls from")[1])[:3] == [50.0, 30.0, 5.0]
@@ -240,7 +238,7 @@ def test_what_describes_a_rest_is_told_from_what_has_a_name():
     statement = statement_from(3, MismatchVerdict.MISSING_PHYSICS)
     runs = {"before": 0.5, "recalibrated": 0.3, "augmented": 0.05, "named": 0.2}
     errors = errors_with(runs, 0.04)
-    text = sentence_of(replace(statement, errors=errors, described=(part,)))
+    text = replace(statement, errors=errors, described=(part,)).sentence
     named, rest = text.split("What is left has no name; a function of x in the equation of v describes it. ")
     assert percentages(named.split("falls from")[1])[:3] == [50.0, 30.0, 20.0]
     assert percentages(rest.split("falls from")[1])[:2] == [20.0, 5.0] and "refitted" not in rest
@@ -260,7 +258,7 @@ def test_random_forces_are_a_verdict_of_their_own():
 
 def test_a_failure_keeps_its_sentence():
     statement = statement_of_failure("it runs away")
-    assert statement.sentence == sentence_of(statement)
+    assert statement.sentence == sentences_of(statement)["sentence"]
     assert statement.sentence.startswith("The simulation cannot be compared with the recordings")
 
 
@@ -268,11 +266,10 @@ def test_a_failure_keeps_its_sentence():
 def test_recordings_are_counted_only_where_there_are_several(recordings):
     for affected in range(1, recordings + 1):
         labels = tuple(f"r{number}" for number in range(affected))
-        text = location_sentence(
-            Location(
-                {"v": 0.9}, "x", {"x": (-2.0, 1.5)}, None, labels, recordings_total=recordings, unit="mm"
-            )
+        place = Location(
+            {"v": 0.9}, "x", {"x": (-2.0, 1.5)}, None, labels, recordings_total=recordings, unit="mm"
         )
+        text = sentences_of(statement_from(0, MismatchVerdict.MISSING_PHYSICS, location=place))["location"]
         assert "between −2.00 and 1.50 mm" in text
         assert ("all" in text) == (affected == recordings > 1)
         assert ("recording" in text) == (recordings > 1)

@@ -15,11 +15,10 @@ from pydantic import TypeAdapter
 from siq.diagnosis.dictionary import dictionary_of
 from siq.diagnosis.statement import Statement
 from siq.diagnosis.verdict import statement_of_failure
-from siq.report.diagnosis_page import Findings, mismatch_answer, mismatch_page
+from siq.report.diagnosis_page import Findings, largest_difference, mismatch_answer, mismatch_page
 from siq.report.formatting import texts
 from siq.report.plots.diagnosis import (
     _limits_of,
-    largest_difference,
     plot_before_after,
     plot_candidates,
     plot_curves,
@@ -276,8 +275,8 @@ def test_the_page_begins_with_the_largest_difference(runaway, recording, before)
         )
     ]  # fmt: skip
     found = largest_difference(pd.concat(parts), after="augmented")
-    assert (found.output, found.recording, found.recordings) == ("y", recording, 3)
-    assert found.before == pytest.approx(before) and found.after == pytest.approx(0.1)
+    assert (found["output"], found["recording"], found["recordings"]) == ("y", recording, 3)
+    assert found["before"] == pytest.approx(before) and found["after"] == pytest.approx(0.1)
 
 
 DESCRIBED = {
@@ -308,7 +307,7 @@ def test_the_model_of_what_has_no_name_is_on_the_page_and_drawn_with_its_band(mo
         "verdict": "unexplained", "mechanisms": [], "description": description, "described": [DESCRIBED],
     }  # fmt: skip
     shown = findings(models, verdict=said)
-    assert shown.final == "augmented"
+    assert shown.statement.final_simulation == "augmented"
     page = mismatch_page(shown, title="t", commands=())
     assert "A model of what is missing" in page and re.search(r"1\.10+\s±\s0\.020?", page)
     assert "with what describes it" in page

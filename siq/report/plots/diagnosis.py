@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from siq.report.diagnosis_page import largest_difference
 from siq.report.plots.quasipotential import add_legend, new_axes
 from siq.report.plots.style import (
     BLACK,
@@ -24,6 +24,7 @@ from siq.report.plots.style import (
     SKY_BLUE,
     VERMILLION,
     WIDTH,
+    axis_label,
     axis_unit,
     counted,
     drawn_to_be_read,
@@ -32,63 +33,9 @@ from siq.report.plots.style import (
     scaled_label,
 )
 
-
-@dataclass(frozen=True)
-class _LargestDifference:
-    """The recording and the output in which a simulation is off the furthest.
-
-    Attributes
-    ----------
-    recording, output
-        Which.
-    before, after
-        Root mean square difference there, in the unit of the output, of the simulation as given and of the
-        one that the verdict ends with; infinite where it runs away.
-    recordings
-        How many were held out.
-    """
-
-    recording: str
-    output: str
-    before: float
-    after: float
-    recordings: int
-
-
-def largest_difference(table: pd.DataFrame, *, after: str) -> _LargestDifference | None:
-    """The held-out recording to begin with; None where nothing was held out.
-
-    The output is the one in which the simulation as given is off the furthest, in units of its spread, in
-    the middle of all recordings, so that a single runaway does not decide. Of its recordings it is the one
-    in which the difference is largest.
-
-    Parameters
-    ----------
-    table
-        Columns ``recording output measured before recalibrated augmented scored``.
-    after
-        The simulation that the verdict ends with: ``"augmented"``, ``"recalibrated"``, or ``"before"``.
-    """
-    scored = table[table["scored"].astype(bool) & table["measured"].notna()]
-    if scored.empty:
-        return None
-    squares = {
-        name: ((scored[name] - scored["measured"]) ** 2).fillna(np.inf)
-        for name in dict.fromkeys(("before", after))
-    }
-    places = [scored["output"], scored["recording"].astype(str)]
-    errors = {name: each.groupby(places, sort=False).mean() for name, each in squares.items()}
-    spread = scored.groupby("output", sort=False)["measured"].var()
-    middle = errors["before"].groupby(level="output", sort=False).median()
-    output = str((middle / spread.where(spread > 0, 1.0)).idxmax())
-    recording = str(errors["before"].loc[output].idxmax())
-    return _LargestDifference(
-        recording,
-        output,
-        before=float(np.sqrt(errors["before"].loc[output, recording])),
-        after=float(np.sqrt(errors[after].loc[output, recording])),
-        recordings=scored["recording"].nunique(),
-    )
+if TYPE_CHECKING:
+    from siq.diagnosis.diagnosis import Diagnosis
+    from siq.inference.measurements import Measurements
 
 
 SAMPLES_SHOWN = 300
@@ -134,17 +81,15 @@ def plot_before_after(
     largest = largest_difference(table, after=after)
     if largest is None:
         return None
-    pair = (largest.recording, largest.output)
+    output = largest["output"]
     figure = Figure(figsize=(WIDTH, 4.2))
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.7, 1])
-    shown = ["before"] if after == "before" else ["before", after]
-    _draw(upper, lower, _rows(table, *pair), shown, noise=(noise or {}).get(pair[1]))
-    unit = axis_unit((units or {}).get(pair[1], "1"))
-    upper.set_ylabel(f"${name_label(pair[1])}${unit}")
-    lower.set_ylabel(f"error{unit}")
-    lower.set_xlabel(f"$t${axis_unit(time_unit)}")
-    handles, labels = upper.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=2, handlelength=1.6, columnspacing=1.2)
+    shown = list(dict.fromkeys(("before", after)))
+    rows = _rows(table, largest["recording"], output)
+    _draw(
+        upper, lower, rows, shown, (units or {}).get(output, "1"), time_unit, noise=(noise or {}).get(output)
+    )
+    _legend_of(upper)
     return figure
 
 
@@ -176,26 +121,18 @@ def plot_held_out(
     outputs = list(dict.fromkeys(scored["output"]))
     recordings = list(dict.fromkeys(scored["recording"]))[: max(1, PAIRS // len(outputs))]
     pairs = [(recording, output) for recording in recordings for output in outputs][:PAIRS]
+    # Where nothing was added two of the three simulations are one.
+    same = np.array_equal(scored["recalibrated"], scored["augmented"], equal_nan=True)
+    shown = ["before", "recalibrated", *([] if same else ["augmented"])]
     figure = Figure(figsize=(WIDTH, 0.6 + 2.9 * len(pairs)))
     axes = figure.subplots(2 * len(pairs), 1, height_ratios=[1.5, 1] * len(pairs))
     for (recording, output), (upper, lower) in zip(pairs, axes.reshape(-1, 2), strict=True):
-        same = _same(scored)
-        shown = ["before", "recalibrated"] if same else ["before", "recalibrated", "augmented"]
-        _draw(upper, lower, _rows(table, recording, output), shown, distinct=not same)
-        unit = axis_unit((units or {}).get(output, "1"))
+        rows, unit = _rows(table, recording, output), (units or {}).get(output, "1")
+        _draw(upper, lower, rows, shown, unit, time_unit)
         upper.set_title(f"recording {recording}", loc="left")
-        upper.set_ylabel(f"${name_label(output)}${unit}")
         upper.tick_params(labelbottom=False)
-        lower.set_ylabel(f"error{unit}")
-        lower.set_xlabel(f"$t${axis_unit(time_unit)}")
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=2, handlelength=1.6, columnspacing=1.2)
+    _legend_of(axes[0])
     return figure
-
-
-def _same(scored: pd.DataFrame) -> bool:
-    """Whether nothing was added, so that two of the three simulations are one."""
-    return bool(np.array_equal(scored["recalibrated"], scored["augmented"], equal_nan=True))
 
 
 def _rows(table: pd.DataFrame, recording: str, output: str) -> pd.DataFrame:
@@ -204,9 +141,10 @@ def _rows(table: pd.DataFrame, recording: str, output: str) -> pd.DataFrame:
 
 
 def _draw(
-    upper: Axes, lower: Axes, rows: pd.DataFrame, shown: list[str], *, noise: float | None = None,
-    distinct: bool = False,
+    upper: Axes, lower: Axes, rows: pd.DataFrame, shown: list[str], unit: str, time_unit: str, *,
+    noise: float | None = None,
 ) -> None:  # fmt: skip
+    """One recording of one output with some simulations, and below it what these are off by."""
     t, measured = rows["t"].to_numpy(float), rows["measured"].to_numpy(float)
     size = 3.5 if len(t) <= 100 else 2.2
     upper.plot(
@@ -222,7 +160,7 @@ def _draw(
     for name in shown:
         label, colour, style = WORDS[name]
         style = "-" if len(shown) == 1 else style
-        if distinct and name == "recalibrated":
+        if name == "recalibrated" and "augmented" in shown:
             colour, style = GREY, ":"
         values = rows[name].to_numpy(float)
         upper.plot(t, values, color=colour, linestyle=style, label=label)
@@ -234,6 +172,20 @@ def _draw(
     largest = 1.1 * min(largest, high - low + room)
     if largest > 0:
         lower.set_ylim(-largest, largest)
+    upper.set_ylabel(axis_label(str(rows["output"].iloc[0]), unit))
+    lower.set_ylabel(f"error{axis_unit(unit)}")
+    lower.set_xlabel(axis_label("t", time_unit))
+
+
+def _legend_of(axes: Axes) -> None:
+    """A legend of a panel's curves above the whole figure."""
+    axes.figure.legend(
+        *axes.get_legend_handles_labels(),
+        loc="outside upper left",
+        ncols=2,
+        handlelength=1.6,
+        columnspacing=1.2,
+    )
 
 
 POINTS = 200
@@ -268,8 +220,7 @@ def plot_described(
     for axes, each in zip(np.atleast_1d(figure.subplots(len(shown), 1)), shown, strict=True):
 
         def with_unit(name: str) -> str:
-            unit = time_unit if name == "t" else (units or {}).get(name, "1")
-            return f"{name if name == 'amplitude' else f'${name_label(name)}$'}{axis_unit(unit)}"
+            return _coordinate_label(name, time_unit if name == "t" else (units or {}).get(name, "1"))
 
         targets = " and ".join(f"${name_label(name)}$" for name in (*each["equations"], *each["outputs"]))
         where = f"added {'in the equation of' if each['equations'] else 'in the measurement of'} {targets}"
@@ -317,16 +268,19 @@ def _draw_surface(axes: Axes, surface: Mapping[str, Any]) -> ContourSet:
     return drawn
 
 
-if TYPE_CHECKING:
-    from siq.diagnosis.diagnosis import Diagnosis
-    from siq.inference.measurements import Measurements
-
 DIAGNOSIS_SAMPLES_SHOWN = 400  # of a long recording the end, where simulations are off the furthest
 DIAGNOSIS_BEYOND = 0.6  # of the range of what was measured, by which the axis is longer
-RECORDED: dict[str, Any] = {"color": ORANGE, "linewidth": 4.0, "alpha": 0.55}
-BEFORE: dict[str, Any] = {"color": GREY, "linestyle": (0, (1, 1)), "linewidth": 1.8}
-RECALIBRATED: dict[str, Any] = {"color": BLUE, "linestyle": (0, (4, 2)), "linewidth": 1.5}
-AUGMENTED: dict[str, Any] = {"color": VERMILLION, "linestyle": "-", "linewidth": 1.5}
+RECORDED: dict[str, Any] = {"color": ORANGE, "linewidth": 4.0, "alpha": 0.55, "label": "recording"}
+SIMULATED: dict[str, dict[str, Any]] = {
+    "before": {"color": GREY, "linestyle": (0, (1, 1)), "linewidth": 1.8, "label": "simulation as given"},
+    "recalibrated": {
+        "color": BLUE,
+        "linestyle": (0, (4, 2)),
+        "linewidth": 1.5,
+        "label": "parameters refitted",
+    },
+    "augmented": {"color": VERMILLION, "linestyle": "-", "linewidth": 1.5, "label": "with what was found"},
+}
 
 
 def plot_diagnosis(
@@ -382,11 +336,9 @@ def plot_diagnosis(
     axes = new_axes() if ax is None else ax
     case, place, rows = _shown(diagnosis, output, recording)
     t, measured = case.t[rows], case.outputs[rows, place]
-    axes.plot(t, measured, **RECORDED)
-    handles = [Line2D([], [], label="recording", **RECORDED)]
-    for values, look, name in _simulations(diagnosis):
-        axes.plot(t, values[rows, place], **look)
-        handles.append(Line2D([], [], label=name, **look))
+    handles = axes.plot(t, measured, **RECORDED)
+    for values, look in _simulations(diagnosis):
+        handles += axes.plot(t, values[rows, place], **look)
     # A simulation that runs away would leave the others no room.
     low, high = np.nanmin(measured), np.nanmax(measured)
     room = DIAGNOSIS_BEYOND * ((high - low) or abs(high) or 1.0)
@@ -403,11 +355,11 @@ def draw_errors(
     """Draw simulation minus recording, held out; what is returned belongs into the legend."""
     case, place, rows = _shown(diagnosis, output, recording)
     t, measured = case.t[rows], case.outputs[rows, place]
-    handles, sizes = [], []
-    for values, look, name in _simulations(diagnosis):
+    handles: list[Any] = []
+    sizes: list[float] = []
+    for values, look in _simulations(diagnosis):
         error = values[rows, place] - measured
-        axes.plot(t, error, **look)
-        handles.append(Line2D([], [], label=name, **look))
+        handles += axes.plot(t, error, **look)
         known = np.abs(error[np.isfinite(error)])
         sizes.append(float(known.max()) if len(known) else np.inf)
     axes.axhline(0.0, color=BLACK, linewidth=0.6, zorder=0)
@@ -419,15 +371,9 @@ def draw_errors(
     return handles
 
 
-def _simulations(diagnosis: Diagnosis) -> list[tuple[np.ndarray, dict[str, Any], str]]:
-    runs = diagnosis.held_out
-    found = [
-        (runs.before.outputs, BEFORE, "simulation as given"),
-        (runs.recalibrated.outputs, RECALIBRATED, "parameters refitted"),
-    ]
-    if diagnosis.mechanisms:
-        found.append((runs.augmented.outputs, AUGMENTED, "with what was found"))
-    return found
+def _simulations(diagnosis: Diagnosis) -> list[tuple[np.ndarray, dict[str, Any]]]:
+    names = [name for name in SIMULATED if name != "augmented" or diagnosis.mechanisms]
+    return [(getattr(diagnosis.held_out, name).outputs, SIMULATED[name]) for name in names]
 
 
 def _shown(
@@ -461,15 +407,6 @@ def _name(axes: Axes, diagnosis: Diagnosis, place: int, t: np.ndarray, what: str
     axes.set_ylabel(scaled_label(axes.yaxis, f"{what}${name_label(name)}$", unit, largest))
     axes.set_xlabel(scaled_label(axes.xaxis, "$t$", system.time_unit, float(np.abs(t).max(initial=0.0))))
 
-
-__all__ = [
-    "plot_before_after",
-    "plot_candidates",
-    "plot_curves",
-    "plot_escapes",
-    "plot_held_out",
-    "plot_missing",
-]
 
 SIMULATIONS = {"before": "as given", "recalibrated": "refitted", "augmented": "with what was found"}
 CURVES = 3
@@ -532,11 +469,8 @@ def plot_curves(
         first = equation.split(", ")[0]
         unit = (units or {}).get(coordinate if coordinate != "amplitude" else first, "1")
         unit = time_unit if coordinate == "t" else unit
-        symbol = coordinate if coordinate == "amplitude" else f"${name_label(coordinate)}$"
-        axes.set_xlabel(f"{symbol}{axis_unit(unit)}")
-        rate = axis_unit(rate_unit((units or {}).get(first, "1"), time_unit))
-        where = " and ".join(f"$\\dot{{{name_label(name)}}}$" for name in equation.split(", "))
-        axes.set_ylabel(f"missing in {where}\n{rate.strip()}" if rate else f"missing in {where}")
+        axes.set_xlabel(_coordinate_label(coordinate, unit))
+        axes.set_ylabel(_missing_label(equation, units, time_unit).replace(" (", "\n("))
         if across:
             axes.set_title("across the amplitude", loc="left")
     figure.legend(
@@ -550,6 +484,17 @@ def plot_curves(
         columnspacing=1.2,
     )  # fmt: skip
     return figure
+
+
+def _coordinate_label(name: str, unit: str) -> str:
+    return f"amplitude{axis_unit(unit)}" if name == "amplitude" else axis_label(name, unit)
+
+
+def _missing_label(equation: str, units: Mapping[str, str] | None, time_unit: str) -> str:
+    """What is missing in one equation, or in several with commas between them, with its unit."""
+    names = equation.split(", ")
+    where = " and ".join(f"$\\dot{{{name_label(name)}}}$" for name in names)
+    return f"missing in {where}{axis_unit(rate_unit((units or {}).get(names[0], '1'), time_unit))}"
 
 
 def _draw_curves(axes: Axes, stages: Mapping[str, pd.DataFrame]) -> None:
@@ -573,14 +518,7 @@ def _draw_curves(axes: Axes, stages: Mapping[str, pd.DataFrame]) -> None:
 
 
 def _limits_of(curves: Iterable[pd.DataFrame]) -> tuple[float, float]:
-    """Limits of an axis by the values of curves where these are supported by data, and zero.
-
-    Parameters
-    ----------
-    curves
-        Each with the columns ``missing standard_error``; a knot whose error is several times the median of
-        its curve has hardly any data.
-    """
+    """Limits of an axis by zero, and by the values of curves where data support them."""
     values = [np.zeros(1)]
     for curve in curves:
         value, error = (curve[name].to_numpy(float) for name in ("missing", "standard_error"))
@@ -646,11 +584,9 @@ def plot_missing(
         )
         axes.set_facecolor("#EDEDED")
         first, second = names
-        axes.set_xlabel(f"${name_label(first)}${axis_unit((units or {}).get(first, '1'))}")
-        axes.set_ylabel(f"${name_label(second)}${axis_unit((units or {}).get(second, '1'))}")
-        rate = axis_unit(rate_unit((units or {}).get(name, "1"), time_unit))
-        label = f"missing in $\\dot{{{name_label(name)}}}${rate}"
-        axes.figure.colorbar(image, ax=axes, extend="both", label=label)
+        axes.set_xlabel(axis_label(first, (units or {}).get(first, "1")))
+        axes.set_ylabel(axis_label(second, (units or {}).get(second, "1")))
+        axes.figure.colorbar(image, ax=axes, extend="both", label=_missing_label(name, units, time_unit))
     if source:
         figure.suptitle(source)
     return figure
@@ -680,8 +616,9 @@ def plot_candidates(table: pd.DataFrame) -> Figure | None:
     figure = Figure(figsize=(WIDTH, 1.3 + 0.27 * len(best) + 0.1 * best["stage"].nunique()))
     axes = figure.add_subplot()
     places = np.arange(len(best))
+    labels = [text if len(text) <= 30 else f"{text[:29]}…" for text in best["label"]]  # room for the bars
     axes.barh(places, best["gain"], color=[STAGES[stage][1] for stage in best["stage"]], height=0.7)
-    axes.set_yticks(places, [_shortened(text).replace("$", r"\$") for text in best["label"]])
+    axes.set_yticks(places, [text.replace("$", r"\$") for text in labels])
     axes.set_xscale("log")
     axes.set_xlim(left=min(1.0, float(best["gain"].min()) / 2))
     axes.set_xlabel(r"gain in $\chi^2$")
@@ -689,11 +626,6 @@ def plot_candidates(table: pd.DataFrame) -> Figure | None:
     handles = [Patch(color=STAGES[stage][1], label=STAGES[stage][0]) for stage in present]
     figure.legend(handles=handles, loc="outside upper left", ncols=1)
     return figure
-
-
-def _shortened(label: str, most: int = 30) -> str:
-    """A label that leaves room for its bar."""
-    return label if len(label) <= most else f"{label[: most - 1]}…"
 
 
 @drawn_to_be_read
