@@ -108,6 +108,16 @@ class Transition:
         return self.path.uphill.points[-1] if over_cycle and self.path else self.saddle.position
 
     @property
+    def uphill(self) -> np.ndarray:
+        """The path of least action up to the saddle, shape ``(n, d)``; empty where none was found."""
+        return np.zeros((0, len(self.saddle.position))) if self.path is None else self.path.uphill.points
+
+    @property
+    def downhill(self) -> np.ndarray:
+        """The way down from there without noise, likewise."""
+        return np.zeros((0, len(self.saddle.position))) if self.path is None else self.path.downhill
+
+    @property
     def error(self) -> float:
         """Standard error of the barrier: from f, and by how much the formula and the path alone differ."""
         if self.path is None:

@@ -21,6 +21,7 @@ from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.rates import NoiseStrength, mean_exit_time
 from siq.report.formatting import counted_text, paragraphs, percent_text, predicted_text, texts, time_text
 from siq.report.summary import LandscapeSummary, settled, summarise, visits_of, well_name
+from siq.systems.cycles import Cycle
 from siq.workflow.tables import Method
 
 MOST_COLUMNS = 4  # wells that are columns of a table; more are rows
@@ -139,30 +140,28 @@ def exits_table(summary: LandscapeSummary) -> tuple[pd.DataFrame, pd.DataFrame]:
     rows, numbers = [], []
     for way in summary.ways:
         known = math.isfinite(way.barrier)
-        mean = None if summary.noise is None or not known else mean_exit_time(way.law, summary.noise)
+        law, action = way.exit, None if way.path is None else way.path.uphill.action
+        mean = None if summary.noise is None or not known else mean_exit_time(law, summary.noise)
         start, end = well_name(way.start), "" if way.end is None else well_name(way.end)
-        place = _place(summary, way.saddle)
-        if math.isfinite(way.period):
-            period = value_text(way.period, unit=summary.time_unit, digits=4)
+        place = _place(summary, way.place)
+        if isinstance(way.saddle, Cycle):
+            period = value_text(way.saddle.period, unit=summary.time_unit, digits=4)
             place += f", on an unstable cycle of period {period}"
         row = {
             "way": f"{start} to {end or f'out of the {summary.region}'}",
             "over the saddle at": place,
-            headed("barrier ΔU", summary.energy_unit): value_text(way.barrier, way.standard_error)
-            if known
-            else "",
+            headed("barrier ΔU", summary.energy_unit): value_text(way.barrier, way.error) if known else "",
         }
         if not summary.given:
-            action = way.minimum_action
             row["the same by the path alone"] = "" if action is None else value_text(action)
         row[headed("mean time", summary.time_unit)] = time_text(mean)
-        rows.append(row | {"to be known": "; ".join(way.remarks)})
+        rows.append(row | {"to be known": "; ".join(way.notes)})
         numbers.append(
             {
                 "start": start, "end": end,
-                **{f"saddle_{name}": value for name, value in zip(summary.names, way.saddle, strict=True)},
-                "barrier": way.barrier, "barrier_error": way.standard_error,
-                "minimum_action": way.minimum_action, "prefactor": way.law.prefactor,
+                **{f"saddle_{name}": value for name, value in zip(summary.names, way.place, strict=True)},
+                "barrier": way.barrier, "barrier_error": way.error, "minimum_action": action,
+                "prefactor": law.prefactor,
                 "mean_time": np.nan if mean is None else mean.value,
                 "data_error": np.nan if mean is None else mean.data_error,
                 "law_error": np.nan if mean is None else mean.law_error,

@@ -30,7 +30,7 @@ from siq.data.recordings import Recordings
 from siq.data.two_states import RecordStates
 from siq.numerics.text import number_text, unit_text
 from siq.report.formatting import environment, in_paragraphs, texts
-from siq.report.summary import BLOCK_OF_POINTS, LandscapeSummary, chosen_states
+from siq.report.summary import LandscapeSummary, chosen_states
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -579,13 +579,9 @@ def interactive_view(landscape: LandscapeSummary) -> Markup | None:
     nodes = min(int(NODES ** (1 / len(shown)) + 1e-9), MOST_NODES)
     axes = [landscape.along(place, nodes) for place in shown]
     mesh = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(shown))
-    parts = []
-    for start in range(0, len(mesh), BLOCK_OF_POINTS):
-        part = mesh[start : start + BLOCK_OF_POINTS]
-        points = np.tile(lowest, (len(part), 1))
-        points[:, shown] = part
-        parts.append(landscape.potential(points))
-    values = np.concatenate(parts).reshape((nodes,) * len(shown))
+    points = np.tile(lowest, (len(mesh), 1))
+    points[:, shown] = mesh
+    values = landscape.potential(points).reshape((nodes,) * len(shown))
     known = np.isfinite(values)
     if not known.any():
         return None

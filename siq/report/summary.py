@@ -25,6 +25,7 @@ from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import Landscape, least_over_wells
 from siq.quasipotential.occupancy import VisitTest
 from siq.quasipotential.rates import EscapeRate, MeanTime, NoiseStrength, mean_residence_time
+from siq.quasipotential.transitions import Transition
 from siq.quasipotential.wells import Well
 from siq.remarks import sentence
 from siq.systems.cycles import Cycle
@@ -151,46 +152,6 @@ class WellSummary:
 
 
 @dataclass(frozen=True)
-class ExitSummary:
-    """The way out of a well over a saddle.
-
-    Attributes
-    ----------
-    start, end
-        Places of the wells; the end is None where the way leads out of the recorded region.
-    saddle
-        Shape ``(d,)``.
-    barrier, standard_error
-        ΔU and its error, NaN where not known.
-    uphill, downhill
-        The path of least action and the way down without noise, shape ``(n, d)``; empty where there is none.
-    law
-        What its mean time follows from.
-    minimum_action
-        That of the path alone, None where there is no path.
-    remarks
-        What has to be known of it.
-    no_time_reason
-        Why there is no law of its mean time; empty where there is one.
-    period
-        Of the unstable cycle that takes the place of the saddle, NaN of a saddle.
-    """
-
-    start: int
-    end: int | None
-    saddle: np.ndarray
-    barrier: float
-    standard_error: float
-    uphill: np.ndarray
-    downhill: np.ndarray
-    law: EscapeRate
-    minimum_action: float | None = None
-    remarks: tuple[str, ...] = ()
-    no_time_reason: str = ""
-    period: float = math.nan
-
-
-@dataclass(frozen=True)
 class LandscapeSummary:
     """Wells, exits and U of a landscape.
 
@@ -239,7 +200,7 @@ class LandscapeSummary:
     units: tuple[str, ...]
     time_unit: str
     wells: tuple[WellSummary, ...]
-    ways: tuple[ExitSummary, ...]
+    ways: tuple[Transition, ...]
     others: tuple[EquilibriumSummary, ...]
     noise: NoiseStrength | None
     given: bool = False
@@ -267,12 +228,13 @@ class LandscapeSummary:
     @property
     def has_times(self) -> bool:
         """Whether some exit has a law of its mean time."""
-        return any(math.isfinite(way.law.prefactor) for way in self.ways)
+        return any(math.isfinite(way.exit.prefactor) for way in self.ways)
 
     @property
     def no_time_reason(self) -> str:
         """Why an exit has no law of its mean time, as far as that is known."""
-        return next((way.no_time_reason for way in self.ways if way.no_time_reason), "")
+        remarks = (remark for way in self.ways for remark in way.remarks)
+        return next((str(each.values["reason"]) for each in remarks if each.code == NO_ESCAPE_TIME), "")
 
     @property
     def cycles(self) -> tuple[np.ndarray, ...]:
@@ -286,6 +248,10 @@ class LandscapeSummary:
 
     def potential(self, x: np.ndarray) -> np.ndarray:
         """U at points ``(n, d)``, NaN where it is not known: shape ``(n,)``."""
+        starts = range(0, max(len(x), 1), BLOCK_OF_POINTS)
+        return np.concatenate([self._potential(x[start : start + BLOCK_OF_POINTS]) for start in starts])
+
+    def _potential(self, x: np.ndarray) -> np.ndarray:
         if self.formula is not None and self.points is not None:
             low, high = self.points.min(axis=0), self.points.max(axis=0)
             inside = ((x >= low) & (x <= high)).all(axis=1)
@@ -307,7 +273,7 @@ class LandscapeSummary:
         winding = bool(self.cycles or self.parting)  # exits wind then, and leave their wells
         seen = [
             *(well.position[None] for well in self.wells), *self.cycles, *self.parting,
-            *(way.uphill for way in self.ways if winding), *(way.saddle[None] for way in self.ways),
+            *(way.uphill for way in self.ways if winding), *(way.place[None] for way in self.ways),
             *(well.points for well in self.formulas if well is not None),
         ]  # fmt: skip
         if self.points is not None and (self.formula is not None or not any(map(len, seen))):
@@ -350,7 +316,7 @@ class LandscapeSummary:
         """Where the lowest saddle lies; the deepest well where there is none."""
         known = [way for way in self.ways if np.isfinite(self.wells[way.start].height + way.barrier)]
         if known:
-            return min(known, key=lambda way: self.wells[way.start].height + way.barrier).saddle
+            return min(known, key=lambda way: self.wells[way.start].height + way.barrier).place
         places = self.saddles or self.marks or self.others
         heights = [np.inf if np.isnan(one.height) else one.height for one in places]
         return places[int(np.argmin(heights))].position
@@ -449,25 +415,7 @@ def summarise(
         heights = heights - heights.min() if np.isfinite(heights).all() else heights
     matched = bool(len(heights)) and bool(np.isfinite(heights).all())
     heights = heights if matched else np.zeros(len(attractors))
-    ways = tuple(
-        ExitSummary(
-            start=one.start,
-            end=one.end,
-            saddle=one.place,
-            barrier=one.barrier,
-            standard_error=one.error,
-            uphill=np.zeros((0, dynamics.dimension)) if one.path is None else one.path.uphill.points,
-            downhill=np.zeros((0, dynamics.dimension)) if one.path is None else one.path.downhill,
-            law=one.exit,
-            minimum_action=None if one.path is None else one.path.uphill.action,
-            remarks=one.notes,
-            no_time_reason="".join(
-                str(each.values["reason"]) for each in one.remarks if each.code == NO_ESCAPE_TIME
-            ),
-            period=one.saddle.period if isinstance(one.saddle, Cycle) else math.nan,
-        )
-        for one in landscape.transitions
-    )
+    ways = landscape.transitions
     extent = [one.position[None] for one in (*landscape.equilibria, *attractors)]
     extent += [one.points for one in attractors if isinstance(one, Cycle)]
     size = np.abs(np.concatenate([*extent, *fitted, np.zeros((1, dynamics.dimension))])).max(axis=0)
@@ -475,7 +423,7 @@ def summarise(
     size = size if len(set(units)) > 1 else np.full(dynamics.dimension, size.max())
     tops: dict[tuple[float, ...], float] = {}
     for way in ways:
-        key, top = tuple(way.saddle.tolist()), float(heights[way.start] + way.barrier)
+        key, top = tuple(way.place.tolist()), float(heights[way.start] + way.barrier)
         tops[key] = top if np.isnan(tops.get(key, np.nan)) else min(top, tops[key])
     letters = {tuple(one.position.tolist()): well_name(index) for index, one in enumerate(attractors)}
     equilibria = tuple(
@@ -536,7 +484,7 @@ def _well(
     landscape: Landscape,
     index: int,
     height: float,
-    ways: Sequence[ExitSummary],
+    ways: Sequence[Transition],
     size: np.ndarray,
     visits: VisitTest | None,
 ) -> WellSummary:
@@ -554,11 +502,11 @@ def _well(
         height=height,
         basin=float(landscape.basins[index]),
         depth=math.nan if lowest is None else lowest.barrier,
-        depth_error=math.nan if lowest is None else lowest.standard_error,
+        depth_error=math.nan if lowest is None else lowest.error,
         beyond=None if lowest is None or lowest.end is None else well_name(lowest.end),
         known_up_to=math.nan if formula is None else 2 * formula.level,
-        exits=tuple(way.law for way in ways),
-        leverage=1.0 if lowest is None else lowest.law.leverage,
+        exits=tuple(way.exit for way in ways),
+        leverage=1.0 if lowest is None else lowest.leverage,
         visits=visits,
         cycle=attractor if isinstance(attractor, Cycle) else None,
     )

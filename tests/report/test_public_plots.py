@@ -20,15 +20,12 @@ from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_files import landscape_data, landscape_from_data
-from siq.quasipotential.rates import EscapeRate
-from siq.quasipotential.transitions import barrier_uncertainty
+from siq.quasipotential.transitions import Transition, barrier_uncertainty
 from siq.quasipotential.wells import WellOptions
 from siq.report.plots import prediction
-from siq.report.plots.quasipotential import _plane_of, quasipotential_figure
+from siq.report.plots.quasipotential import _on_plane, quasipotential_figure
 from siq.report.plots.wells import _joined
-from siq.report.summary import ExitSummary, LandscapeSummary, summarise
-
-NONE = np.zeros((0, 1))
+from siq.report.summary import LandscapeSummary, summarise
 
 
 @functools.cache
@@ -80,26 +77,27 @@ def test_the_states_of_the_plane_and_the_view_can_be_chosen() -> None:
     with pytest.raises(ValueError, match="name two of x, y, z"):
         siq.plot_quasipotential(landscape(3), states=("x", "w"), ax=Figure().add_subplot())
     with pytest.raises(ValueError, match="'projection' or 'section'"):
-        _plane_of(summarise(landscape(3)), view="shadow")  # type: ignore[arg-type]
+        _on_plane(summarise(landscape(3)), (0, 1), "shadow")  # type: ignore[arg-type]
 
 
 def test_a_projection_keeps_wells_and_passes_at_their_heights() -> None:
     """The lowest U over z is U of the double well of x and y, since z only adds to it."""
     shown = summarise(landscape(3))
-    plane = _plane_of(shown, states=("x", "y"))
-    known = np.isfinite(plane.values)
+    values, _ = _on_plane(shown, (0, 1))
+    known = np.isfinite(values)
     assert known.mean() > 0.1
-    grid = np.stack(np.meshgrid(plane.x1, plane.x2, indexing="ij"), axis=-1).reshape(-1, 2)
+    x, y = (shown.along(place, len(values)) for place in (0, 1))
+    grid = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
     points = np.column_stack([grid, np.zeros(len(grid))])
-    at_zero = shown.potential(points).reshape(plane.values.shape)
+    at_zero = shown.potential(points).reshape(values.shape)
     both = known & np.isfinite(at_zero)
     # Never above the section through any one z, and at most as far below it as V falls beside z = 0.
-    assert (plane.values[both] <= at_zero[both] + 1e-12).all()
+    assert (values[both] <= at_zero[both] + 1e-12).all()
     fine = np.linspace(*shown.box[2], 81)
     columns = np.repeat(grid[both.ravel()][::40], 81, axis=0)
     every = shown.potential(np.column_stack([columns, np.tile(fine, len(columns) // 81)])).reshape(-1, 81)
     lowest = np.nanmin(every, axis=1)
-    np.testing.assert_allclose(plane.values[both][::40], lowest, atol=0.01 * np.nanmax(at_zero))
+    np.testing.assert_allclose(values[both][::40], lowest, atol=0.01 * np.nanmax(at_zero))
 
 
 def test_the_band_of_one_state_is_that_of_the_barrier() -> None:
@@ -155,16 +153,19 @@ def test_the_first_picture_can_be_read_on_a_phone(dimension: int) -> None:
 
 
 def of_heights(heights: list[float], passes: dict[tuple[int, int], float]) -> LandscapeSummary:
+    known = summarise(landscape(1))
     ways = [
-        ExitSummary(*pair, np.zeros(1), top - heights[pair[0]], 0.01, NONE, NONE, EscapeRate(np.nan, np.nan))
+        Transition(*pair, known.ways[0].saddle, None, top - heights[pair[0]], standard_error=0.01)
         for (left, right), top in passes.items()
         for pair in ((left, right), (right, left))
     ]
-    known = summarise(landscape(1))
     wells = tuple(
-        replace(known.wells[0], label="ABCDEF"[k], position=np.array([float(k)]), height=u)
+        replace(
+            known.wells[0], label="ABCDEF"[k], position=np.array([float(k)]), height=u,
+            depth=min(way.barrier for way in ways if way.start == k), depth_error=0.01,
+        )
         for k, u in enumerate(heights)
-    )
+    )  # fmt: skip
     return replace(known, wells=wells, ways=tuple(ways), others=())
 
 
@@ -172,11 +173,9 @@ def test_wells_join_from_the_lowest_pass_to_the_highest_and_no_lines_cross() -> 
     six = of_heights(
         [0.0, 0.3, 0.1, 0.5, 0.2, 0.4], {(0, 3): 1.0, (1, 2): 0.8, (2, 3): 1.5, (4, 5): 0.9, (5, 0): 2.0}
     )
-    tree = _joined(six, [one.height for one in six.wells])
-    assert [one.height for one in tree] == pytest.approx([0.8, 0.9, 1.0, 1.5, 2.0])
-    assert [(set(one.left), set(one.right)) for one in tree][3] in (
-        ({1, 2}, {0, 3}), ({0, 3}, {1, 2}),
-    )  # fmt: skip
+    tree, _ = _joined(six)
+    assert [height for *_, height in tree] == pytest.approx([0.8, 0.9, 1.0, 1.5, 2.0])
+    assert [set(group) for group in tree[3][:2]] == [{0, 3}, {1, 2}]
     axes = siq.plot_barriers(six, ax=Figure().add_subplot())
     columns = {
         text.get_text()[0]: place

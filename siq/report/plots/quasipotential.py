@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -17,7 +16,6 @@ from matplotlib.ticker import MaxNLocator
 
 from siq.numerics.text import unit_text
 from siq.quasipotential.landscape import Landscape
-from siq.quasipotential.landscape_comparison import Potential
 from siq.report.plots.style import (
     BLACK,
     BLUE,
@@ -29,11 +27,10 @@ from siq.report.plots.style import (
     power_of_ten,
     scaled_label,
 )
-from siq.report.summary import BLOCK_OF_POINTS, LandscapeSummary, chosen_states, summarise
+from siq.report.summary import LandscapeSummary, chosen_states, summarise
 
-if TYPE_CHECKING:  # to draw takes none of what it takes to compute
-    pass
-
+if TYPE_CHECKING:
+    from siq.data.recordings import Recordings
 
 View = Literal["projection", "section"]
 
@@ -43,69 +40,27 @@ BEHIND = 40  # states in the other directions that a projection tries at each po
 SWEEPS = 3  # after which the lowest of them moves by less than a pixel
 
 
-@dataclass(frozen=True)
-class _Plane:
-    """U on a plane of two states.
-
-    Attributes
-    ----------
-    shown
-        Places of the two states.
-    x1, x2
-        The grid, shapes ``(n,)`` and ``(m,)``.
-    values
-        U, shape ``(n, m)``, NaN where it is not known.
-    sentence
-        What the plane is, where there are more states; otherwise empty.
-    """
-
-    shown: tuple[int, int]
-    x1: np.ndarray
-    x2: np.ndarray
-    values: np.ndarray
-    sentence: str
-
-
-def _plane_of(
-    landscape: LandscapeSummary, *, states: Sequence[str] | None = None, view: View = "projection"
-) -> _Plane:
-    """U on the plane of two states.
-
-    Parameters
-    ----------
-    landscape
-        What is drawn, of two states at least.
-    states
-        Names of the two.
-    view
-        Of more states: ``projection``, the lowest U that the others allow, which keeps wells and passes at
-        their heights; or ``section``, the others held at the lowest pass.
-    """
+def _on_plane(
+    landscape: LandscapeSummary, shown: tuple[int, int], view: View = "projection"
+) -> tuple[np.ndarray, str]:
+    """U on a grid over the plane of two states, and in words what it is of where there are more states."""
     if view not in ("projection", "section"):
         raise ValueError(f"view is '{view}'; it is 'projection' or 'section'")
-    shown = chosen_states(landscape, states)
     rest = [place for place in range(len(landscape.names)) if place not in shown]
     count = POINTS_OF_MORE if rest and view == "projection" else POINTS
     x1, x2 = (landscape.along(place, count) for place in shown)
     at = landscape.lowest_pass
     grid = np.tile(at, (count * count, 1))
     grid[:, shown] = np.stack(np.meshgrid(x1, x2, indexing="ij"), axis=-1).reshape(-1, 2)
-    if not rest:
-        values, sentence = in_blocks(landscape.potential, grid), ""
-    elif view == "section":
-        values = in_blocks(landscape.potential, grid)
+    sentence = ""
+    if rest and view == "section":
         held = ", ".join(f"{landscape.names[place]} = {at[place]:.3g}" for place in rest)
-        sentence = f"section at {held}, through the lowest pass"
-    else:
-        values = _lowest_behind(landscape, grid, rest)
-        sentence = f"projection: the lowest $U$ over {', '.join(landscape.names[place] for place in rest)}"
-    return _Plane(shown, x1, x2, values.reshape(count, count), sentence)
-
-
-def in_blocks(potential: Potential, x: np.ndarray) -> np.ndarray:
-    """A potential at many points, some at a time."""
-    parts = [potential(x[start : start + BLOCK_OF_POINTS]) for start in range(0, len(x), BLOCK_OF_POINTS)]
-    return np.concatenate(parts) if parts else np.zeros(0)
+        sentence = f"Section at {held}, through the lowest pass"
+    elif rest:
+        sentence = f"Projection: the lowest $U$ over {', '.join(landscape.names[place] for place in rest)}"
+    projected = rest and view == "projection"
+    values = _lowest_behind(landscape, grid, rest) if projected else landscape.potential(grid)
+    return values.reshape(count, count), sentence
 
 
 def _lowest_behind(landscape: LandscapeSummary, grid: np.ndarray, rest: list[int]) -> np.ndarray:
@@ -122,7 +77,7 @@ def _lowest_behind(landscape: LandscapeSummary, grid: np.ndarray, rest: list[int
     for one in behind:
         tried = grid.copy()
         tried[:, rest] = one
-        values = np.nan_to_num(in_blocks(landscape.potential, tried), nan=np.inf)
+        values = np.nan_to_num(landscape.potential(tried), nan=np.inf)
         better = values < lowest
         best[better], lowest[better] = tried[better], values[better]
     known = np.flatnonzero(np.isfinite(lowest))
@@ -135,7 +90,12 @@ def _lowest_behind(landscape: LandscapeSummary, grid: np.ndarray, rest: list[int
 
 
 def _descend(
-    potential: Potential, best: np.ndarray, lowest: np.ndarray, known: np.ndarray, place: int, size: float
+    potential: Callable[[np.ndarray], np.ndarray],
+    best: np.ndarray,
+    lowest: np.ndarray,
+    known: np.ndarray,
+    place: int,
+    size: float,
 ) -> None:
     """Move points along one state to the lowest place of a parabola, where U really is lower there."""
     middle, centre = lowest[known].copy(), best[known].copy()
@@ -143,14 +103,14 @@ def _descend(
     for sign in (-1, 1):
         moved = centre.copy()
         moved[:, place] += sign * size
-        sides.append(in_blocks(potential, moved))
+        sides.append(potential(moved))
         _take(best, lowest, known, moved, sides[-1])
     left, right = sides
     with np.errstate(invalid="ignore", divide="ignore"):
         shift = 0.5 * size * (left - right) / (left + right - 2 * middle)
     moved = centre
     moved[:, place] += np.clip(np.nan_to_num(shift, nan=0.0, posinf=0.0, neginf=0.0), -size, size)
-    _take(best, lowest, known, moved, in_blocks(potential, moved))
+    _take(best, lowest, known, moved, potential(moved))
 
 
 def _take(
@@ -178,9 +138,6 @@ def _far_apart(points: np.ndarray, count: int) -> np.ndarray:
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return points[chosen]
 
-
-if TYPE_CHECKING:
-    from siq.data.recordings import Recordings
 
 WIDTH = 4.5  # inches: on a phone of 400 pixels its letters are 11 pixels high
 LEVELS = 12
@@ -331,14 +288,15 @@ def _draw_quasipotential(
     """Draw U on axes; what is returned belongs into their legend."""
     if len(landscape.names) == 1:
         return _draw_curve(axes, landscape)
-    plane = _plane_of(landscape, states=states, view=view)
-    handles = _draw_map(axes, landscape, plane)
-    handles += _draw_points(axes, landscape, plane.shown)
-    handles += _draw_ways(axes, landscape, plane.shown)
-    handles += draw_equilibria(axes, landscape, plane.shown)
-    name_axes(axes, landscape, plane.shown)
-    if plane.sentence:
-        axes.set_title(plane.sentence[0].upper() + plane.sentence[1:], fontsize="medium", loc="left")
+    shown = chosen_states(landscape, states)
+    values, sentence = _on_plane(landscape, shown, view)
+    handles = _draw_map(axes, landscape, shown, values.T)
+    handles += _draw_points(axes, landscape, shown)
+    handles += _draw_ways(axes, landscape, shown)
+    handles += draw_equilibria(axes, landscape, shown)
+    name_axes(axes, landscape, shown)
+    if sentence:
+        axes.set_title(sentence, fontsize="medium", loc="left")
     return handles
 
 
@@ -391,7 +349,7 @@ def _draw_curve(axes: Axes, landscape: LandscapeSummary) -> list[Any]:
     for way in landscape.ways:
         if np.isfinite(way.barrier):
             _draw_depth(
-                axes, landscape.wells[way.start].position[0], way.saddle[0], heights[way.start], way.barrier
+                axes, landscape.wells[way.start].position[0], way.place[0], heights[way.start], way.barrier
             )
     marks = [(one, WELL) for one in landscape.wells] + [(one, SADDLE) for one in landscape.saddles]
     for one, style in marks:
@@ -418,9 +376,11 @@ def _draw_depth(axes: Axes, well: float, saddle: float, bottom: float, barrier: 
     )  # fmt: skip
 
 
-def _draw_map(axes: Axes, landscape: LandscapeSummary, plane: _Plane) -> list[Any]:
+def _draw_map(
+    axes: Axes, landscape: LandscapeSummary, shown: tuple[int, int], values: np.ndarray
+) -> list[Any]:
     handles: list[Any] = []
-    values = plane.values.T
+    x1, x2 = (landscape.along(place, len(values)) for place in shown)
     if np.isfinite(values).any():
         top, lowest = highest_shown(landscape, values), float(np.nanmin(values))
         lowest = 0.0 if abs(lowest) < 1e-3 * abs(top - lowest) else lowest
@@ -428,10 +388,8 @@ def _draw_map(axes: Axes, landscape: LandscapeSummary, plane: _Plane) -> list[An
         levels = np.asarray(MaxNLocator(LEVELS, steps=[1, 2, 2.5, 5, 10]).tick_values(lowest, top))
         norm = BoundaryNorm(levels, 256, extend="max")
         heights = np.maximum(values, levels[0])
-        filled = axes.contourf(
-            plane.x1, plane.x2, heights, levels=levels, norm=norm, cmap=COLOURS, extend="max"
-        )  # fmt: skip
-        axes.contour(plane.x1, plane.x2, heights, levels=levels, colors=BLACK, linewidths=0.35, alpha=0.5)
+        filled = axes.contourf(x1, x2, heights, levels=levels, norm=norm, cmap=COLOURS, extend="max")
+        axes.contour(x1, x2, heights, levels=levels, colors=BLACK, linewidths=0.35, alpha=0.5)
         power = power_of_ten(float(np.abs(levels).max()))
         bar = axes.figure.colorbar(filled, ax=axes, pad=0.02, aspect=25, spacing="proportional")
         bar.set_ticks(levels[:: 2 if len(levels) > 7 else 1].tolist())
@@ -441,7 +399,7 @@ def _draw_map(axes: Axes, landscape: LandscapeSummary, plane: _Plane) -> list[An
         bar.set_label(f"$U$ ($10^{{{power}}}$ {unit})" if power else f"$U$ ({unit})")
         if np.isnan(values).any():
             handles.append(Patch(facecolor="white", edgecolor="#B0B0B0", label="white: $U$ not known"))
-    first, second = plane.shown
+    first, second = shown
     axes.set_xlim(*landscape.box[first])
     axes.set_ylim(*landscape.box[second])
     return handles

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from scipy.interpolate import PchipInterpolator
 
 from siq.numerics.text import unit_text
 from siq.quasipotential.landscape import Landscape
+from siq.quasipotential.transitions import Transition
 from siq.quasipotential.wells import Well
 from siq.report.plots.quasipotential import (
     CURVE_POINTS,
@@ -24,7 +24,6 @@ from siq.report.plots.quasipotential import (
     draw_equilibria,
     energy_axis_label,
     highest_shown,
-    in_blocks,
     name_axes,
     new_axes,
 )
@@ -42,10 +41,12 @@ from siq.report.plots.style import (
     magnitude_label,
     mean_and_spread,
 )
-from siq.report.summary import ExitSummary, LandscapeSummary, chosen_states
+from siq.report.summary import LandscapeSummary, chosen_states
 
 if TYPE_CHECKING:
     from siq.data.recordings import Recordings
+
+_Join = tuple[tuple[int, ...], tuple[int, ...], float]  # the wells on both sides of a pass, and U at it
 
 COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY_BLUE)
 
@@ -98,13 +99,7 @@ def plot_wells(
     axes = new_axes() if ax is None else ax
     known = [(place, well) for place, well in enumerate(shown.formulas) if well is not None]
     handles = [
-        Line2D(
-            [],
-            [],
-            color=_colour(place),
-            marker=MARKERS[place % len(MARKERS)],
-            label=f"well {shown.wells[place].label}",
-        )
+        Line2D([], [], **_look(place, "color", "marker"), label=f"well {shown.wells[place].label}")
         for place, _ in known
     ]
     if len(shown.names) == 1:
@@ -170,8 +165,8 @@ def plot_paths(
         along, values = _profile(shown, way, scale)
         end = "outside" if way.end is None else shown.wells[way.end].label
         axes.plot(
-            along, values, color=_colour(place), linestyle=LINE_STYLES[place % len(LINE_STYLES)],
-            linewidth=2.2 - 0.6 * (place % 2), label=f"{shown.wells[way.start].label} to {end}",
+            along, values, **_look(place, "color", "linestyle"), linewidth=2.2 - 0.6 * (place % 2),
+            label=f"{shown.wells[way.start].label} to {end}",
         )  # fmt: skip
     seen: set[tuple[str, bool]] = set()
     for way in ways:
@@ -182,10 +177,7 @@ def plot_paths(
         for where, well in ends:
             key = (well.label, bool(where > 0))
             if key not in seen:
-                axes.annotate(
-                    well.label, (float(where), well.height), xytext=(0, -5), textcoords="offset points",
-                    ha="center", va="top", fontweight="bold",
-                )  # fmt: skip
+                _letter(axes, well.label, (float(where), well.height), -5)
             seen.add(key)
     axes.axvline(0.0, color=GREY, linewidth=0.8, linestyle=(0, (2, 2)), zorder=0)
     axes.margins(y=0.15)
@@ -200,7 +192,7 @@ def plot_paths(
 
 
 def _profile(
-    landscape: LandscapeSummary, way: ExitSummary, scale: np.ndarray
+    landscape: LandscapeSummary, way: Transition, scale: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Distance along a way, zero at the pass, and U there: by the action uphill, by the formulas downhill."""
     up, down = way.uphill, way.downhill[1:]
@@ -239,28 +231,32 @@ def _share_of_action(landscape: LandscapeSummary, path: np.ndarray) -> np.ndarra
     return np.asarray(spent / spent[-1]) if spent[-1] > 0 else None
 
 
-def _colour(place: int) -> str:
-    return COLOURS[place % len(COLOURS)]
+def _look(place: int, *parts: str) -> dict[str, str]:
+    """Some of the ``color``, ``linestyle`` and ``marker`` of a well or a way."""
+    looks = {"color": COLOURS, "linestyle": LINE_STYLES, "marker": MARKERS}
+    return {part: looks[part][place % len(looks[part])] for part in parts}
+
+
+def _letter(axes: Axes, label: str, place: tuple[float, float], below: float) -> None:
+    axes.annotate(
+        label, place, xytext=(0, below), textcoords="offset points", ha="center", va="top", fontweight="bold"
+    )
 
 
 def _draw_curves(axes: Axes, landscape: LandscapeSummary, known: Sequence[tuple[int, Well]]) -> None:
     x = landscape.along(0, CURVE_POINTS)
-    heights = [one.height if landscape.matched else 0.0 for one in landscape.wells]
-    every = [heights[place] + 2 * well.known_values(x[:, None]) for place, well in known]
+    every = [landscape.wells[place].height + 2 * well.known_values(x[:, None]) for place, well in known]
     top = highest_shown(landscape, np.concatenate(every) if every else np.zeros(0))
     for (place, _), values in zip(known, every, strict=True):
         shade = np.where(values < top, values, np.nan)
-        axes.plot(x, shade, color=_colour(place), linewidth=2.0)
-        axes.fill_between(x, shade, top, color=_colour(place), alpha=0.12, linewidth=0)
-        well = landscape.wells[place]
+        well, colour = landscape.wells[place], _look(place, "color")
+        axes.plot(x, shade, **colour, linewidth=2.0)
+        axes.fill_between(x, shade, top, **colour, alpha=0.12, linewidth=0)
         axes.plot(
-            well.position, [heights[place]], marker=MARKERS[place % len(MARKERS)], color=_colour(place),
-            markeredgecolor=BLACK, linestyle="none",
+            well.position, [well.height], **_look(place, "color", "marker"), markeredgecolor=BLACK,
+            linestyle="none",
         )  # fmt: skip
-        axes.annotate(
-            well.label, (well.position[0], heights[place]), xytext=(0, -8), textcoords="offset points",
-            ha="center", va="top", fontweight="bold",
-        )  # fmt: skip
+        _letter(axes, well.label, (well.position[0], well.height), -8)
     for one in landscape.saddles:
         axes.plot(one.position, [one.height], **SADDLE)
     axes.margins(y=0.15)
@@ -274,68 +270,46 @@ def _draw_states(
     points = landscape.points
     points = np.zeros((0, len(landscape.names))) if points is None else points
     points = points[:: max(len(points) // MOST_POINTS, 1)]
-    heights = [one.height if landscape.matched else 0.0 for one in landscape.wells]
     values = np.full((len(landscape.wells), len(points)), np.inf)
     for place, well in known:
-        values[place] = np.nan_to_num(heights[place] + 2 * well.known_values(points), nan=np.inf)
+        above = landscape.wells[place].height + 2 * well.known_values(points)
+        values[place] = np.nan_to_num(above, nan=np.inf)
     owner = np.where(np.isfinite(values).any(axis=0), values.argmin(axis=0), -1)
     handles = []
     for place in [-1, *(place for place, _ in known)]:
         rows = owner == place
-        look: dict[str, Any] = (
-            {"color": GREY, "alpha": 0.25} if place < 0 else {"color": _colour(place), "alpha": 0.5}
-        )
+        look: dict[str, Any] = {"color": GREY, "alpha": 0.25, "marker": "."}
+        look = look if place < 0 else _look(place, "color", "marker") | {"alpha": 0.5}
         axes.plot(
             *points[rows][:, list(plane)].T, linestyle="none", markersize=2.5, markeredgewidth=0,
-            rasterized=True,
-            marker=MARKERS[place % len(MARKERS)] if place >= 0 else ".", **look,
+            rasterized=True, **look,
         )  # fmt: skip
         if place < 0 and rows.any():
             handles.append(Line2D([], [], linestyle="none", marker=".", color=GREY, label="no formula holds"))
     if len(landscape.names) == 2:
-        _draw_rims(axes, landscape, known, heights)
+        _draw_rims(axes, landscape, known)
         handles.append(Line2D([], [], color=GREY, linewidth=1.6, label="rim: height of the lowest saddle"))
     return handles
 
 
-def _draw_rims(
-    axes: Axes, landscape: LandscapeSummary, known: Sequence[tuple[int, Well]], heights: Sequence[float]
-) -> None:
+def _draw_rims(axes: Axes, landscape: LandscapeSummary, known: Sequence[tuple[int, Well]]) -> None:
     """Around each well the line of U at the height of its lowest pass."""
     x1, x2 = landscape.along(0, POINTS), landscape.along(1, POINTS)
     grid = np.stack(np.meshgrid(x1, x2, indexing="ij"), axis=-1).reshape(-1, 2)
     for place, well in known:
-        barriers = [way.barrier for way in landscape.ways if way.start == place and np.isfinite(way.barrier)]
-        level = min(barriers) if barriers else 2 * well.level
-        values = in_blocks(lambda x, well=well: 2 * well.known_values(x), grid)  # type: ignore[misc]
+        level, values = landscape.wells[place].depth, 2 * well.known_values(grid)
+        level = level if np.isfinite(level) else 2 * well.level
         if np.nanmin(values, initial=np.inf) < level:
+            look = _look(place, "color", "linestyle")
             axes.contour(
-                x1, x2, values.reshape(POINTS, POINTS).T, levels=[level], colors=_colour(place),
-                linewidths=1.6,
-                linestyles=LINE_STYLES[place % len(LINE_STYLES)],
+                x1, x2, values.reshape(POINTS, POINTS).T, levels=[level], colors=look["color"],
+                linewidths=1.6, linestyles=look["linestyle"],
             )  # fmt: skip
 
 
 NO_ERROR = 1e-4  # of a barrier: a smaller error is not written
 SIDE_BY_SIDE = 3  # wells whose barriers stand beside each other with their errors
 OPEN = 0.14  # of the height of the picture: how far a way out of the recorded region rises
-
-
-@dataclass(frozen=True)
-class _Join:
-    """Two groups of wells that join at a height.
-
-    Attributes
-    ----------
-    left, right
-        Places of the wells in each.
-    height
-        U at the pass between them.
-    """
-
-    left: tuple[int, ...]
-    right: tuple[int, ...]
-    height: float
 
 
 def plot_barriers(landscape: Landscape | LandscapeSummary, *, ax: Axes | None = None) -> Axes:
@@ -375,37 +349,33 @@ def plot_barriers(landscape: Landscape | LandscapeSummary, *, ax: Axes | None = 
     if not any(np.isfinite(way.barrier) for way in shown.ways):
         raise ValueError("no barrier of this landscape is known: there is nothing to draw")
     axes = new_axes() if ax is None else ax
-    heights = [one.height if shown.matched else 0.0 for one in shown.wells]
-    joins = _joined(shown, heights) if shown.matched else []
-    places = _columns(len(heights), joins)
+    joins, order = _joined(shown)
+    places = {well: float(place) for place, well in enumerate(order)}
     tops = _draw_joins(axes, joins, places)
-    lowest_ways = [_lowest_way(shown, well) for well in range(len(heights))]
-    reach = max(
-        [*tops.values(), *(heights[way.start] + way.barrier for way in lowest_ways if way is not None)]
-    )
-    span = (reach - min(heights)) or 1.0
-    labels, many = [], len(heights) > SIDE_BY_SIDE
-    for well, (height, way) in enumerate(zip(heights, lowest_ways, strict=True)):
-        label = shown.wells[well].label
-        if way is None:
-            labels.append(f"{label}\nno barrier\nknown")
-            axes.plot(places[well], height, marker="_", markersize=18, markeredgewidth=3, color=BLUE)
+    reach = max([*tops.values(), *(w.height + w.depth for w in shown.wells if np.isfinite(w.depth))])
+    span = (reach - min(well.height for well in shown.wells)) or 1.0
+    labels, many = [], len(order) > SIDE_BY_SIDE
+    for number, well in enumerate(shown.wells):
+        place, height = places[number], well.height
+        axes.plot(place, height, marker="_", markersize=18, markeredgewidth=3, color=BLUE, zorder=3)
+        if not np.isfinite(well.depth):
+            labels.append(f"{well.label}\nno barrier\nknown")
             continue
-        top = tops.get(well, height + way.barrier)
-        dashed = well not in tops and way.end is None
-        style = (0, (3, 2)) if dashed else "-"
-        end = top + OPEN * span if dashed else top
-        axes.plot([places[well]] * 2, [height, end], color=BLACK, linewidth=1.4, linestyle=style, zorder=2)
-        axes.plot(places[well], height, marker="_", markersize=18, markeredgewidth=3, color=BLUE, zorder=3)
-        if np.isfinite(way.standard_error):
+        end = tops.get(number, height + well.depth)
+        dashed = number not in tops and well.beyond is None
+        end, style = (end + OPEN * span, (0, (3, 2))) if dashed else (end, "-")
+        axes.plot([place] * 2, [height, end], color=BLACK, linewidth=1.4, linestyle=style, zorder=2)
+        if np.isfinite(well.depth_error):
             axes.errorbar(
-                places[well], height + way.barrier, yerr=2 * way.standard_error, color=VERMILLION, marker="_",
+                place, height + well.depth, yerr=2 * well.depth_error, color=VERMILLION, marker="_",
                 markersize=9, capsize=4, elinewidth=1.4, zorder=4,
             )  # fmt: skip
-        labels.append(f"{label}\n$\\Delta U$ =\n{_with_error(way.barrier, way.standard_error, broken=many)}")
-    axes.set_xticks([places[well] for well in range(len(heights))], labels)
+        labels.append(
+            f"{well.label}\n$\\Delta U$ =\n{_with_error(well.depth, well.depth_error, broken=many)}"
+        )
+    axes.set_xticks([places[number] for number in range(len(order))], labels)
     axes.tick_params(axis="x", length=0)
-    axes.set_xlim(-0.6, len(heights) - 0.4)
+    axes.set_xlim(-0.6, len(order) - 0.4)
     axes.grid(axis="y", linewidth=0.4, color="#DDDDDD")
     axes.set_axisbelow(True)
     axes.margins(y=0.08)
@@ -424,52 +394,37 @@ def _with_error(value: float, error: float, *, broken: bool) -> str:
     return text.replace(r" \pm ", "$\n$\\pm$ $") if broken and "(" not in text else text
 
 
-def _joined(landscape: LandscapeSummary, heights: list[float]) -> list[_Join]:
-    """The passes by which wells join into one, from the lowest to the highest."""
+def _joined(landscape: LandscapeSummary) -> tuple[list[_Join], tuple[int, ...]]:
+    """How wells join into one, from the lowest pass to the highest; their order, without crossings."""
+    wells = landscape.wells
+    groups: dict[int, tuple[int, ...]] = {well: (well,) for well in range(len(wells))}
     passes = sorted(
-        (heights[way.start] + way.barrier, way.start, way.end)
+        (wells[way.start].height + way.barrier, way.start, way.end)
         for way in landscape.ways
-        if way.end is not None and np.isfinite(way.barrier)
+        if way.end is not None and np.isfinite(way.barrier) and landscape.matched
     )
-    groups: dict[int, tuple[int, ...]] = {well: (well,) for well in range(len(heights))}
-    joins = []
+    joins: list[_Join] = []
     for height, start, end in passes:
-        left, right = groups[start], groups[end]
+        left, right = sorted((groups[start], groups[end]), key=min)
         if left != right:
-            joins.append(_Join(left, right, height))
+            joins.append((left, right, height))
             groups |= dict.fromkeys((*left, *right), (*left, *right))
-    return joins
-
-
-def _columns(count: int, joins: list[_Join]) -> dict[int, float]:
-    """Where each well stands, so that no two lines of the tree cross."""
-    groups: dict[int, tuple[int, ...]] = {well: (well,) for well in range(count)}
-    for join in joins:
-        left, right = groups[join.left[0]], groups[join.right[0]]
-        order = (*left, *right) if min(left) < min(right) else (*right, *left)
-        groups |= dict.fromkeys(order, order)
-    order = tuple(dict.fromkeys(well for start in range(count) for well in groups[start]))
-    return {well: float(place) for place, well in enumerate(order)}
+    return joins, tuple(dict.fromkeys(well for group in groups.values() for well in group))
 
 
 def _draw_joins(axes: Axes, joins: list[_Join], places: dict[int, float]) -> dict[int, float]:
     """Draw the tree above its columns; what is returned is the height at which each well first joins."""
     tops: dict[int, float] = {}
     stems: dict[int, tuple[float, float]] = {}  # of the group of a well: where its stem stands, and begins
-    for join in joins:
+    for left, right, height in joins:
         ends = []
-        for group in (join.left, join.right):
+        for group in (left, right):
             place, bottom = stems.get(group[0], (places[group[0]], np.nan))
             if np.isnan(bottom):
-                tops[group[0]] = join.height
+                tops[group[0]] = height
             else:
-                axes.plot([place] * 2, [bottom, join.height], color=BLACK, linewidth=1.4, zorder=2)
+                axes.plot([place] * 2, [bottom, height], color=BLACK, linewidth=1.4, zorder=2)
             ends.append(place)
-        axes.plot(ends, [join.height] * 2, color=BLACK, linewidth=1.4, zorder=2)
-        stems |= dict.fromkeys((*join.left, *join.right), (sum(ends) / 2, join.height))
+        axes.plot(ends, [height] * 2, color=BLACK, linewidth=1.4, zorder=2)
+        stems |= dict.fromkeys((*left, *right), (sum(ends) / 2, height))
     return tops
-
-
-def _lowest_way(landscape: LandscapeSummary, well: int) -> ExitSummary | None:
-    ways = [way for way in landscape.ways if way.start == well and np.isfinite(way.barrier)]
-    return min(ways, key=lambda way: way.barrier, default=None)
