@@ -205,13 +205,14 @@ def test_residuals_of_the_right_field_lie_within_the_band_and_a_missing_term_bey
         x = x + 0.01 * known.dynamics.drift(x) + 0.03 * rng.normal(size=x.shape)
         path.append(x)
     noisy = siq.Recordings.from_arrays(0.01 * np.arange(401), np.stack(path, axis=1), names=["x"])
-    right = prediction._binned_residuals(known.dynamics, noisy, 0)
-    far = np.abs(right.mean) / right.standard_error
+    right, _ = prediction._binned_residuals(known.dynamics, noisy, 0)
+    far = np.abs(right["mean"]) / right["standard_error"]
     assert (far < 2).mean() > 0.75 and far.max() < 5
     missing = known.dynamics.of(known.dynamics.symbols, [known.dynamics.formulas[0] + 0.5])
-    wrong = prediction._binned_residuals(missing, noisy, 0)
-    assert (np.abs(wrong.mean) > 2 * wrong.standard_error).mean() > 0.7
-    assert np.average(wrong.mean, weights=wrong.standard_error**-2) == pytest.approx(-0.5, abs=0.05)
+    wrong, _ = prediction._binned_residuals(missing, noisy, 0)
+    mean, error = wrong["mean"], wrong["standard_error"]
+    assert (np.abs(mean) > 2 * error).mean() > 0.7
+    assert np.average(mean, weights=error**-2) == pytest.approx(-0.5, abs=0.05)
 
 
 def test_where_rounding_alone_is_left_there_is_no_figure_and_no_band() -> None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -39,24 +39,6 @@ RESIDUALS_BINS = 24
 FEWEST = 8  # increments in a bin: a mean of fewer has no error worth the name
 PAIRS = 60_000  # drawn from; more would only take longer
 ACCURACY = 0.01  # of an integrator's step, times the norm of the Jacobian
-
-
-@dataclass(frozen=True)
-class _BinnedResiduals:
-    """What f leaves of one state's increments, per time, in bins along that state.
-
-    Attributes
-    ----------
-    at, mean, standard_error
-        Of each bin: its middle, the mean of what is left, and the standard error of that mean.
-    share
-        Root mean square of what is left, as a share of that of the increments.
-    """
-
-    at: np.ndarray
-    mean: np.ndarray
-    standard_error: np.ndarray
-    share: float
 
 
 def plot_residuals(
@@ -121,9 +103,8 @@ def plot_residuals(
         raise ValueError(f"there is no state {state}; name one of {', '.join(dynamics.states)}")
     place = 0 if state is None else dynamics.states.index(state)
     axes = new_axes() if ax is None else ax
-    time_unit = recordings.time_unit or dynamics.time_unit
-    handles = _draw(axes, _binned_residuals(dynamics, recordings, place), dynamics.states[place],
-                    (dynamics.units[place], time_unit))  # fmt: skip
+    units = (dynamics.units[place], recordings.time_unit or dynamics.time_unit)
+    handles = _draw(axes, *_binned_residuals(dynamics, recordings, place), dynamics.states[place], units)
     if legend:
         add_legend(axes, handles)
     return axes
@@ -138,13 +119,13 @@ def residuals_figure(
     None of recordings without noise, where nothing is left but rounding.
     """
     every = [_binned_residuals(dynamics, recordings, place) for place in range(dynamics.dimension)]
-    if all(one.share < NOISE_FREE for one in every):
+    if all(share < NOISE_FREE for _, share in every):
         return None
     figure = Figure(figsize=(COLUMN_WIDTH, 2.3 * len(every) + 0.5))
     panels = figure.subplots(len(every), squeeze=False)[:, 0]
     handles: dict[str, Any] = {}
     for axes, binned, name, unit in zip(panels, every, dynamics.states, units, strict=True):
-        handles |= {one.get_label(): one for one in _draw(axes, binned, name, (unit, time_unit))}
+        handles |= {one.get_label(): one for one in _draw(axes, *binned, name, (unit, time_unit))}
     figure.legend(handles=list(handles.values()), loc="outside lower center", ncols=1)
     return figure
 
@@ -157,11 +138,12 @@ def _rate_unit(unit: str, time_unit: str) -> str:
     return f"1/{time_unit}" if plain else f"{unit}/{time_unit}"
 
 
-def _binned_residuals(dynamics: Dynamics, recordings: Recordings, place: int) -> _BinnedResiduals:
-    """What f leaves of the increments of one state, in bins along it.
+def _binned_residuals(dynamics: Dynamics, recordings: Recordings, place: int) -> tuple[pd.DataFrame, float]:
+    """What f leaves of one state's increments, per time, in bins along that state; and its share of them.
 
-    Where recordings remember, the present state tells which way their noise pushes: bins are then along the
-    state so much earlier, which does not.
+    A row for each bin: its middle, the mean of what is left, and the standard error of that mean. The share
+    is one of root mean squares. Where recordings remember, the present state tells which way their noise
+    pushes: bins are then along the state so much earlier, which does not.
     """
     memory = markov_lag(recordings)
     lag = memory.lag if memory.remembers else None
@@ -192,12 +174,12 @@ def _binned_residuals(dynamics: Dynamics, recordings: Recordings, place: int) ->
     )
     rows = [which == one for one in np.unique(which) if (which == one).sum() >= FEWEST]
     rows = rows or [np.ones(len(along), dtype=bool)]
-    return _BinnedResiduals(
-        np.array([along[one].mean() for one in rows]),
-        np.array([left[one].mean() for one in rows]),
-        np.array([together * left[one].std(ddof=1) / np.sqrt(one.sum()) for one in rows]),
-        float(np.sqrt(np.mean(left**2) / np.mean((xh - x0)[:, place] ** 2 / h**2))),
-    )
+    binned = [
+        (along[one].mean(), left[one].mean(), together * left[one].std(ddof=1) / np.sqrt(one.sum()))
+        for one in rows
+    ]
+    share = float(np.sqrt(np.mean(left**2) / np.mean((xh - x0)[:, place] ** 2 / h**2)))
+    return pd.DataFrame(binned, columns=["at", "mean", "standard_error"]), share
 
 
 def _together(left: np.ndarray, number: np.ndarray, lag: int) -> float:
@@ -208,23 +190,24 @@ def _together(left: np.ndarray, number: np.ndarray, lag: int) -> float:
     return float(np.sqrt(max(share, 1.0)))
 
 
-def _draw(axes: Axes, binned: _BinnedResiduals, name: str, units: tuple[str, str]) -> list[Any]:
+def _draw(axes: Axes, binned: pd.DataFrame, share: float, name: str, units: tuple[str, str]) -> list[Any]:
     """Draw residuals of a state on axes, with the units of the state and of time."""
-    quiet = binned.share < NOISE_FREE  # rounding and the integrator are left, which no band is the measure of
+    at, mean, error = binned.to_numpy().T
+    quiet = share < NOISE_FREE  # rounding and the integrator are left, which no band is the measure of
     if not quiet:
-        band = 2 * binned.standard_error
-        axes.fill_between(binned.at, -band, band, color=GREY, alpha=0.3, linewidth=0)
+        axes.fill_between(at, -2 * error, 2 * error, color=GREY, alpha=0.3, linewidth=0)
     axes.axhline(0.0, color=GREY, linewidth=0.8)
-    axes.plot(binned.at, binned.mean, marker="o", markersize=4, linestyle="none", color=BLUE)
-    largest = float(np.abs(binned.at).max())
+    axes.plot(at, mean, marker="o", markersize=4, linestyle="none", color=BLUE)
+    largest = float(np.abs(at).max())
     axes.set_xlabel(scaled_label(axes.xaxis, f"${name_label(name)}$", units[0], largest))
     largest = max(abs(limit) for limit in axes.get_ylim())
     what = f"left of d${name_label(name)}$/d$t$"
     axes.set_ylabel(scaled_label(axes.yaxis, what, _rate_unit(*units), largest))
-    within = int((np.abs(binned.mean) <= 2 * binned.standard_error).sum())
-    title = f"{within} of {len(binned.at)} bins within the band"
+    within = int((np.abs(mean) <= 2 * error).sum())
+    title = f"{within} of {len(binned)} bins within the band"
     if quiet:
-        title = f"no noise: {magnitude_label(binned.share, digits=1)} of the increments is left"
+        title = f"no noise: {magnitude_label(share, digits=1)} of the increments is left"
     axes.set_title(title, loc="left", fontsize="medium")
-    mean = Line2D([], [], color=BLUE, marker="o", linestyle="none", label="mean of a bin")
-    return [mean] if quiet else [mean, Patch(color=GREY, alpha=0.3, label="noise alone: ± 2 standard errors")]
+    handle = Line2D([], [], color=BLUE, marker="o", linestyle="none", label="mean of a bin")
+    band = Patch(color=GREY, alpha=0.3, label="noise alone: ± 2 standard errors")
+    return [handle] if quiet else [handle, band]

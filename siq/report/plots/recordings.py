@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -53,8 +55,8 @@ def inspection_figures(found: Inspection) -> dict[str, Figure]:
     """The figures of a page by name: ``states_in_time``, ``visited``, ``memory``."""
     return {
         "states_in_time": _record_figure(found),
-        "visited": _visited_figure(found),
-        "memory": _memory_figure(found),
+        "visited": _figure_of(_draw_visits, found, 2.9),
+        "memory": _figure_of(_draw_memory, found, 2.7),
     }
 
 
@@ -73,18 +75,9 @@ def _record_figure(found: Inspection) -> Figure:
 
 
 @drawn_in_style
-def _visited_figure(found: Inspection) -> Figure:
-    """How often each state was visited, on the plane of the first two."""
-    figure = Figure(figsize=(COLUMN_WIDTH, 2.9))
-    _draw_visits(figure.add_subplot(), found)
-    return figure
-
-
-@drawn_in_style
-def _memory_figure(found: Inspection) -> Figure:
-    """How residuals of increments go together over lags."""
-    figure = Figure(figsize=(COLUMN_WIDTH, 2.7))
-    _draw_memory(figure.add_subplot(), found)
+def _figure_of(draw: Callable[[Axes, Inspection], None], found: Inspection, height: float) -> Figure:
+    figure = Figure(figsize=(COLUMN_WIDTH, height))
+    draw(figure.add_subplot(), found)
     return figure
 
 
