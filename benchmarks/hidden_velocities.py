@@ -38,7 +38,7 @@ from siq.quasipotential.transitions import barrier_uncertainty, ways_out
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, symbol
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
-from siq.workflow import results
+from siq.workflow import pipeline
 from siq.workflow.pipeline import PipelineSettings, analyse
 
 RECORDS, SAMPLES, STEP, WITHIN = 8, 20_000, 0.01, 10
@@ -143,8 +143,8 @@ def analysed(particle: Particle, seed: int) -> dict[str, object]:
     began = time.process_time()
     found = analyse(recordings, settings)
     seconds = time.process_time() - began
-    certificate, record = found.refined.certificate, found.identified.record
-    landscape = None if found.landscape is None else found.landscape.landscape
+    certificate, record = found.refined.certificate, found.identified.result
+    landscape = None if found.landscape is None else found.landscape.result
     if landscape is None or record is None:
         return {"fault": [one.reason for one in found.outcomes if one.reason], "seconds": seconds}
     table = landscape.barriers()
@@ -164,7 +164,7 @@ def only_barriers(particle: Particle, seed: int) -> dict[str, object]:
     settings = PipelineSettings(identification=IdentificationOptions(hidden_velocities=True))
     recordings = in_stretches(without_slow_drift(recorded(particle, seed)))
     began = time.process_time()
-    identified = results.identify_run(settings, recordings, number=0)
+    identified = pipeline.identify_run(settings, recordings, number=0)
     record = identified.record
     if record is None:
         return {"fault": [identified.outcome.reason], "seconds": time.process_time() - began}

@@ -61,8 +61,8 @@ def of_known(name: str) -> tuple[Recordings, PipelineSettings, sympy.Expr | None
 def error_of(found: Analysis, recordings: Recordings, exact: sympy.Expr | None) -> float:
     """Relative error of V, or of barriers."""
     if exact is None:
-        assert found.landscape is not None and found.landscape.landscape is not None
-        barriers = found.landscape.landscape.barriers()["barrier"].to_numpy()
+        assert found.landscape is not None and found.landscape.result is not None
+        barriers = found.landscape.result.barriers()["barrier"].to_numpy()
         return float(np.abs(barriers / RESONATOR_BARRIERS - 1).max())
     formulas = found.refined.formulas[Method.REFINED]
     if formulas.potential is None:

@@ -25,7 +25,7 @@ from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import compile_formulas
 from siq.systems.phase_portrait import PhasePortrait, phase_portrait
-from siq.workflow.scoring import exact_answer
+from workflow.scoring import exact_answer
 
 Function = Callable[[np.ndarray], np.ndarray]
 

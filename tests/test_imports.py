@@ -42,7 +42,6 @@ UPWARDS: frozenset[tuple[str, str]] = frozenset(
         ("siq.quasipotential.landscape", "siq.report.landscape"),
         ("siq.quasipotential.landscape", "siq.report.plots.quasipotential"),
         ("siq.quasipotential.landscape", "siq.workflow.pipeline"),
-        ("siq.workflow.files", "siq.report.plots.style"),
         ("siq.workflow.sweep", "siq.report.plots.sweep"),
     }
 )

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from siq.systems.cards import load_system
-from siq.workflow import results
+from siq.workflow import pipeline
 from siq.workflow.pipeline import Analysis, analyse
 from siq.workflow.study import _system_path, load_study, settings_of
+from workflow.steps import source_of
 
 SYSTEMS = Path(__file__).parents[1] / "config" / "systems"
 
@@ -22,6 +23,6 @@ def analysed(data: str, folder: Path) -> Analysis:
     settings = settings_of(study, system)
     source = card if study.recordings is None else study.recordings.file
     assert source is not None
-    drawn = results.draw_run(settings, results.source_of(source, settings), number=0)
-    assert drawn.recordings is not None
-    return analyse(drawn.recordings, settings)
+    drawn = pipeline.draw_run(settings, source_of(source, settings), number=0)
+    assert drawn.result is not None
+    return analyse(drawn.result, settings)

@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from siq.workflow.tasks import Given, task
+from workflow.task import Given, task
 
 if TYPE_CHECKING:
     import numpy as np

@@ -7,8 +7,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from siq.workflow.steps import _models, _trained, published_mesh
-from siq.workflow.tasks import Given, task
+from workflow.steps import model_files, published_mesh, trained_run
+from workflow.task import Given, task
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,7 +34,7 @@ def _files(folders: Iterable[str], suffix: str) -> dict[str, bytes]:
 
 def _first_stored(given: Given) -> tuple[int, Landscape] | None:
     """The first run with a U over all wells."""
-    from siq.workflow.comparison import first_stored
+    from workflow.comparison import first_stored
 
     landscapes = given.files.get("quasipotential") or ()
     return first_stored(given.files["field"][: len(landscapes)], landscapes)
@@ -69,12 +69,13 @@ def figures(given: Given, settings: PipelineSettings) -> Any:
     from siq.quasipotential.landscape_files import read_landscape
     from siq.report.page import inspection_drawn, interactive_view
     from siq.report.summary import summarise
-    from siq.workflow.results import read_states
-    from siq.workflow.scoring import exact_answer, shown_formula
+    from siq.workflow.models import shown_formula
     from siq.workflow.tables import Method
     from workflow.figures import study as report
+    from workflow.files import read_states
+    from workflow.scoring import exact_answer
 
-    source, models = given.files, _models(given)
+    source, models = given.files, model_files(given)
     tables = {name: getattr(given, name) for name in report.DRAWN_TABLES}
     chosen = shown_formula(tables["rrmse"], models)
     of_landscape = chosen.run is None or chosen.method == Method.REGRESSION
@@ -83,7 +84,7 @@ def figures(given: Given, settings: PipelineSettings) -> Any:
     shown = replace(
         shown,
         recordings=read_states(source["recordings"][run], source["field"][run]),
-        networks=_trained(given, run).networks,
+        networks=trained_run(given, run).result,
         exact=None if card is None else exact_answer(card),
     )
     drawn: dict[str, Any] = dict(report.study_figures(settings, tables, shown, given.card, _published(given)))
@@ -119,7 +120,7 @@ def landscape_figures(given: Given, settings: PipelineSettings) -> Any:
 
     found, formulas, networks = _first_stored(given), None, None
     if found is not None:
-        formulas, networks = given.model[found[0]][0], _trained(given, found[0]).networks
+        formulas, networks = given.model[found[0]][0], trained_run(given, found[0]).result
     drawn = report.landscape_figures(
         settings.space,
         compare_below=None if settings.landscape is None else settings.landscape.compare_below,
@@ -141,38 +142,46 @@ def landscape_figures(given: Given, settings: PipelineSettings) -> Any:
 )  # fmt: skip
 def invariant(given: Given, settings: PipelineSettings) -> Any:
     """The invariant distribution of the formula that is shown, or of the landscape where none holds."""
-    from siq.workflow import comparison
+    from siq.workflow.tables import as_table
+    from workflow.comparison import compare_invariant
     from workflow.figures.density import plot_invariant_distribution
 
-    shown = _what_it_follows_from(given) if settings.invariant and given.card is not None else None
-    found = comparison.compare_invariant(settings, given.card, shown, _published(given))
-    drawn = {}
-    if found.densities:
+    table, shares, drawn = as_table("invariant", []), as_table("well_shares", []), {}
+    found = _density_source(given) if settings.invariant and given.card is not None else None
+    if found is not None:
+        run, method, source = found
+        table, shares, densities = compare_invariant(
+            settings, given.card, source, _published(given), run=run, method=method
+        )
         names = settings.space.names or ()
         units = [settings.space.unit(name) for name in names]
-        drawn["invariant"] = plot_invariant_distribution(found.densities, states=names, units=units)
-    return {"table": found.table, "shares": found.shares, "drawn": drawn}
+        if densities:
+            drawn["invariant"] = plot_invariant_distribution(densities, states=names, units=units)
+    return {"table": table, "shares": shares, "drawn": drawn}
 
 
-def _what_it_follows_from(given: Given) -> Any:
-    """See `siq.workflow.comparison.compare_invariant`; equations have one landscape, and nothing else."""
+def _density_source(given: Given) -> tuple[int, str, Any] | None:
+    """Run, method and formulas that the density follows from; equations have one landscape, and nothing else.
+
+    That is a refined formula where one holds over the whole region, otherwise the landscape where there is
+    one, otherwise the published method's formula.
+    """
     from siq.quasipotential.landscape_files import read_landscape
-    from siq.workflow.comparison import FormulaShown, LandscapeShown
-    from siq.workflow.scoring import shown_formula
+    from siq.workflow.models import shown_formula
     from siq.workflow.tables import Method
 
     if not given.path("model"):
         stored = read_landscape(given.files["quasipotential"], dynamics=given.card)
-        return None if stored is None else LandscapeShown(0, stored)
-    models = _models(given)
+        return None if stored is None else (0, "local formulas", stored)
+    models = model_files(given)
     shown = shown_formula(given.rrmse, models)
     if shown.run is None or shown.method == Method.REGRESSION:
         complete = _first_stored(given)
         if complete is not None:
-            return LandscapeShown(*complete)
+            return complete[0], "local formulas", complete[1]
     if shown.run is None:
         return None
-    return FormulaShown(shown.run, shown.method, models.formulas(shown.run)[shown.method])
+    return shown.run, shown.method, models.formulas(shown.run)[shown.method]
 
 
 @task(
@@ -189,10 +198,11 @@ def page(given: Given, settings: PipelineSettings) -> Any:
     from siq.report.page import read_inspection, read_seen, render_report
     from siq.report.study_page import StudyResults, answer_data, study_page
     from siq.report.summary import summarise
-    from siq.workflow.scoring import exact_answer, shown_formula
+    from siq.workflow.models import shown_formula
+    from workflow.scoring import exact_answer
 
     source, study = given.files, _study(given)
-    tables, models, card = _tables(given), _models(given), given.path("card")
+    tables, models, card = _tables(given), model_files(given), given.path("card")
     shown = shown_formula(tables["rrmse"], models)
     shown = shown if shown.run is not None else models.first_wells()
     overview = given.overview

@@ -17,7 +17,6 @@ from siq.numerics.files import Document, read_document, validate
 from siq.systems.cards import check_name, load_exact
 from siq.systems.dynamics import Dynamics
 from siq.version import DISTRIBUTION
-from siq.workflow.published import load_published
 from siq.workflow.study import (
     PipelineSettings,
     Study,
@@ -29,6 +28,7 @@ from siq.workflow.study import (
     settings_of,
 )
 from workflow.places import BASE, config_path, names_in, needed_file, published_figures, system_card
+from workflow.published import load_published
 
 WORKFLOW_KEYS = ("statistics", "device", "runs_per_training", "mismatch", "cases", "keys", "proof", "origin")
 NETWORKS = ("torch", "pysindy")

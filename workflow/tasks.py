@@ -19,9 +19,8 @@ from typing import Any
 from benchmarks.proof import tasks as proof
 from benchmarks.publication import tasks as publication
 from siq.errors import InputError
-from siq.workflow import steps
-from siq.workflow.tasks import TASKS, Given, outputs_of
-from workflow import diagnosis, pages
+from workflow import diagnosis, pages, steps
+from workflow.task import TASKS, Given
 
 __all__ = ["TASKS", "Job", "run"]
 
@@ -80,8 +79,8 @@ class Job:
 
     def __call__(self) -> None:
         """Run the task and write its results."""
-        from siq.workflow.files import write
         from siq.workflow.study import PipelineSettings
+        from workflow.files import write
 
         options = dict(self.params.get("options") or {})
         known = {each.name for each in fields(PipelineSettings)}
@@ -92,7 +91,7 @@ class Job:
             wildcards=self.wildcards, outputs=self.output, device=self.device, threads=self.threads,
             tell=_teller(self.wildcards.get("case", "")),
         )  # fmt: skip
-        made = outputs_of(TASKS[self.task].run(given, settings))
+        made = TASKS[self.task].run(given, settings)
         for name, path in self.output.items():
             if name in made:
                 write(name, path, made[name], settings)

@@ -13,7 +13,7 @@ from benchmarks.discrepancies.scores import CARD, CONCEALING
 from benchmarks.discrepancies.summary import GENERATORS, quartiles, summary_of
 from siq.numerics.files import whole_file
 from siq.report.plots.style import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION, WIDTH, drawn_to_be_read
-from siq.workflow.tables import read_table
+from workflow.files import read_table
 
 WIDEST = 100.0  # times the oracle's error: what is worse, or runs away, stands at the edge
 LEAST = 0.7

@@ -23,7 +23,7 @@ from siq.diagnosis.study import Comparison
 from siq.errors import NumericalFailure
 from siq.inference.recalibration import recalibrate
 from siq.systems.dynamics import Dynamics
-from siq.workflow.tables import write_table
+from workflow.files import write_table
 
 CARD = "card alone"
 """The row of the recalibrated card, to which nothing was added."""

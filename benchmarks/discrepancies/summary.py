@@ -9,7 +9,7 @@ import pandas as pd
 
 from benchmarks.discrepancies.scores import CARD, CONCEALING
 from benchmarks.proof.scoring import NOISE, NOTHING_CONCEALED
-from siq.workflow.tables import read_table, write_table
+from workflow.files import read_table, write_table
 
 GENERATORS = {"concealment": "named physics", "foreign": "drawn functions"}
 

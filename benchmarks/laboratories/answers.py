@@ -78,14 +78,14 @@ def _read(laboratory: Laboratory, analysis: Analysis, known: Truth) -> Answer:
     count = len(known.attractors)
     answer = Answer(*(False, [np.nan] * count, [np.nan] * count, [np.nan] * count))
     said = [one.reason for one in analysis.outcomes if one.reason]
-    if analysis.identified.record is not None:
-        answer.terms = len(analysis.identified.record.support)
+    if analysis.identified.result is not None:
+        answer.terms = len(analysis.identified.result.support)
     certificate = analysis.refined.certificate
     if certificate is not None:
         answer.certified, answer.stated_error = certificate.certified, float(certificate.error)
         failed = [name for name, verdict in certificate.tests.items() if not verdict.passed]
         said += [certificate.reason, f"tests not passed: {', '.join(failed)}" if failed else ""]
-    found = None if analysis.landscape is None else analysis.landscape.landscape
+    found = None if analysis.landscape is None else analysis.landscape.result
     if found is not None:
         _read_landscape(laboratory, found, known, answer)
     else:

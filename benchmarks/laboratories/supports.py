@@ -32,7 +32,7 @@ from siq.inference.library import CandidateLibrary, IdentificationOptions, field
 from siq.inference.observation import ObservationModel, unbroken
 from siq.inference.regression import refit
 from siq.systems.diffusion import Diffusion
-from siq.workflow.results import identify_run
+from siq.workflow.pipeline import identify_run
 from siq.workflow.study import PipelineSettings, Sampling, StateSpace
 
 STRONG = 5.0  # standard errors of the weakest true term of a record that counts

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from siq.workflow.tasks import Given, task
+from workflow.task import Given, task
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -32,9 +32,11 @@ from siq.report.landscape import in_words
 from siq.report.page import ReportFigure, ReportTable, render_template
 from siq.report.study_page import errors_over_runs
 from siq.systems.dynamics import Dynamics
-from siq.workflow.published import PublishedFigure, own_equations, published_decomposition
-from siq.workflow.scoring import ModelFiles, shown_formula, summary_row, summary_table
-from siq.workflow.tables import Method, as_table, read_table
+from siq.workflow.models import ModelFiles, shown_formula
+from siq.workflow.tables import Method, as_table
+from workflow.files import read_table
+from workflow.published import PublishedFigure, own_equations, published_decomposition
+from workflow.scoring import summary_row, summary_table
 
 POINTS = 20_000  # of the domain, on which published formulas are held against their own equations
 SHOWN = 60  # rows of a table

@@ -20,9 +20,9 @@ from siq.numerics.files import read_document, validate
 from siq.numerics.text import number_text
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import parse_formula
-from siq.workflow.published import PublishedFigure
-from siq.workflow.scoring import summary_row
 from siq.workflow.tables import as_table
+from workflow.published import PublishedFigure
+from workflow.scoring import summary_row
 
 REPRODUCED_METHODS = ("refined", "regression")
 SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")

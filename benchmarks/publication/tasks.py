@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from siq.workflow.tasks import Given, task
+from workflow.task import Given, task
 
 if TYPE_CHECKING:
     from siq.workflow.study import PipelineSettings

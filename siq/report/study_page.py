@@ -56,7 +56,7 @@ from siq.report.page import (
 from siq.report.summary import LandscapeSummary, well_name
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
-from siq.workflow.scoring import ModelFiles, Shown
+from siq.workflow.models import ModelFiles, Shown
 from siq.workflow.study import Study, SweepOptions
 from siq.workflow.tables import Method, Outcome, Status, Step, why_no_landscape
 

@@ -6,14 +6,10 @@ import argparse
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from siq.errors import InputError, MissingExtra, NumericalFailure
 from siq.version import version
 from siq.workflow.answers import Exit
-
-if TYPE_CHECKING:
-    from siq.workflow.launch import Request
 
 EPILOG = """\
 what to begin with:
@@ -37,12 +33,76 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"siq {version()}")
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    _add_run(commands)
-    _add_diagnose(commands)
-    _add_inspect(commands)
-    _add_init(commands)
-    _add_example(commands)
+    one = commands.add_parser(
+        "run",
+        help="answer a study, or recordings without a study",
+        description="Works out the landscape behind recordings or a system, and writes"
+        " results/NAME/report.html in the folder in which you are.",
+        epilog="What stands after -- is passed on to Snakemake: siq run my-study.yaml -- --forceall",
+    )
+    one.add_argument(
+        "given",
+        metavar="FILE",
+        help="a study (.yaml), recordings (a file, or a folder with one file for each recording), or the name"
+        " of a study that comes with siq, such as archetype3d",
+    )
+    _add_workflow_options(one, "run_study")
+    one = commands.add_parser(
+        "diagnose",
+        help="say which physics a simulation lacks",
+        description="Compares the equations of a simulation with recordings, and writes"
+        " results/mismatch/NAME/report.html in the folder in which you are.",
+        epilog="What stands after -- is passed on to Snakemake.",
+    )
+    one.add_argument(
+        "given",
+        metavar="DIR",
+        help="a folder with system.yaml (the equations) and recordings.csv or recordings.parquet, or a folder"
+        " of such folders",
+    )
+    _add_workflow_options(one, "diagnose_cases")
+    one = commands.add_parser(
+        "inspect",
+        help="say what is in a file of recordings, in seconds",
+        description="Reads recordings and says what is in them: states, units, steps, noise, and what can be"
+        " learned from them. Computes nothing else and writes nothing.",
+    )
+    one.add_argument(
+        "recordings", metavar="FILE", nargs="+", help="a file of recordings, or a folder of files"
+    )
+    one.set_defaults(action=_inspect)
+    one = commands.add_parser(
+        "init",
+        help="write a commented study for a file of recordings",
+        description="Looks at recordings and writes a study for them that runs as it is, with comments on"
+        " what you can set.",
+    )
+    one.add_argument("recordings", metavar="FILE", help="a file of recordings, or a folder of files")
+    one.add_argument("--output", "-o", metavar="STUDY", help="where to write it (default: NAME.yaml here)")
+    one.add_argument("--force", action="store_true", help="replace a study that is there already")
+    one.set_defaults(action=_init)
+    one = commands.add_parser(
+        "example",
+        help="write recordings and a study to try",
+        description="Writes an example into a folder: recordings of a bead in two optical traps with a study,"
+        " or a simulation that lacks something with the recordings that show it.",
+    )
+    one.add_argument(
+        "name", nargs="?", default="double-well", choices=("double-well", "mismatch"),
+        help="double-well (default): for siq run; mismatch: for siq diagnose",
+    )  # fmt: skip
+    one.add_argument("--folder", default=".", metavar="DIR", help="where to write it (default: here)")
+    one.add_argument("--force", action="store_true", help="replace files that are there already")
+    one.set_defaults(action=_example)
     return top
+
+
+def _add_workflow_options(one: argparse.ArgumentParser, function: str) -> None:
+    """What `run` and `diagnose` have in common; `function` is of `siq.workflow.launch`."""
+    one.add_argument("--cores", "-c", default="all", metavar="N", help="how many cores to use (default: all)")
+    one.add_argument("--dry-run", "-n", action="store_true", help="only say which steps would run")
+    one.add_argument("--verbose", "-v", action="store_true", help="show all that Snakemake says")
+    one.set_defaults(further=(), action=_launch, function=function)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -81,120 +141,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return int(Exit.FAULT)
 
 
-def _add_run(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    one = commands.add_parser(
-        "run",
-        help="answer a study, or recordings without a study",
-        description="Works out the landscape behind recordings or a system, and writes"
-        " results/NAME/report.html in the folder in which you are.",
-        epilog="What stands after -- is passed on to Snakemake: siq run my-study.yaml -- --forceall",
-    )
-    one.add_argument(
-        "study",
-        metavar="FILE",
-        help="a study (.yaml), recordings (a file, or a folder with one file for each recording), or the name"
-        " of a study that comes with siq, such as archetype3d",
-    )
-    _add_workflow_options(one)
-    one.set_defaults(action=_run)
-
-
-def _add_diagnose(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    one = commands.add_parser(
-        "diagnose",
-        help="say which physics a simulation lacks",
-        description="Compares the equations of a simulation with recordings, and writes"
-        " results/mismatch/NAME/report.html in the folder in which you are.",
-        epilog="What stands after -- is passed on to Snakemake.",
-    )
-    one.add_argument(
-        "folder",
-        metavar="DIR",
-        help="a folder with system.yaml (the equations) and recordings.csv or recordings.parquet, or a folder"
-        " of such folders",
-    )
-    _add_workflow_options(one)
-    one.set_defaults(action=_diagnose)
-
-
-def _add_workflow_options(one: argparse.ArgumentParser) -> None:
-    one.add_argument("--cores", "-c", default="all", metavar="N", help="how many cores to use (default: all)")
-    one.add_argument("--dry-run", "-n", action="store_true", help="only say which steps would run")
-    one.add_argument("--verbose", "-v", action="store_true", help="show all that Snakemake says")
-    one.set_defaults(further=())
-
-
-def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    one = commands.add_parser(
-        "inspect",
-        help="say what is in a file of recordings, in seconds",
-        description="Reads recordings and says what is in them: states, units, steps, noise, and what can be"
-        " learned from them. Computes nothing else and writes nothing.",
-    )
-    one.add_argument(
-        "recordings", metavar="FILE", nargs="+", help="a file of recordings, or a folder of files"
-    )
-    one.set_defaults(action=_inspect)
-
-
-def _add_init(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    one = commands.add_parser(
-        "init",
-        help="write a commented study for a file of recordings",
-        description="Looks at recordings and writes a study for them that runs as it is, with comments on"
-        " what you can set.",
-    )
-    one.add_argument("recordings", metavar="FILE", help="a file of recordings, or a folder of files")
-    one.add_argument("--output", "-o", metavar="STUDY", help="where to write it (default: NAME.yaml here)")
-    one.add_argument("--force", action="store_true", help="replace a study that is there already")
-    one.set_defaults(action=_init)
-
-
-def _add_example(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    one = commands.add_parser(
-        "example",
-        help="write recordings and a study to try",
-        description="Writes an example into a folder: recordings of a bead in two optical traps with a study,"
-        " or a simulation that lacks something with the recordings that show it.",
-    )
-    one.add_argument(
-        "name", nargs="?", default="double-well", choices=("double-well", "mismatch"),
-        help="double-well (default): for siq run; mismatch: for siq diagnose",
-    )  # fmt: skip
-    one.add_argument("--folder", default=".", metavar="DIR", help="where to write it (default: here)")
-    one.add_argument("--force", action="store_true", help="replace files that are there already")
-    one.set_defaults(action=_example)
-
-
 # Each command imports what it needs only then: `siq --help` answers at once.
 
 
-def _run(options: argparse.Namespace) -> Exit:
-    from siq.workflow.launch import run_study
+def _launch(options: argparse.Namespace) -> Exit:
+    from siq.workflow import launch
 
-    return run_study(options.study, _request(options))
-
-
-def _diagnose(options: argparse.Namespace) -> Exit:
-    from siq.workflow.launch import diagnose_cases
-
-    return diagnose_cases(options.folder, _request(options))
-
-
-def _request(options: argparse.Namespace) -> Request:
-    """How to run the workflow, as the options of `run` and `diagnose` have it."""
-    from siq.workflow.launch import Request
-
-    return Request(
-        cores=_cores(options.cores), verbose=options.verbose, dry_run=options.dry_run,
-        further=tuple(options.further),
-    )  # fmt: skip
-
-
-def _cores(text: str) -> str:
-    if text != "all" and not (text.isdigit() and int(text) > 0):
-        raise InputError("--cores", "", f"'{text}' is not a number of cores", "write 1 or more, or all")
-    return text
+    cores = options.cores
+    if cores != "all" and not (cores.isdigit() and int(cores) > 0):
+        raise InputError("--cores", "", f"'{cores}' is not a number of cores", "write 1 or more, or all")
+    asked = launch.Request(
+        cores=cores, verbose=options.verbose, dry_run=options.dry_run, further=tuple(options.further)
+    )
+    ended: Exit = getattr(launch, options.function)(options.given, asked)
+    return ended
 
 
 def _inspect(options: argparse.Namespace) -> Exit:

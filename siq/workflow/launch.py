@@ -22,7 +22,7 @@ from typing import IO, Any, TextIO
 
 from siq.errors import InputError, MissingExtra, suggestion
 from siq.numerics.files import CARD, case_folders, read_document
-from siq.workflow.answers import Exit, Told, answer_of_page
+from siq.workflow.answers import Exit, answer_of_page
 from siq.workflow.examples import is_study, name_for, own_path, write_generated
 
 MARK = "\x1e"
@@ -252,15 +252,7 @@ def follow(lines: Iterable[str], screen: Screen, progress: _Progress) -> list[st
 
 
 def _faults(progress: _Progress, passed_on: list[str]) -> list[str]:
-    """Sentences on why a workflow stopped, where its jobs did not say so themselves.
-
-    Parameters
-    ----------
-    progress
-        Where it stopped.
-    passed_on
-        What its jobs said.
-    """
+    """Sentences on why a workflow stopped, where its jobs did not say so themselves."""
     if passed_on and not progress.broken:
         return []
     if progress.failed:
@@ -268,11 +260,6 @@ def _faults(progress: _Progress, passed_on: list[str]) -> list[str]:
         where = f"; the log is {logs[0]}" if logs else ""
         return [f"This step stopped by a fault that is not yours: {what}{where}. Please report it."]
     return progress.errors[:1] or ["The workflow did not end; `siq run --verbose` shows what Snakemake says."]
-
-
-def _screen_of(stream: TextIO = sys.stderr, *, columns: int = 80) -> Screen:
-    """A screen on a stream, rewritten in place where it is a terminal."""
-    return Screen(stream, columns=columns if stream.isatty() else None)
 
 
 NEEDED = ("snakemake", "filelock", "matplotlib")
@@ -289,13 +276,7 @@ def _workflow_folder() -> Path:
 
 
 def _need_workflow() -> None:
-    """Say what to install where the workflow cannot run.
-
-    Raises
-    ------
-    MissingExtra
-        For the first package that is missing.
-    """
+    """Refuse to begin where a package is missing that the workflow needs."""
     for package in NEEDED:
         if importlib.util.find_spec(package) is None:
             raise MissingExtra("workflow", package)
@@ -351,66 +332,6 @@ class Request:
 
 FOLLOWED = "SIQ_FOLLOWED"
 """Environment variable that tells jobs that what they say of their progress is read."""
-
-
-@dataclass(frozen=True)
-class _Ended:
-    """How a workflow ended.
-
-    Attributes
-    ----------
-    code
-        Snakemake's own exit code.
-    said
-        The lines that were shown on the way.
-    steps
-        How many there were to do.
-    planned
-        What they were about, in words.
-    interrupted
-        Whether it was stopped from the keyboard.
-    """
-
-    code: int
-    said: tuple[str, ...] = ()
-    steps: int = 0
-    planned: tuple[str, ...] = ()
-    interrupted: bool = False
-
-
-def _run_workflow(request: Request) -> _Ended:
-    """Run the workflow in the folder in which you work, with one line of progress on standard error.
-
-    Raises
-    ------
-    MissingExtra
-        Where it is not installed.
-    """
-    _need_workflow()
-    process = subprocess.Popen(
-        request.command(),
-        env=_environment() | ({} if request.verbose else {FOLLOWED: "1"}),
-        stdout=None if request.verbose else subprocess.PIPE,
-        stderr=None if request.verbose else subprocess.STDOUT,
-        text=None if request.verbose else True,
-        encoding=None if request.verbose else "utf-8",
-        errors=None if request.verbose else "replace",
-    )
-    progress, said = _Progress(), []
-    try:
-        if process.stdout is not None:
-            screen = _screen_of(columns=shutil.get_terminal_size().columns)
-            said = follow(_lines(process.stdout), screen, progress)
-        code = process.wait()
-    except KeyboardInterrupt:  # Snakemake has been told, too, and lets no half of a file stand
-        _wait_once_more(process)
-        print(file=sys.stderr)
-        return _Ended(process.returncode, interrupted=True)
-    if code and not request.verbose:
-        said += (more := _faults(progress, said))
-        for line in more:
-            print(line, file=sys.stderr)
-    return _Ended(code, tuple(said), progress.total, tuple(progress.planned))
 
 
 def _environment() -> dict[str, str]:
@@ -493,18 +414,21 @@ def run_study(given: str, asked: Request) -> Exit:
             f"compare them by: siq diagnose {given}",
         )  # fmt: skip
     elif is_study(path):
-        from siq.workflow.study import (
-            load_study,  # here, so that `siq --help` and a fault of the line are quick
-        )
+        from siq.workflow.study import load_study  # here, so that a fault of the line is told at once
 
-        _refuse_card(path)
+        data = read_document(path).data
+        if "equations" in data:
+            raise InputError(
+                path, "", "this is the card of a system, not a study",
+                f"write a study beside it, of two lines: 'name: {data.get('name', 'my-study')}' and"
+                f" 'system: {path.name}'",
+            )  # fmt: skip
         name, study = load_study(path).name, path
     else:
         name = name_for(path)
         study, settings = write_generated(path, name), (f"origin={own_path(path)}",)
     page = RESULTS / name / "report.html"
-    request = replace(asked, targets=(page.as_posix(),), study=study, settings=settings)
-    return _told(_run_workflow(request), request, [page])
+    return _answered(replace(asked, targets=(page.as_posix(),), study=study, settings=settings), [page])
 
 
 def diagnose_cases(folder: str, asked: Request) -> Exit:
@@ -531,18 +455,7 @@ def diagnose_cases(folder: str, asked: Request) -> Exit:
     if not place.is_dir():
         raise _not_there(folder)
     pages = [RESULTS / "mismatch" / name / "report.html" for name in case_folders(place)]
-    request = replace(asked, targets=("diagnose",), settings=(f"cases={place.as_posix()}",))
-    return _told(_run_workflow(request), request, pages)
-
-
-def _refuse_card(path: Path) -> None:
-    data = read_document(path).data
-    if "equations" in data:
-        raise InputError(
-            path, "", "this is the card of a system, not a study",
-            f"write a study beside it, of two lines: 'name: {data.get('name', 'my-study')}' and"
-            f" 'system: {path.name}'",
-        )  # fmt: skip
+    return _answered(replace(asked, targets=("diagnose",), settings=(f"cases={place.as_posix()}",)), pages)
 
 
 def _not_there(given: str) -> InputError:
@@ -556,32 +469,45 @@ def _not_there(given: str) -> InputError:
     return InputError(given, "", f"there is no file or folder of that name in {place.parent}", remedy)
 
 
-def _told(ended: _Ended, request: Request, pages: Sequence[Path]) -> Exit:
-    """Say how it ended, and name the pages."""
-    if ended.interrupted:
-        print("Stopped. Give the same command again to go on from here.", file=sys.stderr)
+def _answered(request: Request, pages: Sequence[Path]) -> Exit:
+    """Run the workflow in the folder in which you work, with one line of progress; say how it ended."""
+    process = subprocess.Popen(
+        request.command(),
+        env=_environment() | ({} if request.verbose else {FOLLOWED: "1"}),
+        stdout=None if request.verbose else subprocess.PIPE,
+        stderr=None if request.verbose else subprocess.STDOUT,
+        text=None if request.verbose else True,
+        encoding=None if request.verbose else "utf-8",
+        errors=None if request.verbose else "replace",
+    )
+    progress, said = _Progress(), []
+    try:
+        if process.stdout is not None:
+            columns = shutil.get_terminal_size().columns if sys.stderr.isatty() else None
+            said = follow(_lines(process.stdout), Screen(sys.stderr, columns=columns), progress)
+        code = process.wait()
+    except KeyboardInterrupt:  # Snakemake has been told, too, and lets no half of a file stand
+        _wait_once_more(process)
+        print("\nStopped. Give the same command again to go on from here.", file=sys.stderr)
         return Exit.INTERRUPTED
-    if ended.code not in (0, Exit.NO_ANSWER):
+    if code and not request.verbose:
+        said += (more := _faults(progress, said))
+        for line in more:
+            print(line, file=sys.stderr)
+    if code not in (0, Exit.NO_ANSWER):
         return Exit.FAULT
+    steps = progress.total
     if request.dry_run:
-        for words in ended.planned:
+        for words in progress.planned:
             print(words)
         if not request.verbose:
-            print(
-                f"{ended.steps} steps would run." if ended.steps else "Nothing would run: all is up to date."
-            )
+            print(f"{steps} steps would run." if steps else "Nothing would run: all is up to date.")
         return Exit.ANSWERED
     told = [answer_of_page(page) for page in pages if page.is_file()]
-    if not ended.steps and not request.verbose:
+    if not steps and not request.verbose:
         print("Nothing has changed since the last time; this is the answer that you have.", file=sys.stderr)
     for one in told:
-        _say(one, ended.said)
+        for line in (*one.lines, f"The page to read: {one.page}"):
+            if line not in said:
+                print(line)
     return max((one.code for one in told), default=Exit.FAULT)
-
-
-def _say(one: Told, said: Sequence[str]) -> None:
-    for line in one.lines:
-        if line not in said:
-            print(line)
-    if (page := f"The page to read: {one.page}") not in said:
-        print(page)

@@ -1,29 +1,320 @@
-"""All that a run of recordings gives, in memory: f, networks, V with its certificate, landscape.
+"""All that a run of recordings gives, step by step: f, networks, V with its certificate, landscape.
 
-The tasks of the workflow, chained without its files.
+Each step gives what it found, None where it failed, and an outcome that says why. The formulas of the
+regression are certified beside the refined ones, and so is a control: what the same refinement makes of a
+network with its weights in random order. `analyse` chains the steps in memory; the tasks of the workflow
+call the same functions, and add files.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from siq.data.inspection import seen_states
 from siq.data.preparation import in_stretches, joined, without_slow_drift
-from siq.data.recordings import Recordings, recordings_of
+from siq.data.recordings import Recordings, recordings_of, resample_recordings, snapshot_pairs
+from siq.errors import NumericalFailure
+from siq.inference.field_estimate import FieldEstimate
+from siq.inference.identify import identify
+from siq.inference.kalman_identification import of_all_states
+from siq.inference.library import candidate_library
+from siq.networks.decomposition import TrainedNetworks
+from siq.networks.regression import RegressionResult, points_below, sparse_decomposition
+from siq.numerics.randomness import Purpose, generator
+from siq.quasipotential.certificate import Certificate, certify, uncertified
+from siq.quasipotential.formulas import SymbolicDecomposition, decomposition_from_coefficients
 from siq.quasipotential.landscape import Landscape, NoLandscape
+from siq.quasipotential.landscape_assembly import find_landscape
+from siq.quasipotential.occupancy import OccupancyCheck, VisitTest
+from siq.quasipotential.rates import NoiseStrength
+from siq.quasipotential.refinement import Refinement, RefinementContext, control, refine_and_certify
+from siq.quasipotential.wells import Well
+from siq.remarks import Remark, sentence
+from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
-from siq.workflow import results, steps
+from siq.systems.phase_portrait import PhasePortrait, evenly_spread, phase_portrait
+from siq.systems.simulation import simulate_snapshots
 from siq.workflow.study import PipelineSettings
-from siq.workflow.tables import Outcome, why_no_landscape
-from siq.workflow.tasks import Given, outputs_of
-from siq.workflow.training import TrainedRun, trained_run
+from siq.workflow.tables import Method, Outcome, Status, Step, StepResult, why_no_landscape
+from siq.workflow.training import not_trained, train_block
 
 __all__ = ["Analysis", "PipelineSettings", "analyse", "landscape_from_recordings"]
+
+
+def draw_run(
+    settings: PipelineSettings, source: Dynamics | Recordings, *, number: int
+) -> StepResult[Recordings]:
+    """The trajectories of run `number`.
+
+    Parameters
+    ----------
+    settings
+        What is drawn.
+    source
+        The system to be simulated, or the recordings: run 0 takes them all, further runs resample them.
+    number
+        Of the run.
+    """
+    if isinstance(source, Recordings):
+        hidden = settings.identification.hidden_velocities
+        source = in_stretches(without_slow_drift(source), hidden_velocities=hidden)
+        if number > 0:
+            draw = generator(settings.seed, number, Purpose.RESAMPLE)
+            source = resample_recordings(source, generator=draw)
+        return StepResult(source, Outcome(number, Step.RESAMPLE, reason="; ".join(source.notes)))
+    assert settings.simulation is not None  # a system is simulated
+    try:
+        draw = generator(settings.seed, number, Purpose.SIMULATE)
+        recordings = simulate_snapshots(source, options=settings.simulation, generator=draw)
+        return StepResult(recordings, Outcome(number, Step.SIMULATE))
+    except NumericalFailure as error:
+        return StepResult(None, Outcome(number, Step.SIMULATE, Status.FAILED, str(error)))
+
+
+def identify_run(
+    settings: PipelineSettings, recordings: Recordings | None, *, number: int
+) -> StepResult[FieldEstimate]:
+    """f of run `number`, from its recordings; None where drawing them failed."""
+    if recordings is None:
+        reason = "the run has no trajectories"
+        return StepResult(None, Outcome(number, Step.IDENTIFY, Status.SKIPPED, reason))
+    named = zip(recordings.names, recordings.units, strict=True)
+    try:
+        found = identify(
+            recordings, options=settings.identification, limits=settings.prediction,
+            draw=partial(generator, settings.seed, number), diffusion=settings.space.noise(recordings.names),
+            units=[unit or settings.space.unit(name) or None for name, unit in named],
+            pair_step=settings.sampling.pair_step, integrator_step=settings.sampling.integrator_step,
+        )  # fmt: skip
+    except (NumericalFailure, np.linalg.LinAlgError) as error:
+        return StepResult(None, Outcome(number, Step.IDENTIFY, Status.FAILED, str(error)))
+    assert found.diagnosis is not None and found.prediction is not None
+    remarks = [sentence(remark) for remark in found.diagnosis.remarks]
+    if found.prediction.passed:
+        status, first = Status.OK, found.diffusion_source.note
+    else:
+        status, first = Status.WARNING, found.prediction.reason
+    reasons = "; ".join(one for one in (first, *remarks) if one)
+    return StepResult(found, Outcome(number, Step.IDENTIFY, status, reasons))
+
+
+def regress_run(
+    settings: PipelineSettings, recordings: Recordings | None, trained: StepResult[TrainedNetworks]
+) -> StepResult[SymbolicDecomposition]:
+    """Formulas of the networks of one run."""
+    number = trained.outcome.run
+    if trained.result is None or recordings is None:
+        return StepResult(None, Outcome(number, Step.REGRESS, Status.SKIPPED, _no_networks(trained.outcome)))
+    try:
+        formulas, found = _regressed(settings, recordings, trained.result)
+    except NumericalFailure as error:
+        return StepResult(None, Outcome(number, Step.REGRESS, Status.FAILED, str(error)))
+    status = Status.OK if found.converged else Status.WARNING
+    reason = "" if found.converged else f"SR3 did not settle in {found.iterations - 1} iterations"
+    details = {
+        "points": found.points,
+        "converged": found.converged,
+        "iterations": found.iterations,
+        "constraint_residual": found.constraint_residual,
+        "sparse_constraint_residual": found.sparse_constraint_residual,
+        "misfit": np.round(found.misfit, 12).tolist(),
+    }
+    return StepResult(formulas, Outcome(number, Step.REGRESS, status, reason, details))
+
+
+def _no_networks(outcome: Outcome) -> str:
+    return f"the training gave no networks ({outcome.reason})"
+
+
+def _regressed(
+    settings: PipelineSettings, recordings: Recordings, networks: TrainedNetworks
+) -> tuple[SymbolicDecomposition, RegressionResult]:
+    options = settings.regression
+    points = snapshot_pairs(recordings, pair_step=settings.sampling.pair_step).x0
+    values = networks.evaluate(points)
+    below = points_below(values.potential, level=options.level)
+    library = candidate_library(
+        recordings.names,
+        degree=options.degree,
+        potential_degree=options.potential_degree,
+        circulatory_degree=options.circulatory_degree,
+        further=options.functions,
+    )
+    result = sparse_decomposition(
+        library,
+        points[below],
+        values.potential[below],
+        values.circulatory[below],
+        values.vector_field[below],
+        # D that nobody gave is that of the networks, in their precision.
+        diffusion=settings.space.constant_noise(points.shape[1]) or Diffusion(networks.diffusion),
+        options=options,
+    )
+    formulas = decomposition_from_coefficients(
+        library,
+        potential=result.potential,
+        circulatory=result.circulatory,
+        vector_field=result.vector_field,
+        points=points[below],
+    )
+    return formulas, result
+
+
+@dataclass(frozen=True)
+class RefinedRun:
+    """Formulas of a run by method, with a certificate for each and for the control, and the outcome.
+
+    Certificates are plain data, as they stand in `model.json`. `refinement` has the refined formulas with
+    their certificate as an object, the test against the record and the phase portrait; `portrait` stands
+    also where refinement failed.
+    """
+
+    formulas: Mapping[Method, SymbolicDecomposition]
+    certificates: Mapping[Method, Mapping[str, Any]]
+    outcome: Outcome
+    refinement: Refinement | None = None
+    portrait: PhasePortrait | None = None
+
+    @property
+    def wells(self) -> tuple[Well, ...]:
+        """V about the attractors, as refined."""
+        return () if self.refinement is None else self.refinement.formulas.wells
+
+    @property
+    def certificate(self) -> Certificate | None:
+        """That of the refined formulas."""
+        return None if self.refinement is None else self.refinement.certificate
+
+    @property
+    def record(self) -> OccupancyCheck | None:
+        """The test of f against the hops and the histogram of the recordings."""
+        return None if self.refinement is None else self.refinement.record
+
+
+def refine_run(
+    settings: PipelineSettings,
+    recordings: Recordings | None,
+    identified: StepResult[FieldEstimate],
+    trained: StepResult[TrainedNetworks],
+    regressed: SymbolicDecomposition | None = None,
+) -> RefinedRun:
+    """V about every attractor of the identified f, or over the region, with its certificate.
+
+    Parameters
+    ----------
+    settings
+        Routes, degrees, and the limits of the certificate.
+    recordings, identified, trained
+        Trajectories, f and networks of the run.
+    regressed
+        The formulas of the networks, which are certified beside the refined ones; None where there are none.
+    """
+    number, networks = identified.outcome.run, trained.result
+    formulas = {} if regressed is None else {Method.REGRESSION: regressed}
+    certificates: dict[Method, Mapping[str, Any]] = {}
+    context: RefinementContext | None = None
+    refinement: Refinement | None = None
+    # Networks that were asked for and are not there are the first cause of whatever follows.
+    routes = settings.refinement.routes or ()
+    asked = trained.outcome.status == Status.FAILED or "network" in routes
+    lost = [_no_networks(trained.outcome)] if networks is None and asked else []
+    if identified.result is None or recordings is None:
+        missing = f"no vector field was identified ({identified.outcome.reason})"
+        outcome = Outcome(number, Step.REFINE, Status.SKIPPED, missing)
+    elif networks is None and routes == ("network",):
+        outcome = Outcome(number, Step.REFINE, Status.SKIPPED, _no_networks(trained.outcome))
+    else:
+        try:
+            context = RefinementContext(
+                recordings, identified.result, networks, number=number, seed=settings.seed,
+                pair_step=settings.sampling.pair_step, refinement=settings.refinement,
+                limits=settings.certificate,
+            )  # fmt: skip
+            if regressed is not None:
+                certificates[Method.REGRESSION] = certify(regressed, context.evidence).as_data()
+            refinement = refine_and_certify(context, regressed)
+            certificate = refinement.certificate
+            formulas[Method.REFINED] = refinement.formulas
+            certificates[Method.REFINED] = certificate.as_data() | {
+                "notes": [*lost, *refinement.notes], "no_record_test": refinement.record.missing or ""
+            }  # fmt: skip
+            status = Status.OK if certificate.certified else Status.WARNING
+            reason = [] if certificate.certified else [*lost, certificate.reason]
+            outcome = Outcome(number, Step.REFINE, status, "; ".join(reason))
+        except (NumericalFailure, np.linalg.LinAlgError) as error:
+            outcome = Outcome(number, Step.REFINE, Status.FAILED, "; ".join([*lost, str(error)]))
+    if context is not None and networks is not None:
+        theirs = (None, None) if refinement is None else (refinement.formulas, refinement.certificate)
+        certificates[Method.CONTROL] = control(context, *theirs)
+    for method in formulas.keys() - certificates.keys():
+        certificates[method] = uncertified(f"no test was made: {outcome.reason}")
+    portrait = None if context is None else context.portrait
+    return RefinedRun(formulas, certificates, outcome, refinement, portrait)
+
+
+def landscape_of_run(
+    settings: PipelineSettings,
+    recordings: Recordings | None,
+    record: FieldEstimate | None,
+    *,
+    number: int,
+    wells: Sequence[Well] = (),
+    seek_wells: bool = True,
+    certificate: Certificate | None = None,
+    visits: tuple[VisitTest, ...] = (),
+) -> StepResult[Landscape]:
+    """The landscape of the identified f within the recorded region.
+
+    The wells are those of the refinement, with their certificate, and `visits` those that its test against
+    the record compared; where it found none, the local route is asked once more, within the whole
+    recorded region, unless `seek_wells` says that it shall not.
+    """
+    if recordings is None or record is None:
+        reason = "no vector field was identified"
+        return StepResult(None, Outcome(number, Step.LANDSCAPE, Status.SKIPPED, reason))
+    recordings = of_all_states(recordings, record, pair_step=settings.sampling.pair_step)
+    x = snapshot_pairs(recordings, pair_step=settings.sampling.pair_step).x0
+    draw = generator(settings.seed, number, Purpose.LANDSCAPE)
+    points = x[evenly_spread(x, generator=draw)]
+    try:
+        portrait = phase_portrait(record.dynamics, points, seed=number)
+        found = find_landscape(
+            record, portrait, wells=wells if wells or not seek_wells else None, certificate=certificate,
+            options=settings.refinement, noise=_noise_strength(settings, record), seed=number,
+        )  # fmt: skip
+    except (NumericalFailure, np.linalg.LinAlgError) as error:
+        return StepResult(None, Outcome(number, Step.LANDSCAPE, Status.FAILED, str(error)))
+    whole = found.global_quasipotential is not None and not found.notes
+    status = Status.OK if whole else Status.WARNING
+    outcome = Outcome(number, Step.LANDSCAPE, status, "; ".join(found.notes))
+    note = record.diffusion_source.note
+    if note is not None:
+        remark = Remark("quasipotential.reason", {"reason": note})
+        found = replace(found, remarks=(*found.remarks, remark))
+    # The attractors of both steps are those of one f: where they differ in number, indices mean nothing.
+    if visits and max(one.well for one in visits) < len(found.attractors):
+        found = replace(found, visits=visits)
+    # Units are as the recordings say, or else the card; 1 where none does.
+    space = settings.space
+    named = zip(recordings.names, recordings.units, strict=True)
+    units = tuple(unit or space.unit(name, unknown="1") for name, unit in named)
+    found = found.in_units(units, time=recordings.time_unit or space.unit("t", unknown="1"))
+    return StepResult(found, outcome)
+
+
+def _noise_strength(settings: PipelineSettings, record: FieldEstimate) -> NoiseStrength | None:
+    """The noise that the recordings show, or else the first that the study gives."""
+    if (shown := record.noise_strength) is not None:
+        return NoiseStrength(*shown, source="estimated")
+    given = () if settings.landscape is None else settings.landscape.noise_intensities
+    return NoiseStrength(given[0]) if given else None
 
 
 @dataclass(frozen=True)
@@ -42,11 +333,11 @@ class Analysis:
         Wells, barriers, ways; None where not asked for.
     """
 
-    identified: results.Identified
-    trained: TrainedRun
-    regressed: results.Regressed | None
-    refined: results.RefinedRun
-    landscape: results.FoundLandscape | None
+    identified: StepResult[FieldEstimate]
+    trained: StepResult[TrainedNetworks]
+    regressed: StepResult[SymbolicDecomposition] | None
+    refined: RefinedRun
+    landscape: StepResult[Landscape] | None
 
     @property
     def outcomes(self) -> tuple[Outcome, ...]:
@@ -57,8 +348,7 @@ class Analysis:
     @property
     def dynamics(self) -> Dynamics | None:
         """What was identified, None where nothing was."""
-        record = self.identified.record
-        return None if record is None else record.dynamics
+        return None if self.identified.result is None else self.identified.result.dynamics
 
 
 def analyse(
@@ -85,24 +375,20 @@ def analyse(
     settings = settings or PipelineSettings()
     networks, hidden = settings.training is not None, settings.identification.hidden_velocities
     settings = replace(settings, refinement=settings.refinement.with_routes(networks=networks))
-    made: dict[str, Any] = {
-        "recordings": in_stretches(without_slow_drift(recordings), hidden_velocities=hidden)
-    }
-
-    def run(one: Callable[[Given, PipelineSettings], Any]) -> Any:
-        block = one is steps.train  # whose runs train side by side; here there is one
-        values = {name: [value] for name, value in made.items()} if block else dict(made)
-        found = one(Given(values=values, number=number, device=device), settings)
-        made.update(outputs_of(found))
-        return found
-
-    identified = run(steps.identify)
+    recordings = in_stretches(without_slow_drift(recordings), hidden_velocities=hidden)
+    identified = identify_run(settings, recordings, number=number)
+    trained, regressed, landscape = not_trained(number), None, None
     if networks:
-        run(steps.train)
-    trained = trained_run(made.get("networks"), made.get("train_outcome"), number=number)
-    regressed = run(steps.regress) if networks and settings.published_method else None
-    made["refined"] = refined = run(steps.refine)
-    landscape = run(steps.landscape) if settings.landscape is not None else None
+        trained = train_block(settings, {number: (recordings, identified.result)}, device=device)[0][number]
+        if settings.published_method:
+            regressed = regress_run(settings, recordings, trained)
+    formulas = None if regressed is None else regressed.result
+    refined = refine_run(settings, recordings, identified, trained, formulas)
+    if settings.landscape is not None:
+        landscape = landscape_of_run(
+            settings, recordings, identified.result, wells=refined.wells, number=number,
+            certificate=refined.certificate, visits=() if refined.record is None else refined.record.visits,
+        )  # fmt: skip
     return Analysis(identified, trained, regressed, refined, landscape)
 
 
@@ -117,7 +403,7 @@ def landscape_from_recordings(
     if hidden_velocities:
         settings = replace(settings, identification=replace(settings.identification, hidden_velocities=True))
     analysis = analyse(trajectories, settings)
-    found = None if analysis.landscape is None else analysis.landscape.landscape
+    found = None if analysis.landscape is None else analysis.landscape.result
     certified = found is not None and found.certificate is not None and found.certificate.certified
     whole = certified and found is not None and len(found.attractors) > 1
     seen = None if whole else seen_states(joined(trajectories))

@@ -1,25 +1,13 @@
-"""Tables of results, and outcomes of steps: their columns, and how they are files.
-
-A table is Parquet with a CSV beside it, whole or not at all. An outcome says what became of a step of a
-run.
-"""
+"""Tables of results: their columns; and outcomes, which say what became of the steps of a run."""
 
 from __future__ import annotations
 
-import json
-import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import pandas as pd
-
-from siq.errors import InputError
-from siq.numerics.files import whole_file
-
-logger = logging.getLogger(__name__)
 
 
 class Step(StrEnum):
@@ -93,11 +81,24 @@ class Outcome:
         plain = {"run": self.run, "step": str(self.step), "status": str(self.status), "reason": self.reason}
         return plain | dict(self.details)
 
+    @classmethod
+    def from_data(cls, data: Mapping[str, Any]) -> Outcome:
+        """The outcome that `as_data` gave."""
+        details = {
+            key: value for key, value in data.items() if key not in ("run", "step", "status", "reason")
+        }
+        return cls(int(data["run"]), Step(data["step"]), Status(data["status"]), data["reason"], details)
 
-def _outcome_of_data(data: Mapping[str, Any]) -> Outcome:
-    """The outcome that `Outcome.as_data` gave."""
-    details = {key: value for key, value in data.items() if key not in ("run", "step", "status", "reason")}
-    return Outcome(int(data["run"]), Step(data["step"]), Status(data["status"]), data["reason"], details)
+
+Result = TypeVar("Result", covariant=True)
+
+
+@dataclass(frozen=True)
+class StepResult(Generic[Result]):
+    """What a step of a run found, None where it failed, and what became of it."""
+
+    result: Result | None
+    outcome: Outcome
 
 
 def why_no_landscape(outcomes: Iterable[Outcome]) -> str:
@@ -108,21 +109,6 @@ def why_no_landscape(outcomes: Iterable[Outcome]) -> str:
         for one in sorted(mine, key=lambda each: each.step != Step.LANDSCAPE):
             return one.reason.rstrip(".")
     return "the recorded states lead to no stable state"
-
-
-def write_outcomes(path: str | Path, outcomes: Sequence[Outcome]) -> None:
-    """Write outcomes whole or not at all, and log those that are not ``ok``."""
-    for one in outcomes:
-        if one.status != Status.OK:
-            logger.warning("run %d, %s: %s, %s", one.run, one.step, one.status, one.reason)
-    with whole_file(path) as partial:
-        text = json.dumps([one.as_data() for one in outcomes], indent=1)
-        partial.write_text(text + "\n", encoding="utf-8")
-
-
-def read_outcomes(path: str | Path) -> list[Outcome]:
-    """Read what `write_outcomes` wrote."""
-    return [_outcome_of_data(one) for one in json.loads(Path(path).read_text(encoding="utf-8"))]
 
 
 COLUMNS: Mapping[str, Mapping[str, str]] = {
@@ -348,35 +334,3 @@ def as_table(name: str, rows: pd.DataFrame | list[dict[str, object]]) -> pd.Data
             f"the table '{name}' has no columns {sorted(unknown)}; see siq.workflow.tables.COLUMNS"
         )
     return frame.reindex(columns=list(columns)).astype(dict(columns)).reset_index(drop=True)
-
-
-def concatenate(name: str, tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
-    """Tables of one kind below each other, in the order given; also of none."""
-    filled = [table for table in tables if len(table)]
-    return as_table(name, pd.concat(filled, ignore_index=True) if filled else [])
-
-
-def write_table(path: str | Path, table: pd.DataFrame) -> None:
-    """Write a table as Parquet to `path`, and as CSV beside it.
-
-    Numbers in the CSV have as many digits as it takes to read the same numbers back.
-    """
-    path = Path(path)
-    with whole_file(path.with_suffix(".csv")) as partial:
-        table.to_csv(partial, index=False)
-    with whole_file(path) as partial:
-        table.to_parquet(partial, index=False)
-
-
-def read_table(path: str | Path) -> pd.DataFrame:
-    """Read a table that `write_table` wrote.
-
-    Raises
-    ------
-    InputError
-        When the file is missing or is not Parquet.
-    """
-    try:
-        return pd.read_parquet(path)
-    except (OSError, ValueError):
-        raise InputError(path, "", "it is not a Parquet table", "make it again") from None

@@ -8,11 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from dataclasses import dataclass as plain_dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -26,90 +23,27 @@ from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.refinement import TrainingCheck
 from siq.systems.diffusion import Diffusion
 from siq.workflow.study import PipelineSettings
-from siq.workflow.tables import Outcome, Status, Step, as_table
+from siq.workflow.tables import Outcome, Status, Step, StepResult, as_table
 
 POSITION = "position"
 """In the details of an outcome: where the run stands among the networks of its block."""
 
 
-@dataclass(frozen=True)
-class TrainedRun:
-    """The networks of a run, None where its training left none, and why."""
-
-    networks: TrainedNetworks | None
-    outcome: Outcome
-
-    @property
-    def missing(self) -> str:
-        """Why there are no networks, in words."""
-        return f"the training gave no networks ({self.outcome.reason})"
-
-
-def _not_trained(number: int) -> TrainedRun:
+def not_trained(number: int) -> StepResult[TrainedNetworks]:
     """A run for which no networks were asked."""
-    return TrainedRun(None, Outcome(number, Step.TRAIN, Status.SKIPPED, "no networks were asked for"))
-
-
-def trained_run(
-    networks: Mapping[int, TrainedNetworks] | None, outcomes: Sequence[Outcome] | None, *, number: int
-) -> TrainedRun:
-    """The networks of run `number` from those of its block by position; None where none were asked for."""
-    if networks is None or outcomes is None:
-        return _not_trained(number)
-    mine = next(one for one in outcomes if one.run == number)
-    return TrainedRun(networks[mine.details[POSITION]] if mine.usable else None, mine)
+    return StepResult(None, Outcome(number, Step.TRAIN, Status.SKIPPED, "no networks were asked for"))
 
 
 MOST_POINTS = 10_000  # over which a D that depends on the state is averaged
 
 
-@plain_dataclass(frozen=True)
-class RunToTrain:
-    """What a run brings to its training: its trajectories and its f, None where a step before failed."""
-
-    recordings: Recordings | None
-    record: FieldEstimate | None
-
-
-@plain_dataclass(frozen=True)
-class _Trained:
-    """The networks of a block.
-
-    Attributes
-    ----------
-    networks
-        By run, of those that have data, in the order of their positions in the file.
-    history
-        The loss, see the table `training`.
-    outcomes
-        Of every run of the block.
-    """
-
-    networks: Mapping[int, TrainedNetworks]
-    history: pd.DataFrame
-    outcomes: tuple[Outcome, ...]
-
-    def files(self) -> dict[str, Any]:
-        """By the names of the rule."""
-        networks = list(self.networks.values())
-        return {"networks": networks or None, "history": self.history, "train_outcome": self.outcomes}
-
-
-@plain_dataclass(frozen=True)
-class _Checks:
-    """When the training of each run may end; of those that have no check, why not."""
-
-    ready: Mapping[int, TrainingCheck]
-    faults: Mapping[int, str]
+Runs = Mapping[int, tuple[Recordings | None, FieldEstimate | None]]
+"""What runs bring to their training, by number: trajectories and f, None where a step before failed."""
 
 
 def train_block(
-    settings: PipelineSettings,
-    runs: Mapping[int, RunToTrain],
-    *,
-    folder: Path | None = None,
-    device: str = "auto",
-) -> _Trained:
+    settings: PipelineSettings, runs: Runs, *, folder: Path | None = None, device: str = "auto"
+) -> tuple[dict[int, StepResult[TrainedNetworks]], list[TrainedNetworks], pd.DataFrame]:
     """Train the networks of a block of runs.
 
     Parameters
@@ -122,27 +56,36 @@ def train_block(
         Where a killed training leaves what it goes on from; None keeps nothing. See `clean`.
     device
         ``auto``, ``cpu``, ``cuda``.
+
+    Returns
+    -------
+    results
+        Of every run.
+    networks
+        Of the runs that have data, by their positions, be they good for anything or not.
+    history
+        The loss, see the table `training`.
     """
     assert settings.training is not None  # networks are asked for
-    data, outcomes = _training_data(settings, runs)
+    data, results = _training_data(settings, runs)
     if not data:
-        return _Trained({}, as_table("training", []), tuple(outcomes))
-
-    checks = _checks(settings, runs, data)
+        return results, [], as_table("training", [])
+    ready, faults = _checks(settings, runs, data)
     block = Block(
         data,
-        checks.ready,
+        ready,
         options=settings.training,
         diffusion=_diffusion(settings, runs, data),
         seed=settings.seed,
         checkpoints=Checkpoints(folder, _fingerprint(settings, runs, data)),
         device=choose_device(device),
-        faults=checks.faults,
+        faults=faults,
     )
     block.train()
-    outcomes += [_outcome_of(block, number) for number in data]
-    networks = {number: block.last[number] for number in data}
-    return _Trained(networks, as_table("training", block.history()), tuple(outcomes))
+    for number in data:
+        outcome = _outcome_of(block, number)
+        results[number] = StepResult(block.last[number] if outcome.usable else None, outcome)
+    return results, [block.last[number] for number in data], as_table("training", block.history())
 
 
 def _outcome_of(block: Block, run: int) -> Outcome:
@@ -155,9 +98,7 @@ def _outcome_of(block: Block, run: int) -> Outcome:
     return Outcome(run, Step.TRAIN, Status.WARNING, block.unchecked(run), details)
 
 
-def _diffusion(
-    settings: PipelineSettings, runs: Mapping[int, RunToTrain], data: Mapping[int, TrainingData]
-) -> Diffusion:
+def _diffusion(settings: PipelineSettings, runs: Runs, data: Mapping[int, TrainingData]) -> Diffusion:
     """D of all networks of a block: as given, or else the mean of what its runs show.
 
     Networks only lead to the right solution, which is then found with the D of its own run.
@@ -166,7 +107,7 @@ def _diffusion(
     given = settings.space.constant_noise(dimension)
     if given is not None:
         return given
-    records = [record for number in data if (record := runs[number].record) is not None]
+    records = [record for number in data if (record := runs[number][1]) is not None]
     if not records:
         return Diffusion.identity(dimension)
     if not all(record.diffusion.constant for record in records):
@@ -179,35 +120,33 @@ def _diffusion(
 
 
 def _training_data(
-    settings: PipelineSettings, runs: Mapping[int, RunToTrain]
-) -> tuple[dict[int, TrainingData], list[Outcome]]:
-    """The data of every run of the block that has some, and the outcomes of those that have none."""
+    settings: PipelineSettings, runs: Runs
+) -> tuple[dict[int, TrainingData], dict[int, StepResult[TrainedNetworks]]]:
+    """The data of every run of the block that has some, and the results of those that have none."""
     assert settings.training is not None
-    data, outcomes = {}, []
-    for number, one in runs.items():
-        if one.recordings is None:
+    data, failed = {}, dict[int, StepResult[TrainedNetworks]]()
+    for number, (recordings, _) in runs.items():
+        if recordings is None:
             reason = "the run has no trajectories"
-            outcomes.append(Outcome(number, Step.TRAIN, Status.SKIPPED, reason))
+            failed[number] = StepResult(None, Outcome(number, Step.TRAIN, Status.SKIPPED, reason))
             continue
         try:
-            pairs = snapshot_pairs(one.recordings, pair_step=settings.sampling.pair_step)
+            pairs = snapshot_pairs(recordings, pair_step=settings.sampling.pair_step)
             draw = generator(settings.seed, number, Purpose.DIVIDE)
             data[number] = prepare_data(pairs, options=settings.training, generator=draw)
         except NumericalFailure as error:
-            outcomes.append(Outcome(number, Step.TRAIN, Status.FAILED, str(error)))
-    return data, outcomes
+            failed[number] = StepResult(None, Outcome(number, Step.TRAIN, Status.FAILED, str(error)))
+    return data, failed
 
 
 def _checks(
-    settings: PipelineSettings, runs: Mapping[int, RunToTrain], data: Mapping[int, TrainingData]
-) -> _Checks:
-    """The check of every run whose vector field is known; the others train for all their steps."""
-    from siq.quasipotential.refinement import TrainingCheck
-
+    settings: PipelineSettings, runs: Runs, data: Mapping[int, TrainingData]
+) -> tuple[dict[int, TrainingCheck], dict[int, str]]:
+    """When the training of each run whose f is known may end; of those that have no check, why not."""
     assert settings.training is not None
     ready, faults = {}, {}
     for number, part in data.items():
-        options, record = settings.training.check, runs[number].record
+        options, record = settings.training.check, runs[number][1]
         if record is None or options is None:
             continue
         x = part.training.x0
@@ -215,17 +154,15 @@ def _checks(
             ready[number] = TrainingCheck(record, x, options=options, seed=number)
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             faults[number] = f"the check of the training could not be prepared: {error}"
-    return _Checks(ready, faults)
+    return ready, faults
 
 
-def _fingerprint(
-    settings: PipelineSettings, runs: Mapping[int, RunToTrain], data: Mapping[int, TrainingData]
-) -> str:
+def _fingerprint(settings: PipelineSettings, runs: Runs, data: Mapping[int, TrainingData]) -> str:
     """What everything kept by a killed training must share with the one that goes on from it."""
     told = settings.parts(("seed", "space", "sampling", "training"))
     digest = hashlib.sha256(json.dumps([list(data), told], sort_keys=True).encode())
     for number, part in data.items():
-        record = runs[number].record
+        record = runs[number][1]
         arrays = [part.training.x0, part.training.xh, part.training.h]
         if record is not None:
             noise = record.diffusion.at(part.training.x0[:1])

@@ -21,10 +21,10 @@ from benchmarks.publication.publication import (
 )
 from siq.report.formatting import texts
 from siq.systems.dynamics import Dynamics
-from siq.workflow.published import PublishedFigure, load_published
-from siq.workflow.scoring import summary_table
 from siq.workflow.study import load_study
 from siq.workflow.tables import as_table
+from workflow.published import PublishedFigure, load_published
+from workflow.scoring import summary_table
 
 CONFIG = Path(__file__).parents[2] / "config"
 RULES = Path(__file__).parents[2] / "workflow" / "rules"

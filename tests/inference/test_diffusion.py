@@ -18,10 +18,10 @@ from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_comparison import _check_same_noise
 from siq.systems.diffusion import Diffusion
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
-from siq.workflow import results
+from siq.workflow import pipeline
 from siq.workflow.pipeline import PipelineSettings
 from siq.workflow.study import Sampling, StateSpace
-from siq.workflow.tables import Status
+from siq.workflow.tables import Status, StepResult
 
 pytestmark = pytest.mark.portable
 
@@ -41,10 +41,10 @@ def recorded(
     return replace(found, units=units)
 
 
-def identified(recordings: Recordings, space: StateSpace | None = None) -> results.Identified:
+def identified(recordings: Recordings, space: StateSpace | None = None) -> StepResult[FieldEstimate]:
     sampling = Sampling(integrator_step=0.002)
     settings = PipelineSettings(space=space or StateSpace(), sampling=sampling, identification=LINEAR)
-    return results.identify_run(settings, recordings, number=0)
+    return pipeline.identify_run(settings, recordings, number=0)
 
 
 def test_an_estimated_d_is_compared_within_its_errors() -> None:
@@ -58,21 +58,21 @@ def test_an_estimated_d_is_compared_within_its_errors() -> None:
             _check_same_noise(learned.with_diffusion(Diffusion(other)), learned, states, found=field)
 
 
-def field_of(found: results.Identified) -> FieldEstimate:
-    assert found.record is not None
-    return found.record
+def field_of(found: StepResult[FieldEstimate]) -> FieldEstimate:
+    assert found.result is not None
+    return found.result
 
 
 def test_d_is_estimated_from_white_noise_at_determinant_one() -> None:
     # Of units that differ, too: noise shows what a unit matrix could not.
     found = identified(recorded(noise=0.02, units=("m", "s")))
-    assert found.outcome.status == Status.OK and found.record is not None
+    assert found.outcome.status == Status.OK and found.result is not None
     assert found.outcome.reason == DiffusionSource.ESTIMATED.note
     own = field_of(found).diffusion.matrix
     assert np.linalg.det(own) == pytest.approx(1, rel=1e-12)
     # 4000 pairs: a relative standard error of √(2/4000) = 2 % in each entry of the diagonal.
     np.testing.assert_allclose(own, NORMALISED, atol=0.1)
-    assert found.record.diagnosis.intensity == pytest.approx(0.02 * np.sqrt(np.linalg.det(D)), rel=0.1)
+    assert found.result.diagnosis.intensity == pytest.approx(0.02 * np.sqrt(np.linalg.det(D)), rel=0.1)
 
 
 def test_noises_without_a_significant_correlation_have_none() -> None:
@@ -109,7 +109,7 @@ def test_without_noise_units_that_are_alike_or_unknown_have_the_unit_matrix_and_
 
 def test_without_noise_d_of_different_units_is_asked_for() -> None:
     found = identified(recorded(noise=0.0, units=("m", "s")))
-    assert found.record is None and found.outcome.status == Status.FAILED
+    assert found.result is None and found.outcome.status == Status.FAILED
     assert "x is in m and y is in s" in found.outcome.reason
     assert "'recordings.diffusion'" in found.outcome.reason
     settings = PipelineSettings(identification=LINEAR)
@@ -139,11 +139,11 @@ def test_the_derivative_of_another_state_shows_no_noise_of_its_own() -> None:
 def test_where_d_is_from_is_kept_with_the_field_and_said_of_the_landscape(tmp_path) -> None:
     recordings = recorded(noise=0.0)
     found = identified(recordings)
-    assert found.record is not None
-    write_field(tmp_path / "vector_field.json", found.record, LINEAR)
+    assert found.result is not None
+    write_field(tmp_path / "vector_field.json", found.result, LINEAR)
     kept = read_field(tmp_path / "vector_field.json")
     assert kept is not None and kept.diffusion_source == DiffusionSource.UNIT
     settings = PipelineSettings(identification=LINEAR)
-    seen = results.landscape_of_run(settings, recordings, kept, number=0)
+    seen = pipeline.landscape_of_run(settings, recordings, kept, number=0)
     assert seen.landscape is not None and seen.outcome.status == Status.OK
     assert DiffusionSource.UNIT.note in seen.landscape.notes

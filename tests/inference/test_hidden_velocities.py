@@ -25,19 +25,20 @@ from siq.quasipotential.rates import _covariance_axes
 from siq.quasipotential.transitions import barrier_uncertainty, ways_out
 from siq.systems.diffusion import Diffusion
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
-from siq.workflow import results
+from siq.workflow import pipeline
 from siq.workflow.pipeline import PipelineSettings
 from siq.workflow.study import StateSpace
-from siq.workflow.tables import Status
+from siq.workflow.tables import Status, StepResult
+from workflow.steps import source_of
 
 FRICTION, SENSOR = 0.3, 0.02
 SETTINGS = PipelineSettings(identification=IdentificationOptions(degree=3, hidden_velocities=True))
 
 
 @cache
-def identified() -> tuple[results.Identified, Recordings, np.ndarray]:
+def identified() -> tuple[StepResult[FieldEstimate], Recordings, np.ndarray]:
     recordings, velocities = particle(1)
-    done = results.identify_run(SETTINGS, recordings, number=0)
+    done = pipeline.identify_run(SETTINGS, recordings, number=0)
     return done, recordings, velocities
 
 
@@ -51,24 +52,24 @@ def found_by(recordings: Recordings, names: list[str], *, degree: int) -> FieldE
 @pytest.mark.portable
 def test_positions_alone_show_the_force_and_both_noises() -> None:
     done, _, _ = identified()
-    assert done.outcome.status == Status.OK and done.record is not None
+    assert done.outcome.status == Status.OK and done.result is not None
     assert "velocities were not recorded" in done.outcome.reason
-    field = done.record
+    field = done.result
     assert [field.library.names[k] for _, k in field.support] == ["v_x", "x", "v_x", "x**3"]
     assert field.values[0] == 1 and not field.covariance[0].any()
     errors = np.sqrt(np.diag(field.covariance))[1:]
     assert (np.abs(field.values[1:] - [1, -FRICTION, -1]) < 3.5 * errors).all()
     np.testing.assert_allclose(field.diffusion.matrix, [[0, 0], [0, 1]], rtol=1e-12)
-    intensity, error = done.record.diagnosis.intensity, done.record.diagnosis.intensity_error
+    intensity, error = done.result.diagnosis.intensity, done.result.diagnosis.intensity_error
     assert abs(intensity - 2 * FRICTION * TEMPERATURE) < 3.5 * error < 0.2 * intensity
-    assert done.record.diagnosis.measurement[0] == pytest.approx(SENSOR, rel=0.03)
+    assert done.result.diagnosis.measurement[0] == pytest.approx(SENSOR, rel=0.03)
 
 
 def test_the_filter_knows_the_velocities() -> None:
     done, recordings, velocities = identified()
-    assert done.record is not None
+    assert done.result is not None
     measured = replace(recordings, units=("µm",), time_unit="s")
-    states = of_all_states(measured, done.record, pair_step=None)
+    states = of_all_states(measured, done.result, pair_step=None)
     assert states.units == ("µm", "µm/s")
     assert states.names == ("x", "v_x")
     error = states.values[:, 1] - velocities
@@ -77,10 +78,10 @@ def test_the_filter_knows_the_velocities() -> None:
 
 def test_barriers_of_the_identified_particle_hold() -> None:
     done, recordings, _ = identified()
-    assert done.record is not None
-    states = of_all_states(recordings, done.record, pair_step=None).values
+    assert done.result is not None
+    states = of_all_states(recordings, done.result, pair_step=None).values
     points = states[evenly_spread(states, generator=np.random.default_rng(0))]
-    field = done.record
+    field = done.result
     ways = ways_out(field.dynamics, phase_portrait(field.dynamics, points, seed=0))
     assert len(ways) == 2
     for way in ways:
@@ -91,14 +92,14 @@ def test_barriers_of_the_identified_particle_hold() -> None:
 
 def test_it_is_kept_in_a_file(tmp_path: Path) -> None:
     done, _, _ = identified()
-    assert done.record is not None
-    write_field(tmp_path / "field.json", done.record, SETTINGS.identification)
+    assert done.result is not None
+    write_field(tmp_path / "field.json", done.result, SETTINGS.identification)
     again = read_field(tmp_path / "field.json")
     assert again is not None and again.hidden_velocities
     assert again.diffusion_source == DiffusionSource.OF_VELOCITIES
     assert str(DiffusionSource.OF_VELOCITIES.note) in done.outcome.reason
-    np.testing.assert_array_equal(again.coefficients, done.record.coefficients)
-    np.testing.assert_array_equal(again.covariance, done.record.covariance)
+    np.testing.assert_array_equal(again.coefficients, done.result.coefficients)
+    np.testing.assert_array_equal(again.covariance, done.result.covariance)
 
 
 def test_two_coupled_positions() -> None:
@@ -144,8 +145,8 @@ def test_what_cannot_be_done_is_said() -> None:
     with pytest.raises(NumericalFailure, match="v_x is recorded"):
         velocity_names(["x", "v_x"])
     given = replace(SETTINGS, space=StateSpace(diffusion="identity"))
-    done = results.identify_run(given, identified()[1], number=0)
-    assert done.record is None and "leave the diffusion out" in done.outcome.reason
+    done = pipeline.identify_run(given, identified()[1], number=0)
+    assert done.result is None and "leave the diffusion out" in done.outcome.reason
 
 
 def test_one_record_of_smooth_positions_is_enough(tmp_path: Path) -> None:
@@ -159,12 +160,12 @@ def test_one_record_of_smooth_positions_is_enough(tmp_path: Path) -> None:
         PipelineSettings(identification=IdentificationOptions(hidden_velocities=key)) for key in (False, True)
     )
     with pytest.raises(InputError, match="positions of something that has inertia, set 'identification"):
-        results.source_of(path, alone)
-    drawn = results.draw_run(hidden, results.source_of(path, hidden), number=0).recordings
+        source_of(path, alone)
+    drawn = pipeline.draw_run(hidden, source_of(path, hidden), number=0).result
     assert drawn is not None and len(drawn.labels) >= FEWEST_STRETCHES
-    done = results.identify_run(SETTINGS, drawn, number=0)
-    assert done.record is not None and done.record.prediction.passed
-    field = done.record
+    done = pipeline.identify_run(SETTINGS, drawn, number=0)
+    assert done.result is not None and done.result.prediction.passed
+    field = done.result
     assert [field.library.names[k] for _, k in field.support] == ["v_x", "x", "v_x", "x**3"]
 
 
@@ -183,12 +184,12 @@ def ring_downs(positions: int = 1) -> Recordings:
 
 
 def test_ring_downs_have_no_random_forces_and_the_unit_matrix_of_the_velocities() -> None:
-    done = results.identify_run(SETTINGS, ring_downs(), number=0)
-    assert done.record is not None and done.record.prediction.passed
-    assert done.record.diffusion_source == DiffusionSource.UNIT_OF_VELOCITIES
-    assert done.record.noise_strength is None and done.record.diagnosis.kind == "sensor"
-    assert done.record.diagnosis.measurement[0] == pytest.approx(0.005, rel=0.05)
-    field = done.record
+    done = pipeline.identify_run(SETTINGS, ring_downs(), number=0)
+    assert done.result is not None and done.result.prediction.passed
+    assert done.result.diffusion_source == DiffusionSource.UNIT_OF_VELOCITIES
+    assert done.result.noise_strength is None and done.result.diagnosis.kind == "sensor"
+    assert done.result.diagnosis.measurement[0] == pytest.approx(0.005, rel=0.05)
+    field = done.result
     assert not field.noise_rate.any()
     np.testing.assert_array_equal(field.diffusion.matrix, [[0, 0], [0, 1]])
     errors = np.sqrt(np.diag(field.covariance))[1:]
@@ -204,8 +205,8 @@ def test_ring_downs_of_positions_in_different_units_show_no_unit_matrix(
     still = replace(found, noise_rate=0 * found.noise_rate)
     monkeypatch.setattr(identify, "identify_by_likelihood", lambda *_, **__: still)
     several = replace(ring_downs(2), units=("m", "rad"))
-    done = results.identify_run(SETTINGS, several, number=0)
-    assert done.record is None and "scale them to one unit" in done.outcome.reason
+    done = pipeline.identify_run(SETTINGS, several, number=0)
+    assert done.result is None and "scale them to one unit" in done.outcome.reason
 
 
 def test_what_is_known_exactly_has_no_axis() -> None:

@@ -10,7 +10,7 @@ from siq.data.recordings import Recordings
 from siq.errors import NumericalFailure
 from siq.inference.library import IdentificationOptions
 from siq.inference.observation import inertia_test
-from siq.workflow import results
+from siq.workflow import pipeline
 from siq.workflow.pipeline import PipelineSettings
 from siq.workflow.tables import Status
 
@@ -64,7 +64,7 @@ def test_it_is_of_one_position() -> None:
 
 def test_a_position_alone_is_refused_and_the_option_named() -> None:
     settings = PipelineSettings(identification=IdentificationOptions(degree=3))
-    done = results.identify_run(settings, particle(1, records=4)[0], number=0)
+    done = pipeline.identify_run(settings, particle(1, records=4)[0], number=0)
     assert done.outcome.status in (Status.WARNING, Status.FAILED)
     assert "identification.hidden_velocities: true" in done.outcome.reason
     assert "has inertia" in done.outcome.reason
@@ -72,8 +72,8 @@ def test_a_position_alone_is_refused_and_the_option_named() -> None:
 
 def test_velocities_of_a_position_without_inertia_are_refused_and_the_option_named() -> None:
     settings = PipelineSettings(identification=IdentificationOptions(degree=3, hidden_velocities=True))
-    done = results.identify_run(settings, overdamped(3, step=0.02), number=0)
-    assert done.record is None
+    done = pipeline.identify_run(settings, overdamped(3, step=0.02), number=0)
+    assert done.result is None
     assert "leave 'identification.hidden_velocities' out" in done.outcome.reason
 
 

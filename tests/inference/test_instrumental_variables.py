@@ -15,7 +15,7 @@ from siq.inference.library import IdentificationOptions, field_library
 from siq.inference.regression import coarse_pairs, identify_vector_field, lagged_pairs, lost_time, refit
 from siq.quasipotential.landscape import Landscape
 from siq.workflow.pipeline import PipelineSettings
-from siq.workflow.results import identify_run as identify_step
+from siq.workflow.pipeline import identify_run as identify_step
 
 OPTIONS = IdentificationOptions(degree=3)
 
@@ -96,11 +96,11 @@ def test_gaps_everywhere_are_refused_in_a_sentence() -> None:
 def test_the_step_says_that_it_looked_from_earlier() -> None:
     recordings = recorded(double_wells(1, memory=3.0, samples=10_000))
     found = identify_step(PipelineSettings(), recordings, number=0)
-    assert found.record is not None
-    assert found.record.memory is not None
-    assert found.record.prediction.passed
+    assert found.result is not None
+    assert found.result.memory is not None
+    assert found.result.prediction.passed
     assert "the recordings are Markovian" in found.outcome.reason
-    strength = found.record.noise_strength
+    strength = found.result.noise_strength
     assert strength is not None
     assert abs(strength[0] - 0.2) < 4 * strength[1]
 

@@ -23,7 +23,7 @@ from siq.inference.library import IdentificationOptions, candidate_library
 from siq.inference.observation import ObservationModel, unbroken
 from siq.inference.regression import identify_vector_field
 from siq.systems.diffusion import Diffusion
-from siq.workflow import results
+from siq.workflow import pipeline
 from siq.workflow.pipeline import PipelineSettings
 from siq.workflow.tables import Status
 
@@ -151,14 +151,14 @@ def test_means_over_an_exposure_are_treated_as_such() -> None:
     means += 0.03 * generator.standard_normal(means.shape)
     recordings = Recordings.from_arrays(step * np.arange(samples), means.T[:, :, None], names=["x"])
     settings = PipelineSettings()
-    done = results.identify_run(settings, recordings, number=0)
-    assert done.record is not None and done.record.exposure == pytest.approx(step)
-    field = done.record
+    done = pipeline.identify_run(settings, recordings, number=0)
+    assert done.result is not None and done.result.exposure == pytest.approx(step)
+    field = done.result
     assert [field.library.names[k] for _, k in field.support] == ["x", "x**3"]
     assert (np.abs(field.values - [1, -1]) < 3.5 * np.sqrt(np.diag(field.covariance))).all()
     assert field.noise_rate[0, 0] == pytest.approx(FORCES, rel=0.05)
-    assert done.record.sensor_variance is not None
-    assert np.sqrt(done.record.sensor_variance[0]) == pytest.approx(0.03, rel=0.1)
+    assert done.result.sensor_variance is not None
+    assert np.sqrt(done.result.sensor_variance[0]) == pytest.approx(0.03, rel=0.1)
     assert "as the mean over the 0.04 before it" in done.outcome.reason
 
 
@@ -172,10 +172,10 @@ def test_a_gap_begins_another_recording() -> None:
 def test_the_step_asks_the_likelihood_where_sensors_are_noisy() -> None:
     recordings, _ = double_well(2, samples=2000)
     settings = PipelineSettings()
-    done = results.identify_run(settings, recordings, number=0)
-    assert done.record is not None and done.outcome.status == Status.OK
-    assert done.record.sensor_variance is not None
-    assert np.sqrt(done.record.sensor_variance[0]) == pytest.approx(SENSOR, rel=0.1)
+    done = pipeline.identify_run(settings, recordings, number=0)
+    assert done.result is not None and done.outcome.status == Status.OK
+    assert done.result.sensor_variance is not None
+    assert np.sqrt(done.result.sensor_variance[0]) == pytest.approx(SENSOR, rel=0.1)
     assert "measurement noise" in done.outcome.reason
 
 

@@ -13,7 +13,7 @@ from siq.inference.field_estimate import HARMLESS_BIAS
 from siq.inference.library import IdentificationOptions, candidate_library
 from siq.inference.regression import identify_vector_field
 from siq.remarks import has_code
-from siq.workflow import results
+from siq.workflow import pipeline
 from siq.workflow.pipeline import PipelineSettings
 from siq.workflow.tables import Status
 
@@ -40,13 +40,13 @@ def identified(recordings: Recordings):  # type: ignore[no-untyped-def]
 @pytest.mark.parametrize("decimals", [3, 5])
 def test_rounded_recordings_give_formulas_and_it_is_said(decimals: int) -> None:
     settings = PipelineSettings()
-    found = results.identify_run(settings, settling(decimals), number=0)
-    assert found.record is not None and found.outcome.status == Status.OK
+    found = pipeline.identify_run(settings, settling(decimals), number=0)
+    assert found.result is not None and found.outcome.status == Status.OK
     error = {3: "0.0003", 5: "3e-06"}[decimals]
     said = f"'x' and 'y' are written to {decimals} decimals, an error of {error} µm in each value"
     assert said in found.outcome.reason
-    assert found.record.diagnosis.kind == "rounding" and found.record.diagnosis.intensity == 0.0
-    field = found.record
+    assert found.result.diagnosis.kind == "rounding" and found.result.diagnosis.intensity == 0.0
+    field = found.result
     np.testing.assert_array_equal(field.support[:, 0], [0, 1])
     errors = np.sqrt(np.diag(field.covariance))
     assert (np.abs(field.values - [-1, -2]) < 3 * errors).all()

@@ -15,7 +15,7 @@ from siq.inference.measurements import Measurements
 from siq.inference.observation import ObservationModel
 from siq.quasipotential.landscape import Landscape
 from siq.systems.diffusion import Diffusion
-from siq.workflow import results
+from siq.workflow import pipeline
 from siq.workflow.pipeline import PipelineSettings
 
 STEP, STRENGTH, SENSOR = 0.02, 0.3, 0.1
@@ -107,18 +107,18 @@ def test_a_formula_that_is_no_covariance_somewhere_drives_nothing_there() -> Non
 
 
 def test_the_step_finds_d_of_the_state_beside_the_sensor() -> None:
-    done = results.identify_run(
+    done = pipeline.identify_run(
         PipelineSettings(),
         records(3, slope=0.4, samples=2500),
         number=0,
     )
-    assert done.record is not None and done.record.prediction.passed
-    found = done.record
+    assert done.result is not None and done.result.prediction.passed
+    found = done.result
     assert [found.library.names[k] for _, k in found.support] == ["x", "x**3"]
     assert (np.abs(found.values - [1, -1]) < 3 * np.sqrt(np.diag(found.covariance))).all()
     assert found.noise is not None and found.constant_noise is None
-    assert np.sqrt(done.record.sensor_variance) == pytest.approx([SENSOR], rel=0.03)
-    strength = done.record.noise_strength
+    assert np.sqrt(done.result.sensor_variance) == pytest.approx([SENSOR], rel=0.03)
+    strength = done.result.noise_strength
     assert strength is not None and 0 < strength[1] < 0.1 * strength[0]
 
 

@@ -11,7 +11,7 @@ from siq.inference.library import CandidateLibrary, candidate_library
 from siq.networks.regression import RegressionOptions, RegressionResult, points_below, sparse_decomposition
 from siq.quasipotential.formulas import term_coefficients
 from siq.systems.diffusion import Diffusion
-from siq.workflow.scoring import _exact_values
+from workflow.scoring import _exact_values
 
 pytestmark = pytest.mark.portable
 

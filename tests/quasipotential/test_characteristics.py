@@ -40,7 +40,7 @@ from siq.quasipotential.characteristics import (
 )
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
-from siq.workflow.scoring import _exact_values
+from workflow.scoring import _exact_values
 
 WELL = np.array([[-2.0, 0.0], [-1.5, 1.5]])  # of Maier–Stein's system, up to the separatrix
 SADDLE_LEVEL = 0.25  # of V along the axis; the barrier itself is lower for β > 4

@@ -16,9 +16,9 @@ from siq.remarks import Remark, sentence
 from siq.report.landscape import comparison_table
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
-from siq.workflow import comparison
 from siq.workflow.study import PipelineSettings
 from siq.workflow.tables import COLUMNS
+from workflow import comparison
 
 X, Y = sympy.symbols("x y", real=True)
 NOISE = 0.05

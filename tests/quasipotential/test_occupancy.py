@@ -19,7 +19,7 @@ from siq.quasipotential.occupancy import (
 )
 from siq.quasipotential.rates import NoiseStrength
 from siq.systems.phase_portrait import PhasePortrait, phase_portrait
-from siq.workflow import results
+from siq.workflow import pipeline
 from siq.workflow.pipeline import PipelineSettings
 
 STEP, WITHIN, SAMPLES, RECORDS, INTENSITY = 0.05, 5, 4000, 10, 0.25
@@ -37,10 +37,10 @@ def recorded() -> RECORDED:
             kick = np.sqrt(INTENSITY * step) * generator.standard_normal(RECORDS)
             state = state + step * (state - state**3) + kick
     recordings = Recordings.from_arrays(STEP * np.arange(SAMPLES), values, names=["x"])
-    found = results.identify_run(PipelineSettings(), recordings, number=0)
-    assert found.record is not None
-    portrait = phase_portrait(found.record.dynamics, recordings.values[::40], seed=0)
-    return recordings, found.record, portrait, held_out_recordings(recordings, generator=generator)
+    found = pipeline.identify_run(PipelineSettings(), recordings, number=0)
+    assert found.result is not None
+    portrait = phase_portrait(found.result.dynamics, recordings.values[::40], seed=0)
+    return recordings, found.result, portrait, held_out_recordings(recordings, generator=generator)
 
 
 def compared(recorded: RECORDED, intensity: float = INTENSITY) -> OccupancyCheck:

@@ -6,9 +6,9 @@ import pytest
 
 from siq.report.formatting import paragraphs
 from siq.report.study_page import _control_counts, _run_figures
-from siq.workflow.published import PublishedFigure
-from siq.workflow.scoring import summary_table
 from siq.workflow.tables import as_table
+from workflow.published import PublishedFigure
+from workflow.scoring import summary_table
 
 PUBLISHED = {"rrmse": PublishedFigure(mean=1e-3, source="paper")}
 

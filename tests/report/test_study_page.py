@@ -18,9 +18,10 @@ from siq.report.page import LEADING, OF_NETWORKS, OF_RUNS, ReportContent, Report
 from siq.report.study_page import StudyResults, study_page
 from siq.report.summary import summarise
 from siq.systems.dynamics import Dynamics
-from siq.workflow.scoring import ModelFiles, _coefficient_table, shown_formula, summary_table
+from siq.workflow.models import ModelFiles, shown_formula
 from siq.workflow.study import Study
 from siq.workflow.tables import COLUMNS, Method, as_table
+from workflow.scoring import _coefficient_table, summary_table
 
 CAPTIONS = {name: caption["text"] for name, caption in texts("captions")["figures"].items()}
 OF_ONE_STATE = texts("captions")["lead"]["one_state"]

@@ -11,9 +11,9 @@ from benchmarks.publication.page import Paper, Results, render_reproduction, rep
 from benchmarks.publication.publication import Parameters, Place
 from siq.quasipotential.formulas import read_model
 from siq.systems.cards import load_system
-from siq.workflow.published import load_published
 from siq.workflow.study import completed, load_study, settings_of
 from siq.workflow.tables import COLUMNS
+from workflow.published import load_published
 
 pytestmark = pytest.mark.workflow
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from siq.errors import InputError
-from siq.workflow.tables import read_table
 from workflow.cases import CARD, STUDY, Cases
+from workflow.files import read_table
 
 CARD_TEXT = """\
 name: spring

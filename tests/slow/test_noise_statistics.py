@@ -17,7 +17,7 @@ from siq.networks.regression import RegressionOptions
 from siq.quasipotential.formulas import term_coefficients
 from siq.systems.cards import load_system
 from siq.systems.simulation import SimulationOptions
-from siq.workflow import results
+from siq.workflow import pipeline
 from siq.workflow.pipeline import PipelineSettings, analyse
 from siq.workflow.study import Sampling, StateSpace
 from siq.workflow.tables import Method
@@ -85,7 +85,7 @@ def one_run(run: int):
         landscape=None,
     )
     drawing = replace(settings, seed=SEED, sampling=sampling, simulation=SIMULATION)
-    recordings = results.draw_run(drawing, load_system(CARD), number=run).recordings
+    recordings = pipeline.draw_run(drawing, load_system(CARD), number=run).result
     x = snapshot_pairs(recordings, pair_step=sampling.pair_step).x0
     formulas = analyse(recordings, settings, number=run).refined.formulas[Method.REFINED]
     components = formulas.components()

@@ -29,8 +29,8 @@ def by_default(known: KnownSystem) -> tuple[Analysis, np.ndarray]:
 
 
 def barriers_of(found: Analysis) -> np.ndarray:
-    assert found.landscape is not None and found.landscape.landscape is not None
-    return found.landscape.landscape.barriers()["barrier"].to_numpy()
+    assert found.landscape is not None and found.landscape.result is not None
+    return found.landscape.result.barriers()["barrier"].to_numpy()
 
 
 @pytest.mark.parametrize("name", SYSTEMS)

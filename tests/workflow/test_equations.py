@@ -30,7 +30,7 @@ from siq.systems.cards import load_system
 from siq.systems.cycles import hessians_along
 from siq.systems.dynamics import Dynamics
 from siq.validation.mesh import mesh_quasipotential
-from siq.workflow.results import _landscape_rows
+from workflow.rows import landscape_rows
 
 X, Y, Z = sympy.symbols("x y z", real=True)
 SYSTEMS = Path(__file__).parents[2] / "config" / "systems"
@@ -223,7 +223,7 @@ def test_a_limit_cycle_is_an_attractor_without_a_formula() -> None:
     across = cycle.points / np.linalg.norm(cycle.points, axis=1, keepdims=True)
     curvature = np.einsum("ni,nij,nj->n", across, hessians_along(landscape.dynamics, cycle), across)
     np.testing.assert_allclose(curvature, 2, rtol=1e-7)
-    rows = _landscape_rows(0, landscape).set_index("kind")
+    rows = landscape_rows(0, landscape).set_index("kind")
     assert rows.loc["cycle", "item"] == "A1" and rows.loc["cycle", "note"].startswith("period 3.1415927")
     (stored,) = landscape_data(landscape)["wells"]
     assert stored["cycle"]["period"] == cycle.period and len(stored["cycle"]["points"]) == len(cycle.points)

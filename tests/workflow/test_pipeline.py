@@ -11,16 +11,16 @@ from known_systems import as_system, double_well, potential_gradient, potential_
 
 from siq.data.recordings import Recordings
 from siq.errors import NumericalFailure
-from siq.networks.decomposition import CheckOptions, TrainingOptions
+from siq.networks.decomposition import CheckOptions, TrainedNetworks, TrainingOptions
 from siq.networks.regression import RegressionOptions
 from siq.quasipotential.formulas import exact_decomposition, model_to_data
 from siq.quasipotential.refinement import RefinementOptions
 from siq.systems.simulation import SimulationOptions
-from siq.workflow import results, scoring, training
+from siq.workflow import pipeline, training
 from siq.workflow.pipeline import Analysis, PipelineSettings, analyse
 from siq.workflow.study import Sampling, StateSpace
-from siq.workflow.tables import COLUMNS, Method, Outcome, Status, Step
-from siq.workflow.training import TrainedRun, _not_trained
+from siq.workflow.tables import COLUMNS, Method, Outcome, Status, Step, StepResult
+from workflow import scoring
 
 KNOWN = double_well(2)
 SYSTEM = as_system(KNOWN)
@@ -41,14 +41,19 @@ BRIEF = replace(
 )
 
 
-def drawn(*, number: int = 0) -> results.Drawn:
+FAILED: StepResult[TrainedNetworks] = StepResult(
+    None, Outcome(0, Step.TRAIN, Status.FAILED, "the loss became infinite")
+)
+
+
+def drawn(*, number: int = 0) -> StepResult[Recordings]:
     settings = replace(SETTINGS, simulation=SIMULATION)
-    return results.draw_run(settings, SYSTEM, number=number)
+    return pipeline.draw_run(settings, SYSTEM, number=number)
 
 
 @pytest.fixture(scope="module")
 def recordings() -> Recordings:
-    found = drawn().recordings
+    found = drawn().result
     assert found is not None
     return found
 
@@ -73,8 +78,8 @@ def test_v_and_its_barriers_are_right(analysis: Analysis) -> None:
     x = np.random.default_rng(0).uniform(-1, 1, size=(50, 2))
     ours = refined.evaluate_gradient(np.ascontiguousarray(x.T)).T
     assert np.abs(ours - potential_gradient(KNOWN, x)).max() < 1e-5
-    assert analysis.landscape is not None and analysis.landscape.landscape is not None
-    found = analysis.landscape.landscape
+    assert analysis.landscape is not None and analysis.landscape.result is not None
+    found = analysis.landscape.result
     for way in found.transitions:
         saddle, bottom = way.saddle.position, found.attractors[way.start].position
         top, low = potential_values(KNOWN, np.stack([saddle, bottom]))
@@ -86,14 +91,14 @@ def test_the_same_seed_gives_the_same_and_another_run_another_answer(recordings:
     one, same = analyse(recordings, settings), analyse(recordings, settings)
     assert one.landscape is None
     assert one.refined.certificates == same.refined.certificates
-    first, second = drawn(number=0).recordings, drawn(number=1).recordings
+    first, second = drawn(number=0).result, drawn(number=1).result
     assert first is not None and second is not None and not np.array_equal(first.values, second.values)
 
 
 def test_networks_take_part_where_settings_ask_for_them(recordings: Recordings) -> None:
     settings = replace(SETTINGS, training=BRIEF, published_method=False, landscape=None)
     found = analyse(recordings, settings, device="cpu")
-    assert found.trained.networks is not None and found.trained.outcome.status == Status.OK
+    assert found.trained.result is not None and found.trained.outcome.status == Status.OK
     # Here refinement finds the true V from random weights too: no false solution, and it says so.
     control = found.refined.certificates[Method.CONTROL]
     assert control["certified"] is True and control["tests"]["same_as_refined"]["passed"] is True
@@ -131,14 +136,13 @@ def test_the_regression_does_not_steer_the_refined_formulas(
 
 def test_networks_are_trained_with_the_d_that_the_noise_shows() -> None:
     noisy = replace(SIMULATION, pairs=40, noise_intensity=0.02)
-    found = results.draw_run(PipelineSettings(seed=3, simulation=noisy), SYSTEM, number=0).recordings
+    found = pipeline.draw_run(PipelineSettings(seed=3, simulation=noisy), SYSTEM, number=0).result
     assert found is not None
     settings = PipelineSettings(
         sampling=Sampling(0.01, 0.002), training=replace(BRIEF, matching="explicit", steps=2)
     )
-    record = results.identify_run(settings, found, number=0).record
-    runs = {0: training.RunToTrain(found, record)}
-    networks = training.train_block(settings, runs, device="cpu").networks[0]
+    record = pipeline.identify_run(settings, found, number=0).result
+    networks = training.train_block(settings, {0: (found, record)}, device="cpu")[0][0].result
     assert record is not None and networks is not None
     np.testing.assert_allclose(networks.diffusion, record.diffusion.matrix, rtol=1e-6)
     shape = KNOWN.diffusion / np.sqrt(np.linalg.det(KNOWN.diffusion))
@@ -147,19 +151,19 @@ def test_networks_are_trained_with_the_d_that_the_noise_shows() -> None:
 
 def test_a_run_without_trajectories_is_skipped_by_every_step_after() -> None:
     settings = SETTINGS
-    nothing = results.identify_run(settings, None, number=5)
+    nothing = pipeline.identify_run(settings, None, number=5)
     assert (nothing.outcome.run, nothing.outcome.status) == (5, Status.SKIPPED)
     told = replace(SETTINGS, training=BRIEF)
-    trained = training.train_block(told, {5: training.RunToTrain(None, None)})
-    assert not trained.networks
-    assert trained.outcomes[0].reason == "the run has no trajectories"
+    trained, networks, _ = training.train_block(told, {5: (None, None)})
+    assert not networks and trained[5].result is None
+    assert trained[5].outcome.reason == "the run has no trajectories"
 
 
 def test_a_simulation_that_runs_to_infinity_fails_and_says_so() -> None:
     away = replace(SYSTEM, equations=tuple(symbol**3 for symbol in SYSTEM.symbols))
     settings = PipelineSettings(simulation=replace(SIMULATION, interval=2.0))
-    found = results.draw_run(settings, away, number=2)
-    assert found.recordings is None
+    found = pipeline.draw_run(settings, away, number=2)
+    assert found.result is None
     assert (found.outcome.step, found.outcome.status) == (Step.SIMULATE, Status.FAILED)
 
 
@@ -167,8 +171,8 @@ def test_recordings_are_taken_whole_by_the_first_run_and_resampled_by_others(
     recordings: Recordings,
 ) -> None:
     settings = PipelineSettings()
-    first, second = (results.draw_run(settings, recordings, number=number) for number in (0, 1))
-    assert first.recordings is recordings and second.recordings is not recordings
+    first, second = (pipeline.draw_run(settings, recordings, number=number) for number in (0, 1))
+    assert first.result is recordings and second.result is not recordings
     assert first.outcome.step == second.outcome.step == Step.RESAMPLE
 
 
@@ -178,11 +182,11 @@ def test_why_a_check_could_not_be_prepared_is_the_reason(
     def refuse(*arguments: object, **named: object) -> None:
         raise NumericalFailure("the attractors cannot be told apart")
 
-    monkeypatch.setattr("siq.quasipotential.refinement.TrainingCheck", refuse)
+    monkeypatch.setattr(training, "TrainingCheck", refuse)
     options = replace(BRIEF, check=CheckOptions(first=10, every=10, attempts=2))
     settings = replace(SETTINGS, training=options)
-    runs = {0: training.RunToTrain(recordings, analysis.identified.record)}
-    said = training.train_block(settings, runs, device="cpu").outcomes[0]
+    runs = {0: (recordings, analysis.identified.result)}
+    said = training.train_block(settings, runs, device="cpu")[0][0].outcome
     assert said.status == Status.WARNING
     assert said.reason.endswith("could not be prepared: the attractors cannot be told apart")
 
@@ -193,12 +197,8 @@ def test_why_a_check_could_not_be_prepared_is_the_reason(
 def test_why_a_training_failed_is_what_refinement_says_first(
     recordings: Recordings, analysis: Analysis, routes: tuple[str, ...] | None
 ) -> None:
-    failed = TrainedRun(None, Outcome(0, Step.TRAIN, Status.FAILED, "the loss became infinite"))
     options = replace(SETTINGS, refinement=RefinementOptions(routes=routes, degrees=(2,)))
-    found = results.refine_run(
-        options,
-        results.RunToRefine(recordings, analysis.identified, failed),
-    )
+    found = pipeline.refine_run(options, recordings, analysis.identified, FAILED)
     assert found.outcome.status != Status.OK
     assert found.outcome.reason.startswith("the training gave no networks (the loss became infinite)")
 
@@ -206,11 +206,7 @@ def test_why_a_training_failed_is_what_refinement_says_first(
 def test_where_refinement_needs_no_networks_their_failure_is_a_note(
     recordings: Recordings, analysis: Analysis
 ) -> None:
-    failed = TrainedRun(None, Outcome(0, Step.TRAIN, Status.FAILED, "the loss became infinite"))
-    found = results.refine_run(
-        SETTINGS,
-        results.RunToRefine(recordings, analysis.identified, failed),
-    )
+    found = pipeline.refine_run(SETTINGS, recordings, analysis.identified, FAILED)
     assert found.outcome.status == Status.OK
     notes = found.certificates[Method.REFINED]["notes"]
     assert notes[0] == "the training gave no networks (the loss became infinite)"
@@ -222,14 +218,11 @@ def test_scores_are_in_the_columns_of_the_contract(analysis: Analysis) -> None:
     formulas = {str(name): one for name, one in analysis.refined.formulas.items()}
     assert KNOWN.potential is not None
     exact = exact_decomposition(SYSTEM, 2 * KNOWN.potential)
-    given = scoring.RunToScore(formulas, certificates, _not_trained(0), SYSTEM, exact)
-    found = scoring.score_run(settings, given)
-    assert found.outcome == Outcome(0, Step.SCORE)
+    found = scoring.score_run(settings, formulas, certificates, None, number=0, system=SYSTEM, exact=exact)
+    assert found["score_outcome"] == [Outcome(0, Step.SCORE)]
     for name in ("coefficients", "rrmse", "prediction", "certificates"):
-        assert list(getattr(found, name).columns) == list(COLUMNS[name])
-    errors = found.rrmse.set_index("method")["rrmse"]
+        assert list(found[name].columns) == list(COLUMNS[name])
+    errors = found["rrmse"].set_index("method")["rrmse"]
     assert errors["refined"] < 1e-5 and np.isnan(errors["regression"])
-    skipped = scoring.score_run(
-        settings, scoring.RunToScore({}, {}, TrainedRun(None, Outcome(0, Step.TRAIN)))
-    )
-    assert skipped.outcome.reason == "there is no formula to score"
+    (skipped,) = scoring.score_run(settings, {}, {}, None, number=0)["score_outcome"]
+    assert skipped.reason == "there is no formula to score"

@@ -25,8 +25,8 @@ def refused(found: Analysis) -> bool:
 @pytest.mark.skipif(not ICE.is_file(), reason="the recordings are not at hand")
 def test_dust_in_the_ice_has_two_states_whose_barrier_is_not_resolved() -> None:
     found = analyse(read_recordings(ICE, columns=["lnCa"]))
-    assert refused(found) and found.landscape is not None and found.landscape.landscape is not None
-    landscape = found.landscape.landscape
+    assert refused(found) and found.landscape is not None and found.landscape.result is not None
+    landscape = found.landscape.result
     places = np.array([one.position[0] for one in landscape.attractors])
     assert np.allclose(places, [4.0, 5.55], atol=0.25)
     visits = landscape.visits

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from siq.workflow.scoring import ModelFiles, Shown, shown_formula
+from siq.workflow.models import ModelFiles, Shown, shown_formula
 from siq.workflow.tables import Method
 
 

@@ -13,9 +13,9 @@ from siq.networks.regression import RegressionOptions
 from siq.quasipotential.landscape import LandscapeOptions
 from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import SimulationEntry, SimulationOptions
-from siq.workflow.published import load_published
 from siq.workflow.study import load_study, load_study_system, settings_of
 from siq.workflow.tables import Method
+from workflow.published import load_published
 
 Write = Callable[..., Path]
 CONFIG = Path(__file__).parents[2] / "config"

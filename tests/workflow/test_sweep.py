@@ -9,9 +9,9 @@ from siq.errors import InputError
 from siq.quasipotential.landscape import Landscape
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
-from siq.workflow.files import write
 from siq.workflow.study import PipelineSettings
 from siq.workflow.sweep import ALONE, Sweep, SweptPoint, _with_parameters, collected, point_at, sweep
+from workflow.files import write
 
 h, a, x, y = sympy.symbols("h a x y", real=True)
 FOLD = 2 / (3 * np.sqrt(3))

@@ -7,7 +7,9 @@ import pandas as pd
 import pytest
 
 from siq.errors import InputError
-from siq.workflow.tables import COLUMNS, as_table, concatenate, read_table, write_table
+from siq.workflow.tables import COLUMNS, as_table
+from workflow.files import read_table, write_table
+from workflow.rows import concatenate
 
 
 def coefficients(seed: int = 0, count: int = 200) -> pd.DataFrame:

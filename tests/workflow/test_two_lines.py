@@ -16,8 +16,8 @@ from siq.workflow.tables import Method
 
 
 def landscape_of(found: Analysis) -> Landscape:
-    assert found.landscape is not None and found.landscape.landscape is not None
-    return found.landscape.landscape
+    assert found.landscape is not None and found.landscape.result is not None
+    return found.landscape.result
 
 
 def test_of_a_system_they_give_the_certified_landscape(tmp_path: Path) -> None:

@@ -25,8 +25,7 @@ from siq.report.summary import LandscapeSummary, energy_unit
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import compile_formulas
 from siq.systems.simulation import simulate_snapshots
-from siq.workflow.published import PublishedFigure, published_formula
-from siq.workflow.scoring import ModelFiles, Shown
+from siq.workflow.models import ModelFiles, Shown
 from siq.workflow.study import PipelineSettings, StateSpace, Study, SweepOptions
 from siq.workflow.tables import METHODS, Method
 from workflow.figures.comparison import plot_degrees, plot_error_curves, plot_error_maps, plot_escape
@@ -38,6 +37,7 @@ from workflow.figures.runs import (
     plot_inclusion,
     plot_training,
 )
+from workflow.published import PublishedFigure, published_formula
 
 
 def _project(
@@ -285,7 +285,7 @@ def representative_run(
     Parameters
     ----------
     shown
-        The formula that is shown, see `siq.workflow.scoring.shown_formula`.
+        The formula that is shown, see `siq.workflow.models.shown_formula`.
     models
         The formulas of all runs.
     complete

@@ -9,9 +9,9 @@ from siq.errors import InputError
 from siq.numerics.files import files_of
 from siq.report.formatting import texts
 from siq.workflow.answers import Exit, answer_of_page
-from siq.workflow.published import load_published
 from siq.workflow.study import point_name
 from workflow.places import config_path, find_file
+from workflow.published import load_published
 from workflow.settings import Studies, prepare_environment
 from workflow.tasks import TASKS
 from workflow.versions import versions

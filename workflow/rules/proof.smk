@@ -83,7 +83,7 @@ rule blind_diagnosis:
     input:
         cases="results/proof/{proof}/cases/{batch}",
         digests="results/proof/{proof}/digests.json",
-        dictionary="siq/diagnosis/mechanisms.yaml",
+        dictionary=DICTIONARY,
     output:
         verdicts="results/proof/{proof}/verdicts/{batch}.json",
     log:

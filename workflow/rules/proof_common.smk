@@ -1,5 +1,8 @@
 # What the rules of the proofs share: sets of cases, their batches and keys.
+import siq
 from benchmarks.proof.sets import FOREIGN, load_proofs
+
+DICTIONARY = str(Path(siq.__file__).parent / "diagnosis" / "mechanisms.yaml")
 
 try:
     PROOF_SETS = load_proofs(config_path("proof.yaml"))

@@ -1,5 +1,5 @@
 # The science in its order: draw trajectories, identify f, train two networks, regress and refine formulas of V, score
-# every run, collect all of them. A rule says which files its task reads and makes; the tasks are in siq/workflow/steps.py.
+# every run, collect all of them. A rule says which files its task reads and makes; the tasks are in workflow/steps.py.
 
 
 rule draw:

@@ -15,11 +15,11 @@ from siq.quasipotential.landscape import LandscapeOptions
 from siq.quasipotential.landscape_files import write_landscape
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
-from siq.workflow import comparison
-from siq.workflow.comparison import first_stored
 from siq.workflow.pipeline import Analysis
 from siq.workflow.study import PipelineSettings
 from siq.workflow.tables import Method
+from workflow import comparison
+from workflow.comparison import first_stored
 
 CARD = Path(__file__).parents[2] / "config" / "systems" / "maier-stein.yaml"
 INTENSITY = 0.15  # ΔU/ε = 3.3: walkers settle, and change wells, within a short simulation
@@ -34,10 +34,10 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Analysis:
 def files(found: Analysis, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("run")
     field, landscape = folder / "vector_field.json", folder / "quasipotential.json"
-    record = found.identified.record
-    assert record is not None and found.landscape is not None and found.landscape.landscape is not None
+    record = found.identified.result
+    assert record is not None and found.landscape is not None and found.landscape.result is not None
     write_field(field, record, IdentificationOptions())
-    write_landscape(landscape, found.landscape.landscape)
+    write_landscape(landscape, found.landscape.result)
     return field, landscape
 
 
@@ -61,11 +61,11 @@ def test_the_first_landscape_with_heights_is_read_and_gives_the_same_u(
     empty = tmp_path / "empty.json"
     empty.touch()
     first = first_stored([empty, field], [empty, landscape])
-    assert first is not None and found.landscape is not None and found.landscape.landscape is not None
+    assert first is not None and found.landscape is not None and found.landscape.result is not None
     assert first[0] == 1
     x = np.array([[1.0, 0.0], [-0.7, 0.1], [0.5, -0.2]])
     assert first[1].global_quasipotential is not None
-    np.testing.assert_allclose(first[1].quasipotential(x), found.landscape.landscape.quasipotential(x))
+    np.testing.assert_allclose(first[1].quasipotential(x), found.landscape.result.quasipotential(x))
 
 
 def test_the_density_of_two_like_wells_is_that_of_a_simulation(
@@ -73,30 +73,36 @@ def test_the_density_of_two_like_wells_is_that_of_a_simulation(
 ) -> None:
     first = first_stored([files[0]], [files[1]])
     assert first is not None
-    got = comparison.compare_invariant(asked(INTENSITY), system, comparison.LandscapeShown(*first), {})
-    row = got.table.iloc[0]
-    assert row["simulated_distance"] < 2 * row["sampling_floor"]
-    np.testing.assert_allclose(got.shares["share"], 0.5, atol=1e-3)
-    np.testing.assert_allclose(got.shares["by_rates"], 0.5, atol=1e-6)
+    table, shares, densities = comparison.compare_invariant(
+        asked(INTENSITY), system, first[1], {}, run=first[0], method="local formulas"
+    )
+    row = table.iloc[0]
+    assert row["simulated_distance"] < 2 * row["sampling_floor"] and len(densities) == 1
+    np.testing.assert_allclose(shares["share"], 0.5, atol=1e-3)
+    np.testing.assert_allclose(shares["by_rates"], 0.5, atol=1e-6)
 
 
 def test_the_density_of_a_formula_is_normalised_and_that_of_a_simulation(
     found: Analysis, system: Dynamics
 ) -> None:
     formulas = found.refined.formulas[Method.REFINED]
-    shown = comparison.FormulaShown(0, str(Method.REFINED), formulas)
-    got = comparison.compare_invariant(asked(INTENSITY), system, shown, {})
-    assert len(got.table) == 1 and got.shares.empty
+    table, shares, _ = comparison.compare_invariant(
+        asked(INTENSITY), system, formulas, {}, run=0, method=str(Method.REFINED)
+    )
+    assert len(table) == 1 and shares.empty
     axes = [np.linspace(low, high, 801) for low, high in system.box]
     u = formulas.evaluate(np.stack([x.ravel() for x in np.meshgrid(*axes, indexing="ij")]))[0] * 2
     cell = np.prod([axis[1] - axis[0] for axis in axes])
     total = np.exp(-u / INTENSITY).sum() * cell
-    assert got.table["quadrature"][0] == pytest.approx(total, rel=5e-3)
+    assert table["quadrature"][0] == pytest.approx(total, rel=5e-3)
 
 
 def test_nothing_is_simulated_where_nothing_was_asked(found: Analysis, system: Dynamics) -> None:
-    got = comparison.compare_invariant(asked(), system, None, {})
-    assert got.table.empty and got.shares.empty and got.densities == []
+    formulas = found.refined.formulas[Method.REFINED]
+    table, shares, densities = comparison.compare_invariant(
+        asked(), system, formulas, {}, run=0, method="refined"
+    )
+    assert table.empty and shares.empty and densities == []
 
 
 def test_escapes_are_simulated_beside_the_law(files: tuple[Path, Path], system: Dynamics) -> None:

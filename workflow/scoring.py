@@ -2,45 +2,31 @@
 
 Nothing here feeds back into a method. A run without formulas has no coefficients and no error; it stays in
 the tables with missing values, and where no exact answer is known the coefficients stand without one.
-`shown_formula` chooses the run that figures and pages show.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from dataclasses import dataclass as plain_dataclass
-from functools import cached_property
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from siq.data.recordings import Recordings
 from siq.inference.checks import prediction_errors
-from siq.inference.field_estimate import FieldEstimate
 from siq.inference.library import candidate_library
 from siq.networks.decomposition import TrainedNetworks, shuffled
 from siq.numerics.randomness import Purpose, generator
-from siq.quasipotential.formulas import (
-    SymbolicDecomposition,
-    exact_decomposition,
-    read_model,
-    term_coefficients,
-)
-from siq.quasipotential.landscape_files import landscape_data
-from siq.quasipotential.wells import Well
+from siq.quasipotential.formulas import SymbolicDecomposition, exact_decomposition, term_coefficients
 from siq.systems.cards import load_exact, load_system
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import compile_formulas
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
-from siq.workflow import results
-from siq.workflow.published import PublishedFigure
 from siq.workflow.study import PipelineSettings
-from siq.workflow.tables import METHODS, Method, Outcome, Status, Step, as_table, concatenate
-from siq.workflow.training import TrainedRun
+from siq.workflow.tables import METHODS, Method, Outcome, Status, Step, as_table
+from workflow.published import PublishedFigure
+from workflow.rows import certificate_rows, concatenate
 
 GRID_POINTS = 1_000_000  # the paper's grid has 100 points along each of three axes
 
@@ -205,58 +191,41 @@ COARSE = 50_000  # points of the grid on which the randomised network is scored
 UNSEEN = 1000  # trajectories that no run learns from (paper, section 3.1)
 
 
-@plain_dataclass(frozen=True)
-class RunToScore:
-    """What is scored, and by what.
+def score_run(
+    settings: PipelineSettings,
+    formulas: Mapping[str, SymbolicDecomposition],
+    certificates: Mapping[str, Mapping[str, Any]],
+    networks: TrainedNetworks | None,
+    *,
+    number: int,
+    system: Dynamics | None = None,
+    exact: SymbolicDecomposition | None = None,
+) -> dict[str, Any]:
+    """Scores of one run: tables, see `siq.workflow.tables.COLUMNS`, and the outcome, by name.
 
-    Attributes
+    Parameters
     ----------
+    settings
+        Of the study.
     formulas, certificates
         Of the run, by method.
-    trained
-        Its networks.
-    system
-        Its card, None where there is none.
-    exact
-        The exact decomposition, None where the card does not know it.
+    networks
+        Of the run, None where there are none.
+    number
+        Of the run.
+    system, exact
+        Its card and the exact decomposition, None where there is none, or where the card does not know it.
     """
-
-    formulas: Mapping[str, SymbolicDecomposition]
-    certificates: Mapping[str, Mapping[str, Any]]
-    trained: TrainedRun
-    system: Dynamics | None = None
-    exact: SymbolicDecomposition | None = None
-
-
-@plain_dataclass(frozen=True)
-class _Scored:
-    """The tables of a run, see `siq.workflow.tables.COLUMNS`, and the outcome."""
-
-    coefficients: pd.DataFrame
-    rrmse: pd.DataFrame
-    prediction: pd.DataFrame
-    certificates: pd.DataFrame
-    outcome: Outcome
-
-    def files(self) -> dict[str, Any]:
-        """By the names of the rule."""
-        names = ("coefficients", "rrmse", "prediction", "certificates")
-        return {name: getattr(self, name) for name in names} | {"score_outcome": [self.outcome]}
-
-
-def score_run(settings: PipelineSettings, given: RunToScore) -> _Scored:
-    """Scores of one run."""
-    number, system, exact = given.trained.outcome.run, given.system, given.exact
     options, tables = settings.regression, []
     errors: dict[str, dict[str, Any]] = {
         # A method without a formula stays in the table, without an error to boast of.
         str(method): {"run": number, "method": str(method), "certified": False}
         for method in Method
-        if method in settings.methods or method in given.certificates
+        if method in settings.methods or method in certificates
     }
-    for method, one in given.certificates.items():
+    for method, one in certificates.items():
         errors[method] |= {"certified": one["certified"], "stated_error": one["stated_error"]}
-    for method, identified in given.formulas.items():
+    for method, identified in formulas.items():
         library = candidate_library(
             [symbol.name for symbol in identified.symbols], degree=options.degree, further=options.functions
         )
@@ -266,29 +235,24 @@ def score_run(settings: PipelineSettings, given: RunToScore) -> _Scored:
             "rrmse": _relative_root_mean_square_error(table),
             "support_correct": _support_is_correct(table),
         }
-    if exact is not None and system is not None and given.trained.networks is not None:
+    if exact is not None and system is not None and networks is not None:
         draw = generator(settings.seed, number, Purpose.SHUFFLE)
-        known = _network_errors(given.trained.networks, system.box, exact, draw)
+        known = _network_errors(networks, system.box, exact, draw)
         for method, row in errors.items():
             row["network_error"] = known[method]
     predicted = as_table("prediction", [])
-    if system is not None and settings.simulation is not None and given.formulas:
-        predicted = _predictions(system, given.formulas, number, settings.simulation, settings.seed)
-    return _Scored(
-        coefficients=concatenate("coefficients", tables),
-        rrmse=as_table("rrmse", list(errors.values())),
-        prediction=predicted,
-        certificates=_certificate_table(number, given.certificates),
-        outcome=_outcome(number, has_formulas=bool(given.formulas), known=exact is not None),
-    )
-
-
-def _outcome(number: int, *, has_formulas: bool, known: bool) -> Outcome:
-    if not has_formulas:
-        return Outcome(number, Step.SCORE, Status.SKIPPED, "there is no formula to score")
-    if not known:
-        return Outcome(number, Step.SCORE, Status.SKIPPED, "no exact answer is known")
-    return Outcome(number, Step.SCORE)
+    if system is not None and settings.simulation is not None and formulas:
+        predicted = _predictions(system, formulas, number, settings.simulation, settings.seed)
+    missing = "there is no formula to score" if not formulas else "no exact answer is known"
+    scored = bool(formulas) and exact is not None
+    outcome = Outcome(number, Step.SCORE) if scored else Outcome(number, Step.SCORE, Status.SKIPPED, missing)
+    return {
+        "coefficients": concatenate("coefficients", tables),
+        "rrmse": as_table("rrmse", list(errors.values())),
+        "prediction": predicted,
+        "certificates": certificate_rows(number, certificates),
+        "score_outcome": [outcome],
+    }
 
 
 def _network_errors(
@@ -327,16 +291,6 @@ def _predictions(
         for method, one in formulas.items()
     ]
     return concatenate("prediction", tables)
-
-
-def _certificate_table(number: int, certificates: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
-    """Every test of every formula, with its figure."""
-    rows = [
-        {"run": number, "method": method, "test": test} | verdict
-        for method, one in certificates.items()
-        for test, verdict in one["tests"].items()
-    ]
-    return as_table("certificates", rows)
 
 
 OF_RUNS = (
@@ -402,106 +356,3 @@ def timings(folder: Path, runs: Iterable[int], *, drawing: str) -> pd.DataFrame:
             for run in together
         ]
     return as_table("timings", rows).sort_values(["run", "step"], ignore_index=True)
-
-
-@dataclass(frozen=True)
-class ModelFiles:
-    """The `model.json` of every run; formulas are parsed for the runs that are shown alone."""
-
-    paths: tuple[str, ...]
-
-    @cached_property
-    def _methods(self) -> list[dict[str, Any]]:
-        return [json.loads(Path(path).read_text(encoding="utf-8"))["methods"] for path in self.paths]
-
-    def with_formula(self, method: Method) -> list[int]:
-        """The runs with one formula of V for the whole region."""
-        return [run for run, one in enumerate(self._methods) if one.get(method, {}).get("V")]
-
-    def with_any_formula(self, method: Method) -> list[int]:
-        """The runs with a formula of V, be it of the whole region or of single wells."""
-        have = [one.get(method, {}) for one in self._methods]
-        return [run for run, one in enumerate(have) if one.get("V") or one.get("wells")]
-
-    def first_wells(self) -> Shown:
-        """The first run that has a formula about each attractor, where none has a single one."""
-        for run, methods in enumerate(self._methods):
-            for method, one in methods.items():
-                if one.get("wells"):
-                    return Shown(run, Method(method))
-        return Shown(None, METHODS[0])
-
-    def formulas(self, run: int) -> dict[str, SymbolicDecomposition]:
-        """The formulas of a run by method."""
-        return read_model(self.paths[run])[0]
-
-    def certificates(self, run: int) -> dict[str, Any]:
-        """Their certificates."""
-        return read_model(self.paths[run])[1]
-
-
-@dataclass(frozen=True)
-class Shown:
-    """A run, and the method of it whose formula is shown; None where no run has a formula."""
-
-    run: int | None
-    method: Method
-
-
-def shown_formula(rrmse: pd.DataFrame, models: ModelFiles) -> Shown:
-    """The run and the method whose formula is shown: refined where any run has one, otherwise as published.
-
-    Of the runs with such a formula it is the median by error where errors are known, otherwise the first.
-    """
-    for method in reversed(METHODS):
-        with_formula = models.with_formula(method)
-        if with_formula:
-            mine = rrmse[(rrmse["method"] == method) & rrmse["run"].isin(with_formula)]
-            ranked = mine.dropna(subset="rrmse").sort_values("rrmse")
-            if len(ranked):
-                return Shown(int(ranked["run"].iloc[(len(ranked) - 1) // 2]), method)
-            return Shown(with_formula[0], method)
-    return Shown(None, METHODS[0])
-
-
-@plain_dataclass(frozen=True)
-class RunToShow:
-    """A run: its number, its trajectories, its f, and V about its attractors, as far as they are known."""
-
-    number: int
-    recordings: Recordings | None
-    record: FieldEstimate | None
-    wells: tuple[Well, ...] = ()
-
-
-def choose(shown: int | None, stored: Sequence[Callable[[], Mapping[str, Any] | None]]) -> int | None:
-    """The run whose stored landscape is shown: that of the formulas, or else the first that has an attractor.
-
-    Parameters
-    ----------
-    shown
-        The run whose formulas are shown, None where there is none.
-    stored
-        Reads `quasipotential.json` of each run; None where it is empty.
-    """
-    order = [*([] if shown is None else [shown]), *range(len(stored))]
-    return next((run for run in order if run < len(stored) and _has_wells(stored[run]())), None)
-
-
-def _has_wells(data: Mapping[str, Any] | None) -> bool:
-    return bool(data) and bool((data or {}).get("wells"))
-
-
-def overview_of_run(settings: PipelineSettings, given: RunToShow) -> dict[str, Any] | None:
-    """The overview of a run whose landscape nobody asked for; None where it has none."""
-    found = results.landscape_of_run(
-        settings, given.recordings, given.record,
-        number=given.number, wells=given.wells, seek_wells=False,
-    )  # fmt: skip
-    if found.landscape is None or found.record is None or not found.landscape.attractors:
-        return None
-    data = landscape_data(found.landscape)
-    # No formula about a single well was sought, so that none is missed.
-    missed = "quasipotential.no_refined_formula"
-    data["remarks"] = [one for one in data["remarks"] if one["code"] != missed]
-    return {"run": given.number} | data

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from siq.workflow.tables import Method, Outcome, Status, Step, read_outcomes, write_outcomes
+from siq.workflow.tables import Method, Outcome, Status, Step
+from workflow.files import read_outcomes, write_outcomes
 
 
 def test_outcomes_are_read_back_with_their_details(tmp_path: Path) -> None:

@@ -12,8 +12,10 @@ from known_systems import exact_archetype
 from siq.inference.library import candidate_library
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.systems.dynamics import Dynamics
-from siq.workflow.published import PublishedFigure
-from siq.workflow.scoring import (
+from siq.workflow.tables import as_table
+from workflow.published import PublishedFigure
+from workflow.rows import concatenate
+from workflow.scoring import (
     _coefficient_table,
     _domain_grid,
     _exact_values,
@@ -23,7 +25,6 @@ from siq.workflow.scoring import (
     relative_error,
     summary_table,
 )
-from siq.workflow.tables import as_table, concatenate
 
 
 def perturbed(archetype: Dynamics, addition: object) -> SymbolicDecomposition:

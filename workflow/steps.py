@@ -11,14 +11,16 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from siq.workflow.tasks import Given, task
+from workflow.task import Given, task
 
 if TYPE_CHECKING:
+    from siq.data.recordings import Recordings
+    from siq.networks.decomposition import TrainedNetworks
     from siq.quasipotential.wells import Well
-    from siq.workflow.scoring import ModelFiles
+    from siq.systems.dynamics import Dynamics
+    from siq.workflow.models import ModelFiles
     from siq.workflow.study import PipelineSettings
-    from siq.workflow.training import TrainedRun
-
+    from siq.workflow.tables import StepResult
 
 # The published method, and ours.
 
@@ -29,19 +31,51 @@ if TYPE_CHECKING:
 )  # fmt: skip
 def draw(given: Given, settings: PipelineSettings) -> Any:
     """Trajectories of a run: a simulation of the card, or recordings resampled."""
-    from siq.workflow import results
+    from siq.workflow.pipeline import draw_run
 
-    path = given.path("source")
-    assert path is not None
-    return results.draw_run(settings, results.source_of(path, settings), number=given.number)
+    drawn = draw_run(settings, source_of(given.files["source"], settings), number=given.number)
+    return {"recordings": drawn.result, "draw_outcome": [drawn.outcome]}
+
+
+def source_of(path: str | Path, settings: PipelineSettings) -> Dynamics | Recordings:
+    """The card that is simulated, or the recordings in its place.
+
+    Raises
+    ------
+    InputError
+        When the file is refused.
+    """
+    from dataclasses import replace
+
+    from siq.data.preparation import read_pairs
+    from siq.systems.cards import load_system
+
+    if settings.simulation is not None:
+        return load_system(path)
+    recordings, _ = read_pairs(
+        path,
+        states=settings.space.names,
+        units=settings.space.units,
+        pair_step=settings.sampling.pair_step,
+        hidden_velocities=settings.identification.hidden_velocities,
+    )
+    space = settings.space
+    units = tuple(
+        unit or space.unit(name, unknown="") or None
+        for name, unit in zip(recordings.names, recordings.units, strict=True)
+    )
+    return replace(
+        recordings, units=units, time_unit=recordings.time_unit or space.unit("t", unknown="") or None
+    )
 
 
 @task("recordings", options=("seed", "space", "sampling", "identification", "certificate"))
 def identify(given: Given, settings: PipelineSettings) -> Any:
     """The vector field f from pairs of samples, with the test of its predictions."""
-    from siq.workflow import results
+    from siq.workflow.pipeline import identify_run
 
-    return results.identify_run(settings, given.recordings, number=given.number)
+    found = identify_run(settings, given.recordings, number=given.number)
+    return {"field": found.result, "identify_outcome": [found.outcome]}
 
 
 @task("recordings", "field", options=("seed", "space", "sampling", "training"))
@@ -53,15 +87,19 @@ def train(given: Given, settings: PipelineSettings) -> Any:
     from siq.workflow import training
 
     torch.set_num_threads(given.threads)
-    pairs = zip(given.recordings, given.field, strict=True)
-    runs = {
-        number: training.RunToTrain(recordings, record)
-        for number, (recordings, record) in enumerate(pairs, start=given.number)
-    }
-    folder = Path(given.outputs["networks"]).parent if given.outputs else None
-    if folder is not None:
-        given.afterwards.append(partial(training.clean, folder))
-    return training.train_block(settings, runs, folder=folder, device=given.device)
+    runs = dict(enumerate(zip(given.recordings, given.field, strict=True), start=given.number))
+    folder = Path(given.outputs["networks"]).parent
+    given.afterwards.append(partial(training.clean, folder))
+    results, networks, history = training.train_block(settings, runs, folder=folder, device=given.device)
+    outcomes = [one.outcome for one in results.values()]
+    return {"networks": networks or None, "history": history, "train_outcome": outcomes}
+
+
+UNCERTIFIED = {
+    "certified": False,
+    "tests": {},
+    "reason": "no certificate is computed for this method; the formula may belong to a false decomposition",
+}
 
 
 @task("recordings", "networks", "train_outcome", options=("space", "sampling", "regression"))
@@ -69,9 +107,13 @@ def regress(given: Given, settings: PipelineSettings) -> Any:
     """Sparse formulas of V, g and f from the networks, as published."""
     import pysindy  # noqa: F401 (once for all runs: it takes seconds)
 
-    from siq.workflow import results
+    from siq.workflow.pipeline import regress_run
+    from siq.workflow.tables import Method
 
-    return results.regress_run(settings, given.recordings, _trained(given))
+    found = regress_run(settings, given.recordings, trained_run(given))
+    formulas = {} if found.result is None else {Method.REGRESSION: found.result}
+    certificates = dict.fromkeys(formulas, UNCERTIFIED)
+    return {"regression": (formulas, certificates), "regress_outcome": [found.outcome]}
 
 
 @task(
@@ -80,17 +122,22 @@ def regress(given: Given, settings: PipelineSettings) -> Any:
 )  # fmt: skip
 def refine(given: Given, settings: PipelineSettings) -> Any:
     """V and g refined on the Hamilton–Jacobi equation, and the certificate of every formula."""
-    from siq.workflow import results
-    from siq.workflow.tables import Method
+    from siq.workflow.pipeline import refine_run
+    from siq.workflow.tables import Method, StepResult
+    from workflow.rows import density_rows, visit_rows
 
+    recordings = given.recordings
     regressed = {} if given.regression is None else given.regression[0]
-    run = results.RunToRefine(
-        given.recordings,
-        results.Identified(given.field, given.identify_outcome[0]),
-        _trained(given),
-        regressed.get(Method.REGRESSION),
-    )
-    return results.refine_run(settings, run)
+    identified = StepResult(given.field, given.identify_outcome[0])
+    run = refine_run(settings, recordings, identified, trained_run(given), regressed.get(Method.REGRESSION))
+    attractors = () if run.portrait is None else [one.position for one in run.portrait.attractors]
+    states = () if recordings is None else recordings.names
+    return {
+        "model": (run.formulas, run.certificates),
+        "refine_outcome": [run.outcome],
+        "record": visit_rows(given.number, run.record, attractors),
+        "record_density": density_rows(given.number, run.record, attractors, states),
+    }
 
 
 @task(
@@ -99,14 +146,15 @@ def refine(given: Given, settings: PipelineSettings) -> Any:
 )  # fmt: skip
 def score(given: Given, settings: PipelineSettings) -> Any:
     """How close a run comes to exact answers, where these are known."""
-    from siq.workflow import scoring
-    from siq.workflow.scoring import exact_answer
+    from workflow.scoring import exact_answer, score_run
 
     card = given.path("card")
     exact = None if card is None else exact_answer(card)
     formulas, certificates = given.model
-    run = scoring.RunToScore(formulas, certificates, _trained(given), given.card, exact)
-    return scoring.score_run(settings, run)
+    return score_run(
+        settings, formulas, certificates, trained_run(given).result,
+        number=given.number, system=given.card, exact=exact,
+    )  # fmt: skip
 
 
 @task(
@@ -115,8 +163,8 @@ def score(given: Given, settings: PipelineSettings) -> Any:
 )  # fmt: skip
 def collect(given: Given, settings: PipelineSettings) -> Any:
     """All runs of a study as tables."""
-    from siq.workflow import scoring
-    from siq.workflow.tables import read_outcomes
+    from workflow import scoring
+    from workflow.files import read_outcomes
 
     return scoring.collect_runs(
         {name: list(getattr(given, name) or ()) for name in scoring.OF_RUNS},
@@ -132,14 +180,18 @@ def collect(given: Given, settings: PipelineSettings) -> Any:
 @task("recordings", "field", "model", options=("seed", "space", "sampling", "refinement", "landscape"))
 def landscape(given: Given, settings: PipelineSettings) -> Any:
     """Equilibria of the identified f, a formula for each well, barriers, paths and times."""
-    from siq.workflow import results
+    from siq.workflow.pipeline import landscape_of_run
+    from workflow.rows import degree_rows, landscape_rows
 
-    refined = given.refined  # known in memory alone
-    return results.landscape_of_run(
-        settings, given.recordings, given.field, wells=_wells(given.model), number=given.number,
-        certificate=None if refined is None else refined.certificate,
-        visits=() if refined is None or refined.record is None else refined.record.visits,
-    )  # fmt: skip
+    number, field = given.number, given.field
+    found = landscape_of_run(settings, given.recordings, field, wells=_wells(given.model), number=number)
+    note = None if field is None else field.diffusion_source.note
+    return {
+        "quasipotential": found.result,
+        "landscape": landscape_rows(number, found.result, note),
+        "degrees": degree_rows(number, found.result),
+        "landscape_outcome": [found.outcome],
+    }
 
 
 @task(
@@ -148,30 +200,37 @@ def landscape(given: Given, settings: PipelineSettings) -> Any:
 )  # fmt: skip
 def overview(given: Given, settings: PipelineSettings) -> Any:
     """The landscape that the page opens with, found for this run alone where the study asks for none."""
-    from siq.workflow import scoring
+    from siq.quasipotential.landscape_files import landscape_data
+    from siq.workflow.models import shown_formula
+    from siq.workflow.pipeline import landscape_of_run
 
-    models = _models(given)
-    shown = scoring.shown_formula(given.rrmse, models)
+    models = model_files(given)
+    shown = shown_formula(given.rrmse, models)
     number = shown.run if shown.run is not None else models.first_wells().run
-    found = None
-    if given.options["every_run"]:
+    if given.options["every_run"]:  # that of the formulas, or else the first that has an attractor
         stored = given.quasipotential
-        readers = [partial(stored.__getitem__, run) for run in range(len(stored))]
-        chosen = scoring.choose(number, readers)
-        if chosen is not None:
-            found = {"run": chosen} | stored[chosen]
-    elif number is not None:
-        run = scoring.RunToShow(
-            number, given.recordings[number], given.field[number], _wells(given.model[number])
-        )
-        found = scoring.overview_of_run(settings, run)
-    return {"overview": found}
+        order = [*([] if number is None else [number]), *range(len(stored))]
+        chosen = next((run for run in order if run < len(stored) and (stored[run] or {}).get("wells")), None)
+        return {"overview": None if chosen is None else {"run": chosen} | stored[chosen]}
+    if number is None:
+        return {"overview": None}
+    found = landscape_of_run(
+        settings, given.recordings[number], given.field[number],
+        number=number, wells=_wells(given.model[number]), seek_wells=False,
+    ).result  # fmt: skip
+    if found is None or not found.attractors:
+        return {"overview": None}
+    data = landscape_data(found)
+    # No formula about a single well was sought, so that none is missed.
+    missed = "quasipotential.no_refined_formula"
+    data["remarks"] = [one for one in data["remarks"] if one["code"] != missed]
+    return {"overview": {"run": number} | data}
 
 
 @task("card", options=("seed", "card"))
 def reference(given: Given, settings: PipelineSettings) -> Any:
     """What methods say of the card's settings vector field that share no code with ours."""
-    from siq.workflow import comparison
+    from workflow import comparison
 
     return {"reference": comparison.reference_of_card(settings, given.card)}
 
@@ -182,27 +241,26 @@ def reference(given: Given, settings: PipelineSettings) -> Any:
 )  # fmt: skip
 def landscape_errors(given: Given, settings: PipelineSettings) -> Any:
     """The landscapes of all runs against the references, networks, formulas, and what was published."""
-    from siq.workflow import comparison
+    from workflow import comparison
 
     runs = [
-        comparison.RunToCompare(
-            number,
+        (
             comparison.read_stored(given.files["field"][number], given.files["quasipotential"][number]),
             given.model[number][0],
-            _trained(given, number).networks,
+            trained_run(given, number).result,
         )
         for number in range(len(given.model))
     ]
-    published = None
-    if given.published is not None:
-        published = comparison.PublishedAnswers(given.published.figures, published_mesh(given))
-    return {"table": comparison.run_landscape_errors(settings, given.reference, runs, published)}
+    figures, mesh = (
+        ({}, None) if given.published is None else (given.published.figures, published_mesh(given))
+    )
+    return {"table": comparison.run_landscape_errors(settings, given.reference, runs, figures, mesh)}
 
 
 @task("quasipotential", "card", options=("seed", "landscape", "card"))
 def beside_equations(given: Given, settings: PipelineSettings) -> Any:
     """The landscape of the card's settings equations beside those of the runs: scoring alone."""
-    from siq.workflow import comparison
+    from workflow import comparison
 
     table = comparison.run_beside_equations(settings, given.card, list(given.quasipotential))
     return {"table": table}
@@ -211,7 +269,7 @@ def beside_equations(given: Given, settings: PipelineSettings) -> Any:
 @task("quasipotential", "card", options=("seed", "landscape", "card"))
 def escapes(given: Given, settings: PipelineSettings) -> Any:
     """Simulated escapes beside the law."""
-    from siq.workflow import comparison
+    from workflow import comparison
 
     return {"table": comparison.run_escapes(settings, given.card, list(given.quasipotential))}
 
@@ -221,15 +279,35 @@ def escapes(given: Given, settings: PipelineSettings) -> Any:
 
 @task("card", options=("seed", "refinement", "certificate", "landscape", "card"))
 def equations(given: Given, settings: PipelineSettings) -> Any:
-    """The landscape of equations."""
-    from siq.quasipotential.landscape import LandscapeOptions
-    from siq.quasipotential.landscape_assembly import EquationSettings
-    from siq.workflow import results
+    """The landscape of equations; where there is none, the outcome says why."""
+    import numpy as np
+
+    from siq.errors import NumericalFailure
+    from siq.quasipotential.landscape import LandscapeOptions, NoLandscape
+    from siq.quasipotential.landscape_assembly import EquationSettings, landscape_from_equations
+    from siq.workflow.tables import Method, Outcome, Status, Step, as_table
+    from workflow.rows import certificate_rows, degree_rows, landscape_rows
 
     own = EquationSettings(
         settings.seed, settings.refinement, settings.certificate, settings.landscape or LandscapeOptions()
     )
-    return results.landscape_of_equations(own, given.card)
+    found, certificate = None, None
+    try:
+        found = landscape_from_equations(given.card, own)
+        certificate = found.certificate
+        status = Status.WARNING if found.global_quasipotential is None else Status.OK
+        outcome = Outcome(0, Step.LANDSCAPE, status, "; ".join(found.notes))
+    except (NumericalFailure, np.linalg.LinAlgError) as error:
+        reason = error.reason if isinstance(error, NoLandscape) else str(error)
+        outcome = Outcome(0, Step.LANDSCAPE, Status.FAILED, reason)
+    tests = {} if certificate is None else {str(Method.REFINED): certificate.as_data()}
+    return {
+        "quasipotential": found,
+        "outcomes": as_table("outcomes", [outcome.as_data()]),
+        "landscape": landscape_rows(0, found),
+        "degrees": degree_rows(0, found),
+        "certificates": certificate_rows(0, tests),
+    }
 
 
 @task("card", options=("seed", "card_but_for_swept"))
@@ -256,7 +334,11 @@ def sweep(given: Given, settings: PipelineSettings) -> Any:
     points = [adapter.validate_json(Path(path).read_bytes()) for path in given.files["points"]]
     names = SweepOptions.model_validate(given.options["sweep"]).names
     noises = () if settings.landscape is None else settings.landscape.noise_intensities
-    return collected(given.card, names, points, noise=next(iter(noises), None))
+    found = collected(given.card, names, points, noise=next(iter(noises), None))
+    return {
+        "sweep": found.table, "sweep_ways": found.ways, "branches": found.branches,
+        "bifurcations": found.bifurcations, "bifurcation_curves": found.curves,
+    }  # fmt: skip
 
 
 # Recordings to try things with.
@@ -284,15 +366,19 @@ def example_hopping(given: Given, settings: PipelineSettings) -> Any:
 # What several tasks read.
 
 
-def _trained(given: Given, run: int | None = None) -> TrainedRun:
+def trained_run(given: Given, run: int | None = None) -> StepResult[TrainedNetworks]:
     """The networks of a run; of one of several where `run` says which."""
-    from siq.workflow.training import trained_run
+    from siq.workflow.tables import StepResult
+    from siq.workflow.training import POSITION, not_trained
 
-    if not given.networks:
-        return trained_run(None, None, number=given.number if run is None else run)
-    if run is None:
-        return trained_run(given.networks, given.train_outcome, number=given.number)
-    return trained_run(given.networks[run], given.train_outcome[run], number=run)
+    number = given.number if run is None else run
+    networks, outcomes = given.networks, given.train_outcome
+    if not outcomes:
+        return not_trained(number)
+    if run is not None:
+        networks, outcomes = networks[run], outcomes[run]
+    outcome = next(one for one in outcomes if one.run == number)
+    return StepResult(networks[outcome.details[POSITION]] if outcome.usable else None, outcome)
 
 
 def _wells(model: Any) -> tuple[Well, ...]:
@@ -302,15 +388,16 @@ def _wells(model: Any) -> tuple[Well, ...]:
     return model[0][Method.REFINED].wells if Method.REFINED in model[0] else ()
 
 
-def _models(given: Given) -> ModelFiles:
-    from siq.workflow.scoring import ModelFiles
+def model_files(given: Given) -> ModelFiles:
+    """The formulas of all runs."""
+    from siq.workflow.models import ModelFiles
 
     return ModelFiles(tuple(given.files["model"]))
 
 
 def published_mesh(given: Given) -> Any:
     """U on the mesh that was published, None where it is not at hand."""
-    from siq.workflow.published import mesh_potential
+    from workflow.published import mesh_potential
 
     path, mesh = given.path("mesh"), given.published.mesh
     return None if path is None or mesh is None else mesh_potential(path, mesh)

@@ -20,16 +20,24 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+import logging
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import pandas as pd
+
+from siq.errors import InputError
 from siq.numerics.files import whole_file
-from siq.workflow.tables import read_outcomes, write_outcomes
+from siq.workflow.tables import Outcome, Status
 
 if TYPE_CHECKING:
+    from siq.data.recordings import Recordings
     from siq.networks.decomposition import TrainedNetworks
     from siq.workflow.study import PipelineSettings
+
+
+LOGGER = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +82,7 @@ def read(name: str, path: str | Path) -> Any:
 
         return load_system(path)
     if name == "published":
-        from siq.workflow.published import load_published
+        from workflow.published import load_published
 
         return load_published(path)
     if name == "reference":
@@ -84,11 +92,19 @@ def read(name: str, path: str | Path) -> Any:
     if name.endswith("_outcome"):
         return read_outcomes(path)
     if path.suffix == ".parquet":
-        from siq.workflow.tables import read_table
-
         return read_table(path)
     text = path.read_text(encoding="utf-8")
     return json.loads(text) if path.suffix == ".json" else text
+
+
+def read_states(path: str | Path, field: str | Path) -> Recordings | None:
+    """Trajectories of a run, with velocities that were not recorded as its identified f has them."""
+    from siq.inference.kalman_identification import of_all_states
+
+    recordings, record = read("recordings", path), read("field", field)
+    if recordings is None or record is None:
+        return recordings
+    return of_all_states(recordings, record, pair_step=None)
 
 
 def write(name: str, path: str | Path, value: Any, settings: PipelineSettings) -> None:
@@ -103,8 +119,6 @@ def write(name: str, path: str | Path, value: Any, settings: PipelineSettings) -
     settings
         Of the task.
     """
-    import pandas as pd
-
     path = Path(path)
     if value is None:
         path.touch()
@@ -135,8 +149,6 @@ def write(name: str, path: str | Path, value: Any, settings: PipelineSettings) -
     elif name.endswith("_outcome"):
         write_outcomes(path, value)
     elif isinstance(value, pd.DataFrame):
-        from siq.workflow.tables import write_table
-
         write_table(path, value)
     elif not path.suffix:
         _write_folder(path, value)
@@ -166,3 +178,44 @@ def _write_folder(folder: Path, files: Mapping[str, Any]) -> None:
             (folder / name).write_bytes(value)
         elif value is not None:
             save_figure(value, folder / name)
+
+
+def write_outcomes(path: str | Path, outcomes: Sequence[Outcome]) -> None:
+    """Write outcomes whole or not at all, and log those that are not ``ok``."""
+    for one in outcomes:
+        if one.status != Status.OK:
+            LOGGER.warning("run %d, %s: %s, %s", one.run, one.step, one.status, one.reason)
+    with whole_file(path) as partial:
+        text = json.dumps([one.as_data() for one in outcomes], indent=1)
+        partial.write_text(text + "\n", encoding="utf-8")
+
+
+def read_outcomes(path: str | Path) -> list[Outcome]:
+    """Read what `write_outcomes` wrote."""
+    return [Outcome.from_data(one) for one in json.loads(Path(path).read_text(encoding="utf-8"))]
+
+
+def write_table(path: str | Path, table: pd.DataFrame) -> None:
+    """Write a table as Parquet to `path`, and as CSV beside it.
+
+    Numbers in the CSV have as many digits as it takes to read the same numbers back.
+    """
+    path = Path(path)
+    with whole_file(path.with_suffix(".csv")) as partial:
+        table.to_csv(partial, index=False)
+    with whole_file(path) as partial:
+        table.to_parquet(partial, index=False)
+
+
+def read_table(path: str | Path) -> pd.DataFrame:
+    """Read a table that `write_table` wrote.
+
+    Raises
+    ------
+    InputError
+        When the file is missing or is not Parquet.
+    """
+    try:
+        return pd.read_parquet(path)
+    except (OSError, ValueError):
+        raise InputError(path, "", "it is not a Parquet table", "make it again") from None

@@ -14,9 +14,9 @@ from known_systems import as_system, limit_cycle
 from siq.quasipotential.landscape_comparison import read_reference, write_reference
 from siq.report.study_page import _without_landscape
 from siq.systems.dynamics import Dynamics
-from siq.workflow import comparison
 from siq.workflow.study import PipelineSettings, StateSpace
 from siq.workflow.tables import COLUMNS, Status, Step, as_table
+from workflow import comparison
 from workflow.figures.study import landscape_figures
 
 X, Y = sympy.symbols("x y", real=True)
@@ -47,7 +47,7 @@ def test_without_wells_there_is_a_reason_and_no_rows(card: Dynamics, reason: str
     found = read_reference(tmp_path / "reference.npz")
     assert reason in found.reason and found.attractors.shape == (0, 2)
     settings = PipelineSettings(seed=1)
-    table = comparison.run_landscape_errors(settings, found, [], None)
+    table = comparison.run_landscape_errors(settings, found, [], {})
     assert list(table.columns) == list(COLUMNS["landscape_errors"]) and table.empty
     drawn = landscape_figures(
         StateSpace(),

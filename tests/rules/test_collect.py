@@ -7,8 +7,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from siq.workflow import scoring
 from siq.workflow.tables import COLUMNS, Outcome, Status, Step
+from workflow import scoring
 
 
 def benchmark(folder: Path, name: str, seconds: float) -> None:

@@ -8,9 +8,8 @@ found here of the card is no input of any other step.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
-from dataclasses import dataclass as plain_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -59,9 +58,10 @@ from siq.systems.phase_portrait import evenly_spread, phase_portrait
 from siq.systems.simulation import simulate_stationary
 from siq.validation.escapes import Neighbourhood, neighbourhood, simulate_escapes
 from siq.validation.mesh import mesh_potential
-from siq.workflow.published import PublishedFigure, published_formula, published_potentials
 from siq.workflow.study import PipelineSettings
-from siq.workflow.tables import as_table, concatenate
+from siq.workflow.tables import as_table
+from workflow.published import PublishedFigure, published_formula, published_potentials
+from workflow.rows import concatenate
 
 
 def read_stored(field: str | Path, landscape: str | Path) -> Landscape | None:
@@ -110,50 +110,56 @@ NONE_OF_OURS = -1  # the run of what was published, or of a mesh
 TABLE = "landscape_errors"
 
 
-@plain_dataclass(frozen=True)
-class RunToCompare:
-    """What a run says of U: its landscape, its formulas by method, its networks, as far as there are any."""
-
-    number: int
-    landscape: Landscape | None
-    formulas: Mapping[str, SymbolicDecomposition]
-    networks: TrainedNetworks | None
-
-
-@plain_dataclass(frozen=True)
-class PublishedAnswers:
-    """What was published of U: figures by quantity, and U on a mesh where that is at hand."""
-
-    figures: Mapping[str, PublishedFigure]
-    mesh: Potential | None = None
-
-
 def run_landscape_errors(
     settings: PipelineSettings,
     reference: ReferenceLandscape,
-    runs: Sequence[RunToCompare],
-    published: PublishedAnswers | None,
+    runs: Sequence[tuple[Landscape | None, Mapping[str, SymbolicDecomposition], TrainedNetworks | None]],
+    published: Mapping[str, PublishedFigure],
+    published_mesh: Potential | None = None,
 ) -> pd.DataFrame:
-    """The table `landscape_errors`; without a reference it has no rows."""
+    """The table `landscape_errors`; without a reference it has no rows.
+
+    Parameters
+    ----------
+    settings
+        Below which U landscapes are compared.
+    reference
+        Of the card.
+    runs
+        What each says of U: its landscape, its formulas by method, its networks, as far as there are any.
+    published, published_mesh
+        What was published of U: figures by quantity, and U on a mesh where that is at hand.
+    """
     if reference.reason:
         return as_table(TABLE, [])
     below = None if settings.landscape is None else settings.landscape.compare_below
     tables = []
-    for one in runs:
-        if one.landscape is not None:
-            compared = compare_landscape(reference, one.landscape, below=below)
-            tables.append(_rows(one.number, "local formulas", compared))
-        for method, formulas in one.formulas.items():
-            if formulas.potential is not None:
-                compared = compare_estimate(reference, _of_formula(formulas), below=below)
-                tables.append(_rows(one.number, method, compared))
-        if one.networks is not None:
-            compared = compare_estimate(reference, _of_networks(one.networks), below=below)
-            tables.append(_rows(one.number, "networks", compared))
+    for number, (landscape, formulas, networks) in enumerate(runs):
+        if landscape is not None:
+            compared = compare_landscape(reference, landscape, below=below)
+            tables.append(_rows(number, "local formulas", compared))
+        sources = {method: _of_formula(one) for method, one in formulas.items() if one.potential is not None}
+        if networks is not None:
+            sources["networks"] = _of_networks(networks)
+        for source, potential in sources.items():
+            tables.append(_rows(number, source, compare_estimate(reference, potential, below=below)))
     if np.isfinite(reference.mesh).any():
         tables.append(_rows(NONE_OF_OURS, "mesh", compare_mesh(reference, below=below)))
-    if published is not None:
-        tables += _of_published(settings, published, reference)
+    formulas_of_others = published_potentials(
+        published, [sympy.Symbol(name, real=True) for name in settings.space.names or ()],
+        draws=DRAWS, generator=generator(settings.seed, Purpose.ROUNDING),
+    )  # fmt: skip
+    for number, one in enumerate(formulas_of_others):  # as printed, and with what the rounding leaves open
+        label = "published formula" + (", digits not printed" if number else "")
+        tables.append(_rows(number + NONE_OF_OURS, label, compare_estimate(reference, one, below=below)))
+    if published_mesh is not None:
+        compared = compare_estimate(reference, published_mesh, below=below)
+        tables.append(_rows(NONE_OF_OURS, "published mesh", compared))
+        if formulas_of_others:  # the paper's own comparison, in its Appendix E
+            level = overall_level(reference) if below is None else below
+            values = formulas_of_others[0](reference.points)
+            both = [compare_with_mesh(values, published_mesh(reference.points), below=level)]
+            tables.append(_rows(NONE_OF_OURS, "published formula, against the published mesh", both))
     return concatenate(TABLE, tables)
 
 
@@ -169,31 +175,6 @@ def _of_formula(one: SymbolicDecomposition) -> Potential:
 def _of_networks(one: TrainedNetworks) -> Potential:
     """U of networks as a function of points in rows."""
     return lambda x: 2 * one.evaluate(x).potential
-
-
-def _of_published(
-    settings: PipelineSettings, published: PublishedAnswers, reference: ReferenceLandscape
-) -> list[pd.DataFrame]:
-    """The published formula, as printed and with what its rounding leaves open, and the published mesh."""
-    below = None if settings.landscape is None else settings.landscape.compare_below
-    formulas = published_potentials(
-        published.figures, [sympy.Symbol(name, real=True) for name in settings.space.names or ()],
-        draws=DRAWS, generator=generator(settings.seed, Purpose.ROUNDING),
-    )  # fmt: skip
-    tables = []
-    for number, one in enumerate(formulas):
-        label = "published formula" + (", digits not printed" if number else "")
-        compared = compare_estimate(reference, one, below=below)
-        tables.append(_rows(number + NONE_OF_OURS, label, compared))
-    if published.mesh is not None:
-        compared = compare_estimate(reference, published.mesh, below=below)
-        tables.append(_rows(NONE_OF_OURS, "published mesh", compared))
-        if formulas:  # the paper's own comparison, in its Appendix E
-            level = overall_level(reference) if below is None else below
-            values = formulas[0](reference.points)
-            both = [compare_with_mesh(values, published.mesh(reference.points), below=level)]
-            tables.append(_rows(NONE_OF_OURS, "published formula, against the published mesh", both))
-    return tables
 
 
 WALKERS = 400
@@ -313,186 +294,143 @@ KEPT = 50  # samples of every walker
 ACCURACY = 0.025  # step times the norm of the Jacobian where the walkers are
 
 
-@plain_dataclass(frozen=True)
-class Invariant:
-    """The invariant distribution for all ε: tables `invariant` and `well_shares`, and densities to draw."""
-
-    table: pd.DataFrame
-    shares: pd.DataFrame
-    densities: list[StationaryDensity]
-
-
-@plain_dataclass(frozen=True)
-class FormulaShown:
-    """One formula over the whole region: of which run, by which method."""
-
-    run: int
-    method: str
-    formulas: SymbolicDecomposition
-
-
-@plain_dataclass(frozen=True)
-class LandscapeShown:
-    """The formulas of all wells of a run."""
-
-    run: int
-    landscape: Landscape
-
-
-Shown = FormulaShown | LandscapeShown
-
-
 def compare_invariant(
     settings: PipelineSettings,
-    system: Dynamics | None,
-    shown: Shown | None,
+    system: Dynamics,
+    source: SymbolicDecomposition | Landscape,
     published: Mapping[str, PublishedFigure],
-) -> Invariant:
-    """Z, and the density against a long simulation of the card.
-
-    It follows from a refined formula where one holds over the whole region, otherwise from the landscape
-    where there is one, otherwise from the published method's formula.
+    *,
+    run: int,
+    method: str,
+) -> tuple[pd.DataFrame, pd.DataFrame, list[StationaryDensity]]:
+    """Z, and the density against a long simulation of the card, for all ε of the settings.
 
     Parameters
     ----------
     settings
-        The intensities ε; none asks for nothing.
+        The intensities ε.
     system
-        The card, None where there is none to simulate.
-    shown
-        What it follows from.
+        The card.
+    source
+        What the density follows from: one formula over the whole region, or the formulas of all wells.
     published
         Figures to be set beside ours.
+    run, method
+        Whose formulas these are.
+
+    Returns
+    -------
+    table, shares
+        The tables `invariant` and `well_shares`.
+    densities
+        To be drawn.
     """
-    found = _Rows([], [], [])
-    if settings.invariant and system is not None and shown is not None:
-        asked: dict[str, Any] = {"published": published, "seed": settings.seed}
-        if isinstance(shown, LandscapeShown):
-            found = _of_landscape(shown, system, settings.invariant, **asked)
-        else:
-            found = _density_of_formula(shown, system, settings.invariant, **asked)
-    return Invariant(
-        as_table("invariant", found.rows), as_table("well_shares", found.shares), found.densities
-    )
-
-
-@plain_dataclass(frozen=True)
-class _Rows:
-    """What the tables and the figure have for all ε."""
-
-    rows: list[dict[str, Any]]
-    densities: list[StationaryDensity]
-    shares: list[dict[str, Any]]
-
-
-def _simulate(system: Dynamics, intensity: float, *, seed: int) -> np.ndarray:
-    """Samples of a long simulation of the system itself, walkers side by side, ``(d, times, walkers)``."""
-    draw = generator(seed, Purpose.INVARIANT, str(intensity))
-    low, high = system.box.T
-    start = draw.uniform(low, high, (DENSITY_WALKERS, system.dimension)).T
-    rate = np.linalg.norm(system.jacobian(start[:, :500].T), axis=(1, 2))
-    return simulate_stationary(
-        system, intensity=intensity, start=start,
-        step=ACCURACY / float(np.median(rate)), burn_in=STEPS // 5, steps=STEPS, thin=STEPS // KEPT,
-        generator=draw,
-    )  # fmt: skip
-
-
-def _density_of_formula(
-    shown: FormulaShown,
-    system: Dynamics,
-    intensities: Sequence[float],
-    *,
-    published: Mapping[str, PublishedFigure],
-    seed: int,
-) -> _Rows:
-    """From one formula over the whole region."""
-    identified = shown.formulas
-    rows, densities = [], []
-    for intensity in intensities:
-        samples = _simulate(system, intensity, seed=seed)
-        known: dict[str, Any] = {"intensity": intensity, "box": system.box}
-        figure = published.get(f"Z:{intensity:g}")
-        try:
-            density = marginal_density(identified.quasipotential, identified.symbols, **known)
-            quadrature = normalisation_quadrature(identified.quasipotential, identified.symbols, **known)
-        except NumericalFailure as error:
-            logger.warning("intensity %g: %s", intensity, error)
-            continue
-        compared = density.compare(samples)
-        rows.append(
-            {
-                "run": shown.run,
-                "method": shown.method,
-                "intensity": intensity,
-                "bessel": normalisation_bessel(
-                    identified.quasipotential, identified.symbols, intensity=intensity
-                ),
-                "quadrature": quadrature,
-                "simulated_distance": compared.total_variation,
-                "sampling_floor": compared.sampling_floor,
-                "published": figure.mean if figure else np.nan,
-            }
-        )
-        densities.append(replace(density, normalisation=quadrature, comparison=compared))
-        rows += _density_of_published(published, system, samples, intensity)
-    return _Rows(rows, densities, [])
-
-
-def _of_landscape(
-    shown: LandscapeShown,
-    system: Dynamics,
-    intensities: Sequence[float],
-    *,
-    published: Mapping[str, PublishedFigure],
-    seed: int,
-) -> _Rows:
-    """From the formulas of all wells, where these are believed."""
-    stored, potential = shown.landscape, shown.landscape.global_quasipotential
-    assert potential is not None
-    identified, count = potential.wells[0].dynamics, len(potential.wells)
+    rows: list[dict[str, Any]] = []
+    shares: list[dict[str, Any]] = []
+    densities: list[StationaryDensity] = []
     try:
-        fine = sample_potential(potential, system.box)
-        coarse = sample_potential(potential, system.box, cells=CELLS[system.dimension] // 2)
+        at = _of_wells(source, system) if isinstance(source, Landscape) else _of_one_formula(source, system)
     except NumericalFailure as error:
         logger.warning("%s", error)
-        return _Rows([], [], [])
-    lowest = lowest_possible(coarse, identified)
-    laws = [(way.start, way.end, way.barrier, way.exit.prefactor) for way in stored.transitions]
-    rows, densities, shares = [], [], []
-    for intensity in intensities:
+        at, settings = None, replace(settings, invariant=())
+    for intensity in settings.invariant:
+        assert at is not None
         try:
-            density = known_density(fine, coarse, lowest, intensity=intensity)
+            density, samples, row, of_wells = at(
+                intensity, generator(settings.seed, Purpose.INVARIANT, str(intensity))
+            )
         except NumericalFailure as error:
             logger.warning("intensity %g: %s", intensity, error)
             continue
-        draw = generator(seed, Purpose.INVARIANT, str(intensity))
+        densities.append(density)
+        row = {"run": run, "method": method, "intensity": intensity} | row
+        if not isinstance(source, Landscape):
+            figure = published.get(f"Z:{intensity:g}")
+            row["published"] = figure.mean if figure else np.nan
+        rows += [row, *_density_of_published(published, system, samples, intensity)]
+        shares += [{"run": run, "intensity": intensity} | one for one in of_wells]
+    return as_table("invariant", rows), as_table("well_shares", shares), densities
+
+
+AtIntensity = Callable[
+    [float, np.random.Generator], tuple[StationaryDensity, np.ndarray, dict[str, Any], list[dict[str, Any]]]
+]
+"""For ε: the density with its comparison, samples, a row of the table, and rows of shares of wells."""
+
+
+def _of_one_formula(formulas: SymbolicDecomposition, system: Dynamics) -> AtIntensity:
+    """From one formula over the whole region; walkers start anywhere in it."""
+    formula, symbols = formulas.quasipotential, formulas.symbols
+
+    def at(
+        intensity: float, draw: np.random.Generator
+    ) -> tuple[StationaryDensity, np.ndarray, dict[str, Any], list[dict[str, Any]]]:
+        low, high = system.box.T
+        start = draw.uniform(low, high, (DENSITY_WALKERS, system.dimension)).T
+        rate = np.linalg.norm(system.jacobian(start[:, :500].T), axis=(1, 2))
+        samples = simulate_stationary(
+            system, intensity=intensity, start=start,
+            step=ACCURACY / float(np.median(rate)), burn_in=STEPS // 5, steps=STEPS, thin=STEPS // KEPT,
+            generator=draw,
+        )  # fmt: skip
+        row, density = _density_row(formula, symbols, system, samples, intensity)
+        return density, samples, row, []
+
+    return at
+
+
+def _density_row(
+    formula: sympy.Expr,
+    symbols: Sequence[sympy.Symbol],
+    system: Dynamics,
+    samples: np.ndarray,
+    intensity: float,
+) -> tuple[dict[str, Any], StationaryDensity]:
+    """Z and the density of a formula of U over the whole domain, against samples."""
+    known: dict[str, Any] = {"intensity": intensity, "box": system.box}
+    density = marginal_density(formula, symbols, **known)
+    quadrature = normalisation_quadrature(formula, symbols, **known)
+    compared = density.compare(samples)
+    row = {
+        "bessel": normalisation_bessel(formula, symbols, intensity=intensity),
+        "quadrature": quadrature,
+        "simulated_distance": compared.total_variation,
+        "sampling_floor": compared.sampling_floor,
+    }
+    return row, replace(density, normalisation=quadrature, comparison=compared)
+
+
+def _of_wells(landscape: Landscape, system: Dynamics) -> AtIntensity:
+    """From the formulas of all wells, where these are believed; walkers start as the density says."""
+    potential = landscape.global_quasipotential
+    assert potential is not None
+    identified, count = potential.wells[0].dynamics, len(potential.wells)
+    fine = sample_potential(potential, system.box)
+    coarse = sample_potential(potential, system.box, cells=CELLS[system.dimension] // 2)
+    lowest = lowest_possible(coarse, identified)
+    laws = [(way.start, way.end, way.barrier, way.exit.prefactor) for way in landscape.transitions]
+
+    def at(
+        intensity: float, draw: np.random.Generator
+    ) -> tuple[StationaryDensity, np.ndarray, dict[str, Any], list[dict[str, Any]]]:
+        density = known_density(fine, coarse, lowest, intensity=intensity)
         start = density.starting_states(DENSITY_WALKERS, generator=draw)
         samples = walk(
             system, start, intensity=intensity, burn_in=STEPS // 5, steps=STEPS,
             thin=STEPS // KEPT, generator=draw,
         )  # fmt: skip
         compared = density.compare(samples)
-        rows.append(
-            {
-                "run": shown.run,
-                "method": "local formulas",
-                "intensity": intensity,
-                "quadrature": density.normalisation,
-                "simulated_distance": compared.total_variation,
-                "sampling_floor": compared.sampling_floor,
-                "unknown_at_most": density.unknown,
-                "simulated_unknown": compared.outside,
-            }
-        )
-        densities.append(replace(density.marginal(), comparison=compared))
-        rows += _density_of_published(published, system, samples, intensity)
+        row = {
+            "quadrature": density.normalisation,
+            "simulated_distance": compared.total_variation,
+            "sampling_floor": compared.sampling_floor,
+            "unknown_at_most": density.unknown,
+            "simulated_unknown": compared.outside,
+        }
         simulated, changed = fine.simulated_shares(start, samples)
         by_rates = shares_by_rates(laws, count, intensity=intensity)
-        shares += [
+        shares = [
             {
-                "run": shown.run,
-                "intensity": intensity,
                 "well": f"A{index + 1}",
                 "share": density.shares[index],
                 "by_rates": by_rates[index],
@@ -501,7 +439,9 @@ def _of_landscape(
             }
             for index in range(count)
         ]
-    return _Rows(rows, densities, shares)
+        return replace(density.marginal(), comparison=compared), samples, row, shares
+
+    return at
 
 
 def _density_of_published(
@@ -511,20 +451,9 @@ def _density_of_published(
     formula = published_formula(published, "U", system.symbols)
     if formula is None:
         return []
-    known: dict[str, Any] = {"intensity": intensity, "box": system.box}
     try:
-        compared = marginal_density(formula, system.symbols, **known).compare(samples)
-        quadrature = normalisation_quadrature(formula, system.symbols, **known)
+        row, _ = _density_row(formula, system.symbols, system, samples, intensity)
     except NumericalFailure as error:
         logger.warning("published formula, intensity %g: %s", intensity, error)
         return []
-    row = {
-        "run": NONE_OF_OURS,
-        "method": "published formula",
-        "intensity": intensity,
-        "bessel": normalisation_bessel(formula, system.symbols, intensity=intensity),
-        "quadrature": quadrature,
-        "simulated_distance": compared.total_variation,
-        "sampling_floor": compared.sampling_floor,
-    }
-    return [row]
+    return [{"run": NONE_OF_OURS, "method": "published formula", "intensity": intensity} | row]

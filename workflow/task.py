@@ -1,8 +1,8 @@
 """Tasks: the jobs of the workflow, each a function from files and settings to files.
 
 A task is a function ``run(given, settings)`` under the decorator `task`. It names what it reads and the parts
-of the settings that it depends on; what it returns is written by name (`siq.workflow.files`). A rule names
-its task; `siq.workflow.pipeline.analyse` chains the same tasks in memory.
+of the settings that it depends on; what it returns is written by name (`workflow.files`). A rule names its
+task.
 """
 
 from __future__ import annotations
@@ -31,21 +31,24 @@ class Task:
     options
         Parts of the settings that it depends on, see `siq.workflow.study.PipelineSettings.parts`.
     run
-        The function: of what is given and of settings, its results by the names of the rule's outputs, or an
-        object with the method ``files()`` that gives them. When they may change for the same input, its
-        version is raised (``python -m workflow.versions --raise TASK``), which makes them anew.
+        The function: of what is given and of settings, its results by the names of the rule's outputs. When
+        they may change for the same input, its version is raised (``python -m workflow.versions --raise
+        TASK``), which makes them anew.
     """
 
     name: str
     needs: tuple[str, ...]
     options: tuple[str, ...]
-    run: Callable[[Given, PipelineSettings], Any]
+    run: Callable[[Given, PipelineSettings], Mapping[str, Any]]
 
 
-def task(*needs: str, options: Sequence[str] = ()) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+Run = Callable[..., Mapping[str, Any]]
+
+
+def task(*needs: str, options: Sequence[str] = ()) -> Callable[[Run], Run]:
     """Make a task of a function, which keeps its name; rules and tasks share it."""
 
-    def register(run: Callable[..., Any]) -> Callable[..., Any]:
+    def register(run: Run) -> Run:
         TASKS[run.__name__] = Task(run.__name__, needs, tuple(options), run)
         return run
 
@@ -62,7 +65,7 @@ class _Stored(Sequence[Any]):
         return len(self.paths)
 
     def __getitem__(self, place: Any) -> Any:
-        from siq.workflow.files import read
+        from workflow.files import read
 
         return read(self.name, self.paths[place])
 
@@ -78,8 +81,6 @@ class Given:
     ----------
     files
         Paths by name: one, or several where each run has one.
-    values
-        What is known already, by the same names; all of it in memory.
     number
         Of the run, or of the first run of a block.
     options
@@ -87,7 +88,7 @@ class Given:
     wildcards
         Of the rule.
     outputs
-        Where results go, by name; empty in memory.
+        Where results go, by name.
     device, threads
         Where networks are trained, and on how many threads.
     tell
@@ -97,7 +98,6 @@ class Given:
     """
 
     files: Mapping[str, Any] = field(default_factory=dict)
-    values: dict[str, Any] = field(default_factory=dict)
     number: int = 0
     options: Mapping[str, Any] = field(default_factory=dict)
     wildcards: Mapping[str, str] = field(default_factory=dict)
@@ -106,23 +106,19 @@ class Given:
     threads: int = 1
     tell: Callable[[str], None] = lambda text: None
     afterwards: list[Callable[[], None]] = field(default_factory=list)
+    _read: dict[str, Any] = field(default_factory=dict)
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
             raise AttributeError(name)
-        if name not in self.values:
-            from siq.workflow.files import read
+        if name not in self._read:
+            from workflow.files import read
 
             path = self.files.get(name) or None
             several = path is not None and not isinstance(path, str)
-            self.values[name] = _Stored(name, path or ()) if several else path and read(name, path)
-        return self.values[name]
+            self._read[name] = _Stored(name, path or ()) if several else path and read(name, path)
+        return self._read[name]
 
     def path(self, name: str) -> str | None:
         """A file as such, None where it is absent."""
         return self.files.get(name) or None
-
-
-def outputs_of(made: Any) -> Mapping[str, Any]:
-    """What a task returned, by the names of its outputs."""
-    return made if isinstance(made, Mapping) else made.files()

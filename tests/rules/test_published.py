@@ -11,7 +11,7 @@ from known_systems import exact_archetype
 from siq.errors import InputError
 from siq.systems.cards import load_system
 from siq.systems.diffusion import Diffusion
-from siq.workflow.published import (
+from workflow.published import (
     PublishedFigure,
     PublishedMesh,
     _component_terms,
