@@ -66,7 +66,10 @@ def _closure(name: str) -> tuple[list[str], list[Path]]:
 @cache
 def _files_behind(file: Path) -> list[Path]:
     """What a file imports, but for what only methods for users call above it, such as `Landscape.report`."""
-    package = file.relative_to(LIBRARY).parts[1] if file.is_relative_to(LIBRARY / "siq") else "report"
+    if file.is_relative_to(LIBRARY / "siq"):
+        package = file.relative_to(LIBRARY).parts[1]
+    else:  # what writes figures to files draws none of them
+        package = "workflow" if file == BASE / "workflow" / "files.py" else "report"
     above = {"report": (), "workflow": ("siq.report",)}.get(package, ("siq.report", "siq.workflow"))
     modules = {module for module in _imports_of(str(file)) if not module.startswith(above)}
     return [each for module in modules for each in _files(module)]

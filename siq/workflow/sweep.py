@@ -1,29 +1,17 @@
-"""The step that follows landscapes along control parameters.
+"""Landscapes of equations along one control parameter, or over two.
 
-Equilibria, paths of least action and escape times by `siq.quasipotential.landscape_assembly`, without
-formulas of U. A point knows of no noise and of no other point, so that a change of the range, or of the
-noise, leaves those that there are.
-
-Those on one stable stretch of a branch of equilibria that does not turn back. A stretch ends at a fold, at a
-Hopf point, and where branches meet.
-
-Along each row and each column of the map branches of equilibria are followed through those that its points
-know. What folds or begins to oscillate there is a point of a curve, which is followed through the plane
-(`siq.systems.continuation`).
-
-Barriers and prefactors are those of the point; times and shares follow from them for a noise
-(`siq.quasipotential.rates`, `siq.quasipotential.invariant_density`).
-
-Points (`siq.workflow.sweep`) become tables here: equilibria are joined to branches by continuation
-(`siq.systems.continuation`), a well is a stable stretch of a branch, and its times and weights follow for a
-noise (`siq.workflow.sweep`).
+A point of a sweep is the landscape at one value, without formulas of U. It knows of no noise and of no other
+point, so that a change of the range, or of the noise, leaves those that there are. Of one parameter
+equilibria are joined to branches by continuation (`siq.systems.continuation`), and a well is a stable stretch
+of a branch that does not turn back: it ends at a fold, at a Hopf point, and where branches meet. Of two,
+folds and Hopf points along rows and columns of the map are points of curves, which are followed through the
+plane. Times and weights follow from barriers and prefactors for a noise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from dataclasses import dataclass as plain_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -40,7 +28,6 @@ from siq.quasipotential.cell_density import shares_by_rates
 from siq.quasipotential.landscape import NoLandscape
 from siq.quasipotential.landscape_assembly import EquationSettings, landscape_from_equations, usable_system
 from siq.quasipotential.rates import EscapeRate, NoiseStrength, mean_residence_time
-from siq.quasipotential.transitions import Transition
 from siq.remarks import Remark, sentence
 from siq.systems.cards import ParameterEntry, SystemCard, build_system, load_system
 from siq.systems.continuation import Bifurcation, Branch, follow_branches, follow_curves
@@ -105,32 +92,10 @@ class SweptPoint:
     notes: tuple[str, ...] = ()
 
 
-def _check_noise(system: Dynamics, names: Iterable[str]) -> None:
-    """Refuse parameters on which D depends: a dynamics has it with their values inserted.
-
-    Raises
-    ------
-    InputError
-        With what to give instead.
-    """
-    if of_noise := sorted(set(names) & set(system.parameters_of_noise)):
-        raise InputError(
-            system.name or "the system", "diffusion",
-            f"D depends on {', '.join(of_noise)}, and was made with the value of the card",
-            "give the card instead of the dynamics",
-        )  # fmt: skip
-
-
 def _with_parameters(
     system: str | Path | Dynamics, names: Sequence[str], values: Sequence[float]
 ) -> Dynamics:
-    """A system with other values of some parameters, those in D included.
-
-    Raises
-    ------
-    InputError
-        Where the system has no landscape at these values.
-    """
+    """A system with other values of some parameters, those in D included."""
     changed = dict(zip(names, map(float, values), strict=True))
     if not isinstance(system, Dynamics):
         document = read_document(system)
@@ -171,7 +136,16 @@ def point_at(
             _SweptWell(tuple(map(float, one.position)), float(-one.eigenvalues.real.max()))
             for one in found.attractors
         ),
-        tuple(map(_as_way, found.transitions)),
+        tuple(
+            _SweptWay(
+                way.start,
+                way.end,
+                float(way.barrier) if np.isfinite(way.barrier) else None,
+                None if way.rate is None else float(way.rate.prefactor),
+                "; ".join(way.notes),
+            )
+            for way in found.transitions
+        ),
         settled=float(found.basins.sum()),
         notes=found.notes,
     )
@@ -189,85 +163,60 @@ def _resting(system: Dynamics, seed: int) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(map(float, one.position)) for one in found)
 
 
-def _as_way(way: Transition) -> _SweptWay:
-    barrier = float(way.barrier) if np.isfinite(way.barrier) else None
-    prefactor = None if way.rate is None else float(way.rate.prefactor)
-    return _SweptWay(way.start, way.end, barrier, prefactor, "; ".join(way.notes))
-
-
 DIGITS = 10  # of positions in tables
 
 
-@dataclass(frozen=True)
-class Wells:
-    """Wells as stable stretches of branches.
-
-    Attributes
-    ----------
-    branches
-        Equilibria against the parameter.
-    number
-        For each branch the well that each of its points belongs to, -1 where it is unstable.
-    """
-
-    branches: Sequence[Branch]
-    number: tuple[np.ndarray, ...]
-
-    @classmethod
-    def along(cls, branches: Sequence[Branch]) -> Wells:
-        """Each stretch that is stable and does not turn back is a well, by the first states."""
-        stretches = []
-        for index, branch in enumerate(branches):
-            kind = np.where(branch.unstable == 0, np.where(branch.tangents[:, -1] > 0, 1, -1), 0)
-            ends = [*(np.flatnonzero(np.diff(kind)) + 1), len(kind)]
-            starts = [0, *ends[:-1]]
-            stretches += [
-                (index, first, last) for first, last in zip(starts, ends, strict=True) if kind[first] != 0
-            ]
-
-        def place(stretch: tuple[int, int, int]) -> tuple[float, ...]:
-            index, first, last = stretch
-            branch = branches[index]
-            at = np.argmin(branch.values[first:last]) + first
-            return tuple(np.round(branch.states[at], 6))
-
-        number = [np.full(len(branch.values), -1) for branch in branches]
-        for well, (index, first, last) in enumerate(sorted(stretches, key=place)):
-            number[index][first:last] = well
-        return cls(branches, tuple(number))
-
-    def numbers(self, point: SweptPoint) -> tuple[int, ...]:
-        """Which wells the attractors of a point are; -1 for one that is on no branch."""
-        return tuple(self._number(np.array(well.state), point.values[0]) for well in point.wells)
-
-    def _number(self, state: np.ndarray, value: float) -> int:
-        for branch, number in zip(self.branches, self.number, strict=True):
-            place = branch.index_of(state, value)
-            if place is not None:
-                return self._stable_beside(branch, number, place)
-        return -1
-
-    @staticmethod
-    def _stable_beside(branch: Branch, number: np.ndarray, place: int) -> int:
-        """Next to a fold the nearest point of the branch may lie behind it."""
-        beside = number[max(place - 1, 0) : place + 2]
-        return int(number[place]) if number[place] >= 0 else int(beside.max())
-
-    def branch_rows(self) -> list[dict[str, object]]:
-        """The table of branches."""
-        return [
-            {
-                "branch": index,
-                "well": int(number[k]),
-                "value": branch.values[k],
-                "position": _position_text(branch.states[k]),
-                "unstable": int(branch.unstable[k]),
-                "growth": branch.eigenvalues[k, 0].real,
-                "frequency": abs(branch.eigenvalues[k, 0].imag),
-            }
-            for index, (branch, number) in enumerate(zip(self.branches, self.number, strict=True))
-            for k in range(len(branch.values))
+def _wells_along(branches: Sequence[Branch]) -> list[np.ndarray]:
+    """For each branch the well of each of its points, -1 where it is unstable; in the order of the states."""
+    stretches = []
+    for index, branch in enumerate(branches):
+        kind = np.where(branch.unstable == 0, np.where(branch.tangents[:, -1] > 0, 1, -1), 0)
+        ends = [*(np.flatnonzero(np.diff(kind)) + 1), len(kind)]
+        starts = [0, *ends[:-1]]
+        stretches += [
+            (index, first, last) for first, last in zip(starts, ends, strict=True) if kind[first] != 0
         ]
+
+    def place(stretch: tuple[int, int, int]) -> tuple[float, ...]:
+        index, first, last = stretch
+        branch = branches[index]
+        at = np.argmin(branch.values[first:last]) + first
+        return tuple(np.round(branch.states[at], 6))
+
+    number = [np.full(len(branch.values), -1) for branch in branches]
+    for well, (index, first, last) in enumerate(sorted(stretches, key=place)):
+        number[index][first:last] = well
+    return number
+
+
+def _well_of(
+    branches: Sequence[Branch], numbers: Sequence[np.ndarray], state: np.ndarray, value: float
+) -> int:
+    """Which well an attractor is at a value; -1 for one that is on no branch."""
+    for branch, number in zip(branches, numbers, strict=True):
+        place = branch.index_of(state, value)
+        if place is not None:
+            # Next to a fold the nearest point of the branch may lie behind it.
+            beside = number[max(place - 1, 0) : place + 2]
+            return int(number[place]) if number[place] >= 0 else int(beside.max())
+    return -1
+
+
+def _branch_rows(branches: Sequence[Branch], numbers: Sequence[np.ndarray]) -> list[dict[str, object]]:
+    """The table of branches."""
+    return [
+        {
+            "branch": index,
+            "well": int(number[k]),
+            "value": branch.values[k],
+            "position": _position_text(branch.states[k]),
+            "unstable": int(branch.unstable[k]),
+            "growth": branch.eigenvalues[k, 0].real,
+            "frequency": abs(branch.eigenvalues[k, 0].imag),
+        }
+        for index, (branch, number) in enumerate(zip(branches, numbers, strict=True))
+        for k in range(len(branch.values))
+    ]
 
 
 def _bifurcation_rows(found: Sequence[Bifurcation]) -> list[dict[str, object]]:
@@ -293,23 +242,7 @@ def _position_text(state: np.ndarray | Sequence[float]) -> str:
 def _curves_of_map(
     system: Dynamics, names: tuple[str, ...], points: Sequence[SweptPoint]
 ) -> tuple[list[Branch], list[Remark]]:
-    """Curves of folds and of Hopf points within the ranges of a map.
-
-    Parameters
-    ----------
-    system
-        The system at any of the points.
-    names
-        Of the two parameters.
-    points
-        Of the map. A curve that none of its rows and columns crosses is not found.
-
-    Returns
-    -------
-    tuple
-        The curves, and what could not be followed. None where one of the parameters has a single value, and
-        the map is a line.
-    """
+    """Curves of folds and of Hopf points that a row or a column of a map crosses; none where it is a line."""
     values = np.array([point.values for point in points])
     limits = list(zip(values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True))
     if any(low == high for low, high in limits):
@@ -367,17 +300,7 @@ UNKNOWN = "no way out was found"
 
 
 def _well_rows(point: SweptPoint, number: Sequence[int], noise: float | None) -> list[dict[str, object]]:
-    """One row for every well of a point; one that says why where there is none.
-
-    Parameters
-    ----------
-    point
-        What was found there.
-    number
-        Of each of its wells along their branches.
-    noise
-        ε; None for neither times nor weights.
-    """
+    """One row for every well of a point; one that says why where there is none."""
     if not point.wells:
         return [_place(point) | {"well": -1, "noise": noise, "note": point.reason or "; ".join(point.notes)}]
     weights = _weights(point, noise)
@@ -391,7 +314,7 @@ def _well_rows(point: SweptPoint, number: Sequence[int], noise: float | None) ->
 
 
 def _way_rows(point: SweptPoint, number: Sequence[int]) -> list[dict[str, object]]:
-    """One row for every way out of a well, the arguments as `well_rows` has them."""
+    """One row for every way out of a well of a point."""
     return [
         _place(point)
         | {
@@ -458,7 +381,7 @@ if TYPE_CHECKING:
 MOST_PARAMETERS = 2
 
 
-@plain_dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Sweep:
     """A landscape against one parameter, or two.
 
@@ -493,13 +416,6 @@ class Sweep:
     notes: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
     curves: pd.DataFrame = field(default_factory=lambda: as_table("bifurcation_curves", []))
-
-    def files(self) -> dict[str, pd.DataFrame]:
-        """By the names of the rule."""
-        return {
-            "sweep": self.table, "sweep_ways": self.ways, "branches": self.branches,
-            "bifurcations": self.bifurcations, "bifurcation_curves": self.curves,
-        }  # fmt: skip
 
     def plot(self) -> Figure:
         """Equilibria, barriers and times against the parameter; of two, a map with its curves."""
@@ -575,31 +491,24 @@ def sweep(
         if given.ndim != 1 or not len(given) or not np.isfinite(given).all():
             raise ValueError(f"the values of {name} have to be finite numbers, at least one")
     base = system if isinstance(system, Dynamics) else load_system(system)
-    _check_names(base, named)
-    if isinstance(system, Dynamics):
-        _check_noise(system, named)
+    _check_parameters(base, named, with_noise=isinstance(system, Dynamics))
     grid = np.stack(np.meshgrid(*named.values(), indexing="ij"), axis=-1).reshape(-1, len(named))
     names = tuple(named)
     points = [point_at(system, names, tuple(map(float, one)), seed=seed) for one in grid]
     return collected(base, names, points, noise=noise)
 
 
-def _check_names(system: Dynamics, names: Iterable[str]) -> None:
-    """Refuse parameters that a system has not.
-
-    Raises
-    ------
-    InputError
-        With those that it has.
-    """
-    known = [each.name for each in system.parameters]
+def _check_parameters(system: Dynamics, names: Iterable[str], *, with_noise: bool) -> None:
+    """Refuse unknown parameters, and with `with_noise` those in D, which has their values inserted."""
+    known, who = [each.name for each in system.parameters], system.name or "the system"
     for name in names:
         if name not in known:
             otherwise = f"use one of {', '.join(known)}" if known else "make the number a parameter"
-            raise InputError(
-                system.name or "the system", "parameters", f"there is no parameter '{name}'",
-                suggestion(name, known, otherwise=otherwise),
-            )  # fmt: skip
+            remedy = suggestion(name, known, otherwise=otherwise)
+            raise InputError(who, "parameters", f"there is no parameter '{name}'", remedy)
+    if with_noise and (of_noise := sorted(set(names) & set(system.parameters_of_noise))):
+        fault = f"D depends on {', '.join(of_noise)}, and was made with the value of the card"
+        raise InputError(who, "diffusion", fault, "give the card instead of the dynamics")
 
 
 def collected(
@@ -620,7 +529,8 @@ def collected(
     """
     points = sorted(points, key=lambda point: point.values)
     remarks: list[Remark] = []
-    wells: Wells | None = None
+    branches: Sequence[Branch] = ()
+    stretches: list[np.ndarray] = []
     bifurcations: list[Bifurcation] = []
     curves: list[Branch] = []
     values = [point.values[0] for point in points]
@@ -628,10 +538,13 @@ def collected(
         limits = (min(values), max(values))
         seeds = [(point.values[0], np.array(one)) for point in points for one in point.equilibria]
         branches, bifurcations, remarks = follow_branches(system, names[0], limits, seeds)
-        wells = Wells.along(branches)
-        numbers = [wells.numbers(point) for point in points]
+        stretches = _wells_along(branches)
+        numbers = [
+            [_well_of(branches, stretches, np.array(well.state), point.values[0]) for well in point.wells]
+            for point in points
+        ]
     else:
-        numbers = [tuple(range(len(point.wells))) for point in points]
+        numbers = [list(range(len(point.wells))) for point in points]
     if len(names) == MOST_PARAMETERS:
         curves, remarks = _curves_of_map(system, names, points)
     notes = tuple(dict.fromkeys(map(sentence, remarks)))
@@ -643,7 +556,7 @@ def collected(
     units |= {each.name: each.unit for each in system.parameters if each.name in names}
     return Sweep(
         names, system.states, as_table("sweep", rows), as_table("sweep_ways", ways),
-        as_table("branches", [] if wells is None else wells.branch_rows()),
+        as_table("branches", _branch_rows(branches, stretches)),
         as_table("bifurcations", _bifurcation_rows(bifurcations)),
         notes, units, as_table("bifurcation_curves", _curve_rows(curves)),
     )  # fmt: skip
