@@ -116,9 +116,9 @@ def residual_noise(
         kind = "measurement" if score < 0 else "coloured"
     if kind == "measurement":
         measurement = _measurement_errors(found, sample)
-        rounding = rounding_errors(recordings)
-        if is_rounding(measurement, rounding, correlation=correlation):
-            bias, text = rounding_bias(found, pairs, rounding), rounding_text(recordings)
+        bias = bias_of_rounding(found, pairs, recordings, measurement, correlation=correlation)
+        if bias is not None:
+            text = rounding_text(recordings)
             remark = Remark("inference.rounding", {"written": text})
             # How many decimals leave rounding below everything else: that of a recording without noise.
             moves = np.sqrt(((pairs.xh - pairs.x0) ** 2).mean(axis=0))
@@ -191,17 +191,32 @@ def _measurement_errors(found: FieldEstimate, sample: SnapshotPairs) -> np.ndarr
     return np.sqrt(np.maximum(-covariance / carried, 0.0))
 
 
-def rounding_errors(recordings: Recordings) -> np.ndarray:
+def bias_of_rounding(
+    found: FieldEstimate,
+    pairs: SnapshotPairs,
+    recordings: Recordings,
+    measured: np.ndarray,
+    *,
+    correlation: float,
+) -> float | None:
+    """The largest bias of a coefficient of f where measured noise is that of rounding; None where not.
+
+    The noise is in standard deviations ``(d,)``, and the correlation that of neighbouring residuals.
+    """
+    rounding = _rounding_errors(recordings)
+    if not _is_rounding(measured, rounding, correlation=correlation):
+        return None
+    return _rounding_bias(found, pairs, rounding)
+
+
+def _rounding_errors(recordings: Recordings) -> np.ndarray:
     """Standard deviation of what rounding did to each state, 0 where none is recognised: shape ``(d,)``."""
     steps = [resolution_step(values) for values in recordings.values.T]
     return np.array([0.0 if step is None else rounding_error(step) for step in steps])
 
 
-def is_rounding(measured: np.ndarray, rounding: np.ndarray, *, correlation: float) -> bool:
-    """Whether measured noise, by its standard deviations ``(d,)``, is that of rounding, and no other.
-
-    The correlation is that of neighbouring residuals: -1/2 where nothing but the measurement is noisy.
-    """
+def _is_rounding(measured: np.ndarray, rounding: np.ndarray, *, correlation: float) -> bool:
+    """Whether measured noise is that of rounding alone; neighbours then have the correlation -1/2 at most."""
     low, high = ROUNDING_RANGE
     own = rounding > 0
     known = (measured <= high * rounding) & ((measured >= low * rounding) | (rounding < rounding.max()))
@@ -210,7 +225,7 @@ def is_rounding(measured: np.ndarray, rounding: np.ndarray, *, correlation: floa
     )
 
 
-def rounding_bias(found: FieldEstimate, pairs: SnapshotPairs, rounding: np.ndarray) -> float:
+def _rounding_bias(found: FieldEstimate, pairs: SnapshotPairs, rounding: np.ndarray) -> float:
     """The largest bias that rounding brings into a coefficient of f, in its standard errors.
 
     The error e of X0 stands in the velocity as ``-e/h``, and in a function θ as ``e ∂θ/∂x``: their product

@@ -32,15 +32,13 @@ from siq.data.recordings import (
 from siq.errors import NumericalFailure
 from siq.inference.checks import (
     PredictionLimits,
+    bias_of_rounding,
     check_prediction,
     deviations,
-    is_rounding,
     mean_residual_probability,
     neighbour_correlations,
     prediction_errors,
     residual_noise,
-    rounding_bias,
-    rounding_errors,
     rounding_text,
 )
 from siq.inference.diffusion_model import (
@@ -83,9 +81,7 @@ from siq.remarks import Remark
 from siq.systems.diffusion import Diffusion
 
 SUSPECT_SCORE = -1.0  # standard errors of the correlation of neighbouring residuals
-SENSOR_SHARE = (
-    0.1  # of what means move by: a search finds its way down to no sensor noise, but not up from it
-)
+SENSOR_SHARE = 0.1  # of what means move by: a search finds its way down to no sensor noise, but not up
 MIN_SHARE, MAX_SHARE = 1e-3, 0.45  # of the residuals' variance: a sensor's share that a fit begins with
 WHOLE_STEP_TOLERANCE = 0.05  # of an exposure, as exactly as residuals show it of some thousand samples
 PREDICTED_RECORDINGS = 200  # held-out ones that are predicted: enough for a median
@@ -195,8 +191,7 @@ class _Case:
     def identified(self) -> FieldEstimate:
         """By the method that noise and correlations of the recordings ask for."""
         check_origin(self.library, self.recordings.values, names=self.recordings.titles)
-        training = snapshot_pairs(self.training, pair_step=self.pair_step)
-        step = self.integrator_step
+        training, step = self._pairs(self.training), self.integrator_step
         regress = partial(identify_vector_field, self.library, options=self.options, integrator_step=step)
         if not carries_noise(self.library, training, options=self.options, integrator_step=step):
             return self._finished_by_pairs(regress(training))
@@ -208,7 +203,7 @@ class _Case:
                     return found
             return self.by_instruments(memory)
         # Under noise every recording counts: all give the result, a part of them its test.
-        pairs = snapshot_pairs(self.recordings, pair_step=self.pair_step)
+        pairs = self._pairs(self.recordings)
         found = with_process_noise_rate(regress(pairs), pairs)
         return self.with_sensor_noise(found) or self._finished_by_pairs(found)
 
@@ -218,29 +213,27 @@ class _Case:
         What could be sensor noise is asked of the likelihood from one standard error on: it would bias f long
         before it is significant.
         """
-        pairs = snapshot_pairs(self.recordings, pair_step=self.pair_step)
+        pairs = self._pairs(self.recordings)
         correlation, score = neighbour_correlations(found, pairs)
         if not (score < SUSPECT_SCORE).any():
             return None
         rate = np.diag(found.noise_rate)
-        variance, rounding = rate * float(np.median(pairs.h)), rounding_errors(self.recordings)
+        variance = rate * float(np.median(pairs.h))
         measured = np.sqrt(np.maximum(-correlation, 0.0) * variance)
-        rounded = is_rounding(measured, rounding, correlation=float(correlation.min()))
-        if rounded and rounding_bias(found, pairs, rounding) <= HARMLESS_BIAS:
+        least = float(correlation.min())
+        bias = bias_of_rounding(found, pairs, self.recordings, measured, correlation=least)
+        if bias is not None and bias <= HARMLESS_BIAS:
             return None
         share = np.clip(-correlation, MIN_SHARE, MAX_SHARE)
         try:
-            by_likelihood = identify_by_likelihood(
-                ObservationModel(self.library, found.diffusion), self.recordings,
-                Noise(share * variance, rate * (1 - 2 * share)), false_terms=self.options.false_terms,
-                generator=self.draw(Purpose.STABILITY), pair_step=self.pair_step,
-            )  # fmt: skip
+            observation = ObservationModel(self.library, found.diffusion)
+            again = self._by_likelihood(observation, Noise(share * variance, rate * (1 - 2 * share)))
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             if ((score < -SIGNIFICANT_SCORE) & (correlation < -HARMLESS_CORRELATION)).any():
                 raise NumericalFailure(f"the sensor is noisy, and f with it is not found: {error}") from None
             return None
-        assert by_likelihood.diagnosis is not None and by_likelihood.diagnosis.sensor_evidence is not None
-        return self._finished(by_likelihood) if by_likelihood.diagnosis.sensor_evidence > 1 else None
+        assert again.diagnosis is not None and again.diagnosis.sensor_evidence is not None
+        return self._finished(again) if again.diagnosis.sensor_evidence > 1 else None
 
     def by_exposure(self, observation: ObservationModel) -> FieldEstimate | None:
         """By the likelihood of samples that are means over an exposure; None where they are no such means.
@@ -249,11 +242,7 @@ class _Case:
         """
         try:
             moved, step = moved_by(observation.measured(self.recordings, self.pair_step))
-            found = identify_by_likelihood(
-                observation, self.recordings, Noise(SENSOR_SHARE * moved, moved / step),
-                false_terms=self.options.false_terms, generator=self.draw(Purpose.STABILITY),
-                pair_step=self.pair_step,
-            )  # fmt: skip
+            found = self._by_likelihood(observation, Noise(SENSOR_SHARE * moved, moved / step))
         except (NumericalFailure, np.linalg.LinAlgError):
             return None
         assert found.diagnosis is not None
@@ -266,22 +255,33 @@ class _Case:
                 "D is given for the positions, and noise drives the hidden velocities; leave the diffusion"
                 " out, it is found"
             )
-        found = identify_by_likelihood(
-            observation, self.recordings, false_terms=self.options.false_terms,
+        return self._finished(self._by_likelihood(observation))
+
+    def _by_likelihood(self, observation: ObservationModel, noise: Noise | None = None) -> FieldEstimate:
+        return identify_by_likelihood(
+            observation, self.recordings, noise, false_terms=self.options.false_terms,
             generator=self.draw(Purpose.STABILITY), pair_step=self.pair_step,
         )  # fmt: skip
-        return self._finished(found)
+
+    def _pairs(self, recordings: Recordings) -> SnapshotPairs:
+        return snapshot_pairs(recordings, pair_step=self.pair_step)
 
     def _finished(self, found: FieldEstimate) -> FieldEstimate:
         """An estimate by likelihood with its D, its strength, and its test."""
-        noise, pairs = found.diagnosis, len(snapshot_pairs(self.recordings, pair_step=self.pair_step).h)
+        noise, pairs = found.diagnosis, len(self._pairs(self.recordings).h)
         assert noise is not None and noise.measurement_error is not None
         forced = bool(found.noise_rate.any())
-        remarks = []
+        sizes = zip(noise.measurement, self.recordings.titles, strict=True)
+        sensors = [{"size": float(size), "state": name} for size, name in sizes]
+        remarks = [Remark("inference.measurement_noise", {"sensors": sensors})]
         if found.hidden_velocities:
+            remarks = [Remark("inference.hidden_velocities", {"sensors": sensors, "process_noise": forced})]
             source = DiffusionSource.OF_VELOCITIES if forced else DiffusionSource.UNIT_OF_VELOCITIES
-            if not forced:
-                _check_velocity_units(self.units)
+            if not forced and len({unit for unit in self.units if unit}) > 1:
+                raise NumericalFailure(
+                    "no process noise is seen that would show D, and the positions have different units, so"
+                    " that no unit matrix can stand for it; scale them to one unit"
+                )
         else:
             first = found
             found, source = self._with_diffusion(found, pairs)
@@ -297,20 +297,12 @@ class _Case:
                 remarks.append(Remark("inference.exposure", values))
             if first.noise is not None and self.given is not None and self.given.constant:
                 remarks.append(Remark("inference.noise_depends_on_state"))
-        remarks = [self._sensor_remark(noise, forced), *remarks]
         noise = replace(noise, diffusion=source, pairs=pairs, remarks=tuple(remarks))
         found = replace(found, diagnosis=noise)
         probability, ratio = held_out_innovations(
             found, self.training, self.held_out, pair_step=self.pair_step
         )
         return self._tested(found, mean_probability=probability, held_out_ratio=ratio)
-
-    def _sensor_remark(self, noise: NoiseDiagnosis, forced: bool) -> Remark:
-        sizes = zip(noise.measurement, self.recordings.titles, strict=True)
-        sensors = [{"size": float(size), "state": name} for size, name in sizes]
-        if len(noise.measurement) < self.library.dimension:
-            return Remark("inference.hidden_velocities", {"sensors": sensors, "process_noise": forced})
-        return Remark("inference.measurement_noise", {"sensors": sensors})
 
     def _strength(self, found: FieldEstimate, diffusion: Diffusion) -> float:
         """ε of another D than was found: the mean of ``tr D⁻¹(x) εD(x) / d`` over the states."""
@@ -324,9 +316,8 @@ class _Case:
     def _with_diffusion(self, found: FieldEstimate, samples: int) -> tuple[FieldEstimate, DiffusionSource]:
         """The estimate with D, and where that is from: given, estimated of so many samples, or the unit."""
         if self.given is not None:
-            return replace(
-                found, diffusion=self.given, noise=None, constant_noise=None
-            ), DiffusionSource.GIVEN
+            given = replace(found, diffusion=self.given, noise=None, constant_noise=None)
+            return given, DiffusionSource.GIVEN
         if found.noise is not None:
             return found, DiffusionSource.ESTIMATED
         estimated = estimated_diffusion(found, pairs=samples) if found.noise_rate.any() else None
@@ -375,10 +366,7 @@ class _Case:
 
         f does not depend on D, and whether noise is white does not either: so D can come last.
         """
-        everything, training, unseen = (
-            snapshot_pairs(part, pair_step=self.pair_step)
-            for part in (self.recordings, self.training, self.held_out)
-        )
+        everything, training, unseen = map(self._pairs, (self.recordings, self.training, self.held_out))
         count, false_terms = len(training.h) + len(unseen.h), self.options.false_terms
 
         def diagnosed(found: FieldEstimate, source: DiffusionSource) -> FieldEstimate:
@@ -464,21 +452,6 @@ class _Case:
         if test.undecided:
             return said
         return f"{said}: leave 'identification.hidden_velocities' out, the position alone is the state"
-
-
-def _check_velocity_units(units: Sequence[str | None]) -> None:
-    """Refuse the unit matrix for D of hidden velocities where positions have different units.
-
-    Raises
-    ------
-    NumericalFailure
-        Where they have.
-    """
-    if len({unit for unit in units if unit}) > 1:
-        raise NumericalFailure(
-            "no process noise is seen that would show D, and the positions have different units, so that no"
-            " unit matrix can stand for it; scale them to one unit"
-        )
 
 
 def _possible_exposures(found: MarkovLag) -> list[float]:

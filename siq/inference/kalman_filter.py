@@ -462,6 +462,39 @@ class Noise:
         return replace(self, process=self.process * factor)
 
     @property
+    def driven(self) -> np.ndarray:
+        """Places of the states that process noise drives."""
+        return np.flatnonzero(self.process > 0)
+
+    @property
+    def coordinates(self) -> int:
+        """How many numbers make another noise of it, see `moved`."""
+        count = len(self.driven)
+        pairs = count * (count - 1) // 2 if self.shape is not None and len(self.shape) == 1 else 0
+        return len(self.measurement) + count + pairs
+
+    def moved(self, vector: np.ndarray, known: np.ndarray) -> Noise:
+        """The noise at coordinates: changes of logarithms of variances, then of correlations; zero here.
+
+        Variances of the measurement that are known ``(m,)`` stay, and so does a process noise that is zero.
+        """
+        outputs, driven = len(known), self.driven
+        process = np.zeros_like(self.process)
+        process[driven] = self.process[driven] * np.exp(vector[outputs : outputs + len(driven)])
+        logarithms = np.where(known, 0.0, vector[:outputs])
+        result = replace(self, measurement=self.measurement * np.exp(logarithms), process=process)
+        if self.shape is None or len(self.shape) != 1 or len(driven) < 2:
+            return result
+        root = np.linalg.cholesky(self.shape[0][np.ix_(driven, driven)])
+        change = np.eye(len(driven))
+        change[np.tril_indices(len(driven), -1)] = vector[outputs + len(driven) :]
+        root = root @ change
+        root /= np.linalg.norm(root, axis=1)[:, None]
+        shape = self.shape.copy()
+        shape[0][np.ix_(driven, driven)] = root @ root.T
+        return replace(result, shape=shape)
+
+    @property
     def intensity(self) -> np.ndarray:
         """Intensity of the process noise, per time: shape ``(1, d, d)``, or ``(n, d, d)``."""
         if self.shape is None:

@@ -20,6 +20,7 @@ from functools import partial
 import numpy as np
 
 from siq.data.recordings import Recordings, parent_recordings
+from siq.data.stationarity import runs_of
 from siq.errors import NumericalFailure
 from siq.inference.checks import correlations_between, unexplained_probability
 from siq.inference.diffusion_model import InnovationLikelihood
@@ -27,7 +28,7 @@ from siq.inference.field_estimate import FieldEstimate, FlowMap, NoiseDiagnosis
 from siq.inference.kalman_filter import Grid, Noise, Whitened, linearise, solve, whiten
 from siq.inference.maximum_likelihood import Fit, fit_by_filter, noise_uncertainty
 from siq.inference.measurements import Measurements
-from siq.inference.observation import ObservationModel, kept_rows, moved_by, settled, smoothed_motion
+from siq.inference.observation import ObservationModel, moved_by, settled, smoothed_motion
 from siq.inference.recalibration import drop_insignificant_process_noise, process_noise_needed
 from siq.inference.selection import (
     LinearProblem,
@@ -349,8 +350,9 @@ def filtered_recordings(
         observation, data, noise=observation.noise_of(found), support=support, values=values,
         substeps=found.flow.steps,
     )  # fmt: skip
-    kept = kept_rows(recordings, pair_step=pair_step, every=observation.every(recordings))
-    rows, measured = np.concatenate(kept), ~np.isnan(data.outputs).all(axis=1)
+    runs, every = runs_of(recordings, longest=pair_step), observation.every(recordings)
+    rows = np.concatenate([np.arange(run.start, run.stop, every) for run in runs])
+    measured = ~np.isnan(data.outputs).all(axis=1)
     seen = replace(
         recordings,
         recording=recordings.recording[rows],

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import scipy.optimize
@@ -76,51 +75,6 @@ def first_noise(model: Dynamics, data: Measurements, x: np.ndarray) -> Noise:
     return Noise(data.with_known_noise(data.roughness), np.where(model.kinematic, 0.0, process))
 
 
-@dataclass(frozen=True)
-class _NoiseCoordinates:
-    """A noise as one vector, zero at its origin: logarithms of variances, then correlations."""
-
-    origin: Noise
-    known: np.ndarray
-
-    @property
-    def driven(self) -> np.ndarray:
-        """Places of the states that process noise drives."""
-        return np.flatnonzero(self.origin.process > 0)
-
-    @property
-    def correlates(self) -> bool:
-        """Whether a correlation of the process noise is among the parameters."""
-        return self.origin.shape is not None and len(self.origin.shape) == 1
-
-    @property
-    def size(self) -> int:
-        """Number of parameters."""
-        count = len(self.driven)
-        return len(self.known) + count + (count * (count - 1) // 2 if self.correlates else 0)
-
-    def noise_at(self, vector: np.ndarray) -> Noise:
-        """The noise for a vector, shape ``(size,)``."""
-        outputs, driven = len(self.known), self.driven
-        process = np.zeros_like(self.origin.process)
-        process[driven] = self.origin.process[driven] * np.exp(vector[outputs : outputs + len(driven)])
-        logarithms = np.where(self.known, 0.0, vector[:outputs])
-        result = replace(
-            self.origin, measurement=self.origin.measurement * np.exp(logarithms), process=process
-        )
-        if not self.correlates or len(driven) < 2:
-            return result
-        assert self.origin.shape is not None
-        root = np.linalg.cholesky(self.origin.shape[0][np.ix_(driven, driven)])
-        change = np.eye(len(driven))
-        change[np.tril_indices(len(driven), -1)] = vector[outputs + len(driven) :]
-        root = root @ change
-        root /= np.linalg.norm(root, axis=1)[:, None]
-        shape = self.origin.shape.copy()
-        shape[0][np.ix_(driven, driven)] = root @ root.T
-        return replace(result, shape=shape)
-
-
 def _estimate_noise(
     linearisation: Linearisation,
     data: Measurements,
@@ -133,8 +87,7 @@ def _estimate_noise(
     """The noise of highest restricted likelihood along the trajectories in hand."""
     # The parameters are those that are best for the noise that the search begins with: they depend little on
     # it, and a fit returns here once they have settled.
-    coordinates = _NoiseCoordinates(start, data.known_sensors)
-    driven, outputs = coordinates.driven, len(start.measurement)
+    known, driven, outputs = data.known_sensors, start.driven, len(start.measurement)
     white = whiten(linearisation, data, start)
     columns, innovations = expected.stacked_on(white.columns, white.innovations)
     whole = linearisation.with_parameters_changed(solve(columns, innovations)[0])
@@ -157,7 +110,7 @@ def _estimate_noise(
         def cost(vector: np.ndarray) -> float:
             if charge is not None:
                 charge(len(rows) / count)
-            noise = coordinates.noise_at(vector)
+            noise = start.moved(vector, known)
             if len(rows) < count and noise.shape is not None and len(noise.shape) > 1:
                 noise = replace(noise, shape=noise.shape[rows])
             value = -part.log_likelihood(first, step, noise)
@@ -166,24 +119,22 @@ def _estimate_noise(
         return cost
 
     cost = cost_along(rows, first)
-    begins = [np.zeros(coordinates.size)]
+    begins = [np.zeros(start.coordinates)]
     # Upwards, too: a candidate that promised to need hardly any process noise may not have kept that.
     for factor in (1e-2, 1e-4, 1e-6, 1e2, 1e4) if len(driven) else ():
-        begins.append(np.zeros(coordinates.size))
+        begins.append(np.zeros(start.coordinates))
         begins[-1][outputs : outputs + len(driven)] = np.log(factor)
     best = min(begins, key=cost)
     # States that process noise drives could follow every sample; the noise of a sensor never vanishes.
     least = np.log(MIN_ROUGHNESS_SHARE * data.roughness / start.measurement)
-    bounds = [
-        (0.0, 0.0) if coordinates.known[k] else (min(least[k], 0.0), best[k] + 12.0) for k in range(outputs)
-    ]
+    bounds = [(0.0, 0.0) if known[k] else (min(least[k], 0.0), best[k] + 12.0) for k in range(outputs)]
     bounds += [(np.log(NO_PROCESS_NOISE), 12.0)] * len(driven)
-    bounds += [(-10.0, 10.0)] * (coordinates.size - len(bounds))
+    bounds += [(-10.0, 10.0)] * (start.coordinates - len(bounds))
     vector = _lowest(cost, best, bounds)
     if len(rows) < count and not coarse:
         everything = cost_along(np.arange(count), data.first)
         vector = _corrected(vector, everything, cost, ratio=count / len(rows), bounds=bounds)
-    noise = coordinates.noise_at(vector)
+    noise = start.moved(vector, known)
     gone = vector[outputs : outputs + len(driven)] <= np.log(NO_PROCESS_NOISE) + 1
     noise.process[driven[gone]] = 0.0
     return noise
@@ -244,18 +195,17 @@ def noise_uncertainty(fit: Fit, data: Measurements) -> tuple[np.ndarray, np.ndar
     covariance
         Of the free parameters, with what the noise leaves open in them, shape ``(p, p)``.
     """
-    coordinates = _NoiseCoordinates(fit.noise, data.known_sensors)
-    line = fit.linearisation
+    known, line, driven = data.known_sensors, fit.linearisation, fit.noise.driven
+    outputs, size = len(known), fit.noise.coordinates
     white = whiten(line, data, fit.noise)
     still = line.with_parameters_changed(solve(white.columns, white.innovations)[0])
-    outputs = len(coordinates.known)
-    places = [k for k in range(coordinates.size) if k >= outputs or not coordinates.known[k]]
+    places = [k for k in range(size) if k >= outputs or not known[k]]
 
     def moved(*changes: tuple[int, float]) -> Noise:
-        vector = np.zeros(coordinates.size)
+        vector = np.zeros(size)
         for place, change in changes:
             vector[place] += change
-        return coordinates.noise_at(vector)
+        return fit.noise.moved(vector, known)
 
     def value(*changes: tuple[int, float]) -> float:
         return still.log_likelihood(data.first, data.step, moved(*changes))
@@ -269,9 +219,9 @@ def noise_uncertainty(fit: Fit, data: Measurements) -> tuple[np.ndarray, np.ndar
             apart = value((one, h), (other, -h)) + value((one, -h), (other, h))
             curvature[row, column] = curvature[column, row] = (apart - both) / (4 * h**2)
     told = np.diag(curvature) > 1 / MAX_ERROR**2
-    errors = np.full(coordinates.size, np.inf)
-    errors[:outputs][coordinates.known] = 0.0
-    inside = [place for place, known in zip(places, told, strict=True) if known]
+    errors = np.full(size, np.inf)
+    errors[:outputs][known] = 0.0
+    inside = [place for place, seen in zip(places, told, strict=True) if seen]
     covariance = fit.covariance
     if inside:
         of_noise = np.linalg.pinv(curvature[np.ix_(told, told)], hermitian=True)
@@ -285,7 +235,6 @@ def noise_uncertainty(fit: Fit, data: Measurements) -> tuple[np.ndarray, np.ndar
             changes.append((ends[0] - ends[1]) / (2 * h))
         slope = np.stack(changes, axis=1)
         covariance = covariance + slope @ of_noise @ slope.T
-    driven = coordinates.driven
     process = np.zeros_like(fit.noise.process)
     process[driven] = errors[outputs : outputs + len(driven)]
     return errors[:outputs], process, covariance
@@ -458,33 +407,32 @@ def _or_fault(model: Dynamics, begin: _Iterate, noise: Noise, substeps: int, fit
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
 class _Shooting:
-    """A model to be fitted, on the grid of its measurements; the sizes of states are ``(d,)``.
+    """A model to be fitted, on the grid of its measurements, from states ``(n, d)`` to begin with.
 
     It may be filtered: f is taken at what a filter knows, rather than at smoothed states, and closed, with
-    the effect
-    of the filter's spread on f.
+    the
+    effect of the filter's spread on f.
     """
 
-    model: Dynamics
-    grid: Grid
-    scale: np.ndarray
-    filtered: bool = False
-    closed: ClosedFunctions | None = None
-    budget: Budget | None = None
-
-    @classmethod
-    def of(
-        cls, model: Dynamics, data: Measurements, x: np.ndarray, substeps: int | None, **options: Any
-    ) -> _Shooting:
-        """With as many substeps as the accuracy needs, where it is not said how many."""
+    def __init__(
+        self,
+        model: Dynamics,
+        data: Measurements,
+        x: np.ndarray,
+        substeps: int | None,
+        *,
+        filtered: bool = False,
+        closed: ClosedFunctions | None = None,
+        budget: Budget | None = None,
+    ) -> None:
         if substeps is None:
             substeps = substeps_needed(model, data, model.values, x, tolerance=SUBSTEP_ERROR)
         about_zero = 2 * np.where(x.any(axis=0), np.abs(x).max(axis=0), 1.0)
         wide = np.ptp(model.limits, axis=1)
         resting = RESTING * np.where(np.isfinite(wide), wide, about_zero)
-        return cls(model, Grid(data, substeps), np.maximum(x.std(axis=0), resting), **options)
+        self.model, self.grid, self.scale = model, Grid(data, substeps), np.maximum(x.std(axis=0), resting)
+        self.filtered, self.closed, self.budget = filtered, closed, budget
 
     @property
     def resolution(self) -> float:
@@ -646,7 +594,7 @@ def fit_by_multiple_shooting(
         When nothing is left of what is allowed.
     """
     with np.errstate(all="ignore"):  # what runs away is told as a fault
-        shooting = _Shooting.of(model, data, x, substeps, budget=budget)
+        shooting = _Shooting(model, data, x, substeps, budget=budget)
         begin = _Iterate(model.values, x, linearise(model, shooting.grid, model.values, x), x)
         fit = _or_fault(
             model, begin, noise, shooting.grid.substeps,
@@ -684,7 +632,7 @@ def fit_by_filter(
         if not estimate_sensor:
             data = replace(data, sensor_noise=noise.measurement)
         closed = ClosedFunctions(model) if closure else None
-        shooting = _Shooting.of(model, data, x, substeps, filtered=True, closed=closed, budget=budget)
+        shooting = _Shooting(model, data, x, substeps, filtered=True, closed=closed, budget=budget)
         begin = _Iterate(model.values, x, shooting.linearised(model.values, x, None, noise), x)
         return _or_fault(
             model, begin, noise, shooting.grid.substeps,

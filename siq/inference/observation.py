@@ -313,17 +313,12 @@ def moved_by(data: Measurements) -> tuple[np.ndarray, float]:
     return moved, float((data.t[after] - data.t[before]).mean())
 
 
-def kept_rows(recordings: Recordings, *, pair_step: float | None, every: int = 1) -> list[np.ndarray]:
-    """The rows of each stretch without a gap, of every so many one; see `unbroken`."""
-    return [np.arange(run.start, run.stop, every) for run in runs_of(recordings, longest=pair_step)]
-
-
 def unbroken(recordings: Recordings, *, pair_step: float | None = None, every: int = 1) -> Measurements:
     """Recordings as measurements of their states, a new one behind every gap; of `every` so many samples one.
 
     Samples belong together up to the time `pair_step`, by default one and a half median steps.
     """
-    runs = kept_rows(recordings, pair_step=pair_step, every=every)
+    runs = [np.arange(run.start, run.stop, every) for run in runs_of(recordings, longest=pair_step)]
     rows = np.concatenate(runs)
     return Measurements(
         labels=tuple(recordings.labels[recordings.recording[run[0]]] for run in runs),

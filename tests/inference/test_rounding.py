@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from siq.data.recordings import Recordings, snapshot_pairs
-from siq.inference.checks import is_rounding, residual_noise, rounding_bias, rounding_errors
+from siq.inference.checks import _is_rounding, _rounding_bias, _rounding_errors, residual_noise
 from siq.inference.field_estimate import HARMLESS_BIAS
 from siq.inference.library import IdentificationOptions, candidate_library
 from siq.inference.regression import identify_vector_field
@@ -56,8 +56,8 @@ def test_noise_of_a_sensor_is_not_taken_for_rounding() -> None:
     noisy = settling(4, sensor=1e-3)
     noise = residual_noise(identified(noisy), noisy, pair_step=None)
     assert noise.kind == "measurement" and "measurement noise" in str(noise.fault(("x", "y")))
-    assert not is_rounding(np.array([3e-4, 0.1]), np.array([3e-4, 0.0]), correlation=-0.5)
-    assert is_rounding(np.array([3e-4, 1e-5]), np.array([3e-4, 0.0]), correlation=-0.5)
+    assert not _is_rounding(np.array([3e-4, 0.1]), np.array([3e-4, 0.0]), correlation=-0.5)
+    assert _is_rounding(np.array([3e-4, 1e-5]), np.array([3e-4, 0.0]), correlation=-0.5)
 
 
 def test_the_bias_of_rounding_is_the_one_that_is_foreseen() -> None:
@@ -72,7 +72,7 @@ def test_the_bias_of_rounding_is_the_one_that_is_foreseen() -> None:
             continue
         errors.append(np.sqrt(np.diag(found.covariance)))
         biases.append(found.values - [-1, -2])
-        foreseen.append(rounding_bias(found, snapshot_pairs(noisy), rounding))
+        foreseen.append(_rounding_bias(found, snapshot_pairs(noisy), rounding))
     measured = np.abs(np.mean(biases, axis=0) / np.mean(errors, axis=0)).max()
     assert np.mean(foreseen) == pytest.approx(measured, rel=0.25)
     assert np.mean(foreseen) > HARMLESS_BIAS
@@ -93,5 +93,5 @@ def test_rounding_that_is_too_coarse_is_refused_with_the_decimals_that_it_takes(
 
 
 def test_what_was_not_rounded_has_no_rounding_error() -> None:
-    assert rounding_errors(settling(None)).tolist() == [0.0, 0.0]
-    np.testing.assert_allclose(rounding_errors(settling(2)), 0.01 / np.sqrt(12))
+    assert _rounding_errors(settling(None)).tolist() == [0.0, 0.0]
+    np.testing.assert_allclose(_rounding_errors(settling(2)), 0.01 / np.sqrt(12))
