@@ -16,6 +16,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -77,13 +78,11 @@ class _Components:
 
     def split(self, count: int) -> tuple[_Components, _Components]:
         """The first `count` points, and the others."""
-        return (
-            _Components(*(tensor[:, :count] for tensor in self._tensors())),
-            _Components(*(tensor[:, count:] for tensor in self._tensors())),
+        tensors = self.potential, self.gradient, self.circulatory, self.vector_field
+        first, others = (
+            [tensor[:, part] for tensor in tensors] for part in (slice(count), slice(count, None))
         )
-
-    def _tensors(self) -> tuple[Tensor, ...]:
-        return self.potential, self.gradient, self.circulatory, self.vector_field
+        return _Components(*first), _Components(*others)
 
 
 def initial_layers(
@@ -91,14 +90,9 @@ def initial_layers(
 ) -> tuple[Layer, ...]:
     """Random layers, uniform in ±1/√inputs, each run drawn from its own generator.
 
-    Parameters
-    ----------
-    sizes
-        Numbers of neurons, inputs and outputs included: ``(3, 50, 50, 50, 1)``.
-    generators
-        One per run, so that a run's networks do not depend on which runs train beside it.
-    dtype
-        Floating-point type of the tensors.
+    The sizes are numbers of neurons, inputs and outputs included: ``(3, 50, 50, 50, 1)``. A run's networks do
+    not
+    depend on which runs train beside it.
     """
     layers = []
     for inputs, outputs in itertools.pairwise(sizes):
@@ -110,97 +104,48 @@ def initial_layers(
 
 
 def evaluate(networks: Networks, x: Tensor) -> _Components:
-    """Evaluate V, ∇V, g and f = -D∇V + g.
+    """V, ∇V, g and f = -D∇V + g at points ``(runs, n, d)``, in the units of the states.
 
-    Parameters
-    ----------
-    networks
-        The decomposition.
-    x
-        Points, shape ``(runs, n, d)``, in the units of the states.
-
-    Returns
-    -------
-    Components
-        ∇V is the gradient with respect to x, not to the normalised y.
+    ∇V is the gradient with respect to x, not to the normalised y.
     """
     y = (x - networks.mean) / networks.scale
     value, gradient = _value_and_gradient(networks.potential, y)
     potential = networks.potential_scale * (value + (y * y).sum(dim=-1, keepdim=True))
     gradient = networks.potential_scale / networks.scale * (gradient + 2 * y)
-    circulatory = networks.circulatory_scale * _forward(networks.circulatory, y)
-    downhill = gradient @ networks.diffusion
+    circulatory = networks.circulatory_scale * _hidden(networks.circulatory, y)[-1]
     return _Components(
-        potential=potential.squeeze(-1),
-        gradient=gradient,
-        circulatory=circulatory,
-        vector_field=circulatory - downhill,
+        potential.squeeze(-1), gradient, circulatory, circulatory - gradient @ networks.diffusion
     )
 
 
-def _mapped(networks: Networks, function: Callable[[Tensor], Tensor]) -> Networks:
-    """Networks of which every tensor that has an axis of runs is changed by a function."""
+def _mapped(function: Callable[..., Any], *sources: Networks | TrainedNetworks) -> dict[str, Any]:
+    """All parts that have an axis of runs, each a function of those of some networks."""
 
-    def layers(source: tuple[Layer, ...]) -> tuple[Layer, ...]:
-        return tuple((function(weights), function(biases)) for weights, biases in source)
+    def layers(*of: Any) -> tuple[Any, ...]:
+        return tuple(
+            tuple(function(*parts) for parts in zip(*layer, strict=True)) for layer in zip(*of, strict=True)
+        )
 
-    return replace(
-        networks,
-        potential=layers(networks.potential),
-        circulatory=layers(networks.circulatory),
-        mean=function(networks.mean),
-        scale=function(networks.scale),
-        potential_scale=function(networks.potential_scale),
-        circulatory_scale=function(networks.circulatory_scale),
-    )
+    stacks, numbers = ("potential", "circulatory"), ("mean", "scale", "potential_scale", "circulatory_scale")
+    mapped = {name: layers(*(getattr(one, name) for one in sources)) for name in stacks}
+    return mapped | {name: function(*(getattr(one, name) for one in sources)) for name in numbers}
 
 
 def select_run(networks: Networks, run: int) -> Networks:
     """The networks of one of the runs, as networks with a single run."""
-    return _mapped(networks, lambda tensor: tensor[run : run + 1])
+    return replace(networks, **_mapped(lambda tensor: tensor[run : run + 1], networks))
 
 
 def at_rest(networks: Networks, run: int) -> TrainedNetworks:
     """One of the runs as arrays that share no memory with the training."""
-
-    def array(tensor: Tensor) -> np.ndarray:
-        return tensor[run].detach().cpu().numpy().copy()
-
-    def layers(source: tuple[Layer, ...]) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-        return tuple((array(weights), array(biases)) for weights, biases in source)
-
-    return TrainedNetworks(
-        potential=layers(networks.potential),
-        circulatory=layers(networks.circulatory),
-        mean=array(networks.mean),
-        scale=array(networks.scale),
-        potential_scale=array(networks.potential_scale),
-        circulatory_scale=array(networks.circulatory_scale),
-        diffusion=networks.diffusion.detach().cpu().numpy().copy(),
-    )
+    parts = _mapped(lambda tensor: tensor[run].detach().cpu().numpy().copy(), networks)
+    return TrainedNetworks(**parts, diffusion=networks.diffusion.detach().cpu().numpy().copy())
 
 
 def side_by_side(runs: Sequence[TrainedNetworks]) -> Networks:
     """Networks of several runs to be trained together; the inverse of `at_rest`."""
-
-    def together(arrays: Sequence[np.ndarray]) -> Tensor:
-        return torch.from_numpy(np.stack(arrays))
-
-    def layers(sources: Sequence[tuple[tuple[np.ndarray, np.ndarray], ...]]) -> tuple[Layer, ...]:
-        return tuple(
-            (together([weights for weights, _ in layer]), together([biases for _, biases in layer]))
-            for layer in zip(*sources, strict=True)
-        )
-
-    return Networks(
-        potential=layers([one.potential for one in runs]),
-        circulatory=layers([one.circulatory for one in runs]),
-        mean=together([one.mean for one in runs]),
-        scale=together([one.scale for one in runs]),
-        potential_scale=together([one.potential_scale for one in runs]),
-        circulatory_scale=together([one.circulatory_scale for one in runs]),
-        diffusion=torch.from_numpy(runs[0].diffusion.copy()),
-    )
+    parts = _mapped(lambda *arrays: torch.from_numpy(np.stack(arrays)), *runs)
+    return Networks(**parts, diffusion=torch.from_numpy(runs[0].diffusion.copy()))
 
 
 def move(networks: Networks, device: torch.device | str) -> Networks:
@@ -209,29 +154,24 @@ def move(networks: Networks, device: torch.device | str) -> Networks:
     def there(tensor: Tensor) -> Tensor:
         return tensor.detach().to(device, copy=True)
 
-    return replace(_mapped(networks, there), diffusion=there(networks.diffusion))
+    return replace(networks, **_mapped(there, networks), diffusion=there(networks.diffusion))
 
 
-def _forward(layers: tuple[Layer, ...], y: Tensor) -> Tensor:
+def _hidden(layers: tuple[Layer, ...], y: Tensor) -> list[Tensor]:
+    """Activations of the hidden layers, and the output behind them."""
+    found = []
     for weights, biases in layers[:-1]:
         y = torch.tanh(torch.baddbmm(biases, y, weights))
+        found.append(y)
     weights, biases = layers[-1]
-    return torch.baddbmm(biases, y, weights)
+    return [*found, torch.baddbmm(biases, y, weights)]
 
 
 def _value_and_gradient(layers: tuple[Layer, ...], y: Tensor) -> tuple[Tensor, Tensor]:
-    """Value of a scalar tanh network, and its gradient with respect to its input.
-
-    With ``h_k = tanh(h_{k-1} W_k + b_k)`` the gradient runs backwards through the layers,
-    ``δ_k = (δ_{k+1} W_{k+1}ᵀ) (1 - h_k²)``, starting from the last row of weights.
-    """
-    hidden = []
-    for weights, biases in layers[:-1]:
-        y = torch.tanh(torch.baddbmm(biases, y, weights))
-        hidden.append(y)
-    weights, biases = layers[-1]
-    value = torch.baddbmm(biases, y, weights)
-    delta = weights.mT
+    """Value of a scalar tanh network, and its gradient with respect to its input."""
+    # With h_k = tanh(h_{k-1} W_k + b_k) backwards δ_k = (δ_{k+1} W_{k+1}ᵀ) (1 - h_k²), from the last weights.
+    *hidden, value = _hidden(layers, y)
+    delta = layers[-1][0].mT
     for (weights, _), activation in zip(reversed(layers[:-1]), reversed(hidden), strict=True):
         delta = (delta * (1 - activation * activation)) @ weights.mT
     return value, delta
@@ -240,22 +180,17 @@ def _value_and_gradient(layers: tuple[Layer, ...], y: Tensor) -> tuple[Tensor, T
 def dynamics_loss(
     predicted: Tensor, observed: Tensor, precision: Tensor, *, slow: Tensor | None = None
 ) -> Tensor:
-    """Mean square of the mismatch of velocities, measured in the metric of the noise.
+    """Mean square of the mismatch of velocities ``(runs, n, d)`` in the metric of the noise: ``(runs,)``.
 
     Parameters
     ----------
     predicted, observed
-        Velocities, shape ``(runs, n, d)``.
+        Velocities.
     precision
         D⁻¹, shape ``(d, d)``; the paper has D = 1.
     slow
         Square of the speed, shape ``(runs, 1)``, below which a pair counts as slow. If given, every mismatch
         is divided by the square of its observed speed plus this; the paper does not.
-
-    Returns
-    -------
-    torch.Tensor
-        Shape ``(runs,)``.
     """
     mismatch = predicted - observed
     square = ((mismatch @ precision) * mismatch).sum(dim=-1)
@@ -267,7 +202,7 @@ def dynamics_loss(
 def orthogonality_loss(
     components: _Components, diffusion: Tensor, precision: Tensor, *, asymmetry: float
 ) -> Tensor:
-    """Mean of w(z, δ), z being the cosine of the angle between ∇V and g.
+    """Mean of w(z, δ), z being the cosine of the angle between ∇V and g: shape ``(runs,)``.
 
     The angle is taken in the metric of the noise: ``z = ∇V·g / sqrt(∇V·D∇V  g·D⁻¹g)``, which does not
     change when the states change their units. ``w(z, δ) = z²`` for z ≥ 0 and ``δ z²`` for z < 0.
@@ -280,11 +215,6 @@ def orthogonality_loss(
         D and D⁻¹, shape ``(d, d)``.
     asymmetry
         δ.
-
-    Returns
-    -------
-    torch.Tensor
-        Shape ``(runs,)``.
     """
     gradient, circulatory = components.gradient, components.circulatory
     product = (gradient * circulatory).sum(dim=-1)

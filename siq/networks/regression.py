@@ -148,10 +148,8 @@ def sparse_decomposition(
         The candidate functions.
     x
         Points, shape ``(n, d)``, all of which are used; see `points_below`.
-    potential
-        V_θ at the points, shape ``(n,)``.
-    circulatory, vector_field
-        g_θ and f_θ at the points, shape ``(n, d)``.
+    potential, circulatory, vector_field
+        V_θ at the points, shape ``(n,)``, and g_θ and f_θ, shape ``(n, d)``.
     diffusion
         D.
     options

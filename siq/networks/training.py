@@ -84,10 +84,8 @@ def prepare_data(
 
     Parameters
     ----------
-    pairs
-        The snapshot pairs of one run.
-    options
-        For the share and the thinning distance.
+    pairs, options
+        Of one run; the share and the thinning distance.
     generator
         Decides which recordings train and which points represent.
 
@@ -119,20 +117,11 @@ def prepare_data(
 
 
 def _slowest_part(data: TrainingData, share: float) -> TrainingData:
-    """Representative points without the fastest ones.
-
-    Far out f is often many times faster than about the attractors, and none of what is asked there matters
-    to the wells. Speeds are measured in standard deviations of the states.
-
-    Parameters
-    ----------
-    data
-        The pairs of one run.
-    share
-        Share of the representative points that stay, the slowest; at least a few do.
-    """
+    """Representative points without the fastest ones: a share of them stays, and at least a few do."""
     if share >= 1:
         return data
+    # Far out f is often many times faster than about the attractors, and none of what is asked there matters
+    # to the wells. Speeds are measured in standard deviations of the states.
     pairs = data.representative
     speed = np.linalg.norm((pairs.xh - pairs.x0) / pairs.h[:, None] / data.training.x0.std(axis=0), axis=1)
     count = max(int(np.ceil(share * len(speed))), min(FEWEST_REPRESENTATIVE, len(speed)))
@@ -144,15 +133,6 @@ class _Batches:
 
     All runs stand in one table, so that one look-up serves them all. A batch depends on the seed and on
     the step alone, which is what lets an interrupted training resume exactly.
-
-    Parameters
-    ----------
-    data, seeds
-        One entry a run.
-    options
-        For the batch size.
-    device, dtype
-        Where the batches are wanted, and in which precision.
     """
 
     def __init__(
@@ -164,12 +144,9 @@ class _Batches:
         device: torch.device,
         dtype: torch.dtype,
     ) -> None:
-        self.seeds = seeds
-        self.device = device
-        self.dtype = dtype
+        self.data, self.seeds, self.device, self.dtype = data, seeds, device, dtype
         self.size = options.batch_size
         self.representative_size = round(options.representative_share * options.batch_size)
-        self.data = data
         self.pairs = torch.cat([_table(run.training) for run in data]).to(device, dtype)
         self.dimension = data[0].training.x0.shape[1]
         self.chunk = -1
@@ -184,18 +161,19 @@ class _Batches:
 
     def held_out(self) -> tuple[Tensor, Tensor]:
         """A fixed batch of held-out pairs, and of representative points, for every run."""
-        pairs, points = [], []
-        for run in self.data:
-            table = _table(run.held_out)
-            pairs.append(table[np.linspace(0, len(table) - 1, HELD_OUT_PAIRS).astype(int)])
-            rows = run.representative_rows[
-                np.linspace(0, len(run.representative_rows) - 1, HELD_OUT_PAIRS).astype(int)
-            ]
-            points.append(torch.from_numpy(run.training.x0[rows]))
-        return (
-            torch.stack(pairs).to(self.device, self.dtype),
-            torch.stack(points).to(self.device, self.dtype),
+
+        def evenly(count: int) -> np.ndarray:
+            return np.linspace(0, count - 1, HELD_OUT_PAIRS).astype(int)
+
+        pairs = [_table(run.held_out)[evenly(len(run.held_out.h))] for run in self.data]
+        points = [
+            torch.from_numpy(run.training.x0[run.representative_rows[evenly(len(run.representative_rows))]])
+            for run in self.data
+        ]
+        pairs_of_runs, points_of_runs = (
+            torch.stack(each).to(self.device, self.dtype) for each in (pairs, points)
         )
+        return pairs_of_runs, points_of_runs
 
     def _draw(self, chunk: int) -> Tensor:
         """Rows of a chunk of steps, shape ``(runs, steps, pairs + points)``."""
@@ -231,10 +209,7 @@ def _initial_networks(
     diffusion: Diffusion,
     generators: Sequence[np.random.Generator],
 ) -> Networks:
-    """Random networks, normalised and rescaled to the data of each run (paper, Eqs. eta_v, eta_g).
-
-    η_v and η_g bring the initial ∣∇V∣ and ∣g∣ to the size of the observed velocities.
-    """
+    """Random networks, normalised and rescaled to the data of each run (paper, Eqs. eta_v, eta_g)."""
     dtype = getattr(torch, options.precision)
     dimension = diffusion.dimension
     sources = [run.training if options.normalise_on == "pairs" else run.representative for run in data]
@@ -267,10 +242,10 @@ def _initial_networks(
         circulatory = torch.linalg.norm(components.circulatory, dim=-1)[0].numpy()
         along = float(downhill @ speed / (downhill @ downhill))
         if options.potential_from == "descent":
-            along = (
-                _descent(pairs.x0[rows], components.gradient[0].double().numpy(), velocity, diffusion)
-                or along
-            )
+            # With which -D∇V comes closest to the velocities, unless these go up V on the whole.
+            gradient = components.gradient[0].double().numpy()
+            size = diffusion.contract(pairs.x0[rows], gradient).sum()
+            along = max(float(-(gradient * velocity).sum() / size), 0.0) or along
         potential_scales.append(along)
         circulatory_scales.append(float(circulatory @ speed / (circulatory @ circulatory)))
     return replace(
@@ -278,12 +253,6 @@ def _initial_networks(
         potential_scale=options.potential_gain * torch.tensor(potential_scales, dtype=dtype)[:, None, None],
         circulatory_scale=torch.tensor(circulatory_scales, dtype=dtype)[:, None, None],
     )
-
-
-def _descent(x: np.ndarray, gradient: np.ndarray, velocity: np.ndarray, diffusion: Diffusion) -> float:
-    """The factor on V with which -D∇V comes closest to the velocities; 0 where these go up V on the whole."""
-    size = diffusion.contract(x, gradient).sum()
-    return max(float(-(gradient * velocity).sum() / size), 0.0)
 
 
 logger = logging.getLogger(__name__)
@@ -366,12 +335,10 @@ def train(
     ----------
     state
         From `start`, or from a checkpoint of the same training.
-    data
-        One entry a run.
+    data, seeds
+        One entry a run; batches follow from the seed and the number of the step alone.
     options
         What is trained.
-    seeds
-        One a run; batches follow from the seed and the number of the step alone.
     device
         Where to compute. Results are the same to the last bit only on the same kind of device.
     log_every, checkpoint_every
@@ -428,19 +395,9 @@ def train(
             with torch.no_grad():
                 dynamics, orthogonality = objective(networks, *held_out)
             total = dynamics + options.orthogonality_weight * orthogonality
-            rows.append(
-                pd.DataFrame(
-                    {
-                        "run": range(networks.runs),
-                        "step": done,
-                        "training_loss": losses.detach().double().cpu(),
-                        "held_out_loss": total.double().cpu(),
-                        "dynamics": dynamics.double().cpu(),
-                        "orthogonality": orthogonality.double().cpu(),
-                        "learning_rate": rate,
-                    }
-                )
-            )
+            measured = (losses.detach(), total, dynamics, orthogonality)
+            row = (range(networks.runs), done, *(each.double().cpu() for each in measured), rate)
+            rows.append(pd.DataFrame(dict(zip(HISTORY, row, strict=True))))
             left = (time.perf_counter() - began) / (done - state.step) * (options.steps - done)
             logger.info(
                 "step %d of %d, held-out loss %.3e, %.0f s left",
@@ -519,10 +476,10 @@ def _save_checkpoint(path: str | Path, state: TrainingState, *, fingerprint: str
 
 
 def _load_checkpoint(path: str | Path, *, fingerprint: str) -> TrainingState | None:
-    """Read the state of an interrupted training, or None where there is none that can be continued.
+    """The state of an interrupted training, or None where there is none that can be continued.
 
-    A checkpoint of other data or options has another fingerprint and is passed over, and so is one that
-    is damaged: training then starts afresh, which costs time but never a wrong result.
+    One of other data or options has another fingerprint and is passed over, and so is one that is damaged:
+    training then starts afresh, which costs time but never a wrong result.
     """
     try:
         arrays = read_archive(path)
@@ -600,16 +557,10 @@ class Block:
 
     Parameters
     ----------
-    data
-        Pairs by run.
-    checks
-        When the training of a run may end, for those where that is known.
-    options
-        What the networks are told.
-    diffusion
-        D.
-    seed
-        Of the study.
+    data, checks
+        Pairs by run; when the training of a run may end, for those where that is known.
+    options, diffusion, seed
+        What the networks are told, D, and the seed of the study.
     checkpoints
         What is left behind for a job that goes on from here.
     device
@@ -660,10 +611,8 @@ class Block:
         state = self.checkpoints.state(attempt)
         if state is None:
             state = start(data, options=options, diffusion=self.diffusion, seeds=seeds)
-        early: dict[int, TrainedNetworks] = {}
-        for run in runs:  # what had passed before the job was killed
-            if (before := self.checkpoints.passed(attempt, run)) is not None:
-                early[run] = before
+        kept = ((run, self.checkpoints.passed(attempt, run)) for run in runs)
+        early = {run: one for run, one in kept if one is not None}  # before the job was killed
 
         def finished(step: int, networks: Networks) -> bool:
             for position, run in enumerate(runs):
@@ -707,8 +656,5 @@ class Block:
         latest: dict[int, pd.DataFrame] = {}
         for table in self.histories:
             latest |= {int(run): table[table["run"] == run] for run in table["run"].unique()}
-        return (
-            pd.concat([latest[run] for run in sorted(latest)])
-            if latest
-            else pd.DataFrame(columns=list(HISTORY))
-        )
+        tables = [latest[run] for run in sorted(latest)]
+        return pd.concat(tables) if tables else pd.DataFrame(columns=list(HISTORY))
