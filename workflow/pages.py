@@ -195,7 +195,7 @@ def page(given: Given, settings: PipelineSettings) -> Any:
     from markupsafe import Markup
 
     from siq.quasipotential.landscape_files import landscape_from_data
-    from siq.report.page import read_inspection, read_seen, render_report
+    from siq.report.page import read_inspection, render_report
     from siq.report.study_page import StudyResults, answer_data, study_page
     from siq.report.summary import summarise
     from siq.workflow.models import shown_formula
@@ -213,6 +213,7 @@ def page(given: Given, settings: PipelineSettings) -> Any:
         stored = landscape_from_data(overview, given.field[number].dynamics)
         landscape = summarise(stored, record=tables["record"], run=number)
     view = Path(source["drawn"]) / "interactive.html"
+    lines, seen = read_inspection(source["drawn"])
     folders = [source["drawn"], *source["drawn_landscape"], source["drawn_density"]]
     images, vectors = _files(folders, ".png"), _files(folders, ".svg")
     results = StudyResults(
@@ -225,8 +226,8 @@ def page(given: Given, settings: PipelineSettings) -> Any:
         images=images,
         vectors=vectors,
         record=given.field[run],
-        inspection=read_inspection(source["drawn"]),
-        seen=read_seen(source["drawn"]),
+        inspection=lines,
+        seen=seen,
         interactive=Markup(view.read_text(encoding="utf-8")) if view.is_file() else None,
     )
     programs = PACKAGES if study.training is None else (*PACKAGES, *OF_NETWORKS)

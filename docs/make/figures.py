@@ -22,7 +22,7 @@ import sympy
 from siq.numerics.text import range_text, value_text
 from siq.quasipotential.landscape_files import landscape_from_data
 from siq.report.formatting import counted_text, predicted_text
-from siq.report.page import read_seen
+from siq.report.page import read_inspection
 from siq.report.summary import summarise
 from siq.systems.dynamics import Dynamics
 
@@ -97,7 +97,7 @@ def greenland_ice(tables: Path) -> Found:
         found[f"{name}_barrier"] = value_text(*well.relative_depth(said.noise))
     missing = certificates.set_index("test")["value"]["existence"]
     assert said.noise is not None
-    seen = read_seen(tables.parent / "drawn" / "study")
+    _, seen = read_inspection(tables.parent / "drawn" / "study")
     assert seen is not None
     return found | {
         "one_state": f"{seen.probability:.2g}",
@@ -111,7 +111,7 @@ def greenland_ice(tables: Path) -> Found:
 
 def neuromorphic_chip(tables: Path) -> Found:
     """The study of that name: two states that the record shows without any formula."""
-    seen = read_seen(tables.parent / "drawn" / "study")
+    _, seen = read_inspection(tables.parent / "drawn" / "study")
     assert seen is not None
     found = {"hops": str(seen.transitions)}
     for name, level, one in zip(("quiet", "active"), seen.levels, seen.counts, strict=True):

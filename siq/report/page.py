@@ -15,7 +15,7 @@ import datetime
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -29,7 +29,7 @@ from siq.data.preparation import joined
 from siq.data.recordings import Recordings
 from siq.data.two_states import RecordStates
 from siq.numerics.text import number_text, unit_text
-from siq.report.formatting import environment, in_paragraphs, texts
+from siq.report.formatting import environment, in_paragraphs
 from siq.report.summary import LandscapeSummary, chosen_states
 
 if TYPE_CHECKING:
@@ -148,25 +148,6 @@ class ReportSection:
 
 
 @dataclass(frozen=True)
-class Badge:
-    """Whether the answer may be believed.
-
-    Attributes
-    ----------
-    label
-        In two words.
-    good
-        Whether it may.
-    promise
-        What that means, in plain words.
-    """
-
-    label: str
-    good: bool
-    promise: Sequence[str] = ()
-
-
-@dataclass(frozen=True)
 class ReportContent:
     """All that a report says, in the order in which it is read.
 
@@ -176,8 +157,8 @@ class ReportContent:
         Title of the study.
     answer
         The answer: a sentence that stands alone, and what has to be known of it.
-    badge
-        Whether it may be believed.
+    badge, good, promise
+        Whether it may be believed, in two words, as a flag, and what that means in plain words.
     figure, table
         What it looks like, beside each other.
     figure_first
@@ -192,7 +173,9 @@ class ReportContent:
 
     title: str
     answer: Sequence[str] = ()
-    badge: Badge | None = None
+    badge: str = ""
+    good: bool = False
+    promise: Sequence[str] = ()
     figure: ReportFigure | None = None
     table: ReportTable | None = None
     figure_first: bool = False
@@ -202,52 +185,43 @@ class ReportContent:
 
 
 class _PageWriter:
-    """A page that a template fills; see `compose`.
+    """The parts of a page, as a template tells them; see `compose`."""
 
-    Parameters
-    ----------
-    title
-        Of the page.
-    """
-
-    def __init__(self, title: str) -> None:
-        self.content = ReportContent(title)
-        self._section: ReportSection | None = None
+    def __init__(self) -> None:
+        self.parts: dict[str, Any] = {"sections": []}
+        self._section: dict[str, list[Any]] = {}  # that is being written
 
     def answer(self, caller: Callable[[], str]) -> str:
         """The answer: a sentence that stands alone, and what has to be known of it."""
-        self.content = replace(self.content, answer=in_paragraphs(caller()))
+        self.parts["answer"] = in_paragraphs(caller())
         return ""
 
     def badge(self, label: str, *, good: bool, caller: Callable[[], str]) -> str:
         """Whether the answer may be believed, and what that means."""
-        self.content = replace(self.content, badge=Badge(label, good, in_paragraphs(caller())))
+        self.parts |= {"badge": label, "good": good, "promise": in_paragraphs(caller())}
         return ""
 
     def section(
         self, heading: str, *, folded: bool = False, listing: str = "", caller: Callable[[], str]
     ) -> str:
         """A section; one without content is left out."""
-        self._section = ReportSection(heading, folded=folded, listing=listing)
+        self._section = parts = {"formulas": [], "tables": [], "figures": [], "notes": []}
         text = in_paragraphs(caller())
-        found, self._section = replace(self._section, text=text), None
-        if text or found.formulas or found.tables or found.figures or found.notes or listing:
-            self.content = replace(self.content, sections=[*self.content.sections, found])
-        return ""
-
-    def _add(self, **parts: Sequence[Any]) -> str:
-        assert self._section is not None  # the template opened it
-        found: dict[str, Any] = {n: [*getattr(self._section, n), *more] for n, more in parts.items()}
-        self._section = replace(self._section, **found)
+        if text or listing or any(parts.values()):
+            made = ReportSection(heading, text, folded=folded, listing=listing, **parts)
+            self.parts["sections"].append(made)
+        self._section = {}
         return ""
 
     def formulas(self, rows: Sequence[FormulaRow]) -> str:
         """Formulas of a section."""
-        return self._add(formulas=rows)
+        self._section["formulas"] += rows
+        return ""
 
     def notes(self, caller: Callable[[], str]) -> str:
         """Paragraphs in small print at the end of a section."""
-        return self._add(notes=in_paragraphs(caller()))
+        self._section["notes"] += in_paragraphs(caller())
+        return ""
 
     def table(
         self,
@@ -269,18 +243,20 @@ class _PageWriter:
         told = {str(name): (help or {}).get(str(name).partition(" (")[0], "") for name in frame.columns}
         meaning = {name: text for name, text in told.items() if text}
         made = ReportTable(caption, frame, meaning, file, rows, data, named)
-        if self._section is None:
-            self.content = replace(self.content, table=made)
-            return ""
-        return self._add(tables=[made])
+        if self._section:
+            self._section["tables"].append(made)
+        else:
+            self.parts["table"] = made
+        return ""
 
     def figures(self, figures: Sequence[ReportFigure]) -> str:
         """Figures of a section."""
-        return self._add(figures=figures)
+        self._section["figures"] += figures
+        return ""
 
     def lead(self, figure: ReportFigure | None, *, first: bool = False) -> str:
         """The figure of the answer; `first` puts it above the sentence."""
-        self.content = replace(self.content, figure=figure, figure_first=first)
+        self.parts |= {"figure": figure, "figure_first": first}
         return ""
 
 
@@ -298,9 +274,9 @@ def compose(template: str, *, title: str, interactive: Markup | None = None, **v
     values
         What the template reads.
     """
-    writer = _PageWriter(title)
+    writer = _PageWriter()
     environment().get_template(template).render(page=writer, **values)
-    return replace(writer.content, interactive=interactive)
+    return ReportContent(title, interactive=interactive, **writer.parts)
 
 
 def render_report(content: ReportContent) -> str:
@@ -452,74 +428,8 @@ def _cell_text(value: object) -> str:
     return str(value)
 
 
-OF_NETWORKS = ("coefficients_regression", "inclusion_regression", "training")
-"""Figures that say nothing where no networks were asked for."""
-
-OF_RUNS = ("coefficients_refined", "inclusion_refined", "coefficients_regression", "inclusion_regression",
-           "error_distribution")  # fmt: skip
-"""Figures of a scatter over runs, of which there is none in one."""
-
 INSPECTION, SEEN = "inspection.json", "seen.json"
 """Files beside the figures of an inspection: its lines, and the two states that it shows."""
-
-LEADING = ("quasipotential", "landscape")
-"""Figures that a page can open with, the best first."""
-
-
-def shown_figures(names: set[str], *, runs: int, networks: bool, published: bool) -> set[str]:
-    """Which figures a page shows of those that exist.
-
-    Parameters
-    ----------
-    names
-        Of the figures that were drawn.
-    runs
-        Number of runs.
-    networks
-        Whether networks were asked for.
-    published
-        Whether the study names published figures.
-    """
-    names = names - set(texts("captions")["inspection"])
-    if not published:
-        names = names - {"landscape_published"}
-    if not networks:
-        names = names - set(OF_NETWORKS)
-    if runs == 1:
-        names = names - set(OF_RUNS)
-    return names - {"landscape"} if "quasipotential" in names else names
-
-
-def figures_of(
-    part: str, images: Mapping[str, bytes], vectors: Mapping[str, bytes], *, beside_paper: bool = False
-) -> list[ReportFigure]:
-    """The figures of a part of the page, in the order of their captions.
-
-    Parameters
-    ----------
-    part
-        Of the page; figures without a caption stand last, with the workings.
-    images, vectors
-        PNG and SVG by name.
-    beside_paper
-        Whether to name the figures of the paper.
-    """
-    captions = texts("captions")["figures"]
-    names = [name for name, caption in captions.items() if caption["part"] == part and name in images]
-    if part == "workings":
-        names += sorted(set(images) - set(captions) - set(texts("captions")["inspection"]))
-    return [figure_of(name, images, vectors, beside_paper=beside_paper) for name in names]
-
-
-def figure_of(
-    name: str, images: Mapping[str, bytes], vectors: Mapping[str, bytes], *, beside_paper: bool = False
-) -> ReportFigure:
-    """One figure with its caption."""
-    caption = texts("captions")["figures"].get(name, {"text": f"{name.replace('_', ' ').capitalize()}."})
-    text = caption["text"]
-    if beside_paper and "paper" in caption:
-        text += f" In the paper: {caption['paper']}."
-    return ReportFigure(text, caption["text"], images[name], "png", vectors.get(name))
 
 
 def inspection_drawn(recordings: Recordings, *, folder: Path) -> dict[str, Figure]:
@@ -534,17 +444,11 @@ def inspection_drawn(recordings: Recordings, *, folder: Path) -> dict[str, Figur
     return inspection_figures(found)
 
 
-def read_seen(folder: str | Path) -> RecordStates | None:
-    """What `inspection_drawn` wrote of two states; None where recordings were simulated."""
-    file = Path(folder) / SEEN
-    data = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
-    return None if data is None else RecordStates.from_data(data)
-
-
-def read_inspection(folder: str | Path) -> list[str] | None:
-    """What `inspection_drawn` wrote, line by line; None where recordings were simulated."""
-    file = Path(folder) / INSPECTION
-    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
+def read_inspection(folder: str | Path) -> tuple[list[str] | None, RecordStates | None]:
+    """What `inspection_drawn` wrote: its lines, and the two states; None where recordings were simulated."""
+    files = [Path(folder) / name for name in (INSPECTION, SEEN)]
+    lines, seen = (json.loads(file.read_text("utf-8")) if file.is_file() else None for file in files)
+    return lines, None if seen is None else RecordStates.from_data(seen)
 
 
 NODES = 64_000  # of the grid: 85 kB in the page

@@ -10,6 +10,7 @@ import ast
 import json
 import os
 import platform
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -44,14 +45,10 @@ from siq.report.landscape import (
     wells_table,
 )
 from siq.report.page import (
-    LEADING,
     FormulaRow,
     ReportContent,
     ReportFigure,
     compose,
-    figure_of,
-    figures_of,
-    shown_figures,
 )
 from siq.report.summary import LandscapeSummary, well_name
 from siq.systems.diffusion import Diffusion
@@ -168,22 +165,12 @@ def study_page(
     certificates, rrmse, timings = results.tables["certificates"], table("rrmse"), table("timings")
     refused = certificates[(certificates["method"] == method) & ~certificates["passed"].astype(bool)]
     refused = refused[refused["run"] == shown.run]
-    images, lead = _shown_images(study, results)
-    inspection = {
-        name: ReportFigure(text, text, results.images[name], "png", results.vectors.get(name))
-        for name, text in texts("captions")["inspection"].items()
-        if name in results.images
-    }
+    figures, lead = _figures(study, results)
     density = given is not None and table("invariant") is None and "invariant" in results.tables
     escape, errors = table("escape"), table("landscape_errors")
     invariant, shares = table("invariant"), None if density else table("well_shares")
     named = ", ".join(f"{name} {version}" for name, version in versions.items())
     machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
-
-    def figures(part: str) -> list[ReportFigure]:
-        if part == "inspection":
-            return list(inspection.values())
-        return figures_of(part, images, results.vectors, beside_paper=beside_paper)
 
     return compose(
         "study.j2",
@@ -252,25 +239,42 @@ def study_page(
     )
 
 
-def _shown_images(study: Study, results: StudyResults) -> tuple[Mapping[str, bytes], ReportFigure | None]:
-    """The figures that the sections show, and the one that the page opens with."""
-    given = results.system is not None
-    drawn = set(results.images)
-    if not given:
-        networks, published = study.training is not None, study.published is not None
-        drawn = shown_figures(drawn, runs=study.runs, networks=networks, published=published)
-    images = {name: image for name, image in results.images.items() if name in drawn}
+LEADING = ("quasipotential", "landscape")
+"""Figures that a page can open with, the best first."""
+
+
+def _figures(
+    study: Study, results: StudyResults
+) -> tuple[Mapping[str, list[ReportFigure]], ReportFigure | None]:
+    """The figures by the parts of the page, in the order of their captions, and the one that it opens with.
+
+    Figures without a caption stand last, with the workings.
+    """
+    captions, images, given = texts("captions"), results.images, results.system is not None
+    known = {"runs": study.runs > 1, "networks": study.training is not None}
+    known["paper"] = study.published is not None
+    told = captions["figures"] | {
+        name: {"part": "inspection", "text": text} for name, text in captions["inspection"].items()
+    }
+    told |= {
+        name: {"part": "workings", "text": f"{name.replace('_', ' ').capitalize()}."}
+        for name in sorted(set(images) - set(told))
+    }
     lead = next((name for name in LEADING if name in images), None)
+    parts: dict[str, list[ReportFigure]] = defaultdict(list)
+    for name, caption in told.items():
+        if name in images and name not in LEADING and all(known[one] for one in caption.get("only_with", ())):
+            paper = f" In the paper: {caption['paper']}." if known["paper"] and "paper" in caption else ""
+            figure = ReportFigure(
+                caption["text"] + paper, caption["text"], images[name], "png", results.vectors.get(name)
+            )
+            parts[caption["part"]].append(figure)
     if lead is None:
-        return images, None
-    figure = figure_of(lead, images, results.vectors, beside_paper=study.published is not None)
+        return parts, None
     one = results.landscape is not None and len(results.landscape.names) == 1
     kind = ("one_equation" if one else "equations") if given else "one_state" if one else ""
-    if kind:
-        caption = texts("captions")["lead"][kind]
-        figure = replace(figure, caption=caption, alternative=caption)
-    del images[lead]
-    return images, figure
+    text = captions["lead"][kind] if kind else told[lead]["text"]
+    return parts, ReportFigure(text, text, images[lead], "png", results.vectors.get(lead))
 
 
 def _answer(results: StudyResults, *, certified: bool) -> list[str]:

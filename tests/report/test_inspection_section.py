@@ -15,10 +15,10 @@ def test_an_inspection_leaves_its_lines_and_three_figures(tmp_path: Path) -> Non
     recordings = Recordings.from_arrays(np.arange(values.shape[1]) * STEP, values, names=["x", "y"])
     figures = inspection_drawn(recordings, folder=tmp_path)
     assert list(figures) == list(texts("captions")["inspection"])
-    lines = read_inspection(tmp_path)
-    assert lines is not None
+    lines, seen = read_inspection(tmp_path)
+    assert lines is not None and seen is not None
     assert any(line.startswith("x: ") for line in lines)
 
 
 def test_simulated_studies_have_none(tmp_path: Path) -> None:
-    assert read_inspection(tmp_path) is None
+    assert read_inspection(tmp_path) == (None, None)

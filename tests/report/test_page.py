@@ -14,7 +14,6 @@ from markupsafe import Markup
 from benchmarks.publication.page import ReproductionContent, ReproductionSection, render_reproduction
 from siq.report.formatting import formula_mathml
 from siq.report.page import (
-    Badge,
     FormulaRow,
     ReportContent,
     ReportFigure,
@@ -85,7 +84,9 @@ def content(**changes: Any) -> ReportContent:
         ReportContent(
             title=HOSTILE,
             answer=["There are two stable states, known to 2.4 × 10⁻⁷.", HOSTILE],
-            badge=Badge("certified", True, ["All tests passed.", HOSTILE]),
+            badge="certified",
+            good=True,
+            promise=["All tests passed.", HOSTILE],
             figure=ReportFigure("U over both wells. And more.", HOSTILE, PNG, "png", SVG),
             table=ReportTable(
                 "Stable states.", pd.DataFrame({"state": ["x"], "A": ["1.0 ± 0.1"]}), rows_named=True
@@ -140,7 +141,7 @@ def test_the_answer_comes_first_and_then_the_picture_the_table_and_the_promise(p
     ]
     assert places == sorted(places)
     assert "✓ certified" in page
-    refused = render_report(content(badge=Badge("not certified", False, ["No."])))
+    refused = render_report(content(badge="not certified", good=False, promise=["No."]))
     assert "✗ not certified" in refused and "✓" not in refused
 
 
