@@ -53,6 +53,7 @@ from siq.quasipotential.landscape_comparison import (
 )
 from siq.quasipotential.landscape_files import landscape_from_data, read_landscape
 from siq.quasipotential.transitions import Transition
+from siq.remarks import sentence
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
 from siq.systems.simulation import simulate_stationary
@@ -96,7 +97,7 @@ def reference_of_card(settings: PipelineSettings, system: Dynamics) -> Reference
     try:
         portrait = phase_portrait(system, points)
         if not portrait.attractors and (fault := portrait.fault()) is not None:
-            return no_reference(system.dimension, fault)
+            return no_reference(system.dimension, sentence(fault))
         return reference_landscape(
             system, portrait, box=system.box, reach=REACH, generator=draw,
             mesh=lambda attractor, level: mesh_potential(system, attractor, box=system.box, level=level),

@@ -51,6 +51,7 @@ from siq.quasipotential.characteristics import (
 from siq.quasipotential.characteristics import relative_error as field_error
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.wells import Well
+from siq.remarks import sentence
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
 from siq.systems.formulas import compile_formulas
@@ -239,7 +240,9 @@ def certify(
         if evidence.prediction is not None:
             tests["prediction"] = evidence.prediction
     if (fault := portrait.fault()) is not None:
-        tests["branch"] = Verdict.refused(fault, tests["branch"].limit if "branch" in tests else 0.0)
+        tests["branch"] = Verdict.refused(
+            sentence(fault), tests["branch"].limit if "branch" in tests else 0.0
+        )
     refused = [verdict.reason for verdict in tests.values() if not verdict.passed]
     tested_on = "; ".join(dict.fromkeys(candidate.tested_on for candidate in candidates))
     return Certificate(tests, error, "; ".join(dict.fromkeys(refused)), scope, tested_on)

@@ -38,8 +38,8 @@ from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.refinement import RefinementOptions
 from siq.quasipotential.transitions import Transition, position_standard_errors, transitions, ways_out
 from siq.quasipotential.wells import Depth, Well, WellOptions, local_well, surveyed
-from siq.remarks import Remark
-from siq.systems.basins import enlarged
+from siq.remarks import Remark, sentence
+from siq.systems.basins import follow
 from siq.systems.cards import load_system
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
@@ -109,7 +109,7 @@ def find_landscape(
         Decides which points are used where there are too many.
     """
     fault, kept = portrait.fault(), list[Well | None]()
-    remarks = [] if fault is None else [Remark("quasipotential.reason", {"reason": fault})]
+    remarks = [] if fault is None else [fault]
     width = portrait.box[:, 1] - portrait.box[:, 0]
     for index, one in enumerate(portrait.attractors):
         if wells is None:
@@ -157,8 +157,9 @@ def landscape_from_equations(
         raise NoLandscape(str(error), None, system) from None
     fault, points = portrait.fault(), len(portrait.attractors)
     if not (portrait.attractors or portrait.cycles):
-        raise NoLandscape(fault or "f has no stable equilibrium in the domain", None, system)
-    remarks = [] if fault is None else [Remark("quasipotential.reason", {"reason": fault})]
+        why = "f has no stable equilibrium in the domain" if fault is None else sentence(fault)
+        raise NoLandscape(why, None, system)
+    remarks = [] if fault is None else [fault]
     remarks += portrait.remarks
     if portrait.cycles:
         beside_points = Remark("quasipotential.cycle_beside_formulas")
@@ -338,8 +339,7 @@ def _with_states_along_paths(
         extent *= np.sqrt(way.path.uphill.action)
         along = evenly(way.path.uphill.points, STATES_ALONG_PATH)
         starts = [along + share * draw.standard_normal(along.shape) @ extent for share in PATH_NEIGHBOURHOOD]
-        basins[index] = enlarged(
-            system, basins[index], index, portrait.attractors, np.concatenate(starts), box=portrait.box,
-            generator=draw,
-        )  # fmt: skip
+        ways = follow(system, np.concatenate(starts), portrait.attractors, box=portrait.box)
+        center = portrait.attractors[index].position
+        basins[index] = basins[index].enlarged(ways.paths[ways.ends == index], center, generator=draw)
     return replace(portrait, basins=tuple(basins))

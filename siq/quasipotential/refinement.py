@@ -70,6 +70,7 @@ from siq.quasipotential.hamilton_jacobi import affordable_degree, potential_basi
 from siq.quasipotential.occupancy import OccupancyCheck, check_occupancy
 from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.wells import Well, WellOptions, fit_well, local_well
+from siq.remarks import sentence
 from siq.systems.phase_portrait import PhasePortrait, RecordedRegion, evenly_spread, phase_portrait
 
 logger = logging.getLogger(__name__)
@@ -605,10 +606,11 @@ class TrainingCheck:
 
     def hopeless(self) -> str | None:
         """Why no training can pass, in words; None where one can."""
-        fault = self.portrait.fault()
-        if fault is None and len(self.wells) < len(self.portrait.attractors):
-            fault = "the local route found no formula about some attractor"
-        return fault
+        if (fault := self.portrait.fault()) is not None:
+            return sentence(fault)
+        if len(self.wells) < len(self.portrait.attractors):
+            return "the local route found no formula about some attractor"
+        return None
 
     def passes(self, networks: TrainedNetworks) -> bool:
         """Whether refinement will succeed from the networks of one run."""

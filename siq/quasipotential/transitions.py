@@ -34,7 +34,7 @@ from siq.quasipotential.paths import (
 from siq.quasipotential.rates import EscapeRate, escape_rate, prefactor_error
 from siq.quasipotential.wells import Well
 from siq.remarks import Remark, sentence
-from siq.systems.basins import leads_back, neighbours
+from siq.systems.basins import sides_of
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, measure_at
@@ -165,14 +165,14 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
     settled: list[np.ndarray | Cycle] = [*(one.position for one in portrait.attractors), *cycles]
     for index in range(points + len(cycles)):
         for saddle in portrait.saddles[index]:
-            around = neighbours(dynamics, saddle, portrait.attractors, box=box, cycles=cycles)
-            end = min(around - {index}, default=None)
+            sides = sides_of(dynamics, saddle, portrait.attractors, box=box, cycles=cycles)
+            end = min(set(sides[sides >= 0].tolist()) - {index}, default=None)
             remarks = nothing
             if end is None and not beyond_region:
                 remark = Remark("quasipotential.nothing_beyond_saddle")
                 ways.append(Transition(index, None, saddle, None, remarks=(remark,)))
                 continue
-            if end is None and leads_back(dynamics, saddle, portrait.attractors, box=box, cycles=cycles):
+            if end is None and (sides == index).all():  # it parts no wells
                 continue
             try:
                 if end is None:

@@ -46,7 +46,7 @@ from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, hessian_at, measure_at
 from siq.systems.formulas import DIGITS, Formula
-from siq.systems.phase_portrait import PhasePortrait, RecordedRegion, states_elsewhere
+from siq.systems.phase_portrait import PhasePortrait, RecordedRegion
 
 RESIDUAL_TOLERANCE = 0.05  # residual up to which a formula is believed: V is then off by some per cent
 ROUNDING_SHARE = 1e-16  # of what is usual: |∇V| |f| so close to the attractor says nothing
@@ -367,7 +367,7 @@ def local_well(
         # No formula tells V of the saddle as well as the finest does.
         goal = options.reach * wells[-1].level
         wells = [_extend_well(well, basin, goal=goal, rows=kept) for well in wells]
-    elsewhere = states_elsewhere(portrait, index)
+    elsewhere = portrait.states_elsewhere(index)
     wells = [replace(well, tolerance=options.tolerance, elsewhere=elsewhere) for well in wells]
     x = basin.points(rows[rows % HELD_OUT_STRIDE == 0])
     reached = [well.reaches(x) for well in wells]
@@ -721,5 +721,5 @@ def surveyed(well: Well, dynamics: Dynamics, portrait: PhasePortrait, index: int
         well,
         dynamics=dynamics,
         points=basin.points(basin.below(along, well.reach)),
-        elsewhere=states_elsewhere(portrait, index),
+        elsewhere=portrait.states_elsewhere(index),
     )

@@ -12,7 +12,7 @@ J. D. Skufca, J. A. Yorke, B. Eckhardt, Phys. Rev. Lett. 96 (2006) 174101: edge 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -148,40 +148,15 @@ def settled_on(
     return near
 
 
-def neighbours(
+def sides_of(
     dynamics: Dynamics,
     saddle: Equilibrium,
     attractors: Sequence[Equilibrium],
     *,
     box: np.ndarray,
     cycles: Sequence[Cycle] = (),
-) -> set[int]:
-    """The attractors below a saddle, on either side of its unstable directions; cycles after points."""
-    return {int(end) for end in _sides(dynamics, saddle, attractors, box=box, cycles=cycles) if end >= 0}
-
-
-def leads_back(
-    dynamics: Dynamics,
-    saddle: Equilibrium,
-    attractors: Sequence[Equilibrium],
-    *,
-    box: np.ndarray,
-    cycles: Sequence[Cycle] = (),
-) -> bool:
-    """Whether f leads from all sides of a saddle to one and the same attractor: it parts no wells."""
-    ends = _sides(dynamics, saddle, attractors, box=box, cycles=cycles)
-    return bool(ends[0] >= 0 and (ends == ends[0]).all())
-
-
-def _sides(
-    dynamics: Dynamics,
-    saddle: Equilibrium,
-    attractors: Sequence[Equilibrium],
-    *,
-    box: np.ndarray,
-    cycles: Sequence[Cycle],
 ) -> np.ndarray:
-    """Where f leads from both sides of each unstable direction of a saddle: attractors, cycles, or -1."""
+    """Where f leads from both sides of each unstable direction of a saddle, see `ends_of`."""
     values, vectors = np.linalg.eig(dynamics.jacobian(saddle.position[None])[0])
     width = box[:, 1] - box[:, 0]
     starts = []
@@ -219,6 +194,83 @@ LEVENBERG_STEPS = 200
 SADDLE_DISTANCE = 0.2  # of the box: so close to the edge a root of f has to be its saddle
 
 
+def tracked_edge(
+    dynamics: Dynamics,
+    low: np.ndarray,
+    high: np.ndarray,
+    one: int,
+    ends: Callable[[np.ndarray], np.ndarray],
+    *,
+    width: np.ndarray,
+    generator: np.random.Generator,
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """States on the boundary of a basin as f moves along it, from a way between two attractors on.
+
+    Parameters
+    ----------
+    dynamics
+        f.
+    low, high
+        Shape ``(d,)``: a state within the basin, and one beyond it.
+    one
+        The number of the basin.
+    ends
+        At which attractor each of some states ends.
+    width
+        Shape ``(d,)``: of the domain.
+    generator
+        Bends the first way between both, which symmetry may hold otherwise.
+
+    Yields
+    ------
+    tuple
+        Of each stretch the times that have passed since the last one ended, ``(n,)``, the states there,
+        ``(n, d)``, and the state from which the next one begins, ``(d,)``; first a single state alone. It
+        ends where two states do not come apart.
+    """
+    bend = FIRST_WAY_BEND * width * generator.standard_normal(len(width))
+    pair = _bisected(low, high, one, ends, width, bend)
+    yield np.zeros(1), pair.mean(axis=0)[None], pair.mean(axis=0)
+    while True:
+        step = 1e-3 / max(float(np.abs(dynamics.drift(pair) / width).max()), 1e-300)
+        now, times, middles = 0.0, [], []
+        for _ in range(MAX_TRACKING_STEPS):
+            with np.errstate(over="ignore", invalid="ignore"):  # a step that is too long is taken again
+                moved, error = dormand_prince_step(dynamics.drift, pair, np.full(2, step))
+            relative = np.abs(error / width).max(axis=1) / TRACKING_ACCURACY
+            if relative.max() <= 1:
+                pair, now = moved, now + step
+                times.append(now)
+                middles.append(pair.mean(axis=0))
+                if (np.abs(pair[1] - pair[0]) / width).max() > DIVERGED_DISTANCE:
+                    break
+            step = float(next_step(np.full(2, step), relative).min())
+        else:
+            return
+        pair = _bisected(pair[0], pair[1], one, ends, width, np.zeros(len(width)))
+        yield np.array(times), np.array(middles), pair.mean(axis=0)
+
+
+def _bisected(
+    low: np.ndarray,
+    high: np.ndarray,
+    one: int,
+    ends: Callable[[np.ndarray], np.ndarray],
+    width: np.ndarray,
+    bend: np.ndarray,
+) -> np.ndarray:
+    """Two states on either side of the boundary of a basin that all but agree, on a bent way: ``(2, d)``."""
+    share = np.linspace(0, 1, BISECTION_STATES + 2)[:, None]
+    way = low + share * (high - low) + np.sin(np.pi * share) * bend
+    while True:
+        other = np.flatnonzero(ends(way[1:-1]) != one)
+        last = int(other[0]) if len(other) else len(way) - 2
+        low, high = way[last], way[last + 1]
+        if (np.abs(high - low) / width).max() <= BISECTED_DISTANCE:
+            return np.stack([low, high])
+        way = low + share * (high - low)
+
+
 def edge_saddle(
     dynamics: Dynamics,
     one: int,
@@ -248,56 +300,11 @@ def edge_saddle(
         return follow(dynamics, x, attractors, box=box, states=2, patience=dynamics.dimension).ends
 
     start, end = attractors[one].position, attractors[two].position
-    pair = bisected(start, end, one, ends, width=width, generator=generator)
-    for _ in range(MAX_TRACKING_ROUNDS):
-        found = _saddle_near(dynamics, pair.mean(axis=0), box, width)
-        if found is not None:
+    edge = tracked_edge(dynamics, start, end, one, ends, width=width, generator=generator)
+    for _, _, state in itertools.islice(edge, MAX_TRACKING_ROUNDS):
+        if (found := _saddle_near(dynamics, state, box, width)) is not None:
             return found
-        tracked = apart_of(dynamics, pair, width)
-        if tracked is None:
-            return None
-        pair = bisected(tracked[0][0], tracked[0][1], one, ends, width=width)
     return None
-
-
-def bisected(
-    low: np.ndarray,
-    high: np.ndarray,
-    one: int,
-    ends: Callable[[np.ndarray], np.ndarray],
-    *,
-    width: np.ndarray,
-    generator: np.random.Generator | None = None,
-) -> np.ndarray:
-    """Two states on either side of the boundary of a basin that all but agree, shape ``(2, d)``.
-
-    Parameters
-    ----------
-    low, high
-        Shape ``(d,)``: a state within the basin, and one beyond it.
-    one
-        The number of the basin.
-    ends
-        At which attractor each of some states ends.
-    width
-        Shape ``(d,)``: of the domain.
-    generator
-        Bends the way between both; without it, it is straight.
-    """
-    share = np.linspace(0, 1, BISECTION_STATES + 2)[:, None]
-    bend = (
-        np.zeros(len(width))
-        if generator is None
-        else FIRST_WAY_BEND * width * generator.standard_normal(len(width))
-    )
-    way = low + share * (high - low) + np.sin(np.pi * share) * bend
-    while True:
-        other = np.flatnonzero(ends(way[1:-1]) != one)
-        last = int(other[0]) if len(other) else len(way) - 2
-        low, high = way[last], way[last + 1]
-        if (np.abs(high - low) / width).max() <= BISECTED_DISTANCE:
-            return np.stack([low, high])
-        way = low + share * (high - low)
 
 
 def _saddle_near(dynamics: Dynamics, x: np.ndarray, box: np.ndarray, width: np.ndarray) -> Equilibrium | None:
@@ -336,34 +343,6 @@ def _saddle_near(dynamics: Dynamics, x: np.ndarray, box: np.ndarray, width: np.n
         other = beside(one.position + sign * size * along)
         if other is not None and other.kind == "saddle" and other.unstable == 1:
             return other
-    return None
-
-
-def apart_of(
-    dynamics: Dynamics, pair: np.ndarray, width: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Two states followed for the same time until they have come apart; None where they do not.
-
-    Returns
-    -------
-    tuple
-        The two states, shape ``(2, d)``; the times that have passed at each step, ``(n,)``, and their
-        middles there, ``(n, d)``.
-    """
-    speed = float(np.abs(dynamics.drift(pair) / width).max())
-    step, now = 1e-3 / max(speed, 1e-300), 0.0
-    times, middles = [], []
-    for _ in range(MAX_TRACKING_STEPS):
-        with np.errstate(over="ignore", invalid="ignore"):  # a step that is too long is taken again
-            moved, error = dormand_prince_step(dynamics.drift, pair, np.full(2, step))
-        relative = np.abs(error / width).max(axis=1) / TRACKING_ACCURACY
-        if relative.max() <= 1:
-            pair, now = moved, now + step
-            times.append(now)
-            middles.append(pair.mean(axis=0))
-            if (np.abs(pair[1] - pair[0]) / width).max() > DIVERGED_DISTANCE:
-                return pair, np.array(times), np.array(middles)
-        step = float(next_step(np.full(2, step), relative).min())
     return None
 
 
@@ -414,6 +393,17 @@ class Basin:
     def points(self, rows: np.ndarray) -> np.ndarray:
         """The states of some rows of `chosen`."""
         return self.states[self.chosen[rows, 0], self.chosen[rows, 1]]
+
+    def enlarged(self, further: np.ndarray, center: np.ndarray, *, generator: np.random.Generator) -> Basin:
+        """The basin with further descents, ``(n, k, d)``, to its attractor, which begin at any states."""
+        if not len(further):
+            return self
+        # Points lie about as dense as before, also where the new ones are.
+        width = np.ptp(further.reshape(-1, further.shape[2]), axis=0)
+        added = _chosen(further, center, width, generator) + np.array([len(self.states), 0])
+        spread = len(self.states) if self.spread is None else self.spread
+        states = np.concatenate([self.states, further])
+        return Basin(states, np.concatenate([self.chosen, added]), spread)
 
 
 def basin_of(
@@ -466,39 +456,6 @@ def basin_of(
     states = np.concatenate([recorded, close.paths[close.ends == index]])
     spread = None if near is None else len(recorded)
     return Basin(states, _chosen(states, center, width, generator), spread)
-
-
-def enlarged(
-    dynamics: Dynamics,
-    basin: Basin,
-    index: int,
-    attractors: Sequence[Equilibrium],
-    starts: np.ndarray,
-    *,
-    box: np.ndarray,
-    generator: np.random.Generator,
-) -> Basin:
-    """A basin with further descents, which begin where evenly spread ones are too few.
-
-    Parameters
-    ----------
-    dynamics, index, attractors, box, generator
-        As of `basin_of`.
-    basin
-        Of the attractor.
-    starts
-        Shape ``(n, d)``; those that lead elsewhere are left out.
-    """
-    further = follow(dynamics, starts, attractors, box=box)
-    mine = further.paths[further.ends == index]
-    spread = len(basin.states) if basin.spread is None else basin.spread
-    if not len(mine):
-        return basin
-    states = np.concatenate([basin.states, mine])
-    # Points lie about as dense as before, also where the new ones are.
-    center, width = attractors[index].position, np.ptp(mine.reshape(-1, len(box)), axis=0)
-    added = _chosen(mine, center, width, generator) + np.array([len(basin.states), 0])
-    return Basin(states, np.concatenate([basin.chosen, added]), spread)
 
 
 def _chosen(

@@ -35,7 +35,7 @@ come from. In more states a cycle that separates two basins attracts along their
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -46,7 +46,7 @@ from scipy.integrate import solve_ivp
 from scipy.sparse.linalg import spsolve
 
 from siq.errors import NumericalFailure
-from siq.systems.basins import Descents, apart_of, bisected, ends_of, follow, settled_on
+from siq.systems.basins import Descents, ends_of, follow, settled_on, tracked_edge
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, classify, spread_evenly
 
@@ -317,26 +317,14 @@ def stable_cycles(
     """
     ends, last, asked = descents.ends.copy(), descents.paths[:, -1], np.zeros(len(descents.ends), dtype=bool)
     cycles: list[Cycle] = []
-    width = np.ptp(box, axis=1)
     for _ in range(MAX_TRIED_TRAJECTORIES):
         left = np.flatnonzero((ends < 0) & ~descents.escaped)
         if asked[left].all():
             break
         one = left[~asked[left]][0]
         asked[one] = True
-        found = recurrence_of(dynamics, last[one][None], box=box, rate=rate)
-        if found.place is None:
-            continue
-        around = solve_ivp(
-            lambda _, y: dynamics.drift((y * width)[None])[0] / width, (0.0, found.period),
-            found.place / width, method="DOP853", rtol=1e-9, atol=1e-11,
-            t_eval=np.linspace(0, found.period, PARTS, endpoint=False),
-        )  # fmt: skip
-        if not around.success:
-            continue
-        try:
-            cycle = _closed_orbit(dynamics, around.y.T * width, found.period, scale=width)
-        except NumericalFailure:
+        cycle = recurrence_of(dynamics, last[one][None], box=box, rate=rate).cycle
+        if cycle is None:
             continue
         index = _place_among(cycles, cycle, box)
         near = settled_on(last[left], cycles, box=box)
@@ -411,41 +399,21 @@ def separatrix_cycles(
     def ends(x: np.ndarray) -> np.ndarray:
         return ends_of(dynamics, x, attractors, cycles, box=box)
 
+    width = np.ptp(box, axis=1)
     places = [*(one.position for one in attractors), *(one.position for one in cycles)]
     pairs = [pair for pair in itertools.combinations(range(len(places)), 2) if max(pair) >= len(attractors)]
     found: list[Cycle] = []
     for one, two in pairs[:MAX_PAIRS]:
-        cycle = _edge_cycle(dynamics, one, (places[one], places[two]), ends, box, generator)
-        if cycle is not None:
-            _place_among(found, cycle, box)
-    return tuple(found)
-
-
-def _edge_cycle(
-    dynamics: Dynamics,
-    one: int,
-    places: tuple[np.ndarray, np.ndarray],
-    ends: Callable[[np.ndarray], np.ndarray],
-    box: np.ndarray,
-    generator: np.random.Generator,
-) -> Cycle | None:
-    """The cycle that a boundary is tracked to; None where it is something else."""
-    width = np.ptp(box, axis=1)
-    pair = bisected(*places, one, ends, width=width, generator=generator)
-    times, states = [0.0], [pair.mean(axis=0)]
-    for number in range(TRACKING_ROUNDS):
-        tracked = apart_of(dynamics, pair, width)
-        if tracked is None:
-            return None
-        pair, passed, along = tracked
-        times += (times[-1] + passed).tolist()
-        states += list(along)
-        pair = bisected(pair[0], pair[1], one, ends, width=width)
-        if number >= ROUNDS_BEFORE_SEARCH:
-            cycle = _closed(dynamics, np.array(times), np.array(states), box)
+        edge = tracked_edge(dynamics, places[one], places[two], one, ends, width=width, generator=generator)
+        times, states = np.zeros(0), np.zeros((0, len(box)))
+        for number, (passed, along, _) in enumerate(itertools.islice(edge, TRACKING_ROUNDS + 1)):
+            times = np.append(times, times[-1:].sum() + passed)
+            states = np.concatenate([states, along])
+            cycle = _closed(dynamics, times, states, box) if number > ROUNDS_BEFORE_SEARCH else None
             if cycle is not None and cycle.unstable == 1:
-                return cycle
-    return None
+                _place_among(found, cycle, box)
+                break
+    return tuple(found)
 
 
 def _closed(dynamics: Dynamics, times: np.ndarray, states: np.ndarray, box: np.ndarray) -> Cycle | None:
@@ -479,9 +447,8 @@ LONGEST_RETURN = 50.0  # crossings of the box, in which there has to be a return
 MAX_EVALUATIONS = 1_000_000  # of f: some ten times what the equations of Lorenz and Rössler need
 ESCAPE_DISTANCE = 1.5  # of the box from its middle: what comes so far has escaped, as in `follow`
 MAX_RETURNS_OF_PERIOD = 12  # of longer cycles only those of twice doubled periods are looked for
-RECURRENCE_NEWTON_STEPS = 12
-DIVERGENCE_RATIO = 2.0  # to the first gap: from there Newton's method no longer leads close by
-RETURN_CLOSURE_TOLERANCE = 1e-8  # of the box: by which an orbit may fail to close, with integrals to 1e-10
+SECTION_DISTANCE = 1e-8  # of the box: from the section, so that its start is not taken for a return
+CYCLE_DISTANCE = 0.25  # of the box: so close to a return its cycle passes
 RESTING_SPEED = 1e-4  # of the rate: a trajectory so slow at its end is coming to rest
 
 Kind = Literal["cycle", "chaos", "aperiodic", "none"]
@@ -496,32 +463,16 @@ class Recurrence:
     kind
         ``cycle``: it ends on a limit cycle. ``chaos``: it returns, never to the same place, and small
         differences grow. ``aperiodic``: it returns, and neither can be said. ``none``: it does not return.
-    period
-        Of the cycle, in units of time; NaN of anything else.
     exponent
         Mean rate at which small differences grow, per unit of time: the largest Lyapunov exponent. NaN where
         it was not asked for.
-    place
-        A state on the cycle, shape ``(d,)``; None of anything else.
+    cycle
+        The cycle; None of anything else.
     """
 
     kind: Kind
-    period: float = float("nan")
     exponent: float = float("nan")
-    place: np.ndarray | None = field(default=None, compare=False)
-
-    def sentence(self) -> str:
-        """In words that follow a colon."""
-        if self.kind == "cycle":
-            return f"they end on a limit cycle of period {self.period:.4g}"
-        if self.kind == "chaos":
-            return (
-                "they settle neither on an equilibrium nor on a cycle: aperiodic motion, as of chaos (small"
-                f" differences grow at a rate of {self.exponent:.3g} per unit of time)"
-            )
-        if self.kind == "aperiodic":
-            return "they settle neither on an equilibrium nor on a cycle: aperiodic motion"
-        return "within the time for which they were followed they neither rest nor return"
+    cycle: Cycle | None = field(default=None, compare=False)
 
 
 def recurrence_of(dynamics: Dynamics, starts: np.ndarray, *, box: np.ndarray, rate: float) -> Recurrence:
@@ -602,8 +553,8 @@ class _Motion:
                 close = away <= max(CLOSE_RETURN_RATIO * away.min(), RETURN_TOLERANCE)
                 passed = np.cumsum(times)
                 period = float(passed[-1] - passed[-2 - int(np.flatnonzero(close)[0])])
-                if (found := self._stable_orbit(state, period)) is not None:
-                    return Recurrence("cycle", found[1], place=found[0] * self.width)
+                if (cycle := self._stable_cycle(state, period)) is not None:
+                    return Recurrence("cycle", cycle=cycle)
         if not places:
             return Recurrence("none")
         exponent = float(np.sum(growth) / np.sum(times))
@@ -624,7 +575,7 @@ class _Motion:
         returns.terminal, returns.direction = True, 1.0  # type: ignore[attr-defined]
         escapes.terminal = True  # type: ignore[attr-defined]
         # Away from the section first, on which it begins: what is zero there would be taken for a return.
-        away = RETURN_CLOSURE_TOLERANCE / self.speed
+        away = SECTION_DISTANCE / self.speed
         begin = np.concatenate([state + away * self.drift(state), tangent])
         way = solve_ivp(
             lambda _, z: self.linearised(z), (0.0, LONGEST_RETURN / self.rate), begin, method="DOP853",
@@ -635,33 +586,17 @@ class _Motion:
         end = way.y_events[0][0]
         return end[:d], end[d:], float(way.t_events[0][0]) + away
 
-    def _stable_orbit(self, base: np.ndarray, period: float) -> tuple[np.ndarray, float] | None:
-        """A state and the period of a stable periodic orbit close by, None where there is none."""
-        d, x, longest, widest = self.dimension, base, 2 * period, np.inf
-        across = self.drift(base)
-        for _ in range(RECURRENCE_NEWTON_STEPS):
-            begin = np.concatenate([x, np.eye(d).ravel()])
-            way = solve_ivp(
-                lambda _, z: self.linearised(z), (0.0, period), begin, method="DOP853", rtol=1e-10, atol=1e-12
-            )
-            if not way.success or not np.isfinite(way.y[:, -1]).all():
-                return None
-            end, monodromy = way.y[:d, -1], way.y[d:, -1].reshape(d, d)
-            gap = end - x
-            away = float(np.abs(gap).max())
-            if away < RETURN_CLOSURE_TOLERANCE:
-                # All multipliers but the one of the motion along the orbit lie within the unit circle.
-                multipliers = np.linalg.eigvals(monodromy)
-                others = np.delete(multipliers, np.argmin(np.abs(multipliers - 1)))
-                return (x, period) if (np.abs(others) < 1 - NEUTRAL_MULTIPLIER_MARGIN).all() else None
-            if away > widest:
-                return None
-            widest = min(widest, DIVERGENCE_RATIO * away)
-            matrix = np.zeros((d + 1, d + 1))
-            matrix[:d, :d], matrix[:d, d], matrix[d, :d] = monodromy - np.eye(d), self.drift(end), across
-            step = np.linalg.lstsq(matrix, -np.append(gap, across @ (x - base)), rcond=None)[0]
-            step *= min(1.0, 0.2 / max(float(np.abs(step[:d]).max()), 1e-300))  # a fifth of the box at most
-            x, period = x + step[:d], period + float(step[d])
-            if not 0 < period < longest:
-                return None
-        return None
+    def _stable_cycle(self, base: np.ndarray, period: float) -> Cycle | None:
+        """A stable cycle that passes close by, None where there is none."""
+        around = solve_ivp(
+            lambda _, y: self.drift(y), (0.0, period), base, method="DOP853", rtol=1e-9, atol=1e-11,
+            t_eval=np.linspace(0, period, PARTS, endpoint=False),
+        )  # fmt: skip
+        if not around.success:
+            return None
+        try:
+            cycle = _closed_orbit(self.dynamics, around.y.T * self.width, period, scale=self.width)
+        except NumericalFailure:
+            return None
+        near = cycle.distances((base * self.width)[None], scale=self.width)[0] < CYCLE_DISTANCE
+        return cycle if cycle.stable and near and cycle.period < 2 * period else None

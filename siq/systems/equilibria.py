@@ -70,7 +70,14 @@ class Equilibrium:
         return int((self.eigenvalues.real > 0).sum())
 
 
-def find_equilibria(dynamics: Dynamics, points: np.ndarray) -> list[Equilibrium]:
+def find_equilibria(
+    dynamics: Dynamics,
+    points: np.ndarray,
+    *,
+    box: np.ndarray | None = None,
+    margin: float = BOX_MARGIN,
+    rate: float | None = None,
+) -> list[Equilibrium]:
     """All equilibria in the box of some points that Newton's method finds from these.
 
     Parameters
@@ -79,15 +86,19 @@ def find_equilibria(dynamics: Dynamics, points: np.ndarray) -> list[Equilibrium]
         f.
     points
         Shape ``(n, d)``: recorded states, from all over the recorded region.
+    box, margin
+        Shape ``(d, 2)``: by default that of the points; and the share of it by which one may lie outside.
+    rate
+        At which f crosses the box, see `classify`; by default its median over the points.
 
     Returns
     -------
     list of Equilibrium
         By their position along the first state. Only roots of f that are isolated are found.
     """
-    box = np.stack([points.min(axis=0), points.max(axis=0)], axis=1)
-    found = distinct_roots(dynamics, points, box=box, margin=BOX_MARGIN)
-    return classified(dynamics, found, box=box, rate=_rate_of(dynamics, points))
+    box = np.stack([points.min(axis=0), points.max(axis=0)], axis=1) if box is None else box
+    found = distinct_roots(dynamics, points, box=box, margin=margin)
+    return _classified(dynamics, found, box, _rate_of(dynamics, points) if rate is None else rate)
 
 
 def distinct_roots(
@@ -167,10 +178,10 @@ def _newton(
     return x
 
 
-def classified(
-    dynamics: Dynamics, positions: Sequence[np.ndarray], *, box: np.ndarray, rate: float
+def _classified(
+    dynamics: Dynamics, positions: Sequence[np.ndarray], box: np.ndarray, rate: float
 ) -> list[Equilibrium]:
-    """Equilibria at positions, by these along the first state; see `classify` for the rate."""
+    """Equilibria at positions, by these along the first state."""
     width = np.where(box[:, 1] > box[:, 0], box[:, 1] - box[:, 0], 1.0)
     ordered = sorted(positions, key=lambda position: tuple(np.round(position / width, 6)))
     return [classify(dynamics, position, rate=rate) for position in ordered]
@@ -267,23 +278,12 @@ def unreached_states(dynamics: Dynamics) -> tuple[str, ...]:
     >>> unreached_states(Dynamics.of((x, v, w), (v, -x - v + w, -w), diffusion=pushed))
     ('w',)
     """
-    rows = dynamics.diffusion.formulas
-    reached = {
-        own for own, row in zip(dynamics.symbols, rows, strict=True) if any(entry != 0 for entry in row)
-    }
-    while True:
-        further = {
-            own
-            for own, formula in zip(dynamics.symbols, dynamics.formulas, strict=True)
-            if own not in reached and formula.free_symbols & reached
-        }
-        if not further:
-            return tuple(
-                name
-                for name, own in zip(dynamics.states, dynamics.symbols, strict=True)
-                if own not in reached
-            )
-        reached |= further
+    symbols, rows = dynamics.symbols, dynamics.diffusion.formulas
+    reached = {own for own, row in zip(symbols, rows, strict=True) if any(entry != 0 for entry in row)}
+    for _ in symbols:
+        moved = zip(symbols, dynamics.formulas, strict=True)
+        reached |= {own for own, formula in moved if formula.free_symbols & reached}
+    return tuple(own.name for own in symbols if own not in reached)
 
 
 def measure_at(dynamics: Dynamics, attractor: np.ndarray) -> Diffusion:
@@ -372,7 +372,7 @@ def all_equilibria(
             break
         found += new
     rate = float(np.median(np.linalg.norm(dynamics.drift(starts) / width, axis=1)))
-    equilibria = tuple(classified(dynamics, found, box=box, rate=rate))
+    equilibria = tuple(_classified(dynamics, found, box, rate))
     degree = _boundary_degree(dynamics, equilibria)
     indices = [np.sign(np.linalg.det(dynamics.jacobian(one.position[None])[0])) for one in equilibria]
     if degree is None or degree == int(sum(indices)):

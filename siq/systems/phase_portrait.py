@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from siq.errors import NumericalFailure
 from siq.numerics.randomness import representative_subset
 from siq.remarks import Remark
-from siq.systems.basins import Basin, Descents, basin_of, edge_saddle, follow, neighbours
+from siq.systems.basins import Basin, Descents, basin_of, edge_saddle, follow, sides_of
 from siq.systems.cycles import (
     Cycle,
     Recurrence,
@@ -34,8 +34,6 @@ from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import (
     Equilibrium,
     all_equilibria,
-    classified,
-    distinct_roots,
     find_equilibria,
     hessian_at,
     spread_evenly,
@@ -116,20 +114,25 @@ class PhasePortrait:
         """Share of the recorded points from which f leads to no attractor although it stays in reach."""
         return float(((self.descents.ends < 0) & ~self.descents.escaped).mean())
 
-    def fault(self) -> str | None:
-        """Why this landscape has no wells, in words; None where it has."""
+    def states_elsewhere(self, index: int) -> np.ndarray | None:
+        """Recorded states from which f leads to other attractors, shape ``(m, d)``; None for none."""
+        others = [one for number, one in enumerate(self.basins) if number != index]
+        return np.concatenate([one.points(np.arange(len(one.chosen))) for one in others]) if others else None
+
+    def fault(self) -> Remark | None:
+        """Why this landscape has no wells; None where it has."""
         degenerate = [one for one in self.equilibria if one.kind == "degenerate" and one not in self.harmless]
         if degenerate:
             place = np.array2string(degenerate[0].position, precision=4)
-            return f"the equilibrium at {place} is neither stable nor unstable to first order"
-        ends = "there is another attractor" if self.recurrence is None else self.recurrence.sentence()
-        if not (self.attractors or self.cycles) and self.unsettled <= UNSETTLED:
-            return "f has no stable equilibrium in the recorded region"
+            return Remark("systems.degenerate_equilibrium", {"place": place})
+        alone = not (self.attractors or self.cycles)
         if self.unsettled <= UNSETTLED:
-            return None
-        if not (self.attractors or self.cycles):
-            return f"no recorded state comes to rest at a stable equilibrium: {ends}"
-        return f"{self.unsettled:.0%} of the recorded states lead to no equilibrium: {ends}"
+            return Remark("systems.no_stable_equilibrium") if alone else None
+        values: dict[str, object] = {"share": None if alone else self.unsettled, "kind": None}
+        if (ends := self.recurrence) is not None:
+            period = ends.cycle.period if ends.cycle else None
+            values |= {"kind": ends.kind, "period": period, "exponent": ends.exponent}
+        return Remark("systems.unsettled", values)
 
 
 def evenly_spread(x: np.ndarray, *, generator: np.random.Generator, most: int = 4000) -> np.ndarray:
@@ -193,8 +196,7 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
         equilibria, remarks = all_equilibria(dynamics, generator=generator)
     else:
         resting = follow(dynamics, points, [], box=box, states=2).paths[:, -1]
-        roots = distinct_roots(dynamics, resting, box=box, margin=MERGE_TOLERANCE)
-        equilibria = tuple(classified(dynamics, roots, box=box, rate=rate))
+        equilibria = tuple(find_equilibria(dynamics, resting, box=box, margin=MERGE_TOLERANCE, rate=rate))
 
     stable = [one for one in equilibria if one.kind == "attractor"]
     descents = follow(dynamics, starts, stable, box=box)
@@ -225,7 +227,7 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
     for one in equilibria:
         # Over a saddle of a domain with several unstable directions no way is lowest.
         if one.kind == "saddle":
-            for index in neighbours(dynamics, one, attractors, box=box, cycles=cycles):
+            for index in set(sides_of(dynamics, one, attractors, box=box, cycles=cycles).tolist()) - {-1}:
                 if one.unstable == 1 or not searched:
                     around[index].append(one)
 
@@ -344,7 +346,7 @@ class RecordedRegion:
     def of_basin(cls, portrait: PhasePortrait, index: int) -> RecordedRegion:
         """The region of ``portrait.attractors[index]``, in shares of the recorded box."""
         descents = portrait.descents
-        others = states_elsewhere(portrait, index)
+        others = portrait.states_elsewhere(index)
         away = [descents.paths[descents.ends != index][:, 0], *([] if others is None else [others])]
         basin, box = portrait.basins[index], portrait.box
         return cls(basin.points(np.arange(len(basin.chosen))), np.concatenate(away), box[:, 1] - box[:, 0])
@@ -365,9 +367,3 @@ class RecordedRegion:
         distance, nearest = self._tree.query(places)
         near = distance <= NEIGHBOUR_SPACINGS * self._spacing[nearest]
         return np.asarray(near & ~self._closer_elsewhere(places, distance))
-
-
-def states_elsewhere(portrait: PhasePortrait, index: int) -> np.ndarray | None:
-    """Recorded states from which f leads to other attractors, shape ``(m, d)``; None for none."""
-    others = [one for number, one in enumerate(portrait.basins) if number != index]
-    return np.concatenate([one.points(np.arange(len(one.chosen))) for one in others]) if others else None

@@ -61,6 +61,7 @@ from siq.quasipotential.formulas import exact_decomposition
 from siq.quasipotential.global_formula import fit_values, refine_globally
 from siq.quasipotential.hamilton_jacobi import LibraryBasis
 from siq.quasipotential.wells import Well, _grow_well
+from siq.remarks import sentence
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import PhasePortrait, RecordedRegion
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
@@ -465,7 +466,7 @@ def test_a_limit_cycle_is_named_and_refused_without_any_division_by_zero() -> No
     known = limit_cycle()
     fault = portrait_of(known, 300, share=0.6).fault()
     assert fault is not None
-    assert "limit cycle" in fault
+    assert "limit cycle" in sentence(fault)
     with np.errstate(all="raise"):
         certificate = certified(known, known.potential)
     assert not certificate.certified

@@ -15,7 +15,8 @@ from known_systems import (
     uniform_points,
 )
 
-from siq.systems.basins import follow, neighbours
+from siq.remarks import sentence
+from siq.systems.basins import follow, sides_of
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import classify, find_equilibria, hessian_at
 from siq.systems.phase_portrait import phase_portrait
@@ -69,7 +70,7 @@ def test_a_limit_cycle_has_no_attractor() -> None:
     found = portrait_of(known)
     assert found.attractors == ()
     assert found.unsettled == 1
-    assert "limit cycle" in (found.fault() or "")
+    assert "limit cycle" in sentence(found.fault())
 
 
 def test_a_limit_cycle_beside_an_attractor_is_named() -> None:
@@ -81,7 +82,8 @@ def test_a_limit_cycle_beside_an_attractor_is_named() -> None:
     found = phase_portrait(dynamics, points)
     assert len(found.attractors) == 1
     assert found.unsettled == pytest.approx((np.linalg.norm(points, axis=1) > 1).mean())
-    assert "of the recorded states lead to no equilibrium: they end on a limit cycle" in (found.fault() or "")
+    told = sentence(found.fault())
+    assert "of the recorded states lead to no equilibrium: they end on a limit cycle" in told
 
 
 def test_an_equilibrium_that_is_degenerate_is_named() -> None:
@@ -91,7 +93,7 @@ def test_an_equilibrium_that_is_degenerate_is_named() -> None:
     dynamics = Dynamics.of((x, y), (-x * (x - 1) ** 2, -y))
     points = np.random.default_rng(0).uniform(-1, 2, size=(200, 2))
     found = phase_portrait(dynamics, points)
-    assert "neither stable nor unstable to first order" in (found.fault() or "")
+    assert "neither stable nor unstable to first order" in sentence(found.fault())
 
 
 def test_an_f_that_is_constant_has_no_equilibria() -> None:
@@ -118,7 +120,8 @@ def test_a_saddle_lies_between_the_attractors_next_to_it(known: KnownSystem) -> 
     assert [len(saddles) for saddles in found.saddles] == [1, 1]
     assert found.saddles[0] == found.saddles[1]
     attractors = list(found.attractors)
-    assert neighbours(known.dynamics, found.saddles[0][0], attractors, box=found.box) == {0, 1}
+    sides = sides_of(known.dynamics, found.saddles[0][0], attractors, box=found.box)
+    assert set(sides) == {0, 1}
     np.testing.assert_allclose([one.position for one in attractors], known.attractors, atol=1e-9)
 
 
