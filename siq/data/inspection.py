@@ -29,10 +29,9 @@ from siq.data.recordings import (
     LONGEST_STEP,
     SINGLE_RECORDING_REMEDY,
     Recordings,
-    read_recordings,
     recordings_of,
 )
-from siq.data.two_states import RecordStates, Switching, states_of_record, switching
+from siq.data.two_states import RecordStates, Switching, switching
 from siq.remarks import Remark, sentence
 
 if TYPE_CHECKING:
@@ -48,10 +47,7 @@ VALUES_SAMPLED = 2000  # looked at, for how many of them differ
 MIN_REPETITIONS = 4  # of the values of a label
 NEGLIGIBLE_ROUNDING = 1e-6  # of the range of a state
 COARSE_STEP = 0.5  # relaxation times: over a longer step most of what f does is forgotten
-WITHOUT_TRANSITIONS = (
-    "none",
-    "unknown",
-)  # of memory: what relaxes without noise does not hop
+WITHOUT_TRANSITIONS = ("none", "unknown")  # kinds of memory: what relaxes without noise does not hop
 
 
 class Span(NamedTuple):
@@ -150,11 +146,12 @@ class Inspection:
     @property
     def seen(self) -> RecordStates | None:
         """The two states that the recordings show by themselves; None where nothing is known of them."""
-        return states_of_record(self.recordings, self.switching)
+        return None if self.switching is None else self.switching.summary(self.recordings)
 
     def remarks(self) -> list[Remark]:
         """What was read, what it shows, and what can be learned from it."""
-        return [*self._contents(), *self._findings(), *self._notes(), *self._prospects()]
+        notes = [Remark("data.note", {"text": note}) for note in self.notes]
+        return [*self._contents(), *self._findings(), *notes, *self._prospects()]
 
     def text(self) -> str:
         """As lines of plain text, for a terminal."""
@@ -230,9 +227,6 @@ class Inspection:
         values = {"share": self.coverage, "states": list(titles[:2]), "sparse": sparse}
         return [*found, Remark("data.coverage", values)]
 
-    def _notes(self) -> list[Remark]:
-        return [Remark("data.note", {"text": note}) for note in self.notes]
-
     def _prospects(self) -> list[Remark]:
         values: dict[str, Any]
         recordings, memory = self.recordings, self.memory
@@ -261,6 +255,9 @@ class Inspection:
             values = {"step": memory.step, "relaxation": memory.relaxation, "unit": recordings.time_unit}
             found.append(Remark("data.coarse_step", values))
         return found if recordings.time_unit else [*found, Remark("data.no_time_unit")]
+
+
+_NAMES = {True: "the recordings", False: "the table"}  # of what is in no file
 
 
 def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
@@ -292,14 +289,7 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
     >>> found.memory.kind, found.memory.lag
     ('white', 0)
     """
-    if isinstance(source, str | Path):
-        return inspection_of(read_recordings(source), file=str(source))
-    named = "the recordings" if isinstance(source, Recordings) else "the table"
-    return inspection_of(recordings_of(source), file=named)
-
-
-def inspection_of(recordings: Recordings, *, file: str = "the recordings") -> Inspection:
-    """The inspection of recordings in memory; `file` is what it calls them."""
+    recordings = recordings_of(source)
     counts = np.bincount(recordings.recording)
     first = np.cumsum(counts) - counts
     gaps = np.diff(recordings.t)[np.diff(recordings.recording) == 0]
@@ -319,7 +309,7 @@ def inspection_of(recordings: Recordings, *, file: str = "the recordings") -> In
         )  # fmt: skip
     memory = markov_lag(recordings)
     return Inspection(
-        file=file,
+        file=str(source) if isinstance(source, str | Path) else _NAMES[isinstance(source, Recordings)],
         recordings=recordings,
         states=tuple(states),
         samples=_span(counts),
@@ -336,9 +326,8 @@ def inspection_of(recordings: Recordings, *, file: str = "the recordings") -> In
 
 def seen_states(recordings: Recordings) -> RecordStates | None:
     """The two states that recordings show by themselves, without the rest of an inspection."""
-    if markov_lag(recordings).kind in WITHOUT_TRANSITIONS:
-        return None
-    return states_of_record(recordings, switching(recordings))
+    found = None if markov_lag(recordings).kind in WITHOUT_TRANSITIONS else switching(recordings)
+    return None if found is None else found.summary(recordings)
 
 
 def _span(values: np.ndarray | Sequence[float]) -> Span:

@@ -39,27 +39,24 @@ from siq.data.stationarity import (
     relaxation_samples,
     runs_of,
     stretches_of,
-    usual_step,
 )
 from siq.numerics.integration import machine_code
-from siq.numerics.text import range_text, unit_text, value_text
+from siq.remarks import Remark, sentence
 
 if TYPE_CHECKING:
     import pandas as pd
 
-AVERAGING_TIME = (
-    0.5  # of the local relaxation time, over which samples are averaged for the hidden Markov model
-)
+AVERAGING_TIME = 0.5  # of the local relaxation time: of samples for the hidden Markov model
 MOST_ITERATIONS = 200  # of its estimation, at most
 
 
 def _two_levels(
     recordings: Recordings, values: np.ndarray, runs: list[slice], relaxation: float
-) -> tuple[Background, tuple[float, float], tuple[float, float]]:
+) -> tuple[Background, tuple[float, float]]:
     """Two levels over a common background: each in turn, until neither changes."""
     width = max(int(AVERAGING_TIME * relaxation), 1)
     background = Background(np.zeros(len(values)), 0)
-    levels, spreads = (0.0, 0.0), (0.0, 0.0)
+    levels = (0.0, 0.0)
     for _ in range(5):
         flat = values - background.values
         begins = stretches_of(runs, width)
@@ -68,19 +65,18 @@ def _two_levels(
         centre, spread, weights = _two_normals(means, first)
         order = np.argsort(centre)
         levels = (float(centre[order[0]]), float(centre[order[1]]))
-        spreads = (float(spread[order[0]]), float(spread[order[1]]))
         share = np.full(len(values), np.nan)
         share[begins[:, None] + np.arange(width)] = weights[:, order[1]][:, None]
         known = np.isfinite(share)
         share = np.interp(np.arange(len(share)), np.flatnonzero(known), share[known])
         found = background_of(recordings, values - (1 - share) * levels[0] - share * levels[1])
         unchanged = found.half_periods == background.half_periods and (
-            np.abs(found.values - background.values).max() <= 0.01 * min(spreads)
+            np.abs(found.values - background.values).max() <= 0.01 * spread.min()
         )
         background = found
         if unchanged:
             break
-    return background, levels, spreads
+    return background, levels
 
 
 def _two_normals(series: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -238,10 +234,7 @@ MOST_POINTS = 8192  # of a series that surrogates are made of
 BINS = 40  # of a histogram with a valley
 DEGREE = 5  # of f in the test: two attractors that differ in depth and width need more than a cubic
 STRETCH_TIMES = 40  # local relaxation times: shorter ones bias f towards one state, longer ones let drifts in
-FEWEST_STRETCHES, SHORTEST_TIMES = (
-    6,
-    10,
-)  # stretches, at least, for which they may be as short as ten relaxation times
+FEWEST_STRETCHES, SHORTEST_TIMES = 6, 10  # for so many stretches they may be as short as ten of these
 LAG_SHARE = 0.1  # of the local relaxation time: over it a state hardly changes what pushes it
 PLACES_COMPARED = 25  # at which f is compared with itself, between the quantiles
 INNER_QUANTILE = 0.02  # the quantile from which on f is known well enough
@@ -352,9 +345,7 @@ def _valley(series: np.ndarray) -> float:
 
 SIGNIFICANCE = 0.01  # probability with which a single state is taken for two
 DECISIVE_P = 1e-5  # probability for the first test from which on the second one is not asked
-PULLED_TOGETHER = (
-    -3.0
-)  # standard errors: where f falls so clearly from every place to every other, one state attracts
+PULLED_TOGETHER = -3.0  # standard errors: where f falls so clearly between all places, one state attracts
 
 
 @dataclass(frozen=True)
@@ -367,35 +358,34 @@ class Switching:
         Index of the state (column) that shows them best.
     levels
         The two levels, the lower first, in the unit of the state; of the record less its background.
-    spreads
-        Standard deviation about each.
     counts
         How long each lasts.
     visits
         Shape ``(n,)``: 0 or 1 at each sample, -1 before the record has reached a level.
     background
         What drifts slowly below both levels.
-    relaxation
-        The local relaxation time.
-    pushed
-        By how many standard errors the record is pushed away from between the levels; negative where it is
-        pulled there, NaN where it is too short to tell.
-    valley
-        Share of the samples in the lesser peak of the histogram, above the valley; 0 where there is one peak.
     probability
         Of so much with a single state over a slowly drifting background, both tests and all states counted.
     """
 
     state: int
     levels: tuple[float, float]
-    spreads: tuple[float, float]
     counts: tuple[DwellCount, DwellCount]
     visits: np.ndarray
     background: Background
-    relaxation: float
-    pushed: float
-    valley: float
     probability: float
+
+    def summary(self, recordings: Recordings) -> RecordStates:
+        """What the recordings show by themselves.
+
+        Where a background drifts slowly it is taken off the histogram, as it is off the levels.
+        """
+        values = recordings.values[:, self.state] - self.background.values
+        density, edges = np.histogram(values, bins=BINS, density=True)
+        return RecordStates(
+            recordings.titles[self.state], recordings.units[self.state], recordings.time_unit,
+            self.supported, self.probability, self.levels, self.counts, edges, density,
+        )  # fmt: skip
 
     @property
     def hops(self) -> int:
@@ -435,40 +425,30 @@ def switching(recordings: Recordings, *, generator: np.random.Generator | None =
     >>> found.supported, [round(level, 1) for level in found.levels]
     (True, [-0.9, 0.8])
     """
-    runs, step = runs_of(recordings), usual_step(recordings)
+    runs = runs_of(recordings)
     generator = np.random.default_rng(0) if generator is None else generator
-    tests: dict[int, tuple[float, float, float, float]] = {}
+    tests: dict[int, tuple[float, float, float]] = {}  # probability, less the depth, relaxation
     for place, column in enumerate(recordings.values.T):
         relaxation = relaxation_samples(column, runs)
         if relaxation is None:  # too short, or a column that runs on like a clock
             continue
-        pushed = _pushed_apart(column, runs, relaxation) or (float("nan"), 1.0)
-        if pushed[0] < PULLED_TOGETHER or pushed[1] < DECISIVE_P:
-            valley = (_valley_between(column, runs, relaxation, generator=None)[0], 1.0)
-        else:
-            number = SURROGATES * recordings.values.shape[1]
-            valley = _valley_between(column, runs, relaxation, generator=generator, surrogates=number)
-        tests[place] = (min(pushed[1], valley[1]), pushed[0], valley[0], relaxation)
+        pushed, chance = _pushed_apart(column, runs, relaxation) or (float("nan"), 1.0)
+        clear = pushed < PULLED_TOGETHER or chance < DECISIVE_P
+        depth, rarity = _valley_between(
+            column, runs, relaxation, generator=None if clear else generator,
+            surrogates=SURROGATES * recordings.values.shape[1],
+        )  # fmt: skip
+        tests[place] = (min(chance, rarity), -depth, relaxation)
     if not tests:
         return None
-    state = min(tests, key=lambda place: (tests[place][0], -tests[place][2]))
-    probability, push, depth, relaxation = tests[state]
+    state = min(tests, key=lambda place: tests[place][:2])
+    probability, _, relaxation = tests[state]
     values = recordings.values[:, state]
-    background, levels, spreads = _two_levels(recordings, values, runs, relaxation)
+    background, levels = _two_levels(recordings, values, runs, relaxation)
     visits = _counted_visits(values - background.values, runs, levels)
     lower, upper = dwell_counts(recordings.t, visits, runs)
-    return Switching(
-        state,
-        levels,
-        spreads,
-        (lower, upper),
-        visits,
-        background,
-        relaxation * step,
-        push,
-        depth,
-        min(2 * probability * len(tests), 1.0),
-    )
+    chance = min(2 * probability * len(tests), 1.0)
+    return Switching(state, levels, (lower, upper), visits, background, chance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -529,21 +509,12 @@ class RecordStates:
 
     def sentence(self) -> str:
         """The same in a sentence; empty where two states are not supported."""
-        if not self.supported:
-            return ""
-        low, high = (value_text(level, unit=self.unit or "", digits=3) for level in self.levels)
-        time = unit_text(self.time_unit) or "time units"
-        means = " and ".join(
-            f"{value_text(one.mean, digits=3)} ({range_text(*one.limits)})"
-            if one.visits
-            else f"more than {value_text(one.limits[0], digits=2)}"
-            for one in self.counts
-        )
-        return (
-            f"The recordings hop between two states of {self.state}, at {low} and {high}: {self.transitions}"
-            f" transition{'s were' if self.transitions > 1 else ' was'} seen, from level to level, and the"
-            f" states last {means} {time} in the mean."
-        )
+        values = {
+            "state": self.state, "unit": self.unit, "time_unit": self.time_unit, "levels": self.levels,
+            "transitions": self.transitions, "means": [one.mean for one in self.counts],
+            "limits": [one.limits for one in self.counts], "visits": [one.visits for one in self.counts],
+        }  # fmt: skip
+        return sentence(Remark("data.record_hops", values)) if self.supported else ""
 
     def as_data(self) -> dict[str, Any]:
         """As plain data, which `from_data` reads back."""
@@ -557,18 +528,3 @@ class RecordStates:
         first, second = (DwellCount(**one) for one in data["counts"])
         arrays = {name: np.array(data[name], dtype=float) for name in ("edges", "density")}
         return cls(**{**data, "levels": tuple(data["levels"]), "counts": (first, second), **arrays})
-
-
-def states_of_record(recordings: Recordings, found: Switching | None) -> RecordStates | None:
-    """What `switching` found in recordings; None where it found nothing.
-
-    Where a background drifts slowly it is taken off the histogram, as it is off the levels.
-    """
-    if found is None:
-        return None
-    values = recordings.values[:, found.state] - found.background.values
-    density, edges = np.histogram(values, bins=BINS, density=True)
-    return RecordStates(
-        recordings.titles[found.state], recordings.units[found.state], recordings.time_unit,
-        found.supported, found.probability, found.levels, found.counts, edges, density,
-    )  # fmt: skip

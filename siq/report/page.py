@@ -24,7 +24,7 @@ import pandas as pd
 from jinja2 import ChoiceLoader, Environment, FileSystemLoader, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from siq.data.inspection import inspection_of
+from siq.data.inspection import inspect
 from siq.data.preparation import joined
 from siq.data.recordings import Recordings
 from siq.data.two_states import RecordStates
@@ -436,7 +436,7 @@ def inspection_drawn(recordings: Recordings, *, folder: Path) -> dict[str, Figur
     """The figures of an inspection by name; what it says is written into the folder."""
     from siq.report.plots.recordings import inspection_figures  # matplotlib
 
-    found = inspection_of(joined(recordings))
+    found = inspect(joined(recordings))
     seen = None if found.seen is None else found.seen.as_data()
     for file, data in ((INSPECTION, found.lines()), (SEEN, seen)):
         text = json.dumps(data, ensure_ascii=False, allow_nan=False)

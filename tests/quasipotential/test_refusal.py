@@ -9,7 +9,7 @@ import pytest
 from told_landscapes import landscape, told
 
 import siq
-from siq.data.inspection import inspection_of
+from siq.data.inspection import inspect
 from siq.data.recordings import Recordings
 from siq.data.two_states import RecordStates
 from siq.inference.library import IdentificationOptions
@@ -47,7 +47,7 @@ def test_a_refusal_carries_the_states_of_the_record() -> None:
     record = telegraph()
     with pytest.raises(NoLandscape) as refused:
         siq.Landscape.from_recordings(record, few)
-    states, seen = refused.value.states, inspection_of(record).seen
+    states, seen = refused.value.states, inspect(record).seen
     assert states is not None and seen is not None
     assert states.as_data() == seen.as_data()  # what the page is made of
     times = states.dwell_times()
@@ -72,14 +72,14 @@ def test_a_landscape_that_misses_the_states_says_so_as_the_page_does() -> None:
 
 
 def test_states_of_a_record_come_back_from_plain_data() -> None:
-    seen = inspection_of(telegraph()).seen
+    seen = inspect(telegraph()).seen
     assert seen is not None
     again = RecordStates.from_data(json.loads(json.dumps(seen.as_data())))
     assert again.as_data() == seen.as_data() and again.sentence() == seen.sentence()
 
 
 def test_nothing_is_added_to_what_is_certified() -> None:
-    seen = inspection_of(telegraph()).seen
+    seen = inspect(telegraph()).seen
     two = summarise(told(landscape([[-0.5], [0.5]], [0.25, 0.35])))
     (answer, *further) = answer_lines(two, seen=seen, certified=True)
     assert answer_lines(two) == [answer, *further]

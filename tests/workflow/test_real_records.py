@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from siq.data.inspection import inspection_of
+from siq.data.inspection import inspect
 from siq.data.recordings import read_recordings
 from siq.workflow.pipeline import Analysis, analyse
 
@@ -46,7 +46,7 @@ def test_dust_in_the_ice_has_two_states_whose_barrier_is_not_resolved() -> None:
 @pytest.mark.skipif(not CHIP.is_file(), reason="the recordings are not at hand")
 def test_the_states_of_the_chip_last_as_its_authors_say() -> None:
     record = read_recordings(CHIP, columns=["rate"])
-    seen = inspection_of(record).switching
+    seen = inspect(record).switching
     assert seen is not None and seen.supported
     for count, authors in zip(seen.counts, (1.51, 0.313), strict=True):
         low, high = count.limits
