@@ -257,9 +257,6 @@ class Inspection:
         return found if recordings.time_unit else [*found, Remark("data.no_time_unit")]
 
 
-_NAMES = {True: "the recordings", False: "the table"}  # of what is in no file
-
-
 def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
     """Look at recordings, and say what is in them and what can be learned: seconds, before anything runs.
 
@@ -290,6 +287,7 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
     ('white', 0)
     """
     recordings = recordings_of(source)
+    named = "the recordings" if isinstance(source, Recordings) else "the table"
     counts = np.bincount(recordings.recording)
     first = np.cumsum(counts) - counts
     gaps = np.diff(recordings.t)[np.diff(recordings.recording) == 0]
@@ -309,7 +307,7 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
         )  # fmt: skip
     memory = markov_lag(recordings)
     return Inspection(
-        file=str(source) if isinstance(source, str | Path) else _NAMES[isinstance(source, Recordings)],
+        file=str(source) if isinstance(source, str | Path) else named,
         recordings=recordings,
         states=tuple(states),
         samples=_span(counts),

@@ -108,12 +108,11 @@ class Recordings:
         >>> recordings.names, recordings.units, recordings.labels
         (('x',), ('mm',), ('0',))
         """
-        from siq.data.formats import frame_columns  # these import pyarrow
-        from siq.data.tables import checked_table
+        from siq.data.tables import read_tables  # which imports pyarrow
 
         levels = [name for name in frame.index.names if name in ("recording", "t")]
-        source = frame_columns(TABLE, frame.reset_index(level=levels) if levels else frame)
-        read = cls(**checked_table(TABLE, source, columns, units)._asdict())
+        table = frame.reset_index(level=levels) if levels else frame
+        read = read_tables(table, columns=columns, units=units)
         given = units or {}
         return replace(
             read,
@@ -251,7 +250,7 @@ def read_recordings(
     """
     from siq.data.tables import read_tables  # which imports pyarrow
 
-    return Recordings(**read_tables(path, columns=columns, units=units, gaps=gaps)._asdict())
+    return read_tables(path, columns=columns, units=units, gaps=gaps)
 
 
 def recordings_of(source: str | Path | Recordings | pd.DataFrame) -> Recordings:

@@ -22,8 +22,9 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from siq.data.formats import Column, ColumnFile, open_columns
+from siq.data.formats import Column, ColumnFile, frame_columns, open_columns
 from siq.data.layout import layout_of
+from siq.data.recordings import TABLE, Recordings
 from siq.errors import InputError
 from siq.numerics.files import files_of
 
@@ -54,62 +55,34 @@ class _Rows(NamedTuple):
     labels: tuple[str, ...]
 
 
-class CheckedTable(NamedTuple):
-    """What `siq.data.recordings.Recordings` is made of, by the same names."""
-
-    names: tuple[str, ...]
-    units: tuple[str | None, ...]
-    labels: tuple[str, ...]
-    recording: np.ndarray
-    t: np.ndarray
-    values: np.ndarray
-    time_unit: str | None
-    headings: tuple[str, ...]
-    notes: tuple[str, ...]
-
-
 def read_tables(
-    path: str | Path,
+    source: str | Path | pd.DataFrame,
     *,
     columns: Sequence[str] | None,
     units: Mapping[str, str] | None,
     gaps: bool = True,
-) -> CheckedTable:
-    """Read a file of recordings, or a folder that holds one file per recording.
+) -> Recordings:
+    """Read a table, in memory or in a file, or a folder that holds one file per recording.
 
     See `siq.data.recordings.read_recordings`.
     """
-    if not Path(path).is_dir():
-        return checked_table(str(path), open_columns(path), columns, units, gaps=gaps)
-    files = files_of(Path(path))
-    tables = [checked_table(str(file), open_columns(file), columns, units, gaps=gaps) for file in files]
-    return _joined(files, tables, str(path))
+    if isinstance(source, pd.DataFrame):
+        return _checked(TABLE, frame_columns(TABLE, source), columns, units, gaps)
+    if not Path(source).is_dir():
+        return _checked(str(source), open_columns(source), columns, units, gaps)
+    files = files_of(Path(source))
+    tables = [_checked(str(file), open_columns(file), columns, units, gaps) for file in files]
+    return _joined(files, tables, str(source))
 
 
-def checked_table(
+def _checked(
     file: str,
     source: ColumnFile,
     columns: Sequence[str] | None,
     units: Mapping[str, str] | None,
-    *,
-    gaps: bool = True,
-) -> CheckedTable:
-    """Check a table that has been opened.
-
-    Parameters
-    ----------
-    file
-        What messages call it.
-    source
-        Its columns.
-    columns, units, gaps
-        See `siq.data.recordings.read_recordings`.
-
-    Raises
-    ------
-    InputError
-        For the first thing that cannot be used.
-    """
+    gaps: bool,
+) -> Recordings:
+    """Check a table that has been opened; raises InputError for the first thing that cannot be used."""
     layout = layout_of(file, source, columns)
     used = [layout.time, *layout.states]
     cells = source.load([*([] if layout.recording is None else [layout.recording]), *used])
@@ -154,7 +127,7 @@ def checked_table(
     _refuse_missing(file, numbers, rows, ["t", *layout.titles])
     rows = _in_order(rows, numbers, layout.recording is not None, notes)
     check_times(file, numbers[0][rows.order], rows.recording, rows.labels, rows.order)
-    return CheckedTable(
+    return Recordings(
         names=layout.names,
         units=tuple(found_units[1:]),
         labels=rows.labels,
@@ -238,37 +211,28 @@ def _parse_labels(
     A blank row, in which nothing else stands either, needs no label and gets -1. Labels are text without
     outer spaces; 3 and 3.0 both become ``"3"``.
     """
-    if isinstance(cells, pa.ChunkedArray):
-        cells = cells.combine_chunks()
     if pa.types.is_nested(cells.type):
         remedy = "write one text or whole number per row"
         raise InputError(file, "column recording", f"it holds {cells.type}, not labels", remedy)
-    if not pa.types.is_dictionary(cells.type):
-        cells = cells.dictionary_encode()
-    # All work on text is done once per label, not once per row.
-    texts = cells.dictionary
-    if not _is_text(texts.type):
-        texts = pa.array([_label(value) for value in texts.to_pylist()], type=pa.string())
-    texts = pc.fill_null(pc.utf8_trim_whitespace(texts.cast(pa.string())), "").dictionary_encode()
-    merged = np.append(texts.indices.to_numpy(), -1)
-    codes = merged[cells.indices.cast(pa.int64()).fill_null(len(merged) - 1).to_numpy()]
-    missing = (codes == -1) | (codes == texts.dictionary.index("").as_py())
-    if (missing & ~blank).any():
-        row = int(np.argmax(missing & ~blank)) + 1
+    # All work on text is done once per label, not once per row; -1 stands where nothing does.
+    values, different = pd.factorize(cells.to_pandas())
+    texts, names = pd.factorize(np.array([*map(_label, different), None], dtype=object))
+    codes = texts[values]
+    missing = (codes < 0) & ~blank
+    if missing.any():
+        row = int(np.argmax(missing)) + 1
         remedy = "write the label of the row's recording"
         fault = InputError(file, f"row {row}, column recording", "the label is missing", remedy)
         return codes, (), (row, fault)
-    present = pa.array(codes, mask=missing).dictionary_encode()  # again, now in order of first appearance
-    labels = tuple(texts.dictionary.take(present.dictionary).to_pylist())
-    return present.indices.fill_null(-1).to_numpy().astype(np.int64), labels, None
+    codes, order = pd.factorize(np.where(codes < 0, np.nan, codes))  # now in order of first appearance
+    return codes.astype(np.int64), tuple(str(names[int(each)]) for each in order), None
 
 
-def _label(value: object) -> str:
-    if value is None or value != value:  # NaN, as missing numbers are written
-        return ""
+def _label(value: object) -> str | None:
     if isinstance(value, float) and value.is_integer():
         value = int(value)
-    return value.decode("utf-8", errors="replace") if isinstance(value, bytes) else str(value)
+    text = value.decode("utf-8", errors="replace") if isinstance(value, bytes) else str(value)
+    return text.strip() or None
 
 
 def _agreed_unit(file: str, name: str, stated: Mapping[str, str | None], expected: str | None) -> str | None:
@@ -486,7 +450,7 @@ def check_times(
     raise InputError(file, f"row {rows[earlier + 1] + 1}, column t", fault, remedy)
 
 
-def _joined(files: Sequence[Path], tables: Sequence[CheckedTable], folder: str) -> CheckedTable:
+def _joined(files: Sequence[Path], tables: Sequence[Recordings], folder: str) -> Recordings:
     """Tables of one folder as one; the name of a file is that of its recording."""
     first, names = tables[0], [file.name for file in files]
     stems = [file.stem for file in files]
@@ -515,7 +479,7 @@ def _joined(files: Sequence[Path], tables: Sequence[CheckedTable], folder: str) 
     for note in dict.fromkeys(note for table in tables for note in table.notes):
         having = sum(note in table.notes for table in tables)
         notes.append(note if having == len(tables) else f"in {having} of {len(tables)} files {note}")
-    return CheckedTable(
+    return Recordings(
         names=first.names,
         units=units,
         labels=tuple(labels),
