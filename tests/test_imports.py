@@ -52,6 +52,7 @@ WITHIN: frozenset[tuple[str, str]] = frozenset(
     {
         ("siq.quasipotential.landscape", "siq.quasipotential.landscape_assembly"),
         ("siq.quasipotential.landscape", "siq.quasipotential.landscape_comparison"),
+        ("siq.data.recordings", "siq.data.tables"),
         ("siq.systems.dynamics", "siq.systems.cards"),
     }
 )

@@ -14,7 +14,7 @@ GAP = "\0"  # where a message has a name or a number
 
 
 def sentences() -> list[str]:
-    """All text in the code, what is filled in replaced by `GAP`."""
+    """All text in the code and in the templates of remarks, what is filled in replaced by `GAP`."""
     found = []
     for file in [*(ROOT / "siq").rglob("*.py"), *(ROOT / "workflow").rglob("*.py")]:
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
@@ -23,6 +23,8 @@ def sentences() -> list[str]:
                 found.append("".join(map(str, parts)))
             elif isinstance(node, ast.Constant) and isinstance(node.value, str):
                 found.append(node.value)
+    for file in (ROOT / "siq").rglob("templates/**/*.yaml"):
+        found.append(re.sub(r"\{[{%].*?[%}]\}", GAP, " ".join(file.read_text(encoding="utf-8").split())))
     return found
 
 
