@@ -28,7 +28,6 @@ from siq.diagnosis.study import Comparison
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import recalibrate
-from siq.systems.dynamics import arguments_of, evaluable
 
 HIDDEN = 16  # in each of two layers
 TOGETHER = 0.02  # of a state's deviation, by which segments may miss each other
@@ -75,12 +74,12 @@ class Equations(torch.nn.Module):
         super().__init__()
         model = fit.model
         self.model = model
-        arguments = arguments_of(model)
+        arguments = model.arguments
         self._card = sympy.lambdify(
-            arguments, [evaluable(each, model) for each in model.equations], modules="torch", cse=True
+            arguments, [model.evaluable(each) for each in model.equations], modules="torch", cse=True
         )
         self._outputs = sympy.lambdify(
-            arguments, [evaluable(formula, model) for _, formula in model.outputs], modules="torch", cse=True
+            arguments, [model.evaluable(formula) for _, formula in model.outputs], modules="torch", cse=True
         )
         signals = data.signals(data.t, data.recording, delays=())
         z = np.concatenate([fit.x.T, signals.inputs])

@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from siq.errors import Fault, InputError
 from siq.numerics.files import read_document, validate
 from siq.systems.cards import Formula, Name
-from siq.systems.dynamics import Dynamics, Signals, arguments_of, evaluable, symbol
+from siq.systems.dynamics import Dynamics, Signals, symbol
 from siq.systems.formulas import FormulaError, compile_values, parse_formula
 
 Role = Literal[
@@ -448,8 +448,8 @@ def _feeds(model: Dynamics, prey: str, predator: str) -> bool:
         return False
     x, signals = trial_points(model)
     at = (*np.abs(x), *signals.inputs, *signals.delayed, *signals.slopes, signals.t, *model.values)
-    written = [evaluable(each, model) for each in (lost, won)]
-    losses, gains = compile_values(written, arguments_of(model), common=False)(*at)
+    written = [model.evaluable(each) for each in (lost, won)]
+    losses, gains = compile_values(written, model.arguments, common=False)(*at)
     return bool(np.all(np.asarray(losses) <= 0) and np.all(np.asarray(gains) >= 0))
 
 

@@ -39,7 +39,7 @@ from siq.diagnosis.dictionary import (
 from siq.errors import InputError
 from siq.inference.measurements import Measurements
 from siq.systems.diffusion import Diffusion
-from siq.systems.dynamics import TIME, Dynamics, Parameter, Signals, arguments_of, evaluable, symbol
+from siq.systems.dynamics import TIME, Dynamics, Parameter, Signals, symbol
 from siq.systems.formulas import FormulaError, compile_values, parse_formula
 
 LATTICE_TOLERANCE = (
@@ -426,11 +426,11 @@ def _columns(
     changed = [place for place, pair in enumerate(zip(before, after, strict=True)) if pair[0] != pair[1]]
     formulas: list[sympy.Expr] = []
     for place in changed:
-        formula, known = evaluable(after[place], augmented), evaluable(before[place], model)
+        formula, known = augmented.evaluable(after[place]), model.evaluable(before[place])
         by_amplitude = [formula.diff(symbol(name)) for name in candidate.amplitudes]
         formulas += by_amplitude or [formula - known]
     with np.errstate(all="ignore"):
-        found = compile_values(formulas, arguments_of(augmented), common=False)(*at, *values, *new)
+        found = compile_values(formulas, augmented.arguments, common=False)(*at, *values, *new)
     for number, value in enumerate(found):
         place, column = divmod(number, result.shape[2])
         result[changed[place], :, column] = value

@@ -36,7 +36,7 @@ from siq.inference.kalman_filter import (
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.trajectories import EDGE_SUBSTEPS, run_along, spread_edges
-from siq.systems.dynamics import Dynamics, arguments_of, evaluable, symbol, tape_of
+from siq.systems.dynamics import Dynamics, Tape, symbol
 from siq.systems.formulas import compile_values
 
 
@@ -203,8 +203,8 @@ class _Compiled:
         augmented = candidate.model
         self._candidate, self._count = candidate, len(model.parameters)
         formulas = [*augmented.equations, *(formula for _, formula in augmented.outputs)]
-        arguments = arguments_of(augmented)
-        written = [evaluable(formula, augmented) for formula in formulas]
+        arguments = augmented.arguments
+        written = [augmented.evaluable(formula) for formula in formulas]
         zero = {symbol(name): 0 for name in candidate.amplitudes}
 
         def columns(formula: sympy.Expr, before: sympy.Expr) -> list[sympy.Expr]:
@@ -212,7 +212,7 @@ class _Compiled:
                 return [formula - before]
             return [formula.diff(symbol(name)).subs(zero) for name in candidate.amplitudes]
 
-        base = [evaluable(formula, model) for formula in model.equations]
+        base = [model.evaluable(formula) for formula in model.equations]
         rates = [columns(f, b) for f, b in zip(written[: model.dimension], base, strict=True)]
         outputs = [
             columns(f, b) for f, (_, b) in zip(written[augmented.dimension :], model.outputs, strict=True)
@@ -242,7 +242,7 @@ class _Compiled:
         self, grid: Grid, signals: np.ndarray, numbers: tuple[float, ...], begin: np.ndarray
     ) -> np.ndarray:
         """The further states at all samples, shape ``(n, k)``."""
-        tape = tape_of(self._further, self._memory_arguments)
+        tape = Tape.of(self._further, self._memory_arguments)
         if tape is None:
             names = ", ".join(map(str, self._further))
             raise NumericalFailure(f"a state of its own has a formula that cannot be followed: {names}")

@@ -22,7 +22,7 @@ from siq.inference.kalman_filter import Grid, Linearisation, Noise, integrate_in
 from siq.inference.maximum_likelihood import Fit, fit_by_multiple_shooting, fit_of_states
 from siq.inference.measurements import Expectations, Measurements, first_states
 from siq.numerics.integration import machine_code
-from siq.systems.dynamics import Dynamics, Tape, arguments_of, evaluable, symbol
+from siq.systems.dynamics import Dynamics, Tape, symbol
 from siq.systems.formulas import compile_values
 
 
@@ -489,9 +489,9 @@ def spread_edges(model: Dynamics, data: Measurements, x: np.ndarray, *, substeps
     arguments = jumps_of(model)
     if not arguments:
         return model
-    formulas = [evaluable(each, model) for each in arguments]
+    formulas = [model.evaluable(each) for each in arguments]
     signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
-    function = compile_values(formulas, arguments_of(model), common=False)
+    function = compile_values(formulas, model.arguments, common=False)
     further = np.zeros((model.dimension - x.shape[1], len(x)))  # states that a mechanism brings
     along = function(
         *x.T, *further, *signals.inputs, *signals.delayed, *signals.slopes, signals.t, *model.values

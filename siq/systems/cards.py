@@ -9,7 +9,7 @@ same equations in other units are another problem unless D is carried along.
 from __future__ import annotations
 
 import keyword
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -203,46 +203,9 @@ def diffusion_rows(diffusion: DiffusionEntry, dimension: int) -> list[list[Formu
         row if isinstance(row, list) else [row if i == j else 0.0 for j in range(dimension)]
         for i, row in enumerate(diffusion)
     ]
-    if not _has_formulas(rows):
+    if all(not isinstance(entry, str) for row in rows for entry in row):
         Diffusion(np.array(rows, dtype=float))
     return rows
-
-
-def read_diffusion(
-    diffusion: DiffusionEntry, symbols: Sequence[sympy.Symbol], parse: Callable[[Formula], sympy.Expr] | None
-) -> Diffusion:
-    """D as a card or a study gives it.
-
-    Parameters
-    ----------
-    diffusion
-        The entry.
-    symbols
-        The d states as they stand in formulas.
-    parse
-        What reads a formula; by default it may have the states in it, and nothing else.
-
-    Returns
-    -------
-    Diffusion
-        Symmetric and, where it is constant, positive semi-definite: a zero says that no noise reaches a
-        state.
-
-    Raises
-    ------
-    ValueError
-        When the shape is wrong, or D is not symmetric and positive semi-definite.
-    """
-    names = {each.name: each for each in symbols}
-    rows = diffusion_rows(diffusion, len(symbols))
-    if not _has_formulas(rows):
-        return Diffusion(np.array(rows, dtype=float))
-    read = parse if parse is not None else (lambda text: parse_formula(text, names))
-    return Diffusion.of_formulas(symbols, [[read(entry) for entry in row] for row in rows])
-
-
-def _has_formulas(rows: list[list[Formula]]) -> bool:
-    return any(isinstance(entry, str) for row in rows for entry in row)
 
 
 def load_system(path: str | Path) -> Dynamics:
@@ -279,7 +242,8 @@ def build_system(document: Document, card: SystemCard) -> Dynamics:
         return formula.xreplace(numbers)
 
     try:
-        diffusion = read_diffusion(card.diffusion, [symbol(name) for name in card.states], inserted)
+        rows = diffusion_rows(card.diffusion, len(card.states))
+        diffusion = Diffusion.of_rows([symbol(name) for name in card.states], rows, parse=inserted)
     except Fault as error:
         raise error.at(document.file, document.place(("diffusion",))) from None
     return Dynamics(

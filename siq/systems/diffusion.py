@@ -91,12 +91,22 @@ class Diffusion:
         return Diffusion(np.array([[float(entry) for entry in row] for row in found.formulas]))
 
     @classmethod
-    def of_rows(cls, symbols: Sequence[sympy.Symbol], rows: Sequence[Sequence[str | float]]) -> Diffusion:
-        """D from plain data, see `rows`; raises as `of_formulas`, or `FormulaError`."""
+    def of_rows(
+        cls,
+        symbols: Sequence[sympy.Symbol],
+        rows: Sequence[Sequence[str | float]],
+        *,
+        parse: Callable[[str | float], sympy.Expr] | None = None,
+    ) -> Diffusion:
+        """D from plain data, see `rows`; raises as `of_formulas`, or `FormulaError`.
+
+        `parse` reads a formula; by default it may have the states in it, and nothing else.
+        """
         names = {each.name: each for each in symbols}
         if all(not isinstance(entry, str) for row in rows for entry in row):
             return Diffusion(np.array(rows, dtype=float))
-        return cls.of_formulas(symbols, [[parse_formula(entry, names) for entry in row] for row in rows])
+        read = parse or (lambda text: parse_formula(text, names))
+        return cls.of_formulas(symbols, [[read(entry) for entry in row] for row in rows])
 
     @property
     def rows(self) -> list[list[str | float]]:

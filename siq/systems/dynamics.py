@@ -118,63 +118,63 @@ class Tape:
     base: int
     results: np.ndarray
 
+    @classmethod
+    def of(cls, formulas: Sequence[sympy.Expr], arguments: Sequence[sympy.Symbol]) -> Tape | None:
+        """The tape of formulas in some arguments; None where a formula has a function that no tape knows.
 
-def tape_of(formulas: Sequence[sympy.Expr], arguments: Sequence[sympy.Symbol]) -> Tape | None:
-    """The tape of formulas in some arguments; None where a formula has a function that no tape knows.
+        What occurs twice is worked out once.
+        """
+        formulas = [sympy.sympify(formula) for formula in formulas]
+        constants: dict[sympy.Expr, float] = {}
+        for formula in formulas:
+            for part in sympy.preorder_traversal(formula):
+                if part.is_number and not part.free_symbols:
+                    constants.setdefault(part, float(part) if part.is_real else np.nan)
+        known = {each: place for place, each in enumerate((*arguments, *constants))}
+        start = np.concatenate([np.zeros(len(arguments)), list(constants.values())])
+        operations: list[tuple[int, int, int]] = []
 
-    What occurs twice is worked out once.
-    """
-    formulas = [sympy.sympify(formula) for formula in formulas]
-    constants: dict[sympy.Expr, float] = {}
-    for formula in formulas:
-        for part in sympy.preorder_traversal(formula):
-            if part.is_number and not part.free_symbols:
-                constants.setdefault(part, float(part) if part.is_real else np.nan)
-    known = {each: place for place, each in enumerate((*arguments, *constants))}
-    start = np.concatenate([np.zeros(len(arguments)), list(constants.values())])
-    operations: list[tuple[int, int, int]] = []
+        def add(operation: _Operation, one: int, other: int) -> int:
+            operations.append((int(operation), one, other))
+            return len(start) + len(operations) - 1
 
-    def add(operation: _Operation, one: int, other: int) -> int:
-        operations.append((int(operation), one, other))
-        return len(start) + len(operations) - 1
+        def register(formula: sympy.Expr) -> int:
+            """Where the value of a formula is, once the tape has run so far."""
+            if formula not in known:
+                known[formula] = written(formula)
+            return known[formula]
 
-    def register(formula: sympy.Expr) -> int:
-        """Where the value of a formula is, once the tape has run so far."""
-        if formula not in known:
-            known[formula] = written(formula)
-        return known[formula]
+        def written(formula: sympy.Expr) -> int:
+            if formula.func in _CHAINS:
+                place = register(formula.args[0])
+                for other in formula.args[1:]:
+                    place = add(_CHAINS[formula.func], place, register(other))
+                return place
+            if formula.func in _FUNCTIONS:
+                return add(_FUNCTIONS[formula.func], register(formula.args[0]), 0)
+            if not isinstance(formula, sympy.Pow):
+                raise NotImplementedError(str(formula.func))
+            base, exponent = formula.args
+            place = register(base)
+            if exponent.is_Integer:
+                if abs(int(exponent)) > 1:
+                    place = add(_Operation.WHOLE_POWER, place, abs(int(exponent)))
+            elif abs(exponent) == sympy.S.Half:
+                place = add(_Operation.SQRT, place, 0)
+            else:
+                return add(_Operation.POWER, place, register(exponent))
+            return place if exponent > 0 else add(_Operation.INVERT, place, 0)
 
-    def written(formula: sympy.Expr) -> int:
-        if formula.func in _CHAINS:
-            place = register(formula.args[0])
-            for other in formula.args[1:]:
-                place = add(_CHAINS[formula.func], place, register(other))
-            return place
-        if formula.func in _FUNCTIONS:
-            return add(_FUNCTIONS[formula.func], register(formula.args[0]), 0)
-        if not isinstance(formula, sympy.Pow):
-            raise NotImplementedError(str(formula.func))
-        base, exponent = formula.args
-        place = register(base)
-        if exponent.is_Integer:
-            if abs(int(exponent)) > 1:
-                place = add(_Operation.WHOLE_POWER, place, abs(int(exponent)))
-        elif abs(exponent) == sympy.S.Half:
-            place = add(_Operation.SQRT, place, 0)
-        else:
-            return add(_Operation.POWER, place, register(exponent))
-        return place if exponent > 0 else add(_Operation.INVERT, place, 0)
-
-    try:
-        results = [register(formula) for formula in formulas]
-    except NotImplementedError:
-        return None
-    return Tape(
-        operations=np.array(operations, dtype=np.int64).reshape(-1, 3),
-        registers=np.concatenate([start, np.zeros(len(operations))]),
-        base=len(start),
-        results=np.array(results, dtype=np.int64),
-    )
+        try:
+            results = [register(formula) for formula in formulas]
+        except NotImplementedError:
+            return None
+        return cls(
+            operations=np.array(operations, dtype=np.int64).reshape(-1, 3),
+            registers=np.concatenate([start, np.zeros(len(operations))]),
+            base=len(start),
+            results=np.array(results, dtype=np.int64),
+        )
 
 
 class ParametricFunctions:
@@ -189,12 +189,12 @@ class ParametricFunctions:
     def __init__(self, dynamics: Dynamics) -> None:
         formulas = [*dynamics.equations, *(formula for _, formula in dynamics.outputs)]
         self._delays = dynamics.delays
-        self._arguments = arguments_of(dynamics)
-        written = [evaluable(formula, dynamics) for formula in formulas]
+        self._arguments = dynamics.arguments
+        written = [dynamics.evaluable(formula) for formula in formulas]
         self._equations, self._measured = written[: dynamics.dimension], written[dynamics.dimension :]
         # A jump's derivative is a spike. Spread over more than a step it is seen in full by every rule of
         # integration, and carries deviations across the jump as they are carried in the mean.
-        self._smooth = [evaluable(formula, dynamics, wider=JUMP_WIDTHS) for formula in dynamics.equations]
+        self._smooth = [dynamics.evaluable(formula, wider=JUMP_WIDTHS) for formula in dynamics.equations]
         self._states = [symbol(name) for name in dynamics.states]
         self._free = [symbol(dynamics.parameters[place].name) for place in dynamics.free]
         self._shapes = (dynamics.dimension, len(self._measured), len(self._free))
@@ -234,7 +234,7 @@ class ParametricFunctions:
     @cached_property
     def tape(self) -> Tape | None:
         """f as a tape in the same arguments; None where it has a function that no tape knows."""
-        return tape_of(self._equations, self._arguments)
+        return Tape.of(self._equations, self._arguments)
 
     def rates(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
         """f at states ``(d, n)``, for parameters' values ``(p,)``: shape ``(d, n)``."""
@@ -257,24 +257,6 @@ class ParametricFunctions:
         d, m, p = self._shapes
         flat = _stacked(self._output_slopes, m * d + m * p, x, signals, values)
         return flat[: m * d].reshape(m, d, x.shape[1]), flat[m * d :].reshape(m, p, x.shape[1])
-
-
-def arguments_of(dynamics: Dynamics) -> list[sympy.Symbol]:
-    """The arguments of a compiled model: states, inputs, delayed inputs and slopes, time, parameters."""
-    return [
-        *(symbol(name) for name in dynamics.states),
-        *(symbol(each.name) for each in dynamics.inputs),
-        *(_delayed(k) for k in range(len(dynamics.delays))),
-        *(_slope(k) for k in range(len(dynamics.delays))),
-        TIME,
-        *(symbol(each.name) for each in dynamics.parameters),
-    ]
-
-
-def evaluable(formula: sympy.Expr, dynamics: Dynamics, *, wider: float = 1.0) -> sympy.Expr:
-    """A formula with its jumps spread, over a multiple of their widths, and symbols for delayed inputs."""
-    spread = {sympy.sign(at): sympy.tanh(at / (wider * width)) for at, width in dynamics.edges}
-    return formula.xreplace(spread).xreplace({each: _delayed(k) for k, each in enumerate(dynamics.delays)})
 
 
 def _without_teeth(formula: sympy.Expr) -> sympy.Expr:
@@ -668,6 +650,20 @@ class Dynamics:
     def functions(self) -> ParametricFunctions:
         """f, h and their derivatives as functions of states, signals and parameters."""
         return ParametricFunctions(self)
+
+    @property
+    def arguments(self) -> list[sympy.Symbol]:
+        """Of compiled formulas: states, inputs, delayed inputs and their slopes, the time, parameters."""
+        delayed = range(len(self.delays))
+        return [
+            *self.symbols, *(symbol(each.name) for each in self.inputs), *map(_delayed, delayed),
+            *map(_slope, delayed), TIME, *(symbol(each.name) for each in self.parameters),
+        ]  # fmt: skip
+
+    def evaluable(self, formula: sympy.Expr, *, wider: float = 1.0) -> sympy.Expr:
+        """A formula with symbols for delayed inputs and its jumps spread, over a multiple of their widths."""
+        spread = {sympy.sign(at): sympy.tanh(at / (wider * width)) for at, width in self.edges}
+        return formula.xreplace(spread).xreplace({each: _delayed(k) for k, each in enumerate(self.delays)})
 
     @cached_property
     def delays(self) -> tuple[sympy.Expr, ...]:

@@ -36,7 +36,6 @@ from siq.systems.cards import (
     SystemCard,
     build_system,
     diffusion_rows,
-    read_diffusion,
 )
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, symbol
@@ -420,7 +419,8 @@ def check_states(study: Study, states: Sequence[str], *, file: str) -> None:
     """
     try:
         if study.recordings is not None and study.recordings.diffusion is not None:
-            noise = read_diffusion(study.recordings.diffusion, [symbol(name) for name in states], None)
+            rows = diffusion_rows(study.recordings.diffusion, len(states))
+            noise = Diffusion.of_rows([symbol(name) for name in states], rows)
             if not noise.regular:
                 raise Fault("the noise does not reach every state", "give a positive definite matrix")
     except Fault as error:
@@ -487,7 +487,9 @@ class StateSpace:
         """D of the states by their names in formulas, None where nobody said."""
         if self.diffusion is None:
             return None
-        return read_diffusion(self.diffusion, [symbol(name) for name in states], None)
+        return Diffusion.of_rows(
+            [symbol(name) for name in states], diffusion_rows(self.diffusion, len(states))
+        )
 
     def constant_noise(self, dimension: int) -> Diffusion | None:
         """D of so many states where it is the same everywhere, None where nobody said.
