@@ -28,11 +28,11 @@ import sympy
 from siq.data.preparation import in_stretches, without_slow_drift
 from siq.data.recordings import Recordings
 from siq.inference.field_estimate import FieldEstimate
-from siq.inference.kalman_filter import Grid, linearise, whiten
+from siq.inference.kalman_filter import Grid, Noise, linearise, whiten
 from siq.inference.kalman_identification import of_all_states
 from siq.inference.library import IdentificationOptions
 from siq.inference.maximum_likelihood import fit_by_filter
-from siq.inference.observation import force_noise, seen_positions, smoothed_motion, unbroken
+from siq.inference.observation import seen_positions, smoothed_motion, unbroken
 from siq.numerics.files import whole_file
 from siq.quasipotential.transitions import barrier_uncertainty, ways_out
 from siq.systems.diffusion import Diffusion
@@ -116,7 +116,7 @@ def information(particle: Particle, recordings: Recordings) -> np.ndarray:
     )
     known = replace(model, parameters=tuple(replace(each, fixed=True) for each in parameters))
     data = unbroken(recordings)
-    noise = force_noise(np.array([particle.sensor**2]), np.array([[particle.intensity]]))
+    noise = Noise.of_rate(np.array([particle.sensor**2]), np.diag([0.0, particle.intensity]))
     follow = fit_by_filter(
         known, data, x=smoothed_motion(data, ("x",))[0], noise=noise, estimate_process=False,
         estimate_sensor=False,

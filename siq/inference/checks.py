@@ -283,8 +283,7 @@ def unexplained_probability(
     ----------
     columns, rest
         Shapes ``(n, q)`` and ``(n, r)``, of white residuals; the smallest probability of the r counts,
-        corrected
-        for their number.
+        corrected for their number.
     freedom
         Degrees of freedom of the residuals, n by default.
     variance
@@ -335,8 +334,7 @@ def predict(dynamics: Dynamics, recordings: Recordings) -> np.ndarray:
     """Follow f from the first sample of every recording through all its times.
 
     In the order of ``recordings.values``, shape ``(n, d)``; not finite where the prediction runs away, or f
-    is too
-    fast to be followed from sample to sample.
+    is too fast to be followed from sample to sample.
     """
     starts = np.flatnonzero(np.diff(recordings.recording, prepend=-1))
     lengths = np.diff(np.append(starts, len(recordings.t)))

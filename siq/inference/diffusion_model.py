@@ -70,8 +70,7 @@ class _DiffusionLikelihood:
 
     A coefficient is a row ``(i, j, k)`` of places: of the entry ``i ≤ j`` of εD, and of the function φ_k. The
     `functions` act over each step, those `at_states` at recorded states, shape ``(n, q)``; `start` is εD
-    where it is
-    the same everywhere; `sensor` are the sensors' variances, of which some are free.
+    where it is the same everywhere; `sensor` are the sensors' variances, of which some are free.
     """
 
     functions: np.ndarray
@@ -429,8 +428,7 @@ class InnovationLikelihood(_DiffusionLikelihood):
     """The likelihood of a filter's innovations, the sensors' variances with the coefficients of D.
 
     Of a fit of f, whose trajectories and coefficients stay as they are; noise may drive the first d states of
-    the
-    model, those of the symbols.
+    the model, those of the symbols.
     """
 
     def __init__(self, symbols: tuple[sympy.Symbol, ...], fit: Fit, data: Measurements) -> None:
@@ -519,8 +517,8 @@ def estimated_diffusion(found: FieldEstimate, *, pairs: int) -> Diffusion | None
     in all directions has the unit matrix, but for the error of the diagonal.
 
     There is none without noise, where noise does not reach every state, and where a state is but the
-    derivative
-    of another: what its residuals show is the noise of the other, and depends on the step of the pairs.
+    derivative of another: what its residuals show is the noise of the other, and depends on the step of the
+    pairs.
     """
     if found.noise_free or defined_states(found.dynamics):
         return None

@@ -506,8 +506,7 @@ class FieldEstimate:
         """Variance of what follows from f to first order, by its coefficients and by which terms there are.
 
         Derivatives by all coefficients ``(..., q, d)`` to ``(...)``. The square of `bias` is a part of it,
-        unless it is
-        that `of_mean`, which has been moved by the bias.
+        unless it is that `of_mean`, which has been moved by the bias.
         """
         components, terms = self.support.T
         own = slopes[..., terms, components]

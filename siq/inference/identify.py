@@ -441,7 +441,7 @@ class _Case:
             test = inertia_test(self.recordings, pair_step=self.pair_step, limit=hidden)
         except (NumericalFailure, np.linalg.LinAlgError):
             return None
-        if test is None or test.needs_velocity == hidden:
+        if test.needs_velocity == hidden:
             return None
         said = test.sentence(self.recordings.time_unit or "")
         if not hidden:

@@ -196,8 +196,7 @@ class Linearisation:
         """Innovations of the filter along it; see `siq.inference.filter_kernels.filter_recursion`.
 
         By default recordings begin at zero without a covariance; with functions and places of the process
-        noise the
-        likelihood is derived by it.
+        noise the likelihood is derived by it.
         """
         dimension = self.gap.shape[1]
         begin = np.zeros((len(first) - 1, dimension)) if begin is None else begin
@@ -364,8 +363,7 @@ def substeps_needed(
     """Runge–Kutta steps in every interval, so that doubling them changes little.
 
     The tolerance is the root mean square change of the increments from states ``(n, d)`` that is allowed,
-    relative to
-    the spread of the states.
+    relative to the spread of the states.
     """
     steps = 1
     scale = x.std(axis=0) + 1e-300
@@ -438,6 +436,15 @@ class Noise:
     process: np.ndarray
     shape: np.ndarray | None = None
     field: Diffusion | None = None
+
+    @classmethod
+    def of_rate(cls, measurement: np.ndarray, rate: np.ndarray) -> Noise:
+        """Of the covariance of process noise per time ``(d, d)``, which may leave some states alone."""
+        process, shape = np.diag(rate).copy(), np.eye(len(rate))
+        inside = np.ix_(process > 0, process > 0)
+        size = np.sqrt(process[process > 0])
+        shape[inside] = rate[inside] / np.outer(size, size)
+        return cls(measurement, process, shape[None])
 
     def along(self, x: np.ndarray, spread: np.ndarray | None, step: np.ndarray) -> Noise:
         """A noise with the shape that its field has at states; see `_mean_intensity`."""

@@ -293,10 +293,8 @@ def held_out_innovations(
     """Whether an f by likelihood holds for recordings that it was not fitted to, by the innovations.
 
     Its terms are fitted to the training recordings again. Probability of the unseen innovations having no
-    part
-    left that any function of the library explains, see `unexplained_probability`; and the ratio of their mean
-    square
-    to that of the training recordings.
+    part left that any function of the library explains, see `unexplained_probability`; and the ratio of their
+    mean square to that of the training recordings.
     """
     observation = ObservationModel.of(found)
     support, values = observation.unknown(found)

@@ -411,8 +411,7 @@ class _Shooting:
     """A model to be fitted, on the grid of its measurements, from states ``(n, d)`` to begin with.
 
     It may be filtered: f is taken at what a filter knows, rather than at smoothed states, and closed, with
-    the
-    effect of the filter's spread on f.
+    the effect of the filter's spread on f.
     """
 
     def __init__(
@@ -624,8 +623,7 @@ def fit_by_filter(
     """The second half of `fit_by_multiple_shooting` alone, for a model that follows the data from the start.
 
     Process noise has to drive the states. Where measurement noise is not estimated, the process noise is as
-    given,
-    too. With the closure the spread of what the filter knows acts on the mean of f
+    given, too. With the closure the spread of what the filter knows acts on the mean of f
     (`siq.inference.kalman_filter`).
     """
     with np.errstate(all="ignore"):  # what runs away is told as a fault

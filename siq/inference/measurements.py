@@ -176,8 +176,7 @@ def _course_of_input(t: np.ndarray, u: np.ndarray, interpolation: str) -> scipy.
     """An input as a function of time, from samples ``(n,)`` of one recording.
 
     ``zero_order`` holds each sample until the next; ``linear`` joins them; ``band_limited`` takes the one
-    signal
-    without content above half the sampling rate, which needs regular sampling.
+    signal without content above half the sampling rate, which needs regular sampling.
     """
     if len(t) < 2:
         return scipy.interpolate.PPoly(np.array([[u[0]]]), np.array([t[0], t[0] + 1.0]))

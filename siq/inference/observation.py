@@ -94,17 +94,6 @@ def seen_positions(plain: Dynamics) -> Dynamics:
     )
 
 
-def force_noise(sensor: np.ndarray, rate: np.ndarray) -> Noise:
-    """Both noises: variances of the sensors ``(d/2,)``, and what drives the velocities, ``(d/2, d/2)``."""
-    half = len(sensor)
-    shape, process = np.eye(2 * half), np.zeros(2 * half)
-    process[half:] = np.diag(rate)
-    if process.any():
-        size = np.sqrt(np.diag(rate))
-        shape[half:, half:] = rate / np.outer(size, size)
-    return Noise(sensor, process, shape[None])
-
-
 def smoothed_motion(data: Measurements, names: Sequence[str]) -> tuple[np.ndarray, Noise]:
     """Positions and velocities to begin with, and both noises, when nothing but noise drives the velocities.
 
@@ -130,7 +119,8 @@ def smoothed_motion(data: Measurements, names: Sequence[str]) -> tuple[np.ndarra
     begin = FIRST_FORCE * (rate**2).mean(axis=0) / float(np.median(data.step[begins]))
     fit = fit_by_filter(
         free, data, x=np.concatenate([data.outputs, velocity], axis=1),
-        noise=force_noise(data.with_known_noise(data.roughness), np.diag(begin)), closure=False,
+        noise=Noise.of_rate(data.with_known_noise(data.roughness), np.diag(np.append(0 * begin, begin))),
+        closure=False,
     )  # fmt: skip
     if fit.fault:
         raise NumericalFailure(f"the velocities cannot be worked out: {fit.fault}")
@@ -243,17 +233,10 @@ class ObservationModel:
     def noise_of(self, found: FieldEstimate) -> Noise:
         """Both noises of an estimate, as they are in the model."""
         assert found.diagnosis is not None
-        sensor, rate, half = found.diagnosis.measurement**2, found.noise_rate, self.measured_states
+        sensor, rate = found.diagnosis.measurement**2, found.noise_rate
         if found.noise is not None:
-            noise = Noise(sensor, np.ones(len(rate)), field=found.noise.diffusion(1.0))
-        elif self.hidden:
-            noise = force_noise(sensor, rate[half:, half:])
-        elif not rate.any():
-            noise = Noise(sensor, np.zeros(len(rate)))
-        else:
-            size = np.sqrt(np.diag(rate))
-            noise = Noise(sensor, np.diag(rate).copy(), (rate / np.outer(size, size))[None])
-        return self.noise(noise)
+            return self.noise(Noise(sensor, np.ones(len(rate)), field=found.noise.diffusion(1.0)))
+        return self.noise(Noise.of_rate(sensor, rate))
 
     def states(self, data: Measurements) -> np.ndarray:
         """States of the model to begin with, as they are measured next."""
@@ -386,7 +369,7 @@ class InertiaTest:
 
 def inertia_test(
     recordings: Recordings, *, degree: int = 5, pair_step: float | None = None, limit: bool = True
-) -> InertiaTest | None:
+) -> InertiaTest:
     """Ask recordings of one position whether it has inertia.
 
     Parameters
@@ -398,7 +381,7 @@ def inertia_test(
     pair_step
         Longest time between samples that still belong together.
     limit
-        Whether a limit of γ is searched for where no inertia is seen; if not, the answer is None there.
+        Whether a limit of γ is searched for where no inertia is seen; if not, γ means nothing there.
 
     Raises
     ------
@@ -407,8 +390,10 @@ def inertia_test(
     """
     models = _InertialModels(recordings, degree, pair_step)
     test = models.test()
-    if (test is not None and test.seen) or not limit:
-        return test if test is not None and test.seen else None
+    if test is not None and (test.seen or not limit):
+        return test
+    if test is None and not limit:
+        return InertiaTest(0.0, np.inf, 0.0, None, 0.0, np.nan, np.nan, models.step)
     if test is None:  # the samples show no γ
         fastest = MAX_FRICTION / models.step
         fit = models.with_friction(fastest)
@@ -498,8 +483,9 @@ class _InertialModels:
     def with_friction(self, friction: float) -> Fit:
         """With γ given, beginning with F and the noise of the model without inertia."""
         model = self._with_speed.with_values(np.append(self.without.model.values, friction))
-        rate = friction**2 * np.diag(self.without.noise.process)
-        noise = force_noise(self.without.noise.measurement, rate)
+        noise = self.without.noise
+        rate = np.diag(np.append(0.0, friction**2 * noise.process))
+        noise = Noise.of_rate(noise.measurement, rate)
         return fit_by_filter(model, self.data, x=self.x, noise=noise, closure=False)
 
     def least_friction(self, best: float, highest: float) -> float:

@@ -148,10 +148,8 @@ def fit_with_and_without_process_noise(
 
     Parameters
     ----------
-    model
+    model, data
         With the parameters' values to begin with.
-    data
-        The recordings.
     begin
         A fit whose states and noise are begun with.
     level
@@ -160,8 +158,6 @@ def fit_with_and_without_process_noise(
         States, where the model has more of them.
     settled
         Whether `begin` is itself the fit of the model with process noise, and need not be made again.
-    budget
-        Charged for every evaluation.
 
     Raises
     ------

@@ -91,8 +91,7 @@ def initial_layers(
     """Random layers, uniform in ±1/√inputs, each run drawn from its own generator.
 
     The sizes are numbers of neurons, inputs and outputs included: ``(3, 50, 50, 50, 1)``. A run's networks do
-    not
-    depend on which runs train beside it.
+    not depend on which runs train beside it.
     """
     layers = []
     for inputs, outputs in itertools.pairwise(sizes):
