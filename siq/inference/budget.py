@@ -100,13 +100,6 @@ class Budget:
         """Of the work allowed, that is spent."""
         return self.spent / self.work
 
-    @property
-    def exhausted_by(self) -> Literal["work", "clock"] | None:
-        """Work or time, if either ran out."""
-        if self.spent >= min(self.work * (1 - self._kept), self._limit):
-            return "work"
-        return "clock" if self.elapsed >= self.seconds else None
-
     def charge(self, work: float) -> None:
         """Count work that is about to be done.
 
@@ -115,8 +108,9 @@ class Budget:
         BudgetSpent
             When nothing is left of what is allowed, unless what is done is exempt.
         """
-        if not self._exempt and (gone := self.exhausted_by) is not None:
-            self.stopped_by = gone
+        done = self.spent >= min(self.work * (1 - self._kept), self._limit)
+        if not self._exempt and (done or self.elapsed >= self.seconds):
+            self.stopped_by = "work" if done else "clock"
             raise BudgetSpent("the budget of this case is spent")
         self.spent += work
 

@@ -115,7 +115,16 @@ def residual_noise(
     if abs(score) > SIGNIFICANT_SCORE and abs(correlation) > HARMLESS_CORRELATION:
         kind = "measurement" if score < 0 else "coloured"
     if kind == "measurement":
-        measurement = _measurement_errors(found, sample)
+        # From the covariance of neighbouring residuals. Errors of X0 bias f by the inverse of the step, so
+        # that f is fitted to the long steps as well. An error of the sample that two pairs share is carried
+        # on by the flow of the second.
+        again = refit(replace(found, diffusion=Diffusion.identity(d)), sample)
+        rest = residuals(again, sample)
+        joined = _joined(sample, rest)
+        shared = (rest[:-1][joined] * rest[1:][joined]).mean(axis=0)
+        rates = np.einsum("nii->ni", again.dynamics.jacobian(sample.x0[1:][joined]))
+        carried = np.exp(np.minimum(rates * sample.h[1:][joined, None], 1.0)).mean(axis=0)
+        measurement = np.sqrt(np.maximum(-shared / carried, 0.0))
         bias = bias_of_rounding(found, pairs, recordings, measurement, correlation=correlation)
         if bias is not None:
             text = rounding_text(recordings)
@@ -174,21 +183,6 @@ def _joined(sample: SnapshotPairs, rest: np.ndarray) -> np.ndarray:
     usual = (np.abs(rest) < OUTLIER * np.median(np.abs(rest), axis=0)).all(axis=1)
     same = (sample.recording[1:] == sample.recording[:-1]) & (sample.xh[:-1] == sample.x0[1:]).all(axis=1)
     return np.asarray(same & usual[1:] & usual[:-1])
-
-
-def _measurement_errors(found: FieldEstimate, sample: SnapshotPairs) -> np.ndarray:
-    """Standard deviations of measurement noise, from the covariance of neighbouring residuals.
-
-    Errors of X0 bias f by the inverse of the step, so that f is fitted to the long steps as well. An error
-    of the sample that two pairs share is carried on by the flow of the second.
-    """
-    found = refit(replace(found, diffusion=Diffusion.identity(found.library.dimension)), sample)
-    rest = residuals(found, sample)
-    joined = _joined(sample, rest)
-    covariance = (rest[:-1][joined] * rest[1:][joined]).mean(axis=0)
-    rates = np.einsum("nii->ni", found.dynamics.jacobian(sample.x0[1:][joined]))
-    carried = np.exp(np.minimum(rates * sample.h[1:][joined, None], 1.0)).mean(axis=0)
-    return np.sqrt(np.maximum(-covariance / carried, 0.0))
 
 
 def bias_of_rounding(

@@ -567,7 +567,13 @@ def whiten(linearisation: Linearisation, data: Measurements, noise: Noise) -> Wh
         raise NumericalFailure("small deviations from the recorded motion grow beyond all numbers")
     used = 0
     for begin, end in zip(data.first[:-1] * outputs, data.first[1:] * outputs, strict=True):
-        basis = _orthonormal(initial[begin:end])
+        scale = np.sqrt((initial[begin:end] ** 2).sum(axis=0))
+        scale[scale == 0] = 1.0
+        basis, triangle = np.linalg.qr(initial[begin:end] / scale)
+        values = np.abs(np.diag(triangle))
+        if values.min(initial=1.0) <= RANK * values.max(initial=0.0):
+            basis, values, _ = np.linalg.svd(initial[begin:end] / scale, full_matrices=False)
+            basis = basis[:, values > RANK * max(values[0], 1e-300)]
         innovations[begin:end] -= basis @ (basis.T @ innovations[begin:end])
         columns[begin:end] -= basis @ (basis.T @ columns[begin:end])
         used += basis.shape[1]
@@ -612,15 +618,3 @@ def solve(columns: np.ndarray, target: np.ndarray, *, least: float = RANK) -> tu
     kept = values > least * values[0] if values[0] > 0 else np.zeros(len(values), dtype=bool)
     inverse = right[kept].T / values[kept] / scale[:, None]
     return inverse @ (left[:, kept].T @ triangle[:, -1]), inverse @ inverse.T
-
-
-def _orthonormal(columns: np.ndarray) -> np.ndarray:
-    """Orthonormal basis of what columns span."""
-    scale = np.sqrt((columns**2).sum(axis=0))
-    scale[scale == 0] = 1.0
-    basis, triangle = np.linalg.qr(columns / scale)
-    values = np.abs(np.diag(triangle))
-    if values.min(initial=1.0) <= RANK * values.max(initial=0.0):
-        basis, values, _ = np.linalg.svd(columns / scale, full_matrices=False)
-        basis = basis[:, values > RANK * max(values[0], 1e-300)]
-    return basis

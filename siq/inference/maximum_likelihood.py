@@ -456,14 +456,6 @@ class _Shooting:
         drift = self.closed.at(spread[rows] + intensity * data.step[rows][:, None, None] / 2)
         return linearise(self.model, self.grid, values, x, drift=drift)
 
-    def noise_at(self, now: _Iterate, noise: Noise) -> Noise:
-        """The noise where a fit stands: process noise may depend on the state."""
-        if noise.field is None:
-            return noise
-        rows, middle = self.grid.rows, now.x.copy()
-        middle[rows] += (now.x[rows + 1] + now.along.gap[rows] - now.x[rows]) / 2
-        return noise.along(middle, now.spread, self.grid.data.step)
-
     def stepped(self, now: _Iterate, change: np.ndarray, noise: Noise) -> tuple[_Iterate, float] | None:
         """The step suggested, shortened until it does about what was foreseen, and the share taken."""
         data = self.grid.data
@@ -505,7 +497,10 @@ class _Shooting:
         totals: list[float] = []
         converged, settled_noise, whole = False, False, False
         for iteration in range(most):
-            noise = self.noise_at(now, noise)
+            if noise.field is not None:  # process noise depends on where the fit stands
+                rows, middle = self.grid.rows, now.x.copy()
+                middle[rows] += (now.x[rows + 1] + now.along.gap[rows] - now.x[rows]) / 2
+                noise = noise.along(middle, now.spread, data.step)
             expected = Expectations.of(model, now.values)
             if iteration in (0, 2) or settled_noise:
                 noise = _noise_along(

@@ -20,6 +20,7 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 from siq.errors import InputError
 from siq.numerics.files import whole_file
 
+CHUNK = 4096  # points evaluated together: few enough for their activations to stay in the processor's cache
 MatchingRule = Literal["explicit", "symmetric"]
 Order = Literal[2, 4]
 
@@ -200,27 +201,19 @@ class TrainedNetworks:
     circulatory_scale: np.ndarray
     diffusion: np.ndarray
 
-    def evaluate(self, x: np.ndarray, *, chunk: int = 4096) -> PointValues:
-        """Evaluate V, g and f.
-
-        Parameters
-        ----------
-        x
-            Points, shape ``(n, d)``, in the units of the states.
-        chunk
-            Points evaluated together: few enough for their activations to stay in the processor's cache.
-        """
-        pieces = [self._evaluate(x[begin : begin + chunk]) for begin in range(0, len(x), chunk)]
+    def evaluate(self, x: np.ndarray) -> PointValues:
+        """V, g and f at points ``(n, d)`` in the units of the states."""
+        pieces = [self._evaluate(x[begin : begin + CHUNK]) for begin in range(0, len(x), CHUNK)]
         potential, circulatory, vector_field = zip(*pieces or [self._evaluate(x)], strict=True)
         return PointValues(
             np.concatenate(potential), np.concatenate(circulatory), np.concatenate(vector_field)
         )
 
-    def potential_at(self, x: np.ndarray, *, chunk: int = 4096) -> np.ndarray:
+    def potential_at(self, x: np.ndarray) -> np.ndarray:
         """V alone, shape ``(n,)``, at a third of the cost of `evaluate`."""
         values = [np.zeros(0)]
-        for begin in range(0, len(x), chunk):
-            y = (x[begin : begin + chunk].astype(self.mean.dtype) - self.mean) / self.scale
+        for begin in range(0, len(x), CHUNK):
+            y = (x[begin : begin + CHUNK].astype(self.mean.dtype) - self.mean) / self.scale
             square = (y * y).sum(axis=1, keepdims=True)
             values.append((self.potential_scale * (_hidden(self.potential, y)[-1] + square))[:, 0])
         return np.concatenate(values).astype(float)

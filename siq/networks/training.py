@@ -403,17 +403,13 @@ def train(
                 "step %d of %d, held-out loss %.3e, %.0f s left",
                 done, options.steps, float(total.mean()), left,
             )  # fmt: skip
-        if finished is not None and _is_check(done, options) and finished(done, move(networks, "cpu")):
+        check = options.check
+        pauses = check is not None and done >= check.first and (done - check.first) % check.every == 0
+        if finished is not None and pauses and finished(done, move(networks, "cpu")):
             return snapshot(done)
         if checkpoint is not None and done % checkpoint_every == 0 and done < options.steps:
             checkpoint(snapshot(done))
     return snapshot(max(options.steps, state.step))
-
-
-def _is_check(step: int, options: TrainingOptions) -> bool:
-    """Whether training pauses at a step to see whether it may end."""
-    check = options.check
-    return check is not None and step >= check.first and (step - check.first) % check.every == 0
 
 
 class _Objective:

@@ -223,13 +223,7 @@ CARD, RECORDINGS = "system.yaml", ("recordings.parquet", "recordings.csv")
 
 
 def case_folders(folder: Path) -> dict[str, Path]:
-    """The cases of a folder by name: itself where it has a card, or the folders in it that have one.
-
-    Parameters
-    ----------
-    folder
-        Has to be there.
-    """
+    """The cases of a folder by name: itself where it has a card, or the folders in it that have one."""
     if (folder / CARD).is_file():
         return {folder.resolve().name: folder}
     return {
@@ -240,15 +234,7 @@ def case_folders(folder: Path) -> dict[str, Path]:
 
 
 def missing_file(file: str, looked_at: Sequence[Path]) -> InputError:
-    """What to say of a file that is not there: where it was looked for, and what has nearly its name.
-
-    Parameters
-    ----------
-    file
-        As the user named it.
-    looked_at
-        Every path that was tried.
-    """
+    """What to say of a file as the user named it: where it was looked for, and what has nearly its name."""
     places = list(dict.fromkeys(str(path.absolute()) for path in looked_at))
     fault = f"No such file; it was looked for at {' and at '.join(places)}"
     for path in looked_at:
@@ -270,12 +256,7 @@ def missing_file(file: str, looked_at: Sequence[Path]) -> InputError:
 
 
 def files_of(folder: Path) -> list[Path]:
-    """The files of recordings in a folder, in the order of their names.
-
-    Parameters
-    ----------
-    folder
-        Hidden files in it are left out, and those that cannot be read.
+    """The files of recordings in a folder, in the order of their names, without hidden and unreadable ones.
 
     Raises
     ------

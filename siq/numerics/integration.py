@@ -88,21 +88,10 @@ def machine_code(function: Function) -> Function:
 
 
 def runge_kutta_step(drift: Rates, x: np.ndarray, step: float | np.ndarray) -> np.ndarray:
-    """One step of the classical fourth-order Runge–Kutta rule.
+    """One step of the classical fourth-order Runge–Kutta rule for f of components ``(d, n)``.
 
-    Parameters
-    ----------
-    drift
-        f, mapping components ``(d, n)`` to components ``(d, n)``.
-    x
-        States, shape ``(d, n)``.
-    step
-        Time step, one for all or one for each, shape ``(n,)``.
-
-    Returns
-    -------
-    numpy.ndarray
-        States one step later, shape ``(d, n)``; the local error is O(step⁵).
+    States ``(d, n)`` one step later; the step is one for all or one for each, ``(n,)``, and the local error
+    is O(step⁵).
     """
     k1 = drift(x)
     k2 = drift(x + (step / 2) * k1)
@@ -122,20 +111,14 @@ def euler_maruyama_step(drift: Rates, x: np.ndarray, step: float, increments: np
 
     Parameters
     ----------
-    drift
-        f, mapping components ``(d, n)`` to components ``(d, n)``.
-    x
-        States, shape ``(d, n)``.
+    drift, x
+        f of components ``(d, n)``, and states ``(d, n)``.
     step
         Time step Δt.
     increments
-        ``sqrt(ε) D^(1/2) ΔW``, shape ``(d, n)``: the noise over the step, see `noise_source`.
-
-    Returns
-    -------
-    numpy.ndarray
-        States one step later, shape ``(d, n)``. The rule is of strong order 1 where the noise is additive,
-        and of ½ where D depends on the state; its weak order is 1.
+        ``sqrt(ε) D^(1/2) ΔW``, shape ``(d, n)``: the noise over the step, see `noise_source`. The rule is of
+        strong order 1 where the noise is additive, and of ½ where D depends on the state; its weak order is
+        1.
     """
     result = step * drift(x)
     result += x

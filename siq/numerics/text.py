@@ -97,7 +97,10 @@ def p_text(p: float) -> str:
     """Write a p-value: ``0.034``, ``2.9 × 10⁻³``, ``less than 10⁻¹²``."""
     if p < SMALLEST_P:
         return "less than 10⁻¹²"
-    return f"{p:.2g}" if p >= 0.01 else _small(p)
+    if p >= 0.01:
+        return f"{p:.2g}"
+    mantissa, power = f"{p:.1e}".split("e")
+    return f"{mantissa} × 10{str(int(power)).translate(SUPERSCRIPTS)}"
 
 
 def p_equation(p: float) -> str:
@@ -105,16 +108,8 @@ def p_equation(p: float) -> str:
     return "p < 10⁻¹²" if p < SMALLEST_P else f"p = {p_text(p)}"
 
 
-def _small(p: float) -> str:
-    mantissa, power = f"{p:.1e}".split("e")
-    return f"{mantissa} × 10{str(int(power)).translate(SUPERSCRIPTS)}"
-
-
 EXACT_DIGITS = 4  # an error below half of the last of so many digits is left out
-SMALLEST_PLAIN, LARGEST_PLAIN = (
-    -3,
-    4,
-)  # decimal exponents between which a number is written without a power of ten
+SMALLEST_PLAIN, LARGEST_PLAIN = -3, 4  # decimal exponents that are written without a power of ten
 
 
 def value_text(

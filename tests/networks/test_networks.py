@@ -9,6 +9,7 @@ from known_settings import PAPER
 
 from siq.data.recordings import SnapshotPairs
 from siq.errors import NumericalFailure
+from siq.networks import decomposition
 from siq.networks.networks import Networks, at_rest, evaluate, initial_layers, move, select_run, side_by_side
 from siq.networks.training import _initial_networks, prepare_data
 from siq.numerics.randomness import generator
@@ -110,14 +111,17 @@ def test_runs_differ_and_do_not_depend_on_their_neighbours() -> None:
         assert not torch.equal(weights[0], weights[1])
 
 
-def test_networks_at_rest_have_the_values_of_those_in_training() -> None:
+def test_networks_at_rest_have_the_values_of_those_in_training(monkeypatch: pytest.MonkeyPatch) -> None:
     nets = networks(diffusion=FULL)
     x = generator(2).normal(size=(25, 3))
     for run in range(2):
         one = at_rest(nets, run)
         components = evaluate(select_run(nets, run), torch.from_numpy(x)[None])
-        whole, pieces = one.evaluate(x), one.evaluate(x, chunk=7)
-        np.testing.assert_allclose(one.potential_at(x, chunk=7), whole.potential, rtol=1e-12)
+        whole = one.evaluate(x)
+        with monkeypatch.context() as patch:
+            patch.setattr(decomposition, "CHUNK", 7)
+            pieces = one.evaluate(x)
+            np.testing.assert_allclose(one.potential_at(x), whole.potential, rtol=1e-12)
         for name in ("potential", "circulatory", "vector_field"):
             np.testing.assert_allclose(getattr(pieces, name), getattr(whole, name), rtol=1e-12, atol=1e-14)
             np.testing.assert_allclose(
