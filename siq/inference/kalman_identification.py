@@ -28,7 +28,7 @@ from siq.inference.field_estimate import FieldEstimate, FlowMap, NoiseDiagnosis
 from siq.inference.kalman_filter import Grid, Noise, Whitened, linearise, solve, whiten
 from siq.inference.maximum_likelihood import Fit, fit_by_filter, noise_uncertainty
 from siq.inference.measurements import Measurements
-from siq.inference.observation import ObservationModel, moved_by, settled, smoothed_motion
+from siq.inference.observation import ObservationModel, moved_by, smoothed_motion
 from siq.inference.recalibration import drop_insignificant_process_noise, process_noise_needed
 from siq.inference.selection import (
     LinearProblem,
@@ -182,7 +182,7 @@ def _estimate(
     intensity, sensor = fit.noise.intensity, fit.noise.measurement
     rate = (intensity[0] if len(intensity) == 1 else intensity[data.begins].mean(axis=0))[:d, :d]
     moved, step = moved_by(data)
-    strength, evidence, driven = 0.0, None, slice(d // 2 if observation.hidden else 0, d)
+    strength, evidence, driven = 0.0, None, slice(observation.hidden_states, d)
     if observation.hidden:
         # The part of D that acts on velocities has the determinant 1.
         force, matrix = rate[driven, driven], np.zeros((d, d))
@@ -235,11 +235,9 @@ def _with_formula(
         likelihood = InnovationLikelihood(symbols, fit, data)
         formula, sensor, covariance = likelihood.selected(false_terms=false_terms, probability=probability)
         noise = observation.noise(Noise(sensor, np.ones(len(symbols)), field=formula.diffusion(1.0)))
-        fit = settled(
-            fit_by_filter(
-                fit.model, data, x=fit.linearised_at, noise=noise, estimate_process=False,
-                estimate_sensor=False, substeps=fit.substeps,
-            )
+        fit = observation.fitted(
+            support, fit.model.values, data, noise=noise, x=fit.linearised_at, estimate_process=False,
+            estimate_sensor=False, substeps=fit.substeps,
         )  # fmt: skip
     found = _estimate(
         observation, support, fit, data, np.sqrt(np.diag(covariance)[len(formula.values) :]),
@@ -342,7 +340,8 @@ def filtered_recordings(
     states do; those of the measured values do not.
     """
     observation = ObservationModel.of(found)
-    data, count = observation.measured(recordings, pair_step), observation.measured_states
+    data = observation.measured(recordings, pair_step)
+    count = observation.library.dimension - observation.hidden_states
     support, values = observation.unknown(found)
     follow = _follow(
         observation, data, noise=observation.noise_of(found), support=support, values=values,

@@ -34,6 +34,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import sympy
@@ -152,26 +153,25 @@ class ObservationModel:
         return cls(found.library, found.diffusion, found.exposure, found.hidden_velocities)
 
     @property
-    def measured_states(self) -> int:
-        """Number of states that are measured."""
-        return self.library.dimension // 2 if self.hidden else self.library.dimension
+    def hidden_states(self) -> int:
+        """Number of velocities that are not measured, and of components of f that hold by definition."""
+        return self.library.dimension // 2 if self.hidden else 0
 
     @property
     def everything(self) -> np.ndarray:
         """Component and term of every coefficient that is not known beforehand, shape ``(p, 2)``."""
-        d = self.library.dimension
-        return all_coefficients(range(d // 2 if self.hidden else 0, d), self.library.size)
+        return all_coefficients(range(self.hidden_states, self.library.dimension), self.library.size)
 
     @property
     def definitions(self) -> np.ndarray:
         """Component and term of each ``dx/dt = v``, shape ``(d/2, 2)``; none where nothing is hidden."""
-        half = self.library.dimension // 2 if self.hidden else 0
-        velocities = [self.library.terms.index(self.library.symbols[half + i]) for i in range(half)]
-        return np.array(list(enumerate(velocities)), dtype=int).reshape(-1, 2)
+        velocities = self.library.symbols[len(self.library.symbols) - self.hidden_states :]
+        places = [self.library.terms.index(one) for one in velocities]
+        return np.array(list(enumerate(places)), dtype=int).reshape(-1, 2)
 
     def unknown(self, found: FieldEstimate) -> tuple[np.ndarray, np.ndarray]:
         """The terms of an estimated f that are fitted, and their coefficients."""
-        fitted = found.support[:, 0] >= (self.library.dimension // 2 if self.hidden else 0)
+        fitted = found.support[:, 0] >= self.hidden_states
         return found.support[fitted], found.values[fitted]
 
     def model(self, support: np.ndarray, values: np.ndarray) -> Dynamics:
@@ -241,39 +241,30 @@ class ObservationModel:
     def states(self, data: Measurements) -> np.ndarray:
         """States of the model to begin with, as they are measured next."""
         if self.hidden:
-            return smoothed_motion(data, self.library.states[: self.measured_states])[0]
+            return smoothed_motion(data, self.library.states[: self.hidden_states])[0]
         unknown = np.isnan(data.outputs).any(axis=1)
         values = data.outputs[np.arange(len(unknown)) + unknown]  # never two in a row, nor at an end
         return values if self.exposure is None else np.column_stack([values, values])
 
     def fitted(
-        self, support: np.ndarray, values: np.ndarray, data: Measurements, *, noise: Noise, x: np.ndarray
-    ) -> Fit:
-        """The fit of some terms, beginning with their values, states and noise.
+        self, support: np.ndarray, values: np.ndarray, data: Measurements, *, noise: Noise, x: np.ndarray,
+        **options: Any,
+    ) -> Fit:  # fmt: skip
+        """The fit of some terms, beginning with their values, states and noise; see `fit_by_filter`.
 
         Raises
         ------
         NumericalFailure
             When it does not settle.
         """
-        return settled(fit_by_filter(self.model(support, values), data, x=x, noise=noise))
-
-
-def settled(fit: Fit) -> Fit:
-    """A fit of f and its noise that has converged.
-
-    Raises
-    ------
-    NumericalFailure
-        When it has not.
-    """
-    if not fit.converged:
-        raise NumericalFailure(
-            "the fit of f with measurement noise does not settle"
-            + (f": {fit.fault}" if fit.fault else "")
-            + "; record more, or sample more often"
-        )
-    return fit
+        fit = fit_by_filter(self.model(support, values), data, x=x, noise=noise, **options)
+        if not fit.converged:
+            fault = f": {fit.fault}" if fit.fault else ""
+            raise NumericalFailure(
+                f"the fit of f with measurement noise does not settle{fault}; record more, or sample more"
+                " often"
+            )
+        return fit
 
 
 def moved_by(data: Measurements) -> tuple[np.ndarray, float]:
