@@ -78,14 +78,9 @@ class FlowMap:
     ) -> FlowMap:
         """The map that fits the data: as many steps as the accuracy needs, or as the simulation made.
 
-        Parameters
-        ----------
-        field, x0, h
-            An estimate of f, states ``(d, n)`` and the steps of their pairs ``(n,)``.
-        integrator_step
-            Step of the Euler–Maruyama simulation that made the data; None for everything else.
-        tolerance
-            Accuracy of the increments wanted, relative to their root mean square, state by state.
+        The tolerance of increments of states ``(d, n)`` over steps ``(n,)`` is relative to their root mean
+        square, state by state; `integrator_step` is that of the Euler–Maruyama simulation that made the data,
+        None elsewhere.
         """
         if integrator_step is not None:
             return cls(steps=max(round(float(np.median(h)) / integrator_step), 1), euler=True)
@@ -189,12 +184,11 @@ class NoiseFormula:
     @classmethod
     def from_data(cls, data: Mapping[str, Any], symbols: Sequence[sympy.Symbol]) -> NoiseFormula:
         """A formula as `as_data` stored it."""
-        names = {each.name: each for each in symbols}
-        place = {each.name: index for index, each in enumerate(symbols)}
-        rows = data["terms"]
+        names, rows = {each.name: each for each in symbols}, data["terms"]
+        places = [[list(names).index(row[key]) for key in ("row", "column")] for row in rows]
         return cls(
             tuple(symbols),
-            np.array([[place[row["row"]], place[row["column"]]] for row in rows]),
+            np.array(places),
             tuple(parse_formula(row["term"], names) for row in rows),
             np.array([float(row["coefficient"]) for row in rows]),
             np.array(data["covariance"], dtype=float),
@@ -634,19 +628,16 @@ def write_field(path: str | Path, estimate: FieldEstimate, options: Identificati
     """Write an estimate whole or not at all, as `vector_field.json` is documented."""
     library, average = estimate.library, estimate.alternatives
     shares = [None] * len(estimate.support) if estimate.stability is None else estimate.stability.tolist()
+    errors = np.sqrt(np.diag(estimate.covariance))
+    terms = zip(estimate.support, estimate.values, errors, shares, strict=True)
     data = {
         "states": list(library.states),
         "degree": options.degree,
         "functions": list(options.functions),
         "terms": [
-            {
-                "component": library.states[i],
-                "term": library.names[k],
-                "coefficient": float(estimate.coefficients[k, i]),
-                "standard_error": float(estimate.standard_errors[k, i]),
-                "stability": share,
-            }
-            for (i, k), share in zip(estimate.support, shares, strict=True)
+            {"component": library.states[i], "term": library.names[k], "coefficient": float(value),
+             "standard_error": float(error), "stability": share}
+            for (i, k), value, error, share in terms
         ],
         "covariance": estimate.covariance.tolist(),
         "alternatives": average and {"bias": average.bias.tolist(), "spread": average.spread.tolist()},
@@ -658,7 +649,7 @@ def write_field(path: str | Path, estimate: FieldEstimate, options: Identificati
         "flow": {"steps": estimate.flow.steps, "euler": estimate.flow.euler},
         "noise": estimate.diagnosis and estimate.diagnosis.as_data(),
         "prediction": estimate.prediction and estimate.prediction.as_data(),
-    }
+    }  # fmt: skip
     with whole_file(path) as partial:
         partial.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
