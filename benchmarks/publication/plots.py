@@ -7,7 +7,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from siq.report.plots.style import BLACK, BLUE, VERMILLION, WIDTH, axis_unit, drawn_to_be_read
+from siq.report.formatting import with_unit
+from siq.report.plots.style import BLACK, BLUE, VERMILLION, WIDTH, drawn_to_be_read
 
 FINE = 2000  # points of a curve that can be told apart on a page
 
@@ -39,9 +40,9 @@ def plot_official_tests(runs: pd.DataFrame, *, unit: str, time_unit: str) -> Fig
         for name, colour in (("recalibrated", BLUE), ("augmented", VERMILLION)):
             error = np.where(rows["scored"], rows[name].to_numpy(float) - measured, np.nan)
             lower.plot(*envelope(t, error), color=colour, linewidth=0.8)
-        upper.set_ylabel(f"{output}{axis_unit(unit)}")
-        lower.set_ylabel(f"off by{axis_unit(unit)}")
-        lower.set_xlabel(f"$t${axis_unit(time_unit)}")
+        upper.set_ylabel(with_unit(output, unit))
+        lower.set_ylabel(with_unit("off by", unit))
+        lower.set_xlabel(with_unit("$t$", time_unit))
     handles = [
         Line2D([], [], color=BLACK, label="measured"),
         Line2D([], [], color=BLUE, label="its own parameters refitted"),

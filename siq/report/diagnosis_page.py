@@ -21,9 +21,9 @@ from markupsafe import escape as markup_escape
 from siq.diagnosis.dictionary import Mechanism
 from siq.diagnosis.statement import METRIC, StatedFunction, StatedMechanism, Statement
 from siq.diagnosis.study import MismatchVerdict
-from siq.numerics.text import p_text, unit_text, value_text
+from siq.numerics.text import p_text, value_text
 from siq.report.diagnosis_text import sentences_of
-from siq.report.formatting import environment, formula_mathml, percent_text, texts
+from siq.report.formatting import environment, formula_mathml, percent_text, texts, with_unit
 from siq.report.page import FormulaRow, ReportFigure, compose, render_report
 from siq.systems.dynamics import Dynamics, symbol
 from siq.systems.formulas import FormulaError, parse_formula
@@ -192,7 +192,16 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str]) ->
         explanations=_explanations(statement),
         wells=_wells(findings.wells),
         escape=_escape_times(findings.escape),
-        bounds=_bounds(statement),
+        bounds=pd.DataFrame(
+            [
+                {
+                    "mechanism": label,
+                    "parameter": bound.parameter,
+                    "at most (95 %)": value_text(bound.upper_bound_95, unit=bound.unit, digits=2),
+                }
+                for label, bound in statement.excluded.items()
+            ]
+        ),
         parameters=_own_parameters(statement, before),
         candidates=_candidates(findings),
     )
@@ -262,11 +271,10 @@ def _errors_table(findings: Findings, units: Mapping[str, str]) -> pd.DataFrame 
     for name in shown:
         own = {}
         for output, samples in scored.groupby("output", sort=False) if len(scored) else ():
-            unit = unit_text(units.get(str(output), "1"))
             off = (samples[name] - samples["measured"])[samples["measured"].notna()].to_numpy(float)
             known = len(off) and np.isfinite(off).all()
             text = value_text(float(np.sqrt(np.mean(off**2))), digits=3) if known else "ran away"
-            own[f"{output} ({unit})" if unit else str(output)] = text
+            own[with_unit(str(output), units.get(str(output), "1"))] = text
         said = name
         if name == "augmented" and findings.kind == "unexplained":
             said = "described" if statement.described else "closest"
@@ -345,9 +353,7 @@ def _rate_of(name: str) -> Markup:
     ).format(spoken, Markup(inside))
 
 
-def _parameters_of(
-    parts: Sequence[StatedMechanism | StatedFunction], *, of: bool = False
-) -> pd.DataFrame | None:
+def _parameters_of(parts: Sequence[StatedMechanism | StatedFunction], *, of: bool = False) -> pd.DataFrame:
     """Parameters with errors and units; with `of`, what each is of."""
     rows = [
         ({"of": part.label} if of else {})
@@ -355,7 +361,7 @@ def _parameters_of(
         for part in parts
         for name, one in part.parameters.items()
     ]
-    return pd.DataFrame(rows) if rows else None
+    return pd.DataFrame(rows)
 
 
 def _curve(part: StatedFunction) -> pd.DataFrame:
@@ -398,14 +404,13 @@ def _odds_text(log_odds: float | None) -> str:
     return f"{text} to 1" if log_odds >= 0 else f"1 to {text}"
 
 
-def _explanations(statement: Statement) -> pd.DataFrame | None:
+def _explanations(statement: Statement) -> pd.DataFrame:
     compared = (MismatchVerdict.MISSING_PHYSICS, MismatchVerdict.UNEXPLAINED)
-    if len(statement.explanations) < 2 or statement.verdict not in compared:
-        return None
+    told = len(statement.explanations) > 1 and statement.verdict in compared
     return pd.DataFrame(
         [
             {"explanation": each.what, "log-evidence": round(each.log_evidence, 1)}
-            for each in statement.explanations
+            for each in (statement.explanations if told else ())
         ]
     )
 
@@ -432,19 +437,7 @@ def _escape_times(escape: pd.DataFrame) -> pd.DataFrame | None:
     return pivot.rename(columns={**words, "transition": "way out", "intensity": "ε"})
 
 
-def _bounds(statement: Statement) -> pd.DataFrame | None:
-    rows = [
-        {
-            "mechanism": label,
-            "parameter": bound.parameter,
-            "at most (95 %)": value_text(bound.upper_bound_95, unit=bound.unit, digits=2),
-        }
-        for label, bound in statement.excluded.items()
-    ]
-    return pd.DataFrame(rows) if rows else None
-
-
-def _own_parameters(statement: Statement, before: Dynamics) -> pd.DataFrame | None:
+def _own_parameters(statement: Statement, before: Dynamics) -> pd.DataFrame:
     """The simulation's own parameters, on the card and fitted."""
     units = {entry.name: entry.unit for entry in before.parameters}
     rows = [
@@ -458,7 +451,7 @@ def _own_parameters(statement: Statement, before: Dynamics) -> pd.DataFrame | No
         }
         for name, one in statement.recalibration.items()
     ]
-    return pd.DataFrame(rows) if rows else None
+    return pd.DataFrame(rows)
 
 
 def _candidates(findings: Findings) -> pd.DataFrame | None:

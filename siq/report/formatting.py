@@ -80,6 +80,12 @@ def time_text(mean: MeanTime | None, unit: str = "") -> str:
     return text if mean.complete else f"at most {text}"
 
 
+def with_unit(name: str, unit: str) -> str:
+    """A heading, or the name of an axis, with its unit in brackets; a plain number has none."""
+    shown = unit_text(unit)
+    return f"{name} ({shown})" if shown else name
+
+
 def _position_text(well: WellSummary, summary: LandscapeSummary) -> str:
     """Where a well is: ``x = −0.996 ± 0.005 nm``, ``(x, y) = (−0.50, 0.00) µm``."""
     names, units = summary.names, summary.units
@@ -185,20 +191,7 @@ def texts(name: str) -> Any:
 
 
 def _formula_text(expression: sympy.Expr, *, decimals: int = 3) -> str:
-    """Write a formula in one line of plain text.
-
-    Parameters
-    ----------
-    expression
-        The formula.
-    decimals
-        Decimals of its floating-point coefficients.
-
-    Returns
-    -------
-    str
-        Such as ``"1.000 x⁴ − 2.001 x² + 0.999 y² + 1.001"``: terms by descending degree, the constant last.
-    """
+    """A formula in one line: ``"1.000 x⁴ − 2.001 x² + 1.001"``, by falling degree, the constant last."""
     return str(_TextPrinter(decimals).doprint(_with_integer_exponents(expression)))
 
 

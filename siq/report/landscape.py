@@ -19,10 +19,17 @@ from siq.data.two_states import RecordStates
 from siq.numerics.text import MINUS, range_text, unit_text, value_text
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.rates import NoiseStrength, mean_exit_time
-from siq.report.formatting import counted_text, paragraphs, percent_text, predicted_text, texts, time_text
+from siq.report.formatting import (
+    counted_text,
+    paragraphs,
+    percent_text,
+    predicted_text,
+    texts,
+    time_text,
+    with_unit,
+)
 from siq.report.summary import LandscapeSummary, settled, summarise, visits_of, well_name
 from siq.systems.cycles import Cycle
-from siq.workflow.tables import Method
 
 MOST_COLUMNS = 4  # wells that are columns of a table; more are rows
 
@@ -50,28 +57,6 @@ def _certificate_line(certificate: Mapping[str, Any] | None) -> str:
     """The certificate in one sentence, for text."""
     (line,) = paragraphs("certificate.j2", certificate=certificate, texts=texts("certificate"))[-1:]
     return line
-
-
-def tests_table(certificates: pd.DataFrame, run: int, method: Method) -> pd.DataFrame:
-    """The tests of the formulas of a run: what was asked, the figure, its limit, the verdict."""
-    mine = certificates[(certificates["run"] == run) & (certificates["method"] == method)]
-    asks = texts("certificate")["asks"]
-    return pd.DataFrame(
-        {
-            "test": [str(name).replace("_", " ") for name in mine["test"]],
-            "what it asks": [asks.get(str(name), "") for name in mine["test"]],
-            "found": mine["value"].to_numpy(),
-            "limit": mine["limit"].to_numpy(),
-            "passed": mine["passed"].to_numpy(),
-            "reason": mine["reason"].to_numpy(),
-        }
-    )
-
-
-def headed(name: str, unit: str) -> str:
-    """The heading of a column, with its unit where it has one."""
-    shown = unit_text(unit)
-    return f"{name} ({shown})" if shown else name
 
 
 def _complex_text(value: complex) -> str:
@@ -104,23 +89,23 @@ def wells_table(summary: LandscapeSummary) -> tuple[pd.DataFrame, pd.DataFrame]:
         )  # fmt: skip
         cells = {}
         for place, (name, unit) in enumerate(zip(summary.names, summary.units, strict=True)):
-            cells[headed(name, unit)] = (
+            cells[with_unit(name, unit)] = (
                 value_text(well.position[place], well.position_errors[place])
                 if cycle is None
                 else range_text(cycle.points[:, place].min(), cycle.points[:, place].max())
             )
-        cells[headed("period", time_unit)] = "" if cycle is None else value_text(cycle.period, digits=4)
+        cells[with_unit("period", time_unit)] = "" if cycle is None else value_text(cycle.period, digits=4)
         multipliers = [] if cycle is None else cycle.multipliers.tolist()
         cells["Floquet multipliers"] = ", ".join(_complex_text(one) for one in multipliers)
         deep = math.isfinite(well.depth)
-        cells[headed("depth ΔU", summary.energy_unit)] = (
+        cells[with_unit("depth ΔU", summary.energy_unit)] = (
             value_text(well.depth, well.depth_error) if deep else ""
         )
         cells["ΔU/ε"] = value_text(ratio, ratio_error) if math.isfinite(ratio) else ""
-        cells[headed("lasts", time_unit)] = time_text(mean)
+        cells[with_unit("lasts", time_unit)] = time_text(mean)
         seen = well.visits
-        cells[headed("mean visit, counted", time_unit)] = "" if seen is None else counted_text(seen)
-        cells[headed("mean visit, by f and D", time_unit)] = "" if seen is None else predicted_text(seen)
+        cells[with_unit("mean visit, counted", time_unit)] = "" if seen is None else counted_text(seen)
+        cells[with_unit("mean visit, by f and D", time_unit)] = "" if seen is None else predicted_text(seen)
         cells["next well"] = well.beyond or ""
         if len(wells) > 1:
             cells["share of the domain" if summary.given else "recorded states"] = f"{100 * well.basin:.0f} %"
@@ -150,11 +135,11 @@ def exits_table(summary: LandscapeSummary) -> tuple[pd.DataFrame, pd.DataFrame]:
         row = {
             "way": f"{start} to {end or f'out of the {summary.region}'}",
             "over the saddle at": place,
-            headed("barrier ΔU", summary.energy_unit): value_text(way.barrier, way.error) if known else "",
+            with_unit("barrier ΔU", summary.energy_unit): value_text(way.barrier, way.error) if known else "",
         }
         if not summary.given:
             row["the same by the path alone"] = "" if action is None else value_text(action)
-        row[headed("mean time", summary.time_unit)] = time_text(mean)
+        row[with_unit("mean time", summary.time_unit)] = time_text(mean)
         rows.append(row | {"to be known": "; ".join(way.notes)})
         numbers.append(
             {
@@ -184,7 +169,7 @@ def cycles_table(summary: LandscapeSummary) -> pd.DataFrame:
         ]
         rows.append(
             dict(zip(summary.names, reach, strict=True))
-            | {headed("period", summary.time_unit): value_text(one.period, digits=4)}
+            | {with_unit("period", summary.time_unit): value_text(one.period, digits=4)}
             | {"Floquet multipliers": ", ".join(map(_complex_text, one.multipliers.tolist()))}
         )
     return pd.DataFrame(rows)
@@ -197,7 +182,7 @@ def equilibria_table(summary: LandscapeSummary) -> pd.DataFrame:
     names = summary.names
     position = f"({', '.join(names)})" if len(names) > 1 else names[0]
     if len(set(summary.units)) == 1:
-        position = headed(position, summary.units[0])
+        position = with_unit(position, summary.units[0])
     rows = [
         {
             "name": one.label,
@@ -215,11 +200,11 @@ def times_table(summary: LandscapeSummary, noises: Sequence[float]) -> pd.DataFr
     """How long each well lasts under some noise strengths."""
     rows = []
     for strength in noises:
-        row = {headed("noise strength ε", summary.energy_unit): value_text(strength)}
+        row = {with_unit("noise strength ε", summary.energy_unit): value_text(strength)}
         for well in summary.wells:
             mean = well.time(NoiseStrength(strength))
             strong = texts("tables")["too_strong"] if strength >= well.depth else ""
-            row[headed(f"{well.label} lasts", summary.time_unit)] = (
+            row[with_unit(f"{well.label} lasts", summary.time_unit)] = (
                 strong if mean is None else time_text(mean)
             )
         rows.append(row)
@@ -229,12 +214,6 @@ def times_table(summary: LandscapeSummary, noises: Sequence[float]) -> pd.DataFr
 def in_words(table: pd.DataFrame) -> pd.DataFrame:
     """A table with headings in words, without columns that say nothing."""
     return table.dropna(axis=1, how="all").rename(columns=lambda name: name.replace("_", " "))
-
-
-def counted_over_runs(table: pd.DataFrame, by: str | list[str], **columns: tuple[str, str]) -> pd.DataFrame:
-    """A table over all runs, a row for each group, with its columns as `pandas.DataFrame.agg` takes them."""
-    counted = table.groupby(by, sort=False).agg(**columns).reset_index()
-    return counted.rename(columns=lambda name: "way" if name == "item" else name.replace("_", " "))
 
 
 def record_table(record: pd.DataFrame, time_unit: str) -> pd.DataFrame:
@@ -256,14 +235,14 @@ def record_table(record: pd.DataFrame, time_unit: str) -> pd.DataFrame:
             {
                 "well about": one["attractor"],
                 "visits seen to end": count,
-                headed("mean visit, counted", time_unit): counted_text(visits)
+                with_unit("mean visit, counted", time_unit): counted_text(visits)
                 if count
                 else f"above {value_text(lowest, digits=2)}",
                 "held out: visits": int(one["held_out_visits"]),
-                headed("held out: mean", time_unit): value_text(held_out, digits=3)
+                with_unit("held out: mean", time_unit): value_text(held_out, digits=3)
                 if math.isfinite(held_out)
                 else words["none_ended"],
-                headed("predicted", time_unit): predicted_text(visits),
+                with_unit("predicted", time_unit): predicted_text(visits),
                 "by": words["methods"].get(visits.method, visits.method),
                 "probability": f"{one['probability']:.2g}",
             }

@@ -7,7 +7,6 @@ here stand the tables and numbers that it is filled with.
 from __future__ import annotations
 
 import ast
-import json
 import os
 import platform
 from collections import defaultdict
@@ -24,23 +23,27 @@ from markupsafe import Markup
 
 from siq.data.two_states import RecordStates
 from siq.inference.field_estimate import DiffusionSource, FieldEstimate
-from siq.numerics.files import whole_file
 from siq.numerics.text import unit_text, value_text
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import sentences_without_landscape
 from siq.quasipotential.wells import Well
-from siq.report.formatting import formula_mathml, matrix_mathml, paragraphs, term_text, texts, vector_mathml
+from siq.report.formatting import (
+    formula_mathml,
+    matrix_mathml,
+    paragraphs,
+    term_text,
+    texts,
+    vector_mathml,
+    with_unit,
+)
 from siq.report.landscape import (
     answer_lines,
     comparison_table,
-    counted_over_runs,
     cycles_table,
     equilibria_table,
     exits_table,
-    headed,
     in_words,
     record_table,
-    tests_table,
     times_table,
     wells_table,
 )
@@ -169,6 +172,7 @@ def study_page(
     density = given is not None and table("invariant") is None and "invariant" in results.tables
     escape, errors = table("escape"), table("landscape_errors")
     invariant, shares = table("invariant"), None if density else table("well_shares")
+    swept = [] if table("sweep") is None else results.tables["sweep"]["well"]
     named = ", ".join(f"{name} {version}" for name, version in versions.items())
     machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
 
@@ -204,7 +208,7 @@ def study_page(
         compared=compared,
         comparison=None if compared is None else comparison_table(compared),
         compared_notes=[] if compared is None else _comparison_notes(compared),
-        tests=None if shown.run is None else tests_table(certificates, shown.run, method),
+        tests=None if shown.run is None else _tests_table(certificates, shown.run, method),
         landscape_errors=None if errors is None else errors_over_runs(errors),
         escape=None if escape is None else escape.rename(columns=lambda name: name.replace("_", " ")),
         time_unit=results.time_unit,
@@ -224,7 +228,7 @@ def study_page(
         tables=results.tables,
         folder=results.folder,
         bifurcations=None if given is None else _bifurcations(given, study.sweep, table("bifurcations")),
-        swept_wells=_swept_wells(table("sweep")),
+        swept_wells=[well_name(int(well)) for well in sorted(set(swept)) if well >= 0],
         of_runs=_method_tables(results.tables, (str(method), str(Method.CONTROL))) if several else None,
         published_formulas=_formulas_by(results, Method.REGRESSION) if other else [],
         published_certificate=results.certificates.get(str(Method.REGRESSION)),
@@ -320,12 +324,6 @@ def answer_data(page: ReportContent, study: Study, results: StudyResults) -> dic
     }  # fmt: skip
 
 
-def _write_answer(path: str | Path, answer: Mapping[str, Any]) -> None:
-    """Write `answer.json` whole or not at all."""
-    with whole_file(path) as partial:
-        partial.write_text(json.dumps(answer, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-
-
 def _formulas(results: StudyResults) -> list[FormulaRow]:
     """Formulas and D of the run that is shown; f and D alone where no formula was found."""
     words = texts("formulas")
@@ -333,7 +331,7 @@ def _formulas(results: StudyResults) -> list[FormulaRow]:
         formulas = () if results.landscape is None else results.landscape.formulas
         wells = tuple(well for well in formulas if well is not None)
         found = SymbolicDecomposition(system.symbols, None, (), system.formulas, wells)
-        rows = _formula_rows(found, None, places=_places(results.landscape))
+        rows = _formula_rows(found, None, results.landscape)
         rows[-1] = replace(rows[-1], note=words["given"])
         return [*rows, FormulaRow("D", _diffusion_mathml(system.diffusion), words["D"]["given"])]
     rows, record = _formulas_by(results, results.shown.method), results.record
@@ -351,42 +349,22 @@ def _diffusion_mathml(noise: Diffusion) -> Markup:
     return matrix_mathml(noise.matrix.tolist() if noise.constant else noise.formulas)
 
 
-def _places(summary: LandscapeSummary | None) -> list[np.ndarray]:
-    return [] if summary is None else [well.position for well in summary.wells]
-
-
 def _formulas_by(results: StudyResults, method: Method) -> list[FormulaRow]:
     """The formulas of the run that is shown, as a method found them; none where it found none."""
-    run, summary = results.shown.run, results.landscape
+    run = results.shown.run
     found = {} if run is None else results.models.formulas(run)
-    if method not in found:
-        return []
-    barriers = [] if summary is None else [way.barrier for way in summary.ways if np.isfinite(way.barrier)]
-    return _formula_rows(
-        found[method], results.exact, places=_places(summary), depth=max(barriers, default=0.0)
-    )
+    return _formula_rows(found[method], results.exact, results.landscape) if method in found else []
 
 
 def _formula_rows(
-    found: SymbolicDecomposition,
-    exact: SymbolicDecomposition | None,
-    *,
-    places: Sequence[np.ndarray] = (),
-    depth: float = 0.0,
+    found: SymbolicDecomposition, exact: SymbolicDecomposition | None, summary: LandscapeSummary | None
 ) -> list[FormulaRow]:
-    """U, g and f of one method; U about each well where no single formula holds.
+    """U, g and f of one method, beside the exact ones; U about each well where no single formula holds.
 
-    Parameters
-    ----------
-    found
-        The formulas.
-    exact
-        The exact ones, where they are known.
-    places
-        The attractors in the order of their letters; by default that of the wells.
-    depth
-        Of the deepest well: a constant far below it is what rounding left of zero.
+    A constant of U far below the depth of the deepest well is what rounding left of zero.
     """
+    places = [] if summary is None else [well.position for well in summary.wells]
+    barriers = [] if summary is None else [way.barrier for way in summary.ways if np.isfinite(way.barrier)]
 
     def typeset(one: SymbolicDecomposition, depth: float = 0.0) -> dict[str, Markup]:
         formulas = {}
@@ -402,7 +380,7 @@ def _formula_rows(
     truths, notes = {} if exact is None else typeset(exact), texts("formulas")
     rows = [
         FormulaRow(name, formula, notes[name], truths.get(name))
-        for name, formula in typeset(found, depth).items()
+        for name, formula in typeset(found, max(barriers, default=0.0)).items()
     ]
     return [*(_well_row(well, places) for well in found.wells if found.potential is None), *rows]
 
@@ -465,7 +443,7 @@ def _coefficients(results: StudyResults) -> tuple[pd.DataFrame, pd.DataFrame] | 
         if kind != "f":
             return f"{kind}, {state}" if state else kind
         unit = unit_text(units.get(state, ""))
-        return headed(f"d{state}/dt", f"{unit or '1'}/{time}" if time else unit)
+        return with_unit(f"d{state}/dt", f"{unit or '1'}/{time}" if time else unit)
 
     table = pd.DataFrame(
         {
@@ -536,14 +514,11 @@ def _comparison_notes(table: pd.DataFrame) -> list[tuple[str, list[str]]]:
 def _run_figures(tables: Mapping[str, pd.DataFrame], *, runs: int, method: str) -> dict[str, Any]:
     """What all runs of a study say together of a method, for `templates/runs.j2`.
 
-    Returns
-    -------
-    dict
-        How many ``runs`` were asked for, ``failed``, are ``certified``, have exactly the right terms
-        (``correct``); the errors that certificates state (``stated``), of the coefficients of U (``errors``)
-        and of U of the ``networks``; ``terms`` of U in most runs with mean and standard deviation, and
-        ``rare`` ones; the ``published`` error of the coefficients, NaN where there is none; mean and median
-        error of predictions (``prediction``), None where nothing was predicted.
+    How many ``runs`` were asked for, ``failed``, are ``certified``, have exactly the right terms
+    (``correct``); the errors that certificates state (``stated``), of the coefficients of U (``errors``)
+    and of U of the ``networks``; ``terms`` of U in most runs with mean and standard deviation, and ``rare``
+    ones; the ``published`` error of the coefficients, NaN where there is none; mean and median error of
+    predictions (``prediction``), None where nothing was predicted.
     """
     nothing = pd.Series(dtype=float)
     outcomes, rrmse, summary = tables["outcomes"], tables.get("rrmse"), tables.get("summary")
@@ -577,19 +552,27 @@ def _run_figures(tables: Mapping[str, pd.DataFrame], *, runs: int, method: str) 
     }
 
 
+def _tests_table(certificates: pd.DataFrame, run: int, method: Method) -> pd.DataFrame:
+    """The tests of the formulas of a run: what was asked, the figure, its limit, the verdict."""
+    mine = certificates[(certificates["run"] == run) & (certificates["method"] == method)]
+    asks = texts("certificate")["asks"]
+    return pd.DataFrame(
+        {
+            "test": [str(name).replace("_", " ") for name in mine["test"]],
+            "what it asks": [asks.get(str(name), "") for name in mine["test"]],
+            "found": mine["value"].to_numpy(),
+            "limit": mine["limit"].to_numpy(),
+            "passed": mine["passed"].to_numpy(),
+            "reason": mine["reason"].to_numpy(),
+        }
+    )
+
+
 def _control_counts(certificates: pd.DataFrame) -> dict[str, int] | None:
     """What became of the control, a network with its weights in random order; None where there is none.
 
-    Parameters
-    ----------
-    certificates
-        The table of that name. `same_as_refined` is no test of the control but a comparison.
-
-    Returns
-    -------
-    dict or None
-        How many ``runs`` there are, in how many it was ``refused``, refined to the ``same`` U, or certified
-        with another: a ``false`` one.
+    In how many ``runs`` it was ``refused``, refined to the ``same`` U, or certified with another: a
+    ``false`` one. `same_as_refined` is no test of the control but a comparison.
     """
     mine = certificates[certificates["method"] == Method.CONTROL]
     if not len(mine):
@@ -603,6 +586,12 @@ def _control_counts(certificates: pd.DataFrame) -> dict[str, int] | None:
     }  # fmt: skip
 
 
+def _counted_over_runs(table: pd.DataFrame, by: str | list[str], **columns: tuple[str, str]) -> pd.DataFrame:
+    """A table over all runs, a row for each group, with its columns as `pandas.DataFrame.agg` takes them."""
+    counted = table.groupby(by, sort=False).agg(**columns).reset_index()
+    return counted.rename(columns=lambda name: "way" if name == "item" else name.replace("_", " "))
+
+
 def _method_tables(
     tables: Mapping[str, pd.DataFrame], methods: tuple[str, ...]
 ) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame, pd.DataFrame]:
@@ -610,7 +599,7 @@ def _method_tables(
     summary, certificates, rrmse = (
         tables[name][tables[name]["method"].isin(methods)] for name in ("summary", "certificates", "rrmse")
     )
-    passed = counted_over_runs(
+    passed = _counted_over_runs(
         certificates, ["method", "test"], passed=("passed", "sum"), runs=("passed", "size"),
         median=("value", "median"), worst=("value", "max"),
     )  # fmt: skip
@@ -631,7 +620,7 @@ def _method_tables(
 
 def errors_over_runs(errors: pd.DataFrame) -> pd.DataFrame:
     """Relative L2 errors of U over the runs, by source and region."""
-    return counted_over_runs(
+    return _counted_over_runs(
         errors, ["source", "region"], runs=("error", "size"), mean_error=("error", "mean"),
         worst_error=("error", "max"), least_covered=("covered", "min"),
         worst_everywhere=("error_everywhere", "max"),
@@ -641,7 +630,7 @@ def errors_over_runs(errors: pd.DataFrame) -> pd.DataFrame:
 def _barriers_over_runs(landscape: pd.DataFrame | None) -> pd.DataFrame | None:
     if landscape is None or landscape["run"].nunique() == 1:
         return None
-    return counted_over_runs(
+    return _counted_over_runs(
         landscape[landscape["kind"] == "transition"], "item", runs=("barrier", "size"),
         mean=("barrier", "mean"), lowest=("barrier", "min"), highest=("barrier", "max"),
         by_the_path_alone=("minimum_action", "mean"), prefactor=("prefactor", "mean"),
@@ -661,16 +650,12 @@ def _bifurcations(
         rows.append(
             {
                 "what": one.kind,
-                headed(options.parameter, unit): f"{one.value:.10g}",
+                with_unit(options.parameter, unit): f"{one.value:.10g}",
                 "state": ", ".join(f"{name} = {x:.5g}" for name, x in states),
                 "frequency": f"{one.frequency:.6g}" if one.kind == "Hopf" else "",
             }
         )
     return pd.DataFrame(rows)
-
-
-def _swept_wells(table: pd.DataFrame | None) -> list[str]:
-    return [] if table is None else [well_name(int(well)) for well in sorted(set(table["well"])) if well >= 0]
 
 
 def _printed(study: Study, *, given: bool) -> str:

@@ -8,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from siq.quasipotential.invariant_density import DensityComparison, StationaryDensity
-from siq.report.plots.style import mean_and_spread, name_label, save_figure, sorted_terms, term_label
+from siq.report.plots.style import mean_and_spread, name_label, save_figure
 from workflow.figures.density import plot_invariant_distribution
 from workflow.figures.prediction import plot_prediction
 from workflow.figures.recorded import ComponentFields, Dataset, plot_components, plot_dataset
@@ -17,6 +17,8 @@ from workflow.figures.runs import (
     plot_error_distribution,
     plot_inclusion,
     plot_training,
+    sorted_terms,
+    term_label,
 )
 
 EXACT = {

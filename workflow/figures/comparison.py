@@ -25,10 +25,8 @@ from siq.report.plots.style import (
     GREY,
     LINE_STYLES,
     PAGE_WIDTH,
-    UNKNOWN,
     counted,
     drawn_in_style,
-    hatch_unknown,
     look,
     magnitude_label,
     name_label,
@@ -37,6 +35,7 @@ from siq.report.plots.style import (
     scaled_label,
 )
 from siq.report.summary import well_name
+from workflow.figures.density import UNKNOWN, hatch_unknown
 
 ENERGY = "unit of ε"
 DECADES = {1: 6, 2: 4}  # of differences, below the largest one, by the number of states

@@ -8,33 +8,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from siq.report.plots.style import (
     BLUE,
+    COLUMN_WIDTH,
     ORANGE,
     PAGE_WIDTH,
-    UNKNOWN,
     VERMILLION,
+    axis_label,
     drawn_in_style,
-    hatch_unknown,
     magnitude_label,
     name_label,
     scaled_label,
     unit_label,
 )
-
-if TYPE_CHECKING:  # to draw takes none of what it takes to compute
-    from siq.quasipotential.invariant_density import StationaryDensity
-from typing import TYPE_CHECKING
-
-from matplotlib.cm import ScalarMappable
-
-from siq.report.plots.style import COLUMN_WIDTH, axis_label
 
 if TYPE_CHECKING:  # to draw a density takes none of what it takes to compute one
     from siq.quasipotential.invariant_density import StationaryDensity
@@ -43,6 +36,7 @@ if TYPE_CHECKING:  # to draw a density takes none of what it takes to compute on
 COLOUR_MAP = "viridis"
 LEVELS = 13  # filled, from zero to the peak
 MARGIN = 0.08  # of what is known: shown around it
+UNKNOWN: dict[str, Any] = {"facecolor": "#F0F0F0", "edgecolor": "#C8C8C8", "hatch": "////", "linewidth": 0}
 LINES = (0.1, 0.5, 0.9)  # shares of the peak at which the density's lines lie over the histogram
 
 
@@ -219,3 +213,8 @@ def _hatch_stretches(axes: Axes, x: np.ndarray, values: np.ndarray) -> list[Any]
     for begin, end in edges.reshape(-1, 2):
         axes.axvspan(x[begin], x[min(end, len(x) - 1)], zorder=-1, **UNKNOWN)
     return [Patch(label="$U$ is not known", **UNKNOWN)] if len(edges) else []
+
+
+def hatch_unknown(axes: Axes, zorder: float = -1) -> None:
+    """Hatch a whole panel, for what is drawn over it to leave out where nothing is known."""
+    axes.add_patch(Rectangle((0, 0), 1, 1, transform=axes.transAxes, zorder=zorder, **UNKNOWN))

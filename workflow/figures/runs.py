@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Iterable
 
 import numpy as np
 import pandas as pd
@@ -26,8 +28,6 @@ from siq.report.plots.style import (
     magnitude_label,
     mean_and_spread,
     name_label,
-    sorted_terms,
-    term_label,
 )
 
 GOLDEN_RATIO = (5**0.5 - 1) / 2
@@ -450,3 +450,33 @@ def _draw_column(axes: Axes, rows: pd.DataFrame, column: str) -> None:
     axes.plot(median.index, median, color=BLACK, linewidth=1.6)
     axes.set_xscale("log")
     axes.set_yscale("log")
+
+
+def term_label(term: str) -> str:
+    """Typeset a term such as ``x**2*y``; anything but a monomial is left as it is."""
+    powers = _powers(term)
+    if powers is None:
+        return term.replace("$", r"\$")
+    typeset = (name_label(name) + (f"^{{{power}}}" if power > 1 else "") for name, power in powers)
+    return "$" + r"\,".join(typeset) + "$"
+
+
+def _degree(term: str) -> int:
+    """Count the factors of a monomial; a term that is none comes after all monomials."""
+    powers = _powers(term)
+    return 1000 if powers is None else sum(power for name, power in powers if name != "1")
+
+
+def _powers(term: str) -> list[tuple[str, int]] | None:
+    factors = [
+        re.fullmatch(r"([^\W\d]\w*|1)(?:\^(\d+))?", factor)
+        for factor in term.replace(" ", "").replace("**", "^").split("*")
+    ]
+    if not all(factors):
+        return None
+    return [(factor[1], int(factor[2] or 1)) for factor in factors if factor]
+
+
+def sorted_terms(terms: Iterable[str]) -> list[str]:
+    """Order different terms by degree, otherwise as they first appear in the table."""
+    return sorted(dict.fromkeys(terms), key=_degree)

@@ -15,6 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from siq.report.diagnosis_page import largest_difference
+from siq.report.formatting import with_unit
 from siq.report.plots.quasipotential import add_legend, new_axes
 from siq.report.plots.style import (
     BLACK,
@@ -25,7 +26,6 @@ from siq.report.plots.style import (
     VERMILLION,
     WIDTH,
     axis_label,
-    axis_unit,
     counted,
     drawn_to_be_read,
     name_label,
@@ -173,7 +173,7 @@ def _draw(
     if largest > 0:
         lower.set_ylim(-largest, largest)
     upper.set_ylabel(axis_label(str(rows["output"].iloc[0]), unit))
-    lower.set_ylabel(f"error{axis_unit(unit)}")
+    lower.set_ylabel(with_unit("error", unit))
     lower.set_xlabel(axis_label("t", time_unit))
 
 
@@ -487,14 +487,14 @@ def plot_curves(
 
 
 def _coordinate_label(name: str, unit: str) -> str:
-    return f"amplitude{axis_unit(unit)}" if name == "amplitude" else axis_label(name, unit)
+    return with_unit(name, unit) if name == "amplitude" else axis_label(name, unit)
 
 
 def _missing_label(equation: str, units: Mapping[str, str] | None, time_unit: str) -> str:
     """What is missing in one equation, or in several with commas between them, with its unit."""
     names = equation.split(", ")
     where = " and ".join(f"$\\dot{{{name_label(name)}}}$" for name in names)
-    return f"missing in {where}{axis_unit(rate_unit((units or {}).get(names[0], '1'), time_unit))}"
+    return with_unit(f"missing in {where}", rate_unit((units or {}).get(names[0], "1"), time_unit))
 
 
 def _draw_curves(axes: Axes, stages: Mapping[str, pd.DataFrame]) -> None:
@@ -663,7 +663,7 @@ def plot_escapes(table: pd.DataFrame, *, time_unit: str = "1") -> Figure | None:
                     linestyle=styles[name], linewidth=2.6 - 1.2 * (place % 2),
                 )  # fmt: skip
     axes.set_xlabel(r"$1/\varepsilon$, inverse of the noise intensity")
-    axes.set_ylabel(f"mean escape time{axis_unit(time_unit)}")
+    axes.set_ylabel(with_unit("mean escape time", time_unit))
     figure.legend(loc="outside upper left", ncols=1)
     if len(ways) > len(colours):
         figure.supxlabel(f"{counted(len(ways) - len(colours), 'further way')} out not drawn")

@@ -5,22 +5,22 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 
 import matplotlib as mpl
 import matplotlib.style
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from matplotlib.rcsetup import cycler
 from matplotlib.ticker import FuncFormatter
 
 from siq.numerics.files import whole_file
 from siq.numerics.text import unit_text
+from siq.report.formatting import with_unit
 
 # Inches. A figure is no wider than its letters allow: a phone of 400 pixels leaves it 368, and there text of
 # `SMALLEST` points in a figure of `PAGE_WIDTH` is 9 pixels high.
@@ -125,36 +125,6 @@ def name_label(name: str) -> str:
     return letter
 
 
-def term_label(term: str) -> str:
-    """Typeset a term such as ``x**2*y``; anything but a monomial is left as it is."""
-    powers = _powers(term)
-    if powers is None:
-        return term.replace("$", r"\$")
-    typeset = (name_label(name) + (f"^{{{power}}}" if power > 1 else "") for name, power in powers)
-    return "$" + r"\,".join(typeset) + "$"
-
-
-def _degree(term: str) -> int:
-    """Count the factors of a monomial; a term that is none comes after all monomials."""
-    powers = _powers(term)
-    return 1000 if powers is None else sum(power for name, power in powers if name != "1")
-
-
-def _powers(term: str) -> list[tuple[str, int]] | None:
-    factors = [
-        re.fullmatch(r"([^\W\d]\w*|1)(?:\^(\d+))?", factor)
-        for factor in term.replace(" ", "").replace("**", "^").split("*")
-    ]
-    if not all(factors):
-        return None
-    return [(factor[1], int(factor[2] or 1)) for factor in factors if factor]
-
-
-def sorted_terms(terms: Iterable[str]) -> list[str]:
-    """Order different terms by degree, otherwise as they first appear in the table."""
-    return sorted(dict.fromkeys(terms), key=_degree)
-
-
 def unit_label(unit: str) -> str:
     """Write a unit behind a name: ``(mV)``; ``1`` is that of a plain number, and nothing that of nobody."""
     if unit == "":
@@ -164,7 +134,7 @@ def unit_label(unit: str) -> str:
 
 def axis_label(name: str, unit: str) -> str:
     """Typeset a state with its unit; the unit ``1`` needs no word where a name stands alone."""
-    return f"${name_label(name)}$ {unit_label('' if unit == '1' else unit)}".strip()
+    return with_unit(f"${name_label(name)}$", unit)
 
 
 def energy_label(unit: str, *, what: str = "$U$") -> str:
@@ -242,12 +212,6 @@ def drawn_to_be_read(function: Callable[Parameters, Drawn]) -> Callable[Paramete
     return drawn_in_style(function, **_LARGE)
 
 
-def axis_unit(unit: str) -> str:
-    """A unit behind the name of an axis, typeset; nothing for a plain number."""
-    text = unit_text(unit)
-    return f" ({text})" if text else ""
-
-
 def rate_unit(unit: str, time_unit: str) -> str:
     """The unit of a rate of change, as cards write units."""
     if time_unit in ("1", ""):
@@ -299,11 +263,3 @@ def scaled_label(axis: Axis, symbol: str, unit: str, largest: float) -> str:
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value / 10.0**power:.6g}".replace("-", "−")))
     factor = rf"$10^{{{power}}}$"
     return f"{symbol} ({factor})" if plain else f"{symbol} ({factor} {unit_text(unit)})"
-
-
-UNKNOWN: dict[str, Any] = {"facecolor": "#F0F0F0", "edgecolor": "#C8C8C8", "hatch": "////", "linewidth": 0}
-
-
-def hatch_unknown(axes: Axes, zorder: float = -1) -> None:
-    """Hatch a whole panel, for what is drawn over it to leave out where nothing is known."""
-    axes.add_patch(Rectangle((0, 0), 1, 1, transform=axes.transAxes, zorder=zorder, **UNKNOWN))
