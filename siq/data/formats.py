@@ -5,7 +5,7 @@ on request. What headings mean is the matter of `siq.data.layout`, what cells me
 
 Laboratories write CSV in many ways: a German Excel separates by semicolons and writes decimal commas, a
 logger puts comments above the table, ``numpy.savetxt`` the headings behind ``#``, other programs the units
-into a second line. What was recognised stands in the notes, so that a wrong guess is seen.
+into a second line. What was recognised is remarked, so that a wrong guess is seen.
 
 Files are data. Nothing is unpickled, and MATLAB objects and structs are refused before they are read.
 """
@@ -29,6 +29,7 @@ import pyarrow.compute as pc
 from siq.data.layout import is_label, is_unit, read_heading
 from siq.errors import InputError
 from siq.numerics.files import missing_file
+from siq.remarks import Remark
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -59,7 +60,7 @@ class ColumnFile:
         Reads the columns of the given positions in `headings`; all have the same length.
     titles
         What people call each column, where the file keeps that beside a name (Parquet that we wrote).
-    notes
+    remarks
         What was recognised or assumed.
     """
 
@@ -67,7 +68,7 @@ class ColumnFile:
     units: tuple[str | None, ...]
     load: Callable[[Sequence[int]], list[Column]]
     titles: tuple[str | None, ...] = ()
-    notes: tuple[str, ...] = ()
+    remarks: tuple[Remark, ...] = ()
 
 
 def open_columns(path: str | Path) -> ColumnFile:
@@ -149,7 +150,7 @@ def _reading(file: str, kind: str) -> Iterator[None]:
 
 def _open_text(file: str) -> ColumnFile:
     """Recognise how a table of text is written: encoding, comments, headings, units, separator, decimals."""
-    content, notes = _in_utf8(file, Path(file).read_bytes())
+    content, remarks = _in_utf8(file, Path(file).read_bytes())
     begin, comments, separator = 0, [], ""
     while begin < len(content):
         end = _after_line(content, begin)
@@ -181,11 +182,11 @@ def _open_text(file: str) -> ColumnFile:
     units: list[str | None] = [None] * len(headings)
     if rows and (found := _line_of_units(rows[0], len(headings))) is not None:
         units, rows, begin = found, rows[1:], _after_line(content, begin)
-        notes.append("the second line of headings was read as the units")
+        remarks.append(Remark("data.line_of_units"))
     decimal_mark = _decimal_mark(file, rows, len(headings), separator)
     if separator != ",":
-        decimals = ", and decimals by a comma" if decimal_mark == "," else ""
-        notes.append(f"the columns are separated by {_SEPARATORS[separator]}{decimals}")
+        values = {"separator": _SEPARATORS[separator], "decimal_comma": decimal_mark == ","}
+        remarks.append(Remark("data.separator", values))
     body, marks = content[begin:], tuple(mark.encode() for mark in _COMMENTS)
     if any(b"\n" + mark in body or body.startswith(mark) for mark in marks):
         body = b"\n".join(line for line in body.splitlines() if not line.startswith(marks))
@@ -202,13 +203,13 @@ def _open_text(file: str) -> ColumnFile:
             cells = _read_cells(file, body, names, separator, decimal_mark, set())
         return [cells.column(str(position)) for position in positions]
 
-    return ColumnFile(tuple(headings), tuple(units), load, notes=tuple(notes))
+    return ColumnFile(tuple(headings), tuple(units), load, remarks=tuple(remarks))
 
 
-def _in_utf8(file: str, content: bytes) -> tuple[bytes, list[str]]:
+def _in_utf8(file: str, content: bytes) -> tuple[bytes, list[Remark]]:
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         try:
-            return content.decode("utf-16").encode(), ["the text is UTF-16"]
+            return content.decode("utf-16").encode(), [Remark("data.encoding", {"name": "UTF-16"})]
         except UnicodeDecodeError:
             pass
     content = content.removeprefix(codecs.BOM_UTF8)
@@ -219,7 +220,7 @@ def _in_utf8(file: str, content: bytes) -> tuple[bytes, list[str]]:
     except UnicodeDecodeError:
         # What Windows writes in western Europe; five bytes have no meaning there.
         try:
-            return content.decode("cp1252").encode(), ["the text is not UTF-8 and was read as Windows-1252"]
+            return content.decode("cp1252").encode(), [Remark("data.encoding", {"name": "Windows-1252"})]
         except UnicodeDecodeError:
             raise InputError(file, "", "the text is not UTF-8", "save it as CSV in UTF-8") from None
     return content, []
@@ -338,8 +339,12 @@ def _open_parquet(file: str) -> ColumnFile:
 
     kept = [field.metadata or {} for field in schema]
     units, titles = (tuple(_text(each.get(key)) for each in kept) for key in (b"unit", b"heading"))
-    notes = json.loads((schema.metadata or {}).get(b"notes", b"[]"))
-    return ColumnFile(tuple(schema.names), units, load, titles, tuple(map(str, notes)))
+    noted = json.loads((schema.metadata or {}).get(b"notes", b"[]"))
+    remarks = tuple(
+        Remark("data.text", {"text": each}) if isinstance(each, str) else Remark.from_data(each)
+        for each in noted
+    )  # sentences were kept before remarks were
+    return ColumnFile(tuple(schema.names), units, load, titles, remarks)
 
 
 def _open_hdf5(file: str) -> ColumnFile:

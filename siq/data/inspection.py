@@ -126,8 +126,6 @@ class Inspection:
     switching
         Two states with the hops between them and the background; None where nothing is known of them, as of
         recordings without noise.
-    notes
-        What was assumed or repaired in reading.
     """
 
     file: str
@@ -141,12 +139,16 @@ class Inspection:
     memory: MarkovLag
     coverage: float
     switching: Switching | None
-    notes: tuple[str, ...]
 
     @property
     def seen(self) -> RecordStates | None:
         """The two states that the recordings show by themselves; None where nothing is known of them."""
         return None if self.switching is None else self.switching.summary(self.recordings)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was assumed or repaired in reading, and what is unusual, in words."""
+        return tuple(map(sentence, (*self.recordings.remarks, *unusual(self.recordings))))
 
     def remarks(self) -> list[Remark]:
         """What was read, what it shows, and what can be learned from it."""
@@ -318,7 +320,6 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
         memory=memory,
         coverage=_coverage(recordings.values[:, :2]),
         switching=None if memory.kind in WITHOUT_TRANSITIONS else switching(recordings),
-        notes=(*recordings.notes, *unusual(recordings)),
     )
 
 

@@ -4,7 +4,7 @@
 Names stand in formulas: ``bead x`` becomes ``bead_x`` there, and keeps its heading beside it.
 
 ``recording`` and ``t`` are the plain names of the label and the time. Where they are missing, a column of
-another name for the same thing takes their place, and a note says so; a table that names no recordings is
+another name for the same thing takes their place, and a remark says so; a table that names no recordings is
 one.
 """
 
@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow as pa
 
 from siq.errors import InputError, suggestion
+from siq.remarks import Remark
 
 if TYPE_CHECKING:
     from siq.data.formats import ColumnFile
@@ -157,7 +158,7 @@ class _Layout(NamedTuple):
     names: tuple[str, ...]  # of the states, in formulas, ...
     titles: tuple[str, ...]  # ... and to people
     units: tuple[dict[str, str | None], ...]  # of all columns: what each place says
-    notes: tuple[str, ...]
+    remarks: tuple[Remark, ...]
 
 
 def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _Layout:
@@ -189,7 +190,7 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
             raise InputError(
                 file, f"column {name}", "the column stands twice", "rename or remove one of them"
             )
-    notes = list(source.notes)
+    remarks = list(source.remarks)
     free = [place for place in range(len(parts)) if columns is None or plain[place] not in columns]
     dropped = set()
     for place in free:  # columns that only count the rows, as pandas writes them, and empty ones at the end
@@ -200,16 +201,16 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
             dropped.add(place)
         elif _counts_rows(values):
             dropped.add(place)
-            called = f"'{source.headings[place]}'" if plain[place] else f"{place + 1}, which has no name,"
-            notes.append(f"the column {called} counts the rows and was left out")
+            named = source.headings[place] if plain[place] else None
+            remarks.append(Remark("data.column_counts_rows", {"column": named, "place": place + 1}))
     free = [place for place in free if place not in dropped]
-    time = _time_column(file, source.headings, parts, free, notes)
+    time = _time_column(file, source.headings, parts, free, remarks)
     free.remove(time)
-    recording = _label_column(source, plain, free, notes)
+    recording = _label_column(source, plain, free, remarks)
     if columns is None:
         others = [place for place in free if place != recording and _is_second_time(source, parts, place)]
         for place in others:
-            notes.append(f"the column '{source.headings[place]}' looks like a second time and was left out")
+            remarks.append(Remark("data.second_time", {"column": source.headings[place]}))
         states = [place for place in free if place not in (recording, *others)]
         names: list[str] = []
         for place in states:
@@ -221,10 +222,10 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
                 count += 1
             names.append(candidate)
             if candidate != plain[place]:
-                notes.append(f"'{titles[place]}' is called {candidate} in formulas")
+                remarks.append(Remark("data.name_in_formulas", {"title": titles[place], "name": candidate}))
     else:
         known = [place for place in range(len(parts)) if place not in (time, recording, *dropped)]
-        states = [_wanted(file, name, plain, known, notes) for name in columns]
+        states = [_wanted(file, name, plain, known, remarks) for name in columns]
         names = list(columns)
     if not states:
         raise InputError(file, "", "there is no measured column", "add one beside 'recording' and 't'")
@@ -232,7 +233,7 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
         {"name": part.unit, "metadata": unit} for part, unit in zip(parts, source.units, strict=True)
     )
     shown = tuple(titles[place] for place in states)
-    return _Layout(recording, time, tuple(states), tuple(names), shown, units, tuple(notes))
+    return _Layout(recording, time, tuple(states), tuple(names), shown, units, tuple(remarks))
 
 
 def _counts_rows(values: np.ndarray) -> bool:
@@ -267,7 +268,7 @@ def _is_second_time(source: ColumnFile, parts: list[_Heading], place: int) -> bo
 
 
 def _time_column(
-    file: str, headings: Sequence[str], parts: list[_Heading], free: list[int], notes: list[str]
+    file: str, headings: Sequence[str], parts: list[_Heading], free: list[int], remarks: list[Remark]
 ) -> int:
     for place in free:
         if parts[place].title == "t":
@@ -277,7 +278,7 @@ def _time_column(
         # "T" is a temperature rather than a time.
         found = [place for place in found if parts[place].title != "T"]
     if len(found) == 1:
-        notes.append(f"the column '{parts[found[0]].title}' is the time")
+        remarks.append(Remark("data.time_column", {"column": parts[found[0]].title}))
         return found[0]
     if found:
         names = " and ".join(f"'{headings[place].strip()}'" for place in found)
@@ -286,7 +287,7 @@ def _time_column(
     raise InputError(file, "", "the column 't' is missing", remedy)
 
 
-def _label_column(source: ColumnFile, plain: list[str], free: list[int], notes: list[str]) -> int | None:
+def _label_column(source: ColumnFile, plain: list[str], free: list[int], remarks: list[Remark]) -> int | None:
     """The column of labels, None where there is none; one that counts the rows is taken out of `free`."""
     if "recording" in plain:
         return plain.index("recording")
@@ -298,21 +299,22 @@ def _label_column(source: ColumnFile, plain: list[str], free: list[int], notes: 
             continue  # measured, and no label
         if values is not None and len(values) > 1 and len(np.unique(values)) == len(values):
             free.remove(place)
-            notes.append(f"the column '{plain[place]}' counts the rows and was left out")
+            remarks.append(Remark("data.column_counts_rows", {"column": plain[place], "place": place + 1}))
             continue
-        notes.append(f"the column '{plain[place]}' says which recording a row belongs to")
+        remarks.append(Remark("data.label_column", {"column": plain[place]}))
         return place
     return None
 
 
-def _wanted(file: str, name: str, plain: list[str], known: list[int], notes: list[str]) -> int:
+def _wanted(file: str, name: str, plain: list[str], known: list[int], remarks: list[Remark]) -> int:
     """The column that is meant by a name: called so, or nearly so, if there is but one."""
     for called in (str, usable_name, lambda title: usable_name(title).casefold()):
         sought = name.casefold() if called not in (str, usable_name) else name
         matches = [place for place in known if called(plain[place]) == sought]
         if len(matches) == 1:
             if plain[matches[0]] != name:
-                notes.append(f"'{plain[matches[0]]}' is called {name} in formulas")
+                values = {"title": plain[matches[0]], "name": name}
+                remarks.append(Remark("data.name_in_formulas", values))
             return matches[0]
     titles = [plain[place] for place in known if plain[place]]
     remedy = suggestion(name, titles, otherwise=f"the measured columns are {', '.join(titles)}")

@@ -1,7 +1,7 @@
 """Preparation of recordings: what is refused, left out, cut or taken off before anything is learned.
 
 A single long recording is cut into stretches, of which some can be held out or drawn again, and less what
-drifts slowly in it. Columns that never change are no states. Each step leaves a note.
+drifts slowly in it. Columns that never change are no states. Each step leaves a remark.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from siq.data.recordings import (
 from siq.data.stationarity import background_of, correlated_samples, runs_of
 from siq.data.two_states import switching
 from siq.errors import InputError
+from siq.remarks import Remark
 
 FULL_TURNS = {2 * np.pi: "2π", 360.0: "360"}  # of an angle, in radians and in degrees
 WRAPPED_SHARE = 0.9  # of a turn: a jump by so much, in a column that stays within one, is no motion
@@ -74,11 +75,9 @@ def read_pairs(
     without = len(recordings.labels) - len(np.unique(pairs.recording))
     single = int((np.bincount(recordings.recording) == 1).sum())
     if without > single:
-        note = (
-            f"{without - single} of {len(recordings.labels)} recordings have longer steps than the others and"
-            " give no pairs; recordings.pair_step in the study says how long a step may be"
-        )
-        recordings = replace(recordings, notes=(*recordings.notes, note))
+        values = {"recordings": without - single, "all": len(recordings.labels)}
+        remark = Remark("data.recordings_without_pairs", values)
+        recordings = replace(recordings, remarks=(*recordings.remarks, remark))
     return recordings, pairs
 
 
@@ -111,10 +110,10 @@ def _checked_for_learning(
             remedy = "leave it out of the states" if chosen else "record how the system moves"
             raise InputError(file, f"column {recordings.titles[first]}", fault, remedy)
         kept = np.flatnonzero(~still)
-        notes = [
-            f"the column '{recordings.titles[place]}' is {recordings.values[0, place]:g} in every row and was"
-            " left out"
-            for place in np.flatnonzero(still)
+        remarks = [
+            Remark("data.column_at_rest", {"column": recordings.titles[place], "value": float(values[0])})
+            for place, values in enumerate(recordings.values.T)
+            if still[place]
         ]
         recordings = replace(
             recordings,
@@ -122,25 +121,19 @@ def _checked_for_learning(
             units=tuple(recordings.units[place] for place in kept),
             headings=tuple(recordings.headings[place] for place in kept) if recordings.headings else (),
             values=np.ascontiguousarray(recordings.values[:, kept]),
-            notes=(*recordings.notes, *notes),
+            remarks=(*recordings.remarks, *remarks),
         )
     if len(recordings.labels) == 1 and not hidden_velocities:
         floors = noise_floors(recordings)
         if floors is not None and all(floor.process == 0 for floor in floors):
             raise InputError(file, "", SINGLE_RECORDING, SINGLE_RECORDING_REMEDY)
-    return replace(recordings, notes=(*recordings.notes, *unusual(recordings)))
+    return replace(recordings, remarks=(*recordings.remarks, *unusual(recordings)))
 
 
-def unusual(recordings: Recordings) -> list[str]:
+def unusual(recordings: Recordings) -> list[Remark]:
     """What is unusual, and may be wrong."""
-    said = []
     single = int((np.bincount(recordings.recording) == 1).sum())
-    if single:
-        said.append(
-            "one recording has a single sample, which tells nothing"
-            if single == 1
-            else f"{single} recordings have a single sample each, which tells nothing"
-        )
+    found = [Remark("data.single_samples", {"recordings": single})] if single else []
     inside = recordings.recording[1:] == recordings.recording[:-1]
     for title, values in zip(recordings.titles, recordings.values.T, strict=True):
         jumps = np.abs(np.diff(values)[inside])
@@ -148,12 +141,8 @@ def unusual(recordings: Recordings) -> list[str]:
             count = int((jumps > WRAPPED_SHARE * turn).sum())
             between = ((jumps > 0.5 * turn) & (jumps < WRAPPED_SHARE * turn)).any()
             if count and not between and np.ptp(values) <= turn * (1 + 1e-6):
-                times = "once" if count == 1 else f"{count} times"
-                said.append(
-                    f"'{title}' jumps by {text} {times}, as an angle does that wraps around: unwrap it first,"
-                    " or record its sine and cosine"
-                )
-    return said
+                found.append(Remark("data.wrapped_angle", {"column": title, "turn": text, "count": count}))
+    return found
 
 
 def in_stretches(recordings: Recordings, *, hidden_velocities: bool = False) -> Recordings:
@@ -181,12 +170,12 @@ def in_stretches(recordings: Recordings, *, hidden_velocities: bool = False) -> 
     longest = max(correlated_samples(column, runs) for column in recordings.values.T)
     cut = int(np.clip(count / (STRETCH_LENGTH * longest), FEWEST_STRETCHES, min(MOST_STRETCHES, count // 2)))
     label = recordings.labels[0]
-    note = f"there is one recording; it was cut into {cut} stretches, so that some can be held out"
+    remark = Remark("data.cut_recording", {"stretches": cut})
     return replace(
         recordings,
         labels=tuple(f"{label} ({number} of {cut})" for number in range(1, cut + 1)),
         recording=np.arange(count) * cut // count,
-        notes=(*recordings.notes, note),
+        remarks=(*recordings.remarks, remark),
     )
 
 
@@ -218,7 +207,7 @@ def joined(recordings: Recordings) -> Recordings:
 
 
 def without_slow_drift(recordings: Recordings) -> Recordings:
-    """A single long recording less what drifts slowly in it, which a note says for each state.
+    """A single long recording less what drifts slowly in it, which is remarked for each state.
 
     Of a record that supports two states the drift is what both levels have in common; of any other, what slow
     cosines explain. Several recordings come back as they are: how they begin may be a part of what they show.
@@ -228,7 +217,7 @@ def without_slow_drift(recordings: Recordings) -> Recordings:
     if floors is None or any(floor.process == 0 for floor in floors):
         return recordings
     found = switching(recordings)
-    flat, notes = recordings.values.copy(), list(recordings.notes)
+    flat, remarks = recordings.values.copy(), list(recordings.remarks)
     for state, values in enumerate(recordings.values.T):
         background = background_of(recordings, values)
         if found is not None and found.supported and state == found.state:
@@ -236,11 +225,12 @@ def without_slow_drift(recordings: Recordings) -> Recordings:
         if not background.half_periods:
             continue
         flat[:, state] -= background.values
-        unit = f" {recordings.units[state]}" if recordings.units[state] else ""
-        notes.append(
-            f"the background of '{recordings.titles[state]}' drifts slowly, over a range of"
-            f" {background.range:.3g}{unit}; it was taken off"
-        )
-    if len(notes) == len(recordings.notes):
+        told = {
+            "column": recordings.titles[state],
+            "range": background.range,
+            "unit": recordings.units[state],
+        }
+        remarks.append(Remark("data.drift_taken_off", told))
+    if len(remarks) == len(recordings.remarks):
         return recordings
-    return replace(recordings, values=flat, notes=tuple(notes))
+    return replace(recordings, values=flat, remarks=tuple(remarks))

@@ -17,6 +17,7 @@ import numpy as np
 
 from siq.errors import NumericalFailure
 from siq.numerics.files import whole_file
+from siq.remarks import Remark, sentence
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -55,8 +56,8 @@ class Recordings:
     headings
         What the file calls each measured column, where that is no name for a formula: ``bead x`` of
         ``bead_x``. Empty where all are called by their names.
-    notes
-        What was assumed or repaired when they were read, each a clause without a full stop.
+    remarks
+        What was assumed or repaired when they were read.
     """
 
     names: tuple[str, ...]
@@ -67,12 +68,17 @@ class Recordings:
     values: np.ndarray
     time_unit: str | None = None
     headings: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    remarks: tuple[Remark, ...] = ()
 
     @property
     def titles(self) -> tuple[str, ...]:
         """What people call each state: its heading in the file, or else its name."""
         return self.headings or self.names
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """`remarks` in words, each a clause without a full stop."""
+        return tuple(map(sentence, self.remarks))
 
     @classmethod
     def from_frame(
@@ -225,7 +231,7 @@ def read_recordings(
     """Read a long table of trajectories and check it.
 
     Rows of one recording need not stand together; they are grouped, in order of first appearance. What had to
-    be assumed, or could be put right without a guess, stands in `Recordings.notes`.
+    be assumed, or could be put right without a guess, stands in `Recordings.remarks`.
 
     Parameters
     ----------
@@ -300,10 +306,11 @@ def write_recordings(path: str | Path, recordings: Recordings) -> None:
     names, units = ("t", *recordings.names), (recordings.time_unit, *recordings.units)
     titles = (None, *(recordings.headings or (None,) * len(recordings.names)))
     fields = [field(name, unit, title) for name, unit, title in zip(names, units, titles, strict=True)]
-    notes = {"notes": json.dumps(recordings.notes, ensure_ascii=False)} if recordings.notes else None
+    remarks = [each.as_data() for each in recordings.remarks]
+    noted = {"notes": json.dumps(remarks, ensure_ascii=False)} if remarks else None
     table = pa.table(
         [label, pa.array(recordings.t), *(pa.array(column) for column in recordings.values.T)],
-        schema=pa.schema([pa.field("recording", label.type), *fields], metadata=notes),
+        schema=pa.schema([pa.field("recording", label.type), *fields], metadata=noted),
     )
     with whole_file(path) as partial:
         parquet.write_table(table, partial, compression="zstd", use_dictionary=["recording"])

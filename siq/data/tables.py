@@ -27,6 +27,7 @@ from siq.data.layout import layout_of
 from siq.data.recordings import TABLE, Recordings
 from siq.errors import InputError
 from siq.numerics.files import files_of
+from siq.remarks import Remark, sentence
 
 # Text that holds a number, and what may follow as its unit: "1.2mm", "5 %", but "3 1/s" only after a space.
 _NUMBER = r"(?:[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?(?i:nan|infinity|inf))"
@@ -93,13 +94,13 @@ def _checked(
     numbers = np.empty((len(used), len(cells[0])))
     found_units: list[str | None] = []
     faults: list[Fault] = []
-    notes = list(layout.notes)
+    remarks = list(layout.remarks)
     for index, (name, place) in enumerate(zip(("t", *layout.names), used, strict=True)):
         clock = _seconds_of_clock(file, called[0], cells[0]) if index == 0 else None
         cell_unit: str | None = "s"
         if clock is not None:
             numbers[index] = clock[0]
-            notes.append(f"the times were turned into seconds since the first, {clock[1]}")
+            remarks.append(Remark("data.seconds_of_clock", {"start": clock[1]}))
         else:
             shown = "t" if index == 0 else called[index]
             numbers[index], cell_unit, fault = _parse_numbers(file, shown, cells[index])
@@ -118,14 +119,14 @@ def _checked(
         order = order[np.argsort(recording[order], kind="stable")]
         rows = _Rows(order, recording[order], names)
     if dropped := numbers.shape[1] - len(rows.order):
-        notes.append(f"{dropped} empty row{'s were' if dropped > 1 else ' was'} left out")
+        remarks.append(Remark("data.empty_rows", {"rows": dropped}))
     if faults:
         raise min(faults, key=lambda each: each[0])[1]
-    rows = _trimmed(rows, numbers, notes)
+    rows = _trimmed(rows, numbers, remarks)
     if gaps:
-        rows = _without_gaps(rows, numbers, notes)
+        rows = _without_gaps(rows, numbers, remarks)
     _refuse_missing(file, numbers, rows, ["t", *layout.titles])
-    rows = _in_order(rows, numbers, layout.recording is not None, notes)
+    rows = _in_order(rows, numbers, layout.recording is not None, remarks)
     check_times(file, numbers[0][rows.order], rows.recording, rows.labels, rows.order)
     return Recordings(
         names=layout.names,
@@ -136,7 +137,7 @@ def _checked(
         values=np.ascontiguousarray(numbers[1:, rows.order].T),
         time_unit=found_units[0],
         headings=() if layout.titles == layout.names else layout.titles,
-        notes=tuple(notes),
+        remarks=tuple(remarks),
     )
 
 
@@ -300,7 +301,7 @@ def _seconds_of_clock(file: str, name: str, cells: Column) -> tuple[np.ndarray, 
     return ((values - start) / pd.Timedelta(seconds=1)).to_numpy(dtype=float), first or str(start)
 
 
-def _trimmed(rows: _Rows, numbers: np.ndarray, notes: list[str]) -> _Rows:
+def _trimmed(rows: _Rows, numbers: np.ndarray, remarks: list[Remark]) -> _Rows:
     """Without rows at the ends of recordings in which a number is missing, where two others are left."""
     whole = ~np.isnan(numbers[:, rows.order]).any(axis=0)
     place, count = np.arange(len(whole)), len(rows.labels)
@@ -312,15 +313,12 @@ def _trimmed(rows: _Rows, numbers: np.ndarray, notes: list[str]) -> _Rows:
     dropped = int((~keep).sum())
     if dropped == 0:
         return rows
-    at = len(np.unique(rows.recording[~keep]))
-    notes.append(
-        f"{_count(dropped, 'row')} with missing values at the beginning or the end of"
-        f" {_count(at, 'recording')} {'was' if dropped == 1 else 'were'} left out"
-    )
+    values = {"rows": dropped, "recordings": len(np.unique(rows.recording[~keep]))}
+    remarks.append(Remark("data.rows_at_ends", values))
     return _Rows(rows.order[keep], rows.recording[keep], rows.labels)
 
 
-def _without_gaps(rows: _Rows, numbers: np.ndarray, notes: list[str]) -> _Rows:
+def _without_gaps(rows: _Rows, numbers: np.ndarray, remarks: list[Remark]) -> _Rows:
     """Without rows in which a measured value is missing, where they are the few.
 
     Where most are missing, the columns were hardly meant to be one state, and they are refused.
@@ -329,11 +327,7 @@ def _without_gaps(rows: _Rows, numbers: np.ndarray, notes: list[str]) -> _Rows:
     count = int(missing.sum())
     if not count or 2 * count > len(missing):
         return rows
-    many = count > 1
-    notes.append(
-        f"{count} row{'s' if many else ''} in which a value is missing {'were' if many else 'was'} left out;"
-        f" nothing is learned across the gap{'s' if many else ''}"
-    )
+    remarks.append(Remark("data.rows_with_gaps", {"rows": count}))
     present, recording = np.unique(rows.recording[~missing], return_inverse=True)
     return _Rows(rows.order[~missing], recording, tuple(rows.labels[place] for place in present))
 
@@ -355,7 +349,7 @@ def _refuse_missing(file: str, numbers: np.ndarray, rows: _Rows, called: Sequenc
     raise InputError(file, f"row {row + 1}, column {column}", fault, remedy)
 
 
-def _in_order(rows: _Rows, numbers: np.ndarray, labelled: bool, notes: list[str]) -> _Rows:
+def _in_order(rows: _Rows, numbers: np.ndarray, labelled: bool, remarks: list[Remark]) -> _Rows:
     """Without rows that stand twice, sorted where in no order; a recording begins where the time starts over.
 
     `labelled` says that the table itself tells where its recordings begin.
@@ -387,16 +381,8 @@ def _in_order(rows: _Rows, numbers: np.ndarray, labelled: bool, notes: list[str]
             twice += len(piece) - len(once)
             parts.append(once)
             labels.append(label if len(pieces) == 1 else f"{label}/{number}" if label != "0" else str(number))
-    if was_sorted:
-        notes.append(
-            f"the rows of {_count(was_sorted, 'recording')} stood in no order and were sorted by time"
-        )
-    if begun:
-        times = "once" if begun == 1 else f"{begun} times"
-        notes.append(f"the time starts over {times}, and each time a new recording begins")
-    if twice:
-        were = "was" if twice == 1 else "were"
-        notes.append(f"{_count(twice, 'row')} stood twice and {were} taken once")
+    counted = (("data.rows_sorted", was_sorted), ("data.time_starts_over", begun), ("data.rows_twice", twice))
+    remarks += [Remark(code, {"count": count}) for code, count in counted if count]
     lengths = [len(part) for part in parts]
     return _Rows(np.concatenate(parts), np.repeat(np.arange(len(parts)), lengths), tuple(labels))
 
@@ -405,10 +391,6 @@ def _once(rows: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     """The rows without those that are, to the last number, like the row before."""
     own = numbers[:, rows]
     return rows[np.append(True, ~(own[:, 1:] == own[:, :-1]).all(axis=0))]
-
-
-def _count(number: int, noun: str) -> str:
-    return f"one {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def check_times(
@@ -474,11 +456,11 @@ def _joined(files: Sequence[Path], tables: Sequence[Recordings], folder: str) ->
     )
     time_unit = agreed("t", [table.time_unit for table in tables])
     starts = np.cumsum([0, *(len(table.labels) for table in tables)])
-    held = "one recording each" if len(labels) == len(files) else f"with {len(labels)} recordings"
-    notes = [f"the folder holds {len(files)} files{',' if len(labels) == len(files) else ''} {held}"]
-    for note in dict.fromkeys(note for table in tables for note in table.notes):
-        having = sum(note in table.notes for table in tables)
-        notes.append(note if having == len(tables) else f"in {having} of {len(tables)} files {note}")
+    remarks = [Remark("data.folder", {"files": len(files), "recordings": len(labels)})]
+    for text, remark in {sentence(each): each for table in tables for each in table.remarks}.items():
+        having = sum(remark in table.remarks for table in tables)
+        values = {"files": having, "all": len(tables), "text": text}
+        remarks.append(remark if having == len(tables) else Remark("data.in_some_files", values))
     return Recordings(
         names=first.names,
         units=units,
@@ -490,5 +472,5 @@ def _joined(files: Sequence[Path], tables: Sequence[Recordings], folder: str) ->
         values=np.concatenate([table.values[:, order] for table, order in zip(tables, orders, strict=True)]),
         time_unit=time_unit,
         headings=first.headings,
-        notes=tuple(notes),
+        remarks=tuple(remarks),
     )
