@@ -1,9 +1,8 @@
-"""consequences"""
+"""What left-out physics, or other parameters, do to wells, barriers and escape times of a system."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -26,25 +25,6 @@ TINY = 1e-100  # what remains of a zero that Newton's method found
 WELL_SHIFT_TOLERANCE = 0.5  # of the spread of the states: how far a well may move and keep its name
 WELLS_COLUMNS = ("simulation", "item", "kind", "position", "U", "barrier", "prefactor", "note")
 ESCAPE_COLUMNS = ("transition", "intensity", "simulation", "time")
-
-
-@dataclass(frozen=True)
-class Consequences:
-    """Two landscapes beside each other.
-
-    Attributes
-    ----------
-    wells
-        Attractors, saddles and ways out of wells, with the columns `WELLS_COLUMNS`.
-    escape
-        Mean escape times, with the columns `ESCAPE_COLUMNS`; ε in the unit of U.
-    notes
-        What is not known, in sentences.
-    """
-
-    wells: pd.DataFrame
-    escape: pd.DataFrame
-    notes: tuple[str, ...]
 
 
 def obstacle(models: Sequence[Dynamics]) -> str:
@@ -100,7 +80,9 @@ def identified(model: Dynamics) -> FieldEstimate:
     )  # fmt: skip
 
 
-def compare_landscapes(models: dict[str, Dynamics], states: np.ndarray, *, seed: int = 0) -> Consequences:
+def compare_landscapes(
+    models: dict[str, Dynamics], states: np.ndarray, *, seed: int = 0
+) -> tuple[pd.DataFrame, pd.DataFrame, list[str]]:
     """Find the landscapes of simulations of one system, and put them beside each other.
 
     Parameters
@@ -111,6 +93,15 @@ def compare_landscapes(models: dict[str, Dynamics], states: np.ndarray, *, seed:
         Recorded states, shape ``(n, d)``: where landscapes are looked for.
     seed
         Decides which points are used where there are too many.
+
+    Returns
+    -------
+    wells
+        Attractors, saddles and ways out of wells, with the columns `WELLS_COLUMNS`.
+    escape
+        Mean escape times, with the columns `ESCAPE_COLUMNS`; ε in the unit of U.
+    notes
+        What is not known, in sentences.
 
     Raises
     ------
@@ -141,10 +132,10 @@ def compare_landscapes(models: dict[str, Dynamics], states: np.ndarray, *, seed:
     if all(len([row for row in wells if row["simulation"] == name and row["kind"] == "attractor"]) < 2
            for name in models):  # fmt: skip
         notes.append("there is one well only, which noise does not leave for another")
-    return Consequences(
+    return (
         pd.DataFrame(wells, columns=list(WELLS_COLUMNS)),
         pd.DataFrame(_escapes(barriers), columns=list(ESCAPE_COLUMNS)),
-        tuple(notes),
+        notes,
     )
 
 

@@ -45,36 +45,27 @@ def diagnosis(given: Given, settings: PipelineSettings) -> Any:
 @task("verdict", "card", "recalibrated", "system", "forces")
 def mismatch_landscape(given: Given, settings: PipelineSettings) -> Any:
     """What left-out physics, or other parameters, do to the wells of a system."""
+    import numpy as np
     import pandas as pd
 
-    from workflow.consequences import ESCAPE_COLUMNS, WELLS_COLUMNS, Consequences
-
-    found = _consequences(given)
-    if isinstance(found, str):
-        wells, escape = (pd.DataFrame(columns=list(names)) for names in (WELLS_COLUMNS, ESCAPE_COLUMNS))
-        found = Consequences(wells, escape, (found,))
-    return {"wells": found.wells, "escape": found.escape, "notes": list(found.notes)}
-
-
-def _consequences(given: Given) -> Any:
-    """Landscapes, or why there are none."""
-    import numpy as np
-
     from siq.errors import NumericalFailure
-    from workflow.consequences import compare_landscapes, obstacle
+    from workflow.consequences import ESCAPE_COLUMNS, WELLS_COLUMNS, compare_landscapes, obstacle
 
+    wells, escape = (pd.DataFrame(columns=list(names)) for names in (WELLS_COLUMNS, ESCAPE_COLUMNS))
     verdict = given.verdict["verdict"]
     if verdict not in COMPARED:
-        return f"The verdict is “{verdict}”: there are no two landscapes to compare."
+        notes = [f"The verdict is “{verdict}”: there are no two landscapes to compare."]
+        return {"wells": wells, "escape": escape, "notes": notes}
     files = {"before": "card", "recalibrated": "recalibrated", "augmented": "system"}
     models = {name: getattr(given, files[name]) for name in COMPARED[verdict]}
     if reason := obstacle(list(models.values())):
-        return reason
+        return {"wells": wells, "escape": escape, "notes": [reason]}
     states = given.forces[list(next(iter(models.values())).states)].to_numpy(dtype=float)
     try:
-        return compare_landscapes(models, states[np.isfinite(states).all(axis=1)])
+        wells, escape, notes = compare_landscapes(models, states[np.isfinite(states).all(axis=1)])
     except NumericalFailure as error:
-        return f"There is no landscape to compare: {error}."
+        notes = [f"There is no landscape to compare: {error}."]
+    return {"wells": wells, "escape": escape, "notes": notes}
 
 
 @task(

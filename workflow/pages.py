@@ -214,7 +214,7 @@ def page(given: Given, settings: PipelineSettings) -> Any:
         landscape = summarise(stored, record=tables["record"], run=number)
     view = Path(source["drawn"]) / "interactive.html"
     lines, seen = read_inspection(source["drawn"])
-    folders = [source["drawn"], *source["drawn_landscape"], source["drawn_density"]]
+    folders = [source[name] for name in ("drawn", "drawn_landscape", "drawn_density") if given.path(name)]
     images, vectors = _files(folders, ".png"), _files(folders, ".svg")
     results = StudyResults(
         tables,

@@ -93,22 +93,28 @@ def landscape_rows(run: int, found: Landscape | None, remark: str | None = None)
         tops[place(way.saddle.position)] = min(top, tops.get(place(way.saddle.position), np.inf))
     noise = found.noise
     rows: list[dict[str, object]] = []
-    for one in found.equilibria:
-        index = heights.get(place(one.position))
-        eigenvalues = ", ".join(_complex(value) for value in one.eigenvalues)
+    for one in (*found.equilibria, *found.cycles, *found.parting):
+        if isinstance(one, Cycle):  # one of its states, the Floquet exponents
+            index = next((at for at, other in enumerate(found.attractors) if other is one), None)
+            multipliers = ", ".join(_complex(value) for value in one.multipliers)
+            further = {"note": f"period {one.period:.8g}, Floquet multipliers {multipliers}"}
+        else:
+            index = heights.get(place(one.position))
+            further = {}
+            if index is not None:
+                further = _time(found, mean_residence_time(found.exits(index), noise))
         rows.append(
             {
                 "run": run,
                 "item": "" if index is None else names[index],
                 "kind": one.kind,
                 "position": place(one.position),
-                "eigenvalues": eigenvalues,
+                "eigenvalues": ", ".join(_complex(value) for value in one.eigenvalues),
                 "U": tops.get(place(one.position), np.nan) if index is None else found.heights[index],
                 "basin": np.nan if index is None else found.basins[index],
             }
-            | ({} if index is None else _time(found, mean_residence_time(found.exits(index), found.noise)))
+            | further
         )
-    rows += [_cycle_row(run, found, one, names, tops) for one in (*found.cycles, *found.parting)]
     for way in found.transitions:
         beyond = "outside" if way.end is None else names[way.end]
         rows.append(
@@ -129,24 +135,6 @@ def landscape_rows(run: int, found: Landscape | None, remark: str | None = None)
             | _time(found, None if noise is None else mean_exit_time(way.exit, noise))
         )
     return as_table("landscape", rows)
-
-
-def _cycle_row(
-    run: int, found: Landscape, one: Cycle, names: list[str], tops: dict[str, float]
-) -> dict[str, object]:
-    """Of a cycle, one of its states, the Floquet exponents, and a note with period and multipliers."""
-    index = next((at for at, other in enumerate(found.attractors) if other is one), None)
-    multipliers = ", ".join(_complex(value) for value in one.multipliers)
-    return {
-        "run": run,
-        "item": "" if index is None else names[index],
-        "kind": one.kind,
-        "position": place(one.position),
-        "eigenvalues": ", ".join(_complex(value) for value in one.eigenvalues),
-        "U": tops.get(place(one.position), np.nan) if index is None else found.heights[index],
-        "basin": np.nan if index is None else found.basins[index],
-        "note": f"period {one.period:.8g}, Floquet multipliers {multipliers}",
-    }
 
 
 def _complex(value: complex) -> str:

@@ -56,23 +56,7 @@ def _coefficient_table(
     *,
     terms: tuple[str, ...],
 ) -> pd.DataFrame:
-    """Every coefficient of U, V, f and g beside the exact one.
-
-    Parameters
-    ----------
-    run, method
-        Whose formulas these are.
-    identified, exact
-        The formulas, and the exact ones where known.
-    terms
-        Terms of the library, of which all are listed, zeros included.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns ``run method component term estimate exact standard_error``; `exact` and
-        `standard_error` are missing where nothing is known.
-    """
+    """Every coefficient of U, V, f and g beside the exact one; all terms of the library, zeros included."""
     rows: list[dict[str, object]] = []
     known = exact.components() if exact is not None else {}
     for component, formula in identified.components().items():

@@ -6,7 +6,7 @@ import time
 from dataclasses import replace
 
 from benchmarks.discrepancies.answers import Answer
-from benchmarks.proof.foreign_scores.rulers import said_place
+from benchmarks.proof.foreign_scores.scores import said_place
 from benchmarks.proof.scoring import NOTHING
 from siq.diagnosis.diagnosis import solve_case
 from siq.diagnosis.study import Allowance, Comparison

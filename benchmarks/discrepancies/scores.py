@@ -14,8 +14,7 @@ from benchmarks.discrepancies.added import Added
 from benchmarks.discrepancies.answers import Answer, Term, answer_file, read_answer
 from benchmarks.discrepancies.cases import CaseFiles
 from benchmarks.discrepancies.truth import TrueCase, true_case
-from benchmarks.proof.foreign_scores.rulers import NEAR, name_error, true_place, unreal_names
-from benchmarks.proof.foreign_scores.scores import first_states
+from benchmarks.proof.foreign_scores.scores import NEAR, first_states, name_error, true_place, unreal_names
 from benchmarks.proof.keys import CaseKey, read_key, read_truth
 from benchmarks.proof.scoring import NOISE, NOTHING_CONCEALED, judgement, model_of
 from benchmarks.proof.scoring import Answer as ProofAnswer

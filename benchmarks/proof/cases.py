@@ -1,7 +1,6 @@
 """Cases: what both generators of the proof share, without anything of `siq`.
 
-What a case is and how it is written, how designs take turns, which parameters of a card are wrong, and which
-rows of a motion a key keeps.
+What is decided of a case beforehand, what a case and its key are, and how they are written.
 """
 
 from __future__ import annotations
@@ -19,6 +18,48 @@ from pyarrow import parquet
 
 HELD_OUT = 0.25  # share of the recordings
 KEY_ROWS = 500
+NOISE_LEVELS = (40.0, 30.0, 20.0)  # signal-to-noise ratios, in decibels
+
+
+class RanAway(Exception):
+    """A motion that does not stay bounded."""
+
+
+@dataclass(frozen=True)
+class Design:
+    """What is decided of a case before anything is simulated; small, so that cases are made in parallel.
+
+    Attributes
+    ----------
+    name
+        Its neutral name.
+    system
+        Name of its system, or of the family that it is drawn from.
+    kind
+        ``null``, ``shift``, ``mechanism``, ``process noise`` or ``withheld``.
+    mechanism
+        Name of what is concealed, or kind of the function; none for nulls and shifts.
+    shifted
+        Whether the card has wrong parameters.
+    strength
+        How strong an effect is aimed at, or where between the weakest and the strongest, from 0 to 1.
+    noise_db
+        Signal-to-noise ratio of the measurement, in decibels.
+    without
+        Dictionary entries that the diagnosis is to do without.
+    seed
+        Seed of everything else.
+    """
+
+    name: str
+    system: str
+    kind: str
+    mechanism: str | None
+    shifted: bool
+    strength: float | None
+    noise_db: float
+    without: tuple[str, ...]
+    seed: int
 
 
 @dataclass(frozen=True)
@@ -67,6 +108,49 @@ class ProofCase:
         np.savez_compressed(keys / f"{name}.npz", **self.truth)
 
 
+def check_shares(shares: Mapping[str, float], kinds: Sequence[str]) -> None:
+    """Refuse shares of other kinds, or that do not sum to one."""
+    if set(shares) - set(kinds) or abs(sum(shares.values()) - 1) > 1e-9:
+        raise ValueError(f"shares {dict(shares)} are not shares of {', '.join(kinds)} that sum to 1")
+
+
+def in_random_order(drawn: Sequence[Mapping[str, Any]], rng: np.random.Generator) -> list[Design]:
+    """Designs in an order that says nothing, with names that follow it."""
+    order = rng.permutation(len(drawn))
+    return [Design(name=f"case-{number:04d}", **drawn[i]) for number, i in enumerate(order, start=1)]
+
+
+def key_of(
+    design: Design,
+    effect: Any,
+    rng: np.random.Generator,
+    *,
+    system: str,
+    mechanism: str | None,
+    strength: float | None,
+    shifts: Mapping[str, Mapping[str, float]],
+    **further: Any,
+) -> dict[str, Any]:
+    """What the key of a case says, with an effect of either generator, or None.
+
+    Its salt is drawn, so that nobody finds the key out by trying digests.
+    """
+    return {
+        "case": design.name,
+        "salt": rng.bytes(16).hex(),
+        "system": system,
+        "kind": design.kind,
+        "mechanism": mechanism,
+        "equations": list(effect.equations) if effect else [],
+        "coordinates": list(effect.coordinates) if effect else [],
+        "noise_db": design.noise_db,
+        "strength": strength,
+        "shifts": shifts,
+        "effect": effect.formulas() if effect else {},
+        **further,
+    }
+
+
 def turns(choices: Sequence[Any], rng: np.random.Generator) -> Iterator[Any]:
     """All choices in random order, again and again."""
     while True:
@@ -82,8 +166,13 @@ def wrong_parameters(
     shifts = {}
     for name in map(str, rng.choice(free, size=count, replace=False)):
         factor = 1 + float(rng.choice([-1, 1])) * rng.uniform(least, most)
-        shifts[name] = {"card": float(f"{true[name] * factor:.4g}"), "true": true[name]}
+        shifts[name] = {"card": rounded(true[name] * factor), "true": true[name]}
     return shifts
+
+
+def rounded(value: float, digits: int = 4) -> float:
+    """A number with few digits, so that what a key says is exactly what was simulated."""
+    return float(f"{value:.{digits}g}")
 
 
 def thinned(count: int) -> np.ndarray:

@@ -76,8 +76,7 @@ def _oracle(case: Comparison, key: CaseKey) -> Oracle:
     best = fit_with_process_noise_as_needed(true, case.learn, recalibrated, x=x)
     if not best.converged:
         # A sensor's fault moves all states: begun further from them, or from the recalibrated parameters.
-        known = {each.name: each.value for each in recalibrated.model.parameters}
-        near = true.with_values(np.array([known.get(each.name, each.value) for each in true.parameters]))
+        near = true.with_values(own_values(true, recalibrated.model))
         trials = [best, fit_with_process_noise_as_needed(near, case.learn, recalibrated, x=x)]
         trials.append(fit_with_process_noise_as_needed(true, case.learn, recalibrated, level=100.0, x=x))
         best = max(trials, key=lambda each: (each.converged, each.log_likelihood))
@@ -122,6 +121,12 @@ def true_model(model: Dynamics, key: CaseKey) -> tuple[Dynamics, Mapping[str, st
         for each in candidate.model.parameters
     ]
     return candidate.model.with_values(np.array(values)), names
+
+
+def own_values(system: Dynamics, other: Dynamics) -> np.ndarray:
+    """The values that another simulation has of a system's parameters; its own where it has none."""
+    known = {each.name: each.value for each in other.parameters}
+    return np.array([known.get(each.name, each.value) for each in system.parameters])
 
 
 def built(model: Dynamics, key: CaseKey) -> MechanismCandidate:
@@ -186,7 +191,7 @@ def pairing(augmented: Dynamics, true: Dynamics, base: Dynamics) -> dict[str, tu
         values[name] = values[name] * np.where(np.arange(POINTS) % 3 == 0, -1.0, 1.0)
     values |= {f"truth {name}": rng.uniform(0.2, 2.0, POINTS) for name in theirs}
     further = rng.uniform(-1, 1, (true.dimension - base.dimension, POINTS))
-    target = _evaluated(true, values | {name: values[f"truth {name}"] for name in theirs}, further)
+    target = _evaluator(true)(values | {name: values[f"truth {name}"] for name in theirs}, further)
     # Signs are changed as seldom as possible.
     options = sorted(
         itertools.product(choices, repeat=len(ours)), key=lambda pairs: sum(sign < 0 for _, sign in pairs)
@@ -199,10 +204,6 @@ def pairing(augmented: Dynamics, true: Dynamics, base: Dynamics) -> dict[str, tu
         if np.allclose(evaluate(values | mapped, further), target, rtol=SAME, atol=1e-12, equal_nan=True):
             return dict(zip(ours, pairs, strict=True))
     return None
-
-
-def _evaluated(model: Dynamics, values: Mapping[str, np.ndarray], further: np.ndarray) -> np.ndarray:
-    return _evaluator(model)(values, further)
 
 
 def _evaluator(model: Dynamics) -> Callable[[Mapping[str, np.ndarray], np.ndarray], np.ndarray]:

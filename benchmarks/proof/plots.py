@@ -9,6 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from benchmarks.proof.scoring import EXPECTED, FAILED
 from siq.report.plots.style import (
     BLUE,
     COLUMN_WIDTH,
@@ -21,15 +22,7 @@ from siq.report.plots.style import (
     say,
 )
 
-KINDS = ("null", "shift", "mechanism", "process noise", "withheld")
-VERDICTS = ("no mismatch", "parameter shift", "missing physics", "unexplained", "failed")
-RIGHT = {
-    "null": "no mismatch",
-    "shift": "parameter shift",
-    "mechanism": "missing physics",
-    "process noise": "missing physics",
-    "withheld": "unexplained",
-}
+VERDICTS = ("no mismatch", "parameter shift", "missing physics", "unexplained", FAILED)
 EDGES = np.array([-np.inf, 10.0, 30.0, 100.0, 300.0, 1000.0, 10_000.0, np.inf])
 MARKERS = {40.0: ("o", BLUE), 30.0: ("s", VERMILLION), 20.0: ("^", GREEN)}
 
@@ -61,8 +54,8 @@ def plot_proof(scores: pd.DataFrame, *, strong: float = 100.0) -> Figure:
 
 
 def _verdicts(axes: Axes, scores: pd.DataFrame) -> None:
-    kinds = [kind for kind in KINDS if (scores["kind"] == kind).any()]
-    verdicts = [each for each in VERDICTS if each != "failed" or (scores["verdict"] == each).any()]
+    kinds = [kind for kind in EXPECTED if (scores["kind"] == kind).any()]
+    verdicts = [each for each in VERDICTS if each != FAILED or (scores["verdict"] == each).any()]
     counts = np.array(
         [
             [((scores["kind"] == kind) & (scores["verdict"] == each)).sum() for each in verdicts]
@@ -74,7 +67,7 @@ def _verdicts(axes: Axes, scores: pd.DataFrame) -> None:
     for (row, column), count in np.ndenumerate(counts):
         axes.text(column, row, str(count), ha="center", va="center", color="black" if count else GREY)
     for row, kind in enumerate(kinds):
-        column = verdicts.index(RIGHT[kind])
+        column = verdicts.index(EXPECTED[kind])
         axes.plot(
             column + np.array([-0.46, 0.46, 0.46, -0.46, -0.46]),
             row + np.array([-0.44, -0.44, 0.44, 0.44, -0.44]),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -129,9 +129,7 @@ def score_case(name: str, folder: str | Path, keys: str | Path, answer: Answer) 
     InputError
         When a file of the case, or its key, cannot be used.
     """
-    folder, keys = Path(folder), Path(keys)
-    key, truth = read_key(keys / f"{name}.json"), read_truth(keys / f"{name}.npz")
-    case = read_case(folder / "system.yaml", recordings_of(folder), study_of(folder))
+    case, key, truth = read_opened(name, Path(folder), Path(keys))
     row = judgement(key, answer) | {"case": name}
     oracle = oracle_of(case, key)
     notes = [answer.failure, oracle.note]
@@ -146,16 +144,12 @@ def score_case(name: str, folder: str | Path, keys: str | Path, answer: Answer) 
     return row | {"note": "; ".join(each for each in notes if each)}
 
 
-def recordings_of(folder: Path) -> Path:
-    """The file of recordings in the folder of a case."""
-    csv = folder / "recordings.csv"
-    return csv if csv.is_file() else folder / "recordings.parquet"
-
-
-def study_of(folder: Path) -> Path | None:
-    """The study in the folder of a case, None where there is none."""
-    study = folder / "study.yaml"
-    return study if study.is_file() else None
+def read_opened(name: str, folder: Path, keys: Path) -> tuple[Comparison, CaseKey, Truth | None]:
+    """A case as the diagnosis had it, its key, and the arrays of the key where there are any."""
+    csv, study = folder / "recordings.csv", folder / "study.yaml"
+    recordings = csv if csv.is_file() else folder / "recordings.parquet"
+    case = read_case(folder / "system.yaml", recordings, study if study.is_file() else None)
+    return case, read_key(keys / f"{name}.json"), read_truth(keys / f"{name}.npz")
 
 
 def score_table(rows: list[dict[str, Any]], columns: Mapping[str, str] = COLUMNS) -> pd.DataFrame:
@@ -166,41 +160,46 @@ def score_table(rows: list[dict[str, Any]], columns: Mapping[str, str] = COLUMNS
     return frame.astype(dict(columns)).sort_values("case", ignore_index=True)
 
 
-def judgement(key: CaseKey, answer: Answer) -> dict[str, Any]:
-    """What follows from verdict and key alone."""
-    verdict: Mapping[str, Any] = answer.verdict or {"verdict": FAILED, "mechanisms": [], "location": None}
-    said = str(verdict["verdict"])
-    named = list(verdict["mechanisms"])
-    reported = reported_class(named)
-    names = [str(each["name"]) for each in named]
-    is_null = key.kind in NOTHING_CONCEALED
-    right = said == EXPECTED[key.kind]
-    if key.kind == NOISE:
-        right = right and names == [NOISE]
-    place = verdict.get("location") or {}
+def stated(key: CaseKey, answer: Answer, names: Sequence[str]) -> dict[str, Any]:
+    """What of a key and a verdict stands in every table of scores; `names` are those that count."""
+    said = str((answer.verdict or {}).get("verdict", FAILED))
+    nothing = said in NOTHING or (said == "missing physics" and not names)
+    found = not nothing and said != FAILED
     return {
         "system": key.system,
         "kind": key.kind,
-        "mechanism": key.mechanism or "",
         "noise_db": np.nan if key.noise_db is None else key.noise_db,
         "strength": np.nan if key.strength is None else key.strength,
         "shifted": bool(key.shifts),
         "verdict": said,
         "named": ", ".join(names),
+        "false_alarm": key.kind in NOTHING_CONCEALED and found,
+        "detected": found,
+        "seconds": answer.seconds,
+    }
+
+
+def judgement(key: CaseKey, answer: Answer) -> dict[str, Any]:
+    """What follows from verdict and key alone."""
+    verdict: Mapping[str, Any] = answer.verdict or {}
+    named = list(verdict.get("mechanisms", ()))
+    reported = reported_class(named)
+    names = [str(each["name"]) for each in named]
+    row = stated(key, answer, names)
+    place = verdict.get("location") or {}
+    return row | {
+        "mechanism": key.mechanism or "",
         "reported_class": ", ".join(reported),
         "class_size": len(reported),
-        "right": right,
+        "right": row["verdict"] == EXPECTED[key.kind] and (key.kind != NOISE or names == [NOISE]),
         "truth_in_class": key.mechanism in reported,
-        "false_alarm": is_null and said not in (*NOTHING, FAILED),
         "deterministic_under_noise": key.kind == NOISE and any(name != NOISE for name in names),
-        "detected": said not in (*NOTHING, FAILED),
         "equation_right": bool(place) and set(key.equations) <= set(place.get("equations", {})),
         "coordinate_right": bool(place) and coordinate_right(key, place, named),
         "location": f"{', '.join(place.get('equations', {}))} along {place.get('coordinate')}"
         if place
         else "",
         "delta_chi2": _number(named[0]["evidence"]["delta_chi2"]) if named else np.nan,
-        "seconds": answer.seconds,
     }
 
 
@@ -306,24 +305,27 @@ def functional_error(
         return np.nan, "the key has no arrays"
     if augmented.dimension > base.dimension or augmented.delays:
         return np.nan, "no functional error: the effect has a memory"
-    signals = Signals(truth.inputs.T, np.zeros((0, len(truth.t))), np.zeros((0, len(truth.t))), truth.t)
-    states = truth.states.T
     if key.effect.outputs and not key.equations:
-        true, _ = true_model(base, key)
-        places = [base.output_names.index(name) for name in key.effect.outputs]
-        ours = augmented.functions.outputs(states, signals, augmented.values)[places]
-        theirs = true.functions.outputs(states, signals, true.values)[places]
-        without = base.functions.outputs(states, signals, base.values)[places]
+        places = [base.dimension + base.output_names.index(name) for name in key.effect.outputs]
+        theirs, without = (values_at(each, truth)[places] for each in (true_model(base, key)[0], base))
     else:
         places = [base.states.index(name) for name in key.equations]
-        ours = augmented.functions.rates(states, signals, augmented.values)[places]
         theirs, without = truth.true.T[places], truth.without.T[places]
+    ours = values_at(augmented, truth)[places]
     size = np.sqrt(np.mean((theirs - without) ** 2, axis=1))
     error = np.sqrt(np.mean((ours - theirs) ** 2, axis=1))
     seen = size > 0
     if not seen.any():
         return np.nan, "no functional error: the effect is zero at all rows"
     return float(np.sqrt(np.mean((error[seen] / size[seen]) ** 2))), ""
+
+
+def values_at(model: Dynamics, truth: Truth) -> np.ndarray:
+    """Time derivatives and outputs at the rows of a key, shape ``(d + m, n)``."""
+    none = np.zeros((0, len(truth.t)))
+    signals, states = Signals(truth.inputs.T, none, none, truth.t), truth.states.T
+    functions = (model.functions.rates, model.functions.outputs)
+    return np.concatenate([one(states, signals, model.values) for one in functions])
 
 
 def intensity_ratio(key: CaseKey, parameters: Mapping[str, Mapping[str, Any]]) -> float:

@@ -188,8 +188,7 @@ def score_proof(given: Given, settings: PipelineSettings) -> Any:
 @task("scores")
 def score_foreign(given: Given, settings: PipelineSettings) -> Any:
     """The page of the proof on random systems."""
-    from benchmarks.proof.foreign_scores.rulers import NEAR
-    from benchmarks.proof.foreign_scores.scores import ENOUGH
+    from benchmarks.proof.foreign_scores.scores import ENOUGH, NEAR
     from benchmarks.proof.plots import plot_foreign_proof
     from benchmarks.proof.targets import foreign_failures, foreign_targets
 

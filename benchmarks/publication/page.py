@@ -20,7 +20,9 @@ from benchmarks.publication.publication import (
     attractor_rows,
     gradient_coefficients,
     numbers,
+    own_equations,
     parameter_table,
+    published_decomposition,
     shown,
 )
 from siq.inference.field_estimate import read_field
@@ -35,7 +37,7 @@ from siq.systems.dynamics import Dynamics
 from siq.workflow.models import ModelFiles, shown_formula
 from siq.workflow.tables import Method, as_table
 from workflow.files import read_table
-from workflow.published import PublishedFigure, own_equations, published_decomposition
+from workflow.published import PublishedFigure
 from workflow.scoring import summary_row, summary_table
 
 POINTS = 20_000  # of the domain, on which published formulas are held against their own equations

@@ -18,10 +18,12 @@ from pydantic import BaseModel, ConfigDict
 from siq.inference.library import linear_combination
 from siq.numerics.files import read_document, validate
 from siq.numerics.text import number_text
+from siq.quasipotential.formulas import SymbolicDecomposition, downhill_formulas
+from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import parse_formula
 from siq.workflow.tables import as_table
-from workflow.published import PublishedFigure
+from workflow.published import PublishedFigure, published_formula
 from workflow.scoring import summary_row
 
 REPRODUCED_METHODS = ("refined", "regression")
@@ -178,6 +180,58 @@ def _root(dynamics: Dynamics, start: np.ndarray) -> np.ndarray:
     value = np.linalg.norm(dynamics.drift(found.x[None])[0])
     small = 1e-9 * float(np.linalg.norm(dynamics.jacobian(start[None])[0]) * np.linalg.norm(start))
     return np.asarray(found.x) if value <= small else np.full(len(start), np.nan)
+
+
+def published_decomposition(
+    figures: Mapping[str, PublishedFigure], symbols: Sequence[sympy.Symbol], diffusion: Diffusion
+) -> SymbolicDecomposition | None:
+    """The published V = U/2 and g, with f = -D∇V + g; None unless U and all of g were published."""
+    quasipotential = published_formula(figures, "U", symbols)
+    circulatory = [published_formula(figures, f"g_{symbol}", symbols) for symbol in symbols]
+    if quasipotential is None or any(one is None for one in circulatory):
+        return None
+    potential = sympy.expand(quasipotential / 2)
+    downhill = downhill_formulas(diffusion, [potential.diff(symbol) for symbol in symbols])
+    return SymbolicDecomposition(
+        symbols=tuple(symbols),
+        potential=potential,
+        circulatory=tuple(circulatory),
+        vector_field=tuple(sympy.expand(g - d) for g, d in zip(circulatory, downhill, strict=True)),
+    )
+
+
+def own_equations(one: SymbolicDecomposition, x: np.ndarray, vector_field: np.ndarray) -> dict[str, float]:
+    """How far a decomposition is from what it should fulfil, rms over points.
+
+    Parameters
+    ----------
+    one
+        V, g and f = -D∇V + g.
+    x
+        Shape ``(n, d)``.
+    vector_field
+        The true f there, shape ``(n, d)``.
+
+    Returns
+    -------
+    dict
+        ``orthogonality``: ∣∇V·g∣ over ∣∇V∣∣g∣; ``vector_field``: ∣-D∇V + g - f∣ over ∣f∣.
+    """
+    components = np.ascontiguousarray(x.T)
+    gradient, values = one.evaluate_gradient(components), one.evaluate(components)
+    d = x.shape[1]
+    circulatory, own = values[1 : 1 + d], values[1 + d :]
+    cosine = (gradient * circulatory).sum(axis=0)
+    sizes = np.linalg.norm(gradient, axis=0) * np.linalg.norm(circulatory, axis=0)
+    away = own - vector_field.T
+
+    def rms(values: np.ndarray) -> float:
+        return float(np.sqrt((values**2).mean()))
+
+    return {
+        "orthogonality": rms(cosine) / rms(sizes),
+        "vector_field": rms(np.linalg.norm(away, axis=0)) / rms(np.linalg.norm(vector_field, axis=1)),
+    }
 
 
 def numbers(summary: pd.DataFrame, patterns: Sequence[str]) -> pd.DataFrame:

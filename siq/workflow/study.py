@@ -383,13 +383,7 @@ def load_study_system(study: Study, *, file: str, systems: Path) -> Dynamics | N
 
 
 def _check_sweep(sweep: SweepOptions, system: Dynamics, *, file: str) -> None:
-    """Whether a system has the parameters that a study sweeps.
-
-    Raises
-    ------
-    InputError
-        When it has not.
-    """
+    """Refuse a sweep of parameters that a system has not."""
     known = [each.name for each in system.parameters]
     places = ("sweep.parameter", "sweep.second.parameter")
     for name, place in zip(sweep.names, places, strict=False):

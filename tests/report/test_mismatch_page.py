@@ -414,14 +414,14 @@ def test_a_force_tilts_the_wells_of_a_gradient_system(write):
     states = np.random.default_rng(0).uniform(-1.6, 1.6, size=(1500, 2))
     models = {"recalibrated": two_wells(write, 0.0), "augmented": two_wells(write, 0.1)}
     assert obstacle(list(models.values())) == ""
-    found = compare_landscapes(models, states)
-    ways = found.wells[found.wells["kind"] == "way out"].set_index(["simulation", "item"])["barrier"]
+    wells, escape, _ = compare_landscapes(models, states)
+    ways = wells[wells["kind"] == "way out"].set_index(["simulation", "item"])["barrier"]
     x = np.sort(np.roots([-1, 0, 1, 0.1]).real)
     energy = x**4 / 4 - x**2 / 2 - 0.1 * x
     left, right = (2 * (energy[1] - energy[end]) for end in (0, 2))
     assert ways["recalibrated"].to_numpy() == pytest.approx([0.5, 0.5], rel=0.01)
     assert sorted(ways["augmented"]) == pytest.approx(sorted([left, right]), rel=0.01)
-    assert set(found.escape["simulation"]) == {"recalibrated", "augmented"}
+    assert set(escape["simulation"]) == {"recalibrated", "augmented"}
 
 
 def test_identified_field_is_the_model_at_its_values(models):

@@ -5,7 +5,7 @@ import json
 import pandas as pd
 import pytest
 
-from benchmarks.proof.concealment.cases import CaseDesign, make_case
+from benchmarks.proof.concealment.cases import Design, make_case
 from benchmarks.proof.scoring import COLUMNS
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]
@@ -59,7 +59,7 @@ def test_other_keys_than_those_published_are_refused(proven):
 
 def test_cases_of_somebody_else_are_scored(proven):
     cases, keys = proven.path("theirs"), proven.path("their-keys")
-    design = CaseDesign("mine", "oscillator", "mechanism", "cubic stiffness", True, 0.15, 40.0, (), 8)
+    design = Design("mine", "oscillator", "mechanism", "cubic stiffness", True, 0.15, 40.0, (), 8)
     make_case(design).write(design.name, cases=cases, keys=keys)
     (keys / "mine.npz").unlink()  # arrays are welcome, not asked for
     proven.make("blind_test", "--config", f"cases={cases}", f"keys={keys}", study="config/config.yaml")

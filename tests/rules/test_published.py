@@ -8,6 +8,7 @@ import scipy.io
 import sympy
 from known_systems import exact_archetype
 
+from benchmarks.publication.publication import own_equations, published_decomposition
 from siq.errors import InputError
 from siq.systems.cards import load_system
 from siq.systems.diffusion import Diffusion
@@ -17,8 +18,6 @@ from workflow.published import (
     _component_terms,
     load_published,
     mesh_potential,
-    own_equations,
-    published_decomposition,
     published_formula,
     published_potentials,
 )

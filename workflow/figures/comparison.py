@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -268,58 +268,11 @@ def by_letters(name: str) -> str:
     return re.sub(r"\bA(\d+)\b", lambda found: well_name(int(found[1]) - 1), name)
 
 
-Extend = Literal["neither", "both", "min", "max"]
 COLOUR_MAP = "viridis"
 DIFFERENCE_MAP = "magma"
 LEVELS = 14
 MARGIN = 0.06  # of what is known: shown around it
 RIM: dict[str, Any] = {"path_effects": [withStroke(linewidth=2.0, foreground="white")]}
-
-
-def _shades(values: np.ndarray, level: float | None) -> dict[str, Any]:
-    """Round levels from the lowest value to the top, and what colours they have."""
-    lowest = float(np.nanmin(values))
-    top = float(np.nanmax(values)) if level is None else level
-    top = top if top > lowest else lowest + (abs(lowest) or 1.0)  # a flat landscape has levels, too
-    # The bottom is zero to rounding, and a level below it would have no meaning.
-    levels = MaxNLocator(LEVELS).tick_values(0.0 if abs(lowest) < 1e-3 * (top - lowest) else lowest, top)
-    extend: Extend = "max" if np.nanmax(values) > levels[-1] else "neither"
-    norm = BoundaryNorm(levels, 256, extend=extend)
-    return {"levels": levels, "norm": norm, "extend": extend, "cmap": COLOUR_MAP}
-
-
-def _draw_values(
-    axes: Axes,
-    axes_values: Sequence[np.ndarray],
-    values: np.ndarray,
-    shades: dict[str, Any],
-    *,
-    as_image: bool = False,
-) -> None:
-    hatch_unknown(axes)
-    heights = values.T if shades["extend"] == "both" else np.maximum(values, shades["levels"][0]).T
-    drawn = [
-        axes.contourf(*axes_values, heights, **shades),
-        axes.contour(*axes_values, heights, levels=shades["levels"], colors="white", linewidths=0.25),
-    ]
-    for one in drawn:
-        one.set_rasterized(as_image)
-
-
-def _limit_landscape(
-    axes: Axes, axes_values: Sequence[np.ndarray], values: np.ndarray, places: np.ndarray | None = None
-) -> None:
-    """Show what is known, and some places, as far as the grid goes: the rest of it would only be hatched."""
-    known = np.isfinite(values)
-    limits = []
-    for index, nodes in enumerate(axes_values):
-        shown = nodes[known.any(axis=1 - index)]
-        if places is not None:
-            shown = np.concatenate([shown, places[:, index]])
-        room = MARGIN * (shown.max() - shown.min())
-        limits.append((max(shown.min() - room, nodes[0]), min(shown.max() + room, nodes[-1])))
-    axes.set_xlim(*limits[0])
-    axes.set_ylim(*limits[1])
 
 
 def _name_axes(
@@ -328,22 +281,6 @@ def _name_axes(
     for axis, place, name, unit in zip((axes.xaxis, axes.yaxis), axes_values, names, units, strict=True):
         label = scaled_label(axis, f"${name_label(name)}$", unit, float(np.abs(place).max()))
         axis.set_label_text(label)
-
-
-def _add_bar(figure: Figure, panels: Sequence[Axes], shades: dict[str, Any], energy_unit: str) -> None:
-    levels = shades["levels"]
-    power = power_of_ten(float(np.abs(levels).max()))
-    factor = f"$10^{{{power}}}$" if power else ""
-    unit = f"{factor} {unit_text(energy_unit) or 'unit of ε'}".strip()
-    bar = figure.colorbar(
-        ScalarMappable(norm=shades["norm"], cmap=shades["cmap"]), ax=list(panels), location="bottom",
-        pad=0.02, aspect=25,
-        label=f"$U$ ({unit})", spacing="proportional",
-    )  # fmt: skip
-    shown = levels[:: 4 if len(levels) > 8 else 2]
-    bar.set_ticks(shown.tolist())
-    bar.minorticks_off()
-    bar.ax.set_xticklabels([f"{one / 10.0**power:.4g}".replace("-", "−") for one in shown])
 
 
 @drawn_in_style
@@ -383,31 +320,49 @@ def plot_error_maps(
     highest = float(np.nanmax(np.abs(reference))) or 1.0
     figure = Figure(figsize=(PAGE_WIDTH, 1.9 * len(fields) + 0.9))
     panels = figure.subplots(len(fields), 2, sharex=True, sharey=True)
-    shades = _shades(reference, None) | {"extend": "both"}
-    shades["norm"] = BoundaryNorm(shades["levels"], 256, extend="both")
+    lowest, top = float(np.nanmin(reference)), float(np.nanmax(reference))
+    top = top if top > lowest else lowest + (abs(lowest) or 1.0)  # a flat landscape has levels, too
+    # The bottom is zero to rounding, and a level below it would have no meaning.
+    levels = MaxNLocator(LEVELS).tick_values(0.0 if abs(lowest) < 1e-3 * (top - lowest) else lowest, top)
+    norm = BoundaryNorm(levels, 256, extend="both")
     differences = [np.abs(values - reference) / highest for values in list(fields.values())[1:]]
     for axes, (name, values) in zip(panels[:, 0], fields.items(), strict=True):
         axes.set_title(name, loc="left")
-        _draw_values(axes, axes_values, values, shades, as_image=True)
-    _add_bar(figure, list(panels[:, 0]), shades, energy_unit)
+        hatch_unknown(axes)
+        for drawn in (
+            axes.contourf(*axes_values, values.T, levels=levels, norm=norm, extend="both", cmap=COLOUR_MAP),
+            axes.contour(*axes_values, values.T, levels=levels, colors="white", linewidths=0.25),
+        ):
+            drawn.set_rasterized(True)
+    power = power_of_ten(float(np.abs(levels).max()))
+    factor = f"$10^{{{power}}}$" if power else ""
+    unit = f"{factor} {unit_text(energy_unit) or ENERGY}".strip()
+    bar = figure.colorbar(
+        ScalarMappable(norm=norm, cmap=COLOUR_MAP), ax=list(panels[:, 0]), location="bottom",
+        pad=0.02, aspect=25, label=f"$U$ ({unit})", spacing="proportional",
+    )  # fmt: skip
+    ticks = levels[:: 4 if len(levels) > 8 else 2]
+    bar.set_ticks(ticks.tolist())
+    bar.minorticks_off()
+    bar.ax.set_xticklabels([f"{one / 10.0**power:.4g}".replace("-", "−") for one in ticks])
     _draw_differences(figure, list(panels[:, 1]), axes_values, differences, np.isfinite(reference).sum())
     corner = panels[0, 1]
     corner.set_axis_off()
     text = f"right: difference\nfrom {reference_name}\n/ highest $U$"
     corner.text(0.5, 0.65, text, transform=corner.transAxes, ha="center", va="center")
     corner.legend(handles=[Patch(label="not known", **UNKNOWN)], loc="lower center", borderpad=0)
-    _limit_landscape(panels[0, 0], axes_values, reference)
+    # What is known, as far as the grid goes: the rest of it would only be hatched.
+    for index, limit in enumerate((panels[0, 0].set_xlim, panels[0, 0].set_ylim)):
+        nodes = axes_values[index]
+        shown = nodes[np.isfinite(reference).any(axis=1 - index)]
+        room = MARGIN * (shown.max() - shown.min())
+        limit(max(shown.min() - room, nodes[0]), min(shown.max() + room, nodes[-1]))
     for axes in panels.ravel().tolist():
         axes.xaxis.set_major_locator(MaxNLocator(3))
         axes.yaxis.set_major_locator(MaxNLocator(4))
         _name_axes(axes, axes_values, names, units)
         axes.label_outer()
     return figure
-
-
-def _draw_nothing(axes: Axes) -> None:
-    hatch_unknown(axes)
-    axes.text(0.5, 0.5, "not known", transform=axes.transAxes, ha="center", va="center", **RIM)
 
 
 def _draw_differences(
@@ -423,7 +378,8 @@ def _draw_differences(
     norm = LogNorm(lowest, largest)
     for axes, difference, found in zip(panels[1:], differences, known, strict=True):
         if not found.size:
-            _draw_nothing(axes)
+            hatch_unknown(axes)
+            axes.text(0.5, 0.5, "not known", transform=axes.transAxes, ha="center", va="center", **RIM)
             continue
         hatch_unknown(axes)
         # As an image: thousands of small rectangles would make a megabyte of vector graphics. What is less

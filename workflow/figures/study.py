@@ -49,26 +49,7 @@ def _project(
     trajectories: Sequence[np.ndarray],
     resolution: int = 81,
 ) -> ComponentFields:
-    """Fields of a decomposition on the plane of the first two states.
-
-    Parameters
-    ----------
-    identified, exact
-        The formulas, and the exact ones where known.
-    domain
-        Shape ``(d, 2)``: the plane's limits are the first two rows.
-    at
-        Shape ``(d,)``: where the plane cuts the other states.
-    trajectories
-        States along some trajectories, each of shape ``(k, d)``.
-    resolution
-        Points along each axis.
-
-    Returns
-    -------
-    siq.report.plots.ComponentFields
-        With the exact U missing where it is not known.
-    """
+    """Fields of a decomposition on the plane of the first two states through `at`."""
     dimension = len(domain)
     shown = min(dimension, 2)
     axes = [np.linspace(domain[axis, 0], domain[axis, 1], resolution) for axis in range(shown)]
@@ -98,19 +79,7 @@ def _project_landscape(
     trajectories: Sequence[np.ndarray],
     resolution: int = 161,
 ) -> ComponentFields:
-    """Fields of the formulas of all wells, for two states or one; NaN where none is believed.
-
-    Parameters
-    ----------
-    potential
-        U over all wells. At each point the formula counts that gives U there.
-    domain
-        Shape ``(d, 2)``: the limits of the states.
-    trajectories
-        States along some trajectories, each of shape ``(k, d)``.
-    resolution
-        Points along each axis.
-    """
+    """Fields of the formulas of all wells, for two states or one: of the one that gives U at a point."""
     axes = [np.linspace(low, high, resolution) for low, high in domain]
     x = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, len(axes))
     x1, x2 = (*axes, np.zeros(0))[:2]

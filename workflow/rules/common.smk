@@ -78,27 +78,49 @@ def points_of_sweep(wildcards):
     )
 
 
+def file_where(asked, pattern):
+    """Input function: a file of studies that ask for it, none for others."""
+
+    def file(wildcards):
+        study = study_of(wildcards).study
+        return pattern.format(study=wildcards.study) if asked(study) else []
+
+    return file
+
+
 def with_sweep(name):
-    """Input function: a table of studies that sweep a parameter, none for others."""
-
-    def files(wildcards):
-        swept = study_of(wildcards).study.sweep is not None
-        return f"results/{wildcards.study}/tables/{name}.parquet" if swept else []
-
-    return files
+    """Input function: a table of studies that sweep a parameter."""
+    return file_where(
+        lambda study: study.sweep is not None, f"results/{{study}}/tables/{name}.parquet"
+    )
 
 
-def with_invariant(path):
-    """Input function: a file of studies of equations that ask for the invariant distribution, none for others."""
+def with_invariant(pattern):
+    """Input function: a file of studies that ask for the invariant distribution."""
+    return file_where(lambda study: study.invariant, pattern)
 
-    def files(wildcards):
-        return (
-            path.format(study=wildcards.study)
-            if study_of(wildcards).study.invariant
-            else []
-        )
 
-    return files
+def with_card(pattern):
+    """Input function: a file that a card alone can give, none for studies of recordings."""
+    return file_where(lambda study: study.recordings is None, pattern)
+
+
+def with_landscape(pattern):
+    """Input function: a file of studies that ask for their landscape."""
+    return file_where(lambda study: study.landscape is not None, pattern)
+
+
+def landscape_table(name):
+    """Input function: a table that a landscape with a card has."""
+    return file_where(
+        lambda study: study.landscape is not None and study.recordings is None,
+        f"results/{{study}}/tables/{name}.parquet",
+    )
+
+
+def with_equations(pattern):
+    """Input function: a file of studies that compare with the equations of their card."""
+    return file_where(lambda study: study.beside_equations, pattern)
 
 
 def block_of(wildcards):
@@ -190,47 +212,6 @@ def card_if_any(wildcards):
 def published_if_any(wildcards):
     """Input function: the published figures that the study is compared with."""
     return study_of(wildcards).published() or []
-
-
-def with_card(pattern):
-    """Input function: a file that a card alone can give, none for studies of recordings."""
-
-    def files(wildcards):
-        known = study_of(wildcards).study.recordings is None
-        return pattern.format(study=wildcards.study) if known else []
-
-    return files
-
-
-def with_landscape(*patterns):
-    """Input function: files of studies that ask for their landscape, none for others."""
-
-    def files(wildcards):
-        asked = study_of(wildcards).study.landscape is not None
-        return [one.format(study=wildcards.study) for one in patterns if asked]
-
-    return files
-
-
-def landscape_table(name):
-    """Input function: a table that a landscape with a card has."""
-
-    def files(wildcards):
-        study = study_of(wildcards).study
-        known = study.landscape is not None and study.recordings is None
-        return f"results/{wildcards.study}/tables/{name}.parquet" if known else []
-
-    return files
-
-
-def with_equations(pattern):
-    """Input function: a file of studies that compare with the equations of their card, none for others."""
-
-    def files(wildcards):
-        asked = study_of(wildcards).study.beside_equations
-        return pattern.format(study=wildcards.study) if asked else []
-
-    return files
 
 
 def networks_of_runs(name):

@@ -6,27 +6,117 @@ the key.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
-from benchmarks.proof.cases import HELD_OUT, ProofCase, thinned, wrong_parameters
+from benchmarks.proof.cases import (
+    HELD_OUT,
+    NOISE_LEVELS,
+    Design,
+    ProofCase,
+    RanAway,
+    check_shares,
+    in_random_order,
+    key_of,
+    rounded,
+    thinned,
+    turns,
+    wrong_parameters,
+)
 from benchmarks.proof.concealment.catalogue import CATALOGUES
-from benchmarks.proof.concealment.designs import CaseDesign, draw_cases, log_uniform
 from benchmarks.proof.concealment.effects import Effect
 from benchmarks.proof.concealment.model import Trajectories, TrueSystem, derivatives
-from benchmarks.proof.concealment.simulation import RanAway, simulate
+from benchmarks.proof.concealment.simulation import simulate
 from benchmarks.proof.concealment.strengths import STRONGEST, WEAKEST, calibrate, effect_strength
 from benchmarks.proof.concealment.systems import SYSTEMS
 
-__all__ = ["CaseDesign", "draw_cases", "make_case"]
-
 SHIFT = (0.03, 0.25)  # relative, by which a parameter of a card is wrong
 ATTEMPTS = 40
+KINDS = ("null", "shift", "mechanism", "process noise", "withheld")
+ALWAYS_WITHHELD: Mapping[str, tuple[str, ...]] = {
+    "predator_prey": ("Allee effect", "delayed response"),
+    # A stop beyond a gap is a backlash beside another stiffness.
+    "oscillator": ("backlash",),
+    "coupled_masses": ("backlash",),
+}
+"""Entries of the dictionary that are, or contain, an effect that this generator calls withheld."""
+DECOYS = 0.15  # of the mechanical cases say "without hysteresis" though there is none
 
 
-def make_case(design: CaseDesign) -> ProofCase:
+def draw_cases(*, count: int, seed: int, shares: Mapping[str, float]) -> list[Design]:
+    """Decide which cases there are.
+
+    Parameters
+    ----------
+    count
+        Their number.
+    seed
+        The same seed draws the same cases.
+    shares
+        Share of each kind, as in ``config/proof.yaml``; they are respected to within one case.
+
+    Returns
+    -------
+    list of Design
+        In an order that says nothing. Systems, and within each system the effects, take turns; half of the
+        cases with an effect have wrong parameters as well.
+    """
+    check_shares(shares, KINDS)
+    rng = np.random.default_rng(seed)
+    # Whole numbers that are as close to the shares as possible: the largest remainders are rounded up.
+    wanted = np.array(list(shares.values())) * count
+    numbers = np.floor(wanted + 1e-9).astype(int)
+    numbers[np.argsort(numbers - wanted, kind="stable")[: count - numbers.sum()]] += 1
+    kinds = np.repeat(list(shares), numbers)
+    systems = {kind: turns(list(SYSTEMS), rng) for kind in shares}
+    effects: dict[tuple[str, str], Iterator[str]] = {}
+    noise = turns(list(NOISE_LEVELS), rng)
+    shifted = turns([True, False], rng)
+    drawn: list[dict[str, Any]] = []
+    for kind in map(str, kinds):
+        system = next(systems[kind])
+        mechanism = None
+        if kind not in ("null", "shift"):
+            choices = {
+                "mechanism": list(CATALOGUES[system].mechanisms),
+                "process noise": ["process noise"],
+                "withheld": list(CATALOGUES[system].withheld),
+            }[kind]
+            mechanism = next(effects.setdefault((kind, system), turns(choices, rng)))
+        drawn.append(
+            {
+                "system": system,
+                "kind": kind,
+                "mechanism": mechanism,
+                "shifted": kind == "shift" or (mechanism is not None and next(shifted)),
+                "strength": log_uniform(WEAKEST, STRONGEST, rng) if mechanism else None,
+                "noise_db": next(noise),
+                "without": _without(system, kind, mechanism, rng),
+                "seed": int(rng.integers(2**63)),
+            }
+        )
+    return in_random_order(drawn, rng)
+
+
+def log_uniform(low: float, high: float, rng: np.random.Generator) -> float:
+    """A number whose logarithm is uniformly distributed."""
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _without(system: str, kind: str, mechanism: str | None, rng: np.random.Generator) -> tuple[str, ...]:
+    """Entries that the diagnosis has to do without; what is always withheld gives nothing away."""
+    always = ALWAYS_WITHHELD.get(system, ())
+    decoy = rng.random() < DECOYS
+    if mechanism == "hysteresis":
+        return (*always, "hysteresis") if kind == "withheld" else always
+    # A study that does without hysteresis must not give away that this is what is concealed.
+    hidden = decoy and "hysteresis" in CATALOGUES[system].mechanisms
+    return (*always, "hysteresis") if hidden else always
+
+
+def make_case(design: Design) -> ProofCase:
     """Simulate a case. The same design makes the same case.
 
     Parameters
@@ -44,7 +134,7 @@ def make_case(design: CaseDesign) -> ProofCase:
     wanted = design.strength
     for attempt in range(ATTEMPTS):
         true = {
-            name: float(f"{value * np.exp(rng.uniform(-0.1, 0.1)) if name in system.free() else value:.4g}")
+            name: rounded(value * np.exp(rng.uniform(-0.1, 0.1)) if name in system.free() else value)
             for name, value in system.nominal().items()
         }
         experiment = system.experiment(rng)
@@ -64,7 +154,7 @@ def make_case(design: CaseDesign) -> ProofCase:
     raise RuntimeError(f"{design.name}: no bounded motion in {ATTEMPTS} attempts")
 
 
-def _draw_effect(design: CaseDesign, rng: np.random.Generator) -> Effect | None:
+def _draw_effect(design: Design, rng: np.random.Generator) -> Effect | None:
     catalogue = CATALOGUES[design.system]
     if design.mechanism is None:
         return None
@@ -74,7 +164,7 @@ def _draw_effect(design: CaseDesign, rng: np.random.Generator) -> Effect | None:
 
 
 def _assemble(
-    design: CaseDesign,
+    design: Design,
     model: TrueSystem,
     path: Trajectories,
     reached: float | None,
@@ -89,19 +179,9 @@ def _assemble(
     study: dict[str, Any] = {"held_out": sorted(map(str, held_out))}
     if design.without:
         study["without"] = list(design.without)
-    key = {
-        "case": design.name,
-        "salt": rng.bytes(16).hex(),  # nobody finds out a key by trying digests
-        "system": design.system,
-        "kind": design.kind,
-        "mechanism": design.mechanism,
-        "equations": list(effect.equations) if effect else [],
-        "coordinates": list(effect.coordinates) if effect else [],
-        "noise_db": design.noise_db,
-        "strength": reached,
-        "shifts": shifts,
-        "effect": effect.formulas() if effect else {},
-    }
+    key = key_of(
+        design, effect, rng, system=design.system, mechanism=design.mechanism, strength=reached, shifts=shifts
+    )
     return ProofCase(_card(model, shifts), study, table, key, _truth(model, path))
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.proof.cases import rounded as to_digits
 from benchmarks.proof.concealment.physics import Values
 
 Named = Mapping[str, Any]  # states, and t, by their names
@@ -94,7 +95,7 @@ class Effect:
 
     def times(self, factor: float) -> Effect:
         """The same effect, stronger by a factor; numbers are rounded so that the key states them exactly."""
-        scaled = {name: float(f"{factor * self.parameters[name]:.6g}") for name in self.scaled}
+        scaled = {name: to_digits(factor * self.parameters[name], 6) for name in self.scaled}
         return replace(self, parameters={**self.parameters, **scaled})
 
     def formulas(self) -> dict[str, Any]:
@@ -217,4 +218,4 @@ def sensor(sizes: Mapping[str, float]) -> Builder:
 
 def rounded(**values: float) -> dict[str, float]:
     """Parameters with four digits: the key then states them exactly."""
-    return {name: float(f"{value:.4g}") for name, value in values.items()}
+    return {name: to_digits(value) for name, value in values.items()}

@@ -14,6 +14,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from benchmarks.proof.cases import RanAway
 from benchmarks.proof.concealment.experiments import Experiment
 from benchmarks.proof.concealment.model import Drive, Trajectories, TrueSystem
 from benchmarks.proof.concealment.physics import PhysicalSystem
@@ -23,10 +24,6 @@ PILOT_SMOOTHING = 0.02  # of a typical speed
 HEUN_STEPS = 40  # between two samples
 CHECKS = 4  # between two samples, whether a switch has been crossed
 MOST_EVENTS = 50  # between two samples
-
-
-class RanAway(Exception):
-    """A motion that does not stay bounded."""
 
 
 def simulate(

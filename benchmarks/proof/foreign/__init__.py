@@ -11,7 +11,6 @@ clocks that jitter.
 `effects`     which function is missing, of which coordinates, and where?
 `motion`      what does a system do?
 `sensors`     what is recorded of it?
-`designs`     which cases are there?
-`cases`       what is written of a case, and what does its key say?
+`cases`       which cases are there, what is written of each, and what does its key say?
 ============  ===========================================================================
 """

@@ -7,23 +7,77 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.proof.cases import HELD_OUT, ProofCase, thinned, wrong_parameters
-from benchmarks.proof.foreign.designs import IN_SENSOR, STRENGTHS, ForeignDesign, draw_cases
-from benchmarks.proof.foreign.effects import draw_effect
+from benchmarks.proof.cases import (
+    HELD_OUT,
+    NOISE_LEVELS,
+    Design,
+    ProofCase,
+    RanAway,
+    check_shares,
+    in_random_order,
+    key_of,
+    thinned,
+    turns,
+    wrong_parameters,
+)
+from benchmarks.proof.foreign.effects import LAWS, draw_effect
 from benchmarks.proof.foreign.formulas import evaluator
-from benchmarks.proof.foreign.motion import PILOT, Motion, RanAway, Truth, move
+from benchmarks.proof.foreign.motion import PILOT, Motion, Truth, move
 from benchmarks.proof.foreign.sensors import Sensors, draw_sensors, reader, recorded
 from benchmarks.proof.foreign.systems import FAMILIES, Experiment, draw_experiment
-
-__all__ = ["ForeignDesign", "draw_cases", "make_case"]
 
 ATTEMPTS = 60
 ROUNDS = 4  # in which the amplitude of an effect is found
 CLOSE = 1.25  # factor by which its strength may miss what was wanted
 SHIFT = (0.05, 0.25)  # relative, by which a parameter of a card is wrong
+KINDS = ("null", "shift", "withheld")
+STRENGTHS = (0.05, 0.7)  # rms of the effect over that of what it is added to, the rate or the reading
+IN_SENSOR = (0.03, 0.3)  # the same where it is a sensor's
 
 
-def make_case(design: ForeignDesign) -> ProofCase:
+def draw_cases(*, count: int, seed: int, shares: Mapping[str, float]) -> list[Design]:
+    """Decide which cases there are.
+
+    Parameters
+    ----------
+    count
+        Their number.
+    seed
+        The same seed draws the same cases.
+    shares
+        Share of each of `KINDS`; respected to within one case.
+
+    Raises
+    ------
+    ValueError
+        For other kinds, or shares that do not sum to one.
+    """
+    check_shares(shares, KINDS)
+    rng = np.random.default_rng(seed)
+    edges = np.round(count * np.cumsum(list(shares.values()))).astype(int)
+    kinds = np.repeat(list(shares), np.diff(edges, prepend=0))
+    families = {kind: turns(list(FAMILIES), rng) for kind in shares}
+    noise = {kind: turns(list(NOISE_LEVELS), rng) for kind in shares}
+    laws, shifted = turns(list(LAWS), rng), turns([True, False], rng)
+    drawn: list[dict[str, Any]] = []
+    for kind in map(str, kinds):
+        concealed = kind == "withheld"
+        drawn.append(
+            {
+                "kind": kind,
+                "system": next(families[kind]),
+                "mechanism": next(laws) if concealed else None,
+                "shifted": kind == "shift" or (concealed and next(shifted)),
+                "strength": float(rng.random()),
+                "noise_db": next(noise[kind]),
+                "without": (),
+                "seed": int(rng.integers(2**63)),
+            }
+        )
+    return in_random_order(drawn, rng)
+
+
+def make_case(design: Design) -> ProofCase:
     """Draw and simulate a case. The same design makes the same case.
 
     Raises
@@ -33,12 +87,12 @@ def make_case(design: ForeignDesign) -> ProofCase:
     """
     rng = np.random.default_rng(design.seed)
     for _ in range(ATTEMPTS):
-        system = FAMILIES[design.family](rng)
+        system = FAMILIES[design.system](rng)
         experiment = draw_experiment(system, rng)
         truth = Truth(system, system.parameters)
         strength = None
         try:
-            if design.law is not None:
+            if design.mechanism is not None:
                 truth, strength = _concealing(design, truth, experiment, rng)
             motion = move(truth, experiment)
         except RanAway:
@@ -56,7 +110,7 @@ def _moves(motion: Motion) -> bool:
 
 
 def _concealing(
-    design: ForeignDesign, truth: Truth, experiment: Experiment, rng: np.random.Generator
+    design: Design, truth: Truth, experiment: Experiment, rng: np.random.Generator
 ) -> tuple[Truth, float]:
     """The system with an effect that is as strong as wanted.
 
@@ -68,10 +122,11 @@ def _concealing(
     system = truth.system
     pilot = move(truth, experiment, steps=PILOT)
     effect = draw_effect(
-        str(design.law), ranges=_ranges(truth, pilot, experiment), acceptors=system.acceptors,
+        str(design.mechanism), ranges=_ranges(truth, pilot, experiment), acceptors=system.acceptors,
         outputs=tuple(system.outputs), rng=rng,
     )  # fmt: skip
     low, high = np.log(IN_SENSOR if effect.in_sensor else STRENGTHS)
+    assert design.strength is not None
     wanted = float(np.exp(low + design.strength * (high - low)))
     concealing = Truth(system, truth.parameters, effect)
     amplitude = wanted / strength_of(concealing, pilot, experiment)
@@ -124,7 +179,7 @@ def strength_of(truth: Truth, motion: Motion, experiment: Experiment) -> float:
 
 
 def _assembled(
-    design: ForeignDesign,
+    design: Design,
     truth: Truth,
     experiment: Experiment,
     motion: Motion,
@@ -136,25 +191,21 @@ def _assembled(
     shifts = wrong_parameters(system.free, truth.parameters, *SHIFT, rng) if design.shifted else {}
     table = recorded(truth, motion, experiment, sensors, rng)
     believed = {name: shift["card"] for name, shift in shifts.items()}
-    key: dict[str, Any] = {
-        "case": design.name,
-        "salt": rng.bytes(16).hex(),
-        "system": f"{system.family}, {len(system.states)} states",
-        "kind": design.kind,
-        "mechanism": effect.law if effect else None,
-        "equations": [] if effect is None or effect.in_sensor else [effect.place],
-        "coordinates": list(effect.coordinates) if effect else [],
-        "noise_db": design.noise_db,
-        "strength": strength,
-        "shifts": shifts,
-        "effect": effect.formulas() if effect else {},
-        "sensors": {
+    key = key_of(
+        design,
+        effect,
+        rng,
+        system=f"{system.family}, {len(system.states)} states",
+        mechanism=effect.law if effect else None,
+        strength=strength,
+        shifts=shifts,
+        sensors={
             "noise": table.noise,
             "steps": table.steps,
             "lost": 0.0 if system.driven else sensors.lost,
             "jitter": sensors.jitter,
         },
-    }
+    )
     return ProofCase(
         system.card({**truth.parameters, **believed}),
         _study(table.columns, rng),

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from benchmarks.proof.foreign.formulas import rounded
+from benchmarks.proof.cases import rounded
 
 AMPLITUDE = "amp"
 IN_SENSOR = 0.15  # share of the effects that sit in a sensor
@@ -48,6 +48,11 @@ class Effect:
     coordinates: tuple[str, ...]
     text: str
     amplitude: float = 1.0
+
+    @property
+    def equations(self) -> tuple[str, ...]:
+        """The state in whose equation it stands; none of a sensor."""
+        return () if self.in_sensor else (self.place,)
 
     @property
     def term(self) -> str:

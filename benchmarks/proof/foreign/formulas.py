@@ -46,8 +46,3 @@ def evaluator(texts: Sequence[str], names: Sequence[str]) -> Evaluator:
             return np.array([np.broadcast_to(each, shape) for each in compiled(*given)])
 
     return evaluate
-
-
-def rounded(value: float, digits: int = 4) -> float:
-    """A number with few digits, so that what a formula says is exactly what was simulated."""
-    return float(f"{value:.{digits}g}")

@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
+from benchmarks.proof.cases import RanAway, rounded
 from benchmarks.proof.foreign.effects import AMPLITUDE, Effect
 from benchmarks.proof.foreign.formulas import Evaluator, evaluator
 from benchmarks.proof.foreign.systems import Experiment, RandomSystem
@@ -18,10 +19,6 @@ from benchmarks.proof.foreign.systems import Experiment, RandomSystem
 STEPS = 10  # of the rule, between two ticks
 PILOT = 3  # the same where two digits are enough
 WIDEST = 4.0  # widths of the box of first states, within which a motion counts as bounded
-
-
-class RanAway(Exception):
-    """A motion that does not stay bounded."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +66,7 @@ class Truth:
     def times(self, factor: float) -> Truth:
         """The same with a stronger effect."""
         assert self.effect is not None
-        return replace(self, effect=replace(self.effect, amplitude=float(f"{factor:.6g}")))
+        return replace(self, effect=replace(self.effect, amplitude=rounded(factor, 6)))
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.proof.foreign.formulas import evaluator, rounded
+from benchmarks.proof.cases import rounded
+from benchmarks.proof.foreign.formulas import evaluator
 from benchmarks.proof.foreign.motion import Motion, Truth, drive_at
 from benchmarks.proof.foreign.systems import Experiment
 

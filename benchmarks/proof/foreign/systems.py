@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.proof.foreign.formulas import rounded
+from benchmarks.proof.cases import rounded
 
 FIXED = 0.5  # share of the parameters of which the author of a card is sure
 DRIVEN = 0.5  # share of the systems that have an input

@@ -7,8 +7,6 @@ the true function in place, through an integrator of its own.
 `integrator`   what does a model say of recordings, and how does it depend on parameters?
 `oracle`       how well does the true simulation do, and the card's?
 `places`       could the recordings tell another place from the true one?
-`rulers`       how near is what was named, and how much of the gain was had?
-`scores`       what of it is right, one row a case?
-`targets`      and of all cases: which targets are met?
+`scores`       how near is what was named, how much of the gain was had? One row a case
 =============  ==========================================================================
 """

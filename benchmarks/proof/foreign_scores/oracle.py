@@ -11,7 +11,7 @@ import scipy.optimize
 
 from benchmarks.proof.foreign_scores.integrator import Integrator
 from benchmarks.proof.keys import CaseKey, Truth
-from benchmarks.proof.oracle import true_model
+from benchmarks.proof.oracle import own_values, true_model
 from siq.diagnosis.study import Comparison
 from siq.inference.measurements import Measurements
 from siq.systems.dynamics import Dynamics
@@ -98,7 +98,7 @@ def true_simulation(case: Comparison, key: CaseKey, truth: Truth, starts: np.nda
     noise = np.sqrt(noise**2 + steps**2 / 12)
     right, _ = true_model(case.system, key)
     true = least_squares(right, case.learn, noise, starts)
-    begin = [case.system.values, _own_values(case.system, true.model)]
+    begin = [case.system.values, own_values(case.system, true.model)]
     fits = [
         least_squares(case.system.with_values(values), case.learn, noise, first)
         for values, first in zip(begin, (starts, true.starts), strict=True)
@@ -114,11 +114,6 @@ def true_simulation(case: Comparison, key: CaseKey, truth: Truth, starts: np.nda
         middle[1],
         jackknife(*errors),
     )
-
-
-def _own_values(system: Dynamics, other: Dynamics) -> np.ndarray:
-    known = {each.name: each.value for each in other.parameters}
-    return np.array([known[each.name] for each in system.parameters])
 
 
 def least_squares(model: Dynamics, data: Measurements, noise: np.ndarray, starts: np.ndarray) -> LeastSquares:

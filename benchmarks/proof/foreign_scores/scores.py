@@ -1,23 +1,30 @@
-"""What of a diagnosis is right? One row a case."""
+"""What of a diagnosis is right? One row a case: its names, its place, and how much of the gain was had."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.proof.foreign_scores.oracle import TrueSimulation, free_errors, true_simulation
-from benchmarks.proof.foreign_scores.places import Told, told_places
-from benchmarks.proof.foreign_scores.rulers import NEAR, name_error, said_place, true_place, unreal_names
-from benchmarks.proof.keys import CaseKey, Truth, read_key, read_truth
-from benchmarks.proof.scoring import FAILED, NOTHING, Answer, model_of
-from siq.diagnosis.study import Comparison, read_case
+from benchmarks.proof.foreign_scores.places import Told, orthonormal, told_places
+from benchmarks.proof.keys import CaseKey, Truth
+from benchmarks.proof.oracle import own_values, true_model
+from benchmarks.proof.scoring import EXPECTED, Answer, model_of, read_opened, stated, values_at
+from siq.diagnosis.study import Comparison
+from siq.systems.dynamics import Dynamics
 
 KNOWN = 100.0
 """Δχ² from which on an oracle knows something, as in the first proof."""
 
+NEAR = 0.1
+"""Relative error up to which a named function is the drawn one."""
+
+ROUNDING = "quantisation"
+STEP = 0.1  # relative error up to which a step in which a sensor reads is the true one
 SURE = 2.0  # standard errors of the oracle's gain, from which on it is asked for
 ENOUGH = 0.9  # of it
 
@@ -86,10 +93,9 @@ def score_foreign_case(name: str, folder: str | Path, keys: str | Path, answer: 
     InputError
         When a file of the case, or its key, cannot be used.
     """
-    folder, keys = Path(folder), Path(keys)
-    key, truth = read_key(keys / f"{name}.json"), read_truth(keys / f"{name}.npz")
+    keys = Path(keys)
+    case, key, truth = read_opened(name, Path(folder), keys)
     assert truth is not None
-    case = read_case(folder / "system.yaml", folder / "recordings.parquet", folder / "study.yaml")
     row = said(key, answer) | {"case": name}
     row |= {"recordings": len(case.learn.labels), "samples": len(case.learn.t)}
     notes = [answer.failure]
@@ -118,31 +124,17 @@ def first_states(case: Comparison, path: Path) -> np.ndarray:
 def said(key: CaseKey, answer: Answer) -> dict[str, Any]:
     """What a diagnosis said, and what of it needs no fit to be judged."""
     verdict = answer.verdict or {}
-    word = str(verdict.get("verdict", FAILED))
-    names = unreal_names(verdict.get("mechanisms", []), key)
-    nothing = word in NOTHING or (word == "missing physics" and not names)
-    concealed = key.kind == "withheld"
-    right = {"null": word == "no mismatch", "shift": word == "parameter shift"}
+    row = stated(key, answer, unreal_names(verdict.get("mechanisms", []), key))
     faults = [
         f"steps of {max(key.sensors.steps.values()):.2g}" if key.sensors.steps else "",
         f"{100 * key.sensors.lost:.0f} % lost" if key.sensors.lost else "",
         f"jitter of {100 * key.sensors.jitter:.1f} %" if key.sensors.jitter else "",
     ]
-    return {
-        "system": key.system,
-        "kind": key.kind,
+    return row | {
         "law": key.mechanism or "",
-        "noise_db": key.noise_db,
-        "strength": np.nan if key.strength is None else key.strength,
-        "shifted": bool(key.shifts),
         "sensors": ", ".join(filter(None, faults)),
-        "verdict": word,
-        "named": ", ".join(names),
         "described": ", ".join(str(each["label"]) for each in verdict.get("described", [])),
-        "right": right.get(key.kind, word == "unexplained"),
-        "false_alarm": not concealed and not nothing and word != FAILED,
-        "detected": not nothing and word != FAILED,
-        "seconds": answer.seconds,
+        "right": row["verdict"] == EXPECTED[key.kind],
     }
 
 
@@ -193,3 +185,78 @@ def places(key: CaseKey, told: Told, answer: Answer) -> dict[str, Any]:
         "place_asked": asked,
         "place_right": asked and equation and (coordinate or not along_too),
     }
+
+
+def name_error(system: Dynamics, augmented: Dynamics, key: CaseKey, truth: Truth) -> float:
+    """How far the mended simulation is from the true one, relative to what is concealed.
+
+    Whatever other values of the free parameters can do counts on neither side: no recording tells a function
+    from them. Equations and outputs are taken together, each in units of its own size.
+
+    Parameters
+    ----------
+    system
+        The card's simulation.
+    augmented
+        The simulation with what was named.
+    key, truth
+        What is concealed, and the rows at which it is evaluated.
+
+    Returns
+    -------
+    float
+        Infinite where states or delays were added, which the truth has none of; NaN where free parameters can
+        do all that is concealed.
+    """
+    if augmented.dimension > system.dimension or augmented.delays:
+        return np.inf
+    true, _ = true_model(system, key)
+    own = own_values(system, true)
+    right = system.with_values(own)
+    theirs, without, ours = (values_at(each, truth) for each in (true, right, augmented))
+    size = np.sqrt(np.mean(theirs**2, axis=1, keepdims=True))
+    size = np.where(size > 0, size, 1.0)
+    columns = []
+    for place in system.free:
+        step = 1e-5 * max(abs(own[place]), 1e-3)
+        moved = own.copy()
+        moved[place] += step
+        columns.append(((values_at(system.with_values(moved), truth) - without) / step / size).ravel())
+    basis = orthonormal(np.stack(columns, axis=1)) if columns else np.zeros((without.size, 0))
+
+    def beyond(difference: np.ndarray) -> float:
+        flat = (difference / size).ravel()
+        return float(np.linalg.norm(flat - basis @ (basis.T @ flat)))
+
+    concealed = beyond(theirs - without)
+    if not concealed > 1e-6 * float(np.linalg.norm(((theirs - without) / size).ravel())):
+        return np.nan
+    found = beyond(ours - theirs) / concealed
+    return found if np.isfinite(found) else np.inf
+
+
+def unreal_names(mechanisms: Sequence[Mapping[str, Any]], key: CaseKey) -> list[str]:
+    """Names but for those of sensors' faults: that a sensor rounds is right where it does."""
+    return [str(each["name"]) for each in mechanisms if not _rounds(each, key)]
+
+
+def _rounds(mechanism: Mapping[str, Any], key: CaseKey) -> bool:
+    steps = [key.sensors.steps[name] for name in mechanism["terms"] if name in key.sensors.steps]
+    if mechanism["name"] != ROUNDING or not steps:
+        return False
+    values = [each["estimate"] for each in mechanism["parameters"].values()]
+    return any(abs(value / step - 1) < STEP for value in values for step in steps)
+
+
+def said_place(verdict: Mapping[str, Any]) -> tuple[set[str], set[str]]:
+    """Equations, or sensors, and coordinates that a verdict names as the place of a mismatch."""
+    place = verdict.get("location") or {}
+    if place.get("coordinate") == "measurement":
+        outputs = set(place.get("outputs", []))
+        return {f"sensor {name}" for name in outputs}, outputs
+    return set(place.get("equations", {})), set(re.findall(r"\w+", str(place.get("coordinate", ""))))
+
+
+def true_place(key: CaseKey) -> set[str]:
+    """The equation, or the sensor, in which something is concealed."""
+    return set(key.equations) or {f"sensor {name}" for name in key.effect.outputs}

@@ -17,10 +17,10 @@ import yaml
 from scipy.integrate import solve_ivp
 
 from benchmarks.proof.batches import write_batch
-from benchmarks.proof.concealment.designs import draw_cases as draw_others
+from benchmarks.proof.cases import Design
+from benchmarks.proof.concealment.cases import draw_cases as draw_others
 from benchmarks.proof.foreign import cases as generator
-from benchmarks.proof.foreign.cases import make_case
-from benchmarks.proof.foreign.designs import KINDS, ForeignDesign, draw_cases
+from benchmarks.proof.foreign.cases import KINDS, draw_cases, make_case
 from benchmarks.proof.foreign.effects import LAWS, draw_effect
 from benchmarks.proof.foreign.formulas import evaluator
 from benchmarks.proof.foreign.motion import Truth, move
@@ -30,8 +30,14 @@ from benchmarks.proof.foreign_scores import scores
 from benchmarks.proof.foreign_scores.integrator import Integrator
 from benchmarks.proof.foreign_scores.oracle import TrueSimulation, true_simulation
 from benchmarks.proof.foreign_scores.places import told_places
-from benchmarks.proof.foreign_scores.rulers import name_error, said_place, unreal_names
-from benchmarks.proof.foreign_scores.scores import COLUMNS, said, score_foreign_case
+from benchmarks.proof.foreign_scores.scores import (
+    COLUMNS,
+    name_error,
+    said,
+    said_place,
+    score_foreign_case,
+    unreal_names,
+)
 from benchmarks.proof.keys import CaseKey, read_key, read_truth
 from benchmarks.proof.keys import Truth as KeyTruth
 from benchmarks.proof.oracle import true_model
@@ -48,13 +54,13 @@ ROOT = Path(__file__).parents[3]
 SHARES = {"null": 0.17, "shift": 0.17, "withheld": 0.66}
 
 
-def design(**other: Any) -> ForeignDesign:
+def design(**other: Any) -> Design:
     """By default two states, three short recordings, and a step in x2 that the equation of x2 lacks."""
     whole: dict[str, Any] = {
-        "name": "case-0001", "kind": "withheld", "family": "polynomial", "law": "step", "shifted": False,
-        "strength": 0.7, "noise_db": 40.0, "seed": 160,
+        "name": "case-0001", "kind": "withheld", "system": "polynomial", "mechanism": "step",
+        "shifted": False, "strength": 0.7, "noise_db": 40.0, "without": (), "seed": 160,
     }  # fmt: skip
-    return ForeignDesign(**{**whole, **other})
+    return Design(**{**whole, **other})
 
 
 def written(tmp: Path) -> tuple[Comparison, CaseKey, KeyTruth, np.ndarray]:
@@ -101,7 +107,7 @@ def test_the_generator_shares_what_a_case_is_with_the_first_and_nothing_with_the
             elif isinstance(node, ast.ImportFrom):
                 modules = [node.module or ""]
             assert not [m for m in modules if m.split(".")[0] == "siq"], file.name
-            ours = [m for m in modules if m.startswith("workflow")]
+            ours = [m for m in modules if m.startswith(("workflow", "benchmarks"))]
             own = ("benchmarks.proof.foreign.", "benchmarks.proof.cases")
             assert all(m.startswith(own) for m in ours), file.name
 
@@ -118,8 +124,8 @@ def test_a_third_of_the_cases_conceal_nothing_and_all_kinds_take_turns() -> None
     assert designs == draw_cases(count=60, seed=3, shares=SHARES)
     assert Counter(each.kind for each in designs) == {"null": 10, "shift": 10, "withheld": 40}
     concealed = [each for each in designs if each.kind == "withheld"]
-    assert set(Counter(each.law for each in concealed).values()) == {10} and len(LAWS) == 4
-    assert {each.family for each in concealed} == set(FAMILIES)
+    assert set(Counter(each.mechanism for each in concealed).values()) == {10} and len(LAWS) == 4
+    assert {each.system for each in concealed} == set(FAMILIES)
     assert {each.noise_db for each in designs} == {20.0, 30.0, 40.0}
     assert len(draw_others(count=3, seed=3, shares={"null": 1.0})) == 3  # the first generator's is another
 
