@@ -30,7 +30,7 @@ from siq.data.recordings import Recordings
 from siq.data.two_states import RecordStates
 from siq.numerics.text import number_text, unit_text
 from siq.report.formatting import environment, in_paragraphs
-from siq.report.summary import LandscapeSummary, chosen_states
+from siq.report.summary import LandscapeSummary
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -456,7 +456,6 @@ MOST_NODES = 128  # along one state
 MOST_STATES = 4  # a grid of more would be too coarse to show a well
 ABOVE, UNKNOWN = 254, 255
 PATH_POINTS = 80
-ROOM = 0.3  # of the height of the highest saddle: shown above it, as in the picture
 BANDS = 12  # of colours in a section
 SURFACE = 0.9  # of the height of the lowest saddle: where the surface is at first, a bubble about each well
 
@@ -478,7 +477,7 @@ def interactive_view(landscape: LandscapeSummary) -> Markup | None:
     count = len(landscape.names)
     if count < 2:
         return None
-    first, lowest = list(chosen_states(landscape, None)), landscape.lowest_pass
+    first, lowest = list(landscape.plane()), landscape.lowest_pass
     shown = sorted([*first, *(place for place in range(count) if place not in first)][:MOST_STATES])
     nodes = min(int(NODES ** (1 / len(shown)) + 1e-9), MOST_NODES)
     axes = [landscape.along(place, nodes) for place in shown]
@@ -489,8 +488,7 @@ def interactive_view(landscape: LandscapeSummary) -> Markup | None:
     known = np.isfinite(values)
     if not known.any():
         return None
-    low, top = float(values[known].min()), landscape.top
-    high = float(values[known].max()) if top is None or not top > low else top + ROOM * (top - low)
+    low, high = float(values[known].min()), landscape.highest_shown(values)
     high = high if high > low else low + 1.0
     low = 0.0 if abs(low) < 1e-3 * (high - low) else low  # the bottom is zero, but for the grid
     steps = np.full(values.shape, UNKNOWN)

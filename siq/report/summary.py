@@ -33,6 +33,7 @@ from siq.systems.dynamics import Dynamics, symbol
 from siq.systems.formulas import compile_formulas
 
 ZERO_POSITION = 1e-6  # of the size of a state
+ROOM = 0.3  # of the height of the highest saddle: shown above it
 MARGIN = 0.05  # of what is shown: left free around it
 BLOCK_OF_POINTS = 20_000  # evaluated at once: each has some hundred powers
 NO_ESCAPE_TIME = "quasipotential.no_escape_time"
@@ -165,8 +166,6 @@ class LandscapeSummary:
         The attractors in the order of the tables, as A, B, C and so on.
     ways
         The ways out of the wells.
-    others
-        The equilibria that are no wells.
     noise
         That drives the system, None where nobody knows it.
 
@@ -201,7 +200,6 @@ class LandscapeSummary:
     time_unit: str
     wells: tuple[WellSummary, ...]
     ways: tuple[Transition, ...]
-    others: tuple[EquilibriumSummary, ...]
     noise: NoiseStrength | None
     given: bool = False
     run: int = 0
@@ -289,6 +287,11 @@ class LandscapeSummary:
         return np.stack([low - room, high + room], axis=1)
 
     @property
+    def others(self) -> tuple[EquilibriumSummary, ...]:
+        """The equilibria that are no wells."""
+        return tuple(one for one in self.equilibria if not one.label)
+
+    @property
     def saddles(self) -> tuple[EquilibriumSummary, ...]:
         """Those between the wells."""
         return tuple(one for one in self.others if one.kind == "saddle")
@@ -305,6 +308,36 @@ class LandscapeSummary:
         tops += [one.height for one in self.saddles] if not tops else []
         known = [top for top in tops if np.isfinite(top)]
         return max(known) if known else None
+
+    def highest_shown(self, values: np.ndarray) -> float:
+        """U up to which colours differ, or an axis reaches: somewhat above the highest saddle."""
+        known = values[np.isfinite(values)]
+        lowest = float(known.min()) if len(known) else 0.0
+        if self.top is None or not self.top > lowest:
+            return float(known.max()) if len(known) else 1.0
+        return self.top + ROOM * (self.top - lowest)
+
+    def plane(self, states: Sequence[str] | None = None) -> tuple[int, int]:
+        """Places of the two states that make the plane; by default those along which the wells lie apart.
+
+        Raises
+        ------
+        ValueError
+            When they are not two states of the landscape.
+        """
+        names = self.names
+        if states is not None:
+            if len(set(states)) != 2 or not set(states) <= set(names):
+                raise ValueError(f"states is {list(states)}; name two of {', '.join(names)}")
+            return names.index(states[0]), names.index(states[1])
+        if len(names) == 2:
+            return 0, 1
+        width = np.ptp(self.box, axis=1)
+        places = np.array([one.position for one in self.marks])
+        apart = np.ptp(places, axis=0) / width if len(places) else np.zeros(len(names))
+        # Where wells differ along one state only, the first of the others is as good as any.
+        first, second = np.sort(np.argsort(-np.round(apart, 2), kind="stable")[:2])
+        return int(first), int(second)
 
     def along(self, place: int, count: int) -> np.ndarray:
         """So many values of a state, evenly over what is drawn."""
@@ -343,31 +376,8 @@ class LandscapeSummary:
         return np.sqrt(np.maximum(np.einsum("pn,pq,qn->n", change, covariance, change), 0.0))
 
 
-def chosen_states(landscape: LandscapeSummary, states: Sequence[str] | None) -> tuple[int, int]:
-    """Places of the two states that make the plane; by default those along which the wells lie apart.
-
-    Raises
-    ------
-    ValueError
-        When they are not two states of the landscape.
-    """
-    names = landscape.names
-    if states is not None:
-        if len(set(states)) != 2 or not set(states) <= set(names):
-            raise ValueError(f"states is {list(states)}; name two of {', '.join(names)}")
-        return names.index(states[0]), names.index(states[1])
-    if len(names) == 2:
-        return 0, 1
-    width = np.ptp(landscape.box, axis=1)
-    places = np.array([one.position for one in landscape.marks])
-    apart = np.ptp(places, axis=0) / width if len(places) else np.zeros(len(names))
-    # Where wells differ along one state only, the first of the others is as good as any.
-    first, second = np.sort(np.argsort(-np.round(apart, 2), kind="stable")[:2])
-    return int(first), int(second)
-
-
 def summarise(
-    landscape: Landscape | None,
+    landscape: Landscape | LandscapeSummary | None,
     recordings: Recordings | np.ndarray | None = None,
     *,
     dynamics: Dynamics | None = None,
@@ -380,7 +390,7 @@ def summarise(
     Parameters
     ----------
     landscape
-        The landscape; None where recordings led to none.
+        The landscape, or its summary, which is returned; None where recordings led to none.
     recordings
         Recorded states, or an array ``(n, d)`` of them; by default those that the landscape was fitted to.
     dynamics
@@ -391,15 +401,22 @@ def summarise(
     record, run
         Visits to the wells by run, the table of that name, and the run of the landscape.
     """
+    if isinstance(landscape, LandscapeSummary):
+        return landscape
     points = recordings.values if isinstance(recordings, Recordings) else recordings
     if landscape is None:
         assert isinstance(recordings, Recordings)  # which have names and units
         units, time_unit = tuple(unit or "1" for unit in recordings.units), recordings.time_unit or "1"
         return LandscapeSummary(
-            tuple(recordings.names), units, time_unit, (), (), (), None, points=points, dynamics=dynamics,
+            tuple(recordings.names), units, time_unit, (), (), None, points=points, dynamics=dynamics,
             matched=False, formula=None if formula is None or formula.potential is None else formula,
         )  # fmt: skip
     dynamics = landscape.dynamics
+    if isinstance(recordings, Recordings) and recordings.names != dynamics.states:
+        raise ValueError(
+            f"the recordings have the states {', '.join(recordings.names)}, and the landscape has"
+            f" {', '.join(dynamics.states)}"
+        )
     fitted = [well.points for well in landscape.wells if well is not None]
     if points is None:
         points = np.concatenate([np.zeros((0, dynamics.dimension)), *fitted])
@@ -445,7 +462,6 @@ def summarise(
             )
         ),
         ways=ways,
-        others=tuple(one for one in equilibria if not one.label),
         noise=landscape.noise,
         given=landscape.given,
         run=run,

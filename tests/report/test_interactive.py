@@ -84,7 +84,7 @@ def test_of_many_states_four_are_shown_and_the_others_held_at_the_saddle() -> No
     many = replace(
         three, names=tuple("xyzuvw"), units=("1",) * 6, formulas=(), dynamics=None, points=None,
         wells=tuple(replace(one, position=longer(one.position)) for one in three.wells),
-        others=tuple(replace(one, position=longer(one.position)) for one in three.others),
+        equilibria=tuple(replace(one, position=longer(one.position)) for one in three.equilibria),
         ways=tuple(
             replace(
                 way, saddle=replace(way.saddle, position=longer(way.place)),

@@ -19,6 +19,7 @@ from siq.report.diagnosis_page import Findings, largest_difference, mismatch_ans
 from siq.report.formatting import texts
 from siq.report.plots.diagnosis import (
     _limits_of,
+    _rate_unit,
     plot_before_after,
     plot_candidates,
     plot_curves,
@@ -27,7 +28,6 @@ from siq.report.plots.diagnosis import (
     plot_held_out,
     plot_missing,
 )
-from siq.report.plots.style import rate_unit
 from siq.systems.cards import load_system
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -364,7 +364,7 @@ def test_map_has_a_panel_for_each_of_two_equations():
      ("N/m", "s", "(N/m)/s")],
 )  # fmt: skip
 def test_the_unit_of_a_rate(unit, time, rate):
-    assert rate_unit(unit, time) == rate
+    assert _rate_unit(unit, time) == rate
 
 
 def test_candidates_are_told_apart_by_what_they_are():

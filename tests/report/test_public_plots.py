@@ -166,7 +166,7 @@ def of_heights(heights: list[float], passes: dict[tuple[int, int], float]) -> La
         )
         for k, u in enumerate(heights)
     )  # fmt: skip
-    return replace(known, wells=wells, ways=tuple(ways), others=())
+    return replace(known, wells=wells, ways=tuple(ways), equilibria=())
 
 
 def test_wells_join_from_the_lowest_pass_to_the_highest_and_no_lines_cross() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +30,6 @@ from siq.report.plots.style import (
     counted,
     drawn_to_be_read,
     name_label,
-    rate_unit,
     scaled_label,
 )
 
@@ -494,7 +494,18 @@ def _missing_label(equation: str, units: Mapping[str, str] | None, time_unit: st
     """What is missing in one equation, or in several with commas between them, with its unit."""
     names = equation.split(", ")
     where = " and ".join(f"$\\dot{{{name_label(name)}}}$" for name in names)
-    return with_unit(f"missing in {where}", rate_unit((units or {}).get(names[0], "1"), time_unit))
+    return with_unit(f"missing in {where}", _rate_unit((units or {}).get(names[0], "1"), time_unit))
+
+
+def _rate_unit(unit: str, time_unit: str) -> str:
+    """The unit of a rate of change, as cards write units."""
+    if time_unit in ("1", ""):
+        return unit
+    if unit in ("1", ""):
+        return f"1/{time_unit}"
+    if power := re.fullmatch(rf"(.+)/{re.escape(time_unit)}(?:\*\*(\d+))?", unit):
+        return f"{power[1]}/{time_unit}**{int(power[2] or 1) + 1}"
+    return f"{unit}/{time_unit}" if "/" not in unit else f"({unit})/{time_unit}"
 
 
 def _draw_curves(axes: Axes, stages: Mapping[str, pd.DataFrame]) -> None:

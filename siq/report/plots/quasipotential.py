@@ -27,7 +27,7 @@ from siq.report.plots.style import (
     power_of_ten,
     scaled_label,
 )
-from siq.report.summary import LandscapeSummary, chosen_states, summarise
+from siq.report.summary import LandscapeSummary, summarise
 
 if TYPE_CHECKING:
     from siq.data.recordings import Recordings
@@ -141,7 +141,6 @@ def _far_apart(points: np.ndarray, count: int) -> np.ndarray:
 
 WIDTH = 4.5  # inches: on a phone of 400 pixels its letters are 11 pixels high
 LEVELS = 12
-ROOM = 0.3  # of the height of the highest pass: shown above it
 MOST_POINTS = 2500  # recorded ones; more make a fog
 CURVE_POINTS = 801
 # Dark in the wells, light above them: also without colour, and black letters stand on the light part.
@@ -217,7 +216,7 @@ def plot_quasipotential(
     >>> axes.get_xlabel(), axes.get_ylabel()
     ('$x$', '$U$ (unit of ε)')
     """
-    shown = as_drawn(landscape, recordings)
+    shown = summarise(landscape, recordings)
     axes = new_axes() if ax is None else ax
     handles = _draw_quasipotential(axes, shown, states=states, view=view)
     if legend:
@@ -250,22 +249,6 @@ def quasipotential_figure(
     return figure
 
 
-def as_drawn(
-    landscape: Landscape | LandscapeSummary, recordings: Recordings | None = None
-) -> LandscapeSummary:
-    """What is drawn of a landscape, with recorded states where recordings are given."""
-    if isinstance(landscape, LandscapeSummary):
-        return landscape
-    if recordings is None:
-        return summarise(landscape)
-    if recordings.names != landscape.dynamics.states:
-        raise ValueError(
-            f"the recordings have the states {', '.join(recordings.names)}, and the landscape has"
-            f" {', '.join(landscape.dynamics.states)}"
-        )
-    return summarise(landscape, recordings)
-
-
 def new_axes(**options: Any) -> Axes:
     """New axes of pyplot, so that a notebook shows them."""
     from matplotlib import pyplot  # whose state is left alone where axes are given
@@ -288,7 +271,7 @@ def _draw_quasipotential(
     """Draw U on axes; what is returned belongs into their legend."""
     if len(landscape.names) == 1:
         return _draw_curve(axes, landscape)
-    shown = chosen_states(landscape, states)
+    shown = landscape.plane(states)
     values, sentence = _on_plane(landscape, shown, view)
     handles = _draw_map(axes, landscape, shown, values.T)
     handles += _draw_points(axes, landscape, shown)
@@ -308,27 +291,12 @@ def _values_in(landscape: LandscapeSummary) -> np.ndarray:
     return landscape.potential(np.concatenate(places)) if places else np.zeros(0)
 
 
-def highest_shown(landscape: LandscapeSummary, values: np.ndarray) -> float:
-    """U up to which colours differ, or the axis reaches: somewhat above the highest pass."""
-    known = values[np.isfinite(values)]
-    lowest = float(known.min()) if len(known) else 0.0
-    top = landscape.top
-    if top is None or not top > lowest:
-        return float(known.max()) if len(known) else 1.0
-    return top + ROOM * (top - lowest)
-
-
-def energy_axis_label(axis: Any, landscape: LandscapeSummary, largest: float, what: str = "$U$") -> str:
-    """The label of an axis of U: its unit, and a power of ten where numbers are unhandy."""
-    return scaled_label(axis, what, landscape.energy_unit or "unit of ε", largest)
-
-
 def _draw_curve(axes: Axes, landscape: LandscapeSummary) -> list[Any]:
     x = landscape.along(0, CURVE_POINTS)
     values = landscape.potential(x[:, None])
     handles: list[Any] = []
     error = landscape.standard_error(x)
-    top = highest_shown(landscape, values)
+    top = landscape.highest_shown(values)
     lowest = float(np.nanmin(values)) if np.isfinite(values).any() else 0.0
     if error is not None and np.nanmax(np.where(values < top, error, 0.0)) > 1e-3 * (top - lowest):
         axes.fill_between(x, values - 2 * error, values + 2 * error, color=BLUE, alpha=0.25, linewidth=0)
@@ -364,7 +332,7 @@ def _draw_curve(axes: Axes, landscape: LandscapeSummary) -> list[Any]:
     axes.set_ylim(bottom=lowest - 0.2 * (top - lowest))  # room for the letters
     handles += _names_of_marks(landscape)
     name_axes(axes, landscape, (0,))
-    axes.set_ylabel(energy_axis_label(axes.yaxis, landscape, max(abs(top), abs(lowest))))
+    name_energy(axes, landscape, max(abs(top), abs(lowest)))
     return handles
 
 
@@ -382,7 +350,7 @@ def _draw_map(
     handles: list[Any] = []
     x1, x2 = (landscape.along(place, len(values)) for place in shown)
     if np.isfinite(values).any():
-        top, lowest = highest_shown(landscape, values), float(np.nanmin(values))
+        top, lowest = landscape.highest_shown(values), float(np.nanmin(values))
         lowest = 0.0 if abs(lowest) < 1e-3 * abs(top - lowest) else lowest
         top = top if top > lowest else lowest + (abs(lowest) or 1.0)
         levels = np.asarray(MaxNLocator(LEVELS, steps=[1, 2, 2.5, 5, 10]).tick_values(lowest, top))
@@ -456,6 +424,11 @@ def _names_of_marks(landscape: LandscapeSummary) -> list[Any]:
     handles += [Line2D([], [], label="limit cycle", **CYCLE)] if landscape.cycles else []
     handles += [Line2D([], [], label="unstable cycle", **PARTING)] if landscape.parting else []
     return handles + ([Line2D([], [], label="saddle", **SADDLE)] if landscape.saddles else [])
+
+
+def name_energy(axes: Axes, landscape: LandscapeSummary, largest: float, what: str = "$U$") -> None:
+    """U and its unit at the upright axis, with a power of ten where numbers are unhandy."""
+    axes.set_ylabel(scaled_label(axes.yaxis, what, landscape.energy_unit or "unit of ε", largest))
 
 
 def name_axes(axes: Axes, landscape: LandscapeSummary, shown: Sequence[int]) -> None:

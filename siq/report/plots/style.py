@@ -212,17 +212,6 @@ def drawn_to_be_read(function: Callable[Parameters, Drawn]) -> Callable[Paramete
     return drawn_in_style(function, **_LARGE)
 
 
-def rate_unit(unit: str, time_unit: str) -> str:
-    """The unit of a rate of change, as cards write units."""
-    if time_unit in ("1", ""):
-        return unit
-    if unit in ("1", ""):
-        return f"1/{time_unit}"
-    if power := re.fullmatch(rf"(.+)/{re.escape(time_unit)}(?:\*\*(\d+))?", unit):
-        return f"{power[1]}/{time_unit}**{int(power[2] or 1) + 1}"
-    return f"{unit}/{time_unit}" if "/" not in unit else f"({unit})/{time_unit}"
-
-
 CURVE_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, BLACK)
 MARKERS = ("o", "s", "^", "D", "v", "P")
 LINE_STYLES = ("-", "--", "-.", ":")

@@ -20,11 +20,9 @@ from siq.report.plots.quasipotential import (
     POINTS,
     SADDLE,
     add_legend,
-    as_drawn,
     draw_equilibria,
-    energy_axis_label,
-    highest_shown,
     name_axes,
+    name_energy,
     new_axes,
 )
 from siq.report.plots.style import (
@@ -41,7 +39,7 @@ from siq.report.plots.style import (
     magnitude_label,
     mean_and_spread,
 )
-from siq.report.summary import LandscapeSummary, chosen_states
+from siq.report.summary import LandscapeSummary, summarise
 
 if TYPE_CHECKING:
     from siq.data.recordings import Recordings
@@ -95,7 +93,7 @@ def plot_wells(
     >>> [text.get_text() for text in axes.get_legend().get_texts()]
     ['well A', 'well B', 'saddle']
     """
-    shown = as_drawn(landscape, recordings)
+    shown = summarise(landscape, recordings)
     axes = new_axes() if ax is None else ax
     known = [(place, well) for place, well in enumerate(shown.formulas) if well is not None]
     handles = [
@@ -106,7 +104,7 @@ def plot_wells(
         _draw_curves(axes, shown, known)
         handles.append(Line2D([], [], label="saddle", **SADDLE))
     else:
-        plane = chosen_states(shown, states)
+        plane = shown.plane(states)
         handles += _draw_states(axes, shown, known, plane)
         handles += [one for one in draw_equilibria(axes, shown, plane) if one.get_label() == "saddle"]
         name_axes(axes, shown, plane)
@@ -154,7 +152,7 @@ def plot_paths(
     >>> [line.get_label() for line in axes.lines][:2]
     ['A to B', 'B to A']
     """
-    shown = as_drawn(landscape)
+    shown = summarise(landscape)
     ways = [way for way in shown.ways if len(way.uphill)]
     if not ways:
         raise ValueError("no way out of any well is known: there is no path to draw")
@@ -182,7 +180,7 @@ def plot_paths(
     axes.axvline(0.0, color=GREY, linewidth=0.8, linestyle=(0, (2, 2)), zorder=0)
     axes.margins(y=0.15)
     largest = max(abs(limit) for limit in axes.get_ylim())
-    axes.set_ylabel(energy_axis_label(axes.yaxis, shown, largest, "$U$ along the way"))
+    name_energy(axes, shown, largest, "$U$ along the way")
     unit = shown.units[0] if one_unit else ""
     what = "distance from the saddle" if one_unit else "distance from the saddle / size of the region"
     axes.set_xlabel(f"{what} ({unit_text(unit)})" if unit not in ("", "1") else what)
@@ -246,7 +244,7 @@ def _letter(axes: Axes, label: str, place: tuple[float, float], below: float) ->
 def _draw_curves(axes: Axes, landscape: LandscapeSummary, known: Sequence[tuple[int, Well]]) -> None:
     x = landscape.along(0, CURVE_POINTS)
     every = [landscape.wells[place].height + 2 * well.known_values(x[:, None]) for place, well in known]
-    top = highest_shown(landscape, np.concatenate(every) if every else np.zeros(0))
+    top = landscape.highest_shown(np.concatenate([np.zeros(0), *every]))
     for (place, _), values in zip(known, every, strict=True):
         shade = np.where(values < top, values, np.nan)
         well, colour = landscape.wells[place], _look(place, "color")
@@ -261,7 +259,7 @@ def _draw_curves(axes: Axes, landscape: LandscapeSummary, known: Sequence[tuple[
         axes.plot(one.position, [one.height], **SADDLE)
     axes.margins(y=0.15)
     name_axes(axes, landscape, (0,))
-    axes.set_ylabel(energy_axis_label(axes.yaxis, landscape, abs(top)))
+    name_energy(axes, landscape, abs(top))
 
 
 def _draw_states(
@@ -345,7 +343,7 @@ def plot_barriers(landscape: Landscape | LandscapeSummary, *, ax: Axes | None = 
     >>> [label.get_text().splitlines()[0] for label in axes.get_xticklabels()]
     ['A', 'B']
     """
-    shown = as_drawn(landscape)
+    shown = summarise(landscape)
     if not any(np.isfinite(way.barrier) for way in shown.ways):
         raise ValueError("no barrier of this landscape is known: there is nothing to draw")
     axes = new_axes() if ax is None else ax
@@ -381,7 +379,7 @@ def plot_barriers(landscape: Landscape | LandscapeSummary, *, ax: Axes | None = 
     axes.margins(y=0.08)
     axes.spines["bottom"].set_visible(False)
     what = "$U$" if shown.matched else "$U$ above each bottom"
-    axes.set_ylabel(energy_axis_label(axes.yaxis, shown, reach, what))
+    name_energy(axes, shown, reach, what)
     axes.set_xlabel("bars: ± 2 standard errors of the lowest way out", color=GREY)
     return axes
 
