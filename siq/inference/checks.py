@@ -137,17 +137,8 @@ def residual_noise(
                 rounding_bias=bias, decimals=max(int(np.ceil(-np.log10(step))), 1),
                 remarks=(remark,) if bias <= HARMLESS_BIAS else (),
             )  # fmt: skip
-    return NoiseDiagnosis(
-        kind, intensity, covariance, correlation, score, measurement, **deviations(whole, len(pairs.h))
-    )
-
-
-def deviations(whitened: np.ndarray, samples: int) -> dict[str, float]:
-    """Those of `NoiseDiagnosis`, of the covariance ``(d, d)`` of so many residuals in units of D."""
-    unit = np.eye(len(whitened))
-    excess = np.abs(whitened - unit)
-    score = float((excess / np.sqrt((1 + unit) / samples)).max())
-    return {"deviation": float(excess.max()), "deviation_score": score}
+    noise = NoiseDiagnosis(kind, intensity, covariance, correlation, score, measurement)
+    return noise.with_deviation(whole, len(pairs.h))
 
 
 def neighbour_correlations(found: FieldEstimate, sample: SnapshotPairs) -> tuple[np.ndarray, np.ndarray]:

@@ -26,13 +26,13 @@ import numpy as np
 import sympy
 
 from siq.errors import Fault, InputError, NumericalFailure
-from siq.inference.library import CandidateLibrary, IdentificationOptions, field_library
+from siq.inference.library import CandidateLibrary, IdentificationOptions, field_dynamics, field_library
 from siq.inference.selection import ModelAverage
 from siq.numerics.files import whole_file
 from siq.numerics.integration import runge_kutta_step
 from siq.remarks import Remark, sentence
 from siq.systems.diffusion import Diffusion
-from siq.systems.dynamics import Dynamics, Parameter, symbol
+from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import compile_formulas, parse_formula
 
 Field = Callable[[np.ndarray], np.ndarray]
@@ -320,6 +320,13 @@ class NoiseDiagnosis:
             abs(self.correlation_score) > SIGNIFICANT_SCORE and abs(self.correlation) > HARMLESS_CORRELATION
         )
 
+    def with_deviation(self, whitened: np.ndarray, samples: int) -> NoiseDiagnosis:
+        """With the deviation of the covariance ``(d, d)`` of so many residuals, in units of D."""
+        unit = np.eye(len(whitened))
+        excess = np.abs(whitened - unit)
+        score = float((excess / np.sqrt((1 + unit) / samples)).max())
+        return replace(self, deviation=float(excess.max()), deviation_score=score)
+
     def fault(self, states: Sequence[str]) -> str | None:
         """Why formulas from these recordings would be biased, in words; None where they are not."""
         deviates = self.deviation_score > SIGNIFICANT_SCORE and self.deviation > HARMLESS_CORRELATION
@@ -578,34 +585,6 @@ def _spread_out(library: CandidateLibrary, support: np.ndarray, values: np.ndarr
     matrix = np.zeros((library.size, library.dimension))
     matrix[support[:, 1], support[:, 0]] = values
     return matrix
-
-
-def field_dynamics(
-    library: CandidateLibrary,
-    support: np.ndarray,
-    values: np.ndarray,
-    *,
-    diffusion: Diffusion,
-    covariance: np.ndarray | None = None,
-) -> Dynamics:
-    """Dynamics whose parameters are the coefficients of f over some terms of a library.
-
-    Their values ``(p,)`` and covariance ``(p, p)`` belong to a support ``(p, 2)`` of components and terms.
-    """
-    prefix = "c"
-    while any(f"{prefix}{place}" in library.states for place in range(len(support))):
-        prefix += "_"
-    names = [f"{prefix}{place}" for place in range(len(support))]
-    equations = [sympy.S.Zero] * library.dimension
-    for (component, term), name in zip(support, names, strict=True):
-        equations[component] += symbol(name) * library.terms[term]
-    return Dynamics(
-        states=library.states,
-        equations=tuple(equations),
-        diffusion=diffusion,
-        parameters=tuple(Parameter(name, float(value)) for name, value in zip(names, values, strict=True)),
-        covariance=covariance,
-    )
 
 
 @dataclass(frozen=True, eq=False)

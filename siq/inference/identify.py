@@ -34,7 +34,6 @@ from siq.inference.checks import (
     PredictionLimits,
     bias_of_rounding,
     check_prediction,
-    deviations,
     mean_residual_probability,
     neighbour_correlations,
     prediction_errors,
@@ -345,9 +344,7 @@ class _Case:
         found, source = self._with_diffusion(with_process_noise_rate(found, pairs), independent)
         intensity = found.diffusion.intensity(found.noise_rate)
         covariance = found.noise_rate / intensity
-        deviation = deviations(
-            found.diffusion.whitening @ covariance @ found.diffusion.whitening.T, independent
-        )
+        whitening = found.diffusion.whitening
         state = int(np.argmax(np.abs(memory.correlations[0])))
         correlation = float(memory.correlations[0, state])
         values = {
@@ -357,8 +354,8 @@ class _Case:
         noise = NoiseDiagnosis(
             "process", intensity, covariance, correlation, correlation / float(memory.errors[0, state]),
             np.zeros(len(covariance)), pairs=independent, diffusion=source, lag=memory.lag,
-            lost_time=lost_time(found, pairs), **deviation, remarks=(Remark("inference.correlated", values),),
-        )  # fmt: skip
+            lost_time=lost_time(found, pairs), remarks=(Remark("inference.correlated", values),),
+        ).with_deviation(whitening @ covariance @ whitening.T, independent)  # fmt: skip
         return self._tested_by_pairs(replace(found, diagnosis=noise), training, unseen)
 
     def _finished_by_pairs(self, found: FieldEstimate) -> FieldEstimate:

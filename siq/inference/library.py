@@ -21,6 +21,7 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from siq.errors import NumericalFailure
 from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics, Parameter, symbol
 from siq.systems.formulas import FormulaError, compile_formulas, parse_formula
 
 FAR = 10.0  # half ranges from the origin within which powers are alike for other reasons
@@ -262,6 +263,34 @@ def linear_combination(expression: sympy.Expr) -> dict[sympy.Expr, float]:
         if coefficient != 0:
             combination[function] = combination.get(function, 0.0) + float(coefficient)
     return combination
+
+
+def field_dynamics(
+    library: CandidateLibrary,
+    support: np.ndarray,
+    values: np.ndarray,
+    *,
+    diffusion: Diffusion,
+    covariance: np.ndarray | None = None,
+) -> Dynamics:
+    """Dynamics whose parameters are the coefficients of f over some terms of a library.
+
+    Their values ``(p,)`` and covariance ``(p, p)`` belong to a support ``(p, 2)`` of components and terms.
+    """
+    prefix = "c"
+    while any(f"{prefix}{place}" in library.states for place in range(len(support))):
+        prefix += "_"
+    names = [f"{prefix}{place}" for place in range(len(support))]
+    equations = [sympy.S.Zero] * library.dimension
+    for (component, term), name in zip(support, names, strict=True):
+        equations[component] += symbol(name) * library.terms[term]
+    return Dynamics(
+        states=library.states,
+        equations=tuple(equations),
+        diffusion=diffusion,
+        parameters=tuple(Parameter(name, float(value)) for name, value in zip(names, values, strict=True)),
+        covariance=covariance,
+    )
 
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))

@@ -559,10 +559,8 @@ def fit_by_multiple_shooting(
 
     Parameters
     ----------
-    model
+    model, data
         Its parameters' values are where the fit begins.
-    data
-        The measurements.
     x
         States to begin with, shape ``(n, d)``.
     noise
@@ -571,10 +569,8 @@ def fit_by_multiple_shooting(
         Whether the process noise is estimated, too; the measurement noise always is.
     substeps
         Runge–Kutta steps between samples; by default as many as the accuracy needs.
-    iterations
-        Most steps.
-    budget
-        Charged for every evaluation.
+    iterations, budget
+        Most steps; charged for every evaluation.
 
     Returns
     -------

@@ -42,9 +42,9 @@ import sympy
 from siq.data.recordings import Recordings
 from siq.data.stationarity import runs_of, usual_step
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import FieldEstimate, field_dynamics
+from siq.inference.field_estimate import FieldEstimate
 from siq.inference.kalman_filter import Noise, whiten
-from siq.inference.library import CandidateLibrary, candidate_library
+from siq.inference.library import CandidateLibrary, candidate_library, field_dynamics
 from siq.inference.maximum_likelihood import Fit, fit_by_filter
 from siq.inference.measurements import Measurements
 from siq.inference.selection import all_coefficients

@@ -43,6 +43,7 @@ import scipy.special
 
 from siq.errors import NumericalFailure
 from siq.inference.library import CandidateLibrary, total_degree
+from siq.numerics.randomness import positive
 
 Result = TypeVar("Result")
 
@@ -123,8 +124,7 @@ class LinearProblem:
         places = list(support)
         if places:
             chosen = self.columns[:, places]
-            scale = np.linalg.norm(chosen, axis=0)
-            scale = np.where(scale > 0, scale, 1.0)
+            scale = positive(np.linalg.norm(chosen, axis=0))
             coefficients[places] = np.linalg.lstsq(chosen / scale, self.goal, rcond=None)[0] / scale
         return coefficients
 
@@ -423,8 +423,7 @@ def _mean_over_supports(
     lowest = min(scores.values())
     odds = {one: float(np.exp(-(score - lowest) / 2)) for one, score in scores.items()}
     odds = {one: share for one, share in odds.items() if share > MIN_ODDS}
-    size = np.linalg.norm(problem.columns, axis=0)
-    size = np.where(size > 0, size, 1.0)
+    size = positive(np.linalg.norm(problem.columns, axis=0))
     weights = np.array(list(odds.values()))
     weights /= weights.sum()
     changes = np.array([problem.solve(one) for one in odds]) - problem.solve(support)

@@ -54,7 +54,8 @@ from siq.data.two_states import (
     switching,
 )
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import FieldEstimate, Verdict, field_dynamics
+from siq.inference.field_estimate import FieldEstimate, Verdict
+from siq.inference.library import field_dynamics
 from siq.numerics.randomness import normal_draws
 from siq.numerics.text import place_text
 from siq.quasipotential.rates import NoiseStrength, mean_residence_time
