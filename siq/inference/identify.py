@@ -62,7 +62,7 @@ from siq.inference.kalman_identification import (
     held_out_innovations,
     identify_by_likelihood,
 )
-from siq.inference.library import CandidateLibrary, IdentificationOptions, check_origin, field_library
+from siq.inference.library import CandidateLibrary, IdentificationOptions, field_library
 from siq.inference.observation import ObservationModel, inertia_test, moved_by, velocity_names
 from siq.inference.regression import (
     carries_noise,
@@ -189,7 +189,7 @@ class _Case:
 
     def identified(self) -> FieldEstimate:
         """By the method that noise and correlations of the recordings ask for."""
-        check_origin(self.library, self.recordings.values, names=self.recordings.titles)
+        self.library.check_origin(self.recordings.values, names=self.recordings.titles)
         training, step = self._pairs(self.training), self.integrator_step
         regress = partial(identify_vector_field, self.library, options=self.options, integrator_step=step)
         if not carries_noise(self.library, training, options=self.options, integrator_step=step):

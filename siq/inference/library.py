@@ -20,6 +20,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from siq.errors import NumericalFailure
+from siq.numerics.randomness import positive
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, symbol
 from siq.systems.formulas import FormulaError, compile_formulas, parse_formula
@@ -84,6 +85,57 @@ class CandidateLibrary:
     def evaluate(self, x: np.ndarray) -> np.ndarray:
         """Θ(x): points of shape ``(n, d)`` to values of shape ``(n, q)``."""
         return self._function(np.ascontiguousarray(x.T)).T
+
+    def total_degree(self, place: int) -> int:
+        """Total degree of one of the functions, by its place; 0 of one that is no polynomial."""
+        term = self.terms[place]
+        return int(term.as_poly(*self.symbols).total_degree()) if term.is_polynomial(*self.symbols) else 0
+
+    def check_origin(self, x: np.ndarray, *, names: Sequence[str]) -> None:
+        """Refuse states ``(n, d)`` whose origin is so far from them that their powers are all the same.
+
+        Raises
+        ------
+        NumericalFailure
+            Where errors of coefficients would be rounding. It says what to subtract, by the names that people
+            use.
+        """
+        low, high = x.min(axis=0), x.max(axis=0)
+        middle, half = (low + high) / 2, (high - low) / 2
+        if not (np.abs(middle) > FAR * half).any():
+            return
+        columns = self.evaluate(x)
+        size = np.linalg.norm(columns, axis=0)
+        values = np.linalg.svd(np.linalg.qr(columns / positive(size), mode="r"), compute_uv=False)
+        # Covariances lose twice the digits that coefficients lose.
+        if values[-1] > np.sqrt(np.finfo(float).eps) * values[0]:
+            return
+        worst = int(np.argmax(np.abs(middle) / np.where(half > 0, half, np.inf)))
+        digits = int(np.floor(np.log10(half[worst])))
+        raise NumericalFailure(
+            f"{names[worst]} stays so far from zero, between {low[worst]:.6g} and {high[worst]:.6g}, that its"
+            f" powers cannot be told apart; subtract {round(float(middle[worst]), -digits):.10g} from it"
+        )
+
+    def constraints(self, diffusion: Diffusion) -> np.ndarray:
+        """C of ``C Ξ = 0``: the identity f = -D∇V + g, and the functions that V and g may not use.
+
+        Shape ``(rows, (2d + 1) q)``, of full row rank. Ξ is flattened by target, in order f_1 … f_d, V,
+        g_1 … g_d, with the library's order within each.
+        """
+        q, d = self.size, self.dimension
+        targets = 2 * d + 1
+        identity = np.zeros((d, q, targets, q))
+        downhill = self.downhill(diffusion)
+        for i in range(d):
+            identity[i, :, i, :] = np.eye(q)
+            identity[i, :, d, :] = downhill[i]
+            identity[i, :, d + 1 + i, :] = -np.eye(q)
+        absent = np.zeros((targets, q), dtype=bool)
+        absent[d] = ~self.in_potential
+        absent[d + 1 :] = ~self.in_circulatory
+        zeros = np.eye(targets * q)[absent.ravel()]
+        return np.concatenate([identity.reshape(d * q, targets * q), zeros])
 
 
 def candidate_library(
@@ -165,45 +217,12 @@ def joint_library(
     highest, others = degree, list(further)
     for place, (name, term) in enumerate(zip(of_field.names, of_field.terms, strict=True)):
         if term.is_polynomial(*of_field.symbols):
-            highest = max(highest, total_degree(of_field, place))
+            highest = max(highest, of_field.total_degree(place))
         elif name not in others:
             others.append(name)
     return candidate_library(
         of_field.states, degree=highest, potential_degree=potential_degree, further=others
     )
-
-
-def check_origin(library: CandidateLibrary, x: np.ndarray, *, names: Sequence[str]) -> None:
-    """Refuse states ``(n, d)`` whose origin is so far from them that their powers are all the same function.
-
-    Raises
-    ------
-    NumericalFailure
-        Where errors of coefficients would be rounding. It says what to subtract, by the names that people
-        use.
-    """
-    low, high = x.min(axis=0), x.max(axis=0)
-    middle, half = (low + high) / 2, (high - low) / 2
-    if not (np.abs(middle) > FAR * half).any():
-        return
-    columns = library.evaluate(x)
-    size = np.linalg.norm(columns, axis=0)
-    values = np.linalg.svd(np.linalg.qr(columns / np.where(size > 0, size, 1.0), mode="r"), compute_uv=False)
-    # Covariances lose twice the digits that coefficients lose.
-    if values[-1] > np.sqrt(np.finfo(float).eps) * values[0]:
-        return
-    worst = int(np.argmax(np.abs(middle) / np.where(half > 0, half, np.inf)))
-    digits = int(np.floor(np.log10(half[worst])))
-    raise NumericalFailure(
-        f"{names[worst]} stays so far from zero, between {low[worst]:.6g} and {high[worst]:.6g}, that its"
-        f" powers cannot be told apart; subtract {round(float(middle[worst]), -digits):.10g} from it"
-    )
-
-
-def total_degree(library: CandidateLibrary, place: int) -> int:
-    """Total degree of one function of a library, by its place; 0 of one that is no polynomial."""
-    term = library.terms[place]
-    return int(term.as_poly(*library.symbols).total_degree()) if term.is_polynomial(*library.symbols) else 0
 
 
 def monomial_exponents(dimension: int, degree: int) -> list[tuple[int, ...]]:
@@ -213,43 +232,6 @@ def monomial_exponents(dimension: int, degree: int) -> list[tuple[int, ...]]:
         for total in range(degree + 1)
         for chosen in itertools.combinations_with_replacement(range(dimension), total)
     ]
-
-
-def constraint_matrix(
-    library: CandidateLibrary, diffusion: Diffusion, *, columns: Sequence[np.ndarray] | None = None
-) -> np.ndarray:
-    """C of ``C Ξ = 0``: the identity f = -D∇V + g, and the functions that V and g may not use.
-
-    Parameters
-    ----------
-    library
-        The q functions of the d states.
-    diffusion
-        D.
-    columns
-        Further coefficients that are zero: for each of the 2d + 1 targets a mask of shape ``(q,)``.
-
-    Returns
-    -------
-    numpy.ndarray
-        Shape ``(rows, (2d + 1) q)``; of full row rank without `columns`. Ξ is flattened by target, in order
-        f_1 … f_d, V, g_1 … g_d, with the library's order within each.
-    """
-    q, d = library.size, library.dimension
-    targets = 2 * d + 1
-    identity = np.zeros((d, q, targets, q))
-    downhill = library.downhill(diffusion)
-    for i in range(d):
-        identity[i, :, i, :] = np.eye(q)
-        identity[i, :, d, :] = downhill[i]
-        identity[i, :, d + 1 + i, :] = -np.eye(q)
-    absent = np.zeros((targets, q), dtype=bool)
-    absent[d] = ~library.in_potential
-    absent[d + 1 :] = ~library.in_circulatory
-    if columns is not None:
-        absent |= np.stack(columns)
-    zeros = np.eye(targets * q)[absent.ravel()]
-    return np.concatenate([identity.reshape(d * q, targets * q), zeros])
 
 
 def linear_combination(expression: sympy.Expr) -> dict[sympy.Expr, float]:

@@ -42,7 +42,7 @@ import scipy.linalg
 import scipy.special
 
 from siq.errors import NumericalFailure
-from siq.inference.library import CandidateLibrary, total_degree
+from siq.inference.library import CandidateLibrary
 from siq.numerics.randomness import positive
 
 Result = TypeVar("Result")
@@ -68,7 +68,7 @@ def critical_values(library: CandidateLibrary, *, false_terms: float) -> np.ndar
     """
     degrees = np.array(
         [
-            total_degree(library, place) if term.is_polynomial(*library.symbols) else FURTHER_DEGREE
+            library.total_degree(place) if term.is_polynomial(*library.symbols) else FURTHER_DEGREE
             for place, term in enumerate(library.terms)
         ]
     )

@@ -21,7 +21,7 @@ from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from siq.errors import Fault, NumericalFailure, needs_extra
-from siq.inference.library import CandidateLibrary, constraint_matrix
+from siq.inference.library import CandidateLibrary
 from siq.systems.diffusion import Diffusion
 
 LOWER_SHARE = 0.75
@@ -179,7 +179,7 @@ def sparse_decomposition(
     matrix, goals, rest = triangle[:q, :q], triangle[:q, q:], triangle[q:, q:]
 
     ratio = term_scale[:, None] / target_scale[None, :]  # scaled coefficient = ratio × coefficient
-    constraints = constraint_matrix(library, diffusion) / ratio.T.ravel()
+    constraints = library.constraints(diffusion) / ratio.T.ravel()
     constraints /= np.linalg.norm(constraints, axis=1, keepdims=True)
     thresholds = options.threshold * (ratio if options.threshold_on == "coefficient" else np.ones_like(ratio))
 

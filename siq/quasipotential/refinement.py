@@ -30,7 +30,7 @@ from siq.data.recordings import Recordings, SnapshotPairs, held_out_recordings, 
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.inference.kalman_identification import filtered_recordings
-from siq.inference.library import CandidateLibrary, joint_library, total_degree
+from siq.inference.library import CandidateLibrary, joint_library
 from siq.inference.regression import coarse_pairs
 from siq.inference.selection import ModelAverage
 from siq.networks.decomposition import CheckOptions, TrainedNetworks, shuffled
@@ -159,7 +159,7 @@ def _formula_library(found: FieldEstimate, options: RefinementOptions) -> Candid
     """
     degree = options.formula_degree
     if degree is None:
-        highest = max(total_degree(found.library, term) for _, term in found.support)
+        highest = max(found.library.total_degree(term) for _, term in found.support)
         degree = affordable_degree(found.library.dimension, max(4, highest + 1))
     return joint_library(found.library, degree=degree, potential_degree=degree, further=options.functions)
 

@@ -10,8 +10,6 @@ from siq.errors import NumericalFailure
 from siq.inference.library import (
     CandidateLibrary,
     candidate_library,
-    check_origin,
-    constraint_matrix,
     monomial_exponents,
 )
 from siq.systems.diffusion import Diffusion
@@ -136,7 +134,7 @@ def test_the_constraints_hold_exactly_when_f_is_minus_d_grad_v_plus_g(
     diffusion: np.ndarray, options: dict
 ) -> None:
     library = candidate_library(("x", "y"), **options)
-    matrix = constraint_matrix(library, Diffusion(diffusion))
+    matrix = library.constraints(Diffusion(diffusion))
     assert np.linalg.matrix_rank(matrix) == len(matrix)
     parts = decompose(library, diffusion)
     np.testing.assert_allclose(matrix @ flatten(*parts), 0, atol=1e-12)
@@ -161,19 +159,9 @@ def test_the_constraints_hold_exactly_when_f_is_minus_d_grad_v_plus_g(
 
 def test_every_solution_of_the_constraints_is_a_decomposition() -> None:
     library = candidate_library(("x", "y"), degree=3)
-    matrix = constraint_matrix(library, Diffusion(FULL))
+    matrix = library.constraints(Diffusion(FULL))
     free = matrix.shape[1] - np.linalg.matrix_rank(matrix)
     assert free == library.size * (1 + library.dimension)  # V and g are free, f follows
-
-
-def test_further_zeros_are_imposed() -> None:
-    library = candidate_library(("x", "y"), degree=2)
-    columns = [np.zeros(library.size, dtype=bool) for _ in range(5)]
-    columns[3][2] = True
-    matrix = constraint_matrix(library, Diffusion.identity(2), columns=columns)
-    xi = np.zeros(5 * library.size)
-    xi[3 * library.size + 2] = xi[2] = 1  # g_x and f_x use the term alike
-    assert np.abs(matrix @ xi).max() == 1
 
 
 @pytest.mark.parametrize(
@@ -196,9 +184,9 @@ def test_states_far_from_their_origin_are_refused_with_what_to_subtract() -> Non
     library = candidate_library(["T"], degree=5)
     states = np.random.default_rng(0).uniform(-1.7, 1.7, (500, 1))
     for near in (0.0, 5.0, 15.0):
-        check_origin(library, states + near, names=["T"])
+        library.check_origin(states + near, names=["T"])
     with pytest.raises(
         NumericalFailure, match=r"^T stays .* between 271.\d+ and 274.\d+, .* subtract 273 from it"
     ):
-        check_origin(library, states + 273, names=["T"])
-    check_origin(candidate_library(["T"], degree=1), states + 273, names=["T"])
+        library.check_origin(states + 273, names=["T"])
+    candidate_library(["T"], degree=1).check_origin(states + 273, names=["T"])
