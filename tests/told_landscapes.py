@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import sympy
@@ -57,3 +58,19 @@ def told(data: dict[str, Any]) -> Landscape:
     """The landscape that plain data are of; of its f nothing is asked."""
     symbols = [sympy.Symbol(name, real=True) for name in data["states"]]
     return landscape_from_data(data, Dynamics.of(symbols, symbols))
+
+
+def record_row(**change: Any) -> dict[str, object]:
+    """A row of the table ``record``: visits to a well, counted and predicted."""
+    row: dict[str, object] = {
+        "run": 0, "attractor": "(1)", "visits": 16, "time": 800.0, "counted": 50.0, "lowest": 31.0,
+        "highest": 87.0, "held_out_visits": 4, "held_out_time": 180.0, "held_out_counted": 45.0,
+        "predicted": 51.0, "predicted_error": 3.0, "method": "operator", "probability": 0.8,
+    }  # fmt: skip
+    return row | change
+
+
+def unseen_row(**change: Any) -> dict[str, object]:
+    """One of a well no visit to which was seen to end."""
+    nothing = {"visits": 0, "counted": math.nan, "highest": math.nan}
+    return record_row(**nothing, held_out_visits=0, held_out_counted=math.nan, **change)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from told_landscapes import NOISE, landscape, told
+from told_landscapes import NOISE, landscape, record_row, told
 
 from siq.data.two_states import DwellCount, RecordStates
 from siq.report.summary import summarise
@@ -26,11 +26,9 @@ def test_two_states_of_a_record_are_told_without_any_formula() -> None:
 
 def test_visits_belong_to_the_well_at_their_place() -> None:
     rows = [
-        {"run": 0, "attractor": place, "visits": 5, "time": 5 * mean, "counted": mean, "lowest": 4.0,
-         "highest": 20.0, "held_out_visits": 1, "held_out_time": 9.0, "held_out_counted": 9.0,
-         "predicted": mean + 1, "predicted_error": 1.0, "method": "operator", "probability": 0.5}
+        record_row(attractor=place, visits=5, time=5 * mean, counted=mean)
         for place, mean in (("(0.6)", 12.0), ("(−0.5)", 10.0))
-    ]  # fmt: skip
+    ]
     data = told(landscape([[-0.5], [0.6]], [0.25, 0.35], noise=NOISE))
     wells = summarise(data, record=as_table("record", rows)).wells
     assert [one.visits.whole.mean for one in wells if one.visits] == [10.0, 12.0]

@@ -6,11 +6,10 @@ import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pytest
 import sympy
-from told_landscapes import NOISE, landscape, told
+from told_landscapes import NOISE, landscape, record_row, told, unseen_row
 
 from siq.quasipotential.formulas import SymbolicDecomposition, exact_decomposition, model_to_data, write_model
 from siq.report.formatting import texts
@@ -221,23 +220,8 @@ def test_what_the_command_prints_is_what_the_page_opens_with(tmp_path: Path) -> 
     assert page.index(sentence.split(";")[0]) < page.index("Formulas</h2>")
 
 
-def well(**change: Any) -> dict[str, object]:
-    row: dict[str, object] = {
-        "run": 0, "attractor": "(1)", "visits": 16, "time": 800.0, "counted": 50.0, "lowest": 31.0,
-        "highest": 87.0, "held_out_visits": 4, "held_out_time": 180.0, "held_out_counted": 45.0,
-        "predicted": 51.0, "predicted_error": 3.0, "method": "operator", "probability": 0.8,
-    }  # fmt: skip
-    return row | change
-
-
-def never(**change: Any) -> dict[str, object]:
-    return well(
-        visits=0, counted=np.nan, highest=np.nan, held_out_visits=0, held_out_counted=np.nan, **change
-    )
-
-
 def test_hops_are_counted_and_what_they_allow_is_said(tmp_path: Path) -> None:
-    rows = [well(), well(attractor="(-1)", visits=25)]
+    rows = [record_row(), record_row(attractor="(-1)", visits=25)]
     section = section_of(page_of(tmp_path, overview=WELLS, record=rows), "Against the record itself")
     (said,) = section.text
     assert said.startswith("41 hops") and "8 of them" in said and "is known to 25 % at best" in said
@@ -250,7 +234,9 @@ def test_hops_are_counted_and_what_they_allow_is_said(tmp_path: Path) -> None:
 
 
 def test_where_nothing_hops_it_is_said(tmp_path: Path) -> None:
-    section = section_of(page_of(tmp_path, overview=WELLS, record=[never()]), "Against the record itself")
+    section = section_of(
+        page_of(tmp_path, overview=WELLS, record=[unseen_row()]), "Against the record itself"
+    )
     assert section.text == ["No hop from well to well was seen."]
     assert section.tables[0].frame["mean visit, counted (s)"].tolist() == ["above 217"]
     assert "Against the record itself" not in headings(page_of(tmp_path, overview=WELLS))
@@ -259,7 +245,7 @@ def test_where_nothing_hops_it_is_said(tmp_path: Path) -> None:
 def test_the_test_against_the_record_is_drawn_beside_its_table(tmp_path: Path) -> None:
     images = ("record", "states_in_time", "visited", "memory")
     content = page_of(
-        tmp_path, overview=WELLS, record=[never()], inspection=["the noise is white."], images=images
+        tmp_path, overview=WELLS, record=[unseen_row()], inspection=["the noise is white."], images=images
     )
     assert len(content.sections[0].figures) == 3
     (figure,) = section_of(content, "Against the record itself").figures

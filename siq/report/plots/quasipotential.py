@@ -207,12 +207,11 @@ def plot_quasipotential(
 
     Examples
     --------
+    >>> import siq, sympy
     >>> from matplotlib.figure import Figure
-    >>> from siq.data.recordings import Recordings
-    >>> t, starts = np.linspace(0, 3, 61), np.random.default_rng(0).uniform(-1.5, 1.5, 60)
-    >>> x = starts / np.sqrt(starts**2 + (1 - starts**2) * np.exp(-2 * t[:, None]))  # dx/dt = x - x³
-    >>> recordings = Recordings.from_arrays(t, x.T[:, :, None], names=["x"])
-    >>> axes = plot_quasipotential(Landscape.from_recordings(recordings), ax=Figure().add_subplot())
+    >>> x = sympy.Symbol("x", real=True)
+    >>> wells = siq.Landscape.from_equations(siq.Dynamics.of([x], [x - x**3], domain=[(-2, 2)]))
+    >>> axes = plot_quasipotential(wells, ax=Figure().add_subplot())
     >>> axes.get_xlabel(), axes.get_ylabel()
     ('$x$', '$U$ (unit of ε)')
     """

@@ -84,12 +84,11 @@ def plot_wells(
 
     Examples
     --------
+    >>> import siq, sympy
     >>> from matplotlib.figure import Figure
-    >>> from siq.data.recordings import Recordings
-    >>> t, starts = np.linspace(0, 3, 61), np.random.default_rng(0).uniform(-1.5, 1.5, 60)
-    >>> x = starts / np.sqrt(starts**2 + (1 - starts**2) * np.exp(-2 * t[:, None]))  # dx/dt = x - x³
-    >>> recordings = Recordings.from_arrays(t, x.T[:, :, None], names=["x"])
-    >>> axes = plot_wells(Landscape.from_recordings(recordings), ax=Figure().add_subplot())
+    >>> x = sympy.Symbol("x", real=True)
+    >>> wells = siq.Landscape.from_equations(siq.Dynamics.of([x], [x - x**3], domain=[(-2, 2)]))
+    >>> axes = plot_wells(wells, ax=Figure().add_subplot())
     >>> [text.get_text() for text in axes.get_legend().get_texts()]
     ['well A', 'well B', 'saddle']
     """
@@ -143,12 +142,11 @@ def plot_paths(
 
     Examples
     --------
+    >>> import siq, sympy
     >>> from matplotlib.figure import Figure
-    >>> from siq.data.recordings import Recordings
-    >>> t, starts = np.linspace(0, 3, 61), np.random.default_rng(0).uniform(-1.5, 1.5, 60)
-    >>> x = starts / np.sqrt(starts**2 + (1 - starts**2) * np.exp(-2 * t[:, None]))  # dx/dt = x - x³
-    >>> recordings = Recordings.from_arrays(t, x.T[:, :, None], names=["x"])
-    >>> axes = plot_paths(Landscape.from_recordings(recordings), ax=Figure().add_subplot())
+    >>> x = sympy.Symbol("x", real=True)
+    >>> wells = siq.Landscape.from_equations(siq.Dynamics.of([x], [x - x**3], domain=[(-2, 2)]))
+    >>> axes = plot_paths(wells, ax=Figure().add_subplot())
     >>> [line.get_label() for line in axes.lines][:2]
     ['A to B', 'B to A']
     """
@@ -334,12 +332,11 @@ def plot_barriers(landscape: Landscape | LandscapeSummary, *, ax: Axes | None = 
 
     Examples
     --------
+    >>> import siq, sympy
     >>> from matplotlib.figure import Figure
-    >>> from siq.data.recordings import Recordings
-    >>> t, starts = np.linspace(0, 3, 61), np.random.default_rng(0).uniform(-1.5, 1.5, 60)
-    >>> x = starts / np.sqrt(starts**2 + (1 - starts**2) * np.exp(-2 * t[:, None]))  # dx/dt = x - x³
-    >>> recordings = Recordings.from_arrays(t, x.T[:, :, None], names=["x"])
-    >>> axes = plot_barriers(Landscape.from_recordings(recordings), ax=Figure().add_subplot())
+    >>> x = sympy.Symbol("x", real=True)
+    >>> wells = siq.Landscape.from_equations(siq.Dynamics.of([x], [x - x**3], domain=[(-2, 2)]))
+    >>> axes = plot_barriers(wells, ax=Figure().add_subplot())
     >>> [label.get_text().splitlines()[0] for label in axes.get_xticklabels()]
     ['A', 'B']
     """
