@@ -24,19 +24,15 @@ Lyapunov.
 
 Notes
 -----
-Stable cycles are sought where trajectories end that come to rest nowhere. These are followed from return to
-return through a section, the plane across f at their start; from a close return Newton's method seeks the
-periodic orbit. Chaos has periodic orbits too, but unstable ones; small differences grow in it from return to
-return, at the rate of the largest Lyapunov exponent. In two states unstable cycles are where trajectories
-come from. In more states a cycle that separates two basins attracts along their boundary, which is tracked
-(`siq.systems.basins`).
+A trajectory that comes to rest nowhere is followed from return to return through a section, the plane across
+f at its start; from a close return Newton's method seeks the periodic orbit. Chaos has periodic orbits too,
+but unstable ones; small differences grow in it from return to return, at the rate of the largest Lyapunov
+exponent.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -46,9 +42,7 @@ from scipy.integrate import solve_ivp
 from scipy.sparse.linalg import spsolve
 
 from siq.errors import NumericalFailure
-from siq.systems.basins import Descents, ends_of, follow, settled_on, tracked_edge
 from siq.systems.dynamics import Dynamics
-from siq.systems.equilibria import Equilibrium, classify, spread_evenly
 
 PARTS = 256  # of the period: splines through as many points are exact to about 1e-8
 NEWTON_STEPS = 20
@@ -117,7 +111,7 @@ class Cycle:
         return np.asarray(np.linalg.norm(offset - share[:, :, None] * along, axis=2).min(axis=1))
 
 
-def _closed_orbit(dynamics: Dynamics, guess: np.ndarray, period: float, *, scale: np.ndarray) -> Cycle:
+def closed_orbit(dynamics: Dynamics, guess: np.ndarray, period: float, *, scale: np.ndarray) -> Cycle:
     """The periodic orbit next to a guess, stable or not.
 
     Parameters
@@ -288,156 +282,6 @@ def _parts(
     return end[:, :d], end[:, d : d + d * d].reshape(n, d, d), end[:, d + d * d :].reshape(n, d, d)
 
 
-MAX_TRIED_TRAJECTORIES = 12  # asked for their cycle: there are rarely more cycles than a few
-BACKWARD_STARTS = 256  # states of the domain that are followed backwards
-CYCLE_MERGE_TOLERANCE = 1e-3  # of the domain: closer cycles are one
-MAX_PAIRS = 6  # of attractors, between which a boundary is tracked in three states and more
-TRACKING_ROUNDS = 40  # of tracking a boundary
-ROUNDS_BEFORE_SEARCH = 4  # before a cycle is looked for on it
-RETURN_RADIUS = 0.05  # of the domain: a state on the boundary that has come back, as a guess
-
-
-def stable_cycles(
-    dynamics: Dynamics, descents: Descents, *, first: int, box: np.ndarray, rate: float
-) -> tuple[tuple[Cycle, ...], Descents]:
-    """Stable cycles on which descents end, and the descents with the numbers of these.
-
-    Parameters
-    ----------
-    dynamics
-        f.
-    descents
-        Of which some have come to rest nowhere.
-    first
-        The number of the first cycle: that of the attractors.
-    box
-        Shape ``(d, 2)``: the domain.
-    rate
-        At which f crosses it.
-    """
-    ends, last, asked = descents.ends.copy(), descents.paths[:, -1], np.zeros(len(descents.ends), dtype=bool)
-    cycles: list[Cycle] = []
-    for _ in range(MAX_TRIED_TRAJECTORIES):
-        left = np.flatnonzero((ends < 0) & ~descents.escaped)
-        if asked[left].all():
-            break
-        one = left[~asked[left]][0]
-        asked[one] = True
-        cycle = recurrence_of(dynamics, last[one][None], box=box, rate=rate).cycle
-        if cycle is None:
-            continue
-        index = _place_among(cycles, cycle, box)
-        near = settled_on(last[left], cycles, box=box)
-        ends[left[near >= 0]] = first + near[near >= 0]
-        ends[one] = first + index
-    return tuple(cycles), replace(descents, ends=ends)
-
-
-def _place_among(cycles: list[Cycle], new: Cycle, box: np.ndarray) -> int:
-    """The place of a cycle among those that are known; it is added where it is not known yet."""
-    width = np.ptp(box, axis=1)
-    for index, one in enumerate(cycles):
-        if one.distances(new.points[:1], scale=width)[0] < CYCLE_MERGE_TOLERANCE:
-            return index
-    cycles.append(new)
-    return len(cycles) - 1
-
-
-def unstable_cycles_of_plane(
-    dynamics: Dynamics, equilibria: Sequence[Equilibrium], *, box: np.ndarray, generator: np.random.Generator
-) -> tuple[Cycle, ...]:
-    """Cycles of two states that are left on both sides: stable ones of the same equations backwards in time.
-
-    Parameters
-    ----------
-    dynamics
-        f.
-    equilibria
-        All of the domain.
-    box
-        Shape ``(2, 2)``: the domain.
-    generator
-        Scrambles the states that are followed backwards.
-    """
-    backwards = Dynamics.of(dynamics.symbols, [-one for one in dynamics.formulas])
-    sources = [classify(backwards, one.position) for one in equilibria if one.kind == "repeller"]
-    starts = spread_evenly(box, BACKWARD_STARTS, generator=generator)
-    width = np.ptp(box, axis=1)
-    rate = float(np.median(np.linalg.norm(dynamics.drift(starts) / width, axis=1)))
-    try:
-        with np.errstate(all="ignore"):
-            ways = follow(backwards, starts, sources, box=box)
-            found, _ = stable_cycles(backwards, ways, first=len(sources), box=box, rate=rate)
-    except NumericalFailure:
-        return ()
-    inside = [one for one in found if ((one.points > box[:, 0]) & (one.points < box[:, 1])).all()]
-    return tuple(_closed_orbit(dynamics, one.points[::-1], one.period, scale=width) for one in inside)
-
-
-def separatrix_cycles(
-    dynamics: Dynamics,
-    attractors: Sequence[Equilibrium],
-    cycles: Sequence[Cycle],
-    *,
-    box: np.ndarray,
-    generator: np.random.Generator,
-) -> tuple[Cycle, ...]:
-    """Cycles with one unstable direction on the boundaries of basins, where a cycle is on one side of them.
-
-    Parameters
-    ----------
-    dynamics
-        f.
-    attractors, cycles
-        What is stable.
-    box
-        Shape ``(d, 2)``: the domain.
-    generator
-        Bends the first ways between them.
-    """
-
-    def ends(x: np.ndarray) -> np.ndarray:
-        return ends_of(dynamics, x, attractors, cycles, box=box)
-
-    width = np.ptp(box, axis=1)
-    places = [*(one.position for one in attractors), *(one.position for one in cycles)]
-    pairs = [pair for pair in itertools.combinations(range(len(places)), 2) if max(pair) >= len(attractors)]
-    found: list[Cycle] = []
-    for one, two in pairs[:MAX_PAIRS]:
-        edge = tracked_edge(dynamics, places[one], places[two], one, ends, width=width, generator=generator)
-        times, states = np.zeros(0), np.zeros((0, len(box)))
-        for number, (passed, along, _) in enumerate(itertools.islice(edge, TRACKING_ROUNDS + 1)):
-            times = np.append(times, times[-1:].sum() + passed)
-            states = np.concatenate([states, along])
-            cycle = _closed(dynamics, times, states, box) if number > ROUNDS_BEFORE_SEARCH else None
-            if cycle is not None and cycle.unstable == 1:
-                _place_among(found, cycle, box)
-                break
-    return tuple(found)
-
-
-def _closed(dynamics: Dynamics, times: np.ndarray, states: np.ndarray, box: np.ndarray) -> Cycle | None:
-    """A periodic orbit next to the last return of a trajectory; None where there is none."""
-    width = np.ptp(box, axis=1)
-    away = np.linalg.norm((states - states[-1]) / width, axis=1)
-    gone = np.flatnonzero(away > 2 * RETURN_RADIUS)
-    if not len(gone):
-        return None
-    before = np.flatnonzero(away[: gone[-1]] < RETURN_RADIUS)
-    if not len(before):
-        return None
-    last = before[-1]  # of the latest visit, the closest state
-    visit = last - np.flatnonzero(away[last::-1] > RETURN_RADIUS)[:1].sum() + 1
-    closest = visit + int(np.argmin(away[visit : last + 1]))
-    begin, period = times[closest], float(times[-1] - times[closest])
-    at = begin + np.linspace(0, period, PARTS, endpoint=False)
-    guess = np.stack([np.interp(at, times, column) for column in states.T], axis=1)
-    try:
-        return _closed_orbit(dynamics, guess, period, scale=width)
-    except NumericalFailure:
-        return None
-
-
 RETURNS = 40  # through the section, within which chaos has to have lost what was known at the start
 SEARCHED_RETURNS = (4, 12, RETURNS)  # after which a cycle is sought: most are found long before chaos can
 CLOSE_RETURN_RATIO = 2.0  # to the closest return: one as close may be earlier, and the period shorter
@@ -595,7 +439,7 @@ class _Motion:
         if not around.success:
             return None
         try:
-            cycle = _closed_orbit(self.dynamics, around.y.T * self.width, period, scale=self.width)
+            cycle = closed_orbit(self.dynamics, around.y.T * self.width, period, scale=self.width)
         except NumericalFailure:
             return None
         near = cycle.distances((base * self.width)[None], scale=self.width)[0] < CYCLE_DISTANCE

@@ -208,7 +208,19 @@ class Diffusion:
         NumericalFailure
             Where D is not positive definite, or formulas leave a state out.
         """
-        raise NotImplementedError
+        self._check_inverse()
+        matrices = self.at(x)
+        try:
+            root = np.linalg.cholesky(matrices)
+        except np.linalg.LinAlgError:
+            root = np.full(matrices.shape, np.nan)
+        if not np.isfinite(root).all():
+            lowest = np.full(len(x), -np.inf)  # eigenvalues, in units in which the diagonal is one
+            for k in np.flatnonzero(np.isfinite(matrices).all(axis=(1, 2))):
+                scale = np.sqrt(np.where(np.diag(matrices[k]) > 0, np.diag(matrices[k]), 1.0))
+                lowest[k] = np.linalg.eigvalsh(matrices[k] / np.outer(scale, scale))[0]
+            raise _indefinite(x[np.argmin(lowest)])
+        return root
 
     def whitening_at(self, x: np.ndarray) -> np.ndarray:
         """σ⁻¹ at points: ``(n, d)`` to ``(n, d, d)``; raises NumericalFailure where there is none."""
@@ -233,11 +245,19 @@ class Diffusion:
         Formulas may be none far from the states that they were learned from. Where they leave no state out, D
         has to be positive definite.
         """
-        return np.full(len(x), True)
+        matrices = self.at(x)
+        finite = np.isfinite(matrices).all(axis=(1, 2))
+        values = np.linalg.eigvalsh(np.where(finite[:, None, None], matrices, 0.0))
+        least = 0.0 if self.regular else -ROUNDING * np.abs(values).max(axis=1)
+        return np.asarray(finite & (values[:, 0] > least))
 
     def frozen(self, point: np.ndarray) -> Diffusion:
         """The constant D that is the one at a point ``(d,)``; raises NumericalFailure where it is none."""
-        raise NotImplementedError
+        matrix = self.at(np.asarray(point, dtype=float)[None])[0]
+        try:
+            return Diffusion(matrix)
+        except ValueError:
+            raise _indefinite(point) from None
 
     def kicks(self, x: np.ndarray, numbers: np.ndarray) -> np.ndarray:
         """``σ(x) ξ`` of components, for simulations: states and numbers ``(d, ...)`` to ``(d, ...)``.
@@ -300,6 +320,9 @@ class _Constant(Diffusion):
     def whitening_at(self, x: np.ndarray) -> np.ndarray:
         return np.broadcast_to(self.whitening, (len(x), *self.matrix.shape))
 
+    def positive_at(self, x: np.ndarray) -> np.ndarray:
+        return np.full(len(x), True)
+
     def frozen(self, point: np.ndarray) -> Diffusion:
         return self
 
@@ -345,35 +368,6 @@ class _Formulas(Diffusion):
                 entries = [each.diff(symbol) for each in entries for symbol in self.symbols]
             self._compiled[order] = compile_formulas(entries, self.symbols)
         return self._compiled[order](components)
-
-    def root_at(self, x: np.ndarray) -> np.ndarray:
-        self._check_inverse()
-        matrices = self.at(x)
-        try:
-            root = np.linalg.cholesky(matrices)
-        except np.linalg.LinAlgError:
-            root = np.full(matrices.shape, np.nan)
-        if not np.isfinite(root).all():
-            lowest = np.full(len(x), -np.inf)  # eigenvalues, in units in which the diagonal is one
-            for k in np.flatnonzero(np.isfinite(matrices).all(axis=(1, 2))):
-                scale = np.sqrt(np.where(np.diag(matrices[k]) > 0, np.diag(matrices[k]), 1.0))
-                lowest[k] = np.linalg.eigvalsh(matrices[k] / np.outer(scale, scale))[0]
-            raise _indefinite(x[np.argmin(lowest)])
-        return root
-
-    def positive_at(self, x: np.ndarray) -> np.ndarray:
-        matrices = self.at(x)
-        finite = np.isfinite(matrices).all(axis=(1, 2))
-        values = np.linalg.eigvalsh(np.where(finite[:, None, None], matrices, 0.0))
-        least = 0.0 if self.regular else -ROUNDING * np.abs(values).max(axis=1)
-        return np.asarray(finite & (values[:, 0] > least))
-
-    def frozen(self, point: np.ndarray) -> Diffusion:
-        matrix = self.at(np.asarray(point, dtype=float)[None])[0]
-        try:
-            return Diffusion(matrix)
-        except ValueError:
-            raise _indefinite(point) from None
 
     def kicks(self, x: np.ndarray, numbers: np.ndarray) -> np.ndarray:
         d = self.dimension

@@ -4,6 +4,10 @@ Of an identified f it follows from f and the recorded states. Both routes to V s
 check that ends a training. Of equations it follows from states that are spread evenly over the domain, with
 more of them about each attractor, as its linearisation tells how far: a well may be small in its domain.
 
+Stable cycles are sought where trajectories end that come to rest nowhere. In two states unstable ones are
+where trajectories come from. In more a cycle that separates two basins attracts along their boundary, which
+is tracked.
+
 In many states no search covers the domain. Attractors are then where f leads from states all over it, and
 saddles are found between each two of them by tracking the edge of their basins (`siq.systems.basins`). There
 are no basins in which V could be fitted, and what follows from paths needs none.
@@ -21,19 +25,23 @@ from scipy.spatial import cKDTree
 from siq.errors import NumericalFailure
 from siq.numerics.randomness import representative_subset
 from siq.remarks import Remark
-from siq.systems.basins import Basin, Descents, basin_of, edge_saddle, follow, sides_of
-from siq.systems.cycles import (
-    Cycle,
-    Recurrence,
-    recurrence_of,
-    separatrix_cycles,
-    stable_cycles,
-    unstable_cycles_of_plane,
+from siq.systems.basins import (
+    Basin,
+    Descents,
+    basin_of,
+    edge_saddle,
+    ends_of,
+    follow,
+    settled_on,
+    sides_of,
+    tracked_edge,
 )
+from siq.systems.cycles import PARTS, Cycle, Recurrence, closed_orbit, recurrence_of
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import (
     Equilibrium,
     all_equilibria,
+    classify,
     find_equilibria,
     hessian_at,
     spread_evenly,
@@ -55,6 +63,14 @@ RESTING_SPEED = 1e-3  # of the rate: what is so slow outside the domain does not
 DIRECTIONS = 64  # in which the neighbourhood of a degenerate equilibrium is asked where it leads
 NEIGHBOURHOOD = 0.02  # of the domain: so far from it
 MIN_DECIDED_SHARE = 0.5  # of these, that has to have led somewhere: f is slow where it is degenerate
+# Cycles of a domain.
+MAX_TRIED_TRAJECTORIES = 12  # asked for their cycle: there are rarely more cycles than a few
+BACKWARD_STARTS = 256  # states of the domain that are followed backwards
+CYCLE_MERGE_TOLERANCE = 1e-3  # of the domain: closer cycles are one
+MAX_CYCLE_PAIRS = 6  # of attractors, between which a boundary is tracked in three states and more
+TRACKING_ROUNDS = 40  # of tracking a boundary
+ROUNDS_BEFORE_SEARCH = 4  # before a cycle is looked for on it
+RETURN_RADIUS = 0.05  # of the domain: a state on the boundary that has come back, as a guess
 # In many states.
 INDEPENDENT_STARTS = 64  # independent in each state
 DIAGONAL_STARTS = 33  # with every state at the same share of its range
@@ -214,11 +230,11 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
     cycles: tuple[Cycle, ...] = ()
     unstable_cycles: tuple[Cycle, ...] = ()
     if searched:
-        cycles, descents = stable_cycles(dynamics, descents, first=len(attractors), box=box, rate=rate)
+        cycles, descents = _stable_cycles(dynamics, descents, first=len(attractors), box=box, rate=rate)
         if d == 2:
-            unstable_cycles = unstable_cycles_of_plane(dynamics, equilibria, box=box, generator=generator)
+            unstable_cycles = _cycles_backwards(dynamics, equilibria, box=box, generator=generator)
         elif cycles:
-            unstable_cycles = separatrix_cycles(dynamics, attractors, cycles, box=box, generator=generator)
+            unstable_cycles = _separatrix_cycles(dynamics, attractors, cycles, box=box, generator=generator)
     elif not recorded:
         saddles, further = _edge_saddles(dynamics, attractors, box, generator)
         equilibria = (*attractors, *saddles)
@@ -265,6 +281,109 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
         points, box, equilibria, tuple(attractors), tuple(map(tuple, around)), tuple(basins), descents,
         recurrence, harmless, tuple(remarks), cycles, unstable_cycles,
     )  # fmt: skip
+
+
+def _stable_cycles(
+    dynamics: Dynamics, descents: Descents, *, first: int, box: np.ndarray, rate: float
+) -> tuple[tuple[Cycle, ...], Descents]:
+    """Stable cycles on which descents end, and the descents with the numbers of these, from `first` on."""
+    ends, last, asked = descents.ends.copy(), descents.paths[:, -1], np.zeros(len(descents.ends), dtype=bool)
+    cycles: list[Cycle] = []
+    for _ in range(MAX_TRIED_TRAJECTORIES):
+        left = np.flatnonzero((ends < 0) & ~descents.escaped)
+        if asked[left].all():
+            break
+        one = left[~asked[left]][0]
+        asked[one] = True
+        cycle = recurrence_of(dynamics, last[one][None], box=box, rate=rate).cycle
+        if cycle is None:
+            continue
+        index = _place_among(cycles, cycle, box)
+        near = settled_on(last[left], cycles, box=box)
+        ends[left[near >= 0]] = first + near[near >= 0]
+        ends[one] = first + index
+    return tuple(cycles), replace(descents, ends=ends)
+
+
+def _place_among(cycles: list[Cycle], new: Cycle, box: np.ndarray) -> int:
+    """The place of a cycle among those that are known; it is added where it is not known yet."""
+    width = np.ptp(box, axis=1)
+    for index, one in enumerate(cycles):
+        if one.distances(new.points[:1], scale=width)[0] < CYCLE_MERGE_TOLERANCE:
+            return index
+    cycles.append(new)
+    return len(cycles) - 1
+
+
+def _cycles_backwards(
+    dynamics: Dynamics, equilibria: Sequence[Equilibrium], *, box: np.ndarray, generator: np.random.Generator
+) -> tuple[Cycle, ...]:
+    """Cycles of two states that are left on both sides: stable ones of the equations backwards in time."""
+    backwards = Dynamics.of(dynamics.symbols, [-one for one in dynamics.formulas])
+    sources = [classify(backwards, one.position) for one in equilibria if one.kind == "repeller"]
+    starts = spread_evenly(box, BACKWARD_STARTS, generator=generator)
+    width = np.ptp(box, axis=1)
+    rate = float(np.median(np.linalg.norm(dynamics.drift(starts) / width, axis=1)))
+    try:
+        with np.errstate(all="ignore"):
+            ways = follow(backwards, starts, sources, box=box)
+            found, _ = _stable_cycles(backwards, ways, first=len(sources), box=box, rate=rate)
+    except NumericalFailure:
+        return ()
+    inside = [one for one in found if ((one.points > box[:, 0]) & (one.points < box[:, 1])).all()]
+    return tuple(closed_orbit(dynamics, one.points[::-1], one.period, scale=width) for one in inside)
+
+
+def _separatrix_cycles(
+    dynamics: Dynamics,
+    attractors: Sequence[Equilibrium],
+    cycles: Sequence[Cycle],
+    *,
+    box: np.ndarray,
+    generator: np.random.Generator,
+) -> tuple[Cycle, ...]:
+    """Cycles with one unstable direction on boundaries of basins, where a cycle is on one side of them."""
+
+    def ends(x: np.ndarray) -> np.ndarray:
+        return ends_of(dynamics, x, attractors, cycles, box=box)
+
+    width = np.ptp(box, axis=1)
+    places = [*(one.position for one in attractors), *(one.position for one in cycles)]
+    pairs = [pair for pair in itertools.combinations(range(len(places)), 2) if max(pair) >= len(attractors)]
+    found: list[Cycle] = []
+    for one, two in pairs[:MAX_CYCLE_PAIRS]:
+        edge = tracked_edge(dynamics, places[one], places[two], one, ends, width=width, generator=generator)
+        times, states = np.zeros(0), np.zeros((0, len(box)))
+        for number, (passed, along, _) in enumerate(itertools.islice(edge, TRACKING_ROUNDS + 1)):
+            times = np.append(times, times[-1:].sum() + passed)
+            states = np.concatenate([states, along])
+            cycle = _closed(dynamics, times, states, box) if number > ROUNDS_BEFORE_SEARCH else None
+            if cycle is not None and cycle.unstable == 1:
+                _place_among(found, cycle, box)
+                break
+    return tuple(found)
+
+
+def _closed(dynamics: Dynamics, times: np.ndarray, states: np.ndarray, box: np.ndarray) -> Cycle | None:
+    """A periodic orbit next to the last return of a trajectory; None where there is none."""
+    width = np.ptp(box, axis=1)
+    away = np.linalg.norm((states - states[-1]) / width, axis=1)
+    gone = np.flatnonzero(away > 2 * RETURN_RADIUS)
+    if not len(gone):
+        return None
+    before = np.flatnonzero(away[: gone[-1]] < RETURN_RADIUS)
+    if not len(before):
+        return None
+    last = before[-1]  # of the latest visit, the closest state
+    visit = last - np.flatnonzero(away[last::-1] > RETURN_RADIUS)[:1].sum() + 1
+    closest = visit + int(np.argmin(away[visit : last + 1]))
+    begin, period = times[closest], float(times[-1] - times[closest])
+    at = begin + np.linspace(0, period, PARTS, endpoint=False)
+    guess = np.stack([np.interp(at, times, column) for column in states.T], axis=1)
+    try:
+        return closed_orbit(dynamics, guess, period, scale=width)
+    except NumericalFailure:
+        return None
 
 
 def _edge_saddles(

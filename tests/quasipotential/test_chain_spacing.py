@@ -7,7 +7,7 @@ import pytest
 import sympy
 
 from siq.quasipotential.path_chains import PathProblem, spaced
-from siq.systems.cycles import _closed_orbit
+from siq.systems.cycles import closed_orbit
 from siq.systems.dynamics import Dynamics
 
 pytestmark = pytest.mark.portable
@@ -29,7 +29,7 @@ def to_a_cycle() -> PathProblem:
     system = Dynamics.of((x, y), (x * slope - y, y * slope + x), domain=[(-3, 3)] * 2)
     phase = np.linspace(0, 2 * np.pi, 64, endpoint=False)
     circle = np.stack([np.cos(phase), np.sin(phase)], axis=1)
-    return PathProblem(system, np.zeros(2), _closed_orbit(system, circle, 2 * np.pi, scale=np.ones(2)))
+    return PathProblem(system, np.zeros(2), closed_orbit(system, circle, 2 * np.pi, scale=np.ones(2)))
 
 
 def bow(problem: PathProblem, count: int = 30) -> np.ndarray:

@@ -12,7 +12,7 @@ from siq.errors import NumericalFailure
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.path_chains import MinimumActionPath
 from siq.quasipotential.paths import minimum_action_path
-from siq.systems.cycles import Cycle, _closed_orbit, hessians_along
+from siq.systems.cycles import Cycle, closed_orbit, hessians_along
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
 from siq.systems.phase_portrait import phase_portrait
@@ -42,7 +42,7 @@ def ring(system: Dynamics, radius: float, turn: float) -> Cycle:
     phase = np.linspace(0, 2 * np.pi, 256, endpoint=False)
     guess = radius * np.stack([np.cos(phase), np.sin(phase)], axis=1)
     guess = np.column_stack([guess, np.zeros((256, system.dimension - 2))])
-    return _closed_orbit(system, guess, 2 * np.pi / turn, scale=np.full(system.dimension, 2.0))
+    return closed_orbit(system, guess, 2 * np.pi / turn, scale=np.full(system.dimension, 2.0))
 
 
 def out_of(turn: float, *, axis: bool = False) -> MinimumActionPath:

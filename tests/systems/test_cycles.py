@@ -7,7 +7,7 @@ import pytest
 import sympy
 
 from siq.errors import NumericalFailure
-from siq.systems.cycles import Cycle, _closed_orbit, hessians_along, unstable_direction
+from siq.systems.cycles import Cycle, closed_orbit, hessians_along, unstable_direction
 from siq.systems.dynamics import Dynamics
 
 pytestmark = pytest.mark.portable
@@ -28,7 +28,7 @@ def around(radius: float, *, axis: bool) -> Cycle:
     phase = np.linspace(0, 2 * np.pi, 128, endpoint=False)
     guess = 1.04 * radius * np.stack([np.cos(phase), np.sin(phase)], axis=1)
     guess = np.column_stack([guess, np.full(128, 0.03)]) if axis else guess
-    return _closed_orbit(rings(axis=axis), guess, 3.2, scale=np.full(2 + axis, 2.0))
+    return closed_orbit(rings(axis=axis), guess, 3.2, scale=np.full(2 + axis, 2.0))
 
 
 def curvature(radius: float) -> float:
@@ -70,7 +70,7 @@ def test_a_cycle_that_is_not_symmetric_has_the_curvature_of_its_v() -> None:
     system = Dynamics.of((x, y), f)
     phase = np.linspace(0, 2 * np.pi, 256, endpoint=False)
     guess = settled(system, np.stack([np.cos(phase), np.sin(phase)], axis=1)[:1])
-    cycle = _closed_orbit(system, *guess, scale=np.full(2, 2.0))
+    cycle = closed_orbit(system, *guess, scale=np.full(2, 2.0))
     slope = np.stack([2 * cycle.points[:, 0] + cycle.points[:, 1] / 2,
                       4 * cycle.points[:, 1] ** 3 + cycle.points[:, 0] / 2], axis=1)  # fmt: skip
     exact = np.einsum("ni,nj->nij", slope, slope) / 2
@@ -94,7 +94,7 @@ def settled(system: Dynamics, start: np.ndarray) -> tuple[np.ndarray, float]:
 
 def test_van_der_pol_has_the_period_known_to_ten_digits() -> None:
     system = Dynamics.of((x, y), (y, (1 - x**2) * y - x))
-    cycle = _closed_orbit(system, *settled(system, np.array([[2.0, 0.0]])), scale=np.array([4.0, 5.0]))
+    cycle = closed_orbit(system, *settled(system, np.array([[2.0, 0.0]])), scale=np.array([4.0, 5.0]))
     assert cycle.period == pytest.approx(6.6632868593, rel=1e-10)
     # Liouville: the product of the multipliers is exp ∮ div f dt.
     assert cycle.multipliers[0].real == pytest.approx(
@@ -112,6 +112,6 @@ def test_where_there_is_no_cycle_none_is_found() -> None:
     phase = np.linspace(0, 2 * np.pi, 64, endpoint=False)
     guess = 0.02 * np.stack([np.cos(phase), np.sin(phase)], axis=1)
     with pytest.raises(NumericalFailure):
-        _closed_orbit(rings(axis=False), guess, np.pi, scale=np.full(2, 2.0))
+        closed_orbit(rings(axis=False), guess, np.pi, scale=np.full(2, 2.0))
     with pytest.raises(NumericalFailure, match="no curvature"):
         hessians_along(rings(axis=False), around(INNER, axis=False))
