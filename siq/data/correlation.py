@@ -57,11 +57,7 @@ NEGLIGIBLE_CORRELATION = 0.005  # twice that, one per cent, is what it adds to t
 FIRST_LAGS = 8  # looked at for a first sign; a memory that shows later shows there as well
 STANDARD_ERRORS = 2.0  # the usual ones of 95 %
 STANDARD_ERRORS_LATER = 3.0  # at each of a few longer lags, so that all are kept about as often
-LATER_LAGS = (
-    1.25,
-    1.5,
-    2.0,
-)  # times the lag: correlations that swing do not stay at zero
+LATER_LAGS = (1.25, 1.5, 2.0)  # times the lag: correlations that swing do not stay at zero
 UNSEEN_CORRELATION = 0.1  # the mean is off by no larger share where less than that could remain unseen
 SHAPE_DEPARTURE = 0.05  # of a correlation: a fifth of what an exposure of a whole step makes
 WEAK_INSTRUMENT = 0.1  # a correlation: what the earlier state tells no more of is left out of the mean
@@ -214,19 +210,9 @@ def markov_lag(recordings: Recordings) -> MarkovLag:
     problem = _increments(recordings, stretches)
     first = None if problem is None else problem.residuals(0)
     if problem is None or first is None:
-        nothing = np.zeros((0, d))
-        return MarkovLag(
-            "unknown",
-            None,
-            stretches.step,
-            0.0,
-            float("nan"),
-            np.zeros(0, int),
-            nothing,
-            nothing,
-            np.zeros(d),
-        )
-
+        nothing, none = np.zeros((0, d)), np.zeros(0, dtype=int)
+        step = stretches.step
+        return MarkovLag("unknown", None, step, 0.0, float("nan"), none, nothing, nothing, np.zeros(d))
     relaxation = problem.relaxation
 
     def told(

@@ -60,6 +60,9 @@ _FACTOR = rf"(?:(?:{_ALONE}|{_PREFIX}(?:{_PREFIXED})){_POWER})"
 _UNIT = re.compile(rf"\(?{_FACTOR}(?:\s*(?:[·*⋅×/]|\s)\s*\(?{_FACTOR}\)?)*\)?")
 
 
+_TIME_ARGUMENT = re.compile(r"\s*\(\s*t\s*\)$")  # x(t) is x
+
+
 class _Heading(NamedTuple):
     """A heading, taken apart: what people call the column, and its unit where it says one."""
 
@@ -88,11 +91,11 @@ def read_heading(heading: str) -> _Heading:
     """
     text = heading.strip()
     if match := re.fullmatch(r"(.*?)\s*\[\s*(.*?)\s*\]", text):
-        return _Heading(_without_time(match[1]), match[2] or None)
+        return _Heading(_TIME_ARGUMENT.sub("", match[1]), match[2] or None)
     if match := re.fullmatch(r"(.*?\S)\s*\(\s*(.*?)\s*\)", text):
         if is_unit(match[2]):
-            return _Heading(_without_time(match[1]), match[2])
-        return _Heading(_without_time(text), None)
+            return _Heading(_TIME_ARGUMENT.sub("", match[1]), match[2])
+        return _Heading(_TIME_ARGUMENT.sub("", text), None)
     for pattern in (r"(.*?\S)\s+/\s*(\S.*)", r"(.*?\S)\s+in\s+(\S.*)", r"(.*?\S)\s*,\s*(\S.*)"):
         if (match := re.fullmatch(pattern, text)) and is_unit(match[2]):
             return _Heading(match[1], match[2])
@@ -103,11 +106,6 @@ def read_heading(heading: str) -> _Heading:
     ):
         return _Heading(match[1], match[2])
     return _Heading(text, None)
-
-
-def _without_time(title: str) -> str:
-    """``x`` of ``x(t)``."""
-    return re.sub(r"\s*\(\s*t\s*\)$", "", title)
 
 
 def usable_name(title: str) -> str:
@@ -134,15 +132,6 @@ def _is_time(title: str) -> bool:
 def is_label(title: str) -> bool:
     """Whether a column of this title says which recording a row belongs to."""
     return _plain(title) in LABEL_NAMES
-
-
-def _is_index(title: str) -> bool:
-    """Whether a column of this title may count the rows, as tables that pandas wrote do."""
-    return (
-        title == ""
-        or _plain(re.sub(r"[\d.:\s]+$", "", title)) in INDEX_NAMES
-        or title.startswith("__index_level_")
-    )
 
 
 def _plain(title: str) -> str:
@@ -194,12 +183,17 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
     free = [place for place in range(len(parts)) if columns is None or plain[place] not in columns]
     dropped = set()
     for place in free:  # columns that only count the rows, as pandas writes them, and empty ones at the end
-        values = _numbers(source, place) if _is_index(plain[place]) else None
+        title = plain[place]
+        index = _plain(re.sub(r"[\d.:\s]+$", "", title)) in INDEX_NAMES or title.startswith("__index_level_")
+        values = _numbers(source, place) if index or title == "" else None
         if values is None:
             continue
         if np.isnan(values).all():
             dropped.add(place)
-        elif _counts_rows(values):
+        # 0, 1, 2, … from any start, or those of a table whose rows were taken or mixed.
+        elif (np.isfinite(values) & (values == np.round(values))).all() and (
+            len(np.unique(values)) == len(values) or (np.diff(values) == 1).mean() > 0.5
+        ):
             dropped.add(place)
             named = source.headings[place] if plain[place] else None
             remarks.append(Remark("data.column_counts_rows", {"column": named, "place": place + 1}))
@@ -234,13 +228,6 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
     )
     shown = tuple(titles[place] for place in states)
     return _Layout(recording, time, tuple(states), tuple(names), shown, units, tuple(remarks))
-
-
-def _counts_rows(values: np.ndarray) -> bool:
-    """Whether values are 0, 1, 2, … from any start, or those of a table whose rows were taken or mixed."""
-    if not (np.isfinite(values) & (values == np.round(values))).all():
-        return False
-    return len(np.unique(values)) == len(values) or bool((np.diff(values) == 1).mean() > 0.5)
 
 
 def _numbers(source: ColumnFile, place: int) -> np.ndarray | None:

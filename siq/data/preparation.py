@@ -56,13 +56,13 @@ def read_pairs(
     pair_step
         See `snapshot_pairs`.
     hidden_velocities
-        See `checked_for_learning`.
+        Whether they are positions: these are smooth, however strong the process noise on velocities is.
 
     Raises
     ------
     InputError
-        As `read_recordings` and `checked_for_learning` do, and when no two samples are
-        close enough to be a pair.
+        As `read_recordings` does, for a single recording without noise, for a state that never changes, and
+        when no two samples are close enough to be a pair.
     """
     recordings = read_recordings(path, columns=states, units=units)
     recordings = _checked_for_learning(
@@ -84,24 +84,7 @@ def read_pairs(
 def _checked_for_learning(
     recordings: Recordings, *, file: str, chosen: bool, hidden_velocities: bool = False
 ) -> Recordings:
-    """Refuse what nothing can be learned from; leave out columns that never change.
-
-    Parameters
-    ----------
-    recordings
-        As read.
-    file
-        For messages.
-    chosen
-        Whether somebody named the states: then none is left out.
-    hidden_velocities
-        Whether they are positions: these are smooth, however strong the process noise on velocities is.
-
-    Raises
-    ------
-    InputError
-        For a single recording without noise, and for a state that never changes.
-    """
+    """Refuse what nothing can be learned from; leave out columns that never change, unless `chosen`."""
     still = np.ptp(recordings.values, axis=0) == 0
     if still.any():
         first = int(np.argmax(still))

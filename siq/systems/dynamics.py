@@ -180,6 +180,8 @@ class Tape:
 class ParametricFunctions:
     """Dynamics as functions of arrays, with derivatives by states and by free parameters.
 
+    States come as ``(d, n)``, for parameters' values ``(p,)``.
+
     Parameters
     ----------
     dynamics
@@ -187,41 +189,63 @@ class ParametricFunctions:
     """
 
     def __init__(self, dynamics: Dynamics) -> None:
-        formulas = [*dynamics.equations, *(formula for _, formula in dynamics.outputs)]
-        self._delays = dynamics.delays
-        self._arguments = dynamics.arguments
-        written = [dynamics.evaluable(formula) for formula in formulas]
-        self._equations, self._measured = written[: dynamics.dimension], written[dynamics.dimension :]
+        self._delays, self._arguments, self._states = dynamics.delays, dynamics.arguments, dynamics.symbols
+        self._equations = [dynamics.evaluable(each) for each in dynamics.equations]
+        self._measured = [dynamics.evaluable(each) for _, each in dynamics.outputs]
         # A jump's derivative is a spike. Spread over more than a step it is seen in full by every rule of
         # integration, and carries deviations across the jump as they are carried in the mean.
-        self._smooth = [dynamics.evaluable(formula, wider=JUMP_WIDTHS) for formula in dynamics.equations]
-        self._states = [symbol(name) for name in dynamics.states]
+        self._smooth = [dynamics.evaluable(each, wider=JUMP_WIDTHS) for each in dynamics.equations]
         self._free = [symbol(dynamics.parameters[place].name) for place in dynamics.free]
-        self._shapes = (dynamics.dimension, len(self._measured), len(self._free))
+        self._compiled: dict[str, tuple[int, Compiled]] = {}
 
     @cached_property
-    def _rates(self) -> Compiled:
-        return compile_values(self._equations, self._arguments)
+    def tape(self) -> Tape | None:
+        """f as a tape in the same arguments; None where it has a function that no tape knows."""
+        return Tape.of(self._equations, self._arguments)
 
-    @cached_property
-    def _outputs(self) -> Compiled:
-        return compile_values(self._measured, self._arguments)
+    def rates(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
+        """f: shape ``(d, n)``."""
+        return self._evaluated("rates", x, signals, values)
 
-    @cached_property
-    def _slopes(self) -> Compiled:
-        return compile_values(
-            [each.diff(state) for each in self._smooth for state in self._states]
-            + [self._by_parameter(each, one) for each in self._equations for one in self._free],
-            self._arguments,
-        )
+    def outputs(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
+        """h: shape ``(m, n)``."""
+        return self._evaluated("outputs", x, signals, values)
 
-    @cached_property
-    def _output_slopes(self) -> Compiled:
-        return compile_values(
-            [_without_teeth(each).diff(state) for each in self._measured for state in self._states]
-            + [self._by_parameter(each, one) for each in self._measured for one in self._free],
-            self._arguments,
-        )
+    def slopes(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of f by states and by free parameters: ``(d, d, n)`` and ``(d, p, n)``."""
+        return self._parted(len(self._equations), self._evaluated("slopes", x, signals, values))
+
+    def output_slopes(
+        self, x: np.ndarray, signals: Signals, values: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of h by states and by free parameters: ``(m, d, n)`` and ``(m, p, n)``."""
+        return self._parted(len(self._measured), self._evaluated("output_slopes", x, signals, values))
+
+    def _parted(self, count: int, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        by_state, by_parameter = np.split(flat, [count * len(self._states)])
+        n = flat.shape[1]
+        return by_state.reshape(count, -1, n), by_parameter.reshape(count, len(self._free), n)
+
+    def _evaluated(self, what: str, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
+        if what not in self._compiled:
+            formulas = self._formulas(what)
+            self._compiled[what] = len(formulas), compile_values(formulas, self._arguments)
+        count, function = self._compiled[what]
+        result = np.empty((count, x.shape[1]))
+        arguments = (*x, *signals.inputs, *signals.delayed, *signals.slopes, signals.t, *values)
+        with np.errstate(all="ignore"):  # a trial state may lie where a formula has no value; fits step back
+            for place, value in enumerate(function(*arguments)):
+                result[place] = value
+        return result
+
+    def _formulas(self, what: str) -> list[sympy.Expr]:
+        if what in ("rates", "outputs"):
+            return self._equations if what == "rates" else self._measured
+        smooth, formulas = self._smooth, self._equations
+        if what == "output_slopes":
+            smooth, formulas = [_without_teeth(each) for each in self._measured], self._measured
+        by_state = [each.diff(state) for each in smooth for state in self._states]
+        return by_state + [self._by_parameter(each, one) for each in formulas for one in self._free]
 
     def _by_parameter(self, formula: sympy.Expr, parameter: sympy.Symbol) -> sympy.Expr:
         """Derivative of an evaluable formula by a parameter, which may stand in a delay as well."""
@@ -230,33 +254,6 @@ class ParametricFunctions:
             # u(t - τ) depends on τ through the slope of u, backwards.
             result -= formula.diff(_delayed(k)) * _slope(k) * each.args[1].diff(parameter)
         return result
-
-    @cached_property
-    def tape(self) -> Tape | None:
-        """f as a tape in the same arguments; None where it has a function that no tape knows."""
-        return Tape.of(self._equations, self._arguments)
-
-    def rates(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
-        """f at states ``(d, n)``, for parameters' values ``(p,)``: shape ``(d, n)``."""
-        return _stacked(self._rates, self._shapes[0], x, signals, values)
-
-    def outputs(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
-        """h at states ``(d, n)``: shape ``(m, n)``."""
-        return _stacked(self._outputs, self._shapes[1], x, signals, values)
-
-    def slopes(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of f by states and by free parameters: ``(d, d, n)`` and ``(d, p, n)``."""
-        d, _, p = self._shapes
-        flat = _stacked(self._slopes, d * d + d * p, x, signals, values)
-        return flat[: d * d].reshape(d, d, x.shape[1]), flat[d * d :].reshape(d, p, x.shape[1])
-
-    def output_slopes(
-        self, x: np.ndarray, signals: Signals, values: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of h by states and by free parameters: ``(m, d, n)`` and ``(m, p, n)``."""
-        d, m, p = self._shapes
-        flat = _stacked(self._output_slopes, m * d + m * p, x, signals, values)
-        return flat[: m * d].reshape(m, d, x.shape[1]), flat[m * d :].reshape(m, p, x.shape[1])
 
 
 def _without_teeth(formula: sympy.Expr) -> sympy.Expr:
@@ -277,21 +274,6 @@ def _delayed(place: int) -> sympy.Symbol:
 
 def _slope(place: int) -> sympy.Symbol:
     return sympy.Symbol(f"_slope_{place}", real=True)
-
-
-def _stacked(
-    function: Callable[..., Sequence[np.ndarray | float]],
-    count: int,
-    x: np.ndarray,
-    signals: Signals,
-    values: np.ndarray,
-) -> np.ndarray:
-    result = np.empty((count, x.shape[1]))
-    arguments = (*x, *signals.inputs, *signals.delayed, *signals.slopes, signals.t, *values)
-    with np.errstate(all="ignore"):  # a trial state may lie where a formula has no value; the fit steps back
-        for place, value in enumerate(function(*arguments)):
-            result[place] = value
-    return result
 
 
 @dataclass(frozen=True)
