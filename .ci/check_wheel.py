@@ -24,6 +24,8 @@ for package, name in (
     ("workflow/shipped", "Snakefile"),
     ("workflow/shipped", "config/systems/archetype3d.yaml"),
     ("workflow/shipped", "workflow/rules/common.smk"),
+    ("workflow/shipped", "benchmarks/proof/tasks.py"),
+    ("workflow/shipped", "benchmarks/publication/page.html.j2"),
     ("workflow/shipped", "profiles/default/config.yaml"),
 ):
     assert resources.files("siq").joinpath(package, name).is_file(), f"{package}/{name} is not in the wheel"
