@@ -7,10 +7,9 @@ from pathlib import Path
 from siq.systems.cards import load_system
 from siq.workflow import pipeline
 from siq.workflow.pipeline import Analysis, analyse
-from siq.workflow.study import _system_path, load_study, settings_of
+from siq.workflow.study import load_study, settings_of
+from workflow.places import named_file
 from workflow.steps import source_of
-
-SYSTEMS = Path(__file__).parents[1] / "config" / "systems"
 
 
 def analysed(data: str, folder: Path) -> Analysis:
@@ -18,7 +17,7 @@ def analysed(data: str, folder: Path) -> Analysis:
     path = folder / "study.yaml"
     path.write_text(f"name: study\n{data}\n", encoding="utf-8")
     study = load_study(path)
-    card = None if study.system is None else _system_path(study.system, systems=SYSTEMS)
+    card = None if study.system is None else named_file(study.system, "systems", start=folder)
     system = None if card is None else load_system(card)
     settings = settings_of(study, system)
     source = card if study.recordings is None else study.recordings.file

@@ -17,7 +17,7 @@ from benchmarks.publication.public_recordings import BENCHMARKS
 from siq.errors import InputError
 from siq.numerics.files import CARD, RECORDINGS, Document, case_folders, read_document, validate
 from siq.systems.cards import SystemCard
-from workflow.places import config_path, find_file, needed_file, system_card
+from workflow.places import config_path, find_file, named_file, needed_file
 
 MADE = "results/recordings"
 STUDY = "study.yaml"
@@ -54,12 +54,6 @@ class CheckedCase:
     title: str
     benchmark: str | None
     command: str
-
-    @property
-    def inputs(self) -> dict[str, str]:
-        """The files by the names that the scripts know them by."""
-        files = {"card": self.card, "recordings": self.recordings}
-        return files if self.study is None else files | {"study": self.study}
 
 
 class Cases:
@@ -185,7 +179,7 @@ class Cases:
         assert study.system is not None and study.recordings is not None  # just checked
         command = f"snakemake --cores 2 results/mismatch/{name}/report.html"
         start = Path(file).parent
-        card = str(system_card(study.system, start=start))
+        card = str(named_file(study.system, "systems", start=start))
         recordings = needed_file(study.recordings, start=start, where=(file, document.place(("recordings",))))
         return _checked(name, card, recordings, file, command)
 

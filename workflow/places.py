@@ -53,18 +53,11 @@ def names_in(folder: str) -> list[str]:
     return sorted({path.stem for place in both for path in place.glob("*.yaml")})
 
 
-def system_card(system: str, *, start: Path) -> Path:
-    """The card that a study means: a path as it stands, or a name in ``config/systems``."""
-    if system.endswith((".yaml", ".yml")):
-        return Path(find_file(system, start=start) or system)
-    return config_path("systems", f"{system}.yaml")
-
-
-def published_figures(name: str, *, start: Path) -> Path:
-    """The published figures that a study means: a path as it stands, or a name in ``config/published``."""
+def named_file(name: str, folder: str, *, start: Path) -> Path:
+    """The file that a study means: a path as it stands, or a name in a folder of ``config/``."""
     if name.endswith((".yaml", ".yml")):
         return Path(find_file(name, start=start) or name)
-    return config_path("published", f"{name}.yaml")
+    return config_path(folder, f"{name}.yaml")
 
 
 def find_file(file: str, *, start: Path | None = None) -> str | None:

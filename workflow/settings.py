@@ -27,7 +27,7 @@ from siq.workflow.study import (
     load_study_system,
     settings_of,
 )
-from workflow.places import BASE, config_path, names_in, needed_file, published_figures, system_card
+from workflow.places import BASE, config_path, named_file, names_in, needed_file
 from workflow.published import load_published
 
 WORKFLOW_KEYS = ("statistics", "device", "runs_per_training", "mismatch", "cases", "keys", "proof", "origin")
@@ -127,13 +127,14 @@ class CheckedStudy:
 
     def card(self) -> str | None:
         """The system card, where the study names one."""
-        return None if self.study.system is None else str(system_card(self.study.system, start=self.folder))
+        return self._named(self.study.system, "systems")
 
     def published(self) -> str | None:
         """The file of published figures, where the study names one."""
-        if self.study.published is None:
-            return None
-        return str(published_figures(self.study.published, start=self.folder))
+        return self._named(self.study.published, "published")
+
+    def _named(self, name: str | None, folder: str) -> str | None:
+        return None if name is None else str(named_file(name, folder, start=self.folder))
 
     def _domain(self) -> list[list[float]] | None:
         """The box that the card gives."""
@@ -223,12 +224,8 @@ class Studies(Mapping[str, CheckedStudy]):
             )  # fmt: skip
         if study.training is not None:
             _need_networks(document)
-        if study.system is not None:
-            card = _existing_card(study.system, document)
-            named = study.model_copy(update={"system": str(card)})
-            system = load_study_system(named, file=document.file, systems=card.parent)
-        else:
-            system = load_study_system(study, file=document.file, systems=BASE)
+        card = None if study.system is None else _existing_card(study.system, document)
+        system = load_study_system(study, card, file=document.file)
         checked = CheckedStudy(
             completed(study, system),
             document.file,
@@ -277,7 +274,7 @@ class Studies(Mapping[str, CheckedStudy]):
 
 def _existing_card(system: str, document: Document) -> Path:
     """The card that a study names, which has to be there."""
-    card = system_card(system, start=Path(document.file).parent)
+    card = named_file(system, "systems", start=Path(document.file).parent)
     if card.is_file():
         return card
     where = (document.file, document.place(("system",)))

@@ -345,17 +345,17 @@ def load_study(path: str | Path) -> Study:
     return validate(read_document(path), Study)
 
 
-def load_study_system(study: Study, *, file: str, systems: Path) -> Dynamics | None:
+def load_study_system(study: Study, card: str | Path | None, *, file: str) -> Dynamics | None:
     """The system of a study, checked together with what the study asks of it.
 
     Parameters
     ----------
     study
         The study.
+    card
+        The card that it names, None where it names none.
     file
         Its file, for messages.
-    systems
-        Folder of the cards that studies name.
 
     Raises
     ------
@@ -363,10 +363,14 @@ def load_study_system(study: Study, *, file: str, systems: Path) -> Dynamics | N
         When the card is missing or refused, inputs or the time drive the system, or the study's library or D
         does not fit the states.
     """
-    directly = study.entrance != "equations"
     system = None
-    if study.system is not None:
-        system = _with_landscape(_system_path(study.system, systems=systems), directly=directly)
+    if card is not None:
+        document = read_document(card)
+        system = build_system(document, validate(document, SystemCard))
+        fault = fault_for_landscape(system, directly=study.entrance != "equations")
+        if fault is not None:
+            keys, what, remedy = fault
+            raise InputError(document.file, document.place(keys), what, remedy)
     states = system.states if system is not None else None
     if study.recordings is not None and study.recordings.states is not None:
         if system is not None and study.recordings.states != system.states:
@@ -391,16 +395,6 @@ def _check_sweep(sweep: SweepOptions, system: Dynamics, *, file: str) -> None:
             otherwise = f"use one of {', '.join(known)}" if known else "write it on the card as a parameter"
             fault = f"the card of '{system.name}' has no parameter '{name}'"
             raise InputError(file, place, fault, suggestion(name, known, otherwise=otherwise))
-
-
-def _with_landscape(path: Path, *, directly: bool) -> Dynamics:
-    """The system of a card that can be simulated by itself, and has a landscape that we can work out."""
-    document = read_document(path)
-    system = build_system(document, validate(document, SystemCard))
-    if (fault := fault_for_landscape(system, directly=directly)) is not None:
-        keys, what, remedy = fault
-        raise InputError(document.file, document.place(keys), what, remedy)
-    return system
 
 
 def check_states(study: Study, states: Sequence[str], *, file: str) -> None:
@@ -429,13 +423,6 @@ def check_states(study: Study, states: Sequence[str], *, file: str) -> None:
             candidate_library(known, degree=1, further=functions)
         except FormulaError as error:
             raise InputError(file, f"{step}.functions", error.fault, error.remedy) from None
-
-
-def _system_path(system: str, *, systems: Path) -> Path:
-    """The card that a study means: a path as it stands, a name within the folder of cards."""
-    if system.endswith((".yaml", ".yml")):
-        return Path(system)
-    return systems / f"{system}.yaml"
 
 
 STRICT = ConfigDict(extra="forbid")

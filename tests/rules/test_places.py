@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from siq.errors import InputError
-from workflow.places import BASE, config_path, configuration, find_file, names_in, needed_file, system_card
+from workflow.places import BASE, config_path, configuration, find_file, named_file, names_in, needed_file
 from workflow.settings import Studies
 
 ROWS = "recording,t,x\n" + "".join(f"a,{k},{k % 3}\n" for k in range(9))
@@ -71,7 +71,9 @@ def test_everything_that_a_study_names_starts_from_its_folder(folder: Path) -> N
     assert study.source() == str(Path("studies", "rows.csv"))
     assert study.card() == str(Path("studies", "cards", "own.yaml"))
     assert study.command() == "siq run studies/s.yaml"
-    assert system_card("cards/own.yaml", start=Path("studies")) == Path("studies", "cards", "own.yaml")
+    assert named_file("cards/own.yaml", "systems", start=Path("studies")) == Path(
+        "studies", "cards", "own.yaml"
+    )
 
 
 @pytest.mark.parametrize(

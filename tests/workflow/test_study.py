@@ -13,13 +13,18 @@ from siq.networks.regression import RegressionOptions
 from siq.quasipotential.landscape import LandscapeOptions
 from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import SimulationEntry, SimulationOptions
-from siq.workflow.study import load_study, load_study_system, settings_of
+from siq.workflow.study import Study, load_study, load_study_system, settings_of
 from siq.workflow.tables import Method
+from workflow.places import named_file
 from workflow.published import load_published
 
 Write = Callable[..., Path]
 CONFIG = Path(__file__).parents[2] / "config"
 STUDIES = sorted((CONFIG / "studies").glob("*.yaml"))
+
+
+def card_of(study: Study) -> Path | None:
+    return None if study.system is None else named_file(study.system, "systems", start=CONFIG)
 
 
 def refusal(path: Path) -> InputError:
@@ -32,7 +37,7 @@ def refusal(path: Path) -> InputError:
 def test_every_study_of_the_project_loads_with_its_system_and_figures(path: Path) -> None:
     study = load_study(path)
     assert study.name == path.stem
-    load_study_system(study, file=str(path), systems=CONFIG / "systems")
+    load_study_system(study, card_of(study), file=str(path))
     if study.published is not None:
         assert load_published(CONFIG / "published" / f"{study.published}.yaml").figures
 
@@ -139,7 +144,8 @@ def test_a_faulty_study_is_refused_with_its_line_and_a_remedy(
 
 
 def check_system(study_file: Path) -> None:
-    load_study_system(load_study(study_file), file=str(study_file), systems=CONFIG / "systems")
+    study = load_study(study_file)
+    load_study_system(study, card_of(study), file=str(study_file))
 
 
 def test_a_library_function_of_an_unknown_state_is_refused_before_any_job(write: Write) -> None:
@@ -152,7 +158,7 @@ def test_hidden_velocities_are_states_of_the_library_and_of_recordings_only(writ
     hidden = "identification: {hidden_velocities: true, functions: ['x*v_x/(1 + x**2)']}\n"
     recorded = "name: alone\nrecordings: {file: x.csv, states: [x]}\n"
     path = write(recorded + hidden)
-    load_study_system(load_study(path), file=str(path), systems=CONFIG / "systems")
+    load_study_system(load_study(path), None, file=str(path))
     assert "hidden_velocities" in str(refusal(write(recorded + hidden + "training: {}\n")))
     assert "hidden_velocities" in str(refusal(write("name: alone\nsystem: duffing\n" + hidden)))
 
@@ -230,7 +236,7 @@ def test_an_equation_without_a_value_in_the_domain_is_refused(
     )
     study = load_study(write(f"name: odd\nsystem: {card}\n"))
     with pytest.raises(InputError, match=rf"line 5 \(equations.x\): the equation.*{fault}.*choose a domain"):
-        load_study_system(study, file="study.yaml", systems=CONFIG / "systems")
+        load_study_system(study, card_of(study), file="study.yaml")
 
 
 def test_a_missing_card_is_refused_by_name(write: Write) -> None:

@@ -27,7 +27,7 @@ def case_file(name):
     """Input function: a file of the case; card and study count by content, which is a parameter."""
 
     def file(wildcards):
-        found = case_of(wildcards).inputs.get(name)
+        found = getattr(case_of(wildcards), name)
         if found is None:
             return []
         return found if name == "recordings" else ancient(found)
