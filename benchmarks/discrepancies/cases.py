@@ -13,10 +13,9 @@ from tempfile import TemporaryDirectory
 
 from pydantic import BaseModel, ConfigDict
 
-from benchmarks.proof.batches import Generator, check_digests, read_digests, write_batch
+from benchmarks.proof.batches import Generator, ProofSet, check_digests, read_digests, write_batch
 from benchmarks.proof.concealment import cases as concealment
 from benchmarks.proof.foreign import cases as foreign
-from benchmarks.proof.sets import ProofSet
 from siq.diagnosis.study import Comparison, read_case
 from siq.numerics.files import read_document, validate, whole_file
 

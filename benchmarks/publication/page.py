@@ -31,7 +31,7 @@ from siq.numerics.randomness import Purpose, generator
 from siq.numerics.text import number_text
 from siq.report.formatting import texts
 from siq.report.landscape import in_words
-from siq.report.page import ReportFigure, ReportTable, render_template
+from siq.report.page import ReportFigure, ReportSection, ReportTable, render_template
 from siq.report.study_page import errors_over_runs
 from siq.systems.dynamics import Dynamics
 from siq.workflow.models import ModelFiles, shown_formula
@@ -49,26 +49,6 @@ EXPLAINED = {
 
 
 @dataclass(frozen=True)
-class ReproductionSection:
-    """One place of a publication, with ours beside it.
-
-    Attributes
-    ----------
-    place
-        The place: ``Fig. 8 (fig2b)``.
-    text
-        What it shows, and what of it is not shown here, in paragraphs.
-    tables, figures
-        Its numbers with ours, and our figures.
-    """
-
-    place: str
-    text: Sequence[str] = ()
-    tables: Sequence[ReportTable] = ()
-    figures: Sequence[ReportFigure] = ()
-
-
-@dataclass(frozen=True)
 class ReproductionContent:
     """All that the page of a reproduction says.
 
@@ -81,7 +61,7 @@ class ReproductionContent:
     contradictions
         Sentences.
     sections
-        The places of the publication, in its order.
+        The places of the publication, in its order, each with its numbers and ours, and our figures.
     commands
         Command lines that make everything again.
     language
@@ -92,7 +72,7 @@ class ReproductionContent:
     introduction: Sequence[str] = ()
     overview: Sequence[ReportTable] = ()
     contradictions: Sequence[str] = ()
-    sections: Sequence[ReproductionSection] = ()
+    sections: Sequence[ReportSection] = ()
     commands: Sequence[str] = ()
     language: str = "en"
 
@@ -227,7 +207,7 @@ class _Page:
         shown_here = in_words(first.drop(columns=["run", "kind"] if name == "transitions" else "run"))
         return [ReportTable(caption, shown_here, {}, f"{folder}/landscape.csv")]
 
-    def section(self, place: Place, table: pd.DataFrame) -> ReproductionSection:
+    def section(self, place: Place, table: pd.DataFrame) -> ReportSection:
         """A place of the paper with ours beside it."""
         study = self.studies[place.study] if place.study is not None else None
         text = [f"In the paper: {place.says}", *([place.remark] if place.remark else [])]
@@ -249,7 +229,7 @@ class _Page:
             image = file.read_bytes()
             caption = f"Ours, study {place.study}: {picture.replace('_', ' ')}."
             figures.append(ReportFigure(caption, f"{caption} {place.says}", image, "png"))
-        return ReproductionSection(place.place, text, tables, figures)
+        return ReportSection(place.place, text, tables=tables, figures=figures)
 
 
 def _overview(places: Sequence[Place], tables: Sequence[pd.DataFrame]) -> ReportTable:

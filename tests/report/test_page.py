@@ -11,7 +11,7 @@ import pytest
 import sympy
 from markupsafe import Markup
 
-from benchmarks.publication.page import ReproductionContent, ReproductionSection, render_reproduction
+from benchmarks.publication.page import ReproductionContent, render_reproduction
 from siq.report.formatting import formula_mathml
 from siq.report.page import (
     FormulaRow,
@@ -241,8 +241,8 @@ def test_the_page_of_a_reproduction_has_every_place_and_says_nothing_of_runs_tha
         overview=[table],
         contradictions=[HOSTILE],
         sections=[
-            ReproductionSection("Table 1", [HOSTILE], [table, table]),
-            ReproductionSection("Fig. 1", ["shown"], [], [ReportFigure("ours", HOSTILE, PNG, "png")]),
+            ReportSection("Table 1", [HOSTILE], tables=[table, table]),
+            ReportSection("Fig. 1", ["shown"], figures=[ReportFigure("ours", HOSTILE, PNG, "png")]),
         ],
         commands=["snakemake reproduce"],
     )

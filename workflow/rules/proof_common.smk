@@ -1,6 +1,6 @@
 # What the rules of the proofs share: sets of cases, their batches and keys.
 import siq
-from benchmarks.proof.sets import FOREIGN, load_proofs
+from benchmarks.proof.batches import FOREIGN, load_proofs
 
 DICTIONARY = str(Path(siq.__file__).parent / "diagnosis" / "mechanisms.yaml")
 

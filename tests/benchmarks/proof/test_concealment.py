@@ -17,7 +17,7 @@ import yaml
 from pyarrow import parquet
 from scipy.integrate import solve_ivp
 
-from benchmarks.proof.batches import digests_of
+from benchmarks.proof.batches import digests_of, load_proofs
 from benchmarks.proof.concealment import cases as concealment_cases
 from benchmarks.proof.concealment.cases import (
     KINDS,
@@ -36,7 +36,6 @@ from benchmarks.proof.concealment.mechanics import (
 from benchmarks.proof.concealment.model import Drive, TrueSystem
 from benchmarks.proof.concealment.simulation import simulate
 from benchmarks.proof.concealment.systems import SYSTEMS, PhysicalSystem
-from benchmarks.proof.sets import load_proofs
 from siq.systems.cards import check_name
 from siq.systems.formulas import compile_formulas, parse_formula
 

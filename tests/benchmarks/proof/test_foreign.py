@@ -16,7 +16,7 @@ import sympy
 import yaml
 from scipy.integrate import solve_ivp
 
-from benchmarks.proof.batches import write_batch
+from benchmarks.proof.batches import FOREIGN, load_proofs, write_batch
 from benchmarks.proof.cases import Design
 from benchmarks.proof.concealment.cases import draw_cases as draw_others
 from benchmarks.proof.foreign import cases as generator
@@ -43,7 +43,6 @@ from benchmarks.proof.keys import Truth as KeyTruth
 from benchmarks.proof.oracle import true_model
 from benchmarks.proof.plots import plot_foreign_proof
 from benchmarks.proof.scoring import Answer, score_table
-from benchmarks.proof.sets import FOREIGN, load_proofs
 from benchmarks.proof.targets import foreign_failures, foreign_targets
 from siq.diagnosis.study import Comparison, _measurements_of, read_case
 from siq.systems.cards import load_system

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 import yaml
 
-from benchmarks.proof.batches import check_digests
+from benchmarks.proof.batches import check_digests, load_proofs
 from benchmarks.proof.concealment.cases import Design, make_case
 from benchmarks.proof.keys import CaseKey, Truth, read_key, read_truth
 from benchmarks.proof.oracle import Oracle, pairing, true_model
@@ -27,7 +27,6 @@ from benchmarks.proof.scoring import (
     model_of,
     score_table,
 )
-from benchmarks.proof.sets import load_proofs
 from benchmarks.proof.targets import clopper_pearson, counted, failures_of, quantile, target_table, targets_of
 from siq.errors import InputError
 from siq.systems.dynamics import Dynamics, Signals
