@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -84,7 +84,6 @@ class Budget:
     stopped_by: Literal["work", "clock"] | None = None
     _begun: float = field(default=0.0, init=False)
     _exempt: int = field(default=0, init=False)
-    _kept: float = field(default=0.0, init=False)
     _limit: float = field(default=float("inf"), init=False)
 
     def __post_init__(self) -> None:
@@ -108,7 +107,7 @@ class Budget:
         BudgetSpent
             When nothing is left of what is allowed, unless what is done is exempt.
         """
-        done = self.spent >= min(self.work * (1 - self._kept), self._limit)
+        done = self.spent >= min(self.work, self._limit)
         if not self._exempt and (done or self.elapsed >= self.seconds):
             self.stopped_by = "work" if done else "clock"
             raise BudgetSpent("the budget of this case is spent")
@@ -124,24 +123,21 @@ class Budget:
             self._exempt -= 1
 
     @contextmanager
-    def keeping(self, share: float) -> Iterator[None]:
-        """Work that leaves a share of what is allowed to what comes after it."""
-        before, self._kept = self._kept, share
-        try:
-            yield
-        finally:
-            self._kept = before
-
-    @contextmanager
-    def part(self, share: float) -> Iterator[None]:
-        """Work that may take a share of what is left, and no more: one fit does not take all of it."""
-        before = self._limit
-        left = min(self.work * (1 - self._kept), before) - self.spent
-        self._limit = self.spent + share * max(left, 0.0)
+    def _limited(self, limit: float) -> Iterator[None]:
+        before, self._limit = self._limit, min(limit, self._limit)
         try:
             yield
         finally:
             self._limit = before
+
+    def keeping(self, share: float) -> AbstractContextManager[None]:
+        """Work that leaves a share of what is allowed to what comes after it."""
+        return self._limited(self.work * (1 - share))
+
+    def part(self, share: float) -> AbstractContextManager[None]:
+        """Work that may take a share of what is left, and no more: one fit does not take all of it."""
+        left = min(self.work, self._limit) - self.spent
+        return self._limited(self.spent + share * max(left, 0.0))
 
     def account(self) -> Account:
         """An account until now, as a verdict records it."""

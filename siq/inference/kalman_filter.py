@@ -251,10 +251,9 @@ class Linearisation:
 def integrate_intervals(model: Dynamics, grid: Grid, values: np.ndarray, x: np.ndarray) -> np.ndarray:
     """The states at the ends of all intervals: from states ``(d, k)`` at their begins to ``(d, k)``."""
     delays = model.lags(values)
-    step = grid.step
     for part in range(grid.substeps):
         with np.errstate(all="ignore"):  # what runs away is seen by its end
-            x = _runge_kutta(model.functions, grid, values, x, part, step, delays)[0]
+            x = _runge_kutta(model.functions, grid, values, x, part, delays)[0]
     return x
 
 
@@ -344,7 +343,7 @@ def _carried(
 
     for part in range(grid.substeps):
         with np.errstate(all="ignore"):  # what runs away is seen by `Linearisation.finite`
-            after, begin_rate, end_rate = _runge_kutta(drift, grid, values, state, part, step, delays)
+            after, begin_rate, end_rate = _runge_kutta(drift, grid, values, state, part, delays)
             middle = (state + after) / 2 + step / 8 * (begin_rate - end_rate)
         at = [slopes(place, 3 * part + node) for node, place in enumerate((state, middle, after))]
         if response is None:
@@ -381,16 +380,11 @@ def substeps_needed(
 
 
 def _runge_kutta(
-    drift: ParametricFunctions | ClosedFunctions,
-    grid: Grid,
-    values: np.ndarray,
-    x: np.ndarray,
-    part: int,
-    step: np.ndarray,
+    drift: ParametricFunctions | ClosedFunctions, grid: Grid, values: np.ndarray, x: np.ndarray, part: int,
     delays: tuple[tuple[int, float], ...],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """State after a substep, and f at its begin and its end; the inputs differ from stage to stage."""
-    rates = drift.rates
+    rates, step = drift.rates, grid.step
     begin, middle, end = (grid.signals(3 * part + node, delays) for node in range(3))
     k1 = rates(x, begin, values)
     k2 = rates(x + step / 2 * k1, middle, values)

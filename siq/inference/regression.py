@@ -46,6 +46,7 @@ from siq.inference.selection import (
     critical_values,
     fit_significant,
     stability,
+    strong_terms,
     triangles,
 )
 from siq.numerics.randomness import positive
@@ -371,7 +372,7 @@ def identify_vector_field(
     critical = critical_values(library, false_terms=options.false_terms)
     repeated = 1.0 if noise_free else copies(pairs)
     problems = LinearProblem.of_components(triangle, samples=n / repeated, critical=critical)
-    choose = partial(_contributing, precision=options.precision) if noise_free else best_support
+    choose = partial(strong_terms, precision=options.precision) if noise_free else best_support
     chosen = chosen_terms(problems, library, choose)
     found = FieldEstimate.on_support(
         library, chosen, np.zeros(len(chosen)), np.eye(len(chosen)), rate, ratio, flow, noise
@@ -391,23 +392,6 @@ def identify_vector_field(
     # With the final support and flow a term may turn out to be superfluous after all.
     found, support = fit_significant(fit, chosen)
     return found if noise_free else replace(found, alternatives=ModelAverage.of(problems, support, library))
-
-
-def _contributing(problem: LinearProblem, precision: float) -> tuple[int, ...]:
-    """Backward elimination of one equation without noise: the least contribution leaves, until all count."""
-    goal = problem.goal
-    size = np.linalg.norm(goal)
-    active = np.arange(problem.columns.shape[1])
-    while len(active):
-        columns = problem.columns[:, active]
-        orthogonal, upper = np.linalg.qr(columns)
-        coefficients = scipy.linalg.solve_triangular(upper, orthogonal.T @ goal)
-        contribution = np.abs(coefficients) * np.linalg.norm(columns, axis=0) / (size or 1.0)
-        weakest = int(np.argmin(contribution))
-        if contribution[weakest] >= precision:
-            break
-        active = np.delete(active, weakest)
-    return tuple(active.tolist())
 
 
 def _fit_support(found: FieldEstimate, regression: _PairRegression) -> FieldEstimate:

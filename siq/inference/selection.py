@@ -184,17 +184,26 @@ def all_coefficients(components: Sequence[int], functions: int) -> np.ndarray:
     return np.array([(i, k) for i in components for k in range(functions)])
 
 
-def _strong_terms(problem: LinearProblem, *, among: np.ndarray | None = None) -> tuple[int, ...]:
-    """Backward elimination from all functions, or from some of them, shape ``(q,)``."""
+def strong_terms(
+    problem: LinearProblem, *, among: np.ndarray | None = None, precision: float | None = None
+) -> tuple[int, ...]:
+    """Backward elimination from all functions, or from some of them, shape ``(q,)``.
+
+    The weakest leaves, by its standard error, until all count; without noise, by the share of the goal that
+    it makes, until all make as much as the precision.
+    """
     present = np.linalg.norm(problem.columns, axis=0) > 0
     active = np.flatnonzero(present if among is None else present & among)
     while len(active):
         chosen = problem.columns[:, active]
         size = np.linalg.norm(chosen, axis=0)
         orthogonal, upper = np.linalg.qr(chosen / size)
-        coefficients = scipy.linalg.solve_triangular(upper, orthogonal.T @ problem.goal)
-        errors = np.linalg.norm(scipy.linalg.solve_triangular(upper, np.eye(len(active))), axis=1)
-        strength = np.abs(coefficients) / errors / np.sqrt(problem.variance) / problem.critical[active]
+        strength = np.abs(scipy.linalg.solve_triangular(upper, orthogonal.T @ problem.goal))
+        if precision is None:
+            errors = np.linalg.norm(scipy.linalg.solve_triangular(upper, np.eye(len(active))), axis=1)
+            strength = strength / errors / np.sqrt(problem.variance) / problem.critical[active]
+        else:
+            strength = strength / (np.linalg.norm(problem.goal) or 1.0) / precision
         weakest = int(np.argmin(strength))
         if strength[weakest] >= 1:
             break
@@ -212,7 +221,7 @@ def best_support(problem: LinearProblem) -> tuple[int, ...]:
     """
     ends = {_improved_support(problem, ())}
     for most in np.unique(problem.critical):
-        strong = _strong_terms(problem, among=problem.critical <= most)
+        strong = strong_terms(problem, among=problem.critical <= most)
         ends |= {strong, _improved_support(problem, strong)}
     scores = {one: problem.score(one) for one in ends}
     visited: set[tuple[int, ...]] = set()

@@ -12,9 +12,9 @@ from siq.inference.selection import (
     _improved_support,
     _mean_over_supports,
     _prices,
-    _strong_terms,
     all_coefficients,
     critical_values,
+    strong_terms,
 )
 
 LIBRARY = candidate_library(["x"], degree=5)
@@ -38,7 +38,7 @@ def equation(
 
 
 def chosen(one: LinearProblem) -> tuple[int, ...]:
-    return _improved_support(one, _strong_terms(one))
+    return _improved_support(one, strong_terms(one))
 
 
 def test_odds_of_terms_that_are_not_there_add_up_to_what_was_expected() -> None:
