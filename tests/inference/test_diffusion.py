@@ -145,5 +145,5 @@ def test_where_d_is_from_is_kept_with_the_field_and_said_of_the_landscape(tmp_pa
     assert kept is not None and kept.diffusion_source == DiffusionSource.UNIT
     settings = PipelineSettings(identification=LINEAR)
     seen = pipeline.landscape_of_run(settings, recordings, kept, number=0)
-    assert seen.landscape is not None and seen.outcome.status == Status.OK
-    assert DiffusionSource.UNIT.note in seen.landscape.notes
+    assert seen.result is not None and seen.outcome.status == Status.OK
+    assert DiffusionSource.UNIT.note in seen.result.notes

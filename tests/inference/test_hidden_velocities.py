@@ -200,7 +200,7 @@ def test_ring_downs_have_no_random_forces_and_the_unit_matrix_of_the_velocities(
 def test_ring_downs_of_positions_in_different_units_show_no_unit_matrix(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    found = identified()[0].record
+    found = identified()[0].result
     assert found is not None
     still = replace(found, noise_rate=0 * found.noise_rate)
     monkeypatch.setattr(identify, "identify_by_likelihood", lambda *_, **__: still)
