@@ -25,7 +25,7 @@ from siq.diagnosis.search import Search
 from siq.diagnosis.smooth_functions import MECHANISM
 from siq.diagnosis.statement import Location, StatedMechanism, Statement
 from siq.diagnosis.study import Comparison, MismatchStudy, MismatchVerdict, comparison_of
-from siq.diagnosis.unnamed_models import FitContext, fit_unnamed_models
+from siq.diagnosis.unnamed_models import fit_unnamed_models
 from siq.diagnosis.verdict import statement_of
 from siq.errors import InputError, NumericalFailure
 from siq.inference.budget import Budget
@@ -38,28 +38,17 @@ if TYPE_CHECKING:
 LOGGER = logging.getLogger(__name__)
 
 
-def withdrawn(found: Investigation, case: Comparison, budget: Budget) -> Investigation:
+def withdrawn(found: Investigation) -> Investigation:
     """An investigation without its names, and with models of what has none.
 
     Where nothing else speaks of a mismatch there is none: evidence that recordings held out refute is no
     evidence. Process noise that is needed speaks of one, and so does structure that the recalibrated
     simulation leaves, or a function without a name that is certain by the odds that a name takes.
-
-    Parameters
-    ----------
-    found
-        What was found.
-    case
-        The recordings and the settings.
-    budget
-        Charged for the models; those that it does not reach are left out.
     """
     names = [each.best.candidate.label for each in found.search.found]
     LOGGER.info("%s: not named, since held-out recordings are predicted worse", names)
-    options, recalibrated = case.settings.search, found.search.recalibrated
-    context = FitContext(
-        case.learn, found.roles, case.settings.degree, options.blocks, len(found.candidates), budget
-    )
+    context, recalibrated = found.context, found.search.recalibrated
+    options, budget = context.study.search, context.budget
     models = fit_unnamed_models(found.search, context)
     certain = any(
         each.log_evidence >= options.least_log_odds and all(part.kind != MECHANISM for part in each.parts)
@@ -68,7 +57,7 @@ def withdrawn(found: Investigation, case: Comparison, budget: Budget) -> Investi
     if not (
         recalibrated.has_process_noise
         or certain
-        or remainder_of(found.model, case.learn, recalibrated, recalibrated, found.roles).structured
+        or remainder_of(context.data, recalibrated, recalibrated, context.roles).structured
     ):
         return replace(
             found,
@@ -230,14 +219,13 @@ def solve_case(
     budget = Budget(work=allowed.evaluations, seconds=allowed.seconds, tell=tell, clock=clock)
     try:
         found = investigate(case.system, case.learn, case.dictionary, case.settings, budget=budget)
-        certain = case.settings.search.least_log_odds
-        shown = held_out_runs(found, case.learn, case.kept, certain=certain, tests=case.settings.tests)
+        shown = held_out_runs(found, case.kept)
         named = found.verdict.names and not found.process_noise
         # Tests of somebody else may be among the recordings held out, and decide nothing.
         if named and not case.settings.tests and shown.errors.change("without", "augmented") == "worse":
-            found = withdrawn(found, case, budget)
-            shown = held_out_runs(found, case.learn, case.kept, certain=certain)
-        statement = statement_of(found, case.learn, shown)
+            found = withdrawn(found)
+            shown = held_out_runs(found, case.kept)
+        statement = statement_of(found, shown)
     except InputError:
         raise
     except NUMERICAL_ERRORS as error:
@@ -288,11 +276,11 @@ def tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
     case, found, shown = diagnosis.case, diagnosis.investigation, diagnosis.held_out
     recalibrated, data = found.search.recalibrated, case.kept
     curves = [
-        (", ".join(each.direction.names), each.direction.coordinate, each.direction.across, *point,
+        (", ".join(each.place.targets), each.place.words[0], each.place.across, *point,
          each.gain, each.p_value, stage)
         for stage, structure in (("before", found.remainder.before), ("after", found.remainder.after))
         for each in structure.curves
-        for point in zip(each.direction.knots, each.values, each.standard_errors, strict=True)
+        for point in zip(each.place.knots, each.values, each.standard_errors, strict=True)
     ]  # fmt: skip
     held_out = [
         pd.DataFrame(
@@ -323,7 +311,7 @@ def tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
     forces |= {
         f"missing_in_{name}": -recalibrated.linearisation.gap[rows, place] / step
         for place, name in enumerate(case.system.states)
-        if name in found.roles.states
+        if name in found.context.roles.states
     }
     return {
         "curves": pd.DataFrame(curves, columns=CURVE_COLUMNS),

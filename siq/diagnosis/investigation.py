@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.stats
 
-from siq.diagnosis.dictionary import Mechanism, Roles, roles_of
+from siq.diagnosis.dictionary import Mechanism, roles_of
 from siq.diagnosis.evidence import NotFitted
 from siq.diagnosis.holdout import (
     HeldOutErrors,
@@ -18,7 +18,7 @@ from siq.diagnosis.holdout import (
     mean_error,
     simplest_of,
 )
-from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of, generic_candidates
+from siq.diagnosis.mechanisms import candidates_of, generic_candidates
 from siq.diagnosis.naming import NamingDecision, decide_naming
 from siq.diagnosis.residual_structure import (
     RANDOM_RESIDUALS,
@@ -28,9 +28,9 @@ from siq.diagnosis.residual_structure import (
     noise_nonstationarity,
     remainder_of,
 )
-from siq.diagnosis.search import Search, search
+from siq.diagnosis.search import FitContext, Search, search
 from siq.diagnosis.study import MismatchStudy, MismatchVerdict, SearchOptions
-from siq.diagnosis.unnamed_models import AugmentedModel, FitContext, fit_unnamed_models
+from siq.diagnosis.unnamed_models import AugmentedModel, fit_unnamed_models
 from siq.errors import NumericalFailure
 from siq.inference.budget import UNLIMITED, Account, Budget
 from siq.inference.maximum_likelihood import Fit
@@ -49,10 +49,8 @@ class Investigation:
     ----------
     verdict
         One of four.
-    model
-        The simulation as its author believes it.
-    roles
-        Of its states.
+    context
+        The simulation, the recordings, and the mechanisms that were considered.
     search
         Recalibration, mechanisms found, and the final fit.
     least_squares
@@ -66,8 +64,6 @@ class Investigation:
         p-value of the test that the parameters of the card are the true ones.
     remarks
         Reservations.
-    candidates
-        All mechanisms that were considered.
     naming
         What was asked of mechanisms before they could be named; None where none was found.
     models
@@ -79,15 +75,13 @@ class Investigation:
     """
 
     verdict: MismatchVerdict
-    model: Dynamics
-    roles: Roles
+    context: FitContext
     search: Search
     least_squares: Fit
     exact: Fit | None
     remainder: Remainder
     p_shift: float
     remarks: tuple[Remark, ...]
-    candidates: tuple[MechanismCandidate, ...]
     naming: NamingDecision | None = None
     models: tuple[AugmentedModel, ...] = ()
     account: Account = UNLIMITED
@@ -158,10 +152,11 @@ def investigate(
         monomials = generic_candidates(model, roles, degree=study.degree, named=candidates)
         candidates += [each for each in monomials if each.coordinate != "constant"]
     budget = budget or Budget()
+    context = FitContext(model, data, roles, tuple(candidates), study, budget)
     budget.says("fitting the simulation's own parameters")
     with budget.exempt():
         recalibrated, least_squares = recalibrate(model, data, budget=budget)
-    found = search(model, data, recalibrated, candidates, options=options, budget=budget)
+    found = search(context, recalibrated)
     recalibrated = found.recalibrated  # from where a mechanism led it, if that is better
     if not (recalibrated.has_process_noise or recalibrated.log_likelihood < least_squares.log_likelihood):
         least_squares = recalibrated
@@ -170,24 +165,20 @@ def investigate(
     by_each: list[Remainder] = []
     for place, each in enumerate(found.found):
         try:
-            by_each.append(remainder_of(model, data, recalibrated, each.best.fit, roles))
+            by_each.append(remainder_of(data, recalibrated, each.best.fit, roles))
         except NumericalFailure as error:
             fit = found.found[place - 1].best.fit if place else recalibrated
             untried = (*found.untried, NotFitted.of(each.best.candidate, error))
             found = replace(found, found=found.found[:place], fit=fit, untried=untried)
             break
-    left = by_each[-1] if by_each else remainder_of(model, data, recalibrated, recalibrated, roles)
+    left = by_each[-1] if by_each else remainder_of(data, recalibrated, recalibrated, roles)
     exact: Fit | None = None
     naming: NamingDecision | None = None
     models: tuple[AugmentedModel, ...] = ()
     verdict, remarks = MismatchVerdict.NO_MISMATCH, tuple[Remark, ...]()
-    context = FitContext(data, roles, study.degree, options.blocks, len(candidates), budget)
     tried = bool(found.found)
     if tried:
-        naming = decide_naming(
-            found, by_each, model, context, candidates,
-            options=options, generator=np.random.default_rng(seed),
-        )  # fmt: skip
+        naming = decide_naming(found, by_each, context, generator=np.random.default_rng(seed))
         models, exact, remarks = naming.models, naming.exact, naming.remarks
         found, left = naming.search, naming.remainder
         verdict = MismatchVerdict.MISSING_PHYSICS if naming.named else MismatchVerdict.UNEXPLAINED
@@ -198,7 +189,7 @@ def investigate(
         with budget.exempt():
             # What a mechanism has found already has to be gone more clearly.
             least = RANDOM_RESIDUALS if tried else STRUCTURED
-            rounded = explained_by_quantisation(model, data, least_squares, roles, least=least, budget=budget)
+            rounded = explained_by_quantisation(data, least_squares, roles, least=least, budget=budget)
     if rounded is not None:
         least_squares, left, outputs = rounded
         found = replace(found, recalibrated=least_squares, found=(), fit=least_squares)
@@ -229,15 +220,13 @@ def investigate(
     found = replace(found, fit=replace(found.fit, covariance=covariance))
     return Investigation(
         verdict=verdict,
-        model=model,
-        roles=roles,
+        context=context,
         search=found,
         least_squares=least_squares,
         exact=exact,
         remainder=left,
         p_shift=p_shift,
         remarks=remarks,
-        candidates=tuple(candidates),
         naming=naming,
         models=models,
         account=budget.account(),
@@ -292,14 +281,7 @@ class HeldOutRuns:
     adopted: bool = False
 
 
-def held_out_runs(
-    investigation: Investigation,
-    learned: Measurements,
-    data: Measurements,
-    *,
-    certain: float,
-    tests: Collection[str] = (),
-) -> HeldOutRuns:
+def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRuns:
     """Run the simulations freely on recordings that had no part in anything.
 
     Of several models of what has no name one may be adopted (`siq.diagnosis.holdout`): it makes the
@@ -310,24 +292,18 @@ def held_out_runs(
     Parameters
     ----------
     investigation
-        What was found.
-    learned
-        The recordings that it was found in; they decide which estimates run freely best.
+        What was found. The recordings that it was found in decide which estimates run freely best.
     data
         The recordings held out.
-    certain
-        Logarithm of the odds from which on a model is certain where it was found.
-    tests
-        Labels of those that may choose nothing.
     """
-    search = investigation.search
+    search, learned, study = investigation.search, investigation.context.data, investigation.context.study
     noise, substeps = search.recalibrated.noise, max(search.fit.substeps, search.recalibrated.substeps)
     runs = SimulationProtocol(noise, substeps)
 
     def best_of(*fits: Fit | None) -> Fit:
         return runs.nearest([each for each in fits if each is not None], learned)
 
-    card = replace(search.recalibrated, model=investigation.model)
+    card = replace(search.recalibrated, model=investigation.context.model)
     # What fits best with process noise admitted need not be what runs best without.
     recalibrated = search.recalibrated
     if recalibrated.has_process_noise and np.isfinite(investigation.least_squares.sum_of_squares):
@@ -335,7 +311,7 @@ def held_out_runs(
     plain = best_of(investigation.exact, search.fit)
     choices = [(model, best_of(model.fit, model.exact)) for model in investigation.models]
     named = investigation.verdict.names
-    judges = [place for place, label in enumerate(data.labels) if label not in tests]
+    judges = [place for place, label in enumerate(data.labels) if label not in study.tests]
     adopted: int | None = None
     if choices and judges:
         # What is not certain where it was found has to be better by more than appears by chance, what is
@@ -348,7 +324,7 @@ def held_out_runs(
         errors = [runs.errors(fit, may_choose) for _, fit in choices]
         limits = [
             0.0
-            if model.log_evidence < certain
+            if model.log_evidence < study.search.least_log_odds
             else mean_error(least if model.fit.has_process_noise else alone[-1])
             for model, _ in choices
         ]

@@ -71,7 +71,7 @@ def places_of(search: Shape, data: Measurements, model: Dynamics, x: np.ndarray)
             found = None if top is None else side * top
         return np.zeros(0) if found is None else np.array([found])
     text = search.scale_of or search.inverse_scale_of or search.quantiles_of or search.time_of
-    course = along(str(text), data, model, x)
+    (course,) = along([parse_formula(str(text), model.names)], model, data, x)
     if search.quantiles_of is not None:
         return np.quantile(course, factors)
     if search.time_of is not None:
@@ -114,14 +114,20 @@ def _plateau(values: np.ndarray, recording: np.ndarray, *, noise: float) -> floa
     return float(np.median(values[np.unique(np.concatenate([rows, rows + 1, rows + 2]))]))
 
 
-def along(text: str, data: Measurements, model: Dynamics, x: np.ndarray) -> np.ndarray:
-    """A formula of states and inputs at all samples, shape ``(n,)``."""
+def along(formulas: Sequence[sympy.Expr], model: Dynamics, data: Measurements, x: np.ndarray) -> np.ndarray:
+    """Formulas ``(c,)`` of parameters, states, inputs and time at all samples, shape ``(c, n)``."""
     known = {symbol(each.name): each.value for each in model.parameters}
-    formula = parse_formula(text, model.names).subs(known)
     signals = data.signals(data.t, data.recording, delays=())
-    arguments = [*(symbol(n) for n in model.states), *(symbol(e.name) for e in model.inputs), symbol("t")]
-    value = compile_values([formula], arguments, common=False)(*x.T, *signals.inputs, signals.t)[0]
-    return np.broadcast_to(value, data.t.shape)
+    arguments = [symbol(name) for name in (*model.states, *(each.name for each in model.inputs), "t")]
+    compiled = compile_values([each.subs(known) for each in formulas], arguments, common=False)
+    values = compiled(*x.T[: model.dimension], *signals.inputs, signals.t)
+    return np.stack([np.broadcast_to(each, data.t.shape) for each in values])
+
+
+def fresh_names(stem: str, count: int, used: Collection[str]) -> list[str]:
+    """So many numbered names that are not used yet."""
+    free = (f"{stem}_{number}" for number in itertools.count(1) if f"{stem}_{number}" not in used)
+    return list(itertools.islice(free, count))
 
 
 @dataclass(frozen=True)
@@ -184,7 +190,7 @@ def build_candidate(
     """Build a mechanism into a model, for one assignment of names to roles; None where it changes nothing."""
     fresh: dict[str, str] = {}
     for name in (*form.parameters, *form.states):
-        fresh[name] = _fresh_name(name, model, set(fresh.values()))
+        (fresh[name],) = fresh_names(name, 1, {*model.names, *fresh.values()})
     names = _vocabulary(model, form, assignment, fresh)
     equations = dict(zip(model.states, model.equations, strict=True))
     outputs = dict(model.outputs)
@@ -262,12 +268,6 @@ def build_candidate(
         generalises=mechanism.generalises,
         variant=form.variant,
     )
-
-
-def _fresh_name(name: str, model: Dynamics, taken: set[str] | None = None) -> str:
-    """A name as in the dictionary, numbered so that it collides with none of the card."""
-    used = set(model.names) | (taken or set())
-    return next(f"{name}_{k}" for k in itertools.count(1) if f"{name}_{k}" not in used)
 
 
 def _vocabulary(
@@ -571,7 +571,7 @@ def generic_candidates(
             if sum(powers) > degree:
                 continue
             monomial = sympy.prod([s**p for s, p in zip(states, powers, strict=True)])
-            new = _fresh_name("c", model)
+            (new,) = fresh_names("c", 1, model.names)
             units = {f"_{k}": unit for k, unit in enumerate(model.units)}
             per = "*".join(f"_{k}**{power}" for k, power in enumerate(powers) if power)
             unit = unit_of(f"_{place}/_t" + (f"/({per})" if per else ""), {**units, "_t": model.time_unit})

@@ -9,10 +9,10 @@ evenly on a logarithmic scale. A name takes the odds that keep wrong names as ra
 Effects without a name are drawn as smooth functions at all sites; least squares says how much of each the
 best mechanisms would explain. A name has to explain more than that.
 
-**Beside a remainder.** Where it does not, the first mechanism may still be likelier than a function in its
-place, whatever else is missing being a function for both. The errors that both leave are autocorrelated and
-count as so many as are independent. Where the odds decide nothing, cross-validation does. Where process noise
-still has to stand in for something, the rest has no model, and nobody can say.
+**Where something is left.** Where it does not, the first mechanism may still be likelier than a function in
+its place, whatever else is missing being a function for both. The errors that both leave are autocorrelated
+and count as so many as are independent. Where the odds decide nothing, cross-validation does. Where process
+noise still has to stand in for something, the rest has no model, and nobody can say.
 """
 
 from __future__ import annotations
@@ -43,13 +43,11 @@ from siq.diagnosis.evidence import (
 from siq.diagnosis.holdout import change_between, errors_left_out, in_blocks
 from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.diagnosis.residual_structure import Remainder
-from siq.diagnosis.screening import PROBE_SUBSTEPS, Probe, ProbeColumns, probe_response, probes_of
-from siq.diagnosis.search import Search
-from siq.diagnosis.study import SearchOptions
+from siq.diagnosis.screening import PROBE_SUBSTEPS, ProbeColumns, probe_response, probes_of
+from siq.diagnosis.search import FitContext, Search
 from siq.diagnosis.terms import linearised_with_places, places_in, products_in
 from siq.diagnosis.unnamed_models import (
     AugmentedModel,
-    FitContext,
     fit_models_of_remainder,
     fit_unnamed_models,
     runs_freely,
@@ -61,7 +59,6 @@ from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import fit_with_and_without_process_noise
 from siq.remarks import Remark
-from siq.systems.dynamics import Dynamics
 
 LOGGER = logging.getLogger(__name__)
 FUNCTIONS_EXTENDED = 2  # functions in the place of the mechanism that get another on top of them: a choice
@@ -121,34 +118,26 @@ class _MissingEffect:
         return evidence_of_function(self.projected(columns), self._target, knots, freedom=self._freedom)
 
 
-def _log_odds_of_a_name(
-    fit: Fit,
-    data: Measurements,
-    candidates: Sequence[MechanismCandidate],
-    roles: Roles,
-    model: Dynamics,
-    *,
-    considered: Sequence[MechanismCandidate],
-    unnamed: float,
-) -> float:
+def _log_odds_of_a_name(fit: Fit, candidates: Sequence[MechanismCandidate], context: FitContext) -> float:
     """Logarithm of the odds that what is missing is the mechanism, rather than a function without a name."""
+    model, data, unnamed = context.model, context.data, context.study.search.unnamed
     ours, theirs = -np.inf, []
-    single = places_in(model, roles, data, fit.x)
+    single = places_in(model, context.roles, data, fit.x)
     there = {name for each in candidates for name in each.equations}
     products = products_in([each for each in single if there & set(each.targets)], model, data, fit.x)
-    for response, some in linearised_with_places(fit, data, (*single, *products)):
+    for response, groups in linearised_with_places(fit, data, (*single, *products)):
         white = whiten(response, data, fit.noise)
         problem = _MissingEffect(white, fit, candidates)
         ours = problem.log_evidence_of_mechanisms()
-        begin = len(fit.model.free)
-        for place in some:
-            columns = white.columns[:, begin : begin + len(place.knots)]
-            begin += len(place.knots)
-            if np.isfinite(columns).all():
-                theirs.append(problem.log_evidence_of_function(columns, place.knots))
+        further = white.columns[:, len(fit.model.free) :]
+        theirs += [
+            problem.log_evidence_of_function(further[:, group], place.knots)
+            for place, group in groups
+            if np.isfinite(further[:, group]).all()
+        ]
     if not theirs:
         return np.inf
-    forms = Counter(each.name for each in considered)
+    forms = Counter(each.name for each in context.candidates)
     chosen = sum(np.log(len(forms) * forms[each.name]) for each in candidates if forms[each.name])
     named = ours + np.log1p(-unnamed) - chosen
     nameless = scipy.special.logsumexp(theirs) + np.log(unnamed) - np.log(len(theirs))
@@ -156,28 +145,25 @@ def _log_odds_of_a_name(
 
 
 def _false_match_rate(
-    recalibrated: Fit,
-    data: Measurements,
-    probes: Sequence[Probe],
-    roles: Roles,
-    *,
-    share: float,
-    mechanisms: int,
-    measurement: np.ndarray,
-    generator: np.random.Generator,
+    whole: Search, context: FitContext, *, share: float, mechanisms: int, generator: np.random.Generator
 ) -> float:
     """Probability that so many mechanisms explain as large a share of an effect that has no name."""
-    model, noise = recalibrated.model, Noise(measurement, np.zeros(recalibrated.model.dimension))
-    effects = _drawn_effects(recalibrated, data, roles, noise, generator=generator)
+    recalibrated, data = whole.recalibrated, context.data
+    model, count = recalibrated.model, len(recalibrated.model.free)
+    probes = [
+        probe for each in context.candidates for probe in probes_of(each, data, context.model, recalibrated.x)
+    ]
+    noise = Noise(whole.fit.noise.measurement, np.zeros(model.dimension))
+    effects = _drawn_effects(recalibrated, data, context.roles, noise, generator=generator)
     grid = Grid(data, min(recalibrated.substeps, PROBE_SUBSTEPS))
-    columns = ProbeColumns(model, grid, probes, recalibrated.x, model.values)
-    white = whiten(probe_response(model, grid, recalibrated, columns), data, noise)
-    own = orthonormal(white.columns[:, : len(model.free)])
+    columns = ProbeColumns(model, grid, probes, recalibrated.x)
+    white = whiten(probe_response(recalibrated, grid, columns), data, noise)
+    own = orthonormal(white.columns[:, :count])
     effects = effects - own @ (own.T @ effects)
     effects = effects[:, (effects**2).sum(axis=0) > 0]
     if not effects.shape[1]:
         raise NumericalFailure("no effect can be seen in the recordings")
-    groups, begin = [], len(model.free)
+    groups, begin = [], count
     for probe in probes:
         group = white.columns[:, begin : begin + probe.width]
         begin += probe.width
@@ -194,24 +180,21 @@ def _drawn_effects(
     places = places_in(fit.model, roles, data, fit.x)
     if not places:
         return np.zeros((data.outputs.size, 0))
-    counts = generator.multinomial(EFFECTS_DRAWN, np.full(len(places), 1 / len(places)))
-    drawn, place = [], 0
-    for response, some in linearised_with_places(fit, data, places):
-        white = whiten(response, data, noise)
-        begin = len(fit.model.free)
-        for each in some:
-            columns = white.columns[:, begin : begin + len(each.knots)]
-            begin += len(each.knots)
+    counts = iter(generator.multinomial(EFFECTS_DRAWN, np.full(len(places), 1 / len(places))))
+    drawn = []
+    for response, groups in linearised_with_places(fit, data, places):
+        further = whiten(response, data, noise).columns[:, len(fit.model.free) :]
+        for place, group in groups:
+            count, columns = next(counts), further[:, group]
             if np.isfinite(columns).all():
-                for _ in range(counts[place]):
-                    root = np.linalg.cholesky(smooth_prior(each.knots, generator.choice(SMOOTH_LENGTHS)))
-                    drawn.append(columns @ (root @ generator.normal(size=len(each.knots))))
-            place += 1
+                for _ in range(count):
+                    root = np.linalg.cholesky(smooth_prior(place.knots, generator.choice(SMOOTH_LENGTHS)))
+                    drawn.append(columns @ (root @ generator.normal(size=place.width)))
     return np.stack(drawn, axis=1) if drawn else np.zeros((data.outputs.size, 0))
 
 
 def _best_shares(effects: np.ndarray, groups: Sequence[np.ndarray], most: int) -> np.ndarray:
-    """Share of effects ``(n, e)`` that so many groups of columns explain, chosen one beside the other."""
+    """Share of effects ``(n, e)`` that so many groups of columns explain, chosen one by one."""
     size = (effects**2).sum(axis=0)
     left = effects.copy()
     chosen: list[list[np.ndarray]] = [[] for _ in size]
@@ -226,7 +209,7 @@ def _best_shares(effects: np.ndarray, groups: Sequence[np.ndarray], most: int) -
 
 @dataclass(frozen=True)
 class _ResidualModelComparison:
-    """How likely a mechanism is beside a function without a name, and what was fitted to know it.
+    """How likely a mechanism is where something is left, and what was fitted to know it.
 
     Attributes
     ----------
@@ -248,18 +231,13 @@ class _ResidualModelComparison:
 
 
 def _residual_model_comparison(
-    trial: FittedCandidate,
-    recalibrated: Fit,
-    context: FitContext,
-    *,
-    considered: Sequence[MechanismCandidate],
-    unnamed: float,
-    least: float,
+    trial: FittedCandidate, recalibrated: Fit, context: FitContext
 ) -> _ResidualModelComparison | None:
     """Hold a mechanism against functions in its place, whatever else is missing being a function for both."""
     if trial.fit.has_process_noise or trial.fit.model.dimension > recalibrated.model.dimension:
         return None
-    data = context.data
+    data, options = context.data, context.study.search
+    unnamed = options.unnamed
     on_top = [
         each
         for each in with_function((), trial.fit, context)
@@ -283,15 +261,15 @@ def _residual_model_comparison(
             for each in models
         )
 
-    forms = Counter(each.name for each in considered)
+    forms = Counter(each.name for each in context.candidates)
     chosen = np.log(max(len(forms) * forms[trial.candidate.name], 1))
     log_odds = float(best(ours) + np.log1p(-unnamed) - chosen - best(theirs))
     LOGGER.info(
-        "%s beside a function: log-odds %.1f, errors correlated over %.1f samples",
+        "%s with a function on top of it: log-odds %.1f, errors correlated over %.1f samples",
         trial.candidate.label, log_odds, correlated,
     )  # fmt: skip
     predicts_better = False
-    if abs(log_odds) < least:
+    if abs(log_odds) < options.least_log_odds:
         blocks = []
         for models, candidates in ((theirs, ()), (ours, (trial.candidate,))):
             errors = (
@@ -347,36 +325,18 @@ class NamingDecision:
 
 
 def _judge_mechanisms(
-    whole: Search,
-    left: Sequence[Remainder],
-    data: Measurements,
-    model: Dynamics,
-    roles: Roles,
-    candidates: Sequence[MechanismCandidate],
-    *,
-    options: SearchOptions,
-    generator: np.random.Generator,
+    whole: Search, left: Sequence[Remainder], context: FitContext, *, generator: np.random.Generator
 ) -> NamingDecision:
     """Judge the mechanisms of a search, as far as they explain by themselves what is missing."""
-
-    def log_odds(number: int, chosen: Sequence[int]) -> float:
-        return _log_odds(whole, number, chosen, data, model, roles, candidates, options)
+    options = context.study.search
 
     def convincing(number: int, left: Remainder) -> tuple[bool, float | None]:
         """Whether the first so many mechanisms leave nothing, or explain more than by chance."""
         if not (left.doubtful or whole.found[number - 1].best.fit.has_process_noise):
             return True, None
-        recalibrated = whole.recalibrated
         try:
             p_alike = _false_match_rate(
-                recalibrated,
-                data,
-                [probe for each in candidates for probe in probes_of(each, data, model, recalibrated.x)],
-                roles,
-                share=left.share,
-                mechanisms=number,
-                measurement=whole.fit.noise.measurement,
-                generator=generator,
+                whole, context, share=left.share, mechanisms=number, generator=generator
             )
         except NUMERICAL_ERRORS as error:
             LOGGER.info("matches by chance are not known: %s", error)
@@ -391,14 +351,15 @@ def _judge_mechanisms(
         while (
             kept < len(left)
             and left[kept].share > left[kept - 1].share
-            and log_odds(kept + 1, [kept]) >= options.least_log_odds
+            and _log_odds(whole, kept + 1, [kept], context) >= options.least_log_odds
         ):
             kept += 1
         search = replace(whole, found=whole.found[:kept], fit=whole.found[kept - 1].best.fit)
         left = left[:kept]
     convinces, p_alike = convincing(len(search.found), left[-1])
-    odds = tuple(log_odds(len(search.found), [place]) for place in range(len(search.found)))
-    together = odds[0] if len(odds) == 1 else log_odds(len(odds), list(range(len(odds))))
+    every = range(len(search.found))
+    odds = tuple(_log_odds(whole, len(every), [place], context) for place in every)
+    together = odds[0] if len(odds) == 1 else _log_odds(whole, len(every), every, context)
     least = min(*odds, together)
     remarks = []
     if convinces and p_alike is not None and (left[-1].doubtful or left[-1].share < 1):
@@ -413,14 +374,7 @@ def _judge_mechanisms(
 
 
 def decide_naming(
-    whole: Search,
-    left: Sequence[Remainder],
-    model: Dynamics,
-    context: FitContext,
-    candidates: Sequence[MechanismCandidate],
-    *,
-    options: SearchOptions,
-    generator: np.random.Generator,
+    whole: Search, left: Sequence[Remainder], context: FitContext, *, generator: np.random.Generator
 ) -> NamingDecision:
     """Decide about the names of a search that found something, and fit models of the rest.
 
@@ -430,70 +384,50 @@ def decide_naming(
         The search.
     left
         What is left with the first mechanism, the first two, and so on.
-    model, context, candidates
-        The simulation as its author believes it, what models are made from, and what could be named.
-    options
-        Of the search.
+    context
+        What models are made from, and what could be named.
     generator
         Draws effects without a name.
     """
-    data, roles = context.data, context.roles
-    decision = _judge_mechanisms(
-        whole, left, data, model, roles, candidates, options=options, generator=generator
-    )
-    beside: _ResidualModelComparison | None = None
+    least = context.study.search.least_log_odds
+    decision = _judge_mechanisms(whole, left, context, generator=generator)
+    compared: _ResidualModelComparison | None = None
     # Only few functions are fitted; along the trajectories of a fit all are compared. Where these speak
     # against the name as clearly as something would have to speak for it, the few prove nothing.
-    if not decision.convincing and (
-        _log_odds(whole, 1, [0], data, model, roles, candidates, options) > -options.least_log_odds
-    ):
-        beside = _residual_model_comparison(
-            whole.found[0].best, whole.recalibrated, context,
-            considered=candidates, unnamed=options.unnamed, least=options.least_log_odds,
-        )  # fmt: skip
-    if beside is not None and (beside.log_odds >= options.least_log_odds or beside.predicts_better):
-        first = replace(whole, found=whole.found[:1], fit=whole.found[0].best.fit)
+    if not decision.convincing and _log_odds(whole, 1, [0], context) > -least:
+        compared = _residual_model_comparison(whole.found[0].best, whole.recalibrated, context)
+    if compared is not None and (compared.log_odds >= least or compared.predicts_better):
+        first, odds = replace(whole, found=whole.found[:1], fit=whole.found[0].best.fit), compared.log_odds
         decision = replace(
-            decision, search=first, remainder=left[0], log_odds=(beside.log_odds,), together=beside.log_odds,
+            decision, search=first, remainder=left[0], log_odds=(odds,), together=odds,
             convincing=True, named=True, remarks=(_remainder_remark(left[0], unnamed=True),),
         )  # fmt: skip
     search = decision.search
     if not decision.named:
-        instead = None if beside is None else beside.instead
+        instead = None if compared is None else compared.instead
         return replace(decision, models=fit_unnamed_models(search, context, functions=instead))
     if len(whole.found) > len(search.found) or decision.remainder.doubtful or search.fit.has_process_noise:
-        on_top = None if beside is None else beside.on_top
+        on_top = None if compared is None else compared.on_top
         models = fit_models_of_remainder(search, whole, context, functions=on_top)
         decision = replace(decision, models=models)
     if search.fit.has_process_noise:
         still = replace(search.fit, noise=search.fit.noise.without_process())
         with context.budget.exempt():
-            exact = fit_with_and_without_process_noise(search.fit.model, data, still, budget=context.budget)[
-                1
-            ]
+            _, exact = fit_with_and_without_process_noise(
+                search.fit.model, context.data, still, budget=context.budget
+            )
         if exact.converged:
             remarks = (*decision.remarks, Remark("diagnosis.least_squares"))
             decision = replace(decision, exact=exact, remarks=remarks)
     return decision
 
 
-def _log_odds(
-    search: Search,
-    number: int,
-    chosen: Sequence[int],
-    data: Measurements,
-    model: Dynamics,
-    roles: Roles,
-    candidates: Sequence[MechanismCandidate],
-    options: SearchOptions,
-) -> float:
+def _log_odds(search: Search, number: int, chosen: Sequence[int], context: FitContext) -> float:
     """Logarithm of the odds of some mechanisms of a search, in the fit with the first so many."""
     found = [each.best for each in search.found]
     named = [found[place].candidate for place in chosen]
     try:
-        odds = _log_odds_of_a_name(
-            found[number - 1].fit, data, named, roles, model, considered=candidates, unnamed=options.unnamed
-        )
+        odds = _log_odds_of_a_name(found[number - 1].fit, named, context)
     except NUMERICAL_ERRORS as error:
         LOGGER.info("the odds of a name are not known: %s", error)
         return -np.inf

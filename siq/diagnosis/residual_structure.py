@@ -23,72 +23,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.stats
-import sympy
 
 from siq.diagnosis.dictionary import Roles, roles_of
 from siq.diagnosis.mechanisms import lattice_step
-from siq.diagnosis.screening import PROBE_SUBSTEPS, in_portions, probe_response, projected
-from siq.diagnosis.terms import PlaceColumns, coordinates_of, courses_of
+from siq.diagnosis.screening import projected
+from siq.diagnosis.terms import Place, linearised_with_places, places_in
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget
-from siq.inference.kalman_filter import Grid, Noise, Whitened, profile_likelihood, solve, whiten
+from siq.inference.kalman_filter import Grid, Noise, profile_likelihood, solve, whiten
 from siq.inference.maximum_likelihood import Fit, first_noise, fit_by_multiple_shooting
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import FAINT, process_noise_needed
-from siq.systems.dynamics import Dynamics, symbol
 
-HAT_KNOTS = 9  # of the functions that are tried: a choice
-TINY_AMPLITUDE = sympy.Float(1e-300)  # so that a system at rest has a direction, which is none
 LAGS = 12  # of autocorrelations
-
-
-@dataclass(frozen=True)
-class Direction:
-    """A piecewise linear function of a coordinate in an equation: a `siq.diagnosis.terms.Basis` of hats.
-
-    Attributes
-    ----------
-    names
-        Of the states in whose equations it stands; two of them for a force along or across the amplitude.
-    coordinate
-        Its name.
-    across
-        Whether it is a force across the amplitude.
-    knots
-        Where it bends, shape ``(k,)``.
-    """
-
-    names: tuple[str, ...]
-    coordinate: str
-    across: bool
-    knots: np.ndarray
-    outputs: tuple[tuple[str, sympy.Expr], ...] = ()
-
-    @property
-    def coordinates(self) -> tuple[sympy.Expr, ...]:
-        """The formula of its coordinate."""
-        if self.coordinate != "amplitude":
-            return (symbol(self.coordinate),)
-        return (sympy.sqrt(sum(symbol(name) ** 2 for name in self.names)),)
-
-    @property
-    def equations(self) -> tuple[tuple[str, sympy.Expr], ...]:
-        """The factor in each equation: 1, or the direction along or across the amplitude."""
-        if len(self.names) == 1:
-            return ((self.names[0], sympy.Integer(1)),)
-        a, b = map(symbol, self.names)
-        size = sympy.sqrt(a**2 + b**2 + TINY_AMPLITUDE)
-        along, other = (b, -a) if self.across else (a, b)
-        return ((self.names[0], along / size), (self.names[1], other / size))
-
-    @property
-    def width(self) -> int:
-        """The number of its values."""
-        return len(self.knots)
-
-    def values(self, courses: np.ndarray) -> np.ndarray:
-        """Hats that are one at one knot and zero at the others, along a course ``(1, n)``: ``(k, n)``."""
-        return np.stack([np.interp(courses[0], self.knots, unit) for unit in np.eye(self.width)])
 
 
 @dataclass(frozen=True)
@@ -97,7 +44,7 @@ class Curve:
 
     Attributes
     ----------
-    direction
+    place
         Where.
     values, standard_errors
         At the knots, less what the parameters can do, in the unit of the equation; shape ``(k,)``.
@@ -107,7 +54,7 @@ class Curve:
         Probability of as much by chance.
     """
 
-    direction: Direction
+    place: Place
     values: np.ndarray
     standard_errors: np.ndarray
     gain: float
@@ -142,72 +89,34 @@ class Structure:
         return min(1.0, 2 * min(self.p_curves, self.p_autocorrelation))
 
 
-def _directions_of(model: Dynamics, roles: Roles, data: Measurements, x: np.ndarray) -> tuple[Direction, ...]:
-    """Every equation that may lack something, with every coordinate."""
-    pairs = {name for pair in roles.amplitudes for name in pair}
-    drafts = [
-        Direction(pair, "amplitude", across, np.empty(0))
-        for pair in roles.amplitudes
-        for across in (False, True)
-    ]
-    drafts += [
-        Direction((name,), coordinate, False, np.empty(0))
-        for name in roles.states
-        for coordinate in coordinates_of(model)
-        if not (name in pairs and coordinate in pairs)
-    ]
-    found = []
-    for draft in drafts:
-        (course,) = courses_of(draft.coordinates, model, data, x)
-        if np.ptp(course) > 0:
-            knots = np.unique(np.quantile(course, np.linspace(0, 1, HAT_KNOTS)))
-            if len(knots) > 3:
-                found.append(replace(draft, knots=knots))
-    return tuple(found)
-
-
-def _structure_of(
-    model: Dynamics,
-    data: Measurements,
-    fit: Fit,
-    roles: Roles,
-    *,
-    noise: Noise | None = None,
-) -> Structure:
+def _structure_of(data: Measurements, fit: Fit, roles: Roles, *, noise: Noise | None = None) -> Structure:
     """Describe what a fit leaves."""
-    directions = _directions_of(model, roles, data, fit.x)
-    grid = Grid(data, min(fit.substeps, PROBE_SUBSTEPS))
+    places = places_in(fit.model, roles, data, fit.x, linear=True)
     noise = fit.noise if noise is None else noise
     parameters = len(fit.model.free)
-
-    def projected_with(some: tuple[Direction, ...]) -> tuple[Whitened, np.ndarray, np.ndarray]:
-        white = whiten(probe_response(model, grid, fit, PlaceColumns(model, grid, some)), data, noise)
-        return white, *projected(white, parameters)
-
-    white, left, _ = projected_with(())
+    white = whiten(fit.linearisation, data, noise)
+    left, _ = projected(white, parameters)
     freedom = white.degrees_of_freedom - parameters
     total = float(left @ left)
     # Below its measurement noise a fit has no scale of its own; above it errors are as large as they are.
     scale = 1.0 if noise.process.any() or not fit.has_process_noise else max(total / freedom, 1.0)
     curves = []
-    for portion in in_portions([len(each.knots) for each in directions], model, data):
-        _, left, columns = projected_with(directions[portion])
-        place = 0
-        for direction in directions[portion]:
-            own = columns[:, place : place + len(direction.knots)]
-            place += len(direction.knots)
+    for response, groups in linearised_with_places(fit, data, places):
+        left, columns = projected(whiten(response, data, noise), parameters)
+        for place, group in groups:
+            own = columns[:, group]
             values, covariance = solve(own, left)
             gain = total - float(((left - own @ values) ** 2).sum())
             rank = int((np.linalg.svd(own, compute_uv=False) > 1e-9 * max(np.abs(own).max(), 1e-300)).sum())
             p_value = float(scipy.stats.chi2.sf(max(gain, 0.0) / scale, max(rank, 1)))
             errors = np.sqrt(np.diag(covariance) * scale)
-            curves.append(Curve(direction, values, errors, gain, p_value))
+            curves.append(Curve(place, values, errors, gain, p_value))
     curves.sort(key=lambda each: -each.gain)
     best = min((each.p_value for each in curves), default=1.0)
     return Structure(
         curves=tuple(curves),
         p_curves=min(1.0, best * max(len(curves), 1)),
-        p_autocorrelation=_autocorrelation(left, white.recording, white.known, len(model.outputs)),
+        p_autocorrelation=_autocorrelation(left, white.recording, white.known, len(fit.model.outputs)),
         total=total,
         freedom=freedom,
     )
@@ -266,33 +175,31 @@ class Remainder:
         return self.after.p_value < DOUBTFUL
 
 
-def remainder_of(
-    model: Dynamics, data: Measurements, recalibrated: Fit, final: Fit, roles: Roles
-) -> Remainder:
+def remainder_of(data: Measurements, recalibrated: Fit, final: Fit, roles: Roles) -> Remainder:
     """Structure before and after mechanisms were added, and the share of the excess that they explain.
 
     Parameters
     ----------
-    model, data
-        The simulation as its author believes it, and the recordings.
+    data
+        The recordings.
     recalibrated, final
-        Its fit, and that with mechanisms.
+        The fit of the simulation, and that with mechanisms.
     roles
         Of the simulation's states.
     """
-    after = _structure_of(final.model, data, final, roles)
+    after = _structure_of(data, final, roles)
     # Process noise that stands for missing physics takes measurement noise with it; the final fit is right.
-    still = Noise(final.noise.measurement, np.zeros(model.dimension))
-    before = _structure_of(model, data, recalibrated, roles, noise=still)
+    still = Noise(final.noise.measurement, np.zeros(recalibrated.model.dimension))
+    before = _structure_of(data, recalibrated, roles, noise=still)
     alone = after
     if final.has_process_noise:
-        alone = _structure_of(final.model, data, final, roles, noise=final.noise.without_process())
+        alone = _structure_of(data, final, roles, noise=final.noise.without_process())
     if not before.total > before.freedom:
         return Remainder(before, after, 1.0)
     # What is left is the excess that remains, or what a function of one coordinate still finds: where a fit
     # without process noise takes a misfit for noise, only the latter shows it.
     best = alone.curves[0] if alone.curves else None
-    systematic = 0.0 if best is None else best.gain - 2 * len(best.direction.knots)
+    systematic = 0.0 if best is None else best.gain - 2 * best.place.width
     left = max(alone.total - alone.freedom, systematic, 0.0)
     share = float(np.clip(1 - left / (before.total - before.freedom), 0.0, 1.0))
     return Remainder(before, after, share)
@@ -300,11 +207,10 @@ def remainder_of(
 
 def has_structure(current: Fit, data: Measurements) -> bool:
     """Whether it is worth looking for something on top of a fit."""
-    model = current.model
     if current.has_process_noise:
         return True
     try:
-        return _structure_of(model, data, current, roles_of(model)).p_value < RANDOM_RESIDUALS
+        return _structure_of(data, current, roles_of(current.model)).p_value < RANDOM_RESIDUALS
     except NumericalFailure:  # a simulation that runs away lacks something, whatever it is
         return True
 
@@ -314,7 +220,6 @@ NOISE_SETTLED = 0.01  # relative change of the noise, at which they have settled
 
 
 def explained_by_quantisation(
-    model: Dynamics,
     data: Measurements,
     strict: Fit,
     roles: Roles,
@@ -326,10 +231,10 @@ def explained_by_quantisation(
 
     Parameters
     ----------
-    model, data
-        The simulation as its author believes it, and the recordings.
+    data
+        The recordings.
     strict
-        Its fit without process noise.
+        The fit of the simulation without process noise.
     roles
         Of the simulation's states.
     least
@@ -365,19 +270,19 @@ def explained_by_quantisation(
             return None
         if (np.abs(deviation - before) < NOISE_SETTLED * before).all():
             break
-    faint = Noise(fit.noise.measurement, FAINT * first_noise(model, values, fit.x).process)
+    faint = Noise(fit.noise.measurement, FAINT * first_noise(fit.model, values, fit.x).process)
     forced = fit_by_multiple_shooting(
         fit.model, values, x=fit.x, noise=faint, estimate_process=True, substeps=fit.substeps, budget=budget
     )
     if forced.converged and process_noise_needed(forced, fit):
         return None
     try:
-        left = remainder_of(model, values, fit, fit, roles)
+        left = remainder_of(values, fit, fit, roles)
     except NumericalFailure:
         return None
     if left.after.p_value < least:
         return None
-    names = tuple(name for name, wide in zip(model.output_names, coarse, strict=True) if wide)
+    names = tuple(name for name, wide in zip(fit.model.output_names, coarse, strict=True) if wide)
     return replace(strict, model=fit.model, x=fit.x), left, names
 
 

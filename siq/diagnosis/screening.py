@@ -83,15 +83,10 @@ class ProbeColumns:
         The columns stand in their order.
     x
         States along which further states of candidates are carried, shape ``(n, d)``.
-    values
-        The simulation's parameters.
     """
 
-    def __init__(
-        self, model: Dynamics, grid: Grid, probes: Sequence[Probe], x: np.ndarray, values: np.ndarray
-    ) -> None:
-        self._model, self._grid, self._probes = model, grid, probes
-        self._x, self._values = x, values
+    def __init__(self, model: Dynamics, grid: Grid, probes: Sequence[Probe], x: np.ndarray) -> None:
+        self._model, self._grid, self._probes, self._x = model, grid, probes, x
         candidates = {id(each.candidate): each.candidate for each in probes}
         self._compiled = {key: _Compiled(model, each) for key, each in candidates.items()}
         self.width = sum(probe.width for probe in probes)
@@ -134,9 +129,9 @@ class ProbeColumns:
         grid, model = self._grid, self._model
         rows, substeps = grid.rows, grid.substeps
         begin, end = self._x[rows].T, self._x[rows + 1].T
-        delays, whole = model.lags(self._values), grid.step * substeps
+        delays, whole = model.lags(model.values), grid.step * substeps
         first, last = (
-            whole * model.functions.rates(x, grid.signals(node, delays), self._values)
+            whole * model.functions.rates(x, grid.signals(node, delays), model.values)
             for x, node in ((begin, 0), (end, 3 * substeps - 1))
         )
         turn = first + last - 2 * (end - begin)
@@ -165,11 +160,9 @@ class ProbeColumns:
         compiled = self._compiled[id(probe.candidate)]
         grid = self._grid
         step = grid.step
-        numbers = compiled.numbers(probe, self._values)
-        begin = np.empty((len(grid.data.labels), len(probe.candidate.begins)))
-        model = self._model.with_values(self._values)
-        for place, formula in enumerate(probe.candidate.begins):
-            begin[:, place] = along(str(formula), grid.data, model, self._x)[grid.data.first[:-1]]
+        numbers = compiled.numbers(probe, self._model.values)
+        begins = along(probe.candidate.begins, self._model, grid.data, self._x)
+        begin = np.ascontiguousarray(begins[:, grid.data.first[:-1]].T, dtype=float)
         signals = [
             np.concatenate([x, s.inputs, s.delayed, s.slopes, s.t[None]])
             for x, s in (
@@ -255,24 +248,12 @@ class _Compiled:
         return self._candidate.model.lags(np.array(values))
 
 
-def with_further_states(
-    probe: Probe, model: Dynamics, data: Measurements, x: np.ndarray, *, substeps: int, values: np.ndarray
-) -> np.ndarray:
-    """States along recordings, with those that a probe brings behind them, shape ``(n, d + k)``.
-
-    Parameters
-    ----------
-    probe
-        The mechanism with its shapes.
-    model, data, x
-        The simulation without it, the recordings, and the states along them, shape ``(n, d)``.
-    substeps, values
-        Runge–Kutta steps between samples, and the simulation's parameters.
-    """
+def with_further_states(probe: Probe, fit: Fit, data: Measurements, x: np.ndarray) -> np.ndarray:
+    """States ``(n, d)`` along recordings, with those that a probe brings to a fit, shape ``(n, d + k)``."""
     if not probe.candidate.scales:
         return x
-    own = ProbeColumns(model, Grid(data, substeps), [probe], x, values)
-    return np.concatenate([x, own.further_states(0)], axis=1)
+    columns = ProbeColumns(fit.model, Grid(data, fit.substeps), [probe], x)
+    return np.concatenate([x, columns.further_states(0)], axis=1)
 
 
 def probes_of(
@@ -343,20 +324,10 @@ def in_portions(widths: Sequence[int], model: Dynamics, data: Measurements) -> I
         yield slice(first, len(widths))
 
 
-def probe_response(model: Dynamics, grid: Grid, fit: Fit, columns: Columns) -> Linearisation:
-    """The linearisation of a fit, with the columns of probes behind those of its parameters.
-
-    Parameters
-    ----------
-    model, fit
-        The simulation and its fit.
-    grid
-        On which the columns are worked out; it may be coarser than that of the fit.
-    columns
-        The probes.
-    """
+def probe_response(fit: Fit, grid: Grid, columns: Columns) -> Linearisation:
+    """The linearisation of a fit, with further columns, on a grid that may be coarser, behind its own."""
     with np.errstate(all="ignore"):  # what overflows is left out of the screening
-        coarse = linearise(model, grid, fit.model.values, fit.linearised_at, columns=columns)
+        coarse = linearise(fit.model, grid, fit.model.values, fit.linearised_at, columns=columns)
     known, parameters = fit.linearisation, len(fit.model.free)
     return replace(
         known,
@@ -464,7 +435,6 @@ OVERFLOWS = "its effect along the recorded motion is beyond all numbers"
 
 
 def screen_all(
-    model: Dynamics,
     data: Measurements,
     current: Fit,
     candidates: Sequence[MechanismCandidate],
@@ -479,8 +449,8 @@ def screen_all(
 
     Parameters
     ----------
-    model, data, current
-        The simulation, the recordings, and the fit that is to be improved.
+    data, current
+        The recordings, and the fit that is to be improved.
     candidates
         What may be missing.
     fruitless
@@ -493,8 +463,7 @@ def screen_all(
     list of (Probe, Screened), list of NotFitted
         What each probe would gain; and candidates of which no probe could be screened, with the reason.
     """
-    budget = budget or Budget()
-    substeps = current.substeps
+    budget, model, substeps = budget or Budget(), current.model, current.substeps
     untried: dict[str, NotFitted] = {}
     probes = []
     for candidate in candidates:
@@ -511,8 +480,7 @@ def screen_all(
         try:
             budget.says(f"screening {len(candidates)} candidates")
             budget.charge(grid.substeps * evaluation(model, data, columns=sum(probe.width for probe in some)))
-            columns = ProbeColumns(model, grid, some, current.x, current.model.values)
-            response = probe_response(model, grid, current, columns)
+            response = probe_response(current, grid, ProbeColumns(model, grid, some, current.x))
             ends = np.cumsum([probe.width for probe in some])
             groups = [slice(end - probe.width, end) for probe, end in zip(some, ends, strict=True)]
             positive = [

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 
+from siq.diagnosis.dictionary import Roles
 from siq.diagnosis.evidence import (
     BUDGET_SPENT,
     NUMERICAL_ERRORS,
@@ -28,7 +29,7 @@ from siq.diagnosis.evidence import (
 from siq.diagnosis.mechanisms import MechanismCandidate, rebased, repeats
 from siq.diagnosis.residual_structure import has_structure
 from siq.diagnosis.screening import Probe, Screened, screen_all, with_further_states
-from siq.diagnosis.study import SearchOptions
+from siq.diagnosis.study import MismatchStudy, SearchOptions
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent
 from siq.inference.maximum_likelihood import Fit
@@ -42,6 +43,34 @@ PROMISING_GAIN = 0.2  # of the best gain so far; a candidate that promises less 
 SHARPENED_GAIN = 0.6  # of the best gain, from which on jumps are sharpened: that gains up to a quarter
 BUDGET_FOR_FUNCTIONS = 0.4  # of the budget, for functions without a name: a choice
 Standing = Literal["same", "needless", "less"]
+
+
+@dataclass(frozen=True)
+class FitContext:
+    """A case, and by which means it is explained.
+
+    Attributes
+    ----------
+    model
+        The simulation as its author believes it.
+    data
+        The recordings.
+    roles
+        Of the simulation's states.
+    candidates
+        The mechanisms that may be named.
+    study
+        What counts as found.
+    budget
+        Charged for the work; what it does not reach is left undone.
+    """
+
+    model: Dynamics
+    data: Measurements
+    roles: Roles
+    candidates: tuple[MechanismCandidate, ...] = ()
+    study: MismatchStudy = field(default_factory=MismatchStudy)
+    budget: Budget = field(default_factory=Budget)
 
 
 @dataclass(frozen=True)
@@ -142,27 +171,21 @@ def _accepted(
     )
 
 
-def _better_without(
-    trial: FittedCandidate,
-    current: Fit,
-    model: Dynamics,
-    data: Measurements,
-    *,
-    least: float,
-    budget: Budget,
-) -> Fit | None:
+def _better_without(trial: FittedCandidate, current: Fit, context: FitContext) -> Fit | None:
     """The simulation alone, fitted from where a mechanism led it, if that explains as much as with it.
 
     A mechanism may seem to explain much only because its fit found parameters of the simulation that its own
     fit had missed. Nothing is called missing before the simulation has begun there, too.
     """
-    fit = trial.fit
+    fit, model, least = trial.fit, context.model, context.study.search.same
     known = {each.name: each.value for each in fit.model.parameters}
     begun = model.with_values(np.array([known[each.name] for each in model.parameters]))
     d = model.dimension
     begin = replace(fit, noise=replace(fit.noise, process=fit.noise.process[:d]))
     try:
-        again = fit_with_process_noise_as_needed(begun, data, begin, x=fit.x[:, :d], budget=budget)
+        again = fit_with_process_noise_as_needed(
+            begun, context.data, begin, x=fit.x[:, :d], budget=context.budget
+        )
     except (*NUMERICAL_ERRORS, BudgetSpent):
         return None
     gained = 2 * (again.log_likelihood - current.log_likelihood)
@@ -170,18 +193,11 @@ def _better_without(
 
 
 def _fit_most_promising(
-    data: Measurements,
-    current: Fit,
-    base_model: Dynamics,
-    screened: Sequence[tuple[Probe, Screened]],
-    *,
-    most: int,
-    least_gain: float,
-    blocks: int,
-    budget: Budget | None = None,
+    context: FitContext, current: Fit, screened: Sequence[tuple[Probe, Screened]]
 ) -> tuple[list[FittedCandidate], list[NotFitted]]:
     """Fit the candidates that promise most, each from its best probe."""
-    budget = budget or Budget()
+    data, budget, options = context.data, context.budget, context.study.search
+    most, least_gain, blocks = options.fitted, options.same, options.blocks
     best = best_probes(screened)
     ranked = sorted(best.values(), key=lambda each: -each[1].gain)
     trials: dict[str, FittedCandidate] = {}
@@ -192,10 +208,7 @@ def _fit_most_promising(
         """Fit and judge a candidate; one that leads away, or has a sign that it cannot have, has failed."""
         candidate = probe.candidate
         try:
-            x = with_further_states(
-                probe, base_model, data, begin.x[:, : base_model.dimension],
-                substeps=current.substeps, values=current.model.values,
-            )  # fmt: skip
+            x = with_further_states(probe, current, data, begin.x[:, : current.model.dimension])
             fit = fit_with_process_noise_as_needed(
                 _with_start(probe, result, begin.model), data, begin, level=result.level, x=x, budget=budget
             )
@@ -248,8 +261,8 @@ def _fit_most_promising(
             budget.says(f"once more: {candidate.label}")
             if candidate.shapes and _special_case(better.candidate, candidate):
                 # With the shapes that promise most on top of the special case; alone they may all be that.
-                on_top = replace(rebased(candidate, base_model, better.fit.model), positive=frozenset())
-                again, _ = screen_all(better.fit.model, data, better.fit, [on_top], budget=budget)
+                on_top = replace(rebased(candidate, current.model, better.fit.model), positive=frozenset())
+                again, _ = screen_all(data, better.fit, [on_top], budget=budget)
                 if again:
                     values = [value for _, value in max(again, key=lambda each: each[1].gain)[0].shapes]
                     probe = replace(probe, shapes=tuple(zip(candidate.shapes, values, strict=True)))
@@ -297,13 +310,13 @@ def _with_start(probe: Probe, result: Screened, base: Dynamics) -> Dynamics:
 
 
 def _stands_together(
-    progress: Search, before: Search, data: Measurements, *, chance: float, options: SearchOptions
+    progress: Search, before: Search, context: FitContext, *, chance: float
 ) -> Search | None:
     """A search in which a mechanism was taken on trial, if it stands the clustered test in the final fit.
 
     It has the probabilities of the final fit; None where nothing came on top of it, or it does not stand.
     """
-    place = len(before.found)
+    place, data, blocks = len(before.found), context.data, context.study.search.blocks
     if len(progress.found) < place + 2:
         return None
     on_trial, fit = progress.found[place], progress.fit
@@ -317,9 +330,9 @@ def _stands_together(
         )
         without = fit_with_process_noise_as_needed(replace(fit.model, parameters=absent), data, fit)
     if without is None or not without.converged:
-        p_cluster = clustered_probability(fit, data, candidate, blocks=options.blocks)
+        p_cluster = clustered_probability(fit, data, candidate, blocks=blocks)
     else:
-        p_cluster = probability_by_chance(fit, without, data, candidate, blocks=options.blocks)
+        p_cluster = probability_by_chance(fit, without, data, candidate, blocks=blocks)
     LOGGER.info("%s on trial: p %.1e clustered", candidate.label, p_cluster)
     if p_cluster >= chance:
         return None
@@ -327,31 +340,13 @@ def _stands_together(
     return replace(progress, found=(*progress.found[:place], stands, *progress.found[place + 1 :]))
 
 
-def search(
-    model: Dynamics,
-    data: Measurements,
-    recalibrated: Fit,
-    candidates: Sequence[MechanismCandidate],
-    *,
-    options: SearchOptions,
-    budget: Budget | None = None,
-) -> Search:
+def search(context: FitContext, recalibrated: Fit) -> Search:
     """Look for mechanisms, one after the other, until nothing is found or its part of the budget is spent."""
-    begin, budget = Search(recalibrated, (), recalibrated, ()), budget or Budget()
-    with budget.keeping(BUDGET_FOR_FUNCTIONS):
-        return _extended(begin, model, data, candidates, options=options, budget=budget, on_trial=True)
+    with context.budget.keeping(BUDGET_FOR_FUNCTIONS):
+        return _extended(Search(recalibrated, (), recalibrated, ()), context, on_trial=True)
 
 
-def _extended(
-    progress: Search,
-    model: Dynamics,
-    data: Measurements,
-    candidates: Sequence[MechanismCandidate],
-    *,
-    options: SearchOptions,
-    budget: Budget,
-    on_trial: bool,
-) -> Search:
+def _extended(progress: Search, context: FitContext, *, on_trial: bool) -> Search:
     """A search carried on until nothing more is found.
 
     Where recordings are few, what is still missing may make all errors so large that the best candidate does
@@ -359,6 +354,7 @@ def _extended(
     and both count as found if both stand the test together. Where a mechanism leads to better parameters of
     the simulation itself, the search begins anew from there, once.
     """
+    model, data, options = context.model, context.data, context.study.search
     begun_anew = False
     while True:
         found, current = progress.found, progress.fit
@@ -367,22 +363,18 @@ def _extended(
             return progress
         if base.dimension > model.dimension:
             return progress  # nothing is sought on top of a mechanism that has states of its own
-        if found and budget.stopped_by is not None:
+        if found and context.budget.stopped_by is not None:
             return progress
         labels = [each.best.candidate.label for each in found]
         remaining = [
             rebased(each, model, base) if found else each
-            for each in candidates
+            for each in context.candidates
             if not any(repeats(each, other.best.candidate) for other in found)
         ]
         screened, unscreened = screen_all(
-            base, data, current, remaining, fruitless=progress.fruitless, budget=budget
+            data, current, remaining, fruitless=progress.fruitless, budget=context.budget
         )
-        trials, failed = _fit_most_promising(
-            data, current, base, screened,
-            most=options.fitted, least_gain=options.same, blocks=options.blocks,
-            budget=budget,
-        )  # fmt: skip
+        trials, failed = _fit_most_promising(context, current, screened)
         # All that could never be judged, each once, with the last reason.
         reasons = {each.label: each for each in (*progress.untried, *unscreened, *failed)}
         judged_ones = {each.candidate.label for each in trials}
@@ -402,7 +394,7 @@ def _extended(
         best = _accepted(trials, len(screened), 1.0, options=options)
         if not (found or begun_anew) and best is not None:
             begun_anew = True
-            better = _better_without(best.best, current, model, data, least=options.same, budget=budget)
+            better = _better_without(best.best, current, context)
             if better is not None:
                 LOGGER.info("%s led to better parameters, without it", best.best.candidate.label)
                 progress = replace(progress, recalibrated=better, fit=better, fruitless=frozenset())
@@ -414,11 +406,10 @@ def _extended(
             and (stands is None or best.best.delta_bic < stands.best.delta_bic - options.same)
         ):
             LOGGER.info("%s is on trial", best.best.candidate.label)
-            further = _extended(
-                replace(progress, found=(*found, best), fit=best.best.fit), model, data, candidates,
-                options=options, budget=budget, on_trial=False,
-            )  # fmt: skip
-            together = _stands_together(further, progress, data, chance=chance, options=options)
+            begun = replace(progress, found=(*found, best), fit=best.best.fit)
+            together = _stands_together(
+                _extended(begun, context, on_trial=False), progress, context, chance=chance
+            )
             if together is not None:
                 return together
             on_trial = False

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
@@ -35,18 +36,9 @@ from siq.diagnosis.evidence import (
     evidences_by_size,
     orthonormal,
 )
-from siq.diagnosis.mechanisms import MechanismCandidate
+from siq.diagnosis.mechanisms import MechanismCandidate, along, fresh_names
 from siq.diagnosis.screening import PROBE_SUBSTEPS, levels_of, probe_response, projected
-from siq.diagnosis.terms import (
-    LARGEST_LINEARISATION,
-    FunctionSite,
-    Kind,
-    Place,
-    PlaceColumns,
-    built,
-    fresh_names,
-    unit_in,
-)
+from siq.diagnosis.terms import LARGEST_LINEARISATION, Kind, Place, PlaceColumns, built, unit_in
 from siq.errors import NumericalFailure
 from siq.inference.kalman_filter import Grid, Whitened, profile_likelihood, whiten
 from siq.inference.maximum_likelihood import Fit
@@ -68,13 +60,15 @@ PRODUCT_TOLERANCE = 1e-4  # of what is left, by which an iteration has to be bet
 
 
 @dataclass(frozen=True)
-class _SmoothFunction:
-    """A smooth function as a sum of bumps, and what is expected of it.
+class Bumps:
+    """A smooth function as a sum of bumps, and what is expected of it: a `siq.diagnosis.terms.Basis`.
 
     Attributes
     ----------
-    ground
-        Where it stands, and of what it is a function.
+    coordinates
+        What it is a function of.
+    limits
+        Where the recordings have been: lower and upper, shape ``(2, c)``.
     centres
         Of the bumps, shape ``(b, c)``.
     lengths
@@ -85,54 +79,20 @@ class _SmoothFunction:
         See `siq.systems.dynamics.JointExpectation`.
     """
 
-    ground: FunctionSite
+    coordinates: tuple[sympy.Expr, ...]
+    limits: np.ndarray
     centres: np.ndarray
     lengths: np.ndarray
     deviation: float = 1.0
     weight: float = 1.0
 
     @property
-    def kind(self) -> Kind:
-        """What it looks like."""
-        return CURVE if len(self.lengths) == 1 else SURFACE
-
-    @property
-    def equations(self) -> tuple[tuple[str, sympy.Expr], ...]:
-        """What it is multiplied by in each equation in which it stands."""
-        return self.ground.place.equations
-
-    @property
-    def outputs(self) -> tuple[tuple[str, sympy.Expr], ...]:
-        """The same of outputs."""
-        return self.ground.place.outputs
-
-    @property
-    def coordinates(self) -> tuple[sympy.Expr, ...]:
-        """What it is a function of."""
-        return self.ground.coordinates
-
-    @property
     def width(self) -> int:
         """The number of bumps."""
         return len(self.centres)
 
-    @property
-    def linear(self) -> int:
-        """In how many of its heights it is linear: in all of them."""
-        return self.width
-
-    @property
-    def begin(self) -> np.ndarray:
-        """Heights to begin with, shape ``(b,)``."""
-        return np.zeros(self.width)
-
-    def along(self, heights: np.ndarray, courses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The function along courses ``(c, n)``, ``(n,)``, and its derivatives by the heights, ``(n, b)``."""
-        values = self.values(courses)
-        return heights @ values, values.T
-
     def formula(self, heights: tuple[sympy.Expr, ...]) -> sympy.Expr:
-        """The sum of its bumps, heights being symbols."""
+        """The sum of the bumps, heights being symbols."""
         bumps = []
         for height, centre in zip(heights, self.centres, strict=True):
             away = [
@@ -142,17 +102,13 @@ class _SmoothFunction:
             bumps.append(height * sympy.exp(-sympy.Add(*away) / 2))
         return sympy.Add(*bumps)
 
-    def units(self, whole: str) -> tuple[str, ...]:
-        """Of the heights, of a function with a unit."""
-        return (whole,) * self.width
-
-    def expected(self, names: tuple[str, ...]) -> tuple[JointExpectation, ...]:
-        """What is expected of the heights, by their names."""
-        return (JointExpectation(names, self.triangle.T / self.deviation, self.weight),)
-
     def values(self, courses: np.ndarray) -> np.ndarray:
         """Every bump along courses ``(c, n)`` of the coordinates, shape ``(b, n)``."""
         return np.exp(-0.5 * _squares(courses.T / self.lengths, self.centres / self.lengths)).T
+
+    def expected(self, names: tuple[str, ...]) -> JointExpectation:
+        """What is expected of the heights, by their names."""
+        return JointExpectation(names, self.triangle.T / self.deviation, self.weight)
 
     @cached_property
     def triangle(self) -> np.ndarray:
@@ -163,40 +119,37 @@ class _SmoothFunction:
         """The heights with which it has given values ``(b,)`` at its centres."""
         return scipy.linalg.cho_solve((self.triangle, True), values)
 
-    @property
-    def limits(self) -> np.ndarray:
-        """Where the recordings have been: lower and upper, shape ``(2, c)``."""
-        return np.stack([self.ground.courses.min(axis=1), self.ground.courses.max(axis=1)])
 
-
-def smooth_function(
-    ground: FunctionSite,
+def bumps_along(
+    coordinates: tuple[sympy.Expr, ...],
+    courses: np.ndarray,
     shares: tuple[float, ...],
     *,
     deviation: float = 1.0,
     weight: float = 1.0,
     most: int | None = None,
-) -> _SmoothFunction:
+) -> Bumps:
     """A smooth function with its bumps where the recordings have been.
 
     Parameters
     ----------
-    ground
-        Where it stands.
+    coordinates, courses
+        What it is a function of, and their values along the recordings, shape ``(c, n)``.
     shares
         Its lengths, as shares of the coordinates' ranges.
     deviation, weight
-        See `_SmoothFunction`.
+        See `Bumps`.
     most
         So many bumps at most; those left out are nearest to others.
     """
-    lengths = np.array(shares) * ground.ranges
+    lengths = np.array(shares) * np.ptp(courses, axis=1)
+    limits = np.stack([courses.min(axis=1), courses.max(axis=1)])
     if len(shares) == 1:
-        lower, upper = ground.courses.min(), ground.courses.max()
-        centres = np.linspace(lower, upper, int(np.ceil(1 / (BUMP_SPACING * shares[0]))) + 1)[:most, None]
+        count = int(np.ceil(1 / (BUMP_SPACING * shares[0]))) + 1
+        centres = np.linspace(*limits[:, 0], count)[:most, None]
     else:
         apart = BUMP_SPACING * np.sqrt(len(shares))
-        scaled = ground.courses / lengths[:, None]
+        scaled = courses / lengths[:, None]
         # So far apart, beginning in the middle of the points, each farthest from those before it.
         away = np.full(scaled.shape[1], np.inf)
         middle = np.median(scaled, axis=1)[:, None]
@@ -207,8 +160,8 @@ def smooth_function(
             if away[farthest] < apart**2:
                 break
             chosen.append(farthest)
-        centres = ground.courses[:, chosen].T
-    return _SmoothFunction(ground, centres, lengths, deviation, weight)
+        centres = courses[:, chosen].T
+    return Bumps(coordinates, limits, centres, lengths, deviation, weight)
 
 
 def _triangle_of(points: np.ndarray, lengths: np.ndarray) -> np.ndarray:
@@ -227,84 +180,73 @@ def _squares(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _ProductFunction:
-    """A product of two smooth functions, as two sums of bumps.
+class SmoothFunction:
+    """A smooth function in a place, or a product of two, of one coordinate each.
 
     Attributes
     ----------
-    ground
-        Where it stands, and of which two coordinates it is a function.
-    first, second
-        The factors.
+    place
+        Where it stands, and of what it is a function.
+    factors
+        The function, or the two.
     begin
-        Heights to begin with, of both, shape ``(b,)``: where both are zero nothing points anywhere.
+        Heights to begin with, of all bumps, shape ``(b,)``: of a product none, since where both factors are
+        zero nothing points anywhere.
     """
 
-    ground: FunctionSite
-    first: _SmoothFunction
-    second: _SmoothFunction
+    place: Place
+    factors: tuple[Bumps, ...]
     begin: np.ndarray
 
     @property
     def kind(self) -> Kind:
         """What it looks like."""
-        return SURFACE
+        return CURVE if len(self.place.coordinates) == 1 else SURFACE
 
     @property
     def width(self) -> int:
         """The number of bumps."""
-        return self.first.width + self.second.width
+        return sum(each.width for each in self.factors)
 
     @property
     def linear(self) -> int:
         """In how many of its heights, the first ones, it is linear if the others are given."""
-        return self.first.width
-
-    def along(self, heights: np.ndarray, courses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `siq.diagnosis.smooth_functions.SmoothFunction.along`."""
-        one, other = self.first.values(courses[:1]), self.second.values(courses[1:])
-        f, g = heights[: self.linear] @ one, heights[self.linear :] @ other
-        return f * g, np.concatenate([one * g, other * f]).T
-
-    def formula(self, heights: tuple[sympy.Expr, ...]) -> sympy.Expr:
-        """The product, heights being symbols."""
-        return self.first.formula(heights[: self.linear]) * self.second.formula(heights[self.linear :])
-
-    def units(self, whole: str) -> tuple[str, ...]:
-        """Of the heights: the first factor has none."""
-        return ("1",) * self.linear + (whole,) * (self.width - self.linear)
-
-    def expected(self, names: tuple[str, ...]) -> tuple[JointExpectation, ...]:
-        """What is expected of the heights, by their names."""
-        first, second = names[: self.linear], names[self.linear :]
-        return (*self.first.expected(first), *self.second.expected(second))
+        return self.factors[0].width
 
     @property
     def limits(self) -> np.ndarray:
-        """Where the recordings have been: lower and upper, shape ``(2, 2)``."""
-        return np.concatenate([self.first.limits, self.second.limits], axis=1)
+        """Where the recordings have been: lower and upper, shape ``(2, c)``."""
+        return np.concatenate([each.limits for each in self.factors], axis=1)
 
+    def along(self, heights: np.ndarray, courses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The function along courses ``(c, n)``, ``(n,)``, and its derivatives by the heights, ``(n, b)``."""
+        if len(self.factors) == 1:
+            values = self.factors[0].values(courses)
+            return heights @ values, values.T
+        one, other = (each.values(courses[side, None]) for side, each in enumerate(self.factors))
+        f, g = heights[: self.linear] @ one, heights[self.linear :] @ other
+        return f * g, np.concatenate([one * g, other * f]).T
 
-Smooth = _SmoothFunction | _ProductFunction
-"""Functions of bumps, each with its site, heights to begin with, formula and expectation."""
-
-
-def with_smooth_function(model: Dynamics, function: Smooth) -> MechanismCandidate:
-    """The simulation with a smooth function, as it begins; the heights of its bumps are the amplitudes."""
-    place = function.ground.place
-    names = tuple(fresh_names("b", function.width, model))
-    factors = len(place.words) - len(function.ground.words)
-    units = function.units(unit_in(place, model, 0, factors))
-    candidate = built(model, place, function.formula(tuple(map(symbol, names))), names, units)
-    together = (*candidate.model.expected_together, *function.expected(names))
-    known = dict(zip(names, function.begin, strict=True))
-    values = [known.get(each.name, each.value) for each in candidate.model.parameters]
-    begun = replace(candidate.model, expected_together=together).with_values(np.array(values))
-    return replace(candidate, model=begun)
+    def added_to(self, model: Dynamics) -> MechanismCandidate:
+        """A simulation with it, as it begins; the heights of its bumps are the amplitudes."""
+        names = tuple(fresh_names("b", self.width, model.names))
+        split = (names,) if len(self.factors) == 1 else (names[: self.linear], names[self.linear :])
+        pairs = list(zip(self.factors, split, strict=True))
+        formula = sympy.prod([each.formula(tuple(map(symbol, own))) for each, own in pairs])
+        whole = unit_in(self.place, model, 0, len(self.place.words) - len(self.place.coordinates))
+        last = self.factors[-1].width  # a first factor of two has no unit
+        units = ("1",) * (self.width - last) + (whole,) * last
+        candidate = built(model, self.place, formula, names, units)
+        together = (*candidate.model.expected_together, *(each.expected(own) for each, own in pairs))
+        known = dict(zip(names, self.begin, strict=True))
+        values = [known.get(each.name, each.value) for each in candidate.model.parameters]
+        begun = replace(candidate.model, expected_together=together).with_values(np.array(values))
+        return replace(candidate, model=begun)
 
 
 def _product_of(
-    ground: FunctionSite,
+    place: Place,
+    courses: np.ndarray,
     shares: tuple[float, ...],
     *,
     points: np.ndarray,
@@ -312,20 +254,24 @@ def _product_of(
     overlap: np.ndarray,
     deviation: float,
     weight: float = 1.0,
-) -> _ProductFunction:
+) -> SmoothFunction:
     """The likeliest product, whose lengths may be any of several."""
-    grounds = [
-        FunctionSite(
-            ground.place, (ground.coordinates[side],), (ground.words[side],), ground.courses[side, None]
-        )
-        for side in range(2)
-    ]
     bases = []
-    for side, own in enumerate(grounds):
-        functions = [smooth_function(own, (share,), weight=weight) for share in shares]
-        along = [(each.triangle, each.values(points[:, side, None].T)) for each in functions]
-        independent = [scipy.linalg.solve_triangular(*each, lower=True) for each in along]
-        bases.append(list(zip(functions, independent, strict=True)))
+    for side, coordinate in enumerate(place.coordinates):
+        functions = [
+            bumps_along((coordinate,), courses[side, None], (share,), weight=weight) for share in shares
+        ]
+        bases.append(
+            [
+                (
+                    each,
+                    scipy.linalg.solve_triangular(
+                        each.triangle, each.values(points[:, side, None].T), lower=True
+                    ),
+                )
+                for each in functions
+            ]
+        )
     highest, best = -np.inf, None
     for (one, first), (other, second) in itertools.product(*bases):
         evidence, f, g = _in_turns(first, deviation * second, gram, overlap)
@@ -335,7 +281,7 @@ def _product_of(
                 for function, values in ((one, f), (other, deviation * g))
             ]
             sized = replace(other, deviation=deviation)
-            highest, best = evidence, _ProductFunction(ground, one, sized, np.concatenate(heights))
+            highest, best = evidence, SmoothFunction(place, (one, sized), np.concatenate(heights))
     if best is None:
         raise NumericalFailure("no product of two functions has an evidence that is a number")
     return best
@@ -391,78 +337,76 @@ class Term:
     kind: Kind
     cost: float
     place: Place | None = None
-    smooth: Smooth | None = None
-
-
-@dataclass(frozen=True)
-class _SmoothData:
-    """What a fit leaves says of a function's values, at a level of process noise.
-
-    Attributes
-    ----------
-    level
-        Relative to the process noise of the fit.
-    fine
-        The function, with bumps as narrow as any.
-    correlated
-        Correlation time τ of the innovations in samples, with such a function: n of them count as n/τ.
-    gram, overlap
-        Of what a unit of each bump does to the innovations, with each other and with the innovations; shapes
-        ``(b, b)`` and ``(b,)``. Over τ, as are those that follow.
-    total, freedom
-        Sum of squares of the innovations, and degrees of freedom.
-    likelihood
-        Logarithm, without the function.
-    """
-
-    level: float
-    fine: _SmoothFunction
-    correlated: float
-    gram: np.ndarray
-    overlap: np.ndarray
-    total: float
-    freedom: float
-    likelihood: float
-
-    def over(self, correlated: float) -> _SmoothData:
-        """The same where so many samples are autocorrelated."""
-        return _SmoothData(
-            self.level, self.fine, correlated, self.gram / correlated, self.overlap / correlated,
-            self.total / correlated, self.freedom / correlated, self.likelihood / correlated,
-        )  # fmt: skip
+    smooth: SmoothFunction | None = None
 
 
 @dataclass(frozen=True)
 class Smoothness:
-    """How smooth a function is, as recordings tell it.
+    """How smooth a function is, as recordings tell it at the likeliest level of process noise.
 
     Attributes
     ----------
+    place, courses
+        Where it stands, and its coordinates along the recordings, shape ``(c, n)``.
     shares
         Its lengths, as shares of the ranges of its coordinates.
     deviation
         Its size.
-    told
-        What the recordings tell, at the level of process noise at which it is likeliest.
     noise
-        Variance of the innovations then, in units of what the fit takes for it.
+        Variance of the innovations with it, in units of what the fit takes for it.
+    level
+        Of process noise, relative to that of the fit.
+    correlated
+        Correlation time τ of the innovations in samples, with such a function: n of them count as n/τ.
+    considered
+        How many lengths and sizes were compared.
+    fine
+        The function, with bumps as narrow as any.
+    gram, overlap
+        Of what a unit of each of these does to the innovations, with each other and with the innovations,
+        over τ; shapes ``(b, b)`` and ``(b,)``.
     log_evidence
         Logarithm of the odds for such a function, over none, each at its best level; averaged over all
         lengths and sizes.
-    considered
-        How many lengths and sizes these are.
     """
 
+    place: Place
+    courses: np.ndarray
     shares: tuple[float, ...]
     deviation: float
-    told: _SmoothData
     noise: float
-    log_evidence: float
+    level: float
+    correlated: float
     considered: int
+    fine: Bumps
+    gram: np.ndarray
+    overlap: np.ndarray
+    log_evidence: float = float("nan")
+
+    def function(self, *, product: bool = False, times: float = 1.0) -> SmoothFunction:
+        """The function, or the likeliest product of two, with lengths that are longer by a factor."""
+        place, weight = self.place, self.correlated
+        if not product:
+            shares = tuple(times * share for share in self.shares)
+            bumps = bumps_along(
+                place.coordinates, self.courses, shares, deviation=self.deviation, weight=weight
+            )
+            return SmoothFunction(place, (bumps,), np.zeros(bumps.width))
+        by_value = self.fine.heights_of(self.fine.heights_of(self.gram).T)
+        return _product_of(
+            place,
+            self.courses,
+            tuple(times * share for share in LENGTH_SCALES),
+            points=self.fine.centres,
+            gram=(by_value + by_value.T) / (2 * self.noise),
+            overlap=self.fine.heights_of(self.overlap) / self.noise,
+            deviation=self.deviation,
+            weight=weight,
+        )
 
 
 def smoothness_of(
-    fit: Fit, data: Measurements, ground: FunctionSite, *, known: Term | None = None, alike: bool = False
+    fit: Fit, data: Measurements, place: Place, *, known: Term | None = None, alike: bool = False
 ) -> Smoothness | None:
     """The likeliest smoothness of a function on top of a fit; None where it cannot be worked out.
 
@@ -470,76 +414,36 @@ def smoothness_of(
     ----------
     fit, data
         The fit along whose trajectories everything is linear, and what it was made for.
-    ground
+    place
         Where the function stands.
     known
         A part of the fit that is a first description of this function, in whose stead it comes.
     alike
         Whether both lengths are the same share of the range.
     """
-    least, fine = _finest(ground, data, fit.model)
-    some = [share for share in LENGTH_SCALES if share >= least]
-    choices = [(each,) * len(ground.words) for each in some]
-    if not alike:
-        choices = list(itertools.product(some, repeat=len(ground.words)))
-    # What processes of these lengths have for values at the finest bumps, as heights of these.
-    shapes = [fine.heights_of(_triangle_of(fine.centres, np.array(each) * ground.ranges)) for each in choices]
-    alone = -np.inf
-    values: list[np.ndarray] = []
-    highest, best = -np.inf, None
-    for told in _told(fit, data, fine, known):
-        alone = max(alone, told.likelihood)
-        for shares, shape in zip(choices, shapes, strict=True):
-            gained, scale, rest = evidences_by_size(
-                shape.T @ told.gram @ shape, shape.T @ told.overlap, told.total, freedom=told.freedom
-            )
-            values.append(told.likelihood + gained)
-            place = int(np.argmax(gained))
-            if values[-1][place] > highest:
-                # The scale of the noise was at its best, too, and the size is one in units of it.
-                highest, noise = values[-1][place], float(rest[place] / told.freedom)
-                deviation = float(np.sqrt(scale[place] * noise))
-                best = Smoothness(shares, deviation, told, noise, 0.0, len(gained) * len(choices))
-    if best is None or not best.deviation > 0:
+    courses = along(place.coordinates, fit.model, data, fit.x)
+    ranges = np.ptp(courses, axis=1)
+    if not (np.isfinite(courses).all() and (ranges > 0).all()):
         return None
-    whole = np.concatenate(values)
-    mean = float(np.logaddexp.reduce(whole) - np.log(len(whole)))
-    return replace(best, log_evidence=mean - alone)
-
-
-def likeliest_product(asked: Smoothness, ground: FunctionSite, *, times: float = 1.0) -> _ProductFunction:
-    """The likeliest product of two functions, where a function of two coordinates is asked for.
-
-    Parameters
-    ----------
-    asked
-        What the recordings say of a function of both.
-    ground
-        Where it stands.
-    times
-        Factor on the lengths to choose among.
-    """
-    told = asked.told
-    by_value = told.fine.heights_of(told.fine.heights_of(told.gram).T)
-    return _product_of(
-        ground,
-        tuple(times * share for share in LENGTH_SCALES),
-        points=told.fine.centres,
-        gram=(by_value + by_value.T) / (2 * asked.noise),
-        overlap=told.fine.heights_of(told.overlap) / asked.noise,
-        deviation=asked.deviation,
-        weight=told.correlated,
-    )
-
-
-def _told(fit: Fit, data: Measurements, fine: _SmoothFunction, known: Term | None) -> list[_SmoothData]:
-    """What is told at each level of process noise at which it can be worked out.
-
-    Errors are as correlated as the likeliest level leaves them with such a function, at all levels.
-    """
+    # The shortest length of which the recordings need not too many bumps.
+    count = len(place.coordinates)
+    room = LARGEST_LINEARISATION // (len(data.t) * (fit.model.dimension + len(fit.model.outputs)))
+    most = max(min(MOST_BUMPS, room), 1)
+    for least in LENGTH_SCALES:
+        fine = bumps_along(place.coordinates, courses, (least,) * count, most=most + 1)
+        if fine.width <= most:
+            break
+    else:
+        fine = bumps_along(place.coordinates, courses, (least,) * count, most=most)
+    some = [share for share in LENGTH_SCALES if share >= least]
+    choices = [(each,) * count for each in some] if alike else list(itertools.product(some, repeat=count))
+    # What processes of these lengths have for values at the finest bumps, as heights of these.
+    shapes = [fine.heights_of(_triangle_of(fine.centres, np.array(each) * ranges)) for each in choices]
+    # What is told at each level of process noise at which it can be worked out. Errors are as correlated as
+    # the likeliest level leaves them with such a function, at all levels.
     grid = Grid(data, fit.substeps if known else min(fit.substeps, PROBE_SUBSTEPS))
-    response = probe_response(fit.model, grid, fit, PlaceColumns(fit.model, grid, [fine]))
-    found: list[_SmoothData] = []
+    response = probe_response(fit, grid, PlaceColumns(fit.model, grid, [place], [fine]))
+    levels: list[tuple[float, Sequence[np.ndarray | float]]] = []
     highest, correlated = -np.inf, 1.0
     for level in levels_of(fit):
         try:
@@ -547,31 +451,41 @@ def _told(fit: Fit, data: Measurements, fine: _SmoothFunction, known: Term | Non
             white, parameters = _without(white, fit, known)
             left, columns = projected(white, parameters)
         except NUMERICAL_ERRORS as error:
-            LOGGER.info("no function of %s can be screened: %s", " and ".join(fine.ground.words), error)
+            LOGGER.info("no function of %s can be screened: %s", " and ".join(place.words[:count]), error)
             continue
         total, freedom = float(left @ left), white.degrees_of_freedom - parameters
         likelihood = profile_likelihood(total, freedom, white.log_determinant)
-        found.append(
-            _SmoothData(level, fine, 1.0, columns.T @ columns, columns.T @ left, total, freedom, likelihood)
-        )
+        levels.append((level, (columns.T @ columns, columns.T @ left, total, freedom, likelihood)))
         basis = orthonormal(columns)
         rest = left - basis @ (basis.T @ left)
         likelihood = profile_likelihood(float(rest @ rest), freedom, white.log_determinant)
         if likelihood > highest:
             highest = likelihood
             correlated = correlation_time_of(rest, white.recording, outputs=len(fit.model.outputs))
-    return [each.over(correlated) for each in found]
-
-
-def _finest(ground: FunctionSite, data: Measurements, model: Dynamics) -> tuple[float, _SmoothFunction]:
-    """The shortest length, as a share of the range, of which the recordings need not too many bumps."""
-    room = LARGEST_LINEARISATION // (len(data.t) * (model.dimension + len(model.outputs)))
-    most = max(min(MOST_BUMPS, room), 1)
-    for share in LENGTH_SCALES:
-        function = smooth_function(ground, (share,) * len(ground.words), most=most + 1)
-        if function.width <= most:
-            return share, function
-    return LENGTH_SCALES[-1], smooth_function(ground, (LENGTH_SCALES[-1],) * len(ground.words), most=most)
+    alone, values = -np.inf, list[np.ndarray]()
+    highest, best = -np.inf, None
+    for level, told in levels:
+        gram, overlap, total, freedom, likelihood = (each / correlated for each in told)
+        alone = max(alone, likelihood)
+        for shares, shape in zip(choices, shapes, strict=True):
+            gained, scale, rest = evidences_by_size(
+                shape.T @ gram @ shape, shape.T @ overlap, total, freedom=freedom
+            )
+            values.append(likelihood + gained)
+            size = int(np.argmax(gained))
+            if values[-1][size] > highest:
+                # The scale of the noise was at its best, too, and the size is one in units of it.
+                highest, noise = values[-1][size], float(rest[size] / freedom)
+                deviation = float(np.sqrt(scale[size] * noise))
+                best = Smoothness(
+                    place, courses, shares, deviation, noise, level, correlated,
+                    len(gained) * len(choices), fine, gram, overlap,
+                )  # fmt: skip
+    if best is None or not best.deviation > 0:
+        return None
+    whole = np.concatenate(values)
+    mean = float(np.logaddexp.reduce(whole) - np.log(len(whole)))
+    return replace(best, log_evidence=mean - alone)
 
 
 def _without(white: Whitened, fit: Fit, known: Term | None) -> tuple[Whitened, int]:

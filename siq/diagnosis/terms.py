@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal, Protocol
 
 import numpy as np
@@ -20,7 +20,7 @@ import sympy
 
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
 from siq.diagnosis.evidence import correlation_time_of, evidence_of_function, orthonormal
-from siq.diagnosis.mechanisms import MechanismCandidate
+from siq.diagnosis.mechanisms import MechanismCandidate, along, fresh_names
 from siq.diagnosis.screening import PROBE_SUBSTEPS, Probe, ProbeColumns, levels_of, probe_response, projected
 from siq.errors import NumericalFailure
 from siq.inference.kalman_filter import Grid, Linearisation, profile_likelihood, whiten
@@ -33,70 +33,16 @@ Kind = Literal["formula", "curve", "surface", "mechanism"]
 FORMULA: Final = "formula"
 FUNCTIONS_FITTED = 3  # places in which functions are fitted, the most likely ones: a choice
 SPLINE_KNOTS = 17  # enough for the shortest length of `siq.diagnosis.evidence.SMOOTH_LENGTHS`, two for each
+HAT_KNOTS = 9  # of piecewise linear functions: a choice
+TINY_AMPLITUDE = sympy.Float(1e-300)  # so that a system at rest has a direction, which is none
 LARGEST_LINEARISATION = 40_000_000  # numbers held at a time, which is a third of a gigabyte
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where a function may stand, and of what.
-
-    Attributes
-    ----------
-    equations, outputs
-        What the function is multiplied by, in each equation, or each output, in which it stands.
-    coordinate
-        What it is a function of.
-    words
-        The coordinates in words of the system, the one that it is a function of first.
-    knots
-        Of the spline: quantiles of the coordinate, shape ``(k,)``.
-    """
-
-    equations: tuple[tuple[str, sympy.Expr], ...]
-    outputs: tuple[tuple[str, sympy.Expr], ...]
-    coordinate: sympy.Expr
-    words: tuple[str, ...]
-    knots: np.ndarray
-
-    @property
-    def coordinates(self) -> tuple[sympy.Expr, ...]:
-        """What it is a function of: a single coordinate."""
-        return (self.coordinate,)
-
-    @property
-    def width(self) -> int:
-        """The number of its values."""
-        return len(self.knots)
-
-    def values(self, courses: np.ndarray) -> np.ndarray:
-        """Natural cubic splines that are one at one knot and zero at the others, shape ``(k, n)``.
-
-        What lies beyond the knots has the value at the last one.
-        """
-        course = np.clip(courses[0], self.knots[0], self.knots[-1])
-        unit = np.eye(len(self.knots))
-        return scipy.interpolate.make_interp_spline(self.knots, unit, bc_type="natural")(course).T
-
-    @property
-    def targets(self) -> tuple[str, ...]:
-        """Names of the states or outputs that it changes."""
-        return tuple(name for name, _ in (*self.equations, *self.outputs))
+ONE = sympy.Integer(1)
+Power = tuple[sympy.Expr, int, int]
+"""A term of a formula, and how often the first and the second coordinate are factors of it."""
 
 
 class Basis(Protocol):
-    """A function with linear parameters, such as values at knots, with its place; see `Place`."""
-
-    @property
-    def equations(self) -> tuple[tuple[str, sympy.Expr], ...]:
-        """What it is multiplied by in each equation."""
-
-    @property
-    def outputs(self) -> tuple[tuple[str, sympy.Expr], ...]:
-        """What it is multiplied by in each output."""
-
-    @property
-    def coordinates(self) -> tuple[sympy.Expr, ...]:
-        """What it is a function of."""
+    """A function with linear parameters, such as values at knots."""
 
     @property
     def width(self) -> int:
@@ -106,12 +52,91 @@ class Basis(Protocol):
         """What a unit of each does along courses ``(c, n)`` of the coordinates, shape ``(width, n)``."""
 
 
-class PlaceColumns:
-    """Functions in many places, as `siq.inference.kalman_filter.linearise` wants them."""
+@dataclass(frozen=True)
+class Place:
+    """Where a function may stand, and of what; of one coordinate it is a `Basis` of splines.
 
-    def __init__(self, model: Dynamics, grid: Grid, places: Sequence[Basis]) -> None:
+    Attributes
+    ----------
+    equations, outputs
+        What the function is multiplied by, in each equation, or each output, in which it stands.
+    coordinates
+        What it is a function of: one formula, or two.
+    words
+        The coordinates in words of the system. One more than there are coordinates is that of a factor.
+    knots
+        Of the spline: quantiles of the coordinate, shape ``(k,)``.
+    linear
+        Whether the spline is piecewise linear, rather than a natural cubic one.
+    log_evidence, level
+        Logarithm of the evidence of a smooth function here over that of none, each at its best level of
+        process noise; and that level (`rank_places`).
+    """
+
+    equations: tuple[tuple[str, sympy.Expr], ...]
+    outputs: tuple[tuple[str, sympy.Expr], ...]
+    coordinates: tuple[sympy.Expr, ...]
+    words: tuple[str, ...]
+    knots: np.ndarray = field(default_factory=lambda: np.empty(0))
+    linear: bool = False
+    log_evidence: float = float("nan")
+    level: float = 1.0
+
+    @property
+    def width(self) -> int:
+        """The number of its values."""
+        return len(self.knots)
+
+    def values(self, courses: np.ndarray) -> np.ndarray:
+        """Splines that are one at one knot and zero at the others, shape ``(k, n)``.
+
+        What lies beyond the knots has the value at the last one.
+        """
+        unit = np.eye(len(self.knots))
+        if self.linear:
+            return np.stack([np.interp(courses[0], self.knots, each) for each in unit])
+        course = np.clip(courses[0], self.knots[0], self.knots[-1])
+        return scipy.interpolate.make_interp_spline(self.knots, unit, bc_type="natural")(course).T
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Names of the states or outputs that it changes."""
+        return tuple(name for name, _ in (*self.equations, *self.outputs))
+
+    @property
+    def across(self) -> bool:
+        """Whether it is a force across the amplitude of a rotating frame, rather than along it."""
+        return len(self.equations) > 1 and self.equations[1][1].could_extract_minus_sign()
+
+    @property
+    def factor(self) -> sympy.Expr:
+        """The second coordinate, where a function of the first is multiplied by it; else 1."""
+        if len(self.words) == 1:
+            return ONE
+        if self.words[1] == "amplitude":
+            return _amplitude(*self.targets)
+        return symbol(self.words[1])
+
+    @property
+    def without_factor(self) -> Place:
+        """The same place, but that a function is not multiplied by the second coordinate."""
+        divided = tuple((name, each / self.factor) for name, each in self.equations)
+        return replace(self, equations=divided)
+
+
+def _amplitude(first: str, second: str) -> sympy.Expr:
+    return sympy.sqrt(symbol(first) ** 2 + symbol(second) ** 2)
+
+
+class PlaceColumns:
+    """Functions in many places, as `siq.inference.kalman_filter.linearise` wants them; splines by default."""
+
+    def __init__(
+        self, model: Dynamics, grid: Grid, places: Sequence[Place], bases: Sequence[Basis] | None = None
+    ) -> None:
         self._model, self._grid, self._places = model, grid, places
-        self.width = sum(each.width for each in places)
+        self._bases: Sequence[Basis] = places if bases is None else bases
+        self.width = sum(each.width for each in self._bases)
         names = (*model.states, *(entry.name for entry in model.inputs), "t")
         arguments = [symbol(name) for name in names]
         self._compiled = [
@@ -135,20 +160,22 @@ class PlaceColumns:
         names = list(self._model.output_names if measured else self._model.states)
         result = np.zeros((len(names), self.width, x.shape[1]))
         begin = 0
-        for place, compiled in zip(self._places, self._compiled, strict=True):
-            end = begin + place.width
+        for place, basis, compiled in zip(self._places, self._bases, self._compiled, strict=True):
+            end = begin + basis.width
             targets = place.outputs if measured else place.equations
             if targets:
                 known = compiled(*x, *signals.inputs, signals.t)
                 courses = [np.broadcast_to(each, x.shape[1]) for each in known[: len(place.coordinates)]]
-                values = place.values(np.stack(courses))
+                values = basis.values(np.stack(courses))
                 for (name, _), factor in zip(targets, known[len(place.coordinates) :], strict=True):
                     result[names.index(name), begin:end] = values * factor
             begin = end
         return result
 
 
-def places_in(model: Dynamics, roles: Roles, data: Measurements, x: np.ndarray) -> tuple[Place, ...]:
+def places_in(
+    model: Dynamics, roles: Roles, data: Measurements, x: np.ndarray, *, linear: bool = False
+) -> tuple[Place, ...]:
     """Functions of one coordinate, in every equation that says more than a definition, and in every output.
 
     In a rotating frame they are also those of amplitude and time, along the state and across it.
@@ -159,54 +186,55 @@ def places_in(model: Dynamics, roles: Roles, data: Measurements, x: np.ndarray) 
         The simulation, and the roles of its states.
     data, x
         The recordings and the states along them, shape ``(n, d)``: knots are quantiles of these.
+    linear
+        Whether they are piecewise linear, of few knots, and forces: in equations only, and in a rotating
+        frame of the amplitude only, of which they have the direction and not the size.
     """
     found: list[Place] = []
-    one = sympy.Integer(1)
     coordinates = coordinates_of(model)
     framed = {name for pair in roles.amplitudes for name in pair}
     for first, second in roles.amplitudes:
-        a, b = symbol(first), symbol(second)
-        along, across = ((first, a), (second, b)), ((first, b), (second, -a))
+        a, b, size = symbol(first), symbol(second), ONE
+        functions = {"amplitude": _amplitude(first, second)}
+        if linear:
+            size = sympy.sqrt(a**2 + b**2 + TINY_AMPLITUDE)
+        else:
+            functions["t"] = symbol("t")
+        along_it, across = (
+            ((first, a / size), (second, b / size)),
+            ((first, b / size), (second, -a / size)),
+        )
         found += [
-            Place(equations, (), formula, (word,), np.empty(0))
-            for word, formula in (("amplitude", sympy.sqrt(a**2 + b**2)), ("t", symbol("t")))
-            for equations in (along, across)
+            Place(equations, (), (formula,), (word,), linear=linear)
+            for word, formula in functions.items()
+            for equations in (along_it, across)
         ]
     for name in roles.states:
         found += [
-            Place(((name, one),), (), formula, (word,), np.empty(0))
+            Place(((name, ONE),), (), (formula,), (word,), linear=linear)
             for word, formula in coordinates.items()
             if not (name in framed and word in framed)
         ]
     values = {symbol(each.name): exact_number(each.value) for each in model.parameters}
-    for name, written in model.outputs:
+    for name, written in () if linear else model.outputs:
         formula = written.xreplace(values)  # an offset of the sensor is where the fit has it
         own = str(formula) if formula.is_Symbol else name
         found += [
-            Place((), ((name, one),), formula, (own,), np.empty(0)),
-            Place((), ((name, one),), symbol("t"), ("t",), np.empty(0)),
+            Place((), ((name, ONE),), (formula,), (own,)),
+            Place((), ((name, ONE),), (symbol("t"),), ("t",)),
         ]
-    return tuple(_with_knots(found, model, data, x))
+    return tuple(_with_knots(found, model, data, x, count=HAT_KNOTS if linear else SPLINE_KNOTS))
 
 
 def products_in(
     places: Sequence[Place], model: Dynamics, data: Measurements, x: np.ndarray
 ) -> tuple[Place, ...]:
-    """The same functions as coefficients of each other coordinate but time, in the same equations.
-
-    Parameters
-    ----------
-    places
-        Functions of one coordinate.
-    model, data, x
-        See `places_in`.
-    """
+    """Functions of one coordinate as coefficients of each other one but time, in the same equations."""
     found = []
     for place in places:
         factors = {name: formula for name, formula in coordinates_of(model).items() if name != "t"}
         if len(place.equations) > 1:  # in a rotating frame only the amplitude
-            first, second = (symbol(name) for name in place.targets)
-            factors = {"amplitude": sympy.sqrt(first**2 + second**2)}
+            factors = {"amplitude": _amplitude(*place.targets)}
         for name, formula in factors.items():
             if place.equations and name not in place.words:
                 equations = tuple((target, factor * formula) for target, factor in place.equations)
@@ -220,37 +248,24 @@ def coordinates_of(model: Dynamics) -> dict[str, sympy.Expr]:
 
 
 def _with_knots(
-    drafts: Sequence[Place], model: Dynamics, data: Measurements, x: np.ndarray
+    drafts: Sequence[Place], model: Dynamics, data: Measurements, x: np.ndarray, count: int = SPLINE_KNOTS
 ) -> Iterator[Place]:
     """Places with their knots, but for those whose coordinate takes too few values for a function."""
-    known: dict[sympy.Expr, np.ndarray] = {}
+    known: dict[tuple[sympy.Expr, ...], np.ndarray] = {}
     for each in drafts:
-        if each.coordinate not in known:
-            (course,) = courses_of((each.coordinate,), model, data, x)
+        if each.coordinates not in known:
+            (course,) = along(each.coordinates, model, data, x)
             finite = course[np.isfinite(course)]
-            known[each.coordinate] = (
-                np.unique(np.quantile(finite, np.linspace(0, 1, SPLINE_KNOTS)))
-                if len(finite)
-                else np.empty(0)
+            known[each.coordinates] = (
+                np.unique(np.quantile(finite, np.linspace(0, 1, count))) if len(finite) else np.empty(0)
             )
-        if len(known[each.coordinate]) > 3:
-            yield replace(each, knots=known[each.coordinate])
-
-
-def courses_of(
-    coordinates: tuple[sympy.Expr, ...], model: Dynamics, data: Measurements, x: np.ndarray
-) -> np.ndarray:
-    """What formulas of states, inputs and time are along recordings, shape ``(c, n)``."""
-    names = (*model.states, *(entry.name for entry in model.inputs), "t")
-    compiled = compile_values(coordinates, [symbol(name) for name in names], common=False)
-    signals = data.signals(data.t, data.recording, delays=())
-    values = compiled(*x.T[: model.dimension], *signals.inputs, signals.t)
-    return np.stack([np.broadcast_to(each, data.t.shape) for each in values])
+        if len(known[each.coordinates]) > 3:
+            yield replace(each, knots=known[each.coordinates])
 
 
 def linearised_with_places(
     fit: Fit, data: Measurements, places: Sequence[Place]
-) -> Iterator[tuple[Linearisation, Sequence[Place]]]:
+) -> Iterator[tuple[Linearisation, list[tuple[Place, slice]]]]:
     """The linearisation of a fit with the columns of places behind those of its parameters, in portions.
 
     Parameters
@@ -259,31 +274,25 @@ def linearised_with_places(
         The fit along whose trajectories everything is linear, and what it was made for.
     places
         The functions.
+
+    Yields
+    ------
+    Linearisation, list of (Place, slice)
+        Which of the further columns are those of which place.
     """
     model = fit.model
-    own = len(model.free)
-    room = LARGEST_LINEARISATION // (len(data.t) * (model.dimension + len(model.outputs))) - own
+    room = LARGEST_LINEARISATION // (len(data.t) * (model.dimension + len(model.outputs))) - len(model.free)
     at_once = max(room // SPLINE_KNOTS, 1)
     grid = Grid(data, min(fit.substeps, PROBE_SUBSTEPS))
     for begin in range(0, len(places), at_once):
         some = places[begin : begin + at_once]
-        yield probe_response(model, grid, fit, PlaceColumns(model, grid, some)), some
+        ends = itertools.accumulate(each.width for each in some)
+        groups = [(each, slice(end - each.width, end)) for each, end in zip(some, ends, strict=True)]
+        yield probe_response(fit, grid, PlaceColumns(model, grid, some)), groups
 
 
-@dataclass(frozen=True)
-class RankedPlace:
-    """A place, the logarithm of its evidence, and the level of process noise at which it is best.
-
-    The evidence is that of a smooth function there over that of none, each at its best level.
-    """
-
-    place: Place
-    log_evidence: float
-    level: float
-
-
-def rank_places(fit: Fit, data: Measurements, roles: Roles) -> list[RankedPlace]:
-    """All places, the one in which a smooth function is likeliest first.
+def rank_places(fit: Fit, data: Measurements, roles: Roles) -> list[Place]:
+    """All places with their evidence, the one in which a smooth function is likeliest first.
 
     Functions of one coordinate are tried everywhere, and as coefficients of other coordinates in the
     equations in which they do best.
@@ -292,16 +301,16 @@ def rank_places(fit: Fit, data: Measurements, roles: Roles) -> list[RankedPlace]
     ranked = _compared(fit, data, single)
     if not ranked:
         return []
-    equations = {each.place.targets for each in ranked[:FUNCTIONS_FITTED] if each.place.equations}
+    equations = {each.targets for each in ranked[:FUNCTIONS_FITTED] if each.equations}
     products = products_in([each for each in single if each.targets in equations], fit.model, data, fit.x)
     return sorted((*ranked, *_compared(fit, data, products)), key=lambda each: -each.log_evidence)
 
 
-def _compared(fit: Fit, data: Measurements, places: Sequence[Place]) -> list[RankedPlace]:
+def _compared(fit: Fit, data: Measurements, places: Sequence[Place]) -> list[Place]:
     parameters = len(fit.model.free)
-    found: dict[int, RankedPlace] = {}
+    found: dict[int, Place] = {}
     alone = -np.inf
-    for response, some in linearised_with_places(fit, data, places):
+    for response, groups in linearised_with_places(fit, data, places):
         for level in levels_of(fit):
             try:
                 white = whiten(response, data, fit.noise.scaled(level))
@@ -311,28 +320,26 @@ def _compared(fit: Fit, data: Measurements, places: Sequence[Place]) -> list[Ran
             freedom = white.degrees_of_freedom - parameters
             base = profile_likelihood(float(left @ left), freedom, white.log_determinant)
             alone = max(alone, base)
-            begin = 0
-            for place in some:
-                own = columns[:, begin : begin + len(place.knots)]
-                begin += len(place.knots)
+            for place, group in groups:
+                own = columns[:, group]
                 value = base + evidence_of_function(own, left, place.knots, freedom=freedom)
                 known = found.get(id(place))
                 if own.any() and (known is None or value > known.log_evidence):
-                    found[id(place)] = RankedPlace(place, value, level)
+                    found[id(place)] = replace(place, log_evidence=value, level=level)
     ranked = sorted(found.values(), key=lambda each: -each.log_evidence)
     return [replace(each, log_evidence=each.log_evidence - alone) for each in ranked]
 
 
-def few_powers(likely: RankedPlace, fit: Fit, data: Measurements, *, degree: int) -> tuple[_Power, ...]:
+def few_powers(place: Place, fit: Fit, data: Measurements, *, degree: int) -> tuple[Power, ...]:
     """The powers that a formula needs: each added as long as it earns its place (Schwarz).
 
     Errors count as correlated as all of the powers leave them (`siq.diagnosis.evidence`).
     """
-    terms = _powers(likely.place, degree=degree)
-    probe = Probe(with_formula(fit.model, likely.place, terms), ())
+    terms = _powers(place, degree=degree)
+    probe = Probe(with_formula(fit.model, place, terms), ())
     grid = Grid(data, min(fit.substeps, PROBE_SUBSTEPS))
-    columns = ProbeColumns(fit.model, grid, [probe], fit.x, fit.model.values)
-    white = whiten(probe_response(fit.model, grid, fit, columns), data, fit.noise.scaled(likely.level))
+    response = probe_response(fit, grid, ProbeColumns(fit.model, grid, [probe], fit.x))
+    white = whiten(response, data, fit.noise.scaled(place.level))
     left, own = projected(white, len(fit.model.free))
     basis = orthonormal(own)
     rest = left - basis @ (basis.T @ left)
@@ -342,89 +349,56 @@ def few_powers(likely: RankedPlace, fit: Fit, data: Measurements, *, degree: int
     total = float(left @ left)
     while len(chosen) < len(terms):
         sums = {}
-        for place in range(len(terms)):
-            if place not in chosen and own[:, place].any():
-                some = own[:, [*chosen, place]]
+        for power in range(len(terms)):
+            if power not in chosen and own[:, power].any():
+                some = own[:, [*chosen, power]]
                 some = some / np.sqrt((some**2).sum(axis=0))
-                sums[place] = float(((left - some @ np.linalg.lstsq(some, left, rcond=1e-9)[0]) ** 2).sum())
+                sums[power] = float(((left - some @ np.linalg.lstsq(some, left, rcond=1e-9)[0]) ** 2).sum())
         if not sums:
             break
-        best = min(sums, key=lambda place: sums[place])
+        best = min(sums, key=lambda power: sums[power])
         if count * np.log(total / max(sums[best], 1e-300)) < np.log(count):
             break
         chosen.append(best)
         total = sums[best]
-    return tuple(terms[place] for place in sorted(chosen))
+    return tuple(terms[power] for power in sorted(chosen))
 
 
-def with_formula(model: Dynamics, place: Place, terms: Sequence[_Power]) -> MechanismCandidate:
+def with_formula(model: Dynamics, place: Place, terms: Sequence[Power]) -> MechanismCandidate:
     """The simulation with a sum of terms in a place, whose coefficients are the amplitudes."""
-    names = fresh_names("c", len(terms), model)
-    formula = sympy.Add(*(symbol(name) * term.formula for name, term in zip(names, terms, strict=True)))
-    units = [unit_in(place, model, term.first, term.second) for term in terms]
-    return built(model, _without_factor(place), formula, names, units)
+    names = fresh_names("c", len(terms), model.names)
+    formula = sympy.Add(*(symbol(name) * term for name, (term, _, _) in zip(names, terms, strict=True)))
+    units = [unit_in(place, model, first, second) for _, first, second in terms]
+    return built(model, place.without_factor, formula, names, units)
 
 
-def simplest(place: Place, terms: Sequence[_Power]) -> tuple[Place, tuple[_Power, ...]]:
+def simplest(place: Place, terms: Sequence[Power]) -> tuple[Place, tuple[Power, ...]]:
     """The same terms as a function of the second coordinate alone, where the first is in none of them."""
-    if len(place.words) == 1 or any(term.first for term in terms):
+    if len(place.words) == 1 or any(first for _, first, _ in terms):
         return place, tuple(terms)
     alone = replace(
-        _without_factor(place), coordinate=_second_coordinate(place), words=place.words[1:], knots=np.empty(0)
+        place.without_factor, coordinates=(place.factor,), words=place.words[1:], knots=np.empty(0)
     )
-    return alone, tuple(_Power(term.formula, term.second) for term in terms)
+    return alone, tuple((formula, second, 0) for formula, _, second in terms)
 
 
-def _without_factor(place: Place) -> Place:
-    """The same place, but that a function is not multiplied by the second coordinate."""
-    factor = _second_coordinate(place)
-    return replace(place, equations=tuple((name, each / factor) for name, each in place.equations))
-
-
-@dataclass(frozen=True)
-class _Power:
-    """A term of a formula: what it is, and how often either coordinate is a factor of it."""
-
-    formula: sympy.Expr
-    first: int
-    second: int = 0
-
-
-def _powers(place: Place, *, degree: int) -> list[_Power]:
+def _powers(place: Place, *, degree: int) -> list[Power]:
     """Monomials of a place's coordinates up to a degree.
 
     Of a single coordinate there are the odd functions of even degree beside them, such as z∣z∣; a second
     coordinate stands in every term.
     """
-    z = place.coordinate
+    (z,) = place.coordinates
     if len(place.words) > 1:
-        factor = _second_coordinate(place)
         return [
-            _Power(z**i * factor**j, i, j)
+            (z**i * place.factor**j, i, j)
             for i, j in itertools.product(range(degree + 1), range(1, degree + 1))
             if i + j <= degree
         ]
-    smooth = [_Power(z**power, power) for power in range(degree + 1)]
+    smooth = [(z**power, power, 0) for power in range(degree + 1)]
     if place.words[0] in ("amplitude", "t"):
         return smooth
-    return [*smooth, *(_Power(z ** (power - 1) * sympy.Abs(z), power) for power in range(2, degree + 1, 2))]
-
-
-def fresh_names(stem: str, count: int, model: Dynamics) -> list[str]:
-    """So many numbered names that the model does not have."""
-    used = set(model.names)
-    free = (f"{stem}_{number}" for number in itertools.count(1) if f"{stem}_{number}" not in used)
-    return list(itertools.islice(free, count))
-
-
-def _second_coordinate(place: Place) -> sympy.Expr:
-    """What the function of the first coordinate is multiplied by: the second, or 1."""
-    if len(place.words) == 1:
-        return sympy.Integer(1)
-    if place.words[1] == "amplitude":
-        first, second = (symbol(name) for name in place.targets)
-        return sympy.sqrt(first**2 + second**2)
-    return symbol(place.words[1])
+    return [*smooth, *((z ** (power - 1) * sympy.Abs(z), power, 0) for power in range(2, degree + 1, 2))]
 
 
 def built(
@@ -472,50 +446,3 @@ def unit_in(place: Place, model: Dynamics, first: int, second: int) -> str:
     units["_second"] = known.get(place.targets[0] if factor == "amplitude" else factor, "1")
     per = "/_t" if place.equations else ""
     return unit_of(f"_whole{per}/_first**{first}/_second**{second}", units)
-
-
-@dataclass(frozen=True)
-class FunctionSite:
-    """A place where a smooth function may stand, and where the recordings have been there.
-
-    Attributes
-    ----------
-    place
-        In which equation, or output; what it is multiplied by there.
-    coordinates
-        What it is a function of: one formula, or two.
-    words
-        The same in words.
-    courses
-        Their values along the recordings, shape ``(c, n)``.
-    """
-
-    place: Place
-    coordinates: tuple[sympy.Expr, ...]
-    words: tuple[str, ...]
-    courses: np.ndarray
-
-    @classmethod
-    def of(
-        cls, place: Place, words: tuple[str, ...], model: Dynamics, data: Measurements, x: np.ndarray
-    ) -> FunctionSite:
-        """The site of a function of one coordinate of a place, or of two states or inputs.
-
-        A word of the place that is not among these is a factor of the function.
-        """
-        coordinates = (place.coordinate,) if len(words) == 1 else tuple(map(symbol, words))
-        return cls(place, coordinates, words, courses_of(coordinates, model, data, x))
-
-    @property
-    def ranges(self) -> np.ndarray:
-        """Of each coordinate, shape ``(c,)``."""
-        return np.ptp(self.courses, axis=1)
-
-    @property
-    def usable(self) -> bool:
-        """Whether every coordinate takes several values, all of them finite."""
-        return bool(np.isfinite(self.courses).all() and (self.ranges > 0).all())
-
-    def along(self, model: Dynamics, data: Measurements, x: np.ndarray) -> FunctionSite:
-        """The site with the courses of other states, shape ``(n, d)``."""
-        return replace(self, courses=courses_of(self.coordinates, model, data, x))

@@ -17,8 +17,9 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import sympy
@@ -34,23 +35,13 @@ from siq.diagnosis.evidence import (
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
 from siq.diagnosis.residual_structure import has_structure
 from siq.diagnosis.screening import screen_all, with_further_states
-from siq.diagnosis.search import Search, best_probes
-from siq.diagnosis.smooth_functions import (
-    MECHANISM,
-    Smooth,
-    Smoothness,
-    Term,
-    likeliest_product,
-    smooth_function,
-    smoothness_of,
-    with_smooth_function,
-)
+from siq.diagnosis.search import FitContext, Search, best_probes
+from siq.diagnosis.smooth_functions import MECHANISM, SmoothFunction, Smoothness, Term, smoothness_of
 from siq.diagnosis.terms import (
     FORMULA,
     FUNCTIONS_FITTED,
-    FunctionSite,
+    ONE,
     Place,
-    RankedPlace,
     coordinates_of,
     few_powers,
     rank_places,
@@ -58,7 +49,7 @@ from siq.diagnosis.terms import (
     with_formula,
 )
 from siq.errors import NumericalFailure
-from siq.inference.budget import Budget, BudgetSpent
+from siq.inference.budget import BudgetSpent
 from siq.inference.kalman_filter import substeps_needed
 from siq.inference.maximum_likelihood import SUBSTEP_ERROR, Fit
 from siq.inference.measurements import Measurements
@@ -81,34 +72,6 @@ DESCRIBED_MOST = 2  # functions that are put on top of each other: more are no d
 MEMORY_TIMES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 MEMORY_DAMPINGS = (0.1, 1.0)  # k of what rings, tried and then fitted: over many turns, and over hardly one
 MEMORIES_FITTED = 6  # the most promising ones: a choice
-
-
-@dataclass(frozen=True)
-class FitContext:
-    """What models are made from, and by which means.
-
-    Attributes
-    ----------
-    data
-        The recordings.
-    roles
-        Of the simulation's states.
-    degree
-        Highest degree of formulas.
-    blocks
-        For clustered errors; see `siq.diagnosis.evidence.clustered_probability`.
-    considered
-        How many mechanisms there are.
-    budget
-        Charged for the work; the models that it does not reach are left out.
-    """
-
-    data: Measurements
-    roles: Roles
-    degree: int
-    blocks: int
-    considered: int
-    budget: Budget = field(default_factory=Budget)
 
 
 @dataclass(frozen=True)
@@ -186,7 +149,7 @@ def _fitted_term(
     cost: float,
     context: FitContext,
     *,
-    smooth: Smooth | None = None,
+    smooth: SmoothFunction | None = None,
     begin: Fit | None = None,
 ) -> list[Term]:
     """A function as part of a model, or nothing where it cannot be fitted."""
@@ -227,7 +190,7 @@ def _fitted_term(
                 trial = preferred_fit(trial, damped)
             if not trial.converged:
                 raise NumericalFailure(trial.fault or "its fit does not settle")
-            fitted = judged(trial, fit, data, candidate, blocks=context.blocks)
+            fitted = judged(trial, fit, data, candidate, blocks=context.study.search.blocks)
     except (*NUMERICAL_ERRORS, BudgetSpent) as error:
         LOGGER.info("%s as a %s cannot be fitted: %s", candidate.label, kind, error)
         return []
@@ -235,60 +198,47 @@ def _fitted_term(
 
 
 def _asked(
-    fit: Fit, data: Measurements, ground: FunctionSite, *, known: Term | None, alike: bool = False
+    fit: Fit, data: Measurements, place: Place, *, known: Term | None, alike: bool = False
 ) -> Smoothness | None:
     """See `smoothness_of`; what is beyond all numbers ends a function, not a case."""
     try:
-        return smoothness_of(fit, data, ground, known=known, alike=alike)
+        return smoothness_of(fit, data, place, known=known, alike=alike)
     except NUMERICAL_ERRORS as error:
-        LOGGER.info("no function of %s can be worked out: %s", " and ".join(ground.words), error)
+        LOGGER.info("no function of %s can be worked out: %s", " and ".join(place.words), error)
         return None
 
 
 def _with_smooth_term(
     before: tuple[Term, ...],
     fit: Fit,
-    ground: FunctionSite,
+    place: Place,
     cost: float,
     context: FitContext,
     *,
     like: AugmentedModel | None = None,
     product: bool = False,
 ) -> list[AugmentedModel]:
-    """The likeliest model with a smooth function on a ground; none where none can be fitted."""
+    """The likeliest model with a smooth function in a place; none where none can be fitted."""
     data = context.data
-    if not ground.usable:
-        return []
     likeliest: AugmentedModel | None = None
     current, known = (fit, None) if like is None else (like.fit, like.parts[-1])
     for _ in range(SMOOTH_ROUNDS):
-        here = ground.along(current.model, data, current.x)
-        asked = _asked(current, data, here, known=known)
+        asked = _asked(current, data, place, known=known)
         if asked is None:
             break
         price = cost + float(np.log(asked.considered))
         parts: list[Term] = []
         # What promises to be rough and to need hardly any process noise may be what no fit can follow.
-        for times, level in ((1.0, asked.told.level), (2.0, 1.0)):
+        for times, level in ((1.0, asked.level), (2.0, 1.0)):
             if parts:
                 break
             try:
-                if product:
-                    function: Smooth = likeliest_product(asked, here, times=times)
-                else:
-                    function = smooth_function(
-                        here,
-                        tuple(times * share for share in asked.shares),
-                        deviation=asked.deviation,
-                        weight=asked.told.correlated,
-                    )
+                function = asked.function(product=product, times=times)
             except NUMERICAL_ERRORS as error:
-                LOGGER.info("no function of %s can be worked out: %s", " and ".join(here.words), error)
+                LOGGER.info("no function of %s can be worked out: %s", " and ".join(place.words), error)
                 break
-            candidate = with_smooth_function(fit.model, function)
-            parts = _fitted_term(
-                candidate, level, ground.place, fit, price, context, smooth=function, begin=current
-            )
+            candidate = function.added_to(fit.model)
+            parts = _fitted_term(candidate, level, place, fit, price, context, smooth=function, begin=current)
         if not parts:
             break
         found = AugmentedModel((*before, parts[0]), parts[0].trial.fit)
@@ -317,14 +267,9 @@ def _with_surfaces(fit: Fit, models: Sequence[AugmentedModel], context: FitConte
         if (place := each.parts[0].place) is not None:
             begins.append((place, each))
     if not single:  # one of two may tell so little of either coordinate alone
-        try:
-            likely = rank_places(fit, data, context.roles)
-        except NUMERICAL_ERRORS as error:
-            LOGGER.info("no function can be screened: %s", error)
-            likely = []
-        begins = [(each.place, None) for each in likely[:FUNCTIONS_FITTED]]
+        begins = [(place, None) for place in _ranked_places(fit, context)[:FUNCTIONS_FITTED]]
     names = [name for name in coordinates_of(fit.model) if name != "t"]
-    asked: list[tuple[float, FunctionSite, AugmentedModel | None]] = []
+    asked: list[tuple[float, Place, AugmentedModel | None]] = []
     done = set()
     for place, like in begins:
         if len(place.equations) != 1:
@@ -332,31 +277,36 @@ def _with_surfaces(fit: Fit, models: Sequence[AugmentedModel], context: FitConte
         current, known = (fit, None) if like is None else (like.fit, like.parts[-1])
         alone = 0.0
         if known is not None:
-            ground = FunctionSite.of(place, place.words[:1], current.model, data, current.x)
-            one = _asked(current, data, ground, known=known)
+            one = _asked(current, data, place, known=known)
             alone = -np.inf if one is None else one.log_evidence
         for words in itertools.combinations(names, 2):  # a coordinate of the place, and any other
             if not set(words) & set(place.words) or (place.targets, words) in done:
                 continue
             done.add((place.targets, words))
-            site = Place(((place.targets[0], sympy.Integer(1)),), (), symbol(words[0]), words, np.empty(0))
-            ground = FunctionSite.of(site, words, current.model, data, current.x)
-            if not ground.usable:
-                continue
-            both = _asked(current, data, ground, known=known, alike=True)
+            pair = Place(((place.targets[0], ONE),), (), tuple(map(symbol, words)), words)
+            both = _asked(current, data, pair, known=known, alike=True)
             if both is not None:
-                asked.append((both.log_evidence - alone, ground, like))
+                asked.append((both.log_evidence - alone, pair, like))
     cost = float(np.log(max(len(asked), 1)))
     ranked = sorted((each for each in asked if each[0] > cost), key=lambda each: -each[0])
     price = max((part.cost for model in models for part in model.parts), default=0.0) + cost
     found: list[AugmentedModel] = []
-    for _, ground, like in ranked[:FUNCTIONS_FITTED]:
+    for _, pair, like in ranked[:FUNCTIONS_FITTED]:
         for product in (True, False):
-            some = _with_smooth_term((), fit, ground, price, context, like=like, product=product)
+            some = _with_smooth_term((), fit, pair, price, context, like=like, product=product)
             found += some
             if some and not has_structure(some[0].fit, data):
                 return found  # nothing is left for a surface, nor for a less likely pair
     return found
+
+
+def _ranked_places(fit: Fit, context: FitContext) -> list[Place]:
+    """See `rank_places`; none where nothing can be screened."""
+    try:
+        return rank_places(fit, context.data, context.roles)
+    except NUMERICAL_ERRORS as error:
+        LOGGER.info("no function can be screened: %s", error)
+        return []
 
 
 def with_function(before: tuple[Term, ...], fit: Fit, context: FitContext) -> list[AugmentedModel]:
@@ -374,24 +324,18 @@ def with_function(before: tuple[Term, ...], fit: Fit, context: FitContext) -> li
     list of AugmentedModel
         The likeliest first, with the evidence over that of `fit`.
     """
-    data, budget = context.data, context.budget
-    budget.says("comparing functions without a name")
-    try:
-        ranked = rank_places(fit, data, context.roles)
-    except NUMERICAL_ERRORS as error:
-        LOGGER.info("no function can be screened: %s", error)
-        return []
+    data = context.data
+    context.budget.says("comparing functions without a name")
+    ranked = _ranked_places(fit, context)
     cost = float(np.log(max(len(ranked), 1)))  # a function is chosen among so many places
     ranked = [each for each in ranked if each.log_evidence > cost]
     if not ranked:
         return []
     models = _formulas(before, fit, ranked, cost, context)
-    alone = (each for each in ranked if len(each.place.words) == 1)
-    for likely in {
-        id(each): each for each in (*ranked[:FUNCTIONS_FITTED], *itertools.islice(alone, 1))
-    }.values():
-        ground = FunctionSite.of(likely.place, likely.place.words[:1], fit.model, data, fit.x)
-        models += _with_smooth_term(before, fit, ground, cost, context)
+    alone = (each for each in ranked if len(each.words) == 1)
+    chosen = {id(each): each for each in (*ranked[:FUNCTIONS_FITTED], *itertools.islice(alone, 1))}
+    for place in chosen.values():
+        models += _with_smooth_term(before, fit, place, cost, context)
     given = sum(part.cost for part in before)
     found = [replace(each, log_evidence=each.log_evidence + given) for each in _weighed(models, fit, data)]
     for each in found:
@@ -404,18 +348,18 @@ def with_function(before: tuple[Term, ...], fit: Fit, context: FitContext) -> li
 
 
 def _formulas(
-    before: tuple[Term, ...], fit: Fit, ranked: Sequence[RankedPlace], cost: float, context: FitContext
+    before: tuple[Term, ...], fit: Fit, ranked: Sequence[Place], cost: float, context: FitContext
 ) -> list[AugmentedModel]:
     """Formulas in the likeliest places, each once."""
-    single = {(each.place.targets, each.place.words): each.place.knots for each in ranked}
+    knots = {(each.targets, each.words): each.knots for each in ranked}
     done: set[frozenset[tuple[str, sympy.Expr]]] = set()
     models: list[AugmentedModel] = []
     for likely in ranked[:FUNCTIONS_FITTED]:
-        terms = few_powers(likely, fit, context.data, degree=context.degree)
+        terms = few_powers(likely, fit, context.data, degree=context.study.degree)
         if not terms:
             continue
-        place, terms = simplest(likely.place, terms)
-        place = replace(place, knots=single.get((place.targets, place.words), likely.place.knots))
+        place, terms = simplest(likely, terms)
+        place = replace(place, knots=knots.get((place.targets, place.words), likely.knots))
         candidate = with_formula(fit.model, place, terms)
         # A sum of x²v and xv² is the same function, whichever coordinate comes first.
         monomials = frozenset(
@@ -460,7 +404,7 @@ def _with_memories(fit: Fit, models: Sequence[AugmentedModel], context: FitConte
         for each in (one, replace(one, begins=(sympy.Integer(0),) * len(one.begins)))
     ]
     with context.budget.part(LARGEST_PART):
-        screened, _ = screen_all(fit.model, context.data, fit, begun, budget=context.budget)
+        screened, _ = screen_all(context.data, fit, begun, budget=context.budget)
     found: list[AugmentedModel] = []
     ranked = sorted(best_probes(screened).values(), key=lambda each: -each[1].gain)
     for probe, result in ranked[:MEMORIES_FITTED]:
@@ -472,9 +416,7 @@ def _with_memories(fit: Fit, models: Sequence[AugmentedModel], context: FitConte
         values = [known.get(each.name, each.value) for each in model.parameters]
         candidate = replace(candidate, model=model.with_values(np.array(values)))
         try:
-            x = with_further_states(
-                probe, fit.model, context.data, fit.x, substeps=fit.substeps, values=fit.model.values
-            )
+            x = with_further_states(probe, fit, context.data, fit.x)
         except NUMERICAL_ERRORS as error:
             LOGGER.info("%s cannot be fitted: %s", candidate.label, error)
             continue
@@ -498,70 +440,50 @@ def _memories_of(model: Dynamics, roles: Roles) -> list[MechanismCandidate]:
     return found
 
 
-def _memory_form(
-    roles: dict[str, Role],
-    of: str,
-    terms: dict[str, str],
-    unit: str,
-    variant: str = "",
-    *,
-    own_unit: str | None = None,
-    coordinate: str | None = None,
-) -> Form:
-    """A form in which z follows a coordinate, or a formula with a unit and a word, and acts with c."""
-    return Form(
-        roles=roles,
-        states={"z": FurtherState(equation=f"({of} - z)/tau", begin=of, unit=own_unit or of, scale=of)},
-        terms=terms,
-        parameters={
+def _memory_forms() -> Iterator[Form]:
+    """What follows a coordinate late acts as a force or as a rate at which the state grows; and what rings.
+
+    In a rotating frame it is the intensity that is followed, which shifts the frequency, or damps.
+    """
+
+    def form(of: str, terms: dict[str, str], unit: str, variant: str = "", **changed: Any) -> Form:
+        state = FurtherState(equation=f"({of} - z)/tau", begin=of, unit=changed.pop("own_unit", of), scale=of)
+        parameters = {
             "c": MechanismParameter(unit=unit),
             "tau": MechanismParameter(sign="positive", unit="T", shape=Shape(time_of=of, at=MEMORY_TIMES)),
-        },
-        coordinate=coordinate or of,
-        variant=variant,
+            **changed.pop("parameters", {}),
+        }
+        usual = {"states": {"z": state}, "coordinate": of} | changed
+        return Form(terms=terms, parameters=parameters, variant=variant, **usual)
+
+    pairs: tuple[dict[str, Role], ...] = (
+        {"q": "state"},
+        {"x": "state", "q": "state"},
+        {"x": "position", "q": "state"},
+        {"x": "input", "q": "state"},
     )
-
-
-def _forms_of(roles: dict[str, Role], of: str) -> tuple[Form, ...]:
-    """What is remembered as a force, and as a rate at which the state grows; and what rings."""
-    ringing = Form(
-        roles=roles,
-        states={
+    for roles in pairs:
+        of = next(iter(roles))
+        yield form(of, {"q": "c*z"}, f"q/T/{of}", roles=roles)
+        yield form(of, {"q": "c*z*q"}, f"1/T/{of}", "as a rate", roles=roles)
+        ringing = {
             "z": FurtherState(equation="y", begin=of, unit=of, scale=of),
             "y": FurtherState(equation=f"({of} - z)/tau**2 - k*y/tau", unit=f"{of}/T", scale=of),
-        },
-        terms={"q": "c*z"},
-        parameters={
-            "c": MechanismParameter(unit=f"q/T/{of}"),
-            "tau": MechanismParameter(sign="positive", unit="T", shape=Shape(time_of=of, at=MEMORY_TIMES)),
-            "k": MechanismParameter(sign="positive", shape=Shape(scale_of="1", at=MEMORY_DAMPINGS)),
-        },
-        coordinate=of,
-        variant="that rings",
-    )
-    return (
-        _memory_form(roles, of, {"q": "c*z"}, f"q/T/{of}"),
-        _memory_form(roles, of, {"q": "c*z*q"}, f"1/T/{of}", "as a rate"),
-        ringing,
-    )
+        }
+        damping = MechanismParameter(sign="positive", shape=Shape(scale_of="1", at=MEMORY_DAMPINGS))
+        yield form(
+            of, {"q": "c*z"}, f"q/T/{of}", "that rings",
+            roles=roles, states=ringing, parameters={"k": damping},
+        )  # fmt: skip
+    across, along = {"p": "c*z*q", "q": "-c*z*p"}, {"p": "c*z*p", "q": "c*z*q"}
+    for terms, variant in ((across, "across the state"), (along, "along the state")):
+        yield form(
+            "p**2 + q**2", terms, "1/T/p**2", variant,
+            roles={"p": "amplitude", "q": "amplitude"}, own_unit="p**2", coordinate="amplitude",
+        )  # fmt: skip
 
 
-def _intensity(terms: dict[str, str], variant: str) -> Form:
-    """In a rotating frame what is remembered is the intensity, which shifts the frequency, or damps."""
-    return _memory_form(
-        {"p": "amplitude", "q": "amplitude"}, "p**2 + q**2", terms, "1/T/p**2", variant,
-        own_unit="p**2", coordinate="amplitude",
-    )  # fmt: skip
-
-
-MEMORY_FORMS = (
-    *_forms_of({"q": "state"}, "q"),
-    *_forms_of({"x": "state", "q": "state"}, "x"),
-    *_forms_of({"x": "position", "q": "state"}, "x"),
-    *_forms_of({"x": "input", "q": "state"}, "x"),
-    _intensity({"p": "c*z*q", "q": "-c*z*p"}, "across the state"),
-    _intensity({"p": "c*z*p", "q": "c*z*q"}, "along the state"),
-)
+MEMORY_FORMS = tuple(_memory_forms())
 
 
 def fit_unnamed_models(
@@ -581,7 +503,7 @@ def fit_unnamed_models(
     base, data = search.recalibrated, context.data
     models = list(with_function((), base, context) if functions is None else functions)
     if search.found and np.isfinite(search.fit.log_likelihood):
-        models.append(AugmentedModel(_terms_of(search, context.considered), search.fit))
+        models.append(AugmentedModel(_terms_of(search, context), search.fit))
     models = _weighed(models, base, data)
     if functions is None:
         models = _weighed([*models, *_with_surfaces(base, models, context)], base, data)
@@ -624,7 +546,7 @@ def fit_models_of_remainder(
         return with_function(parts, fit, context)
 
     models = list(functions or ())
-    parts = _terms_of(whole, context.considered)[len(named.found) :]
+    parts = _terms_of(whole, context)[len(named.found) :]
     fits = [each.best.fit for each in whole.found[len(named.found) :]]
     models += [AugmentedModel(parts[: place + 1], fit) for place, fit in enumerate(fits)]
     if parts:
@@ -640,9 +562,9 @@ def fit_models_of_remainder(
     return likeliest(allowed, base, data)
 
 
-def _terms_of(search: Search, considered: int) -> tuple[Term, ...]:
-    """The mechanisms of a search as parts of a model, each chosen among so many."""
-    cost = float(np.log(max(considered, 1)))
+def _terms_of(search: Search, context: FitContext) -> tuple[Term, ...]:
+    """The mechanisms of a search as parts of a model, each chosen among all that were considered."""
+    cost = float(np.log(max(len(context.candidates), 1)))
     return tuple(Term(each.best, MECHANISM, cost) for each in search.found)
 
 

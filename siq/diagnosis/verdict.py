@@ -34,7 +34,6 @@ from siq.diagnosis.study import MismatchVerdict
 from siq.diagnosis.unnamed_models import AugmentedModel
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
-from siq.inference.measurements import Measurements
 from siq.remarks import Remark
 from siq.systems.dynamics import symbol
 from siq.systems.formulas import compile_values
@@ -60,15 +59,13 @@ def statement_of_failure(reason: str) -> Statement:
     return Statement(MismatchVerdict.UNEXPLAINED, remarks=(Remark("diagnosis.no_fit", {"reason": reason}),))
 
 
-def statement_of(investigation: Investigation, data: Measurements, shown: HeldOutRuns) -> Statement:
+def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
     """What follows from an investigation.
 
     Parameters
     ----------
     investigation
         What was found.
-    data
-        The recordings that it was found in.
     shown
         The fit on those held out.
     """
@@ -107,17 +104,17 @@ def statement_of(investigation: Investigation, data: Measurements, shown: HeldOu
             for place, part in enumerate(parts)
             if described_fit is not None
         ),
-        location=_locate(investigation, data, described) if verdict.mismatch else None,
+        location=_locate(investigation, described) if verdict.mismatch else None,
         recalibration={
             entry.name: Recalibrated(
                 entry.value, float(final.model.values[place]), errors[entry.name], entry.unit
             )
-            for place, entry in enumerate(investigation.model.parameters)
+            for place, entry in enumerate(investigation.context.model.parameters)
             if entry.name in errors
         },
         errors=shown.errors,
         excluded={} if verdict.mismatch else _excluded(investigation),
-        explanations=_explanations(investigation, names, data),
+        explanations=_explanations(investigation, names),
         remarks=tuple(remarks),
         not_fitted=search.untried,
         account=investigation.account,
@@ -130,11 +127,9 @@ def _standard_errors(fit: Fit) -> dict[str, float]:
     return dict(zip(names, map(float, fit.standard_errors), strict=True))
 
 
-def _explanations(
-    investigation: Investigation, names: tuple[str, ...], data: Measurements
-) -> tuple[Explanation, ...]:
+def _explanations(investigation: Investigation, names: tuple[str, ...]) -> tuple[Explanation, ...]:
     """Whole explanations with their evidence: parameters, with forces, with mechanisms, with functions."""
-    search = investigation.search
+    search, data = investigation.search, investigation.context.data
     fits = [("other parameters", investigation.least_squares), ("other parameters", search.recalibrated)]
     if search.found:
         fits.append((" and ".join(each.best.candidate.label for each in search.found), search.fit))
@@ -259,7 +254,7 @@ def _stated_function(part: Term, fit: Fit, beside: tuple[str, ...]) -> StatedFun
             factor = dict((*place.equations, *place.outputs))[name]
             columns = []
             for amplitude in candidate.amplitudes:
-                term = _in_coordinate(formula.diff(symbol(amplitude)) / factor, place.coordinate)
+                term = _in_coordinate(formula.diff(symbol(amplitude)) / factor, place.coordinates[0])
                 value = compile_values([term], [COORDINATE], common=False)(knots)[0]
                 columns.append(np.broadcast_to(np.asarray(value, dtype=float), knots.shape))
             weights = np.stack(columns, axis=1)
@@ -276,7 +271,7 @@ def _stated_function(part: Term, fit: Fit, beside: tuple[str, ...]) -> StatedFun
             tuple(map(tuple, each.reshape(GRID_POINTS, GRID_POINTS).tolist()))
             for each in (values, along(weights))
         ]
-        words = smooth.ground.words
+        words = smooth.place.words
         surface = DescribedSurface(
             (words[0], words[1]), (tuple(at[0].tolist()), tuple(at[1].tolist())), rows[0], rows[1]
         )
@@ -310,15 +305,14 @@ def _in_coordinate(term: sympy.Expr, coordinate: sympy.Expr) -> sympy.Expr:
     return term.subs(coordinate, COORDINATE)
 
 
-def _locate(
-    investigation: Investigation, data: Measurements, described: AugmentedModel | None = None
-) -> Location:
+def _locate(investigation: Investigation, described: AugmentedModel | None = None) -> Location:
     """In which equation a mismatch sits, along which coordinate and where, and in which recordings.
 
     What has no name is where the model of it stands. Where nothing describes it, it is sought in all
     equations by what they leave unexplained.
     """
     curves, search = investigation.remainder.before.curves, investigation.search
+    data = investigation.context.data
     candidate, outputs = None, tuple[str, ...]()
     if investigation.verdict.names and search.found:
         candidate = search.found[0].best.candidate
@@ -330,30 +324,30 @@ def _locate(
             measured = set(candidate.model.output_names)
             outputs = tuple(name for name, _ in candidate.changes if name in measured)
     elif curves:
-        equations, coordinate = _most_telling(investigation.remainder.before, investigation.roles)
+        equations, coordinate = _most_telling(investigation.remainder.before, investigation.context.roles)
     else:
         equations, coordinate = (), "unknown"
     curve = next(
         (
             each
             for each in curves
-            if each.direction.coordinate == coordinate and set(each.direction.names) & set(equations)
+            if each.place.words[0] == coordinate and set(each.place.targets) & set(equations)
         ),
         None,
     )
     if investigation.process_noise:
-        driven = zip(investigation.model.states, search.fit.noise.process, strict=False)
+        driven = zip(investigation.context.model.states, search.fit.noise.process, strict=False)
         equations, coordinate, curve = tuple(name for name, q in driven if q > 0), "random", None
     region = {}
     if curve is not None:  # where the missing part is seen beyond its error
-        size, knots = np.abs(curve.values), curve.direction.knots
+        size, knots = np.abs(curve.values), curve.place.knots
         seen = (size > VISIBLE_ERRORS * curve.standard_errors) & (size > VISIBLE_SHARE * size.max())
         knots = knots[seen] if seen.any() else knots
-        region = {curve.direction.coordinate: (float(knots.min()), float(knots.max()))}
+        region = {curve.place.words[0]: (float(knots.min()), float(knots.max()))}
     # What any one equation could explain, as a share of the excess over noise.
     gains: dict[str, float] = {}
     for each in curves:
-        for name in each.direction.names:
+        for name in each.place.targets:
             gains[name] = max(gains.get(name, 0.0), each.gain)
     total = max(investigation.remainder.before.total - investigation.remainder.before.freedom, 1e-300)
     # Recordings whose residuals, process noise not admitted, exceed noise by a fair share of the excess.
@@ -374,7 +368,7 @@ def _locate(
         recordings=affected,
         recordings_total=len(data.labels),
         outputs=outputs,
-        unit=units_of(investigation.model).get(coordinate, "1"),
+        unit=units_of(investigation.context.model).get(coordinate, "1"),
     )
 
 
@@ -386,16 +380,16 @@ def _most_telling(structure: Structure, roles: Roles) -> tuple[tuple[str, ...], 
     coordinate tells nearly all, a force depends on the course of the motion, position and velocity both.
     """
     best = structure.curves[0]
-    equations, coordinate = best.direction.names, best.direction.coordinate
+    equations, coordinate = best.place.targets, best.place.words[0]
     own = next((pair for pair in roles.motions if pair[1] in equations), equations)
     if coordinate in (*own, "amplitude"):
         return equations, coordinate
     motion = {*roles.states, *(name for pair in roles.motions for name in pair), "amplitude"}
     rivals, share = (own, NEARLY_ALL) if coordinate in motion else (motion, MOTION_SHARE)
     for curve in structure.curves:
-        there = set(equations) <= set(curve.direction.names)
-        if there and curve.direction.coordinate in rivals and curve.gain >= share * best.gain:
-            return curve.direction.names, curve.direction.coordinate
+        there = set(equations) <= set(curve.place.targets)
+        if there and curve.place.words[0] in rivals and curve.gain >= share * best.gain:
+            return curve.place.targets, curve.place.words[0]
     excess = structure.total - structure.freedom
     if len(own) > len(equations) and best.gain < NEARLY_ALL * excess:
         return equations, ", ".join(own)

@@ -21,12 +21,11 @@ from siq.diagnosis.investigation import held_out_runs
 from siq.diagnosis.naming import NamingDecision
 from siq.diagnosis.residual_structure import Remainder
 from siq.diagnosis.screening import Probe
-from siq.diagnosis.search import Search
+from siq.diagnosis.search import FitContext, Search
 from siq.diagnosis.smooth_functions import MECHANISM, Term
 from siq.diagnosis.study import MismatchVerdict, read_case
-from siq.diagnosis.unnamed_models import AugmentedModel, FitContext
+from siq.diagnosis.unnamed_models import AugmentedModel
 from siq.errors import InputError, NumericalFailure
-from siq.inference.budget import Budget
 from siq.remarks import has_code
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics, Signals
@@ -313,7 +312,7 @@ def test_what_a_name_leaves_is_described_and_no_sample_of_a_test_chooses_it(
     # Whatever stands in the tests, the card is the same.
     case = diagnosis.case
     other = replace(case.kept, outputs=case.kept.outputs[::-1] + 0.3)
-    again = held_out_runs(diagnosis.investigation, case.learn, other, certain=3.0, tests=study["tests"])
+    again = held_out_runs(diagnosis.investigation, other)
     assert again.model == diagnosis.held_out.model
     assert again.errors.augmented != diagnosis.held_out.errors.augmented
 
@@ -469,12 +468,12 @@ def test_where_nothing_speaks_of_a_mismatch_but_a_refuted_name_there_is_none(tmp
     found = diagnosis.investigation
     assert said(diagnosis)["verdict"] == "no mismatch"
     refuted = replace(found, verdict=MismatchVerdict.MISSING_PHYSICS)
-    again = withdrawn(refuted, diagnosis.case, Budget())
+    again = withdrawn(refuted)
     assert str(again.verdict) == "no mismatch" and not again.withdrawn and not again.search.found
     assert has_code(again.remarks, "diagnosis.refuted")
     # Process noise that is needed speaks of one by itself.
     fit = found.search.recalibrated
     forced = replace(fit, noise=replace(fit.noise, process=np.array([0.0, 1e-3])))
     search = replace(found.search, recalibrated=forced)
-    forced_one = withdrawn(replace(refuted, search=search), diagnosis.case, Budget())
+    forced_one = withdrawn(replace(refuted, search=search))
     assert str(forced_one.verdict) == "unexplained" and forced_one.withdrawn

@@ -272,7 +272,7 @@ def test_each_mechanism_is_among_those_that_are_fitted(name: str) -> None:
     model, truth = HOMES[resident.home].model, truth_of(resident)
     data = recorded(resident)
     best: dict[str, float] = {}
-    screened, _ = screen_all(model, data, recalibrate(model, data)[0], candidates(model))
+    screened, _ = screen_all(data, recalibrate(model, data)[0], candidates(model))
     for probe, result in screened:
         label = probe.candidate.label
         best[label] = max(best.get(label, 0.0), result.gain)

@@ -7,9 +7,10 @@ import pytest
 import sympy
 
 from siq.diagnosis.evidence import _log_evidence, evidence_of_function, orthonormal, smooth_prior
+from siq.diagnosis.mechanisms import fresh_names
 from siq.diagnosis.naming import _best_shares
 from siq.diagnosis.study import SearchOptions
-from siq.diagnosis.terms import Place, _Power, _powers, fresh_names, simplest, with_formula
+from siq.diagnosis.terms import Place, _powers, simplest, with_formula
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, symbol
 from siq.systems.formulas import compile_values
@@ -86,7 +87,7 @@ def test_odds_of_a_name_follow_from_how_many_may_be_wrong() -> None:
 
 def place(*words: str) -> Place:
     factor = symbol(words[1]) if len(words) > 1 else sympy.Integer(1)
-    return Place((("v", factor),), (), symbol(words[0]), words, KNOTS)
+    return Place((("v", factor),), (), (symbol(words[0]),), words, KNOTS)
 
 
 @pytest.mark.parametrize(
@@ -100,7 +101,7 @@ def place(*words: str) -> Place:
 def test_coefficients_of_formulas_have_units(words: tuple[str, ...], terms: str, unit: str) -> None:
     where = place(*words)
     wanted = sympy.sympify(terms, {name: symbol(name) for name in ("c_1", "x", "v", "t")})
-    term = next(each for each in _powers(where, degree=3) if symbol("c_1") * each.formula == wanted)
+    term = next(each for each in _powers(where, degree=3) if symbol("c_1") * each[0] == wanted)
     candidate = with_formula(OSCILLATOR, where, [term])
     assert candidate.model.equations[1] - OSCILLATOR.equations[1] == wanted
     assert candidate.model.parameters[-1].unit == unit
@@ -109,17 +110,19 @@ def test_coefficients_of_formulas_have_units(words: tuple[str, ...], terms: str,
 
 def test_a_formula_without_its_first_coordinate_is_one_of_the_second() -> None:
     t, w = symbol("t"), symbol("v")
-    alone, terms = simplest(place("t", "v"), [_Power(w, 0, 1), _Power(w**2, 0, 2)])
-    assert alone.words == ("v",) and alone.coordinate == w and alone.equations == (("v", sympy.Integer(1)),)
-    assert [each.first for each in terms] == [1, 2]
-    both, _ = simplest(place("t", "v"), [_Power(t * w, 1, 1)])
+    alone, terms = simplest(place("t", "v"), [(w, 0, 1), (w**2, 0, 2)])
+    assert (
+        alone.words == ("v",) and alone.coordinates == (w,) and alone.equations == (("v", sympy.Integer(1)),)
+    )
+    assert [first for _, first, _ in terms] == [1, 2]
+    both, _ = simplest(place("t", "v"), [(t * w, 1, 1)])
     assert both.words == ("t", "v")
 
 
 def test_new_names_are_new() -> None:
-    assert fresh_names("c", 2, OSCILLATOR) == ["c_1", "c_2"]
+    assert fresh_names("c", 2, OSCILLATOR.names) == ["c_1", "c_2"]
     again = with_formula(OSCILLATOR, place("x"), _powers(place("x"), degree=2)[:2]).model
-    assert fresh_names("c", 1, again) == ["c_3"]
+    assert fresh_names("c", 1, again.names) == ["c_3"]
 
 
 def test_derivatives_of_clearances_take_numbers_beside_arrays() -> None:

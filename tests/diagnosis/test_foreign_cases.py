@@ -88,7 +88,7 @@ def test_what_the_budget_does_not_reach_is_named(tmp_path: Path) -> None:
         said = part.statement.as_data()
         assert said["partial"] and said["budget"]["stopped_by"] == "work"
         assert any(each.startswith("This answer is partial") for each in said["remarks"])
-    labels = {each.label for each in whole.investigation.candidates}
+    labels = {each.label for each in whole.investigation.context.candidates}
     # Of the first only the simulation's own parameters were fitted; the second had half of what it takes.
     assert len(parts[1].statement.not_tried) < len(parts[0].statement.not_tried) <= len(labels)
     assert not parts[0].investigation.search.screened and parts[1].investigation.search.screened

@@ -14,7 +14,8 @@ from siq.diagnosis import naming
 from siq.diagnosis.evidence import correlation_time_of
 from siq.diagnosis.holdout import _cross_validation_folds, errors_left_out, first_better
 from siq.diagnosis.naming import _MissingEffect, _residual_model_comparison
-from siq.diagnosis.unnamed_models import AugmentedModel, FitContext, runs_freely
+from siq.diagnosis.search import FitContext
+from siq.diagnosis.unnamed_models import AugmentedModel, runs_freely
 from siq.inference.kalman_filter import Whitened
 from siq.inference.measurements import Measurements, measurements
 from siq.inference.recalibration import recalibrate
@@ -126,31 +127,25 @@ def test_a_name_stands_beside_a_rest_where_no_function_does_as_well_in_its_place
     monkeypatch.setattr(naming, "runs_freely", lambda *_: True)
     monkeypatch.setattr(naming, "correlation_time_left", lambda *_: 5.0)
     monkeypatch.setattr(naming, "log_evidence_of", lambda fit, *_, **__: fit.evidence)
-    context = SimpleNamespace(data=None)
-    considered = [SimpleNamespace(name=name) for name in ("overflow", "overflow", "leak")]
-    found = _residual_model_comparison(
-        trial_of(own), base, context, considered=considered, unnamed=0.1, least=2.9
-    )
+    candidates = tuple(SimpleNamespace(name=name) for name in ("overflow", "overflow", "leak"))
+    context = FitContext(DECAY, SimpleNamespace(), SimpleNamespace(), candidates)
+    assert context.study.search.unnamed == 0.1
+    found = _residual_model_comparison(trial_of(own), base, context)
     # Each function costs what it was chosen among, and the probability that something has no name.
     cost = 1.0 + np.log(10)
     best = max(on_top - cost if on_top else 0.0, 12.0)
     expected = best + np.log(0.9) - np.log(2 * 2) - max(instead - cost, pairs - 2 * cost)
     assert found is not None and found.log_odds == pytest.approx(expected)
     assert bool(found.log_odds >= np.log(19)) is given
-    undecided = abs(found.log_odds) < 2.9
+    undecided = abs(found.log_odds) < context.study.search.least_log_odds
     # Functions on top of the mechanism foresee as badly as those in its place here.
     assert found.predicts_better is (undecided and foreseen == 0.5)
 
 
 def test_what_random_forces_stand_in_for_has_no_model_beside_which_a_name_could_stand() -> None:
-    context = FitContext(SimpleNamespace(), SimpleNamespace(), 3, 10, 5)
+    context = FitContext(DECAY, SimpleNamespace(), SimpleNamespace())
     for fit in (fit_of(50.0, forces=True), fit_of(50.0, dimension=2)):
-        assert (
-            _residual_model_comparison(
-                trial_of(fit), fit_of(0.0), context, considered=(), unnamed=0.1, least=2.9
-            )
-            is None
-        )
+        assert _residual_model_comparison(trial_of(fit), fit_of(0.0), context) is None
 
 
 def decays(count: int, samples: int, *, rate: float = 1.0) -> Measurements:

@@ -49,7 +49,7 @@ def readings(*, quadratic: float, step: float = STEP) -> pd.DataFrame:
 def asked(model: Dynamics, data: Measurements) -> tuple[Fit, Remainder, tuple[str, ...]] | None:
     model = with_expectations(model)
     _, strict = recalibrate(model, data)
-    return explained_by_quantisation(model, data, strict, roles_of(model))
+    return explained_by_quantisation(data, strict, roles_of(model))
 
 
 def test_values_before_rounding_are_means_of_a_normal_distribution_cut_off() -> None:

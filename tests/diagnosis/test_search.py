@@ -16,12 +16,12 @@ from siq.diagnosis.dictionary import Roles, Shape
 from siq.diagnosis.evidence import FittedCandidate, _blocks_of, _correlated_probability, _correlation_time
 from siq.diagnosis.mechanisms import repeats
 from siq.diagnosis.naming import NamingDecision, _judge_mechanisms
-from siq.diagnosis.residual_structure import Curve, Direction, Remainder, Structure
+from siq.diagnosis.residual_structure import Curve, Remainder, Structure
 from siq.diagnosis.screening import _screen
-from siq.diagnosis.search import AcceptedMechanism, Search, _accepted, _better_without
-from siq.diagnosis.study import SearchOptions
+from siq.diagnosis.search import AcceptedMechanism, FitContext, Search, _accepted, _better_without
+from siq.diagnosis.study import MismatchStudy, SearchOptions
+from siq.diagnosis.terms import ONE, Place
 from siq.diagnosis.verdict import _most_telling
-from siq.inference.budget import Budget
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, measurements
 from siq.inference.recalibration import recalibrate
@@ -137,9 +137,15 @@ def test_a_mechanism_that_was_found_is_not_found_once_more_in_another_form() -> 
     assert not repeats(one("parameter drift", "parameter drift in h (b)", ("h",), "t"), drift)
 
 
+def place(coordinate: str, *equations: str) -> Place:
+    """Of a force along a coordinate; of two equations across the amplitude."""
+    factors = ONE, -ONE
+    return Place(tuple(zip(equations, factors, strict=False)), (), (ONE,), (coordinate,), np.zeros(4))
+
+
 def structure(excess: float, *gains: tuple[str, str, float]) -> Structure:
     curves = [
-        Curve(Direction((equation,), coordinate, False, np.zeros(4)), np.zeros(4), np.ones(4), gain, 0.0)
+        Curve(place(coordinate, equation), np.zeros(4), np.ones(4), gain, 0.0)
         for equation, coordinate, gain in gains
     ]
     return Structure(tuple(curves), 0.0, 0.0, excess + 100, 100)
@@ -188,12 +194,13 @@ POPULATIONS = Roles(populations=("prey", "predator"), states=("prey", "predator"
 )
 def test_the_coordinate_that_tells_most(roles: Roles, found: Structure, expected: str) -> None:
     equations, coordinate = _most_telling(found, roles)
-    assert equations == (found.curves[0].direction.names)
+    assert equations == found.curves[0].place.targets
     assert coordinate == expected
 
 
 def test_of_a_rotating_frame_the_motion_is_its_amplitude() -> None:
-    across = Curve(Direction(("P", "Q"), "amplitude", True, np.zeros(4)), np.zeros(4), np.ones(4), 128.0, 0.0)
+    across = Curve(place("amplitude", "P", "Q"), np.zeros(4), np.ones(4), 128.0, 0.0)
+    assert across.place.across
     found = structure(370, ("Q", "t", 150.0))
     found = replace(found, curves=(*found.curves, across))
     assert _most_telling(found, FRAME) == (("P", "Q"), "amplitude")
@@ -209,18 +216,14 @@ def judged(
 ) -> NamingDecision:
     """A search of so many mechanisms, judged by odds and matches that are given."""
 
-    def of_a_name(
-        fit: SimpleNamespace, data: object, candidates: list[SimpleNamespace], *rest: object, **_: object
-    ) -> float:
+    def of_a_name(_: object, candidates: list[SimpleNamespace], context: FitContext) -> float:
         return odds[candidates[0].number - 1] if len(candidates) == 1 else together
 
     monkeypatch.setattr(naming, "_log_odds_of_a_name", of_a_name)
     monkeypatch.setattr(naming, "_false_match_rate", lambda *_, **__: p_alike)
-    data = SimpleNamespace()
-    return _judge_mechanisms(
-        found_with(len(odds)), left, data, SimpleNamespace(), MOTION, (),
-        options=SearchOptions(wrong_names=0.05, unnamed=0.2), generator=np.random.default_rng(0),
-    )  # fmt: skip
+    study = MismatchStudy(search=SearchOptions(wrong_names=0.05, unnamed=0.2))
+    context = FitContext(SimpleNamespace(), SimpleNamespace(), MOTION, study=study)
+    return _judge_mechanisms(found_with(len(odds)), left, context, generator=np.random.default_rng(0))
 
 
 @pytest.mark.parametrize(
@@ -303,6 +306,7 @@ def test_nothing_is_missing_where_its_fit_only_found_better_parameters(decaying:
     missed = replace(
         right, model=right.model.with_values(np.array([9.0])), log_likelihood=right.log_likelihood - 40
     )
-    found = _better_without(trial, missed, decaying, data, least=10.0, budget=Budget())
+    context = FitContext(decaying, data, Roles())
+    found = _better_without(trial, missed, context)
     assert found is not None and found.model.values == pytest.approx(right.model.values, rel=1e-3)
-    assert _better_without(trial, right, decaying, data, least=10.0, budget=Budget()) is None
+    assert _better_without(trial, right, context) is None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,14 +16,13 @@ from siq.diagnosis.evidence import evidences_by_size, log_evidence_of
 from siq.diagnosis.holdout import simplest_of
 from siq.diagnosis.smooth_functions import (
     LENGTH_SCALES,
-    Smooth,
+    Bumps,
+    SmoothFunction,
     _product_of,
-    _ProductFunction,
     _triangle_of,
-    smooth_function,
-    with_smooth_function,
+    bumps_along,
 )
-from siq.diagnosis.terms import FunctionSite, Place
+from siq.diagnosis.terms import Place
 from siq.inference.budget import Budget, BudgetSpent
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import fit_by_multiple_shooting
@@ -38,22 +36,30 @@ ONE = sympy.Integer(1)
 MODEL = Dynamics(("x", "v"), (V, -X), Diffusion.identity(2))
 
 
-def ground(*coordinates: sympy.Symbol, count: int = 400) -> FunctionSite:
-    """Where a function of some coordinates stands, and recordings that have been everywhere."""
-    courses = np.random.default_rng(3).uniform(-1, 3, size=(len(coordinates), count))
-    words = tuple(map(str, coordinates))
-    place = Place((("v", ONE),), (), coordinates[0], words, np.empty(0))
-    return FunctionSite(place, coordinates, words, courses)
+def courses_of(count: int) -> np.ndarray:
+    """So many coordinates along recordings that have been everywhere."""
+    return np.random.default_rng(3).uniform(-1, 3, size=(count, 400))
 
 
-def product() -> _ProductFunction:
-    first, second = (smooth_function(ground(z), (0.25,)) for z in (X, V))
-    return _ProductFunction(ground(X, V), first, second, np.ones(first.width + second.width))
+def bumps(*coordinates: sympy.Symbol, shares: tuple[float, ...], deviation: float = 1.0) -> Bumps:
+    return bumps_along(coordinates, courses_of(len(coordinates)), shares, deviation=deviation)
 
 
-@pytest.mark.parametrize("function", [smooth_function(ground(X, V), (0.25, 0.5)), product()])
-def test_a_formula_says_what_the_function_does(function: Smooth) -> None:
-    candidate = with_smooth_function(MODEL, function)
+def function_of(*factors: Bumps) -> SmoothFunction:
+    coordinates = tuple(each for factor in factors for each in factor.coordinates)
+    place = Place((("v", ONE),), (), coordinates, tuple(map(str, coordinates)))
+    return SmoothFunction(place, factors, np.ones(sum(each.width for each in factors)))
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        function_of(bumps(X, V, shares=(0.25, 0.5))),
+        function_of(bumps(X, shares=(0.25,)), bumps(V, shares=(0.25,))),
+    ],
+)
+def test_a_formula_says_what_the_function_does(function: SmoothFunction) -> None:
+    candidate = function.added_to(MODEL)
     assert candidate.equations == ("v",) and candidate.coordinate == "x, v"
     heights = np.random.default_rng(1).normal(size=function.width)
     known = dict(zip(candidate.amplitudes, heights, strict=True))
@@ -70,23 +76,22 @@ def test_a_formula_says_what_the_function_does(function: Smooth) -> None:
 
 
 @pytest.mark.parametrize(
-    ("where", "shares", "off"), [(ground(X), (0.25,), 1e-4), (ground(X, V), (0.5, 0.25), 0.05)]
+    ("coordinates", "shares", "off"), [((X,), (0.25,), 1e-4), ((X, V), (0.5, 0.25), 0.05)]
 )
 def test_a_sum_of_bumps_is_the_process_where_the_recordings_have_been(
-    where: FunctionSite, shares: tuple[float, ...], off: float
+    coordinates: tuple[sympy.Symbol, ...], shares: tuple[float, ...], off: float
 ) -> None:
-    function = smooth_function(where, shares, deviation=1.7)
-    (expected,) = function.expected(tuple(f"b{k}" for k in range(function.width)))
-    along = np.linalg.solve(expected.roots.T, function.values(where.courses))
-    scaled = where.courses / function.lengths[:, None]
+    function, courses = bumps(*coordinates, shares=shares, deviation=1.7), courses_of(len(coordinates))
+    expected = function.expected(tuple(f"b{k}" for k in range(function.width)))
+    along = np.linalg.solve(expected.roots.T, function.values(courses))
+    scaled = courses / function.lengths[:, None]
     away = ((scaled[:, :, None] - scaled[:, None, :]) ** 2).sum(axis=0)
     np.testing.assert_allclose(along.T @ along, 1.7**2 * np.exp(-0.5 * away), atol=off * 1.7**2)
 
 
 def test_a_length_beyond_the_recordings_a_function_is_zero() -> None:
-    function = smooth_function(ground(X), (0.125,))
-    heights = function.heights_of(np.ones(function.width))
-    values, _ = function.along(heights, np.array([[1.0, 2.9, 3.5, 5.0]]))
+    function = bumps(X, shares=(0.125,))
+    values = function.heights_of(np.ones(function.width)) @ function.values(np.array([[1.0, 2.9, 3.5, 5.0]]))
     np.testing.assert_allclose(values[:2], 1.0, atol=0.03)
     assert 0.5 < values[2] < 0.9 and abs(values[3]) < 0.01
 
@@ -94,17 +99,16 @@ def test_a_length_beyond_the_recordings_a_function_is_zero() -> None:
 def test_length_and_size_of_a_function_are_told() -> None:
     """Of functions that are such processes, over lengths from a sixteenth of the range to half of it."""
     draw = np.random.default_rng(7)
-    where, noise, found = ground(X), 0.05, []
-    fine = smooth_function(where, (1 / 32,))
+    courses, noise, found = courses_of(1), 0.05, []
+    fine = bumps(X, shares=(1 / 32,))
     for share in np.repeat([1 / 16, 1 / 8, 1 / 4, 1 / 2], 5):
-        heights = fine.heights_of(
-            _triangle_of(fine.centres, share * where.ranges) @ draw.normal(size=fine.width)
-        )
-        left = fine.along(heights, where.courses)[0] / noise + draw.normal(size=400)
+        lengths = share * np.ptp(courses, axis=1)
+        heights = fine.heights_of(_triangle_of(fine.centres, lengths) @ draw.normal(size=fine.width))
+        left = heights @ fine.values(courses) / noise + draw.normal(size=400)
         told = []
         for each in LENGTH_SCALES:
-            function = smooth_function(where, (each,))
-            along = np.linalg.solve(function.triangle, function.values(where.courses)).T / noise
+            function = bumps(X, shares=(each,))
+            along = np.linalg.solve(function.triangle, function.values(courses)).T / noise
             total = float(left @ left)
             odds, variance, rest = evidences_by_size(along.T @ along, along.T @ left, total, freedom=400)
             best = int(np.argmax(odds))
@@ -119,15 +123,15 @@ def test_a_product_is_told_where_both_coordinates_were_never_large_at_a_time() -
     draw = np.random.default_rng(5)
     x, y = draw.uniform(-1, 3, size=(2, 600))
     seen = (x < 1) | (y < 1)
-    where = replace(ground(X, V), courses=np.stack([x, y])[:, seen])
+    place, courses = Place((("v", ONE),), (), (X, V), ("x", "v")), np.stack([x, y])[:, seen]
 
     def true(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return np.tanh(2 * x - 2) * np.exp(-((y - 1.5) ** 2))
 
-    told = true(*where.courses) + 0.02 * draw.normal(size=seen.sum())
+    told = true(*courses) + 0.02 * draw.normal(size=seen.sum())
     weights = np.eye(len(told)) / 0.02**2
     found = _product_of(
-        where, LENGTH_SCALES, points=where.courses.T, gram=weights, overlap=weights @ told, deviation=1.0
+        place, courses, LENGTH_SCALES, points=courses.T, gram=weights, overlap=weights @ told, deviation=1.0
     )
     corner = draw.uniform(1.2, 2.8, size=(2, 200))
     values, _ = found.along(found.begin, corner)
@@ -137,15 +141,15 @@ def test_a_product_is_told_where_both_coordinates_were_never_large_at_a_time() -
 def test_evidence_of_parameters_expected_together_is_the_marginal_likelihood() -> None:
     """Exact for a linear model with normal errors: log N(y; 0, ΦKΦᵀ + σ²)."""
     t, noise = np.arange(0, 8, 0.1), 0.1**2
-    place = Place((), (("y", ONE),), TIME, ("t",), np.empty(0))
-    function = smooth_function(FunctionSite(place, (TIME,), ("t",), t[None]), (0.125,), deviation=0.8)
+    bell = bumps_along((TIME,), t[None], (0.125,), deviation=0.8)
+    function = SmoothFunction(Place((), (("y", ONE),), (TIME,), ("t",)), (bell,), np.zeros(bell.width))
     still = Dynamics(("y",), (sympy.Integer(0),), Diffusion.identity(1))
-    along = 0.8 * np.linalg.solve(function.triangle, function.values(t[None]))
+    along = 0.8 * np.linalg.solve(bell.triangle, bell.values(t[None]))
     exact = [along.T @ along + noise * np.eye(len(t)), noise * np.eye(len(t))]
     y = np.random.default_rng(2).multivariate_normal(np.zeros(len(t)), exact[0])
     data = Measurements(("r",), np.array([0, len(t)]), t, y[:, None], ((),), sensor_noise=np.array([noise]))
     found = []
-    for model in (with_smooth_function(still, function).model, still):
+    for model in (function.added_to(still).model, still):
         fit = fit_by_multiple_shooting(
             model, data, x=np.zeros((len(t), 1)), noise=Noise(np.array([noise]), np.zeros(1)),
             estimate_process=False, substeps=1,
@@ -162,13 +166,12 @@ def test_what_is_beyond_all_numbers_ends_a_function_and_not_the_case(monkeypatch
     def singular(*_: object, **__: object) -> None:
         raise np.linalg.LinAlgError("singular matrix")
 
-    where = SimpleNamespace(usable=True, words=("x",), along=lambda *_: where)
+    where = SimpleNamespace(words=("x",))
     fit, context = SimpleNamespace(model=MODEL, x=np.zeros((3, 2))), SimpleNamespace(data=None)
     monkeypatch.setattr(unnamed_models, "smoothness_of", singular)
     assert unnamed_models._with_smooth_term((), fit, where, 0.0, context) == []
-    asked = SimpleNamespace(considered=9, told=SimpleNamespace(level=1.0))
+    asked = SimpleNamespace(considered=9, level=1.0, function=singular)
     monkeypatch.setattr(unnamed_models, "smoothness_of", lambda *_, **__: asked)
-    monkeypatch.setattr(unnamed_models, "likeliest_product", singular)
     assert unnamed_models._with_smooth_term((), fit, where, 0.0, context, product=True) == []
 
 
@@ -195,7 +198,7 @@ CARD = {
 }
 
 
-def bumps(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def two_bumps(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Two bumps in x and y, which are no function of x times y, nor one of y times x."""
     return 1.5 * np.exp(-(((x - 0.4) / 0.5) ** 2) - ((y - 0.5) / 0.4) ** 2) - 1.2 * np.exp(
         -(((x + 0.5) / 0.4) ** 2) - ((y - 0.3) / 0.5) ** 2
@@ -207,7 +210,7 @@ def test_what_depends_on_two_coordinates_gets_a_surface(tmp_path: Path) -> None:
     t = np.arange(0, 6, 0.1)
     begin = rng.uniform(-1.5, 1.5, size=(2, 10))
     x, y = course(
-        lambda t, s: np.stack([-0.2 * s[0] + 2.0 * s[1] + bumps(*s), -0.2 * s[1] - 2.0 * s[0]]), begin, t,
+        lambda t, s: np.stack([-0.2 * s[0] + 2.0 * s[1] + two_bumps(*s), -0.2 * s[1] - 2.0 * s[0]]), begin, t,
         within=8,
     ).transpose(1, 2, 0)  # fmt: skip
     noisy = {name: each + 0.01 * rng.normal(size=each.shape) for name, each in (("x", x), ("y", y))}
@@ -222,7 +225,7 @@ def test_what_depends_on_two_coordinates_gets_a_surface(tmp_path: Path) -> None:
     x, y = np.meshgrid(*map(np.array, surface["at"]), indexing="ij")
     value = np.array(surface["value"])
     near = (np.abs(x) < 0.8) & (np.abs(y) < 0.8)
-    assert np.sqrt(np.mean((value - bumps(x, y))[near] ** 2)) < 0.15
+    assert np.sqrt(np.mean((value - two_bumps(x, y))[near] ** 2)) < 0.15
     figure = plot_described(verdict["described"], units={"x": "mm"}, time_unit="s")
     assert figure is not None
     assert figure.axes[0].get_xlabel() == "$x$ (mm)"

@@ -14,10 +14,9 @@ import sympy
 from siq.data.recordings import Recordings
 from siq.diagnosis import unnamed_models
 from siq.diagnosis.dictionary import roles_of
-from siq.diagnosis.search import Search
-from siq.diagnosis.terms import Place, _Power, with_formula
+from siq.diagnosis.search import FitContext, Search
+from siq.diagnosis.terms import Place, with_formula
 from siq.diagnosis.unnamed_models import (
-    FitContext,
     _fitted_term,
     _memories_of,
     _memory_suspected,
@@ -59,7 +58,7 @@ def alone(fading: Measurements) -> Fit:
 
 
 def context(data: Measurements) -> FitContext:
-    return FitContext(data, roles_of(DECAY), 3, 10, 5)
+    return FitContext(DECAY, data, roles_of(DECAY))
 
 
 def test_what_x_was_is_likelier_than_any_function(fading: Measurements, alone: Fit) -> None:
@@ -125,7 +124,7 @@ def test_the_time_is_suspected_of_standing_in_for_what_was(
     words: tuple[str, ...], *, suspected: bool, fading: Measurements, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("siq.diagnosis.unnamed_models.has_structure", lambda *_: False)
-    place = Place((("x", sympy.Integer(1)),), (), X, words, np.empty(0))
+    place = Place((("x", sympy.Integer(1)),), (), (X,), words)
     model = SimpleNamespace(parts=(SimpleNamespace(place=place),), fit=None)
     assert _memory_suspected([model], fading) is suspected
     assert _memory_suspected([], fading)
@@ -148,9 +147,9 @@ def test_a_function_whose_fit_leads_away_begins_again(monkeypatch: pytest.Monkey
     data = bent_decays()
     _, alone = recalibrate(DECAY, data)
     assert not alone.has_process_noise
-    place = Place((("x", sympy.Integer(1)),), (), X, ("x",), np.empty(0))
-    candidate = with_formula(alone.model, place, [_Power(X**2, 2)])
-    context = FitContext(data, SimpleNamespace(), 3, 10, 5)
+    place = Place((("x", sympy.Integer(1)),), (), (X,), ("x",))
+    candidate = with_formula(alone.model, place, [(X**2, 2, 0)])
+    context = FitContext(DECAY, data, SimpleNamespace())
 
     def fitted() -> Fit:
         (part,) = _fitted_term(candidate, 1.0, place, alone, 0.0, context)
