@@ -22,9 +22,9 @@ from siq.diagnosis.investigation import HeldOutRuns, Investigation, held_out_run
 from siq.diagnosis.mechanisms import completed
 from siq.diagnosis.residual_structure import remainder_of
 from siq.diagnosis.search import Search
-from siq.diagnosis.smooth_functions import MECHANISM
-from siq.diagnosis.statement import Location, StatedMechanism, Statement
+from siq.diagnosis.statement import Location, StatedTerm, Statement
 from siq.diagnosis.study import Comparison, MismatchStudy, MismatchVerdict, comparison_of
+from siq.diagnosis.terms import MECHANISM
 from siq.diagnosis.unnamed_models import fit_unnamed_models
 from siq.diagnosis.verdict import statement_of
 from siq.errors import InputError, NumericalFailure
@@ -109,7 +109,7 @@ class Diagnosis:
         return self.statement.verdict
 
     @property
-    def mechanisms(self) -> tuple[StatedMechanism, ...]:
+    def mechanisms(self) -> tuple[StatedTerm, ...]:
         """What is named."""
         return self.statement.mechanisms
 

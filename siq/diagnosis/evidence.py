@@ -63,6 +63,23 @@ class FittedCandidate:
     p_white: float
     p_cluster: float
 
+    @classmethod
+    def of(
+        cls, trial: Fit, before: Fit, data: Measurements, candidate: MechanismCandidate, *, blocks: int
+    ) -> FittedCandidate:
+        """A candidate's fit with its evidence over the fit without it."""
+        extra = len(trial.model.free) - len(before.model.free)
+        gained = 2 * (trial.log_likelihood - before.log_likelihood)
+        count = trial.degrees_of_freedom + len(trial.model.free)
+        return cls(
+            candidate=candidate,
+            fit=trial,
+            delta_chi2=gained,
+            delta_bic=-gained + extra * np.log(count),
+            p_white=float(scipy.stats.chi2.sf(max(gained, 0.0), extra)),
+            p_cluster=probability_by_chance(trial, before, data, candidate, blocks=blocks),
+        )
+
 
 @dataclass(frozen=True)
 class NotFitted:
@@ -78,35 +95,6 @@ class NotFitted:
         if isinstance(why, Exception):
             why = str(why) if isinstance(why, NumericalFailure) else f"{type(why).__name__}: {why}"
         return cls(candidate.name, candidate.label, why)
-
-
-def judged(
-    trial: Fit, before: Fit, data: Measurements, candidate: MechanismCandidate, *, blocks: int
-) -> FittedCandidate:
-    """A candidate's fit with its evidence over the fit without it."""
-    extra = len(trial.model.free) - len(before.model.free)
-    gained = 2 * (trial.log_likelihood - before.log_likelihood)
-    count = trial.degrees_of_freedom + len(trial.model.free)
-    return FittedCandidate(
-        candidate=candidate,
-        fit=trial,
-        delta_chi2=gained,
-        delta_bic=-gained + extra * np.log(count),
-        p_white=float(scipy.stats.chi2.sf(max(gained, 0.0), extra)),
-        p_cluster=probability_by_chance(trial, before, data, candidate, blocks=blocks),
-    )
-
-
-def admissible(trial: Fit, candidate: MechanismCandidate) -> bool:
-    """Whether parameters that a mechanism allows one sign only have it, or are zero within their errors."""
-    names = [trial.model.parameters[place].name for place in trial.model.free]
-    for name in candidate.positive:
-        if name in names:
-            place = names.index(name)
-            value = trial.model.values[trial.model.free[place]]
-            if value < -2 * trial.standard_errors[place]:
-                return False
-    return True
 
 
 def residuals(
@@ -192,24 +180,25 @@ def _blocks_of(recording: np.ndarray, left: np.ndarray, *, least: int) -> np.nda
 
 
 def probability_by_chance(
-    fit: Fit, before: Fit, data: Measurements, candidate: MechanismCandidate, *, blocks: int
+    fit: Fit, before: Fit | None, data: Measurements, candidate: MechanismCandidate, *, blocks: int
 ) -> float:
     """Probability of a mechanism by chance, where errors of a recording are autocorrelated.
 
-    Among many recordings each counts as one (`clustered_probability`). Of a few, blocks are too few to know a
-    covariance from them; how long errors are correlated is known all the same (`_correlated_probability`).
+    Among many recordings each counts as one (`_clustered_probability`). Of a few, blocks are too few to know
+    a covariance from them; how long errors are correlated is known all the same (`_correlated_probability`).
 
     Parameters
     ----------
     fit, before
-        With the mechanism and without it.
+        With the mechanism and without it; None where there is no such fit.
     data, candidate
         The recordings, and the mechanism.
     blocks
         Where there are fewer recordings than half of it, they are few.
     """
-    if len(data.labels) >= blocks // 2 or fit.has_process_noise or before.has_process_noise:
-        return clustered_probability(fit, data, candidate, blocks=blocks)
+    many = len(data.labels) >= blocks // 2
+    if before is None or many or fit.has_process_noise or before.has_process_noise:
+        return _clustered_probability(fit, data, candidate, blocks=blocks)
     gained = 2 * (fit.log_likelihood - before.log_likelihood)
     return _correlated_probability(fit, data, candidate, gained=gained)
 
@@ -231,7 +220,7 @@ def _correlated_probability(
     return min(1.0, float(np.prod(places)) * alone)
 
 
-def clustered_probability(
+def _clustered_probability(
     fit: Fit, data: Measurements, candidate: MechanismCandidate, *, blocks: int
 ) -> float:
     """Probability of a mechanism by chance, whatever errors within a recording are like.
@@ -286,23 +275,18 @@ def smooth_prior(knots: np.ndarray, length: float) -> np.ndarray:
     return np.exp(-0.5 * (distance / length) ** 2) + PRIOR_JITTER * np.eye(len(knots))
 
 
-def _log_evidence(
-    gram: np.ndarray, overlap: np.ndarray, prior: np.ndarray, *, total: float, freedom: float
-) -> float:
-    """Log-likelihood of columns with normal coefficients, over that without them."""
-    unit = np.eye(len(gram))
-    inner = unit + gram @ prior
-    sign, determinant = np.linalg.slogdet(inner)
-    explained = float(overlap @ (prior @ np.linalg.solve(inner, overlap)))
-    left = max(total - explained, 1e-12 * total)
-    return float(-0.5 * determinant - 0.5 * freedom * np.log(left / total)) if sign > 0 else -np.inf
-
-
 def averaged_evidence(
     gram: np.ndarray, overlap: np.ndarray, priors: Sequence[np.ndarray], total: float, freedom: float
 ) -> float:
-    """Logarithm of the mean evidence over priors; see `_log_evidence`."""
-    values = [_log_evidence(gram, overlap, prior, total=total, freedom=freedom) for prior in priors]
+    """Log-likelihood of columns with normal coefficients over that without them, averaged over priors."""
+    values = []
+    for prior in priors:
+        inner = np.eye(len(gram)) + gram @ prior
+        sign, determinant = np.linalg.slogdet(inner)
+        explained = float(overlap @ (prior @ np.linalg.solve(inner, overlap)))
+        left = max(total - explained, 1e-12 * total)
+        value = float(-0.5 * determinant - 0.5 * freedom * np.log(left / total))
+        values.append(value if sign > 0 else -np.inf)
     return float(scipy.special.logsumexp(values) - np.log(len(values)))
 
 
@@ -316,7 +300,7 @@ def evidences_by_size(
     gram, overlap
         Of the columns with each other and with the target, in units of noise; shapes ``(k, k)`` and ``(k,)``.
     total, freedom
-        Sum of squares of the target, and its degrees of freedom; see `_log_evidence`.
+        Sum of squares of the target, and its degrees of freedom.
 
     Returns
     -------

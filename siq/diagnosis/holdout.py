@@ -39,33 +39,20 @@ FOLDS = 4  # of which one is left out at a time: a quarter, as is held out by de
 MIN_STRETCH_SAMPLES = 16  # of a stretch that an initial state and an error can be told from
 
 
-@dataclass(frozen=True)
-class SimulationProtocol:
-    """How simulations of recordings are run, so that their errors can be compared.
+def simulated(fit: Fit, data: Measurements, *, noise: Noise, substeps: int) -> FreeRun:
+    """A fit's free run of recordings, told how they begin and where it usually is.
 
-    Attributes
+    Parameters
     ----------
+    fit, data
+        Of the simulation, and the recordings.
     noise
         See `siq.inference.trajectories.free_run`.
     substeps
         Runge–Kutta steps between samples at least; a fit that needed more is run with its own.
     """
-
-    noise: Noise
-    substeps: int
-
-    def run(self, fit: Fit, data: Measurements) -> FreeRun:
-        """A fit's simulation of recordings, told how they begin and where it usually is."""
-        finer = max(self.substeps, fit.substeps)
-        return free_run(fit.model, data, noise=self.noise, substeps=finer, usual=fit.x)
-
-    def errors(self, fit: Fit, data: Measurements) -> np.ndarray | None:
-        """Normalised squared errors of that run, shape ``(values,)``; None where it ran away."""
-        return self.run(fit, data).squared_errors(data.outputs)
-
-    def nearest(self, fits: list[Fit], data: Measurements) -> Fit:
-        """The fit that runs nearest to recordings; the first of those that are as near, or run away."""
-        return fits[0] if len(fits) == 1 else min(fits, key=lambda fit: mean_error(self.errors(fit, data)))
+    finer = max(substeps, fit.substeps)
+    return free_run(fit.model, data, noise=noise, substeps=finer, usual=fit.x)
 
 
 def mean_error(squares: np.ndarray | None) -> float:
@@ -198,17 +185,10 @@ def in_blocks(squares: np.ndarray) -> tuple[float, ...]:
     return tuple(float(each.mean()) for each in np.array_split(squares, max(min(BLOCKS, len(squares)), 1)))
 
 
-@dataclass(frozen=True)
-class _Fold:
-    """A part that is left out, the rest, and the rows of the rest in all of the recordings."""
-
-    out: Measurements
-    rest: Measurements
-    rows: np.ndarray
-
-
-def _cross_validation_folds(learned: Measurements) -> Iterator[_Fold]:
-    """The recordings divided into parts, each left out once.
+def _cross_validation_folds(
+    learned: Measurements,
+) -> Iterator[tuple[Measurements, Measurements, np.ndarray]]:
+    """The recordings in parts: one that is left out, the rest, and the rows of the rest in all of them.
 
     Of recordings, so many at equal distances are a part; a single one is cut into stretches, of which the
     rest has two recordings unless it is the first or the last that is left out.
@@ -250,7 +230,7 @@ def _cross_validation_folds(learned: Measurements) -> Iterator[_Fold]:
                 else:
                     joined.append((begin, end))
             kept, owners = joined, np.zeros(len(joined), dtype=int)
-        yield _Fold(stretches([pieces[place] for place in group], owner[group])[0], *stretches(kept, owners))
+        yield stretches([pieces[place] for place in group], owner[group])[0], *stretches(kept, owners)
 
 
 def errors_left_out(
@@ -277,13 +257,12 @@ def errors_left_out(
         away.
     """
     positive = {name for each in candidates for name in each.positive.intersection(each.amplitudes)}
-    runs = SimulationProtocol(noise, fit.substeps)
     squares = []
-    for fold in _cross_validation_folds(learned):
+    for out, rest, rows in _cross_validation_folds(learned):
         model, wrong = fit.model, {""}
         try:
             while wrong:
-                again = fit_with_process_noise_as_needed(model, fold.rest, replace(fit, x=fit.x[fold.rows]))
+                again = fit_with_process_noise_as_needed(model, rest, replace(fit, x=fit.x[rows]))
                 wrong = {p.name for p in again.model.parameters if p.name in positive and p.value < 0}
                 if wrong:
                     LOGGER.info("without rows of one part, %s would be negative", ", ".join(sorted(wrong)))
@@ -292,7 +271,8 @@ def errors_left_out(
                         for each in model.parameters
                     )
                     model = replace(model, parameters=tuple(absent))
-            own = runs.errors(again, fold.out)
+            run = simulated(again, out, noise=noise, substeps=fit.substeps)
+            own = run.squared_errors(out.outputs)
         except NumericalFailure:
             return None
         # One that does not quite settle, as where a reading is cut off, is judged by what it predicts.

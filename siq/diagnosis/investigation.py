@@ -12,11 +12,11 @@ from siq.diagnosis.dictionary import Mechanism, roles_of
 from siq.diagnosis.evidence import NotFitted
 from siq.diagnosis.holdout import (
     HeldOutErrors,
-    SimulationProtocol,
     errors_left_out,
     first_better,
     mean_error,
     simplest_of,
+    simulated,
 )
 from siq.diagnosis.mechanisms import candidates_of, generic_candidates
 from siq.diagnosis.naming import NamingDecision, decide_naming
@@ -298,10 +298,19 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     """
     search, learned, study = investigation.search, investigation.context.data, investigation.context.study
     noise, substeps = search.recalibrated.noise, max(search.fit.substeps, search.recalibrated.substeps)
-    runs = SimulationProtocol(noise, substeps)
+
+    def run(fit: Fit, of: Measurements) -> FreeRun:
+        return simulated(fit, of, noise=noise, substeps=substeps)
+
+    def errors_of(fit: Fit, of: Measurements) -> np.ndarray | None:
+        return run(fit, of).squared_errors(of.outputs)
 
     def best_of(*fits: Fit | None) -> Fit:
-        return runs.nearest([each for each in fits if each is not None], learned)
+        """The fit that runs nearest to what was learned from; the first of those that are as near."""
+        known = [each for each in fits if each is not None]
+        return (
+            known[0] if len(known) == 1 else min(known, key=lambda fit: mean_error(errors_of(fit, learned)))
+        )
 
     card = replace(search.recalibrated, model=investigation.context.model)
     # What fits best with process noise admitted need not be what runs best without.
@@ -319,9 +328,9 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         # tells nothing of a function whose fit had to find them, too. Beside process noise a free run is off
         # by it, and a little may be chance.
         may_choose = data.select(judges)
-        alone = [runs.errors(each, may_choose) for each in ((plain,) if named else (card, recalibrated))]
+        alone = [errors_of(each, may_choose) for each in ((plain,) if named else (card, recalibrated))]
         least = min((each for each in alone if each is not None), key=np.mean, default=None)
-        errors = [runs.errors(fit, may_choose) for _, fit in choices]
+        errors = [errors_of(fit, may_choose) for _, fit in choices]
         limits = [
             0.0
             if model.log_evidence < study.search.least_log_odds
@@ -348,12 +357,12 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     described, fit = (None, plain) if named or not choices else choices[0]
     if adopted is not None:
         described, fit = choices[adopted]
-    before, refitted, run = (runs.run(each, data) for each in (card, recalibrated, fit))
+    before, refitted, augmented = (run(each, data) for each in (card, recalibrated, fit))
     squares = {
         "before": before.squared_errors(data.outputs),
         "recalibrated": refitted.squared_errors(data.outputs),
-        "augmented": run.squared_errors(data.outputs),
-        "named": runs.errors(plain, data) if named and adopted is not None else None,
+        "augmented": augmented.squared_errors(data.outputs),
+        "named": errors_of(plain, data) if named and adopted is not None else None,
     }
     # What a fit leaves may be more than noise; the one that leaves least is nearest to it.
     spread = np.nanvar(data.outputs[before.scored], axis=0)
@@ -362,7 +371,7 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     return HeldOutRuns(
         before=before,
         recalibrated=refitted,
-        augmented=run,
+        augmented=augmented,
         model=fit.model,
         errors=HeldOutErrors.of(squares, noise_floor=floor),
         independent=not set(learned.labels) & set(data.labels),

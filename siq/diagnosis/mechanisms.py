@@ -37,6 +37,7 @@ from siq.diagnosis.dictionary import (
     unit_of,
 )
 from siq.errors import InputError
+from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import TIME, Dynamics, Parameter, Signals, symbol
@@ -182,6 +183,26 @@ class MechanismCandidate:
     def new(self) -> tuple[str, ...]:
         """All new parameters, in the order of the model's."""
         return tuple(p.name for p in self.model.parameters if p.name in {*self.amplitudes, *self.shapes})
+
+    def admits(self, fit: Fit) -> bool:
+        """Whether parameters of a fit that may have one sign only have it, or are zero within errors."""
+        names = [fit.model.parameters[place].name for place in fit.model.free]
+        values = fit.model.values[list(fit.model.free)]
+        return not any(
+            values[place] < -2 * fit.standard_errors[place]
+            for place, name in enumerate(names)
+            if name in self.positive
+        )
+
+    def repeats(self, found: MechanismCandidate) -> bool:
+        """Whether it is what was found already: the same, or in another form at the same place.
+
+        A second threshold beside the first, or a second spring in the same place, is no further physics.
+        """
+        same_place = self.coordinate == found.coordinate and set(self.equations) & set(found.equations)
+        return self.label == found.label or (
+            self.name == found.name and self.coordinate in found.model.states and bool(same_place)
+        )
 
 
 def build_candidate(
@@ -608,17 +629,6 @@ def _added_square(candidate: MechanismCandidate) -> tuple[str, sympy.Expr] | Non
     if candidate.equations != (place,):
         return None  # it changes what is measured
     return place, formula.diff(symbol(candidate.amplitudes[0])) ** 2
-
-
-def repeats(candidate: MechanismCandidate, found: MechanismCandidate) -> bool:
-    """Whether a candidate is what was found already: the same, or in another form at the same place.
-
-    A second threshold beside the first, or a second spring in the same place, is no further physics.
-    """
-    same_place = candidate.coordinate == found.coordinate and set(candidate.equations) & set(found.equations)
-    return candidate.label == found.label or (
-        candidate.name == found.name and candidate.coordinate in found.model.states and bool(same_place)
-    )
 
 
 def rebased(candidate: MechanismCandidate, before: Dynamics, now: Dynamics) -> MechanismCandidate:

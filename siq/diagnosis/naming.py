@@ -30,7 +30,6 @@ from siq.diagnosis.evidence import (
     NUMERICAL_ERRORS,
     SMOOTH_LENGTHS,
     FittedCandidate,
-    admissible,
     averaged_evidence,
     correlation_time_left,
     correlation_time_of,
@@ -242,7 +241,7 @@ def _residual_model_comparison(
         each
         for each in with_function((), trial.fit, context)
         if not each.fit.has_process_noise
-        and admissible(each.fit, trial.candidate)
+        and trial.candidate.admits(each.fit)
         and runs_freely(each.fit, trial.fit, data)
     ]
     instead = with_function((), recalibrated, context)

@@ -21,12 +21,9 @@ from siq.diagnosis.evidence import (
     NUMERICAL_ERRORS,
     FittedCandidate,
     NotFitted,
-    admissible,
-    clustered_probability,
-    judged,
     probability_by_chance,
 )
-from siq.diagnosis.mechanisms import MechanismCandidate, rebased, repeats
+from siq.diagnosis.mechanisms import MechanismCandidate, rebased
 from siq.diagnosis.residual_structure import has_structure
 from siq.diagnosis.screening import Probe, Screened, screen_all, with_further_states
 from siq.diagnosis.study import MismatchStudy, SearchOptions
@@ -217,9 +214,9 @@ def _fit_most_promising(
             # With no effect it would be what it is compared with, but for forces that are not believed.
             if 2 * (current.log_likelihood - fit.log_likelihood) > least_to_believe(current.noise):
                 raise NumericalFailure("its fit leads away, to less than without it")
-            if not admissible(fit, candidate):
+            if not candidate.admits(fit):
                 raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
-            trial = judged(fit, current, data, candidate, blocks=blocks)
+            trial = FittedCandidate.of(fit, current, data, candidate, blocks=blocks)
         except BudgetSpent:
             failed.setdefault(candidate.label, NotFitted.of(candidate, BUDGET_SPENT))
             return
@@ -273,7 +270,7 @@ def _fit_most_promising(
             try:
                 budget.says(f"following the jumps of {label}")
                 sharp = sharpened(trial.fit, data, budget=budget)
-                trials[label] = judged(sharp, current, data, trial.candidate, blocks=blocks)
+                trials[label] = FittedCandidate.of(sharp, current, data, trial.candidate, blocks=blocks)
             except (*NUMERICAL_ERRORS, BudgetSpent) as error:
                 LOGGER.info("%s stays as sharp as it is: %s", label, error)
     return list(trials.values()), [each for label, each in failed.items() if label not in trials]
@@ -329,10 +326,9 @@ def _stands_together(
             for each in fit.model.parameters
         )
         without = fit_with_process_noise_as_needed(replace(fit.model, parameters=absent), data, fit)
-    if without is None or not without.converged:
-        p_cluster = clustered_probability(fit, data, candidate, blocks=blocks)
-    else:
-        p_cluster = probability_by_chance(fit, without, data, candidate, blocks=blocks)
+    if without is not None and not without.converged:
+        without = None
+    p_cluster = probability_by_chance(fit, without, data, candidate, blocks=blocks)
     LOGGER.info("%s on trial: p %.1e clustered", candidate.label, p_cluster)
     if p_cluster >= chance:
         return None
@@ -369,7 +365,7 @@ def _extended(progress: Search, context: FitContext, *, on_trial: bool) -> Searc
         remaining = [
             rebased(each, model, base) if found else each
             for each in context.candidates
-            if not any(repeats(each, other.best.candidate) for other in found)
+            if not any(each.repeats(other.best.candidate) for other in found)
         ]
         screened, unscreened = screen_all(
             data, current, remaining, fruitless=progress.fruitless, budget=context.budget

@@ -23,7 +23,6 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
 
 import numpy as np
 import scipy.linalg
@@ -38,7 +37,16 @@ from siq.diagnosis.evidence import (
 )
 from siq.diagnosis.mechanisms import MechanismCandidate, along, fresh_names
 from siq.diagnosis.screening import PROBE_SUBSTEPS, levels_of, probe_response, projected
-from siq.diagnosis.terms import LARGEST_LINEARISATION, Kind, Place, PlaceColumns, built, unit_in
+from siq.diagnosis.terms import (
+    CURVE,
+    LARGEST_LINEARISATION,
+    SURFACE,
+    Kind,
+    Place,
+    PlaceColumns,
+    built,
+    unit_in,
+)
 from siq.errors import NumericalFailure
 from siq.inference.kalman_filter import Grid, Whitened, profile_likelihood, whiten
 from siq.inference.maximum_likelihood import Fit
@@ -46,9 +54,6 @@ from siq.inference.measurements import Measurements
 from siq.systems.dynamics import Dynamics, JointExpectation, symbol
 
 LOGGER = logging.getLogger(__name__)
-CURVE: Final = "curve"
-SURFACE: Final = "surface"
-MECHANISM: Final = "mechanism"
 LENGTH_SCALES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # of the range; beyond, a function is a parabola
 MOST_BUMPS = 100  # a guard on the time of a fit
 # Lengths between neighbours: a sum of bumps then has the variance of the process to 2e-5, that of two

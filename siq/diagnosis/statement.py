@@ -14,12 +14,12 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, TypeAdapter
 from pydantic_core import to_jsonable_python
 
-from siq.diagnosis.evidence import BUDGET_SPENT, NotFitted
+from siq.diagnosis.evidence import BUDGET_SPENT, FittedCandidate, NotFitted
 from siq.diagnosis.holdout import HeldOutErrors
 from siq.diagnosis.mechanisms import GENERIC, PROCESS_NOISE
 from siq.diagnosis.search import Standing
 from siq.diagnosis.study import MismatchVerdict
-from siq.diagnosis.terms import Kind
+from siq.diagnosis.terms import MECHANISM, Kind
 from siq.inference.budget import UNLIMITED, Account
 from siq.remarks import Remark
 
@@ -58,6 +58,11 @@ class Evidence:
     p_cluster: float | None
     log_odds: float | None = None
 
+    @classmethod
+    def of(cls, trial: FittedCandidate, log_odds: float | None = None) -> Evidence:
+        """Of a candidate that was fitted."""
+        return cls(trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster, log_odds)
+
 
 @dataclass(frozen=True)
 class Rival:
@@ -66,7 +71,7 @@ class Rival:
     Attributes
     ----------
     name, label
-        As of `StatedMechanism`.
+        As of `StatedTerm`.
     delta_chi2
         What it gains, compared with the same simulation.
     further_parameters
@@ -81,53 +86,6 @@ class Rival:
     delta_chi2: float
     further_parameters: int
     standing: Standing
-
-
-@dataclass(frozen=True)
-class StatedMechanism:
-    """A mechanism that is named, or that describes what has no name.
-
-    Attributes
-    ----------
-    name, label
-        Of the dictionary, and told apart from its other forms and places.
-    terms
-        Formula that is added, by equation; see `siq.diagnosis.mechanisms.MechanismCandidate.changes`.
-    parameters
-        Those that it brings.
-    evidence
-        Why it is believed.
-    share_of_excess
-        What all mechanisms together explain of the excess over noise.
-    indistinguishable_from
-        Names of mechanisms that explain the recordings as well; None where it is not named itself.
-    equations
-        States in whose equations it changes something; none for a fault of the sensor.
-    beside
-        Labels of the mechanisms that were in place when it was judged.
-    rivals
-        What else was fitted in its place, the one that gains most first.
-    """
-
-    name: str
-    label: str
-    terms: Mapping[str, str]
-    parameters: Mapping[str, Estimate]
-    evidence: Evidence
-    share_of_excess: float
-    indistinguishable_from: tuple[str, ...] | None = None
-    equations: tuple[str, ...] = ()
-    beside: tuple[str, ...] = ()
-    rivals: tuple[Rival, ...] = ()
-
-    def rival_names(self, standing: Standing) -> list[str]:
-        """Names of rivals, each once; their labels where the name alone is that of the mechanism itself."""
-        names = (
-            each.label if each.name in (self.name, GENERIC) else each.name
-            for each in self.rivals
-            if each.standing == standing
-        )
-        return list(dict.fromkeys(names))
 
 
 @dataclass(frozen=True)
@@ -168,41 +126,61 @@ class DescribedSurface:
     standard_error: tuple[tuple[Number, ...], ...]
 
 
-@dataclass(frozen=True)
-class StatedFunction:
-    """A part of the model of what has no name.
+@dataclass(frozen=True, kw_only=True)
+class StatedTerm:
+    """A mechanism that is named, or that describes what has no name; or a part of the model of the latter.
 
     Attributes
     ----------
-    name, label, terms, parameters, evidence, equations, beside
-        As of `StatedMechanism`.
+    name, label
+        Of the dictionary, and told apart from its other forms and places.
     kind
-        ``formula``: a sum of a few powers. ``curve``, ``surface``: a smooth function of one coordinate, or of
-        two, as a sum of Gaussian bumps. ``mechanism``: one of the dictionary that is not certain enough for
-        its name.
-    outputs
-        What is measured otherwise, for a fault of the sensor.
-    coordinates
-        What it depends on.
-    curve
-        Where it is a function of one coordinate, or a curve; a curve in two coordinates is the coefficient of
-        the second.
-    surface
-        Where it is a surface.
+        ``mechanism``: one of the dictionary. ``formula``: a sum of a few powers. ``curve``, ``surface``: a
+        smooth function of one coordinate, or of two, as a sum of Gaussian bumps.
+    terms
+        Formula that is added, by equation; see `siq.diagnosis.mechanisms.MechanismCandidate.changes`.
+    parameters
+        Those that it brings.
+    evidence
+        Why it is believed.
+    equations
+        States in whose equations it changes something; none for a fault of the sensor.
+    beside
+        Labels of what was in place when it was judged.
+    share_of_excess, indistinguishable_from, rivals
+        Of a mechanism that was found: what all mechanisms together explain of the excess over noise; names of
+        mechanisms that explain the recordings as well, None where it is not named itself; and what else was
+        fitted in its place, the one that gains most first.
+    outputs, coordinates, curve, surface
+        Of a part of a model: what is measured otherwise, for a fault of the sensor; what it depends on; and
+        its values, where it is a function of one coordinate or a surface. A curve in two coordinates is the
+        coefficient of the second.
     """
 
     name: str
     label: str
-    kind: Kind
+    kind: Kind = MECHANISM
     terms: Mapping[str, str]
     parameters: Mapping[str, Estimate]
     evidence: Evidence
+    share_of_excess: float = 0.0
+    indistinguishable_from: tuple[str, ...] | None = None
     equations: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
     coordinates: tuple[str, ...] = ()
     curve: DescribedCurve | None = None
     surface: DescribedSurface | None = None
     beside: tuple[str, ...] = ()
+    rivals: tuple[Rival, ...] = ()
+
+    def rival_names(self, standing: Standing) -> list[str]:
+        """Names of rivals, each once; their labels where the name alone is that of the mechanism itself."""
+        names = (
+            each.label if each.name in (self.name, GENERIC) else each.name
+            for each in self.rivals
+            if each.standing == standing
+        )
+        return list(dict.fromkeys(names))
 
 
 @dataclass(frozen=True)
@@ -230,7 +208,7 @@ class Description:
     """
 
     share_described: float
-    by: tuple[StatedMechanism, ...]
+    by: tuple[StatedTerm, ...]
     p_residuals_random: float
     random_forces_admitted: bool
     too_faint: bool = False
@@ -256,23 +234,6 @@ class UpperBound:
     unit: str
     parameter: str
     label: str
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """A whole explanation of the recordings, and how likely it makes them.
-
-    Attributes
-    ----------
-    what
-        What it consists of.
-    log_evidence
-        Logarithm of its marginal likelihood, less that of the likeliest; see
-        `siq.diagnosis.evidence.log_evidence_of`.
-    """
-
-    what: str
-    log_evidence: float
 
 
 @dataclass(frozen=True)
@@ -336,22 +297,23 @@ class Statement:
     not_fitted
         What could not be judged.
     explanations
-        Whole explanations that were compared, the likeliest first.
+        Logarithms of the marginal likelihoods of whole explanations, less that of the likeliest, which is the
+        first; see `siq.diagnosis.evidence.log_evidence_of`.
     account
         The work that it took, and whether something was left undone.
     """
 
     verdict: MismatchVerdict
-    mechanisms: tuple[StatedMechanism, ...] = ()
+    mechanisms: tuple[StatedTerm, ...] = ()
     description: Description | None = None
-    described: tuple[StatedFunction, ...] = ()
+    described: tuple[StatedTerm, ...] = ()
     location: Location | None = None
     recalibration: Mapping[str, Recalibrated] = field(default_factory=dict)
     errors: HeldOutErrors = field(default_factory=HeldOutErrors)
     excluded: Mapping[str, UpperBound] = field(default_factory=dict)
     remarks: tuple[Remark, ...] = ()
     not_fitted: tuple[NotFitted, ...] = ()
-    explanations: tuple[Explanation, ...] = ()
+    explanations: Mapping[str, float] = field(default_factory=dict)
     account: Account = UNLIMITED
 
     @property
@@ -391,8 +353,18 @@ class Statement:
         data: dict[str, Any] = to_jsonable_python(
             self, inf_nan_mode="null", fallback=lambda value: value.item()
         )
-        for each in (data["description"] or {}).get("by", ()):
+        by = (data["description"] or {}).get("by", ())
+        for each in (*data["mechanisms"], *by):
+            for name in ("kind", "outputs", "coordinates", "curve", "surface"):
+                del each[name]
+        for each in data["described"]:
+            for name in ("share_of_excess", "indistinguishable_from", "rivals"):
+                del each[name]
+        for each in by:
             del each["indistinguishable_from"]
+        data["explanations"] = [
+            {"what": what, "log_evidence": value} for what, value in data["explanations"].items()
+        ]
         data["fit"] = {"metric": METRIC} | data.pop("errors")
         data |= {"partial": self.partial, "not_tried": list(self.not_tried), "budget": data.pop("account")}
         data["remark_codes"] = data.pop("remarks")
@@ -409,5 +381,6 @@ class Statement:
             "errors": data["fit"],
             "account": data["budget"] | {"allowed": data["budget"]["allowed"] or float("inf")},
             "remarks": data["remark_codes"],
+            "explanations": {each["what"]: each["log_evidence"] for each in data["explanations"]},
         }
         return TypeAdapter(cls).validate_python({each.name: known[each.name] for each in fields(cls)})

@@ -31,6 +31,9 @@ from siq.systems.formulas import compile_values, exact_number
 
 Kind = Literal["formula", "curve", "surface", "mechanism"]
 FORMULA: Final = "formula"
+CURVE: Final = "curve"
+SURFACE: Final = "surface"
+MECHANISM: Final = "mechanism"
 FUNCTIONS_FITTED = 3  # places in which functions are fitted, the most likely ones: a choice
 SPLINE_KNOTS = 17  # enough for the shortest length of `siq.diagnosis.evidence.SMOOTH_LENGTHS`, two for each
 HAT_KNOTS = 9  # of piecewise linear functions: a choice

@@ -27,19 +27,19 @@ import sympy
 from siq.diagnosis.dictionary import Form, FurtherState, Mechanism, MechanismParameter, Role, Roles, Shape
 from siq.diagnosis.evidence import (
     NUMERICAL_ERRORS,
-    admissible,
+    FittedCandidate,
     correlation_time_left,
-    judged,
     log_evidence_of,
 )
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
 from siq.diagnosis.residual_structure import has_structure
 from siq.diagnosis.screening import screen_all, with_further_states
 from siq.diagnosis.search import FitContext, Search, best_probes
-from siq.diagnosis.smooth_functions import MECHANISM, SmoothFunction, Smoothness, Term, smoothness_of
+from siq.diagnosis.smooth_functions import SmoothFunction, Smoothness, Term, smoothness_of
 from siq.diagnosis.terms import (
     FORMULA,
     FUNCTIONS_FITTED,
+    MECHANISM,
     ONE,
     Place,
     coordinates_of,
@@ -190,7 +190,7 @@ def _fitted_term(
                 trial = preferred_fit(trial, damped)
             if not trial.converged:
                 raise NumericalFailure(trial.fault or "its fit does not settle")
-            fitted = judged(trial, fit, data, candidate, blocks=context.study.search.blocks)
+            fitted = FittedCandidate.of(trial, fit, data, candidate, blocks=context.study.search.blocks)
     except (*NUMERICAL_ERRORS, BudgetSpent) as error:
         LOGGER.info("%s as a %s cannot be fitted: %s", candidate.label, kind, error)
         return []
@@ -423,7 +423,7 @@ def _with_memories(fit: Fit, models: Sequence[AugmentedModel], context: FitConte
         begin = replace(fit, x=x)
         for part in _fitted_term(candidate, result.level, None, fit, cost, context, begin=begin):
             LOGGER.info("%s: chi2 better by %.1f", candidate.label, part.trial.delta_chi2)
-            if admissible(part.trial.fit, candidate):
+            if candidate.admits(part.trial.fit):
                 found.append(AugmentedModel((part,), part.trial.fit))
     return found
 
@@ -557,7 +557,7 @@ def fit_models_of_remainder(
     allowed = [
         each
         for each in models
-        if np.isfinite(each.fit.log_likelihood) and all(admissible(each.fit, name) for name in names)
+        if np.isfinite(each.fit.log_likelihood) and all(name.admits(each.fit) for name in names)
     ]
     return likeliest(allowed, base, data)
 

@@ -14,23 +14,22 @@ from siq.diagnosis.evidence import BUDGET_SPENT, correlation_time_left, log_evid
 from siq.diagnosis.investigation import HeldOutRuns, Investigation
 from siq.diagnosis.mechanisms import PROCESS_NOISE
 from siq.diagnosis.residual_structure import Structure
-from siq.diagnosis.smooth_functions import CURVE, SURFACE, Term
+from siq.diagnosis.smooth_functions import Term
 from siq.diagnosis.statement import (
     DescribedCurve,
     DescribedSurface,
     Description,
     Estimate,
     Evidence,
-    Explanation,
     Location,
     Recalibrated,
     Rival,
-    StatedFunction,
-    StatedMechanism,
+    StatedTerm,
     Statement,
     UpperBound,
 )
 from siq.diagnosis.study import MismatchVerdict
+from siq.diagnosis.terms import CURVE, SURFACE
 from siq.diagnosis.unnamed_models import AugmentedModel
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
@@ -127,7 +126,7 @@ def _standard_errors(fit: Fit) -> dict[str, float]:
     return dict(zip(names, map(float, fit.standard_errors), strict=True))
 
 
-def _explanations(investigation: Investigation, names: tuple[str, ...]) -> tuple[Explanation, ...]:
+def _explanations(investigation: Investigation, names: tuple[str, ...]) -> dict[str, float]:
     """Whole explanations with their evidence: parameters, with forces, with mechanisms, with functions."""
     search, data = investigation.search, investigation.context.data
     fits = [("other parameters", investigation.least_squares), ("other parameters", search.recalibrated)]
@@ -145,7 +144,7 @@ def _explanations(investigation: Investigation, names: tuple[str, ...]) -> tuple
             evidence[f"{what}{forces}"] = log_evidence_of(fit, data, correlated=correlated)
     best = max(evidence.values(), default=0.0)
     ranked = sorted(evidence.items(), key=lambda each: -each[1])
-    return tuple(Explanation(what, value - best) for what, value in ranked)
+    return {what: value - best for what, value in ranked}
 
 
 def _excluded(investigation: Investigation) -> dict[str, UpperBound]:
@@ -164,7 +163,7 @@ def _excluded(investigation: Investigation) -> dict[str, UpperBound]:
     return dict(sorted(bounds.items()))
 
 
-def _found_mechanisms(investigation: Investigation, card: Fit | None) -> tuple[StatedMechanism, ...]:
+def _found_mechanisms(investigation: Investigation, card: Fit | None) -> tuple[StatedTerm, ...]:
     """Every mechanism that was found, whether it is named or only describes; the estimates are the card's."""
     search = investigation.search
     if investigation.process_noise:
@@ -172,7 +171,7 @@ def _found_mechanisms(investigation: Investigation, card: Fit | None) -> tuple[S
         entries = zip(fit.model.states, fit.model.units, fit.noise.process, strict=True)
         driven = [entry for entry in entries if entry[2] > 0]
         return (
-            StatedMechanism(
+            StatedTerm(
                 name=PROCESS_NOISE,
                 label=PROCESS_NOISE,
                 terms={},
@@ -208,7 +207,7 @@ def _found_mechanisms(investigation: Investigation, card: Fit | None) -> tuple[S
         ]
         alike = {each.name for each in rivals if each.standing == "same"} - {candidate.name}
         stated.append(
-            StatedMechanism(
+            StatedTerm(
                 name=candidate.name,
                 label=candidate.label,
                 terms={name: str(formula) for name, formula in candidate.changes},
@@ -217,7 +216,7 @@ def _found_mechanisms(investigation: Investigation, card: Fit | None) -> tuple[S
                     for name in candidate.new
                     if name in known
                 },
-                evidence=Evidence(trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster, odds),
+                evidence=Evidence.of(trial, odds),
                 share_of_excess=investigation.remainder.share,
                 indistinguishable_from=tuple(sorted(alike)) if investigation.verdict.names else None,
                 equations=candidate.equations,
@@ -228,7 +227,7 @@ def _found_mechanisms(investigation: Investigation, card: Fit | None) -> tuple[S
     return tuple(stated)
 
 
-def _stated_function(part: Term, fit: Fit, beside: tuple[str, ...]) -> StatedFunction:
+def _stated_function(part: Term, fit: Fit, beside: tuple[str, ...]) -> StatedTerm:
     """A part of the model of what has no name, with its curve or surface and their standard errors."""
     trial, candidate, place, smooth = part.trial, part.trial.candidate, part.place, part.smooth
     errors, known = _standard_errors(fit), {entry.name: entry for entry in fit.model.parameters}
@@ -275,7 +274,7 @@ def _stated_function(part: Term, fit: Fit, beside: tuple[str, ...]) -> StatedFun
         surface = DescribedSurface(
             (words[0], words[1]), (tuple(at[0].tolist()), tuple(at[1].tolist())), rows[0], rows[1]
         )
-    return StatedFunction(
+    return StatedTerm(
         name=candidate.name,
         label=candidate.label,
         kind=part.kind,
@@ -283,7 +282,7 @@ def _stated_function(part: Term, fit: Fit, beside: tuple[str, ...]) -> StatedFun
         parameters={
             name: Estimate(known[name].value, errors.get(name), known[name].unit) for name in candidate.new
         },
-        evidence=Evidence(trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster),
+        evidence=Evidence.of(trial),
         equations=candidate.equations,
         outputs=()
         if candidate.equations

@@ -19,7 +19,7 @@ from markupsafe import Markup
 from markupsafe import escape as markup_escape
 
 from siq.diagnosis.dictionary import Mechanism
-from siq.diagnosis.statement import METRIC, StatedFunction, StatedMechanism, Statement
+from siq.diagnosis.statement import METRIC, StatedTerm, Statement
 from siq.diagnosis.study import MismatchVerdict
 from siq.numerics.text import p_text, value_text
 from siq.report.diagnosis_text import sentences_of
@@ -77,7 +77,7 @@ class Findings:
         return "process noise" if self.statement.random_forces else str(self.statement.verdict)
 
     @property
-    def named(self) -> list[StatedMechanism]:
+    def named(self) -> list[StatedTerm]:
         """What was named, or what describes a mismatch that has no name."""
         description = self.statement.description
         return [*self.statement.mechanisms, *(description.by if description else ())]
@@ -297,10 +297,10 @@ def _formulas(findings: Findings) -> list[FormulaRow]:
     return rows
 
 
-def _rows_of(part: StatedMechanism | StatedFunction, findings: Findings) -> list[FormulaRow]:
+def _rows_of(part: StatedTerm, findings: Findings) -> list[FormulaRow]:
     """The formulas of a mechanism or of what has no name, and what each is."""
     entry, words, rows = findings.entry(part.name), texts("tables")["smooth"], []
-    kind = part.kind if isinstance(part, StatedFunction) else ""
+    kind = part.kind
     for name, formula in part.terms.items():
         rows.append(
             FormulaRow(
@@ -353,7 +353,7 @@ def _rate_of(name: str) -> Markup:
     ).format(spoken, Markup(inside))
 
 
-def _parameters_of(parts: Sequence[StatedMechanism | StatedFunction], *, of: bool = False) -> pd.DataFrame:
+def _parameters_of(parts: Sequence[StatedTerm], *, of: bool = False) -> pd.DataFrame:
     """Parameters with errors and units; with `of`, what each is of."""
     rows = [
         ({"of": part.label} if of else {})
@@ -364,7 +364,7 @@ def _parameters_of(parts: Sequence[StatedMechanism | StatedFunction], *, of: boo
     return pd.DataFrame(rows)
 
 
-def _curve(part: StatedFunction) -> pd.DataFrame:
+def _curve(part: StatedTerm) -> pd.DataFrame:
     curve = part.curve
     assert curve is not None
     return pd.DataFrame(
@@ -375,7 +375,7 @@ def _curve(part: StatedFunction) -> pd.DataFrame:
     )
 
 
-def _evidence(parts: Sequence[StatedMechanism]) -> pd.DataFrame:
+def _evidence(parts: Sequence[StatedTerm]) -> pd.DataFrame:
     return pd.DataFrame(
         [
             {
@@ -409,8 +409,8 @@ def _explanations(statement: Statement) -> pd.DataFrame:
     told = len(statement.explanations) > 1 and statement.verdict in compared
     return pd.DataFrame(
         [
-            {"explanation": each.what, "log-evidence": round(each.log_evidence, 1)}
-            for each in (statement.explanations if told else ())
+            {"explanation": what, "log-evidence": round(value, 1)}
+            for what, value in (statement.explanations.items() if told else ())
         ]
     )
 

@@ -22,8 +22,9 @@ from siq.diagnosis.naming import NamingDecision
 from siq.diagnosis.residual_structure import Remainder
 from siq.diagnosis.screening import Probe
 from siq.diagnosis.search import FitContext, Search
-from siq.diagnosis.smooth_functions import MECHANISM, Term
+from siq.diagnosis.smooth_functions import Term
 from siq.diagnosis.study import MismatchVerdict, read_case
+from siq.diagnosis.terms import MECHANISM
 from siq.diagnosis.unnamed_models import AugmentedModel
 from siq.errors import InputError, NumericalFailure
 from siq.remarks import has_code

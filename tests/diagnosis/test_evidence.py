@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.diagnosis.evidence import _log_evidence, evidence_of_function, orthonormal, smooth_prior
+from siq.diagnosis.evidence import averaged_evidence, evidence_of_function, orthonormal, smooth_prior
 from siq.diagnosis.mechanisms import fresh_names
 from siq.diagnosis.naming import _best_shares
 from siq.diagnosis.study import SearchOptions
@@ -36,9 +36,7 @@ def test_the_evidence_is_that_of_a_normal_distribution() -> None:
     expected = -0.5 * np.linalg.slogdet(covariance)[1] - 20 * np.log(
         (target @ np.linalg.solve(covariance, target)) / (target @ target)
     )
-    found = _log_evidence(
-        columns.T @ columns, columns.T @ target, prior, total=float(target @ target), freedom=40
-    )
+    found = averaged_evidence(columns.T @ columns, columns.T @ target, [prior], float(target @ target), 40)
     assert found == pytest.approx(expected, rel=1e-9)
 
 

@@ -80,7 +80,7 @@ def test_evidence_counts_errors_that_hang_together_as_one() -> None:
 
 
 def trial_of(fit: SimpleNamespace) -> SimpleNamespace:
-    candidate = SimpleNamespace(name="overflow", label="overflow in h", positive=frozenset())
+    candidate = SimpleNamespace(name="overflow", label="overflow in h", admits=lambda _: True)
     return SimpleNamespace(fit=fit, candidate=candidate)
 
 
@@ -164,16 +164,14 @@ def test_every_row_is_left_out_once_and_never_fitted_then(count: int, samples: i
     data = decays(count, samples)
     seen = []
     every = list(_cross_validation_folds(data))
-    for part in every:
-        np.testing.assert_array_equal(part.rest.outputs, data.outputs[part.rows])
-        assert len(part.out.t) + len(part.rest.t) == len(data.t)
-        others = np.setdiff1d(np.arange(len(data.t)), part.rows)
-        np.testing.assert_array_equal(part.out.outputs, data.outputs[others])
-        assert part.out.first[-1] == len(part.out.t) and part.rest.first[-1] == len(part.rest.t)
+    for out, rest, rows in every:
+        np.testing.assert_array_equal(rest.outputs, data.outputs[rows])
+        assert len(out.t) + len(rest.t) == len(data.t)
+        others = np.setdiff1d(np.arange(len(data.t)), rows)
+        np.testing.assert_array_equal(out.outputs, data.outputs[others])
+        assert out.first[-1] == len(out.t) and rest.first[-1] == len(rest.t)
         # A stretch of time that was cut out is no gap that the rest runs across.
-        steps = [
-            np.diff(part.rest.t[a:b]) for a, b in zip(part.rest.first, part.rest.first[1:], strict=False)
-        ]
+        steps = [np.diff(rest.t[a:b]) for a, b in itertools.pairwise(rest.first)]
         assert np.concatenate(steps).max() < 1.5 * (data.t[1] - data.t[0])
         seen.append(others)
     assert len(every) == parts
@@ -187,7 +185,7 @@ def test_what_is_left_out_is_foreseen_up_to_noise_and_parameters_are_fitted_to_t
     assert squares is not None and len(squares) > 150
     right = np.sqrt(squares.mean())
     # A fifth of each tells where it begins.
-    spread = np.array([part.out.outputs[12:].std() for part in _cross_validation_folds(data)])
+    spread = np.array([out.outputs[12:].std() for out, _, _ in _cross_validation_folds(data)])
     assert right == pytest.approx(np.sqrt(np.mean((0.01 / spread) ** 2)), rel=0.3)
     # From wrong parameters it ends the same, since they are fitted again, but where they may not be.
     off = replace(fit, model=fit.model.with_values(np.array([1.3])))

@@ -14,7 +14,7 @@ from siq.data.recordings import Recordings
 from siq.diagnosis import naming
 from siq.diagnosis.dictionary import Roles, Shape
 from siq.diagnosis.evidence import FittedCandidate, _blocks_of, _correlated_probability, _correlation_time
-from siq.diagnosis.mechanisms import repeats
+from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.diagnosis.naming import NamingDecision, _judge_mechanisms
 from siq.diagnosis.residual_structure import Curve, Remainder, Structure
 from siq.diagnosis.screening import _screen
@@ -122,19 +122,17 @@ def test_an_amplitude_that_may_not_be_negative_is_zero_and_leaves_the_special_ca
 
 
 def test_a_mechanism_that_was_found_is_not_found_once_more_in_another_form() -> None:
-    def one(name: str, label: str, equations: tuple[str, ...], coordinate: str) -> SimpleNamespace:
+    def one(name: str, label: str, equations: tuple[str, ...], coordinate: str) -> MechanismCandidate:
         model = SimpleNamespace(states=("h", "g"))
-        return SimpleNamespace(
-            name=name, label=label, equations=equations, coordinate=coordinate, model=model
-        )
+        return MechanismCandidate(name, label, model, (), equations, coordinate)
 
     found = one("overflow", "overflow in h, g", ("h", "g"), "h")
-    assert repeats(one("overflow", "overflow in h", ("h",), "h"), found)
-    assert not repeats(one("overflow", "overflow in g", ("g",), "g"), found)
-    assert not repeats(one("leak", "leak in h", ("h",), "h"), found)
+    assert one("overflow", "overflow in h", ("h",), "h").repeats(found)
+    assert not one("overflow", "overflow in g", ("g",), "g").repeats(found)
+    assert not one("leak", "leak in h", ("h",), "h").repeats(found)
     # Two parameters may drift in time, each by its own.
     drift = one("parameter drift", "parameter drift in h (a)", ("h",), "t")
-    assert not repeats(one("parameter drift", "parameter drift in h (b)", ("h",), "t"), drift)
+    assert not one("parameter drift", "parameter drift in h (b)", ("h",), "t").repeats(drift)
 
 
 def place(coordinate: str, *equations: str) -> Place:

@@ -19,8 +19,7 @@ from siq.diagnosis.statement import (
     Location,
     Recalibrated,
     Rival,
-    StatedFunction,
-    StatedMechanism,
+    StatedTerm,
     Statement,
 )
 from siq.diagnosis.study import MismatchVerdict
@@ -34,7 +33,7 @@ SAME = 10.0
 CASES = range(300)
 
 
-def mechanism_of(draw: np.random.Generator, number: int) -> StatedMechanism:
+def mechanism_of(draw: np.random.Generator, number: int) -> StatedTerm:
     """A mechanism with rivals whose gains are drawn, and classed by them as the search does."""
     gain = float(draw.uniform(20, 5000))
     rivals = []
@@ -50,9 +49,10 @@ def mechanism_of(draw: np.random.Generator, number: int) -> StatedMechanism:
         for k in range(draw.integers(0, 3))
     }
     name = str(draw.choice(NAMES))
-    return StatedMechanism(
-        name, f"{name} in v", {"v": "-c_1*sign(v)"}, parameters,
-        Evidence(gain, 7 - gain, 0.0, 0.0), float(draw.choice([0.0, 0.4, 0.9994, 0.99997, 1.0])),
+    return StatedTerm(
+        name=name, label=f"{name} in v", terms={"v": "-c_1*sign(v)"}, parameters=parameters,
+        evidence=Evidence(gain, 7 - gain, 0.0, 0.0),
+        share_of_excess=float(draw.choice([0.0, 0.4, 0.9994, 0.99997, 1.0])),
         equations=("v",), rivals=tuple(rivals),
     )  # fmt: skip
 
@@ -118,7 +118,7 @@ def percentages(text: str) -> list[float]:
     return [float(number) * 10.0 ** int(power.translate(superscripts) or 0) for number, power in found]
 
 
-def mechanisms_in(statement: Statement) -> tuple[StatedMechanism, ...]:
+def mechanisms_in(statement: Statement) -> tuple[StatedTerm, ...]:
     return statement.mechanisms if statement.description is None else statement.description.by
 
 
@@ -212,11 +212,16 @@ def test_all_of_it_is_never_said_of_what_is_not_explained():
         assert ("looks like noise (p =" in text) == (description.p_residuals_random >= 2e-3)
 
 
+def curve_in_v() -> StatedTerm:
+    return StatedTerm(
+        name="a function of x", label="a function of x in v", kind="curve", terms={}, parameters={},
+        evidence=Evidence(90.0, -80.0, 0.0, 0.0), equations=("v",),
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize("described", [False, True])
 def test_a_model_without_a_name_is_said_with_its_gain_or_that_nothing_was_gained(described):
-    part = StatedFunction(
-        "a function of x", "a function of x in v", "curve", {}, {}, Evidence(90.0, -80.0, 0.0, 0.0), ("v",)
-    )
+    part = curve_in_v()
     augmented = 0.05 if described else 0.31
     errors = errors_with({"before": 0.5, "recalibrated": 0.3, "augmented": augmented}, 0.04)
     description = Description(0.0, (), 0.0, False)
@@ -232,9 +237,7 @@ def test_a_model_without_a_name_is_said_with_its_gain_or_that_nothing_was_gained
 
 
 def test_what_describes_a_rest_is_told_from_what_has_a_name():
-    part = StatedFunction(
-        "a function of x", "a function of x in v", "curve", {}, {}, Evidence(90.0, -80.0, 0.0, 0.0), ("v",)
-    )
+    part = curve_in_v()
     statement = statement_from(3, MismatchVerdict.MISSING_PHYSICS)
     runs = {"before": 0.5, "recalibrated": 0.3, "augmented": 0.05, "named": 0.2}
     errors = errors_with(runs, 0.04)
@@ -245,9 +248,10 @@ def test_what_describes_a_rest_is_told_from_what_has_a_name():
 
 
 def test_random_forces_are_a_verdict_of_their_own():
-    forces = StatedMechanism(
-        PROCESS_NOISE, PROCESS_NOISE, {}, {"intensity_v": Estimate(0.02, None, "m**2/s**3")},
-        Evidence(None, None, None, None), 1.0, indistinguishable_from=(),
+    forces = StatedTerm(
+        name=PROCESS_NOISE, label=PROCESS_NOISE, terms={},
+        parameters={"intensity_v": Estimate(0.02, None, "m**2/s**3")},
+        evidence=Evidence(None, None, None, None), share_of_excess=1.0, indistinguishable_from=(),
     )  # fmt: skip
     text = said(statement_from(1, MismatchVerdict.MISSING_PHYSICS, mechanisms=(forces,))).replace(
         "\u00a0", " "

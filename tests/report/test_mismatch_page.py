@@ -311,7 +311,7 @@ def test_the_model_of_what_has_no_name_is_on_the_page_and_drawn_with_its_band(mo
     page = mismatch_page(shown, title="t", commands=())
     assert "A model of what is missing" in page and re.search(r"1\.10+\s±\s0\.020?", page)
     assert "with what describes it" in page
-    explanations = [{"what": "drag in v", "log_evidence": 0.0}, {"what": "forces", "log_evidence": -31.25}]
+    explanations = {"drag in v": 0.0, "forces": -31.25}
     told = findings(models, verdict={"explanations": explanations})
     assert "\N{MINUS SIGN}31.2" in mismatch_page(told, title="t", commands=()).replace(
         "-31.2", "\N{MINUS SIGN}31.2"

@@ -202,7 +202,7 @@ def plot_described(
     Parameters
     ----------
     described
-        As ``verdict.json`` has them; see `siq.diagnosis.statement.StatedFunction`.
+        As ``verdict.json`` has them; see `siq.diagnosis.statement.StatedTerm`.
     units
         Units of states and inputs.
     time_unit
