@@ -26,7 +26,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from siq.data.layout import is_label, is_unit, read_heading
+from siq.data.layout import is_unit, read_heading
+from siq.data.recordings import TABLE
 from siq.errors import InputError
 from siq.numerics.files import missing_file
 from siq.remarks import Remark
@@ -71,8 +72,8 @@ class ColumnFile:
     remarks: tuple[Remark, ...] = ()
 
 
-def open_columns(path: str | Path) -> ColumnFile:
-    """Open a file of columns by its suffix.
+def open_columns(path: str | Path | pd.DataFrame) -> ColumnFile:
+    """Open a file of columns by its suffix, or a table in memory.
 
     Parameters
     ----------
@@ -86,6 +87,8 @@ def open_columns(path: str | Path) -> ColumnFile:
         When the suffix is unknown, or the file is missing, empty or damaged; `ColumnFile.load` raises it
         for columns that are no vectors of numbers or text, or that differ in length.
     """
+    if not isinstance(path, str | Path):
+        return _open_frame(path)
     file, suffix = str(path), Path(path).suffix.lower()
     exists, reader = Path(path).exists(), READERS.get(suffix)
     if not exists and (reader or not suffix):
@@ -109,16 +112,8 @@ def open_columns(path: str | Path) -> ColumnFile:
     return reader(file)
 
 
-def frame_columns(file: str, frame: pd.DataFrame) -> ColumnFile:
-    """The columns of a table in memory, as those of a file.
-
-    Parameters
-    ----------
-    file
-        What messages call the table.
-    frame
-        Columns may have a unit behind their name, or in ``frame.attrs["units"]``.
-    """
+def _open_frame(frame: pd.DataFrame) -> ColumnFile:
+    """The columns of a table in memory, which may have units in ``frame.attrs["units"]``."""
     headings = tuple(str(heading) for heading in frame.columns)
     known = frame.attrs.get("units", {})
 
@@ -129,7 +124,7 @@ def frame_columns(file: str, frame: pd.DataFrame) -> ColumnFile:
                 columns.append(pa.Array.from_pandas(frame.iloc[:, position]))
             except (pa.ArrowInvalid, pa.ArrowTypeError, pa.ArrowNotImplementedError):
                 fault = "it holds a mixture of things, not numbers in one unit"
-                raise InputError(file, f"column {headings[position]}", fault, "make it numbers") from None
+                raise InputError(TABLE, f"column {headings[position]}", fault, "make it numbers") from None
         return columns
 
     return ColumnFile(headings, tuple(known.get(read_heading(one).title) for one in headings), load)
@@ -192,7 +187,7 @@ def _open_text(file: str) -> ColumnFile:
         body = b"\n".join(line for line in body.splitlines() if not line.startswith(marks))
     if separator == " ":
         body, separator = b"\n".join(b"\t".join(line.split()) for line in body.splitlines()), "\t"
-    labels = [place for place, heading in enumerate(headings) if is_label(read_heading(heading).title)]
+    labels = [place for place, heading in enumerate(headings) if read_heading(heading).is_label]
     names = [str(position) for position in range(len(headings))]
 
     def load(positions: Sequence[int]) -> list[Column]:

@@ -69,6 +69,11 @@ class _Heading(NamedTuple):
     title: str
     unit: str | None
 
+    @property
+    def is_label(self) -> bool:
+        """Whether such a column says which recording a row belongs to."""
+        return _plain(self.title) in LABEL_NAMES
+
 
 def is_unit(text: str) -> bool:
     """Whether text reads as a unit: ``mm``, ``µm/s``, ``kg m^-3``, ``arb. units``.
@@ -127,11 +132,6 @@ def usable_name(title: str) -> str:
 def _is_time(title: str) -> bool:
     """Whether a column of this title is the time."""
     return _plain(title) in TIME_NAMES
-
-
-def is_label(title: str) -> bool:
-    """Whether a column of this title says which recording a row belongs to."""
-    return _plain(title) in LABEL_NAMES
 
 
 def _plain(title: str) -> str:
@@ -200,7 +200,7 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
     free = [place for place in free if place not in dropped]
     time = _time_column(file, source.headings, parts, free, remarks)
     free.remove(time)
-    recording = _label_column(source, plain, free, remarks)
+    recording = _label_column(source, parts, free, remarks)
     if columns is None:
         others = [place for place in free if place != recording and _is_second_time(source, parts, place)]
         for place in others:
@@ -274,12 +274,15 @@ def _time_column(
     raise InputError(file, "", "the column 't' is missing", remedy)
 
 
-def _label_column(source: ColumnFile, plain: list[str], free: list[int], remarks: list[Remark]) -> int | None:
+def _label_column(
+    source: ColumnFile, parts: list[_Heading], free: list[int], remarks: list[Remark]
+) -> int | None:
     """The column of labels, None where there is none; one that counts the rows is taken out of `free`."""
+    plain = [part.title for part in parts]
     if "recording" in plain:
         return plain.index("recording")
     for place in free:
-        if not is_label(plain[place]):
+        if not parts[place].is_label:
             continue
         values = _numbers(source, place)
         if values is not None and (np.any(values != np.round(values)) or np.isnan(values).all()):

@@ -195,6 +195,53 @@ class Recordings:
             np.concatenate(parts), time_unit,
         )  # fmt: skip
 
+    def select(self, indices: Sequence[int] | np.ndarray) -> Recordings:
+        """Whole recordings, in the order given.
+
+        Parameters
+        ----------
+        indices
+            Indices into `labels`, not of rows. One that stands twice gives copies, told apart by their
+            labels: ``r07``, ``r07#2``.
+
+        Raises
+        ------
+        ValueError
+            When `indices` is empty, is a mask, or points outside the recordings.
+        """
+        chosen = np.asarray(indices)
+        count = len(self.labels)
+        if chosen.ndim != 1 or chosen.dtype.kind not in "iu" or chosen.size == 0:
+            raise ValueError("recordings are selected by a list of at least one index")
+        if chosen.min() < 0 or chosen.max() >= count:
+            raise ValueError(f"a selected recording is not one of 0 ... {count - 1}")
+        taken = set(self.labels)  # a label of the file may itself look like that of a copy
+        copies: dict[int, int] = {}
+        labels = []
+        for index in chosen.tolist():
+            label, copy = self.labels[index], copies.get(index, 0) + 1
+            while copy > 1 and f"{label}#{copy}" in taken:
+                copy += 1
+            copies[index] = copy
+            labels.append(label if copy == 1 else f"{label}#{copy}")
+            taken.add(labels[-1])
+        bounds = np.searchsorted(self.recording, np.arange(count + 1))
+        lengths = np.diff(bounds)[chosen]
+        begins = np.cumsum(lengths) - lengths
+        rows = np.arange(lengths.sum()) + np.repeat(bounds[chosen] - begins, lengths)
+        return replace(
+            self, labels=tuple(labels), recording=np.repeat(np.arange(len(chosen)), lengths),
+            t=self.t[rows], values=self.values[rows],
+        )  # fmt: skip
+
+    def resampled(self, *, generator: np.random.Generator) -> Recordings:
+        """As many recordings, drawn with replacement: one bootstrap sample.
+
+        Whole recordings are drawn, not rows, since the samples of one recording are not independent.
+        """
+        count = len(self.labels)
+        return self.select(generator.integers(count, size=count))
+
 
 @dataclass(frozen=True)
 class SnapshotPairs:
@@ -352,67 +399,6 @@ def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) ->
         h=gap[keep],
         recording=parent_recordings(recordings.labels)[recording[:-1][keep]],
     )
-
-
-def select_recordings(recordings: Recordings, indices: Sequence[int] | np.ndarray) -> Recordings:
-    """Take whole recordings, in the order given.
-
-    Parameters
-    ----------
-    recordings
-        The trajectories.
-    indices
-        Indices into ``recordings.labels``, not of rows. One that stands twice gives copies, told apart by
-        their labels: ``r07``, ``r07#2``.
-
-    Raises
-    ------
-    ValueError
-        When `indices` is empty, is a mask, or points outside the recordings.
-    """
-    chosen = np.asarray(indices)
-    count = len(recordings.labels)
-    if chosen.ndim != 1 or chosen.dtype.kind not in "iu" or chosen.size == 0:
-        raise ValueError("recordings are selected by a list of at least one index")
-    if chosen.min() < 0 or chosen.max() >= count:
-        raise ValueError(f"a selected recording is not one of 0 ... {count - 1}")
-    taken = set(recordings.labels)  # a label of the file may itself look like that of a copy
-    copies: dict[int, int] = {}
-    labels = []
-    for index in chosen.tolist():
-        label, copy = recordings.labels[index], copies.get(index, 0) + 1
-        while copy > 1 and f"{label}#{copy}" in taken:
-            copy += 1
-        copies[index] = copy
-        labels.append(label if copy == 1 else f"{label}#{copy}")
-        taken.add(labels[-1])
-    bounds = np.searchsorted(recordings.recording, np.arange(count + 1))
-    lengths = np.diff(bounds)[chosen]
-    begins = np.cumsum(lengths) - lengths
-    rows = np.arange(lengths.sum()) + np.repeat(bounds[chosen] - begins, lengths)
-    return replace(
-        recordings,
-        labels=tuple(labels),
-        recording=np.repeat(np.arange(len(chosen)), lengths),
-        t=recordings.t[rows],
-        values=recordings.values[rows],
-    )
-
-
-def resample_recordings(recordings: Recordings, *, generator: np.random.Generator) -> Recordings:
-    """Draw as many recordings as there are, with replacement: one bootstrap sample.
-
-    Whole recordings are drawn, not rows, since the samples of one recording are not independent.
-
-    Parameters
-    ----------
-    recordings
-        The trajectories.
-    generator
-        Where the draw comes from; the only source of chance.
-    """
-    count = len(recordings.labels)
-    return select_recordings(recordings, generator.integers(count, size=count))
 
 
 def parent_recordings(labels: tuple[str, ...]) -> np.ndarray:

@@ -22,7 +22,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from siq.data.formats import Column, ColumnFile, frame_columns, open_columns
+from siq.data.formats import Column, ColumnFile, open_columns
 from siq.data.layout import layout_of
 from siq.data.recordings import TABLE, Recordings
 from siq.errors import InputError
@@ -68,7 +68,7 @@ def read_tables(
     See `siq.data.recordings.read_recordings`.
     """
     if isinstance(source, pd.DataFrame):
-        return _checked(TABLE, frame_columns(TABLE, source), columns, units, gaps)
+        return _checked(TABLE, open_columns(source), columns, units, gaps)
     if not Path(source).is_dir():
         return _checked(str(source), open_columns(source), columns, units, gaps)
     files = files_of(Path(source))

@@ -163,6 +163,24 @@ class DwellCount:
     visits: int
     time: float
 
+    @classmethod
+    def of_visits(
+        cls, t: np.ndarray, visits: np.ndarray, runs: list[slice], *, states: int = 2
+    ) -> tuple[DwellCount, ...]:
+        """Time spent in each state, and visits that ended in another, from the state at each sample.
+
+        The first and the last visit of a run count with the time that was seen of them; only the last has no
+        end.
+        """
+        spent, ended = np.zeros(states), np.zeros(states, dtype=int)
+        for run in runs:
+            inside, gaps = visits[run], np.diff(t[run])
+            before, known = inside[:-1], inside[:-1] >= 0
+            spent += np.bincount(before[known], weights=gaps[known], minlength=states)
+            hops = known & (inside[1:] != before)
+            ended += np.bincount(before[hops], minlength=states)
+        return tuple(cls(int(n), float(time)) for n, time in zip(ended, spent, strict=True))
+
     @property
     def mean(self) -> float:
         """Mean dwell time; NaN where no visit ended."""
@@ -209,23 +227,6 @@ def continued_visits(core: np.ndarray, runs: list[slice]) -> np.ndarray:
         last = np.maximum.accumulate(np.where(part >= 0, np.arange(len(part)), -1))
         visits[run] = np.where(last >= 0, part[np.maximum(last, 0)], -1)
     return visits
-
-
-def dwell_counts(
-    t: np.ndarray, visits: np.ndarray, runs: list[slice], *, states: int = 2
-) -> tuple[DwellCount, ...]:
-    """Time spent in each state, and visits that ended in another: one for each.
-
-    The first and the last visit of a run count with the time that was seen of them; only the last has no end.
-    """
-    spent, ended = np.zeros(states), np.zeros(states, dtype=int)
-    for run in runs:
-        inside, gaps = visits[run], np.diff(t[run])
-        before, known = inside[:-1], inside[:-1] >= 0
-        spent += np.bincount(before[known], weights=gaps[known], minlength=states)
-        hops = known & (inside[1:] != before)
-        ended += np.bincount(before[hops], minlength=states)
-    return tuple(DwellCount(int(n), float(time)) for n, time in zip(ended, spent, strict=True))
 
 
 SURROGATES = 999  # for each state that is looked at: fewer could not be rare enough for all of them
@@ -446,7 +447,7 @@ def switching(recordings: Recordings, *, generator: np.random.Generator | None =
     values = recordings.values[:, state]
     background, levels = _two_levels(recordings, values, runs, relaxation)
     visits = _counted_visits(values - background.values, runs, levels)
-    lower, upper = dwell_counts(recordings.t, visits, runs)
+    lower, upper = DwellCount.of_visits(recordings.t, visits, runs)
     chance = min(2 * probability * len(tests), 1.0)
     return Switching(state, levels, (lower, upper), visits, background, chance)
 

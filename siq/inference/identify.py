@@ -26,7 +26,6 @@ from siq.data.recordings import (
     Recordings,
     SnapshotPairs,
     held_out_recordings,
-    select_recordings,
     snapshot_pairs,
 )
 from siq.errors import NumericalFailure
@@ -184,8 +183,8 @@ class _Case:
         self.given, self.units, self.limits = given, units, limits
         self.pair_step, self.integrator_step = pair_step, integrator_step
         held = held_out_recordings(recordings, generator=draw(Purpose.HOLD_OUT))
-        self.training = select_recordings(recordings, np.flatnonzero(~held))
-        self.held_out = select_recordings(recordings, np.flatnonzero(held))
+        self.training = recordings.select(np.flatnonzero(~held))
+        self.held_out = recordings.select(np.flatnonzero(held))
 
     def identified(self) -> FieldEstimate:
         """By the method that noise and correlations of the recordings ask for."""
@@ -392,7 +391,7 @@ class _Case:
                 found = replace(found, diagnosis=replace(noise, remarks=remarks))
         if found.noise_free:
             chosen = np.arange(min(len(self.held_out.labels), PREDICTED_RECORDINGS))
-            errors = prediction_errors(found.dynamics, select_recordings(self.held_out, chosen))
+            errors = prediction_errors(found.dynamics, self.held_out.select(chosen))
             return self._tested(found, errors=errors)
         if found.diffusion.constant:
             generator = self.draw(Purpose.STABILITY)

@@ -50,7 +50,6 @@ from siq.data.two_states import (
     DwellCount,
     Switching,
     continued_visits,
-    dwell_counts,
     switching,
 )
 from siq.errors import NumericalFailure
@@ -604,8 +603,8 @@ def check_occupancy(
     visits = continued_visits(cores.of(recordings.values), runs_of(joined(recordings)))
     apart = [run for run in runs if held_out[recordings.recording[run.start]]]
     states = len(portrait.attractors)
-    whole = dwell_counts(recordings.t, visits, runs_of(joined(recordings)), states=states)
-    held = dwell_counts(recordings.t, visits, apart, states=states)
+    whole = DwellCount.of_visits(recordings.t, visits, runs_of(joined(recordings)), states=states)
+    held = DwellCount.of_visits(recordings.t, visits, apart, states=states)
     if found.dynamics.dimension not in CELLS and not any(one.visits for one in whole):
         return OccupancyCheck(missing="the recordings do not hop")
     sampled = cores.as_sampled(found.dynamics, noise.intensity, usual_step(recordings))

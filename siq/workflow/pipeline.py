@@ -19,7 +19,7 @@ import pandas as pd
 
 from siq.data.inspection import seen_states
 from siq.data.preparation import in_stretches, joined, without_slow_drift
-from siq.data.recordings import Recordings, recordings_of, resample_recordings, snapshot_pairs
+from siq.data.recordings import Recordings, recordings_of, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
 from siq.inference.identify import identify
@@ -67,7 +67,7 @@ def draw_run(
         source = in_stretches(without_slow_drift(source), hidden_velocities=hidden)
         if number > 0:
             draw = generator(settings.seed, number, Purpose.RESAMPLE)
-            source = resample_recordings(source, generator=draw)
+            source = source.resampled(generator=draw)
         return StepResult(source, Outcome(number, Step.RESAMPLE, reason="; ".join(source.notes)))
     assert settings.simulation is not None  # a system is simulated
     try:

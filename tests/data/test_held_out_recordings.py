@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from siq.data.recordings import Recordings, held_out_recordings, resample_recordings, select_recordings
+from siq.data.recordings import Recordings, held_out_recordings
 from siq.errors import NumericalFailure
 
 
@@ -37,7 +37,7 @@ def test_which_ones_are_held_out_depends_on_the_generator_alone() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_copies_of_a_resampled_recording_stay_together(seed: int) -> None:
-    data = resample_recordings(recordings(12), generator=np.random.default_rng(seed))
+    data = recordings(12).resampled(generator=np.random.default_rng(seed))
     mask = held(data, seed)
     originals = [label.split("#")[0] for label in data.labels]
     assert len(set(originals)) < 12
@@ -48,6 +48,6 @@ def test_copies_of_a_resampled_recording_stay_together(seed: int) -> None:
 def test_one_recording_cannot_be_held_out() -> None:
     with pytest.raises(NumericalFailure, match="there is only one recording"):
         held(recordings(1), 0)
-    copies = select_recordings(recordings(3), [1, 1, 1])
+    copies = recordings(3).select([1, 1, 1])
     with pytest.raises(NumericalFailure, match="there is only one recording"):
         held(copies, 0)

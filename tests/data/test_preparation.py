@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from siq.data.preparation import in_stretches, joined
-from siq.data.recordings import Recordings, resample_recordings, select_recordings
+from siq.data.recordings import Recordings
 from siq.data.stationarity import runs_of
 
 
@@ -32,12 +32,12 @@ def test_stretches_of_one_recording_are_one_run_again() -> None:
 
 def test_stretches_that_do_not_follow_each_other_stay_apart() -> None:
     cut = in_stretches(walk())
-    without = select_recordings(cut, [0, 1, 3, 4, 5])
+    without = cut.select([0, 1, 3, 4, 5])
     assert [run.stop - run.start for run in runs_of(joined(without))] == [
         int((without.recording < 2).sum()),
         int((without.recording >= 2).sum()),
     ]
-    drawn = resample_recordings(cut, generator=np.random.default_rng(0))
+    drawn = cut.resampled(generator=np.random.default_rng(0))
     assert len(set(joined(drawn).labels)) == len(joined(drawn).labels)
 
 

@@ -15,8 +15,6 @@ from scipy.io import savemat
 from siq.data.recordings import (
     Recordings,
     read_recordings,
-    resample_recordings,
-    select_recordings,
     snapshot_pairs,
     write_recordings,
 )
@@ -161,7 +159,7 @@ def test_rows_of_one_recording_need_not_stand_together(tmp_path: Path) -> None:
     table.iloc[order].to_parquet(tmp_path / "a.parquet", index=False)
     mixed = read_recordings(tmp_path / "a.parquet")
     assert mixed.labels == tuple(dict.fromkeys(table["recording"].iloc[order]))
-    back = select_recordings(mixed, [mixed.labels.index(label) for label in ours.labels])
+    back = mixed.select([mixed.labels.index(label) for label in ours.labels])
     assert_identical(back, ours)
 
 
@@ -329,7 +327,7 @@ def test_pairs_do_not_depend_on_the_order_of_recordings() -> None:
         return {np.r_[x0, xh, h].tobytes() for x0, xh, h in zip(pairs.x0, pairs.xh, pairs.h, strict=True)}  # type: ignore[attr-defined]
 
     for order in itertools.islice(itertools.permutations(range(4)), 1, None, 5):
-        pairs = snapshot_pairs(select_recordings(ours, order), pair_step=0.17)
+        pairs = snapshot_pairs(ours.select(order), pair_step=0.17)
         assert rows(pairs) == rows(expected) and len(pairs.h) == len(expected.h)
 
 
@@ -348,8 +346,8 @@ def test_pair_step_forgives_rounding_only(start: float) -> None:
 
 def test_resampling_draws_whole_recordings() -> None:
     ours = recordings(lengths=(3, 1, 5, 2, 4, 2, 6, 3))
-    drawn = resample_recordings(ours, generator=np.random.default_rng(3))
-    assert_identical(drawn, resample_recordings(ours, generator=np.random.default_rng(3)))
+    drawn = ours.resampled(generator=np.random.default_rng(3))
+    assert_identical(drawn, ours.resampled(generator=np.random.default_rng(3)))
     assert len(drawn.labels) == len(set(drawn.labels)) == 8
     assert any("#2" in label for label in drawn.labels)
     for index, label in enumerate(drawn.labels):
@@ -360,13 +358,13 @@ def test_resampling_draws_whole_recordings() -> None:
 
 def test_copies_never_take_a_label_that_exists() -> None:
     ours = dataclasses.replace(recordings(lengths=(2, 2)), labels=("a", "a#2"))
-    assert select_recordings(ours, [0, 0, 1, 0, 1]).labels == ("a", "a#3", "a#2", "a#4", "a#2#2")
+    assert ours.select([0, 0, 1, 0, 1]).labels == ("a", "a#3", "a#2", "a#4", "a#2#2")
 
 
 @pytest.mark.parametrize("indices", [[], [4], [-1], [True, False, True, True], [0.0]])
 def test_a_selection_is_of_existing_recordings(indices: list[float]) -> None:
     with pytest.raises(ValueError, match="select"):
-        select_recordings(recordings(), indices)  # type: ignore[arg-type]
+        recordings().select(indices)  # type: ignore[arg-type]
 
 
 def test_a_table_in_memory_is_read_as_the_same_file_is(tmp_path: Path) -> None:

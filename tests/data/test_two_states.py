@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 from siq.data.preparation import in_stretches, without_slow_drift
 from siq.data.recordings import Recordings
 from siq.data.stationarity import background_of, correlated_samples, relaxation_samples, runs_of, usual_step
-from siq.data.two_states import DwellCount, _counted_visits, dwell_counts, switching
+from siq.data.two_states import DwellCount, _counted_visits, switching
 
 STEP, COUNT = 0.05, 20_000
 TIME = STEP * np.arange(COUNT)
@@ -70,7 +70,7 @@ def test_visits_go_from_level_to_level() -> None:
     runs = runs_of(recordings)
     visits = _counted_visits(x, runs, (-1.0, 1.0))
     assert visits.tolist() == [-1, 0, 0, 0, 1, 1, 1, 0, 0]
-    low, high = dwell_counts(recordings.t, visits, runs)
+    low, high = DwellCount.of_visits(recordings.t, visits, runs)
     assert (low, high) == (DwellCount(1, 4.0), DwellCount(1, 3.0))
 
 
@@ -79,7 +79,7 @@ def test_a_gap_in_time_ends_no_visit() -> None:
     x = np.array([-1.0, -1.0, -1.0, 1.0, 1.0, -1.0])
     recordings = Recordings.from_arrays(t, x[:, None], names=["x"])
     runs = runs_of(recordings)
-    low, high = dwell_counts(t, _counted_visits(x, runs, (-1.0, 1.0)), runs)
+    low, high = DwellCount.of_visits(t, _counted_visits(x, runs, (-1.0, 1.0)), runs)
     assert (low, high) == (DwellCount(0, 2.0), DwellCount(1, 2.0))
 
 

@@ -16,7 +16,7 @@ from known_systems import (
     uniform_points,
 )
 
-from siq.data.recordings import Recordings, SnapshotPairs, select_recordings, snapshot_pairs
+from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate, FlowMap
 from siq.inference.library import IdentificationOptions, candidate_library, field_library
@@ -165,7 +165,7 @@ def test_the_order_of_recordings_does_not_matter() -> None:
     order = np.random.default_rng(1).permutation(len(recordings.labels))
     one, two = (
         identified(TURNING, snapshot_pairs(each, pair_step=0.02), integrator_step=0.01)
-        for each in (recordings, select_recordings(recordings, order))
+        for each in (recordings, recordings.select(order))
     )
     np.testing.assert_array_equal(one.support, two.support)
     np.testing.assert_allclose(one.values, two.values, rtol=1e-9)

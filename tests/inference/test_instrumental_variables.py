@@ -7,7 +7,7 @@ import pytest
 from remembering import STEP, double_wells, trap
 
 from siq.data.correlation import markov_lag
-from siq.data.recordings import Recordings, select_recordings
+from siq.data.recordings import Recordings
 from siq.errors import NumericalFailure
 from siq.inference.checks import mean_residual_probability
 from siq.inference.field_estimate import FieldEstimate
@@ -77,9 +77,7 @@ def test_coarse_pairs_do_not_overlap() -> None:
 def test_held_out_residuals_have_a_mean_for_a_wrong_f_alone() -> None:
     recordings = recorded(double_wells(4, memory=3.0, samples=10_000))
     held = np.arange(8) >= 6
-    training, unseen = (
-        lagged_pairs(select_recordings(recordings, np.flatnonzero(some)), 15) for some in (~held, held)
-    )
+    training, unseen = (lagged_pairs(recordings.select(np.flatnonzero(some)), 15) for some in (~held, held))
     fitted = refit(identified(recordings, 15), training)
     seen = len(training.h)
     assert mean_residual_probability(fitted, unseen, seen=seen) > 1e-3

@@ -10,7 +10,7 @@ from remembering import STEP as TIME
 from remembering import double_wells
 
 from siq.data.correlation import markov_lag
-from siq.data.recordings import Recordings, select_recordings, snapshot_pairs
+from siq.data.recordings import Recordings, snapshot_pairs
 from siq.inference.field_estimate import FieldEstimate
 from siq.inference.identify import _possible_exposures, identify
 from siq.inference.kalman_filter import Noise
@@ -109,7 +109,7 @@ def test_held_out_recordings_refuse_an_f_that_lacks_a_term(
     found: tuple[FieldEstimate, Recordings, np.ndarray],
 ) -> None:
     one, recordings, _ = found
-    parts = select_recordings(recordings, [0, 1, 2, 3]), select_recordings(recordings, [4, 5])
+    parts = recordings.select([0, 1, 2, 3]), recordings.select([4, 5])
     probability, ratio = held_out_innovations(one, *parts)
     assert probability > 1e-3 and ratio == pytest.approx(1.0, abs=0.05)
     linear = replace(one, support=one.support[:1], covariance=one.covariance[:1, :1])

@@ -14,7 +14,7 @@ from known_systems import (
 )
 from scipy.linalg import expm
 
-from siq.data.recordings import Recordings, select_recordings
+from siq.data.recordings import Recordings
 from siq.inference.checks import predict, prediction_errors
 from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
@@ -97,7 +97,7 @@ def test_a_wrong_f_does_not_predict() -> None:
 
 
 def test_a_prediction_that_runs_away_has_an_infinite_error() -> None:
-    recordings = select_recordings(simulated(archetype(2)), [0, 1, 2])
+    recordings = simulated(archetype(2)).select([0, 1, 2])
     runaway = Dynamics.of((x, y), (x**3 + 1, y**3 + 5 * y))
     errors = prediction_errors(runaway, recordings)
     assert (errors > 1).all()

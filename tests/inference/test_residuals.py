@@ -8,7 +8,7 @@ import pytest
 import sympy
 from known_systems import KnownSystem, archetype, as_system, double_well, maier_stein
 
-from siq.data.recordings import Recordings, select_recordings, snapshot_pairs
+from siq.data.recordings import Recordings, snapshot_pairs
 from siq.inference.checks import mean_residual_probability, residual_noise
 from siq.inference.field_estimate import FieldEstimate, NoiseDiagnosis
 from siq.inference.library import IdentificationOptions, field_library
@@ -173,8 +173,8 @@ def test_units_do_not_matter() -> None:
 def test_held_out_residuals_have_no_mean_for_the_right_f_and_one_for_a_wrong_f() -> None:
     recordings = recorded(maier_stein(1), intensity=0.02)
     half = np.arange(75)
-    fitted = identified(select_recordings(recordings, half), euler=True)
-    unseen = snapshot_pairs(select_recordings(recordings, half + 75), pair_step=STEP)
+    fitted = identified(recordings.select(half), euler=True)
+    unseen = snapshot_pairs(recordings.select(half + 75), pair_step=STEP)
     assert mean_residual_probability(fitted, unseen) > 0.01
     wrong = fitted.coefficients.copy()
     wrong[fitted.support[0, 1], fitted.support[0, 0]] *= 1.5
@@ -183,11 +183,11 @@ def test_held_out_residuals_have_no_mean_for_the_right_f_and_one_for_a_wrong_f()
 
 def test_the_probability_of_the_mean_is_uniform_for_the_right_f() -> None:
     recordings = recorded(maier_stein(1), intensity=0.02, trajectories=400)
-    fitted = identified(select_recordings(recordings, np.arange(200)), euler=True)
+    fitted = identified(recordings.select(np.arange(200)), euler=True)
     found = [
         mean_residual_probability(
             fitted,
-            snapshot_pairs(select_recordings(recordings, np.arange(200 + k, 400, 10)), pair_step=STEP),
+            snapshot_pairs(recordings.select(np.arange(200 + k, 400, 10)), pair_step=STEP),
         )
         for k in range(10)
     ]

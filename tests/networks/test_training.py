@@ -10,7 +10,7 @@ import pytest
 import torch
 from known_settings import PAPER
 
-from siq.data.recordings import Recordings, SnapshotPairs, resample_recordings, snapshot_pairs
+from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.errors import InputError, NumericalFailure
 from siq.networks.decomposition import TrainingOptions, load_networks, pack, save_networks
 from siq.networks.networks import _Components, at_rest, dynamics_loss, orthogonality_loss
@@ -245,7 +245,7 @@ def test_copies_of_a_resampled_recording_do_not_both_train_and_measure() -> None
         t=np.tile(0.1 * np.arange(5), 12),
         values=draw.normal(size=(60, 2)),
     )
-    pairs = snapshot_pairs(resample_recordings(recordings, generator=draw))
+    pairs = snapshot_pairs(recordings.resampled(generator=draw))
     divided = prepare_data(pairs, options=OPTIONS, generator=draw)
     training = {tuple(row) for row in divided.training.x0}
     assert not training & {tuple(row) for row in divided.held_out.x0}

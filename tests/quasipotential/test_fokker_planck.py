@@ -9,7 +9,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from siq.data.recordings import Recordings
 from siq.data.stationarity import runs_of
-from siq.data.two_states import continued_visits, dwell_counts
+from siq.data.two_states import DwellCount, continued_visits
 from siq.errors import NumericalFailure
 from siq.quasipotential.occupancy import _cell_process, _Cores
 from siq.systems.diffusion import Diffusion
@@ -87,7 +87,7 @@ def test_two_states_against_a_simulation() -> None:
     levels = np.full(2, 0.4)
     recordings = Recordings.from_arrays(step * np.arange(steps), seen.transpose(1, 0, 2), names=["x", "y"])
     visits = continued_visits(_Cores(attractors, hessians, levels).of(recordings.values), runs_of(recordings))
-    counts = dwell_counts(recordings.t, visits, runs_of(recordings))
+    counts = DwellCount.of_visits(recordings.t, visits, runs_of(recordings))
     process = _cell_process(system, intensity, np.array([[-2.4, 2.4], [-2.2, 2.2]]), cells=100)
     core = _Cores(attractors, hessians, levels).of(process.points)
     for well, count in enumerate(counts):

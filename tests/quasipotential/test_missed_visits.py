@@ -7,7 +7,7 @@ import pytest
 
 from siq.data.preparation import in_stretches
 from siq.data.recordings import Recordings
-from siq.data.two_states import SIGNIFICANCE, continued_visits, dwell_counts
+from siq.data.two_states import SIGNIFICANCE, DwellCount, continued_visits
 from siq.inference.field_estimate import FieldEstimate, FlowMap
 from siq.inference.library import IdentificationOptions, field_library
 from siq.quasipotential.occupancy import _cell_process, _cores_about, check_occupancy
@@ -57,7 +57,7 @@ def test_visits_are_foreseen_as_samples_show_them(intensity: float, step: float)
     values = record(intensity, step, 800, recordings=400, substeps=10)
     runs = [slice(start, start + 800) for start in range(0, values.size, 800)]
     visits = continued_visits(cores.of(values.reshape(-1, 1)), runs)
-    counts = dwell_counts(np.tile(step * np.arange(800), 400), visits, runs)
+    counts = DwellCount.of_visits(np.tile(step * np.arange(800), 400), visits, runs)
     counted = sum(one.time for one in counts) / sum(one.visits for one in counts)
     process = _cell_process(dynamics, intensity, np.array([[-3.5, 3.5]]))
     always, sampled = (
