@@ -490,6 +490,16 @@ class _Shooting:
             length /= 2
         return None
 
+    def fit(
+        self, x: np.ndarray, along: Linearisation, noise: Noise, *, estimate_process: bool, most: int
+    ) -> Fit:
+        """The fit that begins at the model's values and states ``(n, d)``, in at most so many steps."""
+        begin = _Iterate(self.model.values, x, along, x)
+        return _or_fault(
+            self.model, begin, noise, self.grid.substeps,
+            lambda: self.descended(begin, noise, estimate_process=estimate_process, most=most),
+        )  # fmt: skip
+
     def descended(self, now: _Iterate, noise: Noise, *, estimate_process: bool, most: int) -> Fit:
         """Gauss–Newton steps from a begin, at most so many."""
         data, model = self.grid.data, self.model
@@ -585,11 +595,8 @@ def fit_by_multiple_shooting(
     """
     with np.errstate(all="ignore"):  # what runs away is told as a fault
         shooting = _Shooting(model, data, x, substeps, budget=budget)
-        begin = _Iterate(model.values, x, linearise(model, shooting.grid, model.values, x), x)
-        fit = _or_fault(
-            model, begin, noise, shooting.grid.substeps,
-            lambda: shooting.descended(begin, noise, estimate_process=estimate_process, most=iterations),
-        )  # fmt: skip
+        along = linearise(model, shooting.grid, model.values, x)
+        fit = shooting.fit(x, along, noise, estimate_process=estimate_process, most=iterations)
     if not (fit.converged and fit.has_process_noise):
         return fit
     return fit_by_filter(
@@ -622,11 +629,8 @@ def fit_by_filter(
             data = replace(data, sensor_noise=noise.measurement)
         closed = ClosedFunctions(model) if closure else None
         shooting = _Shooting(model, data, x, substeps, filtered=True, closed=closed, budget=budget)
-        begin = _Iterate(model.values, x, shooting.linearised(model.values, x, None, noise), x)
-        return _or_fault(
-            model, begin, noise, shooting.grid.substeps,
-            lambda: shooting.descended(begin, noise, estimate_process=estimate_process, most=iterations),
-        )  # fmt: skip
+        along = shooting.linearised(model.values, x, None, noise)
+        return shooting.fit(x, along, noise, estimate_process=estimate_process, most=iterations)
 
 
 def _stands_still(totals: list[float]) -> bool:

@@ -414,12 +414,11 @@ class _InertialModels:
     @cached_property
     def without(self) -> Fit:
         """The model without inertia."""
-        data, begins = self.data, self.data.begins
+        data, (moved, step) = self.data, moved_by(self.data)
         model = Dynamics(
             self.library.states, (self._force,), Diffusion.identity(1), parameters=self._parameters
         )
-        moved = ((data.outputs[begins + 1] - data.outputs[begins]) ** 2).mean(axis=0)
-        noise = Noise(0.1 * moved, moved / float(data.step[begins].mean()))
+        noise = Noise(0.1 * moved, moved / step)
         fit = fit_by_filter(model, data, x=data.outputs, noise=noise, closure=False)
         if fit.fault:
             raise NumericalFailure(f"the model without inertia cannot be fitted: {fit.fault}")
