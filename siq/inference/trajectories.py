@@ -294,7 +294,7 @@ class _NormalEquations:
         for place, (first, end) in enumerate(zip(data.first[:-1], data.first[1:], strict=True)):
             # As of a root at zero: where a derivative is no number, no direction is known.
             columns, states = (
-                np.nan_to_num(each[first:end].reshape(-1, each.shape[2]), posinf=0.0, neginf=0.0)
+                np.nan_to_num(np.concatenate(each[first:end]), posinf=0.0, neginf=0.0)
                 for each in (by_parameters, by_initial)
             )
             left = innovations[first:end].ravel()

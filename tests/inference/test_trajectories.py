@@ -99,6 +99,18 @@ def test_the_normal_equations_are_those_of_differences_of_trajectories() -> None
     assert found.step(1.0)[2] < gained
 
 
+def test_first_states_alone_are_fitted_where_every_parameter_is_known() -> None:
+    model = with_values(
+        model_of({**PENDULUM, "equations": {"x": "v", "v": "-k*sin(x) - d*v + c*x + u"}}), c=0.1
+    )
+    data, states = driven(model, substeps=2)
+    still = replace(model, parameters=tuple(replace(each, fixed=True) for each in model.parameters))
+    begin, noise = states[data.first[:-1]], Noise(np.array([1e-4]), np.zeros(2))
+    found = fit_trajectories(still, data, begin=begin + 0.05, noise=noise, substeps=2)
+    assert found.converged
+    np.testing.assert_allclose(found.x[data.first[:-1]], begin, atol=1e-3)
+
+
 def test_a_tape_and_numpy_give_the_same_trajectories() -> None:
     x, v, k = sympy.symbols("x v k", real=True)
     smooth = sympy.exp(-(x**2)) * sympy.cos(v) / (2 + sympy.sin(x)) + sympy.log(1 + x**2) + sympy.tan(x / 9)
