@@ -165,14 +165,14 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
     settled: list[np.ndarray | Cycle] = [*(one.position for one in portrait.attractors), *cycles]
     for index in range(points + len(cycles)):
         for saddle in portrait.saddles[index]:
-            sides = sides_of(dynamics, saddle, portrait.attractors, box=box, cycles=cycles)
-            end = min(set(sides[sides >= 0].tolist()) - {index}, default=None)
+            reached = sides_of(dynamics, saddle, portrait.attractors, box=box, cycles=cycles)
+            end = min(set(reached[reached >= 0].tolist()) - {index}, default=None)
             remarks = nothing
             if end is None and not beyond_region:
                 remark = Remark("quasipotential.nothing_beyond_saddle")
                 ways.append(Transition(index, None, saddle, None, remarks=(remark,)))
                 continue
-            if end is None and (sides == index).all():  # it parts no wells
+            if end is None and (reached == index).all():  # it parts no wells
                 continue
             try:
                 if end is None:
