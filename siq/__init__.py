@@ -6,7 +6,7 @@ f by constrained regression. U = 2V is the quasipotential. And from a simulation
 to the physics that was left out.
 
 The names below are what users need. Each is loaded when it is first used, since torch takes seconds to
-import; ``_MODULES`` says from where. Type checkers read the same names from the block beneath it.
+import; ``_NAMES`` says from where. Type checkers read the same names from the block beneath it.
 """
 
 from __future__ import annotations
@@ -91,52 +91,35 @@ __all__ = [
     "write_recordings",
 ]
 
-_MODULES = {
-    "Diagnosis": "siq.diagnosis.diagnosis",
-    "Diffusion": "siq.systems.diffusion",
-    "Dynamics": "siq.systems.dynamics",
-    "EquationSettings": "siq.quasipotential.landscape_assembly",
-    "Formula": "siq.systems.formulas",
-    "InputError": "siq.errors",
-    "Landscape": "siq.quasipotential.landscape",
-    "MismatchStudy": "siq.diagnosis.study",
-    "MissingExtra": "siq.errors",
-    "NoLandscape": "siq.quasipotential.landscape",
-    "NumericalFailure": "siq.errors",
-    "PipelineSettings": "siq.workflow.pipeline",
-    "Recordings": "siq.data.recordings",
-    "RegressionOptions": "siq.networks.regression",
-    "SimulationOptions": "siq.systems.simulation",
-    "Study": "siq.workflow.study",
-    "Sweep": "siq.workflow.sweep",
-    "SymbolicDecomposition": "siq.quasipotential.formulas",
-    "TrainingOptions": "siq.networks.decomposition",
-    "candidate_library": "siq.inference.library",
-    "diagnose": "siq.diagnosis.diagnosis",
-    "inspect": "siq.data.inspection",
-    "load_study": "siq.workflow.study",
-    "load_system": "siq.systems.cards",
-    "parse_formula": "siq.systems.formulas",
-    "plot_barriers": "siq.report.plots.wells",
-    "plot_diagnosis": "siq.report.plots.diagnosis",
-    "plot_paths": "siq.report.plots.wells",
-    "plot_quasipotential": "siq.report.plots.quasipotential",
-    "plot_residuals": "siq.report.plots.prediction",
-    "plot_wells": "siq.report.plots.wells",
-    "probability_of_tipping": "siq.workflow.tipping",
-    "read_case": "siq.diagnosis.study",
-    "read_model": "siq.quasipotential.formulas",
-    "read_recordings": "siq.data.recordings",
-    "reference_systems": "siq.validation.reference_systems",
-    "reference_table": "siq.validation.reference_systems",
-    "simulate_snapshots": "siq.systems.simulation",
-    "snapshot_pairs": "siq.data.recordings",
-    "solve_case": "siq.diagnosis.diagnosis",
-    "sparse_decomposition": "siq.networks.regression",
-    "sweep": "siq.workflow.sweep",
-    "train": "siq.networks.training",
-    "write_recordings": "siq.data.recordings",
+_NAMES = {
+    "siq.data.inspection": "inspect",
+    "siq.data.recordings": "Recordings read_recordings snapshot_pairs write_recordings",
+    "siq.diagnosis.diagnosis": "Diagnosis diagnose solve_case",
+    "siq.diagnosis.study": "MismatchStudy read_case",
+    "siq.errors": "InputError MissingExtra NumericalFailure",
+    "siq.inference.library": "candidate_library",
+    "siq.networks.decomposition": "TrainingOptions",
+    "siq.networks.regression": "RegressionOptions sparse_decomposition",
+    "siq.networks.training": "train",
+    "siq.quasipotential.formulas": "SymbolicDecomposition read_model",
+    "siq.quasipotential.landscape": "Landscape NoLandscape",
+    "siq.quasipotential.landscape_assembly": "EquationSettings",
+    "siq.report.plots.diagnosis": "plot_diagnosis",
+    "siq.report.plots.prediction": "plot_residuals",
+    "siq.report.plots.quasipotential": "plot_quasipotential",
+    "siq.report.plots.wells": "plot_barriers plot_paths plot_wells",
+    "siq.systems.cards": "load_system",
+    "siq.systems.diffusion": "Diffusion",
+    "siq.systems.dynamics": "Dynamics",
+    "siq.systems.formulas": "Formula parse_formula",
+    "siq.systems.simulation": "SimulationOptions simulate_snapshots",
+    "siq.validation.reference_systems": "reference_systems reference_table",
+    "siq.workflow.pipeline": "PipelineSettings",
+    "siq.workflow.study": "Study load_study",
+    "siq.workflow.sweep": "Sweep sweep",
+    "siq.workflow.tipping": "probability_of_tipping",
 }
+_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 
 def __getattr__(name: str) -> Any:
