@@ -56,6 +56,24 @@ def test_paths_of_the_sources_exist(page: Path) -> None:
     assert not {path for path in named if "NAME" not in path and not (ROOT / path).exists()}
 
 
+def test_docstrings_and_templates_name_what_there_is() -> None:
+    """A name such as `siq.data.recordings.Recordings` is a module, or a word in the source of one."""
+    lost = []
+    files = [file for folder in ("siq", "workflow") for file in sorted((ROOT / folder).rglob("*"))]
+    for file in (file for file in files if file.suffix in (".py", ".j2", ".yaml", ".smk")):
+        for name in re.findall(r"`((?:siq|workflow)(?:\.\w+)+)`", file.read_text(encoding="utf-8")):
+            path, names = ROOT, name.split(".")
+            while names and (path / names[0]).is_dir():
+                path /= names.pop(0)
+            if names and (path / f"{names[0]}.py").is_file():
+                source = path / f"{names.pop(0)}.py"
+            else:
+                source = path / "__init__.py"
+            if names and not re.search(rf"\b{names[0]}\b", source.read_text(encoding="utf-8")):
+                lost.append(f"{file.relative_to(ROOT)}: {name}")
+    assert not lost
+
+
 @pytest.mark.parametrize("page", [ROOT / "README.md", ROOT / "CONTRIBUTING.md"], ids=name_of)
 def test_links_lead_somewhere(page: Path) -> None:
     links = re.findall(r"\]\((?!https?://|#)([^)#]+)", page.read_text(encoding="utf-8"))

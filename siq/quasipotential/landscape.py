@@ -369,8 +369,8 @@ class Landscape:
         Returns
         -------
         numpy.ndarray
-            Shape ``(n,)``, from the uncertainty of f (`siq.quasipotential.uncertainty`); zero where
-            recordings carry no noise, NaN where U is not known, or f was not identified.
+            Shape ``(n,)``, from the uncertainty of f; zero where recordings carry no noise, NaN where U is
+            not known, or f was not identified.
         """
         x = np.asarray(points, dtype=float)
         errors = np.full(len(x), np.nan)

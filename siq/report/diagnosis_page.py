@@ -49,7 +49,7 @@ class Findings:
     figures
         SVG files by the names of their captions, as far as there was something to draw.
     wells, escape, notes
-        See `workflow.consequences.Consequences`.
+        See `workflow.consequences.compare_landscapes`.
     scores
         Columns ``simulation score output rms unit published``, of public benchmarks only.
     held_out
