@@ -6,7 +6,7 @@ import io
 import json
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -96,12 +96,8 @@ def init_study(path: Path, *, output: Path | None = None, replace: bool = False)
         raise InputError(path, "", "this is a study already", f"run it by: siq run {path}")
     found = inspect_recordings(path)
     study = Path(f"{name_for(path)}.yaml") if output is None else output
-    if study.exists() and not replace:
-        raise InputError(
-            study, "", "the file is there already", "name another by -o, or replace it by --force"
-        )
-    with whole_file(study) as partial:
-        partial.write_text(_commented_study(found, path, study), encoding="utf-8")
+    text = _commented_study(found, path, study)
+    _write({study: text}, replace=replace, remedy="name another by -o, or replace it by --force")
     return study
 
 
@@ -211,22 +207,26 @@ def write_example(name: str, folder: Path, *, replace: bool = False) -> tuple[li
     InputError
         When a file is there already; then none is written.
     """
-    makers: Mapping[Path, Callable[[], str]]
     if name == "double-well":
         study = folder / "double-well.yaml"
-        makers = {folder / "double-well.csv": double_well_recordings, study: lambda: DOUBLE_WELL}
+        files = {folder / "double-well.csv": double_well_recordings(), study: DOUBLE_WELL}
         command = f"siq run {study}"
     else:
         case = folder / "spring"
-        makers = {case / "recordings.csv": _spring_recordings, case / "system.yaml": lambda: SPRING}
+        files = {case / "recordings.csv": _spring_recordings(), case / "system.yaml": SPRING}
         command = f"siq diagnose {case}"
-    for file in makers:
+    _write(files, replace=replace, remedy="name another --folder, or give --force")
+    return list(files), command
+
+
+def _write(files: Mapping[Path, str], *, replace: bool, remedy: str) -> None:
+    """Write texts, or none of them where one is there already and may not be replaced."""
+    for file in files:
         if file.exists() and not replace:
-            raise InputError(file, "", "the file is there already", "name another --folder, or give --force")
-    for file, maker in makers.items():
+            raise InputError(file, "", "the file is there already", remedy)
+    for file, text in files.items():
         with whole_file(file) as partial:
-            partial.write_text(maker(), encoding="utf-8")
-    return list(makers), command
+            partial.write_text(text, encoding="utf-8")
 
 
 def double_well_recordings(recordings: int = 4, samples: int = 20_000, *, seed: int = 1) -> str:

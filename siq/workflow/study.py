@@ -19,7 +19,6 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from siq.data.layout import read_heading, usable_name
 from siq.errors import Fault, InputError, NumericalFailure, suggestion
-from siq.inference.checks import PredictionLimits
 from siq.inference.library import IdentificationOptions, candidate_library
 from siq.inference.observation import velocity_names
 from siq.networks.decomposition import TrainingOptions
@@ -542,11 +541,6 @@ class PipelineSettings:
             raise Fault(
                 "networks know recorded states only, and velocities are hidden", "leave 'training' out"
             )
-
-    @property
-    def prediction(self) -> PredictionLimits:
-        """The certificate's limits for f."""
-        return self.certificate.of_f
 
     @property
     def methods(self) -> tuple[Method, ...]:

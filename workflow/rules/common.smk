@@ -91,7 +91,8 @@ def file_where(asked, pattern):
 def with_sweep(name):
     """Input function: a table of studies that sweep a parameter."""
     return file_where(
-        lambda study: study.sweep is not None, f"results/{{study}}/tables/{name}.parquet"
+        lambda study: study.sweep is not None,
+        f"results/{{study}}/tables/{name}.parquet",
     )
 
 

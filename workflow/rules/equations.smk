@@ -31,31 +31,15 @@ rule equations:
         "../scripts/run_task.py"
 
 
-rule equations_invariant:
+use rule invariant as equations_invariant with:
     input:
         card=card_if_any,
         quasipotential="results/{study}/quasipotential.json",
-    output:
-        table="results/{study}/tables/invariant.parquet",
-        shares="results/{study}/tables/well_shares.parquet",
-        drawn=directory("results/{study}/drawn/invariant"),
-    log:
-        "results/{study}/logs/invariant.log",
-    benchmark:
-        "results/{study}/benchmarks/invariant.tsv"
     wildcard_constraints:
         study=STUDIES.pattern_of("equations"),
-    conda:
-        "../envs/siq.yaml"
-    params:
-        **task("invariant"),
-    message:
-        "{wildcards.study}: computing the invariant distribution"
-    script:
-        "../scripts/run_task.py"
 
 
-rule equations_page:
+use rule page as equations_page with:
     input:
         card=card_if_any,
         quasipotential="results/{study}/quasipotential.json",
@@ -70,38 +54,11 @@ rule equations_page:
         invariant=with_invariant("results/{study}/tables/invariant.parquet"),
         well_shares=with_invariant("results/{study}/tables/well_shares.parquet"),
         density=with_invariant("results/{study}/drawn/invariant"),
-    output:
-        html=report(
-            "results/{study}/report.html",
-            caption="../report/report.rst",
-            category="{study}",
-            subcategory=ANSWER,
-            labels={"shows": "The page: everything in one file", "kind": "page"},
-        ),
-        figures=report(
-            directory("results/{study}/figures"),
-            patterns=["{name}.svg"],
-            caption="../report/figure.rst",
-            category="{study}",
-            subcategory=figure_part,
-            labels=figure_labels,
-        ),
-        answer="results/{study}/answer.json",
-    log:
-        "results/{study}/logs/page.log",
-    benchmark:
-        "results/{study}/benchmarks/page.tsv"
     wildcard_constraints:
         study=STUDIES.pattern_of("equations"),
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("equations_page"),
         captions=CAPTIONS,  # of Snakemake's own report
-    message:
-        "{wildcards.study}: writing the page"
-    script:
-        "../scripts/run_task.py"
 
 
 rule sweep_point:

@@ -198,9 +198,7 @@ rule score_proof:
         "../scripts/run_task.py"
 
 
-rule score_foreign:
-    input:
-        scores="results/proof/{proof}/tables/score.parquet",
+use rule score_proof as score_foreign with:
     output:
         html=report(
             "results/proof/{proof}/report.html",
@@ -212,23 +210,13 @@ rule score_foreign:
         png="results/proof/{proof}/figures/gains.png",
         targets="results/proof/{proof}/tables/targets.parquet",
         csv="results/proof/{proof}/tables/targets.csv",
-    log:
-        "results/proof/{proof}/logs/page.log",
-    benchmark:
-        "results/proof/{proof}/benchmarks/page.tsv"
     wildcard_constraints:
         proof="|".join(FOREIGN),
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("score_foreign"),
         title=lambda wildcards: PROOF_TITLES[wildcards.proof],
         settings=proof_settings,
         command=lambda wildcards: f"snakemake --cores 2 {wildcards.proof}",
-    message:
-        "{wildcards.proof}: writing the report"
-    script:
-        "../scripts/run_task.py"
 
 
 rule score_case:
@@ -258,7 +246,7 @@ rule score_case:
         "../scripts/run_task.py"
 
 
-rule score_cases:
+use rule collect_scores as score_cases with:
     input:
         scores=all_blind_scores,
     output:
@@ -268,18 +256,14 @@ rule score_cases:
         "results/blind-test/logs/score_cases.log",
     benchmark:
         "results/blind-test/benchmarks/score_cases.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("collect_scores"),
         foreign=False,
     message:
         "collecting the scores of the blind test"
-    script:
-        "../scripts/run_task.py"
 
 
-rule blind_page:
+use rule score_proof as blind_page with:
     input:
         scores="results/blind-test/tables/score.parquet",
     output:
@@ -292,8 +276,6 @@ rule blind_page:
         "results/blind-test/logs/page.log",
     benchmark:
         "results/blind-test/benchmarks/page.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("score_proof"),
         title="Blind test of the diagnosis",
@@ -301,5 +283,3 @@ rule blind_page:
         command="snakemake --cores 2 blind_test --config cases=DIR keys=DIR",
     message:
         "writing the report of the blind test"
-    script:
-        "../scripts/run_task.py"
