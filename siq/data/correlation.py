@@ -217,13 +217,11 @@ def markov_lag(recordings: Recordings) -> MarkovLag:
 
     def told(
         kind: Kind, lag: int | None, seen: _Residuals, most: int, memory: float = 0.0,
-        sensor: np.ndarray | None = None,
+        sensor: np.ndarray = np.zeros(d),  # noqa: B008 (of this call alone)
     ) -> MarkovLag:  # fmt: skip
-        values, errors = seen.correlations(most)
-        return MarkovLag(
-            kind, lag, stretches.step, memory, relaxation, np.arange(1, len(values) + 1), values,
-            errors, np.zeros(d) if sensor is None else sensor,
-        )  # fmt: skip
+        lags = np.arange(1, most + 1)
+        step = stretches.step
+        return MarkovLag(kind, lag, step, memory, relaxation, lags, *seen.correlations(most), sensor)
 
     left = np.diag(lagged_covariances(first.rest, first.number, 0)[0])
     if (left <= NOISE_FREE_RESIDUAL**2 * problem.size**2).all():
@@ -313,7 +311,7 @@ class _Shape(NamedTuple):
     sensor: float  # variance of the sensor's error
     misfit: float  # χ² of what is left, and ...
     freedom: int  # ... the number that it has in the mean where the kind is right
-    departure: float = 0.0  # the largest difference of a correlation from that of the kind
+    departure: float  # the largest difference of a correlation from that of the kind
 
     @property
     def cost(self) -> float:
@@ -363,42 +361,33 @@ def _fitted_shape(covariances: np.ndarray, count: float, *, seen: int) -> _Shape
     goal = root @ covariances
     of_sensor = _increment_covariances(np.where(lags > 0, 2.0, 0.0))
 
-    def own(memory: float, kind: Kind) -> np.ndarray:
+    def fitted(kind: Kind, memory: float, sensor: bool) -> _Shape:
         move = _exposure_displacement if kind == "blur" else _coloured_displacement
-        return _increment_covariances(move(lags, memory))
-
-    def misfit(memory: float, kind: Kind, sensor: bool) -> tuple[float, np.ndarray]:
-        design = np.stack([root @ own(memory, kind), root @ of_sensor], axis=1)
-        design = design if sensor else design[:, :1]
+        parts = np.stack([_increment_covariances(move(lags, memory)), of_sensor][: 1 + sensor])
+        design = (root @ parts[:, :, None])[:, :, 0].T
         scale = np.linalg.norm(design, axis=0)
         values, left = scipy.optimize.nnls(design / scale, goal)
-        return float(left**2), np.append(values / scale, 0.0)[:2]
+        values = values / scale
+        departure = float(np.abs(covariances - values @ parts).max() / covariances[0])
+        freedom = size - 1 - sensor - (memory > 0)
+        return _Shape(kind, memory, float(values[1:].sum()), float(left**2), freedom, departure)
 
     def best(kind: Kind, sensor: bool) -> _Shape:
         tried = np.geomspace(0.1, 1.5 * max(seen, 1), MEMORIES_TRIED)
-        place = int(np.argmin([misfit(u, kind, sensor)[0] for u in tried]))
+        place = int(np.argmin([fitted(kind, u, sensor).misfit for u in tried]))
         found = scipy.optimize.minimize_scalar(
-            lambda u: misfit(u, kind, sensor)[0], method="bounded",
+            lambda u: fitted(kind, u, sensor).misfit, method="bounded",
             bounds=(tried[max(place - 1, 0)], tried[min(place + 1, MEMORIES_TRIED - 1)]),
         )  # fmt: skip
-        left, values = misfit(float(found.x), kind, sensor)
-        return _Shape(kind, float(found.x), float(values[1]), left, size - 2 - sensor)
+        return fitted(kind, float(found.x), sensor)
 
-    candidates = []
-    for sensor in (False, True):
-        left, values = misfit(0.0, "coloured", sensor)
-        shape: Kind = "sensor" if sensor else "white"
-        candidates.append(_Shape(shape, 0.0, float(values[1]), left, size - 1 - sensor))
     with_memory = [
         min((best(kind, False), best(kind, True)), key=lambda fit: fit.cost) for kind in ("blur", "coloured")
     ]
     first, second = sorted(with_memory, key=lambda fit: fit.cost)
-    chosen = min((*candidates, first), key=lambda fit: fit.cost)
-    _, values = misfit(chosen.memory, chosen.shape, chosen.sensor > 0)
-    rest = covariances - values[0] * own(chosen.memory, chosen.shape) - values[1] * of_sensor
+    chosen = min(fitted("white", 0.0, False), fitted("sensor", 0.0, True), first, key=lambda fit: fit.cost)
     either = second.misfit - first.misfit < MIN_CHI2_GAIN and chosen is first
-    departure = float(np.abs(rest).max() / covariances[0])
-    return chosen._replace(shape="either" if either else chosen.shape, departure=departure)
+    return chosen._replace(shape="either") if either else chosen
 
 
 WINDOWS = (32, 16, 8)  # samples; the longest of which the recordings hold enough
