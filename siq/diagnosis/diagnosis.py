@@ -18,8 +18,9 @@ import numpy as np
 import pandas as pd
 
 from siq.diagnosis.evidence import NUMERICAL_ERRORS
-from siq.diagnosis.investigation import HeldOutRuns, Investigation, held_out_runs, investigate, quiet_verdict
+from siq.diagnosis.investigation import HeldOutRuns, held_out_runs, investigate
 from siq.diagnosis.mechanisms import completed
+from siq.diagnosis.naming import Investigation
 from siq.diagnosis.residual_structure import remainder_of
 from siq.diagnosis.search import Search
 from siq.diagnosis.statement import Location, StatedTerm, Statement
@@ -61,9 +62,11 @@ def withdrawn(found: Investigation) -> Investigation:
     ):
         return replace(
             found,
-            verdict=quiet_verdict(found.p_shift, options),
+            verdict=found.quiet_verdict,
             search=replace(found.search, found=(), fit=recalibrated),
-            naming=None,
+            log_odds=(),
+            p_alike=None,
+            convincing=False,
             remarks=(*found.remarks, Remark("diagnosis.refuted", {"names": " and ".join(names)})),
             account=budget.account(),
         )
@@ -342,7 +345,7 @@ def _candidate_rows(search: Search) -> list[tuple[str | float, ...]]:
     fitted: set[tuple[str, str]] = set()
     for place, each in enumerate(search.found):
         beside = ", ".join(labels[:place])
-        for stage, trials in (("found", (each.best,)), *each.standings.items()):
+        for stage, trials in (("found", (each.best,)), *each.others.items()):
             for trial in trials:
                 name, label = trial.candidate.name, trial.candidate.label
                 fitted.add((label, beside))

@@ -19,7 +19,7 @@ from siq.diagnosis.holdout import (
     simulated,
 )
 from siq.diagnosis.mechanisms import candidates_of, generic_candidates
-from siq.diagnosis.naming import NamingDecision, decide_naming
+from siq.diagnosis.naming import Investigation, decide_naming
 from siq.diagnosis.residual_structure import (
     RANDOM_RESIDUALS,
     STRUCTURED,
@@ -28,86 +28,17 @@ from siq.diagnosis.residual_structure import (
     noise_nonstationarity,
     remainder_of,
 )
-from siq.diagnosis.search import FitContext, Search, search
-from siq.diagnosis.study import MismatchStudy, MismatchVerdict, SearchOptions
+from siq.diagnosis.search import FitContext, search_mechanisms
+from siq.diagnosis.study import MismatchStudy, MismatchVerdict
 from siq.diagnosis.unnamed_models import AugmentedModel, fit_unnamed_models
 from siq.errors import NumericalFailure
-from siq.inference.budget import UNLIMITED, Account, Budget
+from siq.inference.budget import Budget
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, with_expectations
 from siq.inference.recalibration import covariance_with_unknown_process_noise, recalibrate
 from siq.inference.trajectories import FreeRun
 from siq.remarks import Remark
 from siq.systems.dynamics import Dynamics
-
-
-@dataclass(frozen=True)
-class Investigation:
-    """What was found out about a simulation and recordings of the system, with all fits that it rests on.
-
-    Attributes
-    ----------
-    verdict
-        One of four.
-    context
-        The simulation, the recordings, and the mechanisms that were considered.
-    search
-        Recalibration, mechanisms found, and the final fit.
-    least_squares
-        The recalibration whose trajectories follow the equations exactly.
-    exact
-        The final simulation fitted so, where a remainder that is no noise was admitted as process noise.
-    remainder
-        What the recalibrated simulation does not explain, what the final fit leaves, and the share of the
-        excess that mechanisms explain.
-    p_shift
-        p-value of the test that the parameters of the card are the true ones.
-    remarks
-        Reservations.
-    naming
-        What was asked of mechanisms before they could be named; None where none was found.
-    models
-        Of what has no name, be it all that is missing or what names leave, the likeliest first.
-    account
-        The work that it took, and whether something was left undone.
-    withdrawn
-        Whether a name was given, and mislead on recordings held out (`siq.diagnosis.diagnosis`).
-    """
-
-    verdict: MismatchVerdict
-    context: FitContext
-    search: Search
-    least_squares: Fit
-    exact: Fit | None
-    remainder: Remainder
-    p_shift: float
-    remarks: tuple[Remark, ...]
-    naming: NamingDecision | None = None
-    models: tuple[AugmentedModel, ...] = ()
-    account: Account = UNLIMITED
-    withdrawn: bool = False
-
-    @property
-    def process_noise(self) -> bool:
-        """Whether process noise is all that is missing."""
-        return self.verdict.names and not self.search.found
-
-    @property
-    def too_faint(self) -> bool:
-        """Whether what was found explains enough, and is not named since a function is nearly as likely."""
-        unexplained = self.verdict is MismatchVerdict.UNEXPLAINED and not self.withdrawn
-        return unexplained and self.naming is not None and self.naming.convincing
-
-    @property
-    def final(self) -> Fit:
-        """The fit that the verdict stands on: with mechanisms only where they are physics."""
-        return self.search.fit if self.verdict.names else self.search.recalibrated
-
-
-def quiet_verdict(p_shift: float, options: SearchOptions) -> MismatchVerdict:
-    """The verdict where nothing is missing, by the probability that the card's parameters are right."""
-    shifted = p_shift < options.false_alarms
-    return MismatchVerdict.PARAMETER_SHIFT if shifted else MismatchVerdict.NO_MISMATCH
 
 
 def investigate(
@@ -156,7 +87,7 @@ def investigate(
     budget.says("fitting the simulation's own parameters")
     with budget.exempt():
         recalibrated, least_squares = recalibrate(model, data, budget=budget)
-    found = search(context, recalibrated)
+    found = search_mechanisms(context, recalibrated)
     recalibrated = found.recalibrated  # from where a mechanism led it, if that is better
     if not (recalibrated.has_process_noise or recalibrated.log_likelihood < least_squares.log_likelihood):
         least_squares = recalibrated
@@ -171,66 +102,52 @@ def investigate(
             untried = (*found.untried, NotFitted.of(each.best.candidate, error))
             found = replace(found, found=found.found[:place], fit=fit, untried=untried)
             break
-    left = by_each[-1] if by_each else remainder_of(data, recalibrated, recalibrated, roles)
-    exact: Fit | None = None
-    naming: NamingDecision | None = None
-    models: tuple[AugmentedModel, ...] = ()
-    verdict, remarks = MismatchVerdict.NO_MISMATCH, tuple[Remark, ...]()
     tried = bool(found.found)
     if tried:
-        naming = decide_naming(found, by_each, context, generator=np.random.default_rng(seed))
-        models, exact, remarks = naming.models, naming.exact, naming.remarks
-        found, left = naming.search, naming.remainder
-        verdict = MismatchVerdict.MISSING_PHYSICS if naming.named else MismatchVerdict.UNEXPLAINED
+        result = decide_naming(found, by_each, context, generator=np.random.default_rng(seed))
+        result = replace(result, least_squares=least_squares)
+    else:
+        left = remainder_of(data, recalibrated, recalibrated, roles)
+        result = Investigation(context, found, left, MismatchVerdict.NO_MISMATCH, least_squares)
     rounded = None
-    doubtful = not tried and (found.fit.has_process_noise or left.structured)
-    if doubtful or verdict is MismatchVerdict.UNEXPLAINED:
+    doubtful = not tried and (found.fit.has_process_noise or result.remainder.structured)
+    if doubtful or result.verdict is MismatchVerdict.UNEXPLAINED:
         budget.says("asking whether the sensors' steps explain it")
         with budget.exempt():
             # What a mechanism has found already has to be gone more clearly.
             least = RANDOM_RESIDUALS if tried else STRUCTURED
             rounded = explained_by_quantisation(data, least_squares, roles, least=least, budget=budget)
     if rounded is not None:
-        least_squares, left, outputs = rounded
-        found = replace(found, recalibrated=least_squares, found=(), fit=least_squares)
-        naming, models, exact = None, (), None
+        fit, left, outputs = rounded
         remarks = (Remark("diagnosis.quantised", {"outputs": ", ".join(outputs)}),)
-    p_shift = _shift_probability(model, found.recalibrated)
+        search = replace(result.search, recalibrated=fit, found=(), fit=fit)
+        result = Investigation(context, search, left, MismatchVerdict.NO_MISMATCH, fit, remarks=remarks)
+    result = replace(result, p_shift=_shift_probability(model, result.search.recalibrated))
     if rounded is not None or not (tried or doubtful):
-        verdict = quiet_verdict(p_shift, options)
-    elif not tried and found.fit.has_process_noise:
+        result = replace(result, verdict=result.quiet_verdict)
+    elif not tried:
+        result = replace(result, verdict=MismatchVerdict.UNEXPLAINED)
+    if not tried and rounded is None and found.fit.has_process_noise:
         # Process noise explains any recordings. It is named where nothing else is likelier, neither a
-        # function instead of it nor one beside what is left of it: noise does not know where a system is, so
-        # that no function of the states takes a part of it over.
-        verdict = MismatchVerdict.UNEXPLAINED
+        # function instead of it nor one on top of it: noise does not know where a system is, so that no
+        # function of the states takes a part of it over.
         steady = noise_nonstationarity(found.fit, data) < 2 * options.least_log_odds
-        remarks = () if steady else (Remark("diagnosis.noise_follows_motion"),)
         knows_noise = any(form.noise for mechanism in dictionary for form in mechanism.forms)
-        if knows_noise and steady and not left.doubtful:
+        if not steady:
+            result = replace(result, remarks=(Remark("diagnosis.noise_follows_motion"),))
+        elif knows_noise and not result.remainder.doubtful:
             models = fit_unnamed_models(found, context)
             if not models or models[0].log_evidence < options.least_log_odds:
-                verdict, models = MismatchVerdict.MISSING_PHYSICS, ()
-    elif not tried:
-        verdict = MismatchVerdict.UNEXPLAINED
-    if verdict is MismatchVerdict.UNEXPLAINED and not (models or found.found):
-        models = fit_unnamed_models(found, context)
+                result = replace(result, verdict=MismatchVerdict.MISSING_PHYSICS)
+            else:
+                result = replace(result, models=models)
+    if result.verdict is MismatchVerdict.UNEXPLAINED and not (result.models or result.search.found):
+        result = replace(result, models=fit_unnamed_models(result.search, context))
     budget.says("working out how well parameters are known")
     with budget.exempt():
-        covariance = covariance_with_unknown_process_noise(found.fit, data, budget=budget)
-    found = replace(found, fit=replace(found.fit, covariance=covariance))
-    return Investigation(
-        verdict=verdict,
-        context=context,
-        search=found,
-        least_squares=least_squares,
-        exact=exact,
-        remainder=left,
-        p_shift=p_shift,
-        remarks=remarks,
-        naming=naming,
-        models=models,
-        account=budget.account(),
-    )
+        covariance = covariance_with_unknown_process_noise(result.search.fit, data, budget=budget)
+    search = replace(result.search, fit=replace(result.search.fit, covariance=covariance))
+    return replace(result, search=search, account=budget.account())
 
 
 def _shift_probability(model: Dynamics, recalibrated: Fit) -> float:

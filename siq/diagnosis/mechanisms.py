@@ -73,13 +73,18 @@ def places_of(search: Shape, data: Measurements, model: Dynamics, x: np.ndarray)
         return np.zeros(0) if found is None else np.array([found])
     text = search.scale_of or search.inverse_scale_of or search.quantiles_of or search.time_of
     (course,) = along([parse_formula(str(text), model.names)], model, data, x)
-    if search.quantiles_of is not None:
-        return np.quantile(course, factors)
     if search.time_of is not None:
         rows = data.begins
         rates = (course[rows + 1] - course[rows]) / (data.t[rows + 1] - data.t[rows])
         rate = float(np.sqrt(np.mean(rates**2)))
         return factors * (float(course.std()) / rate if rate > 0 else float(np.median(steps)))
+    return _sized(search, factors, course)
+
+
+def _sized(search: Shape, factors: np.ndarray, course: np.ndarray) -> np.ndarray:
+    """Quantiles of a course, or multiples of its root mean square, or of the inverse of that."""
+    if search.quantiles_of is not None:
+        return np.quantile(course, factors)
     size = float(np.sqrt(np.mean(course**2))) or 1.0
     return factors * size if search.scale_of is not None else factors / size
 
@@ -184,6 +189,26 @@ class MechanismCandidate:
         """All new parameters, in the order of the model's."""
         return tuple(p.name for p in self.model.parameters if p.name in {*self.amplitudes, *self.shapes})
 
+    def columns(self, model: Dynamics) -> list[tuple[int, int, sympy.Expr]]:
+        """What a unit of each amplitude, none being there yet, does to the equations and outputs of a model.
+
+        Of a mechanism without an amplitude it is the whole change.
+
+        Returns
+        -------
+        list of (int, int, Expr)
+            The row, equations before outputs; the amplitude; and the formula, where it is not zero.
+        """
+        after = [*self.model.equations[: model.dimension], *dict(self.model.outputs).values()]
+        before = [*model.equations, *dict(model.outputs).values()]
+        zero = dict.fromkeys(map(symbol, self.amplitudes), 0)
+        found = []
+        for row, (new, old) in enumerate(zip(after, before, strict=True)):
+            formula = self.model.evaluable(new)
+            columns = [formula.diff(name).subs(zero) for name in zero] or [formula - model.evaluable(old)]
+            found += [(row, column, each) for column, each in enumerate(columns) if each != 0]
+        return found
+
     def admits(self, fit: Fit) -> bool:
         """Whether parameters of a fit that may have one sign only have it, or are zero within errors."""
         names = [fit.model.parameters[place].name for place in fit.model.free]
@@ -203,6 +228,25 @@ class MechanismCandidate:
         return self.label == found.label or (
             self.name == found.name and self.coordinate in found.model.states and bool(same_place)
         )
+
+
+def with_added(
+    model: Dynamics,
+    equations: Mapping[str, sympy.Expr],
+    outputs: Mapping[str, sympy.Expr],
+    parameters: Sequence[Parameter],
+) -> Dynamics:
+    """A model with formulas added to equations and outputs, by name, and with further parameters."""
+    zero = sympy.Integer(0)
+    return replace(
+        model,
+        parameters=(*model.parameters, *parameters),
+        equations=tuple(
+            before + equations.get(name, zero)
+            for name, before in zip(model.states, model.equations, strict=True)
+        ),
+        outputs=tuple((name, before + outputs.get(name, zero)) for name, before in model.outputs),
+    )
 
 
 def build_candidate(
@@ -441,20 +485,13 @@ def _columns(
         _typical(shapes[each.name], model, x, signals) if each.name in shapes else 0.0
         for each in augmented.parameters[len(model.parameters) :]
     ]
-    before = [*model.equations, *dict(model.outputs).values()]
-    after = [*augmented.equations[: model.dimension], *dict(augmented.outputs).values()]
-    result = np.zeros((len(before), count, max(len(candidate.amplitudes), 1)))
-    changed = [place for place, pair in enumerate(zip(before, after, strict=True)) if pair[0] != pair[1]]
-    formulas: list[sympy.Expr] = []
-    for place in changed:
-        formula, known = augmented.evaluable(after[place]), model.evaluable(before[place])
-        by_amplitude = [formula.diff(symbol(name)) for name in candidate.amplitudes]
-        formulas += by_amplitude or [formula - known]
+    entries = candidate.columns(model)
+    result = np.zeros((model.dimension + len(model.outputs), count, max(len(candidate.amplitudes), 1)))
+    functions = compile_values([each for _, _, each in entries], augmented.arguments, common=False)
     with np.errstate(all="ignore"):
-        found = compile_values(formulas, augmented.arguments, common=False)(*at, *values, *new)
-    for number, value in enumerate(found):
-        place, column = divmod(number, result.shape[2])
-        result[changed[place], :, column] = value
+        found = functions(*at, *values, *new)
+    for (row, column, _), value in zip(entries, found, strict=True):
+        result[row, :, column] = value
     return result.reshape(-1, result.shape[2])
 
 
@@ -468,11 +505,7 @@ def _typical(shape: Shape, model: Dynamics, x: np.ndarray, signals: Signals) -> 
     course = compile_values([parse_formula(text, model.names)], names, common=False)(
         *x, *signals.inputs, signals.t
     )[0]
-    course = np.broadcast_to(course, x.shape[1:])
-    if shape.quantiles_of is not None:
-        return float(np.quantile(course, at))
-    size = float(np.sqrt(np.mean(course**2))) or 1.0
-    return at * size if shape.scale_of is not None else at / size
+    return float(_sized(shape, np.array(at), np.broadcast_to(course, x.shape[1:])))
 
 
 def _without_amplitudes(
@@ -596,24 +629,17 @@ def generic_candidates(
             units = {f"_{k}": unit for k, unit in enumerate(model.units)}
             per = "*".join(f"_{k}**{power}" for k, power in enumerate(powers) if power)
             unit = unit_of(f"_{place}/_t" + (f"/({per})" if per else ""), {**units, "_t": model.time_unit})
-            augmented = replace(
-                model,
-                parameters=(*model.parameters, Parameter(new, 0.0, unit)),
-                equations=tuple(
-                    formula + (symbol(new) * monomial if k == place else 0)
-                    for k, formula in enumerate(model.equations)
-                ),
-            )
+            added = {name: symbol(new) * monomial}
             found.append(
                 MechanismCandidate(
                     name=GENERIC,
                     label=f"{GENERIC} {monomial} in {name}",
-                    model=augmented,
+                    model=with_added(model, added, {}, [Parameter(new, 0.0, unit)]),
                     amplitudes=(new,),
                     equations=(name,),
                     coordinate=", ".join(s for s, p in zip(model.states, powers, strict=True) if p)
                     or "constant",
-                    changes=((name, symbol(new) * monomial),),
+                    changes=tuple(added.items()),
                 )
             )
     have_names = {_added_square(each) for each in named} - {None}

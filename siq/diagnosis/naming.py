@@ -42,8 +42,9 @@ from siq.diagnosis.evidence import (
 from siq.diagnosis.holdout import change_between, errors_left_out, in_blocks
 from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.diagnosis.residual_structure import Remainder
-from siq.diagnosis.screening import PROBE_SUBSTEPS, ProbeColumns, probe_response, probes_of
+from siq.diagnosis.screening import PROBE_SUBSTEPS, ProbeColumns, probe_response, probes_of, slices_of
 from siq.diagnosis.search import FitContext, Search
+from siq.diagnosis.study import MismatchVerdict
 from siq.diagnosis.terms import linearised_with_places, places_in, products_in
 from siq.diagnosis.unnamed_models import (
     AugmentedModel,
@@ -53,6 +54,7 @@ from siq.diagnosis.unnamed_models import (
     with_function,
 )
 from siq.errors import NumericalFailure
+from siq.inference.budget import UNLIMITED, Account
 from siq.inference.kalman_filter import Grid, Noise, Whitened, solve, whiten
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
@@ -162,12 +164,8 @@ def _false_match_rate(
     effects = effects[:, (effects**2).sum(axis=0) > 0]
     if not effects.shape[1]:
         raise NumericalFailure("no effect can be seen in the recordings")
-    groups, begin = [], count
-    for probe in probes:
-        group = white.columns[:, begin : begin + probe.width]
-        begin += probe.width
-        if np.isfinite(group).all():
-            groups.append(orthonormal(group - own @ (own.T @ group)))
+    groups = [white.columns[:, count:][:, each] for each in slices_of(probes)]
+    groups = [orthonormal(each - own @ (own.T @ each)) for each in groups if np.isfinite(each).all()]
     best = _best_shares(effects, groups, mechanisms)
     return float((np.sum(best >= share) + 1) / (len(best) + 1))
 
@@ -283,49 +281,84 @@ def _residual_model_comparison(
 
 
 @dataclass(frozen=True)
-class NamingDecision:
-    """Whether mechanisms that were found may be named, and what models the rest.
+class Investigation:
+    """What was found out about a simulation and recordings of the system, with all fits that it rests on.
 
     Attributes
     ----------
+    context
+        The simulation, the recordings, and the mechanisms that were considered.
     search
-        With the mechanisms that are named, or that describe what has no name.
+        Recalibration, mechanisms that are named, or that describe what has no name, and the final fit.
     remainder
-        What they leave.
+        What the recalibrated simulation does not explain, what the final fit leaves, and the share of the
+        excess that mechanisms explain.
+    verdict
+        One of four.
+    least_squares
+        The recalibration whose trajectories follow the equations exactly.
+    p_shift
+        p-value of the test that the parameters of the card are the true ones.
     log_odds
-        For each, that it is the mechanism rather than a function without a name, as a logarithm.
-    together
-        The odds of all of them against one such function, as a logarithm.
+        For each mechanism, that it is this rather than a function without a name, as a logarithm.
     p_alike
         Probability that as many mechanisms explain as much of an effect that has no name; None where nothing
         is left, so that nobody asked.
     convincing
-        Whether they explain enough.
-    named
-        Whether they are named: the odds are for them as well.
+        Whether the mechanisms explain enough; the odds have to be for them as well before they are named.
     remarks
         Reservations.
     models
-        Of what has no name: of what names leave, or of all of it.
+        Of what has no name, be it all that is missing or what names leave, the likeliest first.
     exact
-        The fit with names whose trajectories follow the equations, where process noise is part of the other.
+        The final fit whose trajectories follow the equations, where a remainder that is no noise was admitted
+        as process noise.
+    account
+        The work that it took, and whether something was left undone.
+    withdrawn
+        Whether a name was given, and mislead on recordings held out (`siq.diagnosis.diagnosis`).
     """
 
+    context: FitContext
     search: Search
     remainder: Remainder
-    log_odds: tuple[float, ...]
-    together: float
-    p_alike: float | None
-    convincing: bool
-    named: bool
+    verdict: MismatchVerdict
+    least_squares: Fit
+    p_shift: float = float("nan")
+    log_odds: tuple[float, ...] = ()
+    p_alike: float | None = None
+    convincing: bool = False
     remarks: tuple[Remark, ...] = ()
     models: tuple[AugmentedModel, ...] = ()
     exact: Fit | None = None
+    account: Account = UNLIMITED
+    withdrawn: bool = False
+
+    @property
+    def process_noise(self) -> bool:
+        """Whether process noise is all that is missing."""
+        return self.verdict.names and not self.search.found
+
+    @property
+    def too_faint(self) -> bool:
+        """Whether what was found explains enough, and is not named since a function is nearly as likely."""
+        return self.verdict is MismatchVerdict.UNEXPLAINED and not self.withdrawn and self.convincing
+
+    @property
+    def final(self) -> Fit:
+        """The fit that the verdict stands on: with mechanisms only where they are physics."""
+        return self.search.fit if self.verdict.names else self.search.recalibrated
+
+    @property
+    def quiet_verdict(self) -> MismatchVerdict:
+        """The verdict where nothing is missing, by the probability that the card's parameters are right."""
+        shifted = self.p_shift < self.context.study.search.false_alarms
+        return MismatchVerdict.PARAMETER_SHIFT if shifted else MismatchVerdict.NO_MISMATCH
 
 
 def _judge_mechanisms(
     whole: Search, left: Sequence[Remainder], context: FitContext, *, generator: np.random.Generator
-) -> NamingDecision:
+) -> Investigation:
     """Judge the mechanisms of a search, as far as they explain by themselves what is missing."""
     options = context.study.search
 
@@ -369,12 +402,16 @@ def _judge_mechanisms(
         values = {"names": names, "odds": float(np.exp(least)), "needed": needed}
         remarks.append(Remark("diagnosis.not_certain", values))
     named = convinces and least >= options.least_log_odds
-    return NamingDecision(search, left[-1], odds, together, p_alike, convinces, named, tuple(remarks))
+    verdict = MismatchVerdict.MISSING_PHYSICS if named else MismatchVerdict.UNEXPLAINED
+    return Investigation(
+        context, search, left[-1], verdict, whole.recalibrated,
+        log_odds=odds, p_alike=p_alike, convincing=convinces, remarks=tuple(remarks),
+    )  # fmt: skip
 
 
 def decide_naming(
     whole: Search, left: Sequence[Remainder], context: FitContext, *, generator: np.random.Generator
-) -> NamingDecision:
+) -> Investigation:
     """Decide about the names of a search that found something, and fit models of the rest.
 
     Parameters
@@ -398,11 +435,11 @@ def decide_naming(
     if compared is not None and (compared.log_odds >= least or compared.predicts_better):
         first, odds = replace(whole, found=whole.found[:1], fit=whole.found[0].best.fit), compared.log_odds
         decision = replace(
-            decision, search=first, remainder=left[0], log_odds=(odds,), together=odds,
-            convincing=True, named=True, remarks=(_remainder_remark(left[0], unnamed=True),),
+            decision, search=first, remainder=left[0], log_odds=(odds,), convincing=True,
+            verdict=MismatchVerdict.MISSING_PHYSICS, remarks=(_remainder_remark(left[0], unnamed=True),),
         )  # fmt: skip
     search = decision.search
-    if not decision.named:
+    if not decision.verdict.names:
         instead = None if compared is None else compared.instead
         return replace(decision, models=fit_unnamed_models(search, context, functions=instead))
     if len(whole.found) > len(search.found) or decision.remainder.doubtful or search.fit.has_process_noise:
@@ -432,7 +469,7 @@ def _log_odds(search: Search, number: int, chosen: Sequence[int], context: FitCo
         return -np.inf
     if len(chosen) == 1:  # what cannot be told apart is named as a class
         one = search.found[chosen[0]]
-        same = [one.best.delta_bic, *(each.delta_bic for each in one.indistinguishable)]
+        same = [one.best.delta_bic, *(each.delta_bic for each in one.others["same"])]
         odds += float(scipy.special.logsumexp(-0.5 * (np.array(same) - one.best.delta_bic)))
     LOGGER.info("%s: log-odds of the name %.1f", [each.label for each in named], odds)
     return odds

@@ -8,12 +8,13 @@ noise: where physics is missing the fit had to admit such noise, and the right p
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+import itertools
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
-import sympy
 
 from siq.diagnosis.evidence import (
     BUDGET_SPENT,
@@ -36,7 +37,7 @@ from siq.inference.kalman_filter import (
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.trajectories import EDGE_SUBSTEPS, run_along, spread_edges
-from siq.systems.dynamics import Dynamics, Tape, symbol
+from siq.systems.dynamics import Dynamics, Tape
 from siq.systems.formulas import compile_values
 
 
@@ -69,6 +70,38 @@ class Probe:
         """How many columns it has."""
         return max(len(self.candidate.amplitudes), 1)
 
+    @property
+    def delays(self) -> tuple[tuple[int, float], ...]:
+        """Of inputs in the candidate's formulas."""
+        shapes = dict(self.shapes)
+        values = [shapes.get(each.name, each.value) for each in self.candidate.model.parameters]
+        return self.candidate.model.lags(np.array(values))
+
+    def parameters(self, values: np.ndarray) -> tuple[float, ...]:
+        """All parameters: the simulation's, then the mechanism's."""
+        shapes = dict(self.shapes)
+        new = self.candidate.model.parameters[len(values) :]
+        # As numpy has them: a division by zero is then infinite, and no error.
+        return (*values, *(np.float64(shapes.get(each.name, 0.0)) for each in new))
+
+    def states_along(self, fit: Fit, data: Measurements, x: np.ndarray) -> np.ndarray:
+        """States ``(n, d)`` along recordings, with those that it brings to a fit, shape ``(n, d + k)``."""
+        if not self.candidate.scales:
+            return x
+        columns = ProbeColumns(fit.model, Grid(data, fit.substeps), [self], x)
+        return np.concatenate([x, columns.further_states(0)], axis=1)
+
+
+class Basis(Protocol):
+    """A function with linear parameters, such as values at knots."""
+
+    @property
+    def width(self) -> int:
+        """The number of its parameters."""
+
+    def values(self, courses: np.ndarray) -> np.ndarray:
+        """What a unit of each does along courses ``(c, n)`` of the coordinates, shape ``(width, n)``."""
+
 
 class ProbeColumns:
     """The columns of many probes, as `siq.inference.kalman_filter.linearise` wants them.
@@ -87,9 +120,17 @@ class ProbeColumns:
 
     def __init__(self, model: Dynamics, grid: Grid, probes: Sequence[Probe], x: np.ndarray) -> None:
         self._model, self._grid, self._probes, self._x = model, grid, probes, x
-        candidates = {id(each.candidate): each.candidate for each in probes}
-        self._compiled = {key: _Compiled(model, each) for key, each in candidates.items()}
         self.width = sum(probe.width for probe in probes)
+        # Of each candidate, of rates and of outputs: the entries that are not zero, and their functions.
+        self._compiled = {}
+        self._memories: dict[int, list[np.ndarray]] = {}
+        for key, each in {id(probe.candidate): probe.candidate for probe in probes}.items():
+            columns, d = each.columns(model), model.dimension
+            for measured in (False, True):
+                some = [one for one in columns if (one[0] >= d) is measured]
+                entries = [(row - d * measured, column) for row, column, _ in some]
+                functions = compile_values([one for _, _, one in some], each.model.arguments, common=False)
+                self._compiled[key, measured] = entries, functions
 
     def rates(self, x: np.ndarray, values: np.ndarray, node: int) -> np.ndarray:
         """See `siq.inference.kalman_filter.Columns`."""
@@ -105,16 +146,14 @@ class ProbeColumns:
         result = np.zeros((count, self.width, x.shape[1]))
         place = 0
         for index, probe in enumerate(self._probes):
-            compiled = self._compiled[id(probe.candidate)]
-            entries = compiled.output_entries if node is None else compiled.rate_entries
+            entries, functions = self._compiled[id(probe.candidate), node is None]
             if entries:
-                further, delays = x[:0], compiled.delays_at(probe)
+                further, delays = x[:0], probe.delays
                 if probe.candidate.scales:
                     further = self.further_states(index).T if node is None else self._memory(index)[node]
                 signals = self._grid.at_samples(delays) if node is None else self._grid.signals(node, delays)
                 at = (*x, *further, *signals.inputs, *signals.delayed, *signals.slopes, signals.t)
-                functions = compiled.outputs if node is None else compiled.rates
-                found = functions(*at, *compiled.numbers(probe, values))
+                found = functions(*at, *probe.parameters(values))
                 for (row, column), value in zip(entries, found, strict=True):
                     result[row, place + column] = value
             place += probe.width
@@ -150,32 +189,38 @@ class ProbeColumns:
 
     def _memory(self, index: int) -> list[np.ndarray]:
         """The further states of a probe at all nodes, carried along each recording from its begin."""
-        cache = self.__dict__.setdefault("_memories", {})
-        if index not in cache:
-            cache[index] = self._carry(self._probes[index])
-        return cache[index]
+        if index not in self._memories:
+            self._memories[index] = self._carry(self._probes[index])
+        return self._memories[index]
 
     def _carry(self, probe: Probe) -> list[np.ndarray]:
         """Sample after sample along each recording, then within all intervals side by side."""
-        compiled = self._compiled[id(probe.candidate)]
-        grid = self._grid
+        grid, model, augmented = self._grid, self._model, probe.candidate.model
         step = grid.step
-        numbers = compiled.numbers(probe, self._model.values)
-        begins = along(probe.candidate.begins, self._model, grid.data, self._x)
+        numbers = probe.parameters(model.values)
+        begins = along(probe.candidate.begins, model, grid.data, self._x)
         begin = np.ascontiguousarray(begins[:, grid.data.first[:-1]].T, dtype=float)
+        # Further states, which come first, are carried; all else is known along the recordings.
+        formulas = [augmented.evaluable(each) for each in augmented.equations[model.dimension :]]
+        own = augmented.symbols[model.dimension :]
+        arguments = [*own, *(each for each in augmented.arguments if each not in own)]
+        rates, tape = compile_values(formulas, arguments, common=False), Tape.of(formulas, arguments)
+        if tape is None:
+            names = ", ".join(map(str, formulas))
+            raise NumericalFailure(f"a state of its own has a formula that cannot be followed: {names}")
         signals = [
             np.concatenate([x, s.inputs, s.delayed, s.slopes, s.t[None]])
             for x, s in (
-                (self._node_states[node], grid.signals(node, compiled.delays_at(probe)))
+                (self._node_states[node], grid.signals(node, probe.delays))
                 for node in range(3 * grid.substeps)
             )
         ]
 
         def rate(z: np.ndarray, node: int) -> np.ndarray:
-            values = compiled.memory(*z, *signals[node], *numbers)
+            values = rates(*z, *signals[node], *numbers)
             return np.array([np.broadcast_to(value, z.shape[1:]) for value in values])
 
-        z = compiled.carried(grid, np.stack(signals), numbers, begin)[grid.rows].T
+        z = run_along(tape, grid, np.stack(signals), np.array(numbers), begin)[grid.rows].T
         nodes = []
         for part in range(grid.substeps):
             first, middle, last = 3 * part, 3 * part + 1, 3 * part + 2
@@ -187,73 +232,6 @@ class ProbeColumns:
             nodes += [z, z + step / 2 * k2, after]
             z = after
         return nodes
-
-
-class _Compiled:
-    """The columns of one candidate as functions; entries without an effect are left out."""
-
-    def __init__(self, model: Dynamics, candidate: MechanismCandidate) -> None:
-        augmented = candidate.model
-        self._candidate, self._count = candidate, len(model.parameters)
-        formulas = [*augmented.equations, *(formula for _, formula in augmented.outputs)]
-        arguments = augmented.arguments
-        written = [augmented.evaluable(formula) for formula in formulas]
-        zero = {symbol(name): 0 for name in candidate.amplitudes}
-
-        def columns(formula: sympy.Expr, before: sympy.Expr) -> list[sympy.Expr]:
-            if not candidate.amplitudes:
-                return [formula - before]
-            return [formula.diff(symbol(name)).subs(zero) for name in candidate.amplitudes]
-
-        base = [model.evaluable(formula) for formula in model.equations]
-        rates = [columns(f, b) for f, b in zip(written[: model.dimension], base, strict=True)]
-        outputs = [
-            columns(f, b) for f, (_, b) in zip(written[augmented.dimension :], model.outputs, strict=True)
-        ]
-        self.rate_entries = [(i, j) for i, row in enumerate(rates) for j, each in enumerate(row) if each != 0]
-        self.output_entries = [
-            (i, j) for i, row in enumerate(outputs) for j, each in enumerate(row) if each != 0
-        ]
-        self.rates = compile_values([rates[i][j] for i, j in self.rate_entries], arguments, common=False)
-        self.outputs = compile_values(
-            [outputs[i][j] for i, j in self.output_entries], arguments, common=False
-        )
-        # Of further states, which come first: they are carried, and all else is known along the recordings.
-        self._further = written[model.dimension : augmented.dimension]
-        own = [symbol(name) for name in augmented.states[model.dimension :]]
-        self._memory_arguments = [*own, *(each for each in arguments if each not in own)]
-        self.memory = compile_values(self._further, self._memory_arguments, common=False)
-
-    def numbers(self, probe: Probe, values: np.ndarray) -> tuple[float, ...]:
-        """All parameters: the simulation's, then the mechanism's."""
-        shapes = dict(probe.shapes)
-        new = self._candidate.model.parameters[self._count :]
-        # As numpy has them: a division by zero is then infinite, and no error.
-        return (*values, *(np.float64(shapes.get(each.name, 0.0)) for each in new))
-
-    def carried(
-        self, grid: Grid, signals: np.ndarray, numbers: tuple[float, ...], begin: np.ndarray
-    ) -> np.ndarray:
-        """The further states at all samples, shape ``(n, k)``."""
-        tape = Tape.of(self._further, self._memory_arguments)
-        if tape is None:
-            names = ", ".join(map(str, self._further))
-            raise NumericalFailure(f"a state of its own has a formula that cannot be followed: {names}")
-        return run_along(tape, grid, signals, np.array(numbers), begin)
-
-    def delays_at(self, probe: Probe) -> tuple[tuple[int, float], ...]:
-        """Delayed inputs of the candidate's formulas."""
-        shapes = dict(probe.shapes)
-        values = [shapes.get(each.name, each.value) for each in self._candidate.model.parameters]
-        return self._candidate.model.lags(np.array(values))
-
-
-def with_further_states(probe: Probe, fit: Fit, data: Measurements, x: np.ndarray) -> np.ndarray:
-    """States ``(n, d)`` along recordings, with those that a probe brings to a fit, shape ``(n, d + k)``."""
-    if not probe.candidate.scales:
-        return x
-    columns = ProbeColumns(fit.model, Grid(data, fit.substeps), [probe], x)
-    return np.concatenate([x, columns.further_states(0)], axis=1)
 
 
 def probes_of(
@@ -311,17 +289,10 @@ def levels_of(fit: Fit) -> tuple[float, ...]:
     return NOISE_LEVELS if fit.has_process_noise else (1.0,)
 
 
-def in_portions(widths: Sequence[int], model: Dynamics, data: Measurements) -> Iterator[slice]:
-    """Groups of columns, by their widths, divided so that the response to a portion fits into the memory."""
-    most = max(LARGEST_PORTION // (len(data.t) * (model.dimension + len(model.outputs))), LEAST_PORTION)
-    first, columns = 0, 0
-    for place, width in enumerate(widths):
-        if columns and columns + width > most:
-            yield slice(first, place)
-            first, columns = place, 0
-        columns += width
-    if columns:
-        yield slice(first, len(widths))
+def slices_of(bases: Sequence[Probe | Basis]) -> list[slice]:
+    """Which columns are those of which basis, where they stand one behind the other."""
+    ends = itertools.accumulate(each.width for each in bases)
+    return [slice(end - each.width, end) for each, end in zip(bases, ends, strict=True)]
 
 
 def probe_response(fit: Fit, grid: Grid, columns: Columns) -> Linearisation:
@@ -475,14 +446,19 @@ def screen_all(
             untried[candidate.label] = NotFitted.of(candidate, error)
     grid = Grid(data, min(substeps, PROBE_SUBSTEPS))
     screened: list[tuple[Probe, Screened]] = []
-    for portion in in_portions([probe.width for probe in probes], model, data):
-        some = probes[portion]
+    # Divided so that the response to a portion fits into the memory.
+    most = max(LARGEST_PORTION // (len(data.t) * (model.dimension + len(model.outputs))), LEAST_PORTION)
+    portions: list[list[Probe]] = []
+    for probe in probes:
+        if not portions or sum(each.width for each in portions[-1]) + probe.width > most:
+            portions.append([])
+        portions[-1].append(probe)
+    for some in portions:
         try:
             budget.says(f"screening {len(candidates)} candidates")
             budget.charge(grid.substeps * evaluation(model, data, columns=sum(probe.width for probe in some)))
             response = probe_response(current, grid, ProbeColumns(model, grid, some, current.x))
-            ends = np.cumsum([probe.width for probe in some])
-            groups = [slice(end - probe.width, end) for probe, end in zip(some, ends, strict=True)]
+            groups = slices_of(some)
             positive = [
                 np.array([name in each.candidate.positive for name in each.candidate.amplitudes] or [True])
                 for each in some

@@ -9,7 +9,7 @@ Mechanisms are added one at a time, each on top of those before it.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -25,7 +25,7 @@ from siq.diagnosis.evidence import (
 )
 from siq.diagnosis.mechanisms import MechanismCandidate, rebased
 from siq.diagnosis.residual_structure import has_structure
-from siq.diagnosis.screening import Probe, Screened, screen_all, with_further_states
+from siq.diagnosis.screening import Probe, Screened, screen_all
 from siq.diagnosis.study import MismatchStudy, SearchOptions
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent
@@ -78,23 +78,14 @@ class AcceptedMechanism:
     ----------
     best
         The mechanism.
-    indistinguishable
-        Those that explain the recordings as well.
-    needless
-        Those that explain as much, but with further parameters that do not earn their place.
-    lesser
-        Those that explain less.
+    others
+        What else was fitted, by how it stands beside the mechanism: ``same``, it explains the recordings as
+        well; ``needless``, it explains as much, but with further parameters that do not earn their place;
+        ``less``, it explains less.
     """
 
     best: FittedCandidate
-    indistinguishable: tuple[FittedCandidate, ...]
-    needless: tuple[FittedCandidate, ...] = ()
-    lesser: tuple[FittedCandidate, ...] = ()
-
-    @property
-    def standings(self) -> dict[Standing, tuple[FittedCandidate, ...]]:
-        """What else was fitted, by how it stands beside the mechanism."""
-        return {"same": self.indistinguishable, "needless": self.needless, "less": self.lesser}
+    others: Mapping[Standing, tuple[FittedCandidate, ...]]
 
 
 @dataclass(frozen=True)
@@ -149,23 +140,20 @@ def _accepted(
         best = min(equals, key=lambda each: each.p_cluster)
     least = best.delta_chi2 - options.same
 
-    def needless(other: FittedCandidate) -> bool:
-        """Whether it needs more parameters than the best, and does not earn them.
+    def standing(other: FittedCandidate) -> Standing:
+        """Less, the same, or needless: it needs more parameters than the best, and does not earn them.
 
         One that fits better by as much as its further parameters would bring by chance twice over (Akaike) is
         not ruled out, although the simpler is preferred (Bayes).
         """
+        if not other.delta_chi2 > least:
+            return "less"
         more = len(other.candidate.new) - len(best.candidate.new)
-        return more > 0 and other.delta_chi2 - best.delta_chi2 < 2 * more
+        return "needless" if more > 0 and other.delta_chi2 - best.delta_chi2 < 2 * more else "same"
 
-    others = [other for other in trials if other is not best]
-    equals = [other for other in others if other.delta_chi2 > least]
-    return AcceptedMechanism(
-        best,
-        indistinguishable=tuple(other for other in equals if not needless(other)),
-        needless=tuple(other for other in equals if needless(other)),
-        lesser=tuple(other for other in others if not other.delta_chi2 > least),
-    )
+    stands = [(standing(other), other) for other in trials if other is not best]
+    names: tuple[Standing, ...] = ("same", "needless", "less")
+    return AcceptedMechanism(best, {name: tuple(o for each, o in stands if each == name) for name in names})
 
 
 def _better_without(trial: FittedCandidate, current: Fit, context: FitContext) -> Fit | None:
@@ -205,7 +193,7 @@ def _fit_most_promising(
         """Fit and judge a candidate; one that leads away, or has a sign that it cannot have, has failed."""
         candidate = probe.candidate
         try:
-            x = with_further_states(probe, current, data, begin.x[:, : current.model.dimension])
+            x = probe.states_along(current, data, begin.x[:, : current.model.dimension])
             fit = fit_with_process_noise_as_needed(
                 _with_start(probe, result, begin.model), data, begin, level=result.level, x=x, budget=budget
             )
@@ -336,7 +324,7 @@ def _stands_together(
     return replace(progress, found=(*progress.found[:place], stands, *progress.found[place + 1 :]))
 
 
-def search(context: FitContext, recalibrated: Fit) -> Search:
+def search_mechanisms(context: FitContext, recalibrated: Fit) -> Search:
     """Look for mechanisms, one after the other, until nothing is found or its part of the budget is spent."""
     with context.budget.keeping(BUDGET_FOR_FUNCTIONS):
         return _extended(Search(recalibrated, (), recalibrated, ()), context, on_trial=True)

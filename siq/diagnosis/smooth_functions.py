@@ -66,7 +66,7 @@ PRODUCT_TOLERANCE = 1e-4  # of what is left, by which an iteration has to be bet
 
 @dataclass(frozen=True)
 class Bumps:
-    """A smooth function as a sum of bumps, and what is expected of it: a `siq.diagnosis.terms.Basis`.
+    """A smooth function as a sum of bumps, and what is expected of it: a `siq.diagnosis.screening.Basis`.
 
     Attributes
     ----------

@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final, Literal, Protocol
+from typing import Final, Literal
 
 import numpy as np
 import scipy.interpolate
@@ -20,8 +20,17 @@ import sympy
 
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
 from siq.diagnosis.evidence import correlation_time_of, evidence_of_function, orthonormal
-from siq.diagnosis.mechanisms import MechanismCandidate, along, fresh_names
-from siq.diagnosis.screening import PROBE_SUBSTEPS, Probe, ProbeColumns, levels_of, probe_response, projected
+from siq.diagnosis.mechanisms import MechanismCandidate, along, fresh_names, with_added
+from siq.diagnosis.screening import (
+    PROBE_SUBSTEPS,
+    Basis,
+    Probe,
+    ProbeColumns,
+    levels_of,
+    probe_response,
+    projected,
+    slices_of,
+)
 from siq.errors import NumericalFailure
 from siq.inference.kalman_filter import Grid, Linearisation, profile_likelihood, whiten
 from siq.inference.maximum_likelihood import Fit
@@ -44,20 +53,9 @@ Power = tuple[sympy.Expr, int, int]
 """A term of a formula, and how often the first and the second coordinate are factors of it."""
 
 
-class Basis(Protocol):
-    """A function with linear parameters, such as values at knots."""
-
-    @property
-    def width(self) -> int:
-        """The number of its parameters."""
-
-    def values(self, courses: np.ndarray) -> np.ndarray:
-        """What a unit of each does along courses ``(c, n)`` of the coordinates, shape ``(width, n)``."""
-
-
 @dataclass(frozen=True)
 class Place:
-    """Where a function may stand, and of what; of one coordinate it is a `Basis` of splines.
+    """Where a function may stand, and of what; of one coordinate it is a basis of splines.
 
     Attributes
     ----------
@@ -289,8 +287,7 @@ def linearised_with_places(
     grid = Grid(data, min(fit.substeps, PROBE_SUBSTEPS))
     for begin in range(0, len(places), at_once):
         some = places[begin : begin + at_once]
-        ends = itertools.accumulate(each.width for each in some)
-        groups = [(each, slice(end - each.width, end)) for each, end in zip(some, ends, strict=True)]
+        groups = list(zip(some, slices_of(some), strict=True))
         yield probe_response(fit, grid, PlaceColumns(model, grid, some)), groups
 
 
@@ -410,24 +407,13 @@ def built(
     """The simulation with a formula in a place, whose amplitudes have names and units."""
     added = {name: formula * factor for name, factor in place.equations}
     read = {name: formula * factor for name, factor in place.outputs}
-    augmented = replace(
-        model,
-        parameters=(
-            *model.parameters,
-            *(Parameter(name, 0.0, unit) for name, unit in zip(names, units, strict=True)),
-        ),
-        equations=tuple(
-            before + added.get(name, sympy.Integer(0))
-            for name, before in zip(model.states, model.equations, strict=True)
-        ),
-        outputs=tuple((name, before + read.get(name, sympy.Integer(0))) for name, before in model.outputs),
-    )
+    parameters = [Parameter(name, 0.0, unit) for name, unit in zip(names, units, strict=True)]
     name = f"a function of {' and '.join(place.words)}"
     where = f"{'the measurement of ' if place.outputs else ''}{', '.join(place.targets)}"
     return MechanismCandidate(
         name=name,
         label=f"{name} in {where}",
-        model=augmented,
+        model=with_added(model, added, read, parameters),
         amplitudes=tuple(names),
         equations=tuple(name for name, _ in place.equations),
         coordinate="measurement" if place.outputs else ", ".join(place.words),

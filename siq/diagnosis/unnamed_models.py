@@ -33,7 +33,7 @@ from siq.diagnosis.evidence import (
 )
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
 from siq.diagnosis.residual_structure import has_structure
-from siq.diagnosis.screening import screen_all, with_further_states
+from siq.diagnosis.screening import screen_all
 from siq.diagnosis.search import FitContext, Search, best_probes
 from siq.diagnosis.smooth_functions import SmoothFunction, Smoothness, Term, smoothness_of
 from siq.diagnosis.terms import (
@@ -416,7 +416,7 @@ def _with_memories(fit: Fit, models: Sequence[AugmentedModel], context: FitConte
         values = [known.get(each.name, each.value) for each in model.parameters]
         candidate = replace(candidate, model=model.with_values(np.array(values)))
         try:
-            x = with_further_states(probe, fit, context.data, fit.x)
+            x = probe.states_along(fit, context.data, fit.x)
         except NUMERICAL_ERRORS as error:
             LOGGER.info("%s cannot be fitted: %s", candidate.label, error)
             continue

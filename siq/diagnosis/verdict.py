@@ -11,8 +11,9 @@ import sympy
 
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
 from siq.diagnosis.evidence import BUDGET_SPENT, correlation_time_left, log_evidence_of, residuals
-from siq.diagnosis.investigation import HeldOutRuns, Investigation
+from siq.diagnosis.investigation import HeldOutRuns
 from siq.diagnosis.mechanisms import PROCESS_NOISE
+from siq.diagnosis.naming import Investigation
 from siq.diagnosis.residual_structure import Structure
 from siq.diagnosis.smooth_functions import Term
 from siq.diagnosis.statement import (
@@ -93,7 +94,7 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
             p_residuals_random=investigation.remainder.after.p_value,
             random_forces_admitted=search.fit.has_process_noise,
             too_faint=investigation.too_faint,
-            p_alike=None if investigation.naming is None else investigation.naming.p_alike,
+            p_alike=investigation.p_alike,
             misleading=investigation.withdrawn,
         )
         if verdict is MismatchVerdict.UNEXPLAINED
@@ -188,11 +189,10 @@ def _found_mechanisms(investigation: Investigation, card: Fit | None) -> tuple[S
             ),
         )
     labels = [each.best.candidate.label for each in search.found]
-    log_odds = investigation.naming.log_odds if investigation.naming is not None else ()
     final = search.fit if card is None else card
     errors, known = _standard_errors(final), {entry.name: entry for entry in final.model.parameters}
     stated = []
-    for place, (found, odds) in enumerate(zip(search.found, log_odds, strict=True)):
+    for place, (found, odds) in enumerate(zip(search.found, investigation.log_odds, strict=True)):
         trial, candidate = found.best, found.best.candidate
         rivals = [
             Rival(
@@ -202,7 +202,7 @@ def _found_mechanisms(investigation: Investigation, card: Fit | None) -> tuple[S
                 len(other.candidate.new) - len(candidate.new),
                 standing,
             )
-            for standing, others in found.standings.items()
+            for standing, others in found.others.items()
             for other in others
         ]
         alike = {each.name for each in rivals if each.standing == "same"} - {candidate.name}

@@ -18,7 +18,7 @@ from siq.diagnosis.diagnosis import Diagnosis, solve_case, withdrawn
 from siq.diagnosis.dictionary import standard_dictionary
 from siq.diagnosis.evidence import FittedCandidate
 from siq.diagnosis.investigation import held_out_runs
-from siq.diagnosis.naming import NamingDecision
+from siq.diagnosis.naming import Investigation
 from siq.diagnosis.residual_structure import Remainder
 from siq.diagnosis.screening import Probe
 from siq.diagnosis.search import FitContext, Search
@@ -293,9 +293,14 @@ def test_what_the_dictionary_lacks_stays_unexplained(tmp_path: Path) -> None:
 def test_what_a_name_leaves_is_described_and_no_sample_of_a_test_chooses_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def the_first_alone(whole: Search, left: list[Remainder], *_: Any, **__: Any) -> NamingDecision:
+    def the_first_alone(
+        whole: Search, left: list[Remainder], context: FitContext, **_: object
+    ) -> Investigation:
         first = replace(whole, found=whole.found[:1], fit=whole.found[0].best.fit)
-        return NamingDecision(first, left[0], (9.0,), 9.0, None, convincing=True, named=True)
+        named = MismatchVerdict.MISSING_PHYSICS
+        return Investigation(
+            context, first, left[0], named, whole.recalibrated, log_odds=(9.0,), convincing=True
+        )
 
     monkeypatch.setattr("siq.diagnosis.naming._judge_mechanisms", the_first_alone)
     table = recordings_of(lambda x, v, t: -2.0 * x**3 - 0.1 * v * np.abs(v), count=6)

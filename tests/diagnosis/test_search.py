@@ -15,7 +15,7 @@ from siq.diagnosis import naming
 from siq.diagnosis.dictionary import Roles, Shape
 from siq.diagnosis.evidence import FittedCandidate, _blocks_of, _correlated_probability, _correlation_time
 from siq.diagnosis.mechanisms import MechanismCandidate
-from siq.diagnosis.naming import NamingDecision, _judge_mechanisms
+from siq.diagnosis.naming import Investigation, _judge_mechanisms
 from siq.diagnosis.residual_structure import Curve, Remainder, Structure
 from siq.diagnosis.screening import _screen
 from siq.diagnosis.search import AcceptedMechanism, FitContext, Search, _accepted, _better_without
@@ -160,7 +160,7 @@ def found_with(number: int) -> Search:
     def found(place: int) -> AcceptedMechanism:
         candidate = SimpleNamespace(name=f"mechanism {place}", label=f"mechanism {place}", number=place)
         fit = SimpleNamespace(number=place, has_process_noise=False, noise=SimpleNamespace(measurement=1.0))
-        return AcceptedMechanism(FittedCandidate(candidate, fit, 100.0, -90.0, 0.0, 0.0), ())
+        return AcceptedMechanism(FittedCandidate(candidate, fit, 100.0, -90.0, 0.0, 0.0), {"same": ()})
 
     each = tuple(found(place) for place in range(1, number + 1))
     return Search(SimpleNamespace(number=0, x=None), each, each[-1].best.fit, ())
@@ -211,7 +211,7 @@ def judged(
     *,
     together: float = 20.0,
     p_alike: float = 0.5,
-) -> NamingDecision:
+) -> Investigation:
     """A search of so many mechanisms, judged by odds and matches that are given."""
 
     def of_a_name(_: object, candidates: list[SimpleNamespace], context: FitContext) -> float:
@@ -266,7 +266,7 @@ def test_a_name_has_to_be_likelier_than_none(
 ) -> None:
     left = [remainder(0.99 + 0.001 * place, p_left) for place in range(len(odds))]
     found = judged(monkeypatch, odds, left, together=together, p_alike=p_alike)
-    assert found.named == (verdict == "missing physics")
+    assert found.verdict.names == (verdict == "missing physics")
     assert said is None or said in sentence(found.remarks[-1])
 
 
@@ -288,7 +288,7 @@ def test_of_equals_the_one_that_all_recordings_ask_for_where_white_errors_mean_l
     trials = [trial("better", 331, 1e-9), trial("steadier", 325, 1e-49), trial("worse", 276, 1e-60)]
     found = _accepted(trials, 50, 1e-4, options=SearchOptions())
     assert found is not None and found.best.candidate.name == expected
-    assert {each.candidate.name for each in found.indistinguishable} == {"better", "steadier"} - {expected}
+    assert {each.candidate.name for each in found.others["same"]} == {"better", "steadier"} - {expected}
 
 
 def test_nothing_is_missing_where_its_fit_only_found_better_parameters(decaying: Dynamics) -> None:
