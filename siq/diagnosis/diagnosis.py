@@ -19,9 +19,8 @@ import pandas as pd
 
 from siq.diagnosis.evidence import NUMERICAL_ERRORS
 from siq.diagnosis.investigation import HeldOutRuns, held_out_runs, investigate
-from siq.diagnosis.mechanisms import completed
 from siq.diagnosis.naming import Investigation
-from siq.diagnosis.residual_structure import remainder_of
+from siq.diagnosis.residual_structure import Remainder
 from siq.diagnosis.search import Search
 from siq.diagnosis.statement import Location, StatedTerm, Statement
 from siq.diagnosis.study import Comparison, MismatchStudy, MismatchVerdict, comparison_of
@@ -31,6 +30,7 @@ from siq.diagnosis.verdict import statement_of
 from siq.errors import InputError, NumericalFailure
 from siq.inference.budget import Budget
 from siq.remarks import Remark
+from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 LOGGER = logging.getLogger(__name__)
 
 
-def withdrawn(found: Investigation) -> Investigation:
+def _withdrawn(found: Investigation) -> Investigation:
     """An investigation without its names, and with models of what has none.
 
     Where nothing else speaks of a mismatch there is none: evidence that recordings held out refute is no
@@ -58,7 +58,7 @@ def withdrawn(found: Investigation) -> Investigation:
     if not (
         recalibrated.has_process_noise
         or certain
-        or remainder_of(context.data, recalibrated, recalibrated, context.roles).structured
+        or Remainder.of(context.data, recalibrated, recalibrated, context.roles).structured
     ):
         return replace(
             found,
@@ -196,6 +196,30 @@ def diagnose(
     return solve_case(comparison_of(system, recordings, settings))
 
 
+def _completed(model: Dynamics, x: np.ndarray, *, process: np.ndarray | None = None) -> Dynamics:
+    """A fitted simulation as a dynamics of its own.
+
+    Parameters
+    ----------
+    model
+        With the estimates as its parameters' values.
+    x
+        States along the recordings, shape ``(n, d)``: measured ones as they were measured or smoothed, hidden
+        ones as the fit has them. A state without a domain, such as one that a mechanism brings, gets the
+        range of these.
+    process
+        Intensity of process noise on each state, per time, shape ``(d,)``, where it is part of what was
+        found. It becomes its D, with zeros for states that nothing drives.
+    """
+    limits = np.stack([x.min(axis=0), x.max(axis=0)], axis=1)
+    limits[limits[:, 0] == limits[:, 1]] = np.nan  # of a state that rests nothing is known
+    domain = np.where(np.isfinite(model.limits), model.limits, limits)
+    noise = model.diffusion
+    if process is not None and (process > 0).any():
+        noise = Diffusion(np.diag(process))
+    return replace(model, domain=domain, diffusion=noise)
+
+
 def solve_case(
     case: Comparison,
     *,
@@ -226,7 +250,7 @@ def solve_case(
         named = found.verdict.names and not found.process_noise
         # Tests of somebody else may be among the recordings held out, and decide nothing.
         if named and not case.settings.tests and shown.errors.change("without", "augmented") == "worse":
-            found = withdrawn(found)
+            found = _withdrawn(found)
             shown = held_out_runs(found, case.kept)
         statement = statement_of(found, shown)
     except InputError:
@@ -242,8 +266,8 @@ def solve_case(
     recalibrated = found.search.recalibrated
     return Diagnosis(
         statement=statement,
-        augmented=completed(model, final.x, process=process),
-        recalibrated=completed(recalibrated.model, recalibrated.x),
+        augmented=_completed(model, final.x, process=process),
+        recalibrated=_completed(recalibrated.model, recalibrated.x),
         case=case,
         investigation=found,
         held_out=shown,
@@ -350,8 +374,8 @@ def _candidate_rows(search: Search) -> list[tuple[str | float, ...]]:
                 name, label = trial.candidate.name, trial.candidate.label
                 fitted.add((label, beside))
                 rows.append((name, label, "", trial.delta_chi2, 1.0, stage, beside))
-    beside = ", ".join(search.screened_beside)
-    stage = "further" if list(search.screened_beside) == labels else "instead"
+    beside = ", ".join(search.screened_with)
+    stage = "further" if list(search.screened_with) == labels else "instead"
     for probe, result in search.screened:
         name, label = probe.candidate.name, probe.candidate.label
         if (label, beside) not in fitted:  # of what was fitted, what had been promised is of no interest

@@ -26,7 +26,6 @@ from siq.diagnosis.residual_structure import (
     Remainder,
     explained_by_quantisation,
     noise_nonstationarity,
-    remainder_of,
 )
 from siq.diagnosis.search import FitContext, search_mechanisms
 from siq.diagnosis.study import MismatchStudy, MismatchVerdict
@@ -96,7 +95,7 @@ def investigate(
     by_each: list[Remainder] = []
     for place, each in enumerate(found.found):
         try:
-            by_each.append(remainder_of(data, recalibrated, each.best.fit, roles))
+            by_each.append(Remainder.of(data, recalibrated, each.best.fit, roles))
         except NumericalFailure as error:
             fit = found.found[place - 1].best.fit if place else recalibrated
             untried = (*found.untried, NotFitted.of(each.best.candidate, error))
@@ -107,7 +106,7 @@ def investigate(
         result = decide_naming(found, by_each, context, generator=np.random.default_rng(seed))
         result = replace(result, least_squares=least_squares)
     else:
-        left = remainder_of(data, recalibrated, recalibrated, roles)
+        left = Remainder.of(data, recalibrated, recalibrated, roles)
         result = Investigation(context, found, left, MismatchVerdict.NO_MISMATCH, least_squares)
     rounded = None
     doubtful = not tried and (found.fit.has_process_noise or result.remainder.structured)
@@ -242,8 +241,8 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     if choices and judges:
         # What is not certain where it was found has to be better by more than appears by chance, what is
         # certain better than the simulation fitted alike. A card whose values are right predicts well, and
-        # tells nothing of a function whose fit had to find them, too. Beside process noise a free run is off
-        # by it, and a little may be chance.
+        # tells nothing of a function whose fit had to find them, too. Where there is process noise a free run
+        # is off by it, and a little may be chance.
         may_choose = data.select(judges)
         alone = [errors_of(each, may_choose) for each in ((plain,) if named else (card, recalibrated))]
         least = min((each for each in alone if each is not None), key=np.mean, default=None)

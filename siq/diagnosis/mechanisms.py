@@ -1,7 +1,7 @@
 """Mechanisms built into a simulation, and which of them are no more than a recalibration.
 
 A mechanism is written for roles (`siq.diagnosis.dictionary`); here it becomes models, one for each way of
-filling the roles. Beside the roles its formulas may use what the simulation itself says of them: `v_rate`,
+filling the roles. Besides the roles its formulas may use what the simulation itself says of them: `v_rate`,
 the equation of the state v; `p_with_q`, the part of the equation of p in which q stands as well; `y_rate` and
 `y_curvature`, the first and second time derivative of the output y, inputs being held. What a mechanism does
 not depend on linearly is looked for about sizes, times and frequencies of the recorded motion; what the
@@ -39,7 +39,6 @@ from siq.diagnosis.dictionary import (
 from siq.errors import InputError
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
-from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import TIME, Dynamics, Parameter, Signals, symbol
 from siq.systems.formulas import FormulaError, compile_values, parse_formula
 
@@ -188,6 +187,52 @@ class MechanismCandidate:
     def new(self) -> tuple[str, ...]:
         """All new parameters, in the order of the model's."""
         return tuple(p.name for p in self.model.parameters if p.name in {*self.amplitudes, *self.shapes})
+
+    def rebased(self, before: Dynamics, now: Dynamics) -> MechanismCandidate:
+        """It on top of a model that has grown since."""
+        names = {parameter.name for parameter in now.parameters}
+        model = self.model
+        renamed = {name: name for name in self.new}
+        for name in self.new:
+            if name in names:
+                stem, _, number = name.rpartition("_")
+                k = int(number)
+                while f"{stem}_{k}" in names or f"{stem}_{k}" in renamed.values():
+                    k += 1
+                renamed[name] = f"{stem}_{k}"
+        change = {symbol(old): symbol(new) for old, new in renamed.items() if old != new}
+
+        def merge(theirs: sympy.Expr, old: sympy.Expr, ours: sympy.Expr) -> sympy.Expr:
+            return ours + (theirs - old).xreplace(change)
+
+        count = len(before.parameters)
+        equations = [
+            merge(t, o, n)
+            for t, o, n in zip(
+                model.equations[: before.dimension], before.equations, now.equations, strict=True
+            )
+        ]
+        outputs = [
+            (name, merge(t, o, n))
+            for (name, t), (_, o), (_, n) in zip(model.outputs, before.outputs, now.outputs, strict=True)
+        ]
+        new = tuple(replace(p, name=renamed[p.name]) for p in model.parameters[count:])
+        return replace(
+            self,
+            model=replace(
+                model,
+                equations=(
+                    *equations,
+                    *(each.xreplace(change) for each in model.equations[before.dimension :]),
+                ),
+                outputs=tuple(outputs),
+                parameters=(*now.parameters, *new),
+            ),
+            changes=tuple((name, formula.xreplace(change)) for name, formula in self.changes),
+            amplitudes=tuple(renamed[name] for name in self.amplitudes),
+            shapes=tuple(renamed[name] for name in self.shapes),
+            positive=frozenset(renamed[name] for name in self.positive),
+        )
 
     def columns(self, model: Dynamics) -> list[tuple[int, int, sympy.Expr]]:
         """What a unit of each amplitude, none being there yet, does to the equations and outputs of a model.
@@ -405,7 +450,7 @@ def _label_of(name: str, variant: str, model: Dynamics, augmented: Dynamics) -> 
 
 
 INDEPENDENCE_TOLERANCE = (
-    1e-6  # of a column's length, left beside others: between rounding and what any shape leaves
+    1e-6  # of a column's length, left by others: between rounding and what any shape leaves
 )
 
 
@@ -418,7 +463,7 @@ def _beyond_parameters(
     """
     count = 2 * (len(model.free) + 6)
     x, signals = trial_points(model, count, either_sign=True)
-    # A parameter that happens to be zero hides what others do that stand beside it.
+    # A parameter that happens to be zero hides what others do in the same term.
     nonzero = np.random.default_rng(0).uniform(*ANYWHERE, size=len(model.parameters))
     values = np.where(model.values == 0, nonzero, model.values)
     by_parameter = model.functions.slopes(x, signals, values)[1]
@@ -655,69 +700,3 @@ def _added_square(candidate: MechanismCandidate) -> tuple[str, sympy.Expr] | Non
     if candidate.equations != (place,):
         return None  # it changes what is measured
     return place, formula.diff(symbol(candidate.amplitudes[0])) ** 2
-
-
-def rebased(candidate: MechanismCandidate, before: Dynamics, now: Dynamics) -> MechanismCandidate:
-    """A candidate on top of a model that has grown since."""
-    names = {parameter.name for parameter in now.parameters}
-    model = candidate.model
-    renamed = {name: name for name in candidate.new}
-    for name in candidate.new:
-        if name in names:
-            stem, _, number = name.rpartition("_")
-            k = int(number)
-            while f"{stem}_{k}" in names or f"{stem}_{k}" in renamed.values():
-                k += 1
-            renamed[name] = f"{stem}_{k}"
-    change = {symbol(old): symbol(new) for old, new in renamed.items() if old != new}
-
-    def merge(theirs: sympy.Expr, old: sympy.Expr, ours: sympy.Expr) -> sympy.Expr:
-        return ours + (theirs - old).xreplace(change)
-
-    count = len(before.parameters)
-    equations = [
-        merge(t, o, n)
-        for t, o, n in zip(model.equations[: before.dimension], before.equations, now.equations, strict=True)
-    ]
-    outputs = [
-        (name, merge(t, o, n))
-        for (name, t), (_, o), (_, n) in zip(model.outputs, before.outputs, now.outputs, strict=True)
-    ]
-    new = tuple(replace(p, name=renamed[p.name]) for p in model.parameters[count:])
-    return replace(
-        candidate,
-        model=replace(
-            model,
-            equations=(*equations, *(each.xreplace(change) for each in model.equations[before.dimension :])),
-            outputs=tuple(outputs),
-            parameters=(*now.parameters, *new),
-        ),
-        changes=tuple((name, formula.xreplace(change)) for name, formula in candidate.changes),
-        amplitudes=tuple(renamed[name] for name in candidate.amplitudes),
-        shapes=tuple(renamed[name] for name in candidate.shapes),
-        positive=frozenset(renamed[name] for name in candidate.positive),
-    )
-
-
-def completed(model: Dynamics, x: np.ndarray, *, process: np.ndarray | None = None) -> Dynamics:
-    """A fitted simulation as a dynamics of its own.
-
-    Parameters
-    ----------
-    model
-        With the estimates as its parameters' values.
-    x
-        States along the recordings, shape ``(n, d)``: measured ones as they were measured or smoothed, hidden
-        ones as the fit has them. A state without a domain, such as one that a mechanism brings, gets the
-        range of these.
-    process
-        Intensity of process noise on each state, per time, shape ``(d,)``, where it is part of what was
-        found. It becomes its D, with zeros for states that nothing drives.
-    """
-    limits = np.stack([x.min(axis=0), x.max(axis=0)], axis=1)
-    limits[limits[:, 0] == limits[:, 1]] = np.nan  # of a state that rests nothing is known
-    domain = np.where(np.isfinite(model.limits), model.limits, limits)
-    noise = model.diffusion
-    if process is not None and (process > 0).any():
-        noise = Diffusion(np.diag(process))
-    return replace(model, domain=domain, diffusion=noise)

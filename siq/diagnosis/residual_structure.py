@@ -4,11 +4,11 @@ What may be missing is described without naming it: in every equation a piecewis
 coordinate - a state, an input, the amplitude of a rotating frame, time - is let in, and the data say how
 large it would be. It tells where a mismatch sits, and whether one is left.
 
-**Quantisation.** Where the steps of a sensor are wide beside its noise, rounding errors are autocorrelated
-and look like process noise, or like physics that is missing. The steps are known: the recorded values lie on
-them. Of a reading that was rounded it is known that the value lay within its step, and a simulation says
-where: at the mean of a normal distribution that is cut off at the edges of the step. About the right
-simulation the residuals to these values are independent of each other (the generalised residuals of
+**Quantisation.** Where the steps of a sensor are wide compared with its noise, rounding errors are
+autocorrelated and look like process noise, or like physics that is missing. The steps are known: the recorded
+values lie on them. Of a reading that was rounded it is known that the value lay within its step, and a
+simulation says where: at the mean of a normal distribution that is cut off at the edges of the step. About
+the right simulation the residuals to these values are independent of each other (the generalised residuals of
 Gourieroux, Monfort, Renault and Trognon, Journal of Econometrics 34, 5, 1987), and the fit to them is that of
 highest likelihood of the readings (Dempster, Laird and Rubin's EM algorithm).
 
@@ -174,35 +174,35 @@ class Remainder:
         """Whether what is left is hardly noise: a name has to leave less than that."""
         return self.after.p_value < DOUBTFUL
 
+    @classmethod
+    def of(cls, data: Measurements, recalibrated: Fit, final: Fit, roles: Roles) -> Remainder:
+        """Structure before and after mechanisms were added, and the share of the excess that they explain.
 
-def remainder_of(data: Measurements, recalibrated: Fit, final: Fit, roles: Roles) -> Remainder:
-    """Structure before and after mechanisms were added, and the share of the excess that they explain.
-
-    Parameters
-    ----------
-    data
-        The recordings.
-    recalibrated, final
-        The fit of the simulation, and that with mechanisms.
-    roles
-        Of the simulation's states.
-    """
-    after = _structure_of(data, final, roles)
-    # Process noise that stands for missing physics takes measurement noise with it; the final fit is right.
-    still = Noise(final.noise.measurement, np.zeros(recalibrated.model.dimension))
-    before = _structure_of(data, recalibrated, roles, noise=still)
-    alone = after
-    if final.has_process_noise:
-        alone = _structure_of(data, final, roles, noise=final.noise.without_process())
-    if not before.total > before.freedom:
-        return Remainder(before, after, 1.0)
-    # What is left is the excess that remains, or what a function of one coordinate still finds: where a fit
-    # without process noise takes a misfit for noise, only the latter shows it.
-    best = alone.curves[0] if alone.curves else None
-    systematic = 0.0 if best is None else best.gain - 2 * best.place.width
-    left = max(alone.total - alone.freedom, systematic, 0.0)
-    share = float(np.clip(1 - left / (before.total - before.freedom), 0.0, 1.0))
-    return Remainder(before, after, share)
+        Parameters
+        ----------
+        data
+            The recordings.
+        recalibrated, final
+            The fit of the simulation, and that with mechanisms.
+        roles
+            Of the simulation's states.
+        """
+        after = _structure_of(data, final, roles)
+        # Process noise that stands for missing physics takes measurement noise with it: that of the final fit.
+        still = Noise(final.noise.measurement, np.zeros(recalibrated.model.dimension))
+        before = _structure_of(data, recalibrated, roles, noise=still)
+        alone = after
+        if final.has_process_noise:
+            alone = _structure_of(data, final, roles, noise=final.noise.without_process())
+        if not before.total > before.freedom:
+            return cls(before, after, 1.0)
+        # What is left is the excess that remains, or what a function of one coordinate still finds: where a
+        # fit without process noise takes a misfit for noise, only the latter shows it.
+        best = alone.curves[0] if alone.curves else None
+        systematic = 0.0 if best is None else best.gain - 2 * best.place.width
+        left = max(alone.total - alone.freedom, systematic, 0.0)
+        share = float(np.clip(1 - left / (before.total - before.freedom), 0.0, 1.0))
+        return cls(before, after, share)
 
 
 def has_structure(current: Fit, data: Measurements) -> bool:
@@ -277,7 +277,7 @@ def explained_by_quantisation(
     if forced.converged and process_noise_needed(forced, fit):
         return None
     try:
-        left = remainder_of(values, fit, fit, roles)
+        left = Remainder.of(values, fit, fit, roles)
     except NumericalFailure:
         return None
     if left.after.p_value < least:

@@ -258,7 +258,7 @@ NOISE_LEVELS = (1.0, 0.1, 1e-2, 1e-3, 1e-4, 0.0)
 LARGEST_PORTION = 20_000_000  # numbers that are worked out at once; with copies about a gigabyte
 LEAST_PORTION = 10  # columns
 NEGATIVE_ERRORS = 2.0  # standard errors below zero, from which on an amplitude is taken for negative
-COLLINEAR = 0.02  # share of a column left beside the parameters, below which its amplitude knows no bounds
+COLLINEAR = 0.02  # share of a column left by the parameters, below which its amplitude knows no bounds
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 White errors, errors clustered by recording, and the Bayesian information criterion all have to say so; what
 cannot be told from the best is kept as its class of indistinguishables. One that leads to better parameters
-of the simulation itself is held against these, and one on trial has to stand beside what came after it.
+of the simulation itself is held against these, and one on trial has to stand with what came after it.
 Mechanisms are added one at a time, each on top of those before it.
 """
 
@@ -23,7 +23,7 @@ from siq.diagnosis.evidence import (
     NotFitted,
     probability_by_chance,
 )
-from siq.diagnosis.mechanisms import MechanismCandidate, rebased
+from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.diagnosis.residual_structure import has_structure
 from siq.diagnosis.screening import Probe, Screened, screen_all
 from siq.diagnosis.study import MismatchStudy, SearchOptions
@@ -79,7 +79,7 @@ class AcceptedMechanism:
     best
         The mechanism.
     others
-        What else was fitted, by how it stands beside the mechanism: ``same``, it explains the recordings as
+        What else was fitted, by how it compares with the mechanism: ``same``, it explains the recordings as
         well; ``needless``, it explains as much, but with further parameters that do not earn their place;
         ``less``, it explains less.
     """
@@ -102,7 +102,7 @@ class Search:
         Of the simulation with all of them.
     screened
         The last screening: every candidate with what it would gain.
-    screened_beside
+    screened_with
         Labels of the mechanisms that were in place for it. Where nothing was left to be explained, nothing
         was screened on top of the last mechanism.
     untried
@@ -116,7 +116,7 @@ class Search:
     fit: Fit
     screened: tuple[tuple[Probe, Screened], ...]
     untried: tuple[NotFitted, ...] = ()
-    screened_beside: tuple[str, ...] = ()
+    screened_with: tuple[str, ...] = ()
     fruitless: frozenset[str] = frozenset()
 
 
@@ -216,7 +216,7 @@ def _fit_most_promising(
         if known is None or trial.fit.log_likelihood > known.fit.log_likelihood:
             trials[candidate.label] = trial
 
-    # What the recordings themselves show is fitted beside the others, and in the place of none of them.
+    # What the recordings themselves show is fitted as well as the others, and in the place of none of them.
     most_promised = ranked[0][1].gain if ranked else 0.0
     shown = sum(probe.recorded and result.gain >= most_promised for probe, result in ranked)
     for place, (probe, result) in enumerate(ranked[: shown + 2 * most], start=-shown):
@@ -226,7 +226,7 @@ def _fit_most_promising(
         if result.gain < max(least_gain, PROMISING_GAIN * gained):
             break
         if place >= most and result.gain < gained - least_gain:
-            break  # no rival of the best, which the class of indistinguishables must have
+            break  # no alternative to the best, which the class of indistinguishables must have
         begun.append((probe, result))
         budget.says(
             f"candidate {place + shown + 1} of at most {min(shown + 2 * most, len(ranked))}:"
@@ -236,17 +236,17 @@ def _fit_most_promising(
     for probe, result in begun:  # once more, what led nowhere, or to less than a special case of it
         candidate = probe.candidate
         own = trials.get(candidate.label)
-        rivals = [
+        better_ones = [
             each
             for each in trials.values()
             if own is None or (_special_case(each.candidate, candidate) and each.delta_chi2 > own.delta_chi2)
         ]
-        if rivals:
-            better = max(rivals, key=lambda each: each.delta_chi2)
+        if better_ones:
+            better = max(better_ones, key=lambda each: each.delta_chi2)
             budget.says(f"once more: {candidate.label}")
             if candidate.shapes and _special_case(better.candidate, candidate):
                 # With the shapes that promise most on top of the special case; alone they may all be that.
-                on_top = replace(rebased(candidate, current.model, better.fit.model), positive=frozenset())
+                on_top = replace(candidate.rebased(current.model, better.fit.model), positive=frozenset())
                 again, _ = screen_all(data, better.fit, [on_top], budget=budget)
                 if again:
                     values = [value for _, value in max(again, key=lambda each: each[1].gain)[0].shapes]
@@ -351,7 +351,7 @@ def _extended(progress: Search, context: FitContext, *, on_trial: bool) -> Searc
             return progress
         labels = [each.best.candidate.label for each in found]
         remaining = [
-            rebased(each, model, base) if found else each
+            each.rebased(model, base) if found else each
             for each in context.candidates
             if not any(each.repeats(other.best.candidate) for other in found)
         ]
@@ -365,7 +365,7 @@ def _extended(progress: Search, context: FitContext, *, on_trial: bool) -> Searc
         untried = tuple(each for label, each in reasons.items() if label not in judged_ones)
         fruitless = {each.candidate.label for each in trials if each.delta_chi2 < options.same}
         progress = replace(
-            progress, screened=tuple(screened), untried=untried, screened_beside=tuple(labels),
+            progress, screened=tuple(screened), untried=untried, screened_with=tuple(labels),
             fruitless=progress.fruitless | fruitless,
         )  # fmt: skip
         for trial in trials:

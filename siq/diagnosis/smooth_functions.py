@@ -44,8 +44,6 @@ from siq.diagnosis.terms import (
     Kind,
     Place,
     PlaceColumns,
-    built,
-    unit_in,
 )
 from siq.errors import NumericalFailure
 from siq.inference.kalman_filter import Grid, Whitened, profile_likelihood, whiten
@@ -91,6 +89,51 @@ class Bumps:
     deviation: float = 1.0
     weight: float = 1.0
 
+    @classmethod
+    def along(
+        cls,
+        coordinates: tuple[sympy.Expr, ...],
+        courses: np.ndarray,
+        shares: tuple[float, ...],
+        *,
+        deviation: float = 1.0,
+        weight: float = 1.0,
+        most: int | None = None,
+    ) -> Bumps:
+        """A smooth function with its bumps where the recordings have been.
+
+        Parameters
+        ----------
+        coordinates, courses
+            What it is a function of, and their values along the recordings, shape ``(c, n)``.
+        shares
+            Its lengths, as shares of the coordinates' ranges.
+        deviation, weight
+            See above.
+        most
+            So many bumps at most; those left out are nearest to others.
+        """
+        lengths = np.array(shares) * np.ptp(courses, axis=1)
+        limits = np.stack([courses.min(axis=1), courses.max(axis=1)])
+        if len(shares) == 1:
+            count = int(np.ceil(1 / (BUMP_SPACING * shares[0]))) + 1
+            centres = np.linspace(*limits[:, 0], count)[:most, None]
+        else:
+            apart = BUMP_SPACING * np.sqrt(len(shares))
+            scaled = courses / lengths[:, None]
+            # So far apart, beginning in the middle of the points, each farthest from those before it.
+            away = np.full(scaled.shape[1], np.inf)
+            middle = np.median(scaled, axis=1)[:, None]
+            chosen = [int(np.argmin(((scaled - middle) ** 2).sum(axis=0)))]
+            while most is None or len(chosen) < most:
+                away = np.minimum(away, ((scaled - scaled[:, chosen[-1:]]) ** 2).sum(axis=0))
+                farthest = int(np.argmax(away))
+                if away[farthest] < apart**2:
+                    break
+                chosen.append(farthest)
+            centres = courses[:, chosen].T
+        return cls(coordinates, limits, centres, lengths, deviation, weight)
+
     @property
     def width(self) -> int:
         """The number of bumps."""
@@ -123,50 +166,6 @@ class Bumps:
     def heights_of(self, values: np.ndarray) -> np.ndarray:
         """The heights with which it has given values ``(b,)`` at its centres."""
         return scipy.linalg.cho_solve((self.triangle, True), values)
-
-
-def bumps_along(
-    coordinates: tuple[sympy.Expr, ...],
-    courses: np.ndarray,
-    shares: tuple[float, ...],
-    *,
-    deviation: float = 1.0,
-    weight: float = 1.0,
-    most: int | None = None,
-) -> Bumps:
-    """A smooth function with its bumps where the recordings have been.
-
-    Parameters
-    ----------
-    coordinates, courses
-        What it is a function of, and their values along the recordings, shape ``(c, n)``.
-    shares
-        Its lengths, as shares of the coordinates' ranges.
-    deviation, weight
-        See `Bumps`.
-    most
-        So many bumps at most; those left out are nearest to others.
-    """
-    lengths = np.array(shares) * np.ptp(courses, axis=1)
-    limits = np.stack([courses.min(axis=1), courses.max(axis=1)])
-    if len(shares) == 1:
-        count = int(np.ceil(1 / (BUMP_SPACING * shares[0]))) + 1
-        centres = np.linspace(*limits[:, 0], count)[:most, None]
-    else:
-        apart = BUMP_SPACING * np.sqrt(len(shares))
-        scaled = courses / lengths[:, None]
-        # So far apart, beginning in the middle of the points, each farthest from those before it.
-        away = np.full(scaled.shape[1], np.inf)
-        middle = np.median(scaled, axis=1)[:, None]
-        chosen = [int(np.argmin(((scaled - middle) ** 2).sum(axis=0)))]
-        while most is None or len(chosen) < most:
-            away = np.minimum(away, ((scaled - scaled[:, chosen[-1:]]) ** 2).sum(axis=0))
-            farthest = int(np.argmax(away))
-            if away[farthest] < apart**2:
-                break
-            chosen.append(farthest)
-        centres = courses[:, chosen].T
-    return Bumps(coordinates, limits, centres, lengths, deviation, weight)
 
 
 def _triangle_of(points: np.ndarray, lengths: np.ndarray) -> np.ndarray:
@@ -238,10 +237,10 @@ class SmoothFunction:
         split = (names,) if len(self.factors) == 1 else (names[: self.linear], names[self.linear :])
         pairs = list(zip(self.factors, split, strict=True))
         formula = sympy.prod([each.formula(tuple(map(symbol, own))) for each, own in pairs])
-        whole = unit_in(self.place, model, 0, len(self.place.words) - len(self.place.coordinates))
+        whole = self.place.unit(model, 0, len(self.place.words) - len(self.place.coordinates))
         last = self.factors[-1].width  # a first factor of two has no unit
         units = ("1",) * (self.width - last) + (whole,) * last
-        candidate = built(model, self.place, formula, names, units)
+        candidate = self.place.added_to(model, formula, names, units)
         together = (*candidate.model.expected_together, *(each.expected(own) for each, own in pairs))
         known = dict(zip(names, self.begin, strict=True))
         values = [known.get(each.name, each.value) for each in candidate.model.parameters]
@@ -264,7 +263,7 @@ def _product_of(
     bases = []
     for side, coordinate in enumerate(place.coordinates):
         functions = [
-            bumps_along((coordinate,), courses[side, None], (share,), weight=weight) for share in shares
+            Bumps.along((coordinate,), courses[side, None], (share,), weight=weight) for share in shares
         ]
         bases.append(
             [
@@ -393,7 +392,7 @@ class Smoothness:
         place, weight = self.place, self.correlated
         if not product:
             shares = tuple(times * share for share in self.shares)
-            bumps = bumps_along(
+            bumps = Bumps.along(
                 place.coordinates, self.courses, shares, deviation=self.deviation, weight=weight
             )
             return SmoothFunction(place, (bumps,), np.zeros(bumps.width))
@@ -435,11 +434,11 @@ def smoothness_of(
     room = LARGEST_LINEARISATION // (len(data.t) * (fit.model.dimension + len(fit.model.outputs)))
     most = max(min(MOST_BUMPS, room), 1)
     for least in LENGTH_SCALES:
-        fine = bumps_along(place.coordinates, courses, (least,) * count, most=most + 1)
+        fine = Bumps.along(place.coordinates, courses, (least,) * count, most=most + 1)
         if fine.width <= most:
             break
     else:
-        fine = bumps_along(place.coordinates, courses, (least,) * count, most=most)
+        fine = Bumps.along(place.coordinates, courses, (least,) * count, most=most)
     some = [share for share in LENGTH_SCALES if share >= least]
     choices = [(each,) * count for each in some] if alike else list(itertools.product(some, repeat=count))
     # What processes of these lengths have for values at the finest bumps, as heights of these.

@@ -74,7 +74,7 @@ class SearchOptions(BaseModel):
         """Most probability that an effect without a name is explained as well, if a name is to stand.
 
         By Bayes' rule: where something is left, either the name is right and something without a name is
-        missing beside it, (1 - unnamed) unnamed, or there is only the latter, and looks alike.
+        missing as well, (1 - unnamed) unnamed, or there is only the latter, and looks alike.
         """
         return math.exp(-self.least_log_odds) * (1 - self.unnamed)
 

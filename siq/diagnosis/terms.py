@@ -124,6 +124,42 @@ class Place:
         divided = tuple((name, each / self.factor) for name, each in self.equations)
         return replace(self, equations=divided)
 
+    def added_to(
+        self, model: Dynamics, formula: sympy.Expr, names: Sequence[str], units: Sequence[str]
+    ) -> MechanismCandidate:
+        """A simulation with a formula here, whose amplitudes have names and units."""
+        added = {name: formula * factor for name, factor in self.equations}
+        read = {name: formula * factor for name, factor in self.outputs}
+        parameters = [Parameter(name, 0.0, unit) for name, unit in zip(names, units, strict=True)]
+        name = f"a function of {' and '.join(self.words)}"
+        where = f"{'the measurement of ' if self.outputs else ''}{', '.join(self.targets)}"
+        return MechanismCandidate(
+            name=name,
+            label=f"{name} in {where}",
+            model=with_added(model, added, read, parameters),
+            amplitudes=tuple(names),
+            equations=tuple(name for name, _ in self.equations),
+            coordinate="measurement" if self.outputs else ", ".join(self.words),
+            changes=tuple({**added, **read}.items()),
+        )
+
+    def unit(self, model: Dynamics, first: int, second: int) -> str:
+        """Unit of the coefficient of a term with so many factors of either coordinate."""
+        known = units_of(model)
+        units = {"_t": model.time_unit}
+        if (
+            len(self.equations) > 1
+        ):  # of a rotating frame: the function is multiplied by the states themselves
+            first_unit = known.get(self.words[0], known[self.targets[0]])
+            units |= {"_whole": "1", "_first": first_unit}
+        else:
+            target = self.targets[0] if self.equations else self.words[0]
+            units |= {"_whole": known.get(target, "1"), "_first": known.get(self.words[0], "1")}
+        factor = self.words[1] if len(self.words) > 1 else ""
+        units["_second"] = known.get(self.targets[0] if factor == "amplitude" else factor, "1")
+        per = "/_t" if self.equations else ""
+        return unit_of(f"_whole{per}/_first**{first}/_second**{second}", units)
+
 
 def _amplitude(first: str, second: str) -> sympy.Expr:
     return sympy.sqrt(symbol(first) ** 2 + symbol(second) ** 2)
@@ -330,8 +366,21 @@ def _compared(fit: Fit, data: Measurements, places: Sequence[Place]) -> list[Pla
     return [replace(each, log_evidence=each.log_evidence - alone) for each in ranked]
 
 
-def few_powers(place: Place, fit: Fit, data: Measurements, *, degree: int) -> tuple[Power, ...]:
-    """The powers that a formula needs: each added as long as it earns its place (Schwarz).
+def formula_in(
+    place: Place, fit: Fit, data: Measurements, *, degree: int
+) -> tuple[Place, MechanismCandidate] | None:
+    """The simulation of a fit with a formula in a place, of the powers that it needs; None if it needs none.
+
+    The place is that of a function of the second coordinate, where the first is in none of them.
+    """
+    if not (terms := _few_powers(place, fit, data, degree=degree)):
+        return None
+    place, terms = _simplest(place, terms)
+    return place, with_formula(fit.model, place, terms)
+
+
+def _few_powers(place: Place, fit: Fit, data: Measurements, *, degree: int) -> tuple[Power, ...]:
+    """Powers of which each earns its place, one after the other (Schwarz).
 
     Errors count as correlated as all of the powers leave them (`siq.diagnosis.evidence`).
     """
@@ -368,11 +417,11 @@ def with_formula(model: Dynamics, place: Place, terms: Sequence[Power]) -> Mecha
     """The simulation with a sum of terms in a place, whose coefficients are the amplitudes."""
     names = fresh_names("c", len(terms), model.names)
     formula = sympy.Add(*(symbol(name) * term for name, (term, _, _) in zip(names, terms, strict=True)))
-    units = [unit_in(place, model, first, second) for _, first, second in terms]
-    return built(model, place.without_factor, formula, names, units)
+    units = [place.unit(model, first, second) for _, first, second in terms]
+    return place.without_factor.added_to(model, formula, names, units)
 
 
-def simplest(place: Place, terms: Sequence[Power]) -> tuple[Place, tuple[Power, ...]]:
+def _simplest(place: Place, terms: Sequence[Power]) -> tuple[Place, tuple[Power, ...]]:
     """The same terms as a function of the second coordinate alone, where the first is in none of them."""
     if len(place.words) == 1 or any(first for _, first, _ in terms):
         return place, tuple(terms)
@@ -385,7 +434,7 @@ def simplest(place: Place, terms: Sequence[Power]) -> tuple[Place, tuple[Power, 
 def _powers(place: Place, *, degree: int) -> list[Power]:
     """Monomials of a place's coordinates up to a degree.
 
-    Of a single coordinate there are the odd functions of even degree beside them, such as z∣z∣; a second
+    Of a single coordinate there are also odd functions of even degree, such as z∣z∣; a second
     coordinate stands in every term.
     """
     (z,) = place.coordinates
@@ -399,39 +448,3 @@ def _powers(place: Place, *, degree: int) -> list[Power]:
     if place.words[0] in ("amplitude", "t"):
         return smooth
     return [*smooth, *((z ** (power - 1) * sympy.Abs(z), power, 0) for power in range(2, degree + 1, 2))]
-
-
-def built(
-    model: Dynamics, place: Place, formula: sympy.Expr, names: Sequence[str], units: Sequence[str]
-) -> MechanismCandidate:
-    """The simulation with a formula in a place, whose amplitudes have names and units."""
-    added = {name: formula * factor for name, factor in place.equations}
-    read = {name: formula * factor for name, factor in place.outputs}
-    parameters = [Parameter(name, 0.0, unit) for name, unit in zip(names, units, strict=True)]
-    name = f"a function of {' and '.join(place.words)}"
-    where = f"{'the measurement of ' if place.outputs else ''}{', '.join(place.targets)}"
-    return MechanismCandidate(
-        name=name,
-        label=f"{name} in {where}",
-        model=with_added(model, added, read, parameters),
-        amplitudes=tuple(names),
-        equations=tuple(name for name, _ in place.equations),
-        coordinate="measurement" if place.outputs else ", ".join(place.words),
-        changes=tuple({**added, **read}.items()),
-    )
-
-
-def unit_in(place: Place, model: Dynamics, first: int, second: int) -> str:
-    """Unit of the coefficient of a term with so many factors of either coordinate, in a place."""
-    known = units_of(model)
-    units = {"_t": model.time_unit}
-    if len(place.equations) > 1:  # of a rotating frame: the function is multiplied by the states themselves
-        first_unit = known.get(place.words[0], known[place.targets[0]])
-        units |= {"_whole": "1", "_first": first_unit}
-    else:
-        target = place.targets[0] if place.equations else place.words[0]
-        units |= {"_whole": known.get(target, "1"), "_first": known.get(place.words[0], "1")}
-    factor = place.words[1] if len(place.words) > 1 else ""
-    units["_second"] = known.get(place.targets[0] if factor == "amplitude" else factor, "1")
-    per = "/_t" if place.equations else ""
-    return unit_of(f"_whole{per}/_first**{first}/_second**{second}", units)

@@ -43,10 +43,8 @@ from siq.diagnosis.terms import (
     ONE,
     Place,
     coordinates_of,
-    few_powers,
+    formula_in,
     rank_places,
-    simplest,
-    with_formula,
 )
 from siq.errors import NumericalFailure
 from siq.inference.budget import BudgetSpent
@@ -355,12 +353,10 @@ def _formulas(
     done: set[frozenset[tuple[str, sympy.Expr]]] = set()
     models: list[AugmentedModel] = []
     for likely in ranked[:FUNCTIONS_FITTED]:
-        terms = few_powers(likely, fit, context.data, degree=context.study.degree)
-        if not terms:
+        if (found := formula_in(likely, fit, context.data, degree=context.study.degree)) is None:
             continue
-        place, terms = simplest(likely, terms)
+        place, candidate = found
         place = replace(place, knots=knots.get((place.targets, place.words), likely.knots))
-        candidate = with_formula(fit.model, place, terms)
         # A sum of x²v and xv² is the same function, whichever coordinate comes first.
         monomials = frozenset(
             (name, formula.diff(symbol(amplitude)))
@@ -397,7 +393,7 @@ def _with_memories(fit: Fit, models: Sequence[AugmentedModel], context: FitConte
     if not candidates:
         return []
     cost = float(np.log(len(candidates)))
-    # Nobody knows what was remembered when a recording began: what was there already, or nothing.
+    # Nobody knows what the hidden state was when a recording began: what was there already, or nothing.
     begun = [
         each
         for one in candidates
@@ -518,7 +514,7 @@ def fit_unnamed_models(
         and has_structure(best.fit, data)
     ):
         models += with_function(best.parts, best.fit, context)
-    return likeliest(models, base, data)
+    return _likeliest(models, base, data)
 
 
 def fit_models_of_remainder(
@@ -526,8 +522,8 @@ def fit_models_of_remainder(
 ) -> tuple[AugmentedModel, ...]:
     """Models of what mechanisms with a name leave, the likeliest first; none where none is likelier.
 
-    They are what was found beside the names, not certain enough for one itself, and functions on top of all
-    that was found.
+    They are what was found on top of the names, not certain enough for one itself, and functions on top of
+    all that was found.
 
     Parameters
     ----------
@@ -559,7 +555,7 @@ def fit_models_of_remainder(
         for each in models
         if np.isfinite(each.fit.log_likelihood) and all(name.admits(each.fit) for name in names)
     ]
-    return likeliest(allowed, base, data)
+    return _likeliest(allowed, base, data)
 
 
 def _terms_of(search: Search, context: FitContext) -> tuple[Term, ...]:
@@ -568,7 +564,9 @@ def _terms_of(search: Search, context: FitContext) -> tuple[Term, ...]:
     return tuple(Term(each.best, MECHANISM, cost) for each in search.found)
 
 
-def likeliest(models: Sequence[AugmentedModel], alone: Fit, data: Measurements) -> tuple[AugmentedModel, ...]:
+def _likeliest(
+    models: Sequence[AugmentedModel], alone: Fit, data: Measurements
+) -> tuple[AugmentedModel, ...]:
     """The few models that are likelier than the simulation without them, the likeliest first."""
     likelier = (
         each

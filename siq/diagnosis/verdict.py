@@ -1,7 +1,8 @@
 """The verdict: from an investigation and the runs held out to the statement of a diagnosis.
 
-What is named, with parameters, errors, evidence and rivals; the model of what has no name; in which equation
-the mismatch sits, along which coordinate and where, in which recordings; bounds of what was not found.
+What is named, with parameters, errors, evidence and alternatives; the model of what has no name; in which
+equation the mismatch sits, along which coordinate and where, in which recordings; bounds of what was not
+found.
 """
 
 from __future__ import annotations
@@ -384,10 +385,10 @@ def _most_telling(structure: Structure, roles: Roles) -> tuple[tuple[str, ...], 
     if coordinate in (*own, "amplitude"):
         return equations, coordinate
     motion = {*roles.states, *(name for pair in roles.motions for name in pair), "amplitude"}
-    rivals, share = (own, NEARLY_ALL) if coordinate in motion else (motion, MOTION_SHARE)
+    others, share = (own, NEARLY_ALL) if coordinate in motion else (motion, MOTION_SHARE)
     for curve in structure.curves:
         there = set(equations) <= set(curve.place.targets)
-        if there and curve.place.words[0] in rivals and curve.gain >= share * best.gain:
+        if there and curve.place.words[0] in others and curve.gain >= share * best.gain:
             return curve.place.targets, curve.place.words[0]
     excess = structure.total - structure.freedom
     if len(own) > len(equations) and best.gain < NEARLY_ALL * excess:

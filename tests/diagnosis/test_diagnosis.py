@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from siq.diagnosis import investigation, search
-from siq.diagnosis.diagnosis import Diagnosis, solve_case, withdrawn
+from siq.diagnosis.diagnosis import Diagnosis, _withdrawn, solve_case
 from siq.diagnosis.dictionary import standard_dictionary
 from siq.diagnosis.evidence import FittedCandidate
 from siq.diagnosis.investigation import held_out_runs
@@ -460,7 +460,7 @@ def test_a_name_that_misleads_on_recordings_held_out_is_withdrawn(tmp_path: Path
     assert verdict["verdict"] == "unexplained" and names(diagnosis) == []
     assert verdict["description"]["misleading"] and verdict["description"]["by"][0]["name"] == "constant bias"
     assert "looks like a constant bias in the equation of v" in verdict["sentence"]
-    assert "but recordings held out are foreseen worse with that" in verdict["sentence"]
+    assert "but recordings held out are predicted worse with that" in verdict["sentence"]
     assert any("stands in for something else" in line for line in verdict["words"]["left"])
     # Nothing that was found is put into the card that would make it worse.
     assert verdict["described"] == [] and verdict["fit"]["before"] < verdict["fit"]["augmented"]
@@ -474,12 +474,12 @@ def test_where_nothing_speaks_of_a_mismatch_but_a_refuted_name_there_is_none(tmp
     found = diagnosis.investigation
     assert said(diagnosis)["verdict"] == "no mismatch"
     refuted = replace(found, verdict=MismatchVerdict.MISSING_PHYSICS)
-    again = withdrawn(refuted)
+    again = _withdrawn(refuted)
     assert str(again.verdict) == "no mismatch" and not again.withdrawn and not again.search.found
     assert has_code(again.remarks, "diagnosis.refuted")
     # Process noise that is needed speaks of one by itself.
     fit = found.search.recalibrated
     forced = replace(fit, noise=replace(fit.noise, process=np.array([0.0, 1e-3])))
     search = replace(found.search, recalibrated=forced)
-    forced_one = withdrawn(replace(refuted, search=search))
+    forced_one = _withdrawn(replace(refuted, search=search))
     assert str(forced_one.verdict) == "unexplained" and forced_one.withdrawn

@@ -10,7 +10,7 @@ from siq.diagnosis.evidence import averaged_evidence, evidence_of_function, orth
 from siq.diagnosis.mechanisms import fresh_names
 from siq.diagnosis.naming import _best_shares
 from siq.diagnosis.study import SearchOptions
-from siq.diagnosis.terms import Place, _powers, simplest, with_formula
+from siq.diagnosis.terms import Place, _powers, _simplest, with_formula
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, symbol
 from siq.systems.formulas import compile_values
@@ -108,12 +108,12 @@ def test_coefficients_of_formulas_have_units(words: tuple[str, ...], terms: str,
 
 def test_a_formula_without_its_first_coordinate_is_one_of_the_second() -> None:
     t, w = symbol("t"), symbol("v")
-    alone, terms = simplest(place("t", "v"), [(w, 0, 1), (w**2, 0, 2)])
+    alone, terms = _simplest(place("t", "v"), [(w, 0, 1), (w**2, 0, 2)])
     assert (
         alone.words == ("v",) and alone.coordinates == (w,) and alone.equations == (("v", sympy.Integer(1)),)
     )
     assert [first for _, first, _ in terms] == [1, 2]
-    both, _ = simplest(place("t", "v"), [(t * w, 1, 1)])
+    both, _ = _simplest(place("t", "v"), [(t * w, 1, 1)])
     assert both.words == ("t", "v")
 
 

@@ -20,7 +20,6 @@ from siq.diagnosis.smooth_functions import (
     SmoothFunction,
     _product_of,
     _triangle_of,
-    bumps_along,
 )
 from siq.diagnosis.terms import Place
 from siq.inference.budget import Budget, BudgetSpent
@@ -42,7 +41,7 @@ def courses_of(count: int) -> np.ndarray:
 
 
 def bumps(*coordinates: sympy.Symbol, shares: tuple[float, ...], deviation: float = 1.0) -> Bumps:
-    return bumps_along(coordinates, courses_of(len(coordinates)), shares, deviation=deviation)
+    return Bumps.along(coordinates, courses_of(len(coordinates)), shares, deviation=deviation)
 
 
 def function_of(*factors: Bumps) -> SmoothFunction:
@@ -141,7 +140,7 @@ def test_a_product_is_told_where_both_coordinates_were_never_large_at_a_time() -
 def test_evidence_of_parameters_expected_together_is_the_marginal_likelihood() -> None:
     """Exact for a linear model with normal errors: log N(y; 0, ΦKΦᵀ + σ²)."""
     t, noise = np.arange(0, 8, 0.1), 0.1**2
-    bell = bumps_along((TIME,), t[None], (0.125,), deviation=0.8)
+    bell = Bumps.along((TIME,), t[None], (0.125,), deviation=0.8)
     function = SmoothFunction(Place((), (("y", ONE),), (TIME,), ("t",)), (bell,), np.zeros(bell.width))
     still = Dynamics(("y",), (sympy.Integer(0),), Diffusion.identity(1))
     along = 0.8 * np.linalg.solve(bell.triangle, bell.values(t[None]))
