@@ -245,7 +245,7 @@ def solve_case(
     allowed = case.settings.budget
     budget = Budget(work=allowed.evaluations, seconds=allowed.seconds, tell=tell, clock=clock)
     try:
-        found = investigate(case.system, case.learn, case.dictionary, case.settings, budget=budget)
+        found = investigate(case, budget=budget)
         shown = held_out_runs(found, case.kept)
         named = found.verdict.names and not found.process_noise
         # Tests of somebody else may be among the recordings held out, and decide nothing.

@@ -511,14 +511,15 @@ def assignments(form: Form, model: Dynamics, roles: Roles) -> Iterator[dict[str,
     kinds = list(form.roles.values())
     names = list(form.roles)
     choices: list[list[dict[str, str]]] = []
+    pairs, alone = _fillings(model, roles)
     place = 0
     while place < len(names):
-        pairs = _pairs(kinds[place : place + 2], roles)
-        if pairs is not None:
-            choices.append([{names[place]: one, names[place + 1]: other} for one, other in pairs])
+        together = tuple(kinds[place : place + 2])
+        if together in pairs:
+            choices.append([{names[place]: one, names[place + 1]: other} for one, other in pairs[together]])
             place += 2
         else:
-            choices.append([{names[place]: name} for name in _of_kind(kinds[place], model, roles)])
+            choices.append([{names[place]: name} for name in alone[kinds[place]]])
             place += 1
     units = dict(zip(model.states, model.units, strict=True))
     order = {name: place for place, name in enumerate(model.states)}
@@ -533,41 +534,30 @@ def assignments(form: Form, model: Dynamics, roles: Roles) -> Iterator[dict[str,
         yield {role: name for part in combination for role, name in part.items()}
 
 
-def _pairs(kinds: Sequence[str], roles: Roles) -> tuple[tuple[str, str], ...] | None:
-    """What fills two roles together; None where they are filled one by one."""
-    match kinds:
-        case ["position", "velocity"]:
-            return roles.motions
-        case ["displacement", "velocity"]:
-            return tuple(pair for pair in roles.motions if pair[0] not in roles.angles)
-        case ["angle", "velocity"]:
-            return tuple(pair for pair in roles.motions if pair[0] in roles.angles)
-        case ["amplitude", "amplitude"]:
-            return roles.amplitudes
-        case ["prey", "predator"]:
-            return roles.feeding
-        case ["upper level", "lower level"]:
-            return roles.cascades
-    return None
-
-
-def _of_kind(kind: str, model: Dynamics, roles: Roles) -> tuple[str, ...]:
-    return {
-        "position": tuple(x for x, _ in roles.motions),
-        "displacement": tuple(x for x, _ in roles.motions if x not in roles.angles),
-        "angle": roles.angles,
-        "velocity": tuple(v for _, v in roles.motions),
+def _fillings(
+    model: Dynamics, roles: Roles
+) -> tuple[dict[tuple[str, ...], tuple[tuple[str, str], ...]], dict[str, tuple[str, ...]]]:
+    """What fills two kinds of roles together, and what fills each by itself."""
+    pairs: dict[tuple[str, ...], tuple[tuple[str, str], ...]] = {
+        ("position", "velocity"): roles.motions,
+        ("displacement", "velocity"): tuple(pair for pair in roles.motions if pair[0] not in roles.angles),
+        ("angle", "velocity"): tuple(pair for pair in roles.motions if pair[0] in roles.angles),
+        ("amplitude", "amplitude"): roles.amplitudes,
+        ("prey", "predator"): roles.feeding,
+        ("upper level", "lower level"): roles.cascades,
+    }
+    alone: dict[str, tuple[str, ...]] = {}
+    for kinds, names in pairs.items():
+        for side, kind in enumerate(kinds):
+            alone.setdefault(kind, tuple(pair[side] for pair in names))
+    return pairs, alone | {
         "amplitude": tuple(name for pair in roles.amplitudes for name in pair),
         "population": roles.populations,
-        "prey": tuple(prey for prey, _ in roles.feeding),
-        "predator": tuple(predator for _, predator in roles.feeding),
         "level": roles.levels,
-        "upper level": tuple(upper for upper, _ in roles.cascades),
-        "lower level": tuple(lower for _, lower in roles.cascades),
         "store": roles.stores,
         "stock": (*roles.populations, *roles.levels, *roles.stores),
         "state": roles.states,
         "input": tuple(entry.name for entry in model.inputs),
         "parameter": tuple(entry.name for entry in model.parameters),  # what is known at first may drift, too
         "output": model.output_names,
-    }[kind]
+    }

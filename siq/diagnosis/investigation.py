@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.stats
 
-from siq.diagnosis.dictionary import Mechanism, roles_of
+from siq.diagnosis.dictionary import roles_of
 from siq.diagnosis.evidence import NotFitted
 from siq.diagnosis.holdout import (
     HeldOutErrors,
@@ -28,7 +27,7 @@ from siq.diagnosis.residual_structure import (
     noise_nonstationarity,
 )
 from siq.diagnosis.search import FitContext, search_mechanisms
-from siq.diagnosis.study import MismatchStudy, MismatchVerdict
+from siq.diagnosis.study import Comparison, MismatchVerdict
 from siq.diagnosis.unnamed_models import AugmentedModel, fit_unnamed_models
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget
@@ -40,32 +39,14 @@ from siq.remarks import Remark
 from siq.systems.dynamics import Dynamics
 
 
-def investigate(
-    model: Dynamics,
-    data: Measurements,
-    dictionary: Sequence[Mechanism],
-    study: MismatchStudy,
-    *,
-    file: str = "the dictionary",
-    seed: int = 0,
-    budget: Budget | None = None,
-) -> Investigation:
+def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigation:
     """Say whether, where and in which way a simulation differs from recordings.
 
     Parameters
     ----------
-    model
-        The simulation, as its card says.
-    data
-        The recordings to learn from; those held out stay out.
-    dictionary
-        The mechanisms that may be named.
-    study
-        What counts as found, and whether monomials do.
-    file
-        Where the dictionary's entries come from, for messages.
-    seed
-        Of the effects without a name that mechanisms are held against.
+    case
+        The simulation, the recordings to learn from, and what may be named and counts as found. Recordings
+        held out stay out.
     budget
         Charged for the work; what it does not reach is left undone, and the answer is that of the rest.
 
@@ -74,10 +55,11 @@ def investigate(
     NumericalFailure
         When not even the recalibrated simulation with process noise can be fitted.
     """
+    study, data, dictionary = case.settings, case.learn, case.dictionary
     options = study.search
-    model = with_expectations(model)
+    model = with_expectations(case.system)
     roles = roles_of(model)
-    candidates = candidates_of(model, roles, dictionary, file=file)
+    candidates = candidates_of(model, roles, dictionary)
     if study.generic if study.generic is not None else not roles.physical:
         monomials = generic_candidates(model, roles, degree=study.degree, named=candidates)
         candidates += [each for each in monomials if each.coordinate != "constant"]
@@ -103,7 +85,7 @@ def investigate(
             break
     tried = bool(found.found)
     if tried:
-        result = decide_naming(found, by_each, context, generator=np.random.default_rng(seed))
+        result = decide_naming(found, by_each, context, generator=np.random.default_rng(0))
         result = replace(result, least_squares=least_squares)
     else:
         left = Remainder.of(data, recalibrated, recalibrated, roles)

@@ -48,6 +48,7 @@ from siq.diagnosis.study import MismatchVerdict
 from siq.diagnosis.terms import linearised_with_places, places_in, products_in
 from siq.diagnosis.unnamed_models import (
     AugmentedModel,
+    exact_fit,
     fit_models_of_remainder,
     fit_unnamed_models,
     runs_freely,
@@ -58,7 +59,6 @@ from siq.inference.budget import UNLIMITED, Account
 from siq.inference.kalman_filter import Grid, Noise, Whitened, solve, whiten
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
-from siq.inference.recalibration import fit_with_and_without_process_noise
 from siq.remarks import Remark
 
 LOGGER = logging.getLogger(__name__)
@@ -446,15 +446,11 @@ def decide_naming(
         on_top = None if compared is None else compared.on_top
         models = fit_models_of_remainder(search, whole, context, functions=on_top)
         decision = replace(decision, models=models)
-    if search.fit.has_process_noise:
-        still = replace(search.fit, noise=search.fit.noise.without_process())
-        with context.budget.exempt():
-            _, exact = fit_with_and_without_process_noise(
-                search.fit.model, context.data, still, budget=context.budget
-            )
-        if exact.converged:
-            remarks = (*decision.remarks, Remark("diagnosis.least_squares"))
-            decision = replace(decision, exact=exact, remarks=remarks)
+    with context.budget.exempt():
+        exact = exact_fit(search.fit, context.data, context.budget)
+    if exact is not None:
+        remarks = (*decision.remarks, Remark("diagnosis.least_squares"))
+        decision = replace(decision, exact=exact, remarks=remarks)
     return decision
 
 

@@ -188,7 +188,7 @@ class Remainder:
             Of the simulation's states.
         """
         after = _structure_of(data, final, roles)
-        # Process noise that stands for missing physics takes measurement noise with it: that of the final fit.
+        # Process noise that stands for missing physics takes measurement noise with it: take the final one.
         still = Noise(final.noise.measurement, np.zeros(recalibrated.model.dimension))
         before = _structure_of(data, recalibrated, roles, noise=still)
         alone = after

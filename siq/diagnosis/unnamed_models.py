@@ -47,7 +47,7 @@ from siq.diagnosis.terms import (
     rank_places,
 )
 from siq.errors import NumericalFailure
-from siq.inference.budget import BudgetSpent
+from siq.inference.budget import Budget, BudgetSpent
 from siq.inference.kalman_filter import substeps_needed
 from siq.inference.maximum_likelihood import SUBSTEP_ERROR, Fit
 from siq.inference.measurements import Measurements
@@ -564,6 +564,15 @@ def _terms_of(search: Search, context: FitContext) -> tuple[Term, ...]:
     return tuple(Term(each.best, MECHANISM, cost) for each in search.found)
 
 
+def exact_fit(fit: Fit, data: Measurements, budget: Budget | None = None) -> Fit | None:
+    """Estimates of least squares, where process noise is part of a fit; None where they do not settle."""
+    if not fit.has_process_noise:
+        return None
+    still = replace(fit, noise=fit.noise.without_process())
+    _, exact = fit_with_and_without_process_noise(fit.model, data, still, budget=budget)
+    return exact if exact.converged else None
+
+
 def _likeliest(
     models: Sequence[AugmentedModel], alone: Fit, data: Measurements
 ) -> tuple[AugmentedModel, ...]:
@@ -575,9 +584,5 @@ def _likeliest(
     )
     found = []
     for each in itertools.islice(likelier, FUNCTIONS_FITTED):
-        if each.fit.has_process_noise:  # its estimates of least squares, too
-            still = replace(each.fit, noise=each.fit.noise.without_process())
-            exact = fit_with_and_without_process_noise(each.fit.model, data, still)[1]
-            each = replace(each, exact=exact) if exact.converged else each
-        found.append(each)
+        found.append(replace(each, exact=exact_fit(each.fit, data)))
     return tuple(found)
