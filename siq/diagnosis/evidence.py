@@ -109,19 +109,6 @@ def residuals(
     return white, change, white.innovations - white.columns @ change
 
 
-def correlation_time_left(fits: Sequence[Fit], data: Measurements) -> float:
-    """Correlation time of errors, as the likeliest of several fits leaves them, in samples.
-
-    What the others leave is rather the effect that they lack.
-    """
-    known = [each for each in fits if np.isfinite(each.log_likelihood)]
-    if not known:
-        return 1.0
-    closest = max(known, key=lambda each: each.log_likelihood)
-    white, _, left = residuals(closest, data)
-    return correlation_time_of(left, white.recording, outputs=len(closest.model.outputs))
-
-
 def _correlation_time(series: np.ndarray) -> float:
     """Integral correlation time in samples: one and twice the autocorrelations up to the first negative."""
     power = float(series @ series)
@@ -362,7 +349,7 @@ def log_evidence_of(fit: Fit, data: Measurements, *, correlated: float = 1.0) ->
         The explanation, and the recordings.
     correlated
         Correlation time τ of the errors in samples, the same for all explanations that are compared
-        (`correlation_time_left`): log L/τ - ½ k log(n/τ).
+        (`log_evidences`): log L/τ - ½ k log(n/τ).
     """
     white = whiten(fit.linearisation, data, fit.noise)
     names = [fit.model.parameters[place].name for place in fit.model.free]
@@ -381,3 +368,17 @@ def log_evidence_of(fit: Fit, data: Measurements, *, correlated: float = 1.0) ->
         told = np.linalg.svd(scipy.linalg.solve(roots.T, own.T), compute_uv=False) ** 2
         price += 0.5 * float(np.log1p(told / correlated).sum())
     return float(fit.log_likelihood / correlated - price)
+
+
+def log_evidences(fits: Sequence[Fit], data: Measurements) -> list[float]:
+    """The evidence of whole explanations that are compared (`log_evidence_of`).
+
+    For all of them errors are as correlated as the likeliest leaves them: what the others leave is rather the
+    effect that they lack.
+    """
+    known, correlated = [each for each in fits if np.isfinite(each.log_likelihood)], 1.0
+    if known:
+        closest = max(known, key=lambda each: each.log_likelihood)
+        white, _, left = residuals(closest, data)
+        correlated = correlation_time_of(left, white.recording, outputs=len(closest.model.outputs))
+    return [log_evidence_of(each, data, correlated=correlated) for each in fits]

@@ -31,10 +31,9 @@ from siq.diagnosis.evidence import (
     SMOOTH_LENGTHS,
     FittedCandidate,
     averaged_evidence,
-    correlation_time_left,
     correlation_time_of,
     evidence_of_function,
-    log_evidence_of,
+    log_evidences,
     orthonormal,
     sizes_of_effects,
     smooth_prior,
@@ -247,24 +246,18 @@ def _residual_model_comparison(
         instead = instead + with_function(one.parts, one.fit, context)
     ours = [AugmentedModel((), trial.fit), *on_top]
     theirs = [AugmentedModel((), recalibrated), *instead]
-    correlated = correlation_time_left([each.fit for each in (*ours, *theirs)], data)
-
-    def best(models: Sequence[AugmentedModel]) -> float:
-        """The largest evidence; that something without a name is missing, too, has its own probability."""
-        return max(
-            log_evidence_of(each.fit, data, correlated=correlated)
-            - each.cost
-            + len(each.parts) * np.log(unnamed)
-            for each in models
+    # That something without a name is missing, too, has its own probability.
+    evidences = [
+        evidence - each.cost + len(each.parts) * np.log(unnamed)
+        for each, evidence in zip(
+            (*ours, *theirs), log_evidences([each.fit for each in (*ours, *theirs)], data), strict=True
         )
-
+    ]
+    best, best_without = max(evidences[: len(ours)]), max(evidences[len(ours) :])
     forms = Counter(each.name for each in context.candidates)
     chosen = np.log(max(len(forms) * forms[trial.candidate.name], 1))
-    log_odds = float(best(ours) + np.log1p(-unnamed) - chosen - best(theirs))
-    LOGGER.info(
-        "%s with a function on top of it: log-odds %.1f, errors correlated over %.1f samples",
-        trial.candidate.label, log_odds, correlated,
-    )  # fmt: skip
+    log_odds = float(best + np.log1p(-unnamed) - chosen - best_without)
+    LOGGER.info("%s with a function on top of it: log-odds %.1f", trial.candidate.label, log_odds)
     predicts_better = False
     if abs(log_odds) < options.least_log_odds:
         blocks = []

@@ -28,8 +28,7 @@ from siq.diagnosis.dictionary import Form, FurtherState, Mechanism, MechanismPar
 from siq.diagnosis.evidence import (
     NUMERICAL_ERRORS,
     FittedCandidate,
-    correlation_time_left,
-    log_evidence_of,
+    log_evidences,
 )
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
 from siq.diagnosis.residual_structure import has_structure
@@ -105,19 +104,11 @@ class AugmentedModel:
 
 
 def _weighed(models: Sequence[AugmentedModel], alone: Fit, data: Measurements) -> list[AugmentedModel]:
-    """Models with their evidence over that of a simulation without their parts, the likeliest first.
-
-    Errors are as correlated as the model that fits best leaves them (`correlation_time_left`), for all.
-    """
-    fits = [each.fit for each in models]
-    correlated = correlation_time_left([alone, *fits], data)
-    without = log_evidence_of(alone, data, correlated=correlated)
+    """Models with their evidence over that of a simulation without their parts, the likeliest first."""
+    without, *evidences = log_evidences([alone, *(each.fit for each in models)], data)
     known = [
-        replace(
-            each,
-            log_evidence=log_evidence_of(each.fit, data, correlated=correlated) - each.cost - without,
-        )
-        for each in models
+        replace(each, log_evidence=evidence - each.cost - without)
+        for each, evidence in zip(models, evidences, strict=True)
     ]
     return sorted(known, key=lambda each: -each.log_evidence)
 

@@ -11,7 +11,7 @@ import numpy as np
 import sympy
 
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
-from siq.diagnosis.evidence import BUDGET_SPENT, correlation_time_left, log_evidence_of, residuals
+from siq.diagnosis.evidence import BUDGET_SPENT, log_evidences, residuals
 from siq.diagnosis.investigation import HeldOutRuns
 from siq.diagnosis.mechanisms import PROCESS_NOISE
 from siq.diagnosis.naming import Investigation
@@ -138,12 +138,11 @@ def _explanations(investigation: Investigation, names: tuple[str, ...]) -> dict[
         (" and ".join((*names, *(part.trial.candidate.label for part in model.parts))), model.fit)
         for model in investigation.models
     ]
-    evidence: dict[str, float] = {}
-    correlated = correlation_time_left([fit for _, fit in fits], data)
-    for what, fit in fits:
-        if np.isfinite(fit.log_likelihood):
-            forces = " and process noise" if fit.has_process_noise else ""
-            evidence[f"{what}{forces}"] = log_evidence_of(fit, data, correlated=correlated)
+    known = [each for each in fits if np.isfinite(each[1].log_likelihood)]
+    evidence = {
+        f"{what}{' and process noise' if fit.has_process_noise else ''}": value
+        for (what, fit), value in zip(known, log_evidences([fit for _, fit in known], data), strict=True)
+    }
     best = max(evidence.values(), default=0.0)
     ranked = sorted(evidence.items(), key=lambda each: -each[1])
     return {what: value - best for what, value in ranked}

@@ -125,8 +125,7 @@ def test_a_name_stands_beside_a_rest_where_no_function_does_as_well_in_its_place
 
     monkeypatch.setattr(naming, "with_function", functions)
     monkeypatch.setattr(naming, "runs_freely", lambda *_: True)
-    monkeypatch.setattr(naming, "correlation_time_left", lambda *_: 5.0)
-    monkeypatch.setattr(naming, "log_evidence_of", lambda fit, *_, **__: fit.evidence)
+    monkeypatch.setattr(naming, "log_evidences", lambda fits, _: [fit.evidence for fit in fits])
     candidates = tuple(SimpleNamespace(name=name) for name in ("overflow", "overflow", "leak"))
     context = FitContext(DECAY, SimpleNamespace(), SimpleNamespace(), candidates)
     assert context.study.search.unnamed == 0.1
