@@ -356,9 +356,9 @@ def build_candidate(
         outputs=tuple(outputs.items()),
     )
     shapes = {name: entry.shape for name, entry in form.parameters.items() if entry.shape is not None}
-    return MechanismCandidate(
+    candidate = MechanismCandidate(
         name=mechanism.name,
-        label=_label_of(mechanism.name, form.variant, model, augmented),
+        label="",
         model=augmented,
         amplitudes=tuple(fresh[name] for name in form.parameters if name not in shapes),
         shapes=tuple(fresh[name] for name in shapes),
@@ -368,16 +368,13 @@ def build_candidate(
         searches=tuple(_in_names(shape, names, assignment) for shape in shapes.values()),
         scales=tuple(parse(entry.scale) for entry in form.states.values()),
         begins=tuple(parse(entry.begin) for entry in form.states.values()),
-        equations=tuple(
-            name
-            for name, before in zip(model.states, model.equations, strict=True)
-            if equations[name] != before
-        ),
+        equations=(),
         coordinate=" ".join(assignment.get(word, word) for word in form.coordinate.split()),
         changes=(*changes, *further),
         generalises=mechanism.generalises,
         variant=form.variant,
     )
+    return _labelled(candidate, model)
 
 
 def _vocabulary(
@@ -415,38 +412,36 @@ def _rate_of(formula: sympy.Expr, model: Dynamics) -> sympy.Expr:
 
 def _in_names(shape: Shape, names: Mapping[str, sympy.Expr], assignment: Mapping[str, str]) -> Shape:
     """A search with the system's own names in its formulas."""
-    texts: dict[str, str | None] = {
-        key: None if text is None else str(parse_formula(text, names))
-        for key, text in (
-            ("scale_of", shape.scale_of),
-            ("inverse_scale_of", shape.inverse_scale_of),
-            ("quantiles_of", shape.quantiles_of),
-            ("time_of", shape.time_of),
-        )
+    own = {
+        key: str(parse_formula(text, names))
+        for key in ("scale_of", "inverse_scale_of", "quantiles_of", "time_of")
+        if (text := getattr(shape, key)) is not None
     }
-    for key in ("lattice_of", "top_of", "bottom_of"):
-        if (role := getattr(shape, key)) is not None:
-            texts[key] = assignment[role]
-    return shape.model_copy(update=texts)
+    recorded = {
+        key: assignment[role]
+        for key in ("lattice_of", "top_of", "bottom_of")
+        if (role := getattr(shape, key)) is not None
+    }
+    return shape.model_copy(update=own | recorded)
 
 
-def _label_of(name: str, variant: str, model: Dynamics, augmented: Dynamics) -> str:
-    """A mechanism's name, with its variant, and where it changes a simulation."""
-    places = [
+def _labelled(candidate: MechanismCandidate, model: Dynamics) -> MechanismCandidate:
+    """A candidate with the equations that it changes in a model, which its label tells with its variant."""
+    augmented = candidate.model
+    places = tuple(
         state
         for state, before, after in zip(model.states, model.equations, augmented.equations, strict=False)
         if before != after
-    ]
+    )
     measured = [
         output
         for (output, before), (_, after) in zip(model.outputs, augmented.outputs, strict=True)
         if before != after
     ]
-    new = ", ".join(entry.name for entry in augmented.parameters[len(model.parameters) :])
-    whole = f"{name} {variant}" if variant else name
-    if places or variant:
-        return f"{whole} in {', '.join(places or measured)}"
-    return f"{whole} in {', '.join(measured)}, by {new}"
+    label = f"{candidate.name} {candidate.variant}".rstrip() + f" in {', '.join(places or measured)}"
+    if not (places or candidate.variant):
+        label += f", by {', '.join(entry.name for entry in augmented.parameters[len(model.parameters) :])}"
+    return replace(candidate, label=label, equations=places)
 
 
 INDEPENDENCE_TOLERANCE = (
@@ -567,32 +562,27 @@ def _without_amplitudes(
         return before if before is not None and sympy.expand(left - before) == 0 else left
 
     whole = candidate.model
-    equations = tuple(
-        less(formula, before) for formula, before in itertools.zip_longest(whole.equations, model.equations)
-    )
     reduced = replace(
         whole,
         parameters=tuple(each for each in whole.parameters if each.name not in names),
-        equations=equations,
+        equations=tuple(
+            less(formula, before)
+            for formula, before in itertools.zip_longest(whole.equations, model.equations)
+        ),
         outputs=tuple(
             (name, less(formula, before))
             for (name, formula), (_, before) in zip(whole.outputs, model.outputs, strict=True)
         ),
     )
     changes = ((name, formula.subs(zero)) for name, formula in candidate.changes)
-    return replace(
+    left = replace(
         candidate,
-        label=_label_of(candidate.name, candidate.variant, model, reduced),
         model=reduced,
         amplitudes=tuple(name for name in candidate.amplitudes if name not in names),
         positive=candidate.positive & set(candidate.shapes),
-        equations=tuple(
-            name
-            for name, formula, before in zip(model.states, equations, model.equations, strict=False)
-            if formula != before
-        ),
         changes=tuple((name, formula) for name, formula in changes if formula != 0),
     )
+    return _labelled(left, model)
 
 
 GENERIC = "generic monomial"

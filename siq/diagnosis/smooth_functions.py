@@ -260,22 +260,14 @@ def _product_of(
     weight: float = 1.0,
 ) -> SmoothFunction:
     """The likeliest product, whose lengths may be any of several."""
-    bases = []
-    for side, coordinate in enumerate(place.coordinates):
-        functions = [
-            Bumps.along((coordinate,), courses[side, None], (share,), weight=weight) for share in shares
-        ]
-        bases.append(
-            [
-                (
-                    each,
-                    scipy.linalg.solve_triangular(
-                        each.triangle, each.values(points[:, side, None].T), lower=True
-                    ),
-                )
-                for each in functions
-            ]
-        )
+
+    def basis(side: int, share: float) -> tuple[Bumps, np.ndarray]:
+        """A factor, and what a unit of each of its independent coefficients is at the points."""
+        bumps = Bumps.along((place.coordinates[side],), courses[side, None], (share,), weight=weight)
+        values = bumps.values(points[:, side, None].T)
+        return bumps, scipy.linalg.solve_triangular(bumps.triangle, values, lower=True)
+
+    bases = [[basis(side, share) for share in shares] for side in range(2)]
     highest, best = -np.inf, None
     for (one, first), (other, second) in itertools.product(*bases):
         evidence, f, g = _in_turns(first, deviation * second, gram, overlap)
