@@ -333,7 +333,7 @@ def evidence_of_function(
     return float(scipy.special.logsumexp(values) - np.log(np.size(values)))
 
 
-def log_evidence_of(fit: Fit, data: Measurements, *, correlated: float = 1.0) -> float:
+def _log_evidence_of(fit: Fit, data: Measurements, *, correlated: float = 1.0) -> float:
     """Log-likelihood of a whole explanation, less what its parameters would gain by chance.
 
     Schwarz's approximation of the marginal likelihood, -½ k log n, with process noise counted as
@@ -371,7 +371,7 @@ def log_evidence_of(fit: Fit, data: Measurements, *, correlated: float = 1.0) ->
 
 
 def log_evidences(fits: Sequence[Fit], data: Measurements) -> list[float]:
-    """The evidence of whole explanations that are compared (`log_evidence_of`).
+    """The evidence of whole explanations that are compared (`_log_evidence_of`).
 
     For all of them errors are as correlated as the likeliest leaves them: what the others leave is rather the
     effect that they lack.
@@ -381,4 +381,4 @@ def log_evidences(fits: Sequence[Fit], data: Measurements) -> list[float]:
         closest = max(known, key=lambda each: each.log_likelihood)
         white, _, left = residuals(closest, data)
         correlated = correlation_time_of(left, white.recording, outputs=len(closest.model.outputs))
-    return [log_evidence_of(each, data, correlated=correlated) for each in fits]
+    return [_log_evidence_of(each, data, correlated=correlated) for each in fits]

@@ -55,11 +55,6 @@ def simulated(fit: Fit, data: Measurements, *, noise: Noise, substeps: int) -> F
     return free_run(fit.model, data, noise=noise, substeps=finer, usual=fit.x)
 
 
-def mean_error(squares: np.ndarray | None) -> float:
-    """The mean of squared errors, infinite where a simulation ran away."""
-    return float("inf") if squares is None else float(squares.mean())
-
-
 @dataclass(frozen=True)
 class HeldOutErrors:
     """Normalised errors on held-out recordings; None where a simulation ran away.

@@ -13,7 +13,6 @@ from siq.diagnosis.holdout import (
     HeldOutErrors,
     errors_left_out,
     first_better,
-    mean_error,
     simplest_of,
     simulated,
 )
@@ -202,6 +201,10 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
 
     def errors_of(fit: Fit, of: Measurements) -> np.ndarray | None:
         return run(fit, of).squared_errors(of.outputs)
+
+    def mean_error(squares: np.ndarray | None) -> float:
+        """Infinite where a simulation ran away."""
+        return float("inf") if squares is None else float(squares.mean())
 
     def best_of(*fits: Fit | None) -> Fit:
         """The fit that runs nearest to what was learned from; the first of those that are as near."""

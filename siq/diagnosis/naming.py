@@ -41,7 +41,7 @@ from siq.diagnosis.evidence import (
 from siq.diagnosis.holdout import change_between, errors_left_out, in_blocks
 from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.diagnosis.residual_structure import Remainder
-from siq.diagnosis.screening import PROBE_SUBSTEPS, ProbeColumns, probe_response, probes_of, slices_of
+from siq.diagnosis.screening import PROBE_SUBSTEPS, Probe, ProbeColumns, probe_response, slices_of
 from siq.diagnosis.search import FitContext, Search
 from siq.diagnosis.study import MismatchVerdict
 from siq.diagnosis.terms import linearised_with_places, places_in, products_in
@@ -151,7 +151,9 @@ def _false_match_rate(
     recalibrated, data = whole.recalibrated, context.data
     model, count = recalibrated.model, len(recalibrated.model.free)
     probes = [
-        probe for each in context.candidates for probe in probes_of(each, data, context.model, recalibrated.x)
+        probe
+        for each in context.candidates
+        for probe in Probe.all_of(each, data, context.model, recalibrated.x)
     ]
     noise = Noise(whole.fit.noise.measurement, np.zeros(model.dimension))
     effects = _drawn_effects(recalibrated, data, context.roles, noise, generator=generator)

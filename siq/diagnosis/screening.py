@@ -56,6 +56,25 @@ class Probe:
     candidate: MechanismCandidate
     shapes: tuple[tuple[str, float], ...]
 
+    @classmethod
+    def all_of(
+        cls, candidate: MechanismCandidate, data: Measurements, model: Dynamics, x: np.ndarray
+    ) -> list[Probe]:
+        """A candidate with its shapes at all places where they are looked for.
+
+        Parameters
+        ----------
+        candidate
+            The mechanism.
+        data, model, x
+            The recordings, and the simulation along them: sizes of motion are taken from there.
+        """
+        choices: list[tuple[tuple[str, float], ...]] = [()]
+        for name, search in zip(candidate.shapes, candidate.searches, strict=True):
+            found = places_of(search, data, model, x)
+            choices = [(*before, (name, float(place))) for before in choices for place in found]
+        return [cls(candidate, shapes) for shapes in choices]
+
     @property
     def recorded(self) -> bool:
         """Whether the recordings themselves show its shape.
@@ -232,25 +251,6 @@ class ProbeColumns:
             nodes += [z, z + step / 2 * k2, after]
             z = after
         return nodes
-
-
-def probes_of(
-    candidate: MechanismCandidate, data: Measurements, model: Dynamics, x: np.ndarray
-) -> list[Probe]:
-    """A candidate with its shapes at all places where they are looked for.
-
-    Parameters
-    ----------
-    candidate
-        The mechanism.
-    data, model, x
-        The recordings, and the simulation along them: sizes of motion are taken from there.
-    """
-    choices: list[tuple[tuple[str, float], ...]] = [()]
-    for name, search in zip(candidate.shapes, candidate.searches, strict=True):
-        found = places_of(search, data, model, x)
-        choices = [(*before, (name, float(place))) for before in choices for place in found]
-    return [Probe(candidate, shapes) for shapes in choices]
 
 
 NOISE_LEVELS = (1.0, 0.1, 1e-2, 1e-3, 1e-4, 0.0)
@@ -441,7 +441,7 @@ def screen_all(
         try:
             sharp = max(substeps, EDGE_SUBSTEPS)
             spread = replace(candidate, model=spread_edges(candidate.model, data, current.x, substeps=sharp))
-            probes += probes_of(spread, data, model, current.x)
+            probes += Probe.all_of(spread, data, model, current.x)
         except NUMERICAL_ERRORS as error:
             untried[candidate.label] = NotFitted.of(candidate, error)
     grid = Grid(data, min(substeps, PROBE_SUBSTEPS))

@@ -379,6 +379,89 @@ class Smoothness:
     overlap: np.ndarray
     log_evidence: float = float("nan")
 
+    @classmethod
+    def of(
+        cls, fit: Fit, data: Measurements, place: Place, *, known: Term | None = None, alike: bool = False
+    ) -> Smoothness | None:
+        """The likeliest smoothness of a function on top of a fit; None where it cannot be worked out.
+
+        Parameters
+        ----------
+        fit, data
+            The fit along whose trajectories everything is linear, and what it was made for.
+        place
+            Where the function stands.
+        known
+            A part of the fit that is a first description of this function, in whose stead it comes.
+        alike
+            Whether both lengths are the same share of the range.
+        """
+        courses = along(place.coordinates, fit.model, data, fit.x)
+        ranges = np.ptp(courses, axis=1)
+        if not (np.isfinite(courses).all() and (ranges > 0).all()):
+            return None
+        # The shortest length of which the recordings need not too many bumps.
+        count = len(place.coordinates)
+        room = LARGEST_LINEARISATION // (len(data.t) * (fit.model.dimension + len(fit.model.outputs)))
+        most = max(min(MOST_BUMPS, room), 1)
+        for least in LENGTH_SCALES:
+            fine = Bumps.along(place.coordinates, courses, (least,) * count, most=most + 1)
+            if fine.width <= most:
+                break
+        else:
+            fine = Bumps.along(place.coordinates, courses, (least,) * count, most=most)
+        some = [share for share in LENGTH_SCALES if share >= least]
+        choices = [(each,) * count for each in some] if alike else list(itertools.product(some, repeat=count))
+        # What processes of these lengths have for values at the finest bumps, as heights of these.
+        shapes = [fine.heights_of(_triangle_of(fine.centres, np.array(each) * ranges)) for each in choices]
+        # What is told at each level of process noise at which it can be worked out. Errors are as correlated
+        # as the likeliest level leaves them with such a function, at all levels.
+        grid = Grid(data, fit.substeps if known else min(fit.substeps, PROBE_SUBSTEPS))
+        response = probe_response(fit, grid, PlaceColumns(fit.model, grid, [place], [fine]))
+        levels: list[tuple[float, Sequence[np.ndarray | float]]] = []
+        highest, correlated = -np.inf, 1.0
+        for level in levels_of(fit):
+            try:
+                white = whiten(response, data, fit.noise.scaled(level))
+                white, parameters = _without(white, fit, known)
+                left, columns = projected(white, parameters)
+            except NUMERICAL_ERRORS as error:
+                LOGGER.info("no function of %s can be screened: %s", " and ".join(place.words[:count]), error)
+                continue
+            total, freedom = float(left @ left), white.degrees_of_freedom - parameters
+            likelihood = profile_likelihood(total, freedom, white.log_determinant)
+            levels.append((level, (columns.T @ columns, columns.T @ left, total, freedom, likelihood)))
+            basis = orthonormal(columns)
+            rest = left - basis @ (basis.T @ left)
+            likelihood = profile_likelihood(float(rest @ rest), freedom, white.log_determinant)
+            if likelihood > highest:
+                highest = likelihood
+                correlated = correlation_time_of(rest, white.recording, outputs=len(fit.model.outputs))
+        alone, values = -np.inf, list[np.ndarray]()
+        highest, best = -np.inf, None
+        for level, told in levels:
+            gram, overlap, total, freedom, likelihood = (each / correlated for each in told)
+            alone = max(alone, likelihood)
+            for shares, shape in zip(choices, shapes, strict=True):
+                gained, scale, rest = evidences_by_size(
+                    shape.T @ gram @ shape, shape.T @ overlap, total, freedom=freedom
+                )
+                values.append(likelihood + gained)
+                size = int(np.argmax(gained))
+                if values[-1][size] > highest:
+                    # The scale of the noise was at its best, too, and the size is one in units of it.
+                    highest, noise = values[-1][size], float(rest[size] / freedom)
+                    deviation = float(np.sqrt(scale[size] * noise))
+                    best = cls(
+                        place, courses, shares, deviation, noise, level, correlated,
+                        len(gained) * len(choices), fine, gram, overlap,
+                    )  # fmt: skip
+        if best is None or not best.deviation > 0:
+            return None
+        whole = np.concatenate(values)
+        mean = float(np.logaddexp.reduce(whole) - np.log(len(whole)))
+        return replace(best, log_evidence=mean - alone)
+
     def function(self, *, product: bool = False, times: float = 1.0) -> SmoothFunction:
         """The function, or the likeliest product of two, with lengths that are longer by a factor."""
         place, weight = self.place, self.correlated
@@ -399,89 +482,6 @@ class Smoothness:
             deviation=self.deviation,
             weight=weight,
         )
-
-
-def smoothness_of(
-    fit: Fit, data: Measurements, place: Place, *, known: Term | None = None, alike: bool = False
-) -> Smoothness | None:
-    """The likeliest smoothness of a function on top of a fit; None where it cannot be worked out.
-
-    Parameters
-    ----------
-    fit, data
-        The fit along whose trajectories everything is linear, and what it was made for.
-    place
-        Where the function stands.
-    known
-        A part of the fit that is a first description of this function, in whose stead it comes.
-    alike
-        Whether both lengths are the same share of the range.
-    """
-    courses = along(place.coordinates, fit.model, data, fit.x)
-    ranges = np.ptp(courses, axis=1)
-    if not (np.isfinite(courses).all() and (ranges > 0).all()):
-        return None
-    # The shortest length of which the recordings need not too many bumps.
-    count = len(place.coordinates)
-    room = LARGEST_LINEARISATION // (len(data.t) * (fit.model.dimension + len(fit.model.outputs)))
-    most = max(min(MOST_BUMPS, room), 1)
-    for least in LENGTH_SCALES:
-        fine = Bumps.along(place.coordinates, courses, (least,) * count, most=most + 1)
-        if fine.width <= most:
-            break
-    else:
-        fine = Bumps.along(place.coordinates, courses, (least,) * count, most=most)
-    some = [share for share in LENGTH_SCALES if share >= least]
-    choices = [(each,) * count for each in some] if alike else list(itertools.product(some, repeat=count))
-    # What processes of these lengths have for values at the finest bumps, as heights of these.
-    shapes = [fine.heights_of(_triangle_of(fine.centres, np.array(each) * ranges)) for each in choices]
-    # What is told at each level of process noise at which it can be worked out. Errors are as correlated as
-    # the likeliest level leaves them with such a function, at all levels.
-    grid = Grid(data, fit.substeps if known else min(fit.substeps, PROBE_SUBSTEPS))
-    response = probe_response(fit, grid, PlaceColumns(fit.model, grid, [place], [fine]))
-    levels: list[tuple[float, Sequence[np.ndarray | float]]] = []
-    highest, correlated = -np.inf, 1.0
-    for level in levels_of(fit):
-        try:
-            white = whiten(response, data, fit.noise.scaled(level))
-            white, parameters = _without(white, fit, known)
-            left, columns = projected(white, parameters)
-        except NUMERICAL_ERRORS as error:
-            LOGGER.info("no function of %s can be screened: %s", " and ".join(place.words[:count]), error)
-            continue
-        total, freedom = float(left @ left), white.degrees_of_freedom - parameters
-        likelihood = profile_likelihood(total, freedom, white.log_determinant)
-        levels.append((level, (columns.T @ columns, columns.T @ left, total, freedom, likelihood)))
-        basis = orthonormal(columns)
-        rest = left - basis @ (basis.T @ left)
-        likelihood = profile_likelihood(float(rest @ rest), freedom, white.log_determinant)
-        if likelihood > highest:
-            highest = likelihood
-            correlated = correlation_time_of(rest, white.recording, outputs=len(fit.model.outputs))
-    alone, values = -np.inf, list[np.ndarray]()
-    highest, best = -np.inf, None
-    for level, told in levels:
-        gram, overlap, total, freedom, likelihood = (each / correlated for each in told)
-        alone = max(alone, likelihood)
-        for shares, shape in zip(choices, shapes, strict=True):
-            gained, scale, rest = evidences_by_size(
-                shape.T @ gram @ shape, shape.T @ overlap, total, freedom=freedom
-            )
-            values.append(likelihood + gained)
-            size = int(np.argmax(gained))
-            if values[-1][size] > highest:
-                # The scale of the noise was at its best, too, and the size is one in units of it.
-                highest, noise = values[-1][size], float(rest[size] / freedom)
-                deviation = float(np.sqrt(scale[size] * noise))
-                best = Smoothness(
-                    place, courses, shares, deviation, noise, level, correlated,
-                    len(gained) * len(choices), fine, gram, overlap,
-                )  # fmt: skip
-    if best is None or not best.deviation > 0:
-        return None
-    whole = np.concatenate(values)
-    mean = float(np.logaddexp.reduce(whole) - np.log(len(whole)))
-    return replace(best, log_evidence=mean - alone)
 
 
 def _without(white: Whitened, fit: Fit, known: Term | None) -> tuple[Whitened, int]:

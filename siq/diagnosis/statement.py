@@ -298,7 +298,7 @@ class Statement:
         What could not be judged.
     explanations
         Logarithms of the marginal likelihoods of whole explanations, less that of the likeliest, which is the
-        first; see `siq.diagnosis.evidence.log_evidence_of`.
+        first; see `siq.diagnosis.evidence.log_evidences`.
     account
         The work that it took, and whether something was left undone.
     """

@@ -376,7 +376,7 @@ def formula_in(
     if not (terms := _few_powers(place, fit, data, degree=degree)):
         return None
     place, terms = _simplest(place, terms)
-    return place, with_formula(fit.model, place, terms)
+    return place, _with_formula(fit.model, place, terms)
 
 
 def _few_powers(place: Place, fit: Fit, data: Measurements, *, degree: int) -> tuple[Power, ...]:
@@ -385,7 +385,7 @@ def _few_powers(place: Place, fit: Fit, data: Measurements, *, degree: int) -> t
     Errors count as correlated as all of the powers leave them (`siq.diagnosis.evidence`).
     """
     terms = _powers(place, degree=degree)
-    probe = Probe(with_formula(fit.model, place, terms), ())
+    probe = Probe(_with_formula(fit.model, place, terms), ())
     grid = Grid(data, min(fit.substeps, PROBE_SUBSTEPS))
     response = probe_response(fit, grid, ProbeColumns(fit.model, grid, [probe], fit.x))
     white = whiten(response, data, fit.noise.scaled(place.level))
@@ -413,7 +413,7 @@ def _few_powers(place: Place, fit: Fit, data: Measurements, *, degree: int) -> t
     return tuple(terms[power] for power in sorted(chosen))
 
 
-def with_formula(model: Dynamics, place: Place, terms: Sequence[Power]) -> MechanismCandidate:
+def _with_formula(model: Dynamics, place: Place, terms: Sequence[Power]) -> MechanismCandidate:
     """The simulation with a sum of terms in a place, whose coefficients are the amplitudes."""
     names = fresh_names("c", len(terms), model.names)
     formula = sympy.Add(*(symbol(name) * term for name, (term, _, _) in zip(names, terms, strict=True)))

@@ -34,7 +34,7 @@ from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
 from siq.diagnosis.residual_structure import has_structure
 from siq.diagnosis.screening import screen_all
 from siq.diagnosis.search import FitContext, Search, best_probes
-from siq.diagnosis.smooth_functions import SmoothFunction, Smoothness, Term, smoothness_of
+from siq.diagnosis.smooth_functions import SmoothFunction, Smoothness, Term
 from siq.diagnosis.terms import (
     FORMULA,
     FUNCTIONS_FITTED,
@@ -189,9 +189,9 @@ def _fitted_term(
 def _asked(
     fit: Fit, data: Measurements, place: Place, *, known: Term | None, alike: bool = False
 ) -> Smoothness | None:
-    """See `smoothness_of`; what is beyond all numbers ends a function, not a case."""
+    """See `Smoothness.of`; what is beyond all numbers ends a function, not a case."""
     try:
-        return smoothness_of(fit, data, place, known=known, alike=alike)
+        return Smoothness.of(fit, data, place, known=known, alike=alike)
     except NUMERICAL_ERRORS as error:
         LOGGER.info("no function of %s can be worked out: %s", " and ".join(place.words), error)
         return None

@@ -10,7 +10,7 @@ from siq.diagnosis.evidence import averaged_evidence, evidence_of_function, orth
 from siq.diagnosis.mechanisms import fresh_names
 from siq.diagnosis.naming import _best_shares
 from siq.diagnosis.study import SearchOptions
-from siq.diagnosis.terms import Place, _powers, _simplest, with_formula
+from siq.diagnosis.terms import Place, _powers, _simplest, _with_formula
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, symbol
 from siq.systems.formulas import compile_values
@@ -100,7 +100,7 @@ def test_coefficients_of_formulas_have_units(words: tuple[str, ...], terms: str,
     where = place(*words)
     wanted = sympy.sympify(terms, {name: symbol(name) for name in ("c_1", "x", "v", "t")})
     term = next(each for each in _powers(where, degree=3) if symbol("c_1") * each[0] == wanted)
-    candidate = with_formula(OSCILLATOR, where, [term])
+    candidate = _with_formula(OSCILLATOR, where, [term])
     assert candidate.model.equations[1] - OSCILLATOR.equations[1] == wanted
     assert candidate.model.parameters[-1].unit == unit
     assert candidate.changes == (("v", wanted),)
@@ -119,7 +119,7 @@ def test_a_formula_without_its_first_coordinate_is_one_of_the_second() -> None:
 
 def test_new_names_are_new() -> None:
     assert fresh_names("c", 2, OSCILLATOR.names) == ["c_1", "c_2"]
-    again = with_formula(OSCILLATOR, place("x"), _powers(place("x"), degree=2)[:2]).model
+    again = _with_formula(OSCILLATOR, place("x"), _powers(place("x"), degree=2)[:2]).model
     assert fresh_names("c", 1, again.names) == ["c_3"]
 
 

@@ -12,7 +12,7 @@ import sympy
 
 from siq.diagnosis import unnamed_models
 from siq.diagnosis.diagnosis import solve_case
-from siq.diagnosis.evidence import evidences_by_size, log_evidence_of
+from siq.diagnosis.evidence import _log_evidence_of, evidences_by_size
 from siq.diagnosis.holdout import simplest_of
 from siq.diagnosis.smooth_functions import (
     LENGTH_SCALES,
@@ -153,7 +153,7 @@ def test_evidence_of_parameters_expected_together_is_the_marginal_likelihood() -
             model, data, x=np.zeros((len(t), 1)), noise=Noise(np.array([noise]), np.zeros(1)),
             estimate_process=False, substeps=1,
         )  # fmt: skip
-        found.append(log_evidence_of(fit, data))
+        found.append(_log_evidence_of(fit, data))
     # The first state is a constant of any size; what is the same for both does not count.
     wide = [scipy.stats.multivariate_normal(np.zeros(len(t)), each + 1e4).logpdf(y) for each in exact]
     constant = [np.log(np.linalg.solve(each, np.ones(len(t))).sum()) / 2 for each in exact]
@@ -167,10 +167,10 @@ def test_what_is_beyond_all_numbers_ends_a_function_and_not_the_case(monkeypatch
 
     where = SimpleNamespace(words=("x",))
     fit, context = SimpleNamespace(model=MODEL, x=np.zeros((3, 2))), SimpleNamespace(data=None)
-    monkeypatch.setattr(unnamed_models, "smoothness_of", singular)
+    monkeypatch.setattr(unnamed_models.Smoothness, "of", singular)
     assert unnamed_models._with_smooth_term((), fit, where, 0.0, context) == []
     asked = SimpleNamespace(considered=9, level=1.0, function=singular)
-    monkeypatch.setattr(unnamed_models, "smoothness_of", lambda *_, **__: asked)
+    monkeypatch.setattr(unnamed_models.Smoothness, "of", lambda *_, **__: asked)
     assert unnamed_models._with_smooth_term((), fit, where, 0.0, context, product=True) == []
 
 

@@ -15,7 +15,7 @@ from siq.data.recordings import Recordings
 from siq.diagnosis import unnamed_models
 from siq.diagnosis.dictionary import roles_of
 from siq.diagnosis.search import FitContext, Search
-from siq.diagnosis.terms import Place, with_formula
+from siq.diagnosis.terms import Place, _with_formula
 from siq.diagnosis.unnamed_models import (
     _fitted_term,
     _memories_of,
@@ -148,7 +148,7 @@ def test_a_function_whose_fit_leads_away_begins_again(monkeypatch: pytest.Monkey
     _, alone = recalibrate(DECAY, data)
     assert not alone.has_process_noise
     place = Place((("x", sympy.Integer(1)),), (), (X,), ("x",))
-    candidate = with_formula(alone.model, place, [(X**2, 2, 0)])
+    candidate = _with_formula(alone.model, place, [(X**2, 2, 0)])
     context = FitContext(DECAY, data, SimpleNamespace())
 
     def fitted() -> Fit:
