@@ -41,8 +41,6 @@ from siq.quasipotential.certificate import MIN_DIFFERENCE
 from siq.quasipotential.certificate_tests import (
     Candidate,
     CertificateOptions,
-    check_hamilton_jacobi,
-    stated_error,
 )
 from siq.quasipotential.hamilton_jacobi import LibraryBasis
 from siq.quasipotential.refinement import RefinementOptions, local_wells, refine
@@ -92,7 +90,7 @@ def about_attractors(
         )  # fmt: skip
         wells = refined.network_wells
         if refined.formula is not None:
-            basis = LibraryBasis(refined.library, np.flatnonzero(refined.formula.potential))
+            basis = LibraryBasis(refined.found.library, np.flatnonzero(refined.formula.potential))
             own = refined.formula.potential[basis.chosen]
             return [
                 Candidate(
@@ -104,7 +102,7 @@ def about_attractors(
     if len(wells) < len(portrait.attractors):
         return None
     return [
-        Candidate(well.values, well.gradients, well.hessians, None, well.inside, [one])
+        Candidate(well.values, well.gradients, well.hessians, None, well.inside(), [one])
         for well, one in zip(wells, portrait.attractors, strict=True)
     ]
 
@@ -125,8 +123,8 @@ def judged(
     for one, two in zip(network, local, strict=True):
         x = two.points
         for candidate in (one, two):
-            solve &= check_hamilton_jacobi(candidate, found, LIMITS).passed
-        errors = (stated_error(candidate, found) for candidate in (one, two))
+            solve &= candidate.check_hamilton_jacobi(found, LIMITS).passed
+        errors = (candidate.stated_error(found) for candidate in (one, two))
         limit = MIN_DIFFERENCE + sum(min(error, LIMITS.error) for error in errors)
         agree &= difference(one, two.values, x) <= limit
         wrong |= difference(one, lambda y: potential_values(known, y), x) > WRONG

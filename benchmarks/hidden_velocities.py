@@ -175,7 +175,7 @@ def only_barriers(particle: Particle, seed: int) -> dict[str, object]:
     for way in ways_out(record.dynamics, portrait):
         if way.path is not None:
             error, by_rivals = barrier_uncertainty(way.path, record)
-            barriers.append(way.path.uphill.action + by_rivals)
+            barriers.append(way.path.action + by_rivals)
             errors.append(error)
     return {
         "attractors": len(portrait.attractors) if len(barriers) == 2 else 0,

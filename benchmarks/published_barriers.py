@@ -17,7 +17,7 @@ import numpy as np
 
 from siq.quasipotential.landscape_assembly import EquationSettings, landscape_from_equations
 from siq.systems.cards import load_system
-from siq.validation.escapes import neighbourhood, simulate_escapes
+from siq.validation.escapes import Neighbourhood, simulate_escapes
 
 CARD = Path(__file__).parents[1] / "config" / "systems" / "consumer-resource.yaml"
 PUBLISHED = (0.007056, 0.00092975)  # Φ of the saddle from (1.4049, 2.8081) and from (4.9040, 4.0619)
@@ -34,7 +34,7 @@ if __name__ == "__main__":
         print(f"from A{way.start + 1}: ours {ours:.8f}, published {published:g}, {published / ours - 1:+.1%}")
     first, second = found.transitions
     start, end = (one.position for one in found.attractors)
-    target = neighbourhood(system, end, level=DEEP * second.barrier / 2)
+    target = Neighbourhood.about(system, end, level=DEEP * second.barrier / 2)
     inverse, logarithm, error = [], [], []
     for number, (noise, walkers) in enumerate(SIMULATED):
         foretold = first.rate.prefactor * np.exp(first.barrier / noise)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,26 +20,18 @@ import sympy
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import read_field
 from siq.networks.decomposition import TrainedNetworks
+from siq.numerics.integration import heun_step
 from siq.numerics.randomness import Purpose, generator
-from siq.quasipotential.cell_density import (
-    CELLS,
-    known_density,
-    lowest_possible,
-    sample_potential,
-    shares_by_rates,
-    walk,
-)
+from siq.quasipotential.cell_density import CELLS, SampledPotential, shares_by_rates
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.invariant_density import (
     StationaryDensity,
     marginal_density,
     normalisation_bessel,
-    normalisation_quadrature,
 )
 from siq.quasipotential.landscape import Landscape, NoLandscape
 from siq.quasipotential.landscape_assembly import EquationSettings, landscape_from_equations
 from siq.quasipotential.landscape_comparison import (
-    ErrorInRegion,
     Potential,
     ReferenceLandscape,
     compare_estimate,
@@ -47,8 +39,6 @@ from siq.quasipotential.landscape_comparison import (
     compare_mesh,
     compare_with_mesh,
     differences,
-    no_reference,
-    overall_level,
     reference_landscape,
 )
 from siq.quasipotential.landscape_files import landscape_from_data, read_landscape
@@ -57,7 +47,7 @@ from siq.remarks import sentence
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
 from siq.systems.simulation import simulate_stationary
-from siq.validation.escapes import Neighbourhood, neighbourhood, simulate_escapes
+from siq.validation.escapes import Neighbourhood, simulate_escapes
 from siq.validation.mesh import mesh_potential
 from siq.workflow.study import PipelineSettings
 from siq.workflow.tables import as_table
@@ -97,13 +87,13 @@ def reference_of_card(settings: PipelineSettings, system: Dynamics) -> Reference
     try:
         portrait = phase_portrait(system, points)
         if not portrait.attractors and (fault := portrait.fault()) is not None:
-            return no_reference(system.dimension, sentence(fault))
+            return ReferenceLandscape.missing(system.dimension, sentence(fault))
         return reference_landscape(
             system, portrait, box=system.box, reach=REACH, generator=draw,
             mesh=lambda attractor, level: mesh_potential(system, attractor, box=system.box, level=level),
         )  # fmt: skip
     except (NumericalFailure, np.linalg.LinAlgError) as error:
-        return no_reference(system.dimension, str(error))
+        return ReferenceLandscape.missing(system.dimension, str(error))
 
 
 DRAWS = 100  # of the digits that a published formula does not print
@@ -140,7 +130,7 @@ def run_landscape_errors(
             compared = compare_landscape(reference, landscape, below=below)
             tables.append(_rows(number, "local formulas", compared))
         sources: dict[str, Potential] = {
-            method: lambda x, one=one: 2 * one.evaluate(np.ascontiguousarray(x.T))[0]
+            method: lambda x, one=one: 2 * one.values(x)
             for method, one in formulas.items()
             if one.potential is not None
         }
@@ -161,15 +151,15 @@ def run_landscape_errors(
         compared = compare_estimate(reference, published_mesh, below=below)
         tables.append(_rows(NONE_OF_OURS, "published mesh", compared))
         if formulas_of_others:  # the paper's own comparison, in its Appendix E
-            level = overall_level(reference) if below is None else below
+            level = reference.level if below is None else below
             values = formulas_of_others[0](reference.points)
             both = [compare_with_mesh(values, published_mesh(reference.points), below=level)]
             tables.append(_rows(NONE_OF_OURS, "published formula, against the published mesh", both))
     return concatenate(TABLE, tables)
 
 
-def _rows(number: int, source: str, comparisons: Sequence[ErrorInRegion]) -> pd.DataFrame:
-    return as_table(TABLE, [{"run": number, "source": source} | asdict(one) for one in comparisons])
+def _rows(number: int, source: str, comparisons: Sequence[Mapping[str, object]]) -> pd.DataFrame:
+    return as_table(TABLE, [{"run": number, "source": source, **one} for one in comparisons])
 
 
 WALKERS = 400
@@ -218,7 +208,7 @@ def _simulated(
         barriers = [one.barrier for one in landscape.transitions if one.start == index]
         barriers = [one for one in barriers if np.isfinite(one) and one]
         if index != way.start and barriers:
-            targets.append(neighbourhood(system, position, level=NEIGHBOURHOOD * min(barriers) / 2))
+            targets.append(Neighbourhood.about(system, position, level=NEIGHBOURHOOD * min(barriers) / 2))
     predicted = way.rate.prefactor * np.exp(way.barrier / intensity)
     try:
         found = simulate_escapes(
@@ -286,7 +276,7 @@ logger = logging.getLogger(__name__)
 DENSITY_WALKERS = 4000
 STEPS = 20_000  # of the simulation, after a fifth of them to settle
 KEPT = 50  # samples of every walker
-ACCURACY = 0.025  # step times the norm of the Jacobian where the walkers are
+ACCURACY, HEUN_STEP = 0.025, 0.1  # step times the norm of the Jacobian where the walkers are, by either rule
 
 
 def compare_invariant(
@@ -384,15 +374,14 @@ def _density_row(
     """Z and the density of a formula of U over the whole domain, against samples."""
     known: dict[str, Any] = {"intensity": intensity, "box": system.box}
     density = marginal_density(formula, symbols, **known)
-    quadrature = normalisation_quadrature(formula, symbols, **known)
     compared = density.compare(samples)
     row = {
         "bessel": normalisation_bessel(formula, symbols, intensity=intensity),
-        "quadrature": quadrature,
+        "quadrature": density.normalisation,
         "simulated_distance": compared.total_variation,
         "sampling_floor": compared.sampling_floor,
     }
-    return row, replace(density, normalisation=quadrature, comparison=compared)
+    return row, replace(density, comparison=compared)
 
 
 def _of_wells(landscape: Landscape, system: Dynamics) -> AtIntensity:
@@ -400,19 +389,21 @@ def _of_wells(landscape: Landscape, system: Dynamics) -> AtIntensity:
     potential = landscape.global_quasipotential
     assert potential is not None
     identified, count = potential.wells[0].dynamics, len(potential.wells)
-    fine = sample_potential(potential, system.box)
-    coarse = sample_potential(potential, system.box, cells=CELLS[system.dimension] // 2)
-    lowest = lowest_possible(coarse, identified)
+    fine = SampledPotential.of(potential, system.box)
+    coarse = SampledPotential.of(potential, system.box, cells=CELLS[system.dimension] // 2)
+    lowest = coarse.lowest_possible(identified)
     laws = [(way.start, way.end, way.barrier, way.exit.prefactor) for way in landscape.transitions]
 
     def at(
         intensity: float, draw: np.random.Generator
     ) -> tuple[StationaryDensity, np.ndarray, dict[str, Any], list[dict[str, Any]]]:
-        density = known_density(fine, coarse, lowest, intensity=intensity)
+        density = fine.density(coarse, lowest, intensity=intensity)
         start = density.starting_states(DENSITY_WALKERS, generator=draw)
-        samples = walk(
-            system, start, intensity=intensity, burn_in=STEPS // 5, steps=STEPS,
-            thin=STEPS // KEPT, generator=draw,
+        rate = np.linalg.norm(system.jacobian(start.T), axis=(1, 2))
+        # f turns many times while it descends: the rule of Euler and Maruyama would take damping away.
+        samples = simulate_stationary(
+            system, intensity=intensity, start=start, step=HEUN_STEP / float(np.median(rate)),
+            burn_in=STEPS // 5, steps=STEPS, thin=STEPS // KEPT, generator=draw, rule=heun_step,
         )  # fmt: skip
         compared = density.compare(samples)
         row = {

@@ -86,9 +86,9 @@ def read(name: str, path: str | Path) -> Any:
 
         return load_published(path)
     if name == "reference":
-        from siq.quasipotential.landscape_comparison import read_reference
+        from siq.quasipotential.landscape_comparison import ReferenceLandscape
 
-        return read_reference(path)
+        return ReferenceLandscape.read(path)
     if name.endswith("_outcome"):
         return read_outcomes(path)
     if path.suffix == ".parquet":
@@ -131,9 +131,9 @@ def write(name: str, path: str | Path, value: Any, settings: PipelineSettings) -
 
         write_field(path, value, settings.identification)
     elif name in ("model", "regression"):
-        from siq.quasipotential.formulas import model_to_data, write_model
+        from siq.quasipotential.formulas import write_model
 
-        write_model(path, model_to_data(*({str(key): one for key, one in part.items()} for part in value)))
+        write_model(path, *({str(key): one for key, one in part.items()} for part in value))
     elif name == "networks":
         from siq.networks.decomposition import save_networks
 
@@ -143,9 +143,7 @@ def write(name: str, path: str | Path, value: Any, settings: PipelineSettings) -
 
         write_landscape(path, value)
     elif name == "reference":
-        from siq.quasipotential.landscape_comparison import write_reference
-
-        write_reference(path, value)
+        value.write(path)
     elif name.endswith("_outcome"):
         write_outcomes(path, value)
     elif isinstance(value, pd.DataFrame):

@@ -11,7 +11,7 @@ import pandas as pd
 from siq.numerics.text import place_text
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.occupancy import OccupancyCheck
-from siq.quasipotential.rates import MeanTime, mean_exit_time, mean_residence_time
+from siq.quasipotential.rates import MeanTime, mean_residence_time
 from siq.quasipotential.wells import best_trial
 from siq.systems.cycles import Cycle
 from siq.workflow.tables import as_table
@@ -127,12 +127,12 @@ def landscape_rows(run: int, found: Landscape | None, remark: str | None = None)
                 "barrier": way.barrier,
                 "standard_error": way.standard_error,
                 "formula_share": way.formula_share,
-                "minimum_action": np.nan if way.path is None else way.path.uphill.action,
+                "minimum_action": np.nan if way.path is None else way.path.action,
                 "prefactor": np.nan if way.rate is None else way.rate.prefactor,
                 "barrier_over_noise": np.nan if noise is None else way.barrier / noise.intensity,
                 "note": "; ".join([*way.notes, *([] if remark is None else [remark])]),
             }
-            | _time(found, None if noise is None else mean_exit_time(way.exit, noise))
+            | _time(found, None if noise is None else way.exit.mean_exit_time(noise))
         )
     return as_table("landscape", rows)
 

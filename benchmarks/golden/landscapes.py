@@ -193,7 +193,7 @@ def landscape(found: siq.Landscape) -> dict[str, Any]:
         "saddles": [position(way.saddle) for way in ways],
         "barrier": barrier,
         "barrier_error": barriers["standard_error"].to_numpy(float) / barrier,
-        "path_barrier": [None if way.path is None else way.path.uphill.action for way in ways],
+        "path_barrier": [None if way.path is None else way.path.action for way in ways],
         "heights": found.heights / lowest,
         "U_between": found.quasipotential(np.array(between)) / lowest if between else [],
     }

@@ -119,7 +119,7 @@ def _read_landscape(laboratory: Laboratory, found: Landscape, known: Truth, answ
             answer.barriers[true] = height
             answer.standard_errors[true] = float(np.hypot(lowest.standard_error / unit, height * unsure))
             if lowest.path is not None:
-                answer.path_barriers[true] = float(lowest.path.uphill.action) / unit
+                answer.path_barriers[true] = float(lowest.path.action) / unit
 
 
 def _other_branch(

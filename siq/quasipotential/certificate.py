@@ -19,7 +19,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from siq.data.recordings import SnapshotPairs
 from siq.errors import NumericalFailure
@@ -28,6 +27,7 @@ from siq.numerics.randomness import representative_subset
 from siq.quasipotential.certificate_tests import (
     ERROR_POINTS,
     LEVEL_SHARE,
+    MAX_ERROR_FROM_FIELD,
     MIN_POINTS,
     STATED_SIGMAS,
     Candidate,
@@ -35,23 +35,18 @@ from siq.quasipotential.certificate_tests import (
     Function,
     Reference,
     check_agreement,
-    check_candidate,
-    check_error,
     check_existence,
-    stated_error,
-    sublevel_points,
 )
 from siq.quasipotential.characteristics import (
+    SHEET_MARGIN,
     End,
     Fan,
     adapted_fan,
-    first_caustic,
-    lowest_sheet,
 )
 from siq.quasipotential.characteristics import relative_error as field_error
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.wells import Well
-from siq.remarks import sentence
+from siq.remarks import Remark, sentence
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
 from siq.systems.formulas import compile_formulas
@@ -109,6 +104,13 @@ class Certificate:
             "tests": {name: verdict.as_data() for name, verdict in self.tests.items()},
         }
 
+    @classmethod
+    def from_data(cls, data: Mapping[str, Any]) -> Certificate:
+        """A certificate as `as_data` stored it."""
+        tests = {name: Verdict.from_data(one) for name, one in data["tests"].items()}
+        error = np.inf if data["stated_error"] is None else data["stated_error"]
+        return cls(tests, error, data["reason"], data["scope"], data["tested_on"])
+
 
 def uncertified(reason: str) -> dict[str, Any]:
     """The certificate, as data, of formulas that could not be tested."""
@@ -164,14 +166,11 @@ def certify(
 
     Parameters
     ----------
-    formulas
-        V and g of the region, or V about the attractors.
-    evidence
-        What they are tested with.
-    others
-        V about the attractors by the other route, to be compared with.
-    compared
-        Whether both routes were asked for: then a formula that only one of them found is refused.
+    formulas, evidence
+        V and g of the region, or V about the attractors; and what they are tested with.
+    others, compared
+        V about the attractors by the other route, and whether both were asked for: then a formula that only
+        one of them found is refused.
     relative_error
         Relative standard error of a V of the region from the uncertainty of f.
     """
@@ -194,7 +193,7 @@ def certify(
             verdicts["hamilton_jacobi"] = [Verdict.refused(reason, options.hamilton_jacobi)]
             error = own_error = np.inf
             continue
-        made, its = check_candidate(candidate, found, options, seed=seed)
+        made, its = candidate.check(found, options, seed=seed)
         for name, verdict in made.items():
             verdicts.setdefault(name, []).append(verdict)
         uncertain = STATED_SIGMAS * candidate.relative_error
@@ -210,7 +209,14 @@ def certify(
     if scope == "wells" and (missing or not wells):
         reason = f"{missing} of {len(portrait.attractors)} attractors have no formula"
         tests["branch"] = Verdict.refused(reason, options.branch)
-    tests["error"] = check_error(own_error, from_field, options)
+    # A formula is no solution if the error that its own residual leaves open is too large. What the
+    # uncertainty of f adds is no fault of the formula, and stated as long as a first order tells it.
+    known = from_field <= MAX_ERROR_FROM_FIELD
+    reason = "the error of V that its residual leaves open is too large"
+    if own_error <= options.error:
+        reason = "" if known else "f is not known well enough to tell V: record more"
+    value = own_error if known else from_field
+    tests["error"] = Verdict(value, options.error, own_error <= options.error and known, reason)
     if not isinstance(found, GivenField):
         if portrait.attractors:
             tests["existence"] = check_existence(found, portrait, seed=seed)
@@ -256,7 +262,7 @@ def _candidate_of_region(
     hessian = compile_formulas(second, symbols)
     together, gradient = formulas.evaluate, formulas.evaluate_gradient
     return Candidate(
-        values=lambda x: together(np.ascontiguousarray(x.T))[0],
+        values=formulas.values,
         gradients=lambda x: gradient(np.ascontiguousarray(x.T)).T,
         hessians=lambda x: hessian(np.ascontiguousarray(x.T)).T.reshape(-1, d, d),
         circulatory=lambda x: together(np.ascontiguousarray(x.T))[1 : d + 1].T,
@@ -272,10 +278,9 @@ def _candidate_of_region(
 def _candidate_in_well(well: Well, evidence: Evidence) -> Candidate:
     """V about an attractor, to be tested on what lies in its well below `LEVEL_SHARE` of its level.
 
-    It makes no claim where its own residual is large, as at a caustic: `claimed` has the share of the states
-    where it claims to hold. Where fewer than `MIN_POINTS` held-out states lie in the well, points of
-    characteristics are added, which no fit saw either. Pairs count by their first sample: to ask where the
-    second one lies would be to choose the noise.
+    It makes no claim where its own residual is large, as at a caustic. Where few held-out states lie in the
+    well, points of characteristics are added. Pairs count by their first sample: to ask where the second one
+    lies would be to choose the noise.
     """
     portrait, pairs = evidence.portrait, evidence.pairs
     index = [np.array_equal(one.position, well.attractor) for one in portrait.attractors].index(True)
@@ -311,8 +316,8 @@ def _candidate_in_well(well: Well, evidence: Evidence) -> Candidate:
 def _error_of_well(well: Well, evidence: Evidence) -> float:
     """The error of V that is stated of a well, over the points of its fit."""
     mine = [one for one in evidence.portrait.attractors if np.array_equal(one.position, well.attractor)]
-    candidate = Candidate(well.values, well.gradients, well.hessians, None, sublevel_points(well), mine)
-    return stated_error(candidate, evidence.found, seed=evidence.seed)
+    candidate = Candidate(well.values, well.gradients, well.hessians, None, well.inside(LEVEL_SHARE), mine)
+    return candidate.stated_error(evidence.found, seed=evidence.seed)
 
 
 def _position_text(position: np.ndarray) -> str:
@@ -327,15 +332,15 @@ CAUSTIC_FAN: dict[str, Any] = {"most": 512, "tolerance": 1e-7, "spacing": 0.1}
 
 def caustics_below(
     dynamics: Dynamics, wells: Sequence[Well], portrait: PhasePortrait, error: float, *, seed: int = 0
-) -> tuple[str, ...]:
-    """Where characteristics cross below the saddle of a well, in words: no smooth V exists there.
+) -> tuple[Remark, ...]:
+    """Where characteristics cross below the saddle of a well: no smooth V exists there.
 
     Only sought where the stated error leaves room for one. A kink of V is no fault of the method, but no
     polynomial follows it, and the error that is stated comes from there.
     """
     if not error > MIN_EXPLAINED_ERROR:
         return ()
-    notes = []
+    remarks = []
     width = portrait.box[:, 1] - portrait.box[:, 0]
     box = np.stack([portrait.box[:, 0] - width / 4, portrait.box[:, 1] + width / 4], axis=1)
     for well in wells:
@@ -343,14 +348,11 @@ def caustics_below(
             dynamics, well.attractor, level=0.98 * well.level, box=box,
             generator=np.random.default_rng(seed), **CAUSTIC_FAN,
         )  # fmt: skip
-        if (caustic := first_caustic(fan)) is not None:
+        if (caustic := fan.first_caustic()) is not None:
             where, value = caustic
-            notes.append(
-                f"characteristics from the attractor {_position_text(well.attractor)} cross at a caustic from"
-                f" {_position_text(where)} on, where U = {2 * value:.4g}: V has no smooth form there, and no"
-                " formula follows it"
-            )
-    return tuple(notes)
+            places = {"attractor": _position_text(well.attractor), "place": _position_text(where)}
+            remarks.append(Remark("quasipotential.caustic", places | {"level": 2 * value}))
+    return tuple(remarks)
 
 
 REACHED_SHARE = 0.8  # of what was asked for, up to which a curve has to come where most end before
@@ -358,12 +360,9 @@ LEVEL_FAN = {"count": 32, "most": 64, "rounds": 2, "tolerance": 1e-5}  # curves 
 REFERENCE_FAN = {"count": 64, "most": 128, "rounds": 3}  # and for the comparison: cost, not accuracy
 END_GAP = 0.15  # of the ends of neighbours, the level being at 1
 TOLERANCE = 1e-7  # of the integrator's steps, relative; by so much V may err in each
-START_LEVEL, START_DEGREE = (
-    1e-3,
-    6,
-)  # of the level: the series errs by 10⁻³ to the 5/2; closer, curves bundle
+START_LEVEL = 1e-3  # of the level: the series errs by 10⁻³ to the 5/2; closer, curves bundle
+START_DEGREE = 6
 MAX_STEPS = 1500  # of a curve, where 30 to 130 are usual; stiff systems take as many as their rates differ
-SHEET_MARGIN = 2e-3  # of the level: the margin with which `lowest_sheet` tells sheets apart
 LEVEL_DOUBLINGS = 8  # of the level in search of the saddle
 SADDLE_DISTANCE = 0.6  # of a saddle to a curve, the level being at 1: close enough for an estimate of V
 OVERSHOOT = 1.2  # of the level of the fan: what lies higher was not reached
@@ -376,16 +375,8 @@ def references_about(
 ) -> tuple[Reference, ...]:
     """V by characteristics about every attractor of a phase portrait.
 
-    Parameters
-    ----------
-    dynamics
-        f, twice differentiable, and D.
-    portrait
-        Where to compare.
-    depths
-        V at the lowest saddle of each well, where it is known: higher up nothing is compared.
-    seed
-        Draws directions where there are more than two states, and thins the points.
+    `depths` are V at the lowest saddle of each well, where it is known: higher up nothing is compared. The
+    seed draws directions where there are more than two states, and thins the points.
     """
     known = [np.inf] * len(portrait.attractors) if depths is None else depths
     return tuple(
@@ -396,12 +387,7 @@ def references_about(
 def _follow_well(
     dynamics: Dynamics, portrait: PhasePortrait, index: int, *, depth: float = np.inf, seed: int = 0
 ) -> Reference:
-    """V by characteristics about one attractor, as far as they may be believed.
-
-    Where the depth, V at the lowest saddle, is known, nothing is compared higher up: where curves bundle,
-    none of a few in search of it may come close. The seed draws directions where there are more than two
-    states, and thins the points. The reference has a fault where characteristics give none.
-    """
+    """V by characteristics about one attractor, as far as they may be believed, or a fault."""
     attractor = portrait.attractors[index].position
     name = _position_text(attractor)
     region = RecordedRegion.of_basin(portrait, index)
@@ -414,7 +400,7 @@ def _follow_well(
         fan = _fan(dynamics, portrait, attractor, LEVEL_SHARE * level, seed, **REFERENCE_FAN)
     except (NumericalFailure, ValueError, np.linalg.LinAlgError) as failure:
         return without(f"characteristics cannot be followed from the attractor {name}: {failure}")
-    lowest = lowest_sheet(fan)
+    lowest = fan.lowest_sheet()
     kept = np.flatnonzero(lowest & region.recorded(fan.points))
     if not len(kept):
         return without(f"no characteristic from the attractor {name} stays where states were recorded")
@@ -465,15 +451,16 @@ def _level(
         across[:-1] &= across[1:] & (fan.curve[:-1] == fan.curve[1:])
         across[-1] = False
         ends = fan.values[fan.last]
-        left = np.concatenate([fan.values[across], ends[fan.ends == End.REST], _heights(fan, tops)])
+        # Of saddles that curves come close to, to second order: curves turn off before.
+        distance, nearest, values, bend = fan.expanded(tops, fan.lowest_sheet())
+        heights = np.maximum(values + bend, nearest / 2)[distance < SADDLE_DISTANCE]
+        left = np.concatenate([fan.values[across], ends[fan.ends == End.REST], heights])
         if len(left) and left.min() <= OVERSHOOT * level:
             lowest = float(left.min())
             if level <= REPEAT_RATIO * lowest:
                 return lowest
-            known, level = (
-                lowest,
-                OVERSHOOT * lowest,
-            )  # the same again, where curves lie closer together
+            # The same again, where curves lie closer together.
+            known, level = lowest, OVERSHOOT * lowest
             continue
         if known is not None:
             return known
@@ -483,18 +470,6 @@ def _level(
             return float(ends.max())
         level *= 2
     raise NumericalFailure("they come to no saddle; record the way there")
-
-
-def _heights(fan: Fan, tops: np.ndarray) -> np.ndarray:
-    """V at the saddles that curves come close to, to second order, shape ``(m,)``: curves turn off before."""
-    lowest = lowest_sheet(fan)
-    tree = cKDTree((fan.points[lowest] - fan.attractor) @ fan.metric.T)
-    distance, nearest = tree.query((tops - fan.attractor) @ fan.metric.T)
-    nearest = np.flatnonzero(lowest)[nearest[distance < SADDLE_DISTANCE]]
-    offset = tops[distance < SADDLE_DISTANCE] - fan.points[nearest]
-    slope = np.sum(offset * fan.momenta[nearest], axis=1)
-    bend = np.einsum("ni,nij,nj->n", offset, fan.hessians[nearest], offset) / 2
-    return np.maximum(fan.values[nearest] + slope + bend, fan.values[nearest] / 2)
 
 
 def _fan(

@@ -161,6 +161,74 @@ class Candidate:
     claimed: float = 1.0
     tested_on: str = ""
 
+    def stated_error(self, found: AnyField, *, seed: int = 0) -> float:
+        """Relative L2 error of V on its points that its own residual and the uncertainty of f leave open.
+
+        Infinite where ascending paths do not lead to them, and never below what any recording can tell: its
+        own integrator, or instrument, made f different by as much.
+        """
+        if not self.attractors:
+            return np.inf
+        generator = np.random.default_rng(seed)
+        rows = generator.choice(len(self.points), min(ERROR_POINTS, len(self.points)), replace=False)
+        x = self.points[rows]
+        places = np.concatenate([self.points, [one.position for one in self.attractors]])
+        integral = _residual_integral(
+            self.gradients, found.dynamics, x,
+            box=np.stack([places.min(axis=0), places.max(axis=0)], axis=1),
+            slowest=min(-one.eigenvalues.real.max() for one in self.attractors),
+            fastest=fastest_rate(found.dynamics, x, np.ptp(x, axis=0)),
+        )  # fmt: skip
+        values = self.values(x)
+        lowest = min(float(self.values(one.position[None])[0]) for one in self.attractors)
+        reached = np.isfinite(integral)
+        if reached.mean() < 0.9:
+            return np.inf
+        size = np.linalg.norm(values[reached] - lowest)
+        error = SAFETY_FACTOR * float(np.linalg.norm(integral[reached]) / size) if size > 0 else np.inf
+        return max(error + STATED_SIGMAS * self.relative_error, MIN_ERROR)
+
+    def check(
+        self, found: AnyField, options: CertificateOptions, *, seed: int = 0
+    ) -> tuple[dict[str, Verdict], float]:
+        """The tests that apply, by name, and the error of V that has to be stated after them."""
+        # Characteristics follow the same f: what f's uncertainty adds explains no difference from them.
+        error = self.stated_error(found, seed=seed)
+        followed, error = _check_characteristics(self, found, options, error=error, seed=seed)
+        tests = {
+            "hamilton_jacobi": self.check_hamilton_jacobi(found, options),
+            "branch": _check_branch(self, found, options, seed=seed),
+        }
+        if self.pairs is not None and not isinstance(found, GivenField):
+            tests["descent"] = _check_descent(self, found, options, error=error)
+        tests["characteristics"] = followed
+        if self.circulatory is not None:
+            tests["identity"] = _check_identity(self, found, options)
+        return tests, error
+
+    def check_hamilton_jacobi(self, found: AnyField, options: CertificateOptions) -> Verdict:
+        """Whether ∇V·(f + D∇V) vanishes where ∇V does not.
+
+        The cosine of ∇V and g would be 0/0 for gradient systems, in which g vanishes; this measure is not.
+        """
+        x, measure = self.points, found.diffusion
+        flow, gradient = found.dynamics.drift(x), self.gradients(x)
+        down = found.diffusion.push(x, gradient)
+        if self.attractors:
+            measure = measure_at(found.dynamics, self.attractors[0].position)
+        slope = np.sqrt(np.maximum(measure.contract(x, gradient), 0))
+        speed, fall = (np.sqrt(measure.squared_speed(x, one)) for one in (flow, down))
+        # Where V falls it falls by f: a V that hardly varies while states move is no potential.
+        if not np.isfinite(slope).all() or np.median(slope / np.where(speed > 0, speed, np.inf)) < 1e-6:
+            return Verdict.refused(
+                "∇V vanishes, or is not finite, on the held-out points", options.hamilton_jacobi
+            )
+        residual = np.abs((gradient * (flow + down)).sum(axis=1))
+        size = slope * (speed + fall)
+        value = float(np.sqrt(np.mean((residual / np.where(size > 0, size, 1.0)) ** 2)))
+        limit = options.hamilton_jacobi + STANDARD_ERRORS * _relative_error_of_drift(found, x, measure)
+        return Verdict.of(value, limit, "V does not solve the Hamilton–Jacobi equation of f")
+
 
 def _check_identity(candidate: Candidate, found: AnyField, options: CertificateOptions) -> Verdict:
     """Whether the stored V and g make up the f that was identified without them."""
@@ -172,30 +240,6 @@ def _check_identity(candidate: Candidate, found: AnyField, options: CertificateO
     value = float(np.sqrt(squares / noise.squared_speed(x, flow).mean()))
     limit = options.identity + STANDARD_ERRORS * _relative_error_of_drift(found, x, noise)
     return Verdict.of(value, limit, "V and g do not make up f")
-
-
-def check_hamilton_jacobi(candidate: Candidate, found: AnyField, options: CertificateOptions) -> Verdict:
-    """Whether ∇V·(f + D∇V) vanishes where ∇V does not.
-
-    The cosine of ∇V and g would be 0/0 for gradient systems, in which g vanishes; this measure is not.
-    """
-    x, measure = candidate.points, found.diffusion
-    flow, gradient = found.dynamics.drift(x), candidate.gradients(x)
-    down = found.diffusion.push(x, gradient)
-    if candidate.attractors:
-        measure = measure_at(found.dynamics, candidate.attractors[0].position)
-    slope = np.sqrt(np.maximum(measure.contract(x, gradient), 0))
-    speed, fall = (np.sqrt(measure.squared_speed(x, one)) for one in (flow, down))
-    # Where V falls it falls by f: a V that hardly varies while states move is no potential.
-    if not np.isfinite(slope).all() or np.median(slope / np.where(speed > 0, speed, np.inf)) < 1e-6:
-        return Verdict.refused(
-            "∇V vanishes, or is not finite, on the held-out points", options.hamilton_jacobi
-        )
-    residual = np.abs((gradient * (flow + down)).sum(axis=1))
-    size = slope * (speed + fall)
-    value = float(np.sqrt(np.mean((residual / np.where(size > 0, size, 1.0)) ** 2)))
-    limit = options.hamilton_jacobi + STANDARD_ERRORS * _relative_error_of_drift(found, x, measure)
-    return Verdict.of(value, limit, "V does not solve the Hamilton–Jacobi equation of f")
 
 
 def _relative_error_of_drift(found: AnyField, points: np.ndarray, measure: Diffusion) -> float:
@@ -258,9 +302,8 @@ def _residual_integral(
 ) -> np.ndarray:
     """∫∣∇V·(f + D∇V)∣ dt along the ascending paths that end at points ``(n, d)``: shape ``(n,)``.
 
-    It is infinite where a path runs away instead of coming from the attractor: where it is far outside the
-    box, shape ``(d, 2)``, of the states where V is asked for and of its attractors. Slowest and fastest rate
-    set how long, and how finely, the paths are followed back.
+    It is infinite where a path runs away, far outside the box ``(d, 2)``, instead of coming from the
+    attractor.
     """
     total, _, lost = ascending_integrals(
         gradient, dynamics, x,
@@ -271,53 +314,6 @@ def _residual_integral(
     return np.where(lost, np.inf, total[:, 0])
 
 
-def stated_error(candidate: Candidate, found: AnyField, *, seed: int = 0) -> float:
-    """Relative L2 error of V on its points that its own residual and the uncertainty of f leave open.
-
-    Infinite where ascending paths do not lead to them, and never below what any recording can tell: its own
-    integrator, or instrument, made f different by as much.
-    """
-    if not candidate.attractors:
-        return np.inf
-    generator = np.random.default_rng(seed)
-    rows = generator.choice(len(candidate.points), min(ERROR_POINTS, len(candidate.points)), replace=False)
-    x = candidate.points[rows]
-    places = np.concatenate([candidate.points, [one.position for one in candidate.attractors]])
-    integral = _residual_integral(
-        candidate.gradients, found.dynamics, x,
-        box=np.stack([places.min(axis=0), places.max(axis=0)], axis=1),
-        slowest=min(-one.eigenvalues.real.max() for one in candidate.attractors),
-        fastest=fastest_rate(found.dynamics, x, np.ptp(x, axis=0)),
-    )  # fmt: skip
-    values = candidate.values(x)
-    lowest = min(float(candidate.values(one.position[None])[0]) for one in candidate.attractors)
-    reached = np.isfinite(integral)
-    if reached.mean() < 0.9:
-        return np.inf
-    size = np.linalg.norm(values[reached] - lowest)
-    error = SAFETY_FACTOR * float(np.linalg.norm(integral[reached]) / size) if size > 0 else np.inf
-    return max(error + STATED_SIGMAS * candidate.relative_error, MIN_ERROR)
-
-
-def check_error(own: float, from_field: float, options: CertificateOptions) -> Verdict:
-    """Whether the error that has to be stated is small enough to state.
-
-    A formula is no solution if the relative error that its own residual leaves open is larger than the limit.
-    What the uncertainty of f adds is no fault of the formula and is stated, whatever its size, as long as it
-    is known; from `MAX_ERROR_FROM_FIELD` on its first order says nothing any more.
-    """
-    passed = bool(own <= options.error and from_field <= MAX_ERROR_FROM_FIELD)
-    reason = "" if passed else "the error of V that its residual leaves open is too large"
-    if own <= options.error and not passed:
-        reason = "f is not known well enough to tell V: record more"
-    return Verdict(own if from_field <= MAX_ERROR_FROM_FIELD else from_field, options.error, passed, reason)
-
-
-def sublevel_points(well: Well) -> np.ndarray:
-    """Points of the fit of a well below a share of its level: where two routes are compared."""
-    return np.asarray(well.points[well.values(well.points) < LEVEL_SHARE * well.level])
-
-
 def check_agreement(first: Function, wells: Sequence[Well], *, limit: float) -> Verdict:
     """Whether V by another route is that of every well, up to a constant.
 
@@ -326,7 +322,7 @@ def check_agreement(first: Function, wells: Sequence[Well], *, limit: float) -> 
     """
     worst, where = 0.0, ""
     for well in wells:
-        x = sublevel_points(well)
+        x = well.inside(LEVEL_SHARE)
         one, two = first(x) - first(well.attractor[None]), well.values(x)
         value = float(np.linalg.norm(one - two) / np.linalg.norm(two))
         if value >= worst:
@@ -358,7 +354,7 @@ def _check_characteristics(
         difference = candidate.values(x) - candidate.values(one.attractor[None]) - expected
         value = float(np.linalg.norm(difference) / np.linalg.norm(expected))
         if not value <= error + one.error:  # a mean over a region says little of its deepest part
-            error = max(error, stated_error(replace(candidate, points=x), found, seed=seed))
+            error = max(error, replace(candidate, points=x).stated_error(found, seed=seed))
         # An error that cannot be stated explains nothing: a false solution, whose ascending paths run away.
         from_field = STATED_SIGMAS * candidate.relative_error  # of a formula that was fitted together with f
         own = error - from_field
@@ -370,25 +366,6 @@ def _check_characteristics(
             Verdict.of(value, limit, f"V is not what characteristics give, most of all at {place}")
         )
     return Verdict.worst(verdicts), error
-
-
-def check_candidate(
-    candidate: Candidate, found: AnyField, options: CertificateOptions, *, seed: int = 0
-) -> tuple[dict[str, Verdict], float]:
-    """The tests that apply to a candidate, by name, and the error of V that has to be stated after them."""
-    # Characteristics follow the same f: what f's uncertainty adds explains no difference from them.
-    error = stated_error(candidate, found, seed=seed)
-    followed, error = _check_characteristics(candidate, found, options, error=error, seed=seed)
-    tests = {
-        "hamilton_jacobi": check_hamilton_jacobi(candidate, found, options),
-        "branch": _check_branch(candidate, found, options, seed=seed),
-    }
-    if candidate.pairs is not None and not isinstance(found, GivenField):
-        tests["descent"] = _check_descent(candidate, found, options, error=error)
-    tests["characteristics"] = followed
-    if candidate.circulatory is not None:
-        tests["identity"] = _check_identity(candidate, found, options)
-    return tests, error
 
 
 MAX_PAIRS = 10_000  # evenly taken: memory, not accuracy
@@ -477,10 +454,8 @@ def _lost_shares(
 ) -> np.ndarray:
     """Share of the f that the data allow in which each equilibrium does not exist: shape ``(k,)``.
 
-    f is drawn from its distribution, rivals of its terms included, and every equilibrium is followed from the
-    identified f to the drawn one by Newton's method, in small steps. It is lost where it vanishes together
-    with another one, where its stability changes, and where it has jumped to another one that is followed as
-    well.
+    Every equilibrium is followed from the identified f to drawn ones by Newton's method, in small steps. It
+    is lost where it vanishes together with another one, where its stability changes, and where it has jumped.
     """
     if found.noise_free or not equilibria:
         return np.zeros(len(equilibria))

@@ -49,17 +49,8 @@ class HamiltonianFlow:
     """The equations in units in which M is the unit matrix and the level the unit sphere.
 
     A row of a state is ``y, q, v, X, P``, of length ``2d + 1 + 2d²``, with ``x = A + units y``, ``units =
-    (2 level)^½ L⁻¹``, ``M = LᵀL``, ``p = (2 level)^½ Lᵀ q`` and ``V = level v``; X and P are derivatives of y
-    and q. Tolerances then mean the same for states of any size.
-
-    Parameters
-    ----------
-    dynamics
-        f, twice differentiable.
-    center
-        The attractor A, shape ``(d,)``.
-    level
-        The value of V, not of U = 2V, that becomes 1.
+    (2 level)^½ L⁻¹``, ``M = LᵀL``, ``p = (2 level)^½ Lᵀ q`` and ``V = level v`` (of V, not of U); X and P are
+    derivatives of y and q. Tolerances then mean the same for states of any size.
     """
 
     def __init__(self, dynamics: Dynamics, center: np.ndarray, level: float) -> None:
@@ -153,6 +144,8 @@ MAX_STEPS = 20_000  # numerical, a guard: a curve that takes more is stiff, or c
 HALVINGS = 26  # of the last step, to find where a curve ends
 MAX_RELAXATION_TIMES = 60.0  # in units of the slowest relaxation time of the attractor
 REST_RATIO = 1e-3  # p to x - A, in units in which both are equal near A
+SHEET_DISTANCE = 0.06  # of neighbours, the level being at about 1: more than the gaps of a fan
+SHEET_MARGIN = 2e-3  # of the level: by so much sheets are told apart
 REAL_RATIO = 1e-3  # imaginary to real part, below which an eigenvalue counts as negative and not as turning
 
 
@@ -183,8 +176,8 @@ class Fan:
     directions, ends
         The unit vectors from which the c curves start, in the metric in which M is the unit matrix, shape
         ``(c, d)``; and an `End` for every curve.
-    caustic_points, caustic_values, caustic_curves
-        Shape ``(k, d)``, ``(k,)`` and ``(k,)``: where curves first meet a caustic, and V there.
+    caustic_points, caustic_values
+        Shape ``(k, d)`` and ``(k,)``: where those curves that meet a caustic do so first, and V there.
     """
 
     attractor: np.ndarray
@@ -199,7 +192,6 @@ class Fan:
     ends: np.ndarray
     caustic_points: np.ndarray
     caustic_values: np.ndarray
-    caustic_curves: np.ndarray
 
     @cached_property
     def metric(self) -> np.ndarray:
@@ -210,6 +202,75 @@ class Fan:
     def last(self) -> np.ndarray:
         """Index of the last point of every curve, shape ``(c,)``."""
         return np.searchsorted(self.curve, np.arange(len(self.directions)), side="right") - 1
+
+    def lowest_sheet(self) -> np.ndarray:
+        """Mask of the points of a fan that may be taken as values of V, shape ``(n,)``.
+
+        A neighbour within `SHEET_DISTANCE` says what V should be at a point by its own V, gradient and
+        curvature. Where this is lower than the point's V by more than `SHEET_MARGIN` of the level, the point
+        lies on an upper sheet: another curve gets there with less action. It then drops out with all that
+        follows on its curve, for what is not optimal once never becomes so again.
+
+        An upper sheet is only seen where the fan has curves of the lower sheet so close, not in its gaps, nor
+        where those curves ended at a box or at a caustic; and close to a kink of V, where the sheets differ
+        by less than the margin, points of both are kept, too high by at most the margin.
+        """
+        scaled = (self.points - self.attractor) @ self.metric.T
+        eigenvalues, vectors = np.linalg.eigh(self.hessians)
+        # Towards a caustic the curvature falls without bound and would predict any depth; it counts as none.
+        bends = np.einsum("nij,nj,nkj->nik", vectors, np.maximum(eigenvalues, 0), vectors)
+        upper = np.zeros(len(scaled), dtype=bool)
+        # So close to the attractor V is smooth, and all curves are neighbours of each other.
+        asked = np.flatnonzero(np.linalg.norm(scaled, axis=1) > 2 * SHEET_DISTANCE)
+        if not len(asked):
+            return ~upper
+        tree = cKDTree(scaled[asked])
+        for block in np.array_split(asked, max(len(asked) // CHUNK, 1)):
+            near = tree.query_ball_point(scaled[block], SHEET_DISTANCE)
+            at = np.repeat(block, [len(others) for others in near])
+            neighbour = asked[np.concatenate([np.asarray(others, dtype=int) for others in near])]
+            offset = self.points[at] - self.points[neighbour]
+            predicted = self.values[neighbour] + np.sum(offset * self.momenta[neighbour], axis=1)
+            predicted += np.einsum("ni,nij,nj->n", offset, bends[neighbour], offset) / 2
+            upper[at[predicted < self.values[at] - SHEET_MARGIN * self.level]] = True
+        # Points are sorted along curves: whatever follows an upper point on its curve is upper too.
+        count = np.cumsum(upper)
+        before_curve = np.r_[0, count][np.searchsorted(self.curve, self.curve)]
+        return count == before_curve
+
+    def value_near(self, x: np.ndarray, *, sheet: np.ndarray, distance: float = 0.1) -> np.ndarray:
+        """V at points, to second order from the nearest point of a fan: ``(m, d)`` to ``(m,)``.
+
+        `sheet` masks the points of the fan that may be used, see `lowest_sheet`. Beyond `distance`, in the
+        metric in which the level is at about 1, the value is NaN; so it is where the second order is no small
+        correction, close to a caustic. The error is of third order in the distance, but where V has a kink
+        between x and the nearest point, of first.
+        """
+        distances, _, values, bend = self.expanded(x, sheet)
+        # Towards a caustic ∇²V grows without bound, and two terms no longer tell V.
+        known = (distances <= distance) & (np.abs(bend) <= MAX_SECOND_ORDER * self.level)
+        return np.where(known, values + bend, np.nan)
+
+    def expanded(self, x: np.ndarray, sheet: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Distance of a sheet's nearest point, V there, V at x to first order, and what the second adds."""
+        tree = cKDTree((self.points[sheet] - self.attractor) @ self.metric.T)
+        distance, nearest = tree.query((x - self.attractor) @ self.metric.T)
+        rows = np.flatnonzero(sheet)[nearest]
+        offset = x - self.points[rows]
+        values = self.values[rows] + np.sum(offset * self.momenta[rows], axis=1)
+        bend = np.einsum("ni,nij,nj->n", offset, self.hessians[rows], offset) / 2
+        return distance, self.values[rows], values, bend
+
+    def first_caustic(self) -> tuple[np.ndarray, float] | None:
+        """The lowest caustic that a curve of the fan meets, its position and V there; or None.
+
+        V is the value along the curve. The lowest sheet may have ended before; and curves between those of
+        the fan may meet the caustic a little lower.
+        """
+        if not len(self.caustic_values):
+            return None
+        lowest = int(np.argmin(self.caustic_values))
+        return self.caustic_points[lowest], float(self.caustic_values[lowest])
 
 
 def characteristics(
@@ -332,7 +393,7 @@ def characteristics(
     points, momenta, values, hessians = flow.unpack(np.concatenate(kept)[order])
     return Fan(
         flow.center, flow.hessian, level, points[~met], momenta[~met], values[~met], hessians[~met],
-        curve[~met], directions, ends, points[met], values[met], curve[met],
+        curve[~met], directions, ends, points[met], values[met],
     )  # fmt: skip
 
 
@@ -341,8 +402,7 @@ def _join(first: Fan, second: Fan) -> Fan:
     shift = len(first.directions)
     names = [one.name for one in fields(Fan) if one.name not in ("attractor", "hessian", "level")]
     both = {name: [getattr(first, name), getattr(second, name)] for name in names}
-    for name in ("curve", "caustic_curves"):
-        both[name][1] = both[name][1] + shift
+    both["curve"][1] = both["curve"][1] + shift
     joined: dict[str, Any] = {name: np.concatenate(pair) for name, pair in both.items()}
     return replace(first, **joined)
 
@@ -421,102 +481,30 @@ def adapted_fan(
     return fan
 
 
-def first_caustic(fan: Fan) -> tuple[np.ndarray, float] | None:
-    """The lowest caustic that a curve of the fan meets, its position and V there; or None.
-
-    V is the value along the curve. The lowest sheet may have ended before; and curves between those of the
-    fan may meet the caustic a little lower.
-    """
-    if not len(fan.caustic_values):
-        return None
-    lowest = int(np.argmin(fan.caustic_values))
-    return fan.caustic_points[lowest], float(fan.caustic_values[lowest])
-
-
-def lowest_sheet(fan: Fan, *, distance: float = 0.06, margin: float = 2e-3) -> np.ndarray:
-    """Mask of the points of a fan that may be taken as values of V, shape ``(n,)``.
-
-    A neighbour within `distance` says what V should be at a point by its own V, gradient and curvature. Where
-    this is lower than the point's V by more than the margin, a share of the level, the point lies on an upper
-    sheet: another curve gets there with less action. It then drops out with all that follows on its curve,
-    for what is not optimal once never becomes so again. The distance, in the metric in which the level is at
-    about 1, should exceed the gaps of the fan.
-
-    An upper sheet is only seen where the fan has curves of the lower sheet within `distance`, not in its
-    gaps, nor where those curves ended at a box or at a caustic; and close to a kink of V, where the sheets
-    differ by less than the margin, points of both are kept, too high by at most the margin.
-    """
-    scaled = (fan.points - fan.attractor) @ fan.metric.T
-    eigenvalues, vectors = np.linalg.eigh(fan.hessians)
-    # Towards a caustic the curvature falls without bound and would predict any depth; it counts as none.
-    bends = np.einsum("nij,nj,nkj->nik", vectors, np.maximum(eigenvalues, 0), vectors)
-    upper = np.zeros(len(scaled), dtype=bool)
-    # So close to the attractor V is smooth, and all curves are neighbours of each other.
-    asked = np.flatnonzero(np.linalg.norm(scaled, axis=1) > 2 * distance)
-    if not len(asked):
-        return ~upper
-    tree = cKDTree(scaled[asked])
-    for block in np.array_split(asked, max(len(asked) // CHUNK, 1)):
-        near = tree.query_ball_point(scaled[block], distance)
-        at = np.repeat(block, [len(others) for others in near])
-        neighbour = asked[np.concatenate([np.asarray(others, dtype=int) for others in near])]
-        offset = fan.points[at] - fan.points[neighbour]
-        predicted = fan.values[neighbour] + np.sum(offset * fan.momenta[neighbour], axis=1)
-        predicted += np.einsum("ni,nij,nj->n", offset, bends[neighbour], offset) / 2
-        upper[at[predicted < fan.values[at] - margin * fan.level]] = True
-    # Points are sorted along curves: whatever follows an upper point on its curve is upper too.
-    count = np.cumsum(upper)
-    before_curve = np.r_[0, count][np.searchsorted(fan.curve, fan.curve)]
-    return count == before_curve
-
-
-def value_near(fan: Fan, x: np.ndarray, *, sheet: np.ndarray, distance: float = 0.1) -> np.ndarray:
-    """V at points, to second order from the nearest point of a fan: ``(m, d)`` to ``(m,)``.
-
-    `sheet` masks the points of the fan that may be used, see `lowest_sheet`. Beyond `distance`, in the metric
-    in which the level is at about 1, the value is NaN; so it is where the second order is no small
-    correction, close to a caustic. The error is of third order in the distance, but where V has a kink
-    between x and the nearest point, of first.
-    """
-    points = fan.points[sheet]
-    found, nearest = cKDTree((points - fan.attractor) @ fan.metric.T).query(
-        (x - fan.attractor) @ fan.metric.T
-    )
-    offset = x - points[nearest]
-    values = fan.values[sheet][nearest] + np.sum(offset * fan.momenta[sheet][nearest], axis=1)
-    bend = np.einsum("ni,nij,nj->n", offset, fan.hessians[sheet][nearest], offset) / 2
-    # Towards a caustic ∇²V grows without bound, and two terms no longer tell V.
-    known = (found <= distance) & (np.abs(bend) <= MAX_SECOND_ORDER * fan.level)
-    return np.where(known, values + bend, np.nan)
-
-
 def _between(fan: Fan, gap: float) -> np.ndarray:
     """Directions between neighbours that end further apart than the gap, widest first."""
-    pairs = _neighbours(fan.directions)
+    directions = fan.directions
+    if directions.shape[1] == 1:
+        return np.zeros((0, 1))
+    if directions.shape[1] == 2:
+        order = np.argsort(np.arctan2(directions[:, 1], directions[:, 0]))
+        pairs = np.stack([order, np.roll(order, -1)], axis=1)
+    else:  # edges of the facets of what the directions span on the sphere
+        facets = ConvexHull(directions).simplices
+        size = facets.shape[1]
+        edges = np.concatenate([facets[:, [a, b]] for a in range(size) for b in range(a)])
+        pairs = np.unique(np.sort(edges, axis=1), axis=0)
     ends = (fan.points[fan.last] - fan.attractor) @ fan.metric.T
     width = np.linalg.norm(ends[pairs[:, 0]] - ends[pairs[:, 1]], axis=1)
-    apart = np.linalg.norm(fan.directions[pairs[:, 0]] - fan.directions[pairs[:, 1]], axis=1)
+    apart = np.linalg.norm(directions[pairs[:, 0]] - directions[pairs[:, 1]], axis=1)
     wide = np.flatnonzero((width > gap) & (apart > MIN_DIRECTION_DISTANCE))
     wide = wide[np.argsort(-width[wide], kind="stable")]
     # Several at once in a very wide gap: a pass takes as long for one curve as for a hundred.
     parts = np.clip(np.ceil(width[wide] / gap), 2, MAX_GAP_PARTS).astype(int)
-    first, second = (np.repeat(fan.directions[pairs[wide, side]], parts - 1, axis=0) for side in (0, 1))
+    first, second = (np.repeat(directions[pairs[wide, side]], parts - 1, axis=0) for side in (0, 1))
     share = np.concatenate([np.arange(1, number) / number for number in parts] or [np.zeros(0)])[:, None]
     middle = (1 - share) * first + share * second
     return middle / np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), MIN_DIRECTION_DISTANCE)
-
-
-def _neighbours(directions: np.ndarray) -> np.ndarray:
-    """Pairs of neighbours on the sphere of directions, shape ``(k, 2)``."""
-    if directions.shape[1] == 1:
-        return np.zeros((0, 2), dtype=int)
-    if directions.shape[1] == 2:
-        order = np.argsort(np.arctan2(directions[:, 1], directions[:, 0]))
-        return np.stack([order, np.roll(order, -1)], axis=1)
-    facets = ConvexHull(directions).simplices
-    size = facets.shape[1]
-    edges = np.concatenate([facets[:, [a, b]] for a in range(size) for b in range(a)])
-    return np.unique(np.sort(edges, axis=1), axis=0)
 
 
 RELAXATIONS = 12.0  # times 1/slowest rate: e^-12 of V is left at the beginning of an ascending path
@@ -550,15 +538,12 @@ def ascending_integrals(
 
     Parameters
     ----------
-    gradient, dynamics
-        ∇V, points ``(n, d)`` to ``(n, d)``; f and D.
-    x
-        Where the paths end, shape ``(n, d)``.
+    gradient, dynamics, x
+        ∇V, points ``(n, d)`` to ``(n, d)``; f and D; and where the paths end, shape ``(n, d)``.
     integrand
         Of points, ∇V, f and D∇V there: to ``(n, k)``.
     middle, width
-        Of the box of the states, shape ``(d,)``: a path that leaves it by `RUNAWAY_WIDTHS` times its width in
-        any state has run away, whatever the units.
+        Of the box of the states, shape ``(d,)``: a path that leaves it by `RUNAWAY_WIDTHS` has run away.
     slowest, fastest, fewest_steps
         Rates, and a number of steps, that set how long, and how finely, the paths are followed back.
 
@@ -624,23 +609,10 @@ def _potential_slopes(
 
 
 def potential_errors(found: AnyField, gradient: Function, attractor: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Standard errors of ``V(x) - V(attractor)``, from what is not known of f, and of a D that was estimated.
+    """Standard errors of ``V(x) - V(attractor)``, shape ``(n,)``, from what is not known of f and of D.
 
-    Parameters
-    ----------
-    found
-        f with the covariance of its coefficients, and its doubts about which terms there are; D likewise.
-    gradient
-        ∇V, points ``(n, d)`` to ``(n, d)``.
-    attractor
-        From which V rises, shape ``(d,)``.
-    x
-        Where the errors are wanted, shape ``(n, d)``.
-
-    Returns
-    -------
-    numpy.ndarray
-        Shape ``(n,)``; zero where f carries no noise, NaN where no ascending path comes from the attractor.
+    `gradient` is ∇V, points ``(n, d)`` to ``(n, d)``. They are zero where f carries no noise, and NaN where
+    no ascending path comes from the attractor.
     """
     if isinstance(found, GivenField) or found.noise_free or not len(x):
         return np.zeros(len(x))

@@ -27,6 +27,8 @@ from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import FormulaError, compile_formulas, parse_formula
 
+MOST_STARTS = 8  # of descents to the minimum of V
+
 
 @dataclass(frozen=True)
 class SymbolicDecomposition:
@@ -73,6 +75,10 @@ class SymbolicDecomposition:
         """V, g_1 … g_d, f_1 … f_d: points as components ``(d, ...)`` to values ``(2d + 1, ...)``."""
         return compile_formulas([self._potential(), *self.circulatory, *self.vector_field], self.symbols)
 
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """V at points ``(n, d)``, shape ``(n,)``."""
+        return np.asarray(self.evaluate(np.ascontiguousarray(x.T))[0])
+
     @cached_property
     def evaluate_gradient(self) -> Callable[[np.ndarray], np.ndarray]:
         """∇V: points as components ``(d, ...)`` to components ``(d, ...)``."""
@@ -118,19 +124,9 @@ def decomposition_from_coefficients(
 ) -> SymbolicDecomposition:
     """Formulas from coefficients over a library, with V shifted to be zero at its minimum.
 
-    Parameters
-    ----------
-    library
-        The q functions.
-    potential, circulatory, vector_field
-        Coefficients of V, shape ``(q,)``, and of g and f, shape ``(q, d)``.
-    points
-        Shape ``(n, d)``; the minimum is sought within their box, from the lowest of them.
-
-    Raises
-    ------
-    NumericalFailure
-        When V is nowhere finite on the points.
+    Coefficients of V have the shape ``(q,)``, those of g and f ``(q, d)``. The minimum is sought within the
+    box of the points ``(n, d)``, from the lowest of them; a V that is nowhere finite there is a
+    `NumericalFailure`.
     """
     basis = LibraryBasis(library, np.arange(library.size))
     value = basis.expression(potential)
@@ -143,9 +139,7 @@ def decomposition_from_coefficients(
     )
 
 
-def _minimum(
-    expression: sympy.Expr, symbols: Sequence[sympy.Symbol], points: np.ndarray, *, starts: int = 8
-) -> float:
+def _minimum(expression: sympy.Expr, symbols: Sequence[sympy.Symbol], points: np.ndarray) -> float:
     """Smallest value of an expression within the box of points ``(n, d)``.
 
     Descents start from the lowest of the points that do not lie side by side.
@@ -160,7 +154,7 @@ def _minimum(
     # deeper one.
     order = points[np.argsort(np.where(np.isfinite(values), values, np.inf))]
     chosen: list[np.ndarray] = []
-    while len(order) and len(chosen) < starts:
+    while len(order) and len(chosen) < MOST_STARTS:
         chosen.append(order[0])
         order = order[np.linalg.norm((order - order[0]) / scale, axis=1) > 0.15]
     bounds = np.stack([points.min(axis=0), points.max(axis=0)], axis=1) / scale[:, None]
@@ -204,28 +198,11 @@ def _expression_from_data(data: Mapping[str, Any], symbols: Sequence[sympy.Symbo
     """The formula that `expression_to_data` wrote; text goes through the whitelist of formulas."""
     if "formula" in data:
         return parse_formula(data["formula"], {symbol.name: symbol for symbol in symbols})
-    return basis_from_data(data, tuple(symbols)).expression(data["coefficients"])
+    return PowerBasis.from_data(data, tuple(symbols)).expression(data["coefficients"])
 
 
-def model_to_data(
-    decompositions: Mapping[str, SymbolicDecomposition], certificates: Mapping[str, Mapping[str, Any]]
-) -> dict[str, Any]:
-    """Decompositions by method, with a certificate for each, as plain data.
-
-    Certificates of what is no method, such as a randomised network, stand beside them.
-    """
-    if not decompositions:
-        return {"states": [], "methods": {}, "certificate": {}}
-    symbols = next(iter(decompositions.values())).symbols
-    methods = {method: _decomposition_to_data(one) for method, one in decompositions.items()}
-    return {
-        "states": [symbol.name for symbol in symbols],
-        "methods": methods,
-        "certificate": {method: dict(one) for method, one in certificates.items()},
-    }
-
-
-def _decomposition_to_data(one: SymbolicDecomposition) -> dict[str, Any]:
+def decomposition_data(one: SymbolicDecomposition) -> dict[str, Any]:
+    """A decomposition as it stands in the file."""
     symbols = one.symbols
     data: dict[str, Any] = {
         "V": None if one.potential is None else _expression_to_data(one.potential, symbols),
@@ -241,7 +218,7 @@ def _decomposition_to_data(one: SymbolicDecomposition) -> dict[str, Any]:
                 "reach": well.reach,
                 "tolerance": well.tolerance,
                 "residual": well.residual,
-                "V": powers_to_data(well),
+                "V": well.powers,
                 "degrees": [asdict(trial) for trial in well.trials],
             }
             for well in one.wells
@@ -250,24 +227,6 @@ def _decomposition_to_data(one: SymbolicDecomposition) -> dict[str, Any]:
     if one.standard_errors:
         data["standard_errors"] = {name: dict(errors) for name, errors in one.standard_errors.items()}
     return data
-
-
-def powers_to_data(well: Well) -> dict[str, Any]:
-    """V of a well as center, scale, exponents and coefficients."""
-    basis = well.basis
-    return {
-        "center": basis.center.tolist(),
-        "scale": basis.scale.tolist(),
-        "exponents": basis.exponents.tolist(),
-        "coefficients": well.coefficients.tolist(),
-    }
-
-
-def basis_from_data(powers: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...]) -> PowerBasis:
-    """The powers that `powers_to_data` wrote."""
-    return PowerBasis(
-        symbols, np.array(powers["center"]), np.array(powers["scale"]), np.array(powers["exponents"])
-    )
 
 
 def _wells_from_data(method: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...]) -> tuple[Well, ...]:
@@ -279,8 +238,8 @@ def _wells_from_data(method: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...
     dynamics = Dynamics.of(symbols, equations, diffusion=diffusion)
     return tuple(
         Well(
-            dynamics, np.array(one["attractor"]), basis_from_data(one["V"], symbols),
-            np.array(one["V"]["coefficients"], dtype=float), float(one["level"]),
+            PowerBasis.from_data(one["V"], symbols), np.array(one["V"]["coefficients"], dtype=float),
+            dynamics, np.array(one["attractor"]), float(one["level"]),
             None if one.get("saddle") is None else np.array(one["saddle"]),
             float(one.get("residual", np.nan)), np.zeros((0, d)), float(one.get("reach", one["level"])),
             float(one.get("tolerance", RESIDUAL_TOLERANCE)), None,
@@ -290,8 +249,22 @@ def _wells_from_data(method: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...
     )  # fmt: skip
 
 
-def write_model(path: str | Path, model: Mapping[str, Any]) -> None:
-    """Write a model whole or not at all."""
+def write_model(
+    path: str | Path,
+    decompositions: Mapping[str, SymbolicDecomposition],
+    certificates: Mapping[str, Mapping[str, Any]],
+) -> None:
+    """Write decompositions by method, with a certificate for each, whole or not at all.
+
+    Certificates of what is no method, such as a randomised network, stand beside them.
+    """
+    model: dict[str, Any] = {"states": [], "methods": {}, "certificate": {}}
+    if decompositions:
+        model = {
+            "states": [symbol.name for symbol in next(iter(decompositions.values())).symbols],
+            "methods": {method: decomposition_data(one) for method, one in decompositions.items()},
+            "certificate": {method: dict(one) for method, one in certificates.items()},
+        }
     with whole_file(path) as partial:
         partial.write_text(json.dumps(model, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 

@@ -12,8 +12,8 @@ about V, which solving the Hamilton–Jacobi equation for the f found does not (
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -23,14 +23,9 @@ from siq.inference.field_estimate import FieldEstimate
 from siq.inference.library import CandidateLibrary
 from siq.quasipotential.hamilton_jacobi import (
     HamiltonJacobi,
-    equation_at,
-    gauss_newton,
-    left_inverse,
-    potential_basis,
+    LibraryBasis,
 )
-from siq.quasipotential.wells import Well
 
-LOWER_PARTS = (0.7, 0.5, 0.3)  # of the points, by V
 MIN_PROBABILITY = 1e-4  # a probability below which no orthogonal fit is believed
 FIT_POINTS = 400  # where ∇V·g is asked to vanish in a joint fit
 MAX_STEPS = 50  # of it
@@ -38,53 +33,62 @@ RANK_TOLERANCE = 1e-7  # singular values below this share of the largest are no 
 
 
 @dataclass(frozen=True)
-class GlobalPotential:
-    """V over a library of q functions, refined.
+class GlobalFormula:
+    """V over the library of f, q functions, and g where it was sought.
 
     Attributes
     ----------
-    coefficients
-        Of V, shape ``(q,)``.
-    sensitivity
-        ∂ξ/∂c, shape ``(q, p)``: how they follow the p coefficients of f.
+    potential
+        Coefficients of V, shape ``(q,)``.
     covariance
         Shape ``(q, q)``, zero for terms that are not there.
     residual
         Relative Hamilton–Jacobi residual on the points of the fit.
-    converged
-        Whether Gauss–Newton settled.
+    sensitivity
+        Shape ``(q, p)``: how the coefficients follow the p of f.
+    circulatory, circulatory_errors
+        Coefficients of g with their standard errors, shape ``(q, d)``.
+    joint
+        Whether V and g were fitted together at the Cramér–Rao bound, with ∇V·g = 0 identically.
+    freedom, chi_square
+        Of such a fit the number of constraints on the coefficients of f, and the squared distance of the
+        constrained f from the identified one, in its own covariance.
     """
 
-    library: CandidateLibrary
-    coefficients: np.ndarray
-    sensitivity: np.ndarray
+    potential: np.ndarray
     covariance: np.ndarray
-    residual: float
-    converged: bool
+    residual: float = np.nan
+    sensitivity: np.ndarray | None = None
+    circulatory: np.ndarray | None = None
+    circulatory_errors: np.ndarray | None = None
+    joint: bool = False
+    freedom: int = 0
+    chi_square: float = 0.0
+
+    @property
+    def probability(self) -> float:
+        """Probability of so large a distance by chance: tiny where no such V and g exist."""
+        return float(scipy.special.chdtrc(self.freedom, self.chi_square)) if self.freedom else 1.0
+
+    def relative_error(self, functions: np.ndarray) -> float:
+        """Relative standard error of V over points at which the library has values, shape ``(n, q)``."""
+        values = functions @ self.potential
+        lowest = int(np.argmin(values))
+        difference = functions - functions[lowest]
+        variance = np.einsum("nq,qr,nr->n", difference, self.covariance, difference)
+        size = np.linalg.norm(values - values[lowest])
+        return float(np.sqrt(np.maximum(variance, 0).sum()) / size)
 
 
-def fit_values(library: CandidateLibrary, x: np.ndarray, potential: np.ndarray) -> np.ndarray:
-    """Coefficients of V, shape ``(q,)``, by least squares of its values at points ``(n, d)``."""
-    return _least_squares(library, [x], [potential])
-
-
-def fit_wells(library: CandidateLibrary, wells: Sequence[Well]) -> np.ndarray:
-    """Coefficients of V, shape ``(q,)``, by least squares of the V of several wells within each of them.
-
-    How deep the wells are among each other is left open: each has a constant of its own.
-    """
-    inside = [well.inside for well in wells]
-    return _least_squares(library, inside, [well.values(x) for well, x in zip(wells, inside, strict=True)])
-
-
-def _least_squares(
+def fit_values(
     library: CandidateLibrary, points: Sequence[np.ndarray], values: Sequence[np.ndarray]
 ) -> np.ndarray:
-    """Coefficients of V from its values at groups of points, each group with a constant of its own.
+    """Coefficients of V, shape ``(q,)``, by least squares of its values at groups of points ``(n, d)``.
 
-    Every group counts as much as any other, however many points it has.
+    Each group, as a well, has a constant of its own, and counts as much as any other, however many points
+    it has.
     """
-    basis, counts = potential_basis(library), [len(x) for x in points]
+    basis, counts = LibraryBasis.of_potential(library), [len(x) for x in points]
     weight = np.repeat([1 / np.sqrt(max(count, 1)) for count in counts], counts)
     constants = np.repeat(np.eye(len(points)), counts, axis=0)
     functions = np.column_stack([basis.values(np.concatenate(points)), constants])
@@ -97,80 +101,60 @@ def _least_squares(
     return coefficients
 
 
-def network_starts(
-    library: CandidateLibrary,
-    found: FieldEstimate,
-    points: np.ndarray,
-    potential: np.ndarray,
-) -> Iterator[np.ndarray]:
-    """Starts for V from its values V_θ by the networks, one after the other until one serves.
-
-    The first is the fit of all values. Networks are worst where recordings are few, far out, and Gauss–Newton
-    may follow them to a false solution; the further ones are refined on lower and lower parts of V first.
-    """
-    yield fit_values(library, points, potential)
-    for share in LOWER_PARTS:
-        part = potential <= np.quantile(potential, share)
-        if part.sum() > 2 * library.size:
-            start = fit_values(library, points[part], potential[part])
-            yield refine_globally(start, library, found, points[part], sparse=False).coefficients
-
-
 def refine_globally(
     start: np.ndarray,
-    library: CandidateLibrary,
     found: FieldEstimate,
     points: np.ndarray,
     *,
     false_terms: float = 0.01,
     precision: float = 1e-7,
     sparse: bool = True,
-) -> GlobalPotential:
+) -> GlobalFormula:
     """Refine V from a start, and keep only the terms that the data support.
 
     Parameters
     ----------
     start
-        Coefficients of V over the library, shape ``(q,)``.
-    library
-        The functions that V may use.
-    found
-        The identified f with its uncertainty.
-    points
-        Where the equation is asked for, shape ``(n, d)``.
+        Coefficients of V over the library of f, shape ``(q,)``.
+    found, points
+        The identified f with its uncertainty, and where the equation is asked for, shape ``(n, d)``.
     false_terms
         Probability that the uncertainty of f alone brings any false term into V.
     precision
-        Terms that contribute less than this share of V are dropped in any case.
-    sparse
-        Whether to drop terms at all.
+        Terms that contribute less than this share of V are dropped in any case; none at all if not `sparse`.
     """
-    basis = potential_basis(library)
-    equation = equation_at(basis, points, found.dynamics)
-    solution = gauss_newton(equation, start[basis.chosen])
+    library = found.library
+    basis = LibraryBasis.of_potential(library)
+    equation = HamiltonJacobi.at(basis, points, found.dynamics)
+    solution, left = equation.gauss_newton(start[basis.chosen])
     critical = float(-scipy.special.ndtri(false_terms / (2 * basis.size)))
     # Dropping terms changes the others, hence the errors: repeat until nothing more can go.
     for _ in range(6 if sparse else 0):
-        kept = _eliminate(equation, solution.coefficients, found, critical=critical, precision=precision)
+        kept = _eliminate(equation, solution, found, critical=critical, precision=precision)
         if len(kept) == basis.size or not len(kept):
             break
         equation, basis = equation.restricted(kept), basis.restricted(kept)
-        solution = gauss_newton(equation, solution.coefficients[kept])
+        solution, left = equation.gauss_newton(solution[kept])
     # Coefficients of V follow those of f to first order; a residual that no V here can remove adds to their
     # uncertainty.
-    inverse = left_inverse(equation.jacobian(solution.coefficients))
-    response = -inverse @ _forcing(equation, solution.coefficients, found)
-    residual = equation.residual(solution.coefficients)
+    inverse = _left_inverse(equation.jacobian(solution))
+    response = -inverse @ _forcing(equation, solution, found)
+    residual = equation.residual(solution)
     freedom = max(len(residual) - len(inverse), 1)
     misfit = float(residual @ residual) / freedom * (inverse @ inverse.T)
     q, p = library.size, len(found.support)
     coefficients, sensitivities, covariance = np.zeros(q), np.zeros((q, p)), np.zeros((q, q))
-    coefficients[basis.chosen] = solution.coefficients
+    coefficients[basis.chosen] = solution
     sensitivities[basis.chosen] = response
     covariance[np.ix_(basis.chosen, basis.chosen)] = response @ found.covariance @ response.T + misfit
-    return GlobalPotential(
-        library, coefficients, sensitivities, covariance, solution.residual, solution.converged
-    )
+    return GlobalFormula(coefficients, covariance, left, sensitivities)
+
+
+def _left_inverse(jacobian: np.ndarray) -> np.ndarray:
+    """The inverse of least squares, shape ``(m, n)``, of columns that may be of very different sizes."""
+    scale = np.linalg.norm(jacobian, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    return np.asarray(np.linalg.pinv(jacobian / scale, rcond=1e-11) / scale[:, None])
 
 
 def _forcing(equation: HamiltonJacobi, coefficients: np.ndarray, found: FieldEstimate) -> np.ndarray:
@@ -227,57 +211,15 @@ def _eliminate(
     return active
 
 
-@dataclass(frozen=True)
-class RegionFormula:
-    """V and g over the library of f.
-
-    Attributes
-    ----------
-    potential, circulatory
-        Coefficients of V, shape ``(q,)``, and of g, shape ``(q, d)``.
-    potential_covariance
-        Shape ``(q, q)``.
-    circulatory_errors
-        Standard errors of g, shape ``(q, d)``.
-    joint
-        Whether V and g were fitted together at the Cramér–Rao bound, with ∇V·g = 0 identically.
-    freedom, chi_square
-        Of such a fit the number of constraints on the coefficients of f, and the squared distance of the
-        constrained f from the identified one, in its own covariance.
-    """
-
-    potential: np.ndarray
-    circulatory: np.ndarray
-    potential_covariance: np.ndarray
-    circulatory_errors: np.ndarray
-    joint: bool = False
-    freedom: int = 0
-    chi_square: float = 0.0
-
-    @property
-    def probability(self) -> float:
-        """Probability of so large a distance by chance: tiny where no such V and g exist."""
-        return float(scipy.special.chdtrc(self.freedom, self.chi_square)) if self.freedom else 1.0
-
-    def relative_error(self, functions: np.ndarray) -> float:
-        """Relative standard error of V over points at which the library has values, shape ``(n, q)``."""
-        values = functions @ self.potential
-        lowest = int(np.argmin(values))
-        difference = functions - functions[lowest]
-        variance = np.einsum("nq,qr,nr->n", difference, self.potential_covariance, difference)
-        size = np.linalg.norm(values - values[lowest])
-        return float(np.sqrt(np.maximum(variance, 0).sum()) / size)
-
-
 def with_circulation(
-    best: GlobalPotential,
+    best: GlobalFormula,
     found: FieldEstimate,
     points: np.ndarray,
     *,
     false_terms: float,
     precision: float,
     single_formula: float,
-) -> RegionFormula | None:
+) -> GlobalFormula | None:
     """The circulation g = f + D∇V with its uncertainty, on the terms that differ from zero.
 
     Under noise V and g are fitted together: V may fail the Hamilton–Jacobi equation of the identified f by as
@@ -285,10 +227,11 @@ def with_circulation(
     that the data allow. Where there is none V has to solve the equation as without noise; None where it does
     not.
     """
-    library = best.library
+    assert best.sensitivity is not None
+    library = found.library
     q, d = library.size, library.dimension
     downhill = library.downhill(found.diffusion)
-    circulatory = found.coefficients + np.einsum("ikj,j->ki", downhill, best.coefficients)
+    circulatory = found.coefficients + np.einsum("ikj,j->ki", downhill, best.potential)
     # δg = δf + D∇δV with δV = S δf, coefficient by coefficient
     response = np.einsum("ikj,jp->ikp", downhill, best.sensitivity)
     for column, (component, term) in enumerate(found.support):
@@ -304,12 +247,12 @@ def with_circulation(
     circulatory = np.where(weak, 0.0, circulatory)
     if not found.noise_free:
         rows = np.unique(np.linspace(0, len(points) - 1, FIT_POINTS).astype(int))
-        fit = _fit_orthogonal(found, best.coefficients, circulatory, points[rows])
+        fit = _fit_orthogonal(found, best.potential, circulatory, points[rows])
         if fit is not None and fit.probability >= MIN_PROBABILITY:
             return fit
         if best.residual >= single_formula:
             return None
-    return RegionFormula(best.coefficients, circulatory, best.covariance, np.where(weak, 0.0, errors))
+    return replace(best, circulatory=circulatory, circulatory_errors=np.where(weak, 0.0, errors))
 
 
 def _fit_orthogonal(
@@ -317,12 +260,11 @@ def _fit_orthogonal(
     potential: np.ndarray,
     circulatory: np.ndarray,
     points: np.ndarray,
-) -> RegionFormula | None:
+) -> GlobalFormula | None:
     """Fit V and g on their terms so that f = -D∇V + g, ∇V·g = 0, is closest to the identified f.
 
-    It starts from coefficients over the library of f, shapes ``(q,)`` and ``(q, d)``; those that are zero
-    stay so. ∇V·g is asked to vanish at points; more of them than coefficients make it vanish identically.
-    None where the iteration finds no decomposition that is orthogonal to rounding.
+    ∇V·g is asked to vanish at points; more of them than coefficients make it vanish identically. None where
+    the iteration finds no decomposition that is orthogonal to rounding.
     """
     library, noise = found.library, found.diffusion
     q, d = library.size, library.dimension
@@ -399,7 +341,7 @@ def _fit_orthogonal(
     potential_covariance, errors = np.zeros((q, q)), np.zeros((d, q))
     potential_covariance[np.ix_(terms, terms)] = covariance[:count, :count]
     errors[of_circulatory] = np.sqrt(np.maximum(np.diag(covariance)[count:], 0))
-    return RegionFormula(
-        fitted_potential, fitted.T, potential_covariance, errors.T, joint=True,
+    return GlobalFormula(
+        fitted_potential, potential_covariance, circulatory=fitted.T, circulatory_errors=errors.T, joint=True,
         freedom=len(found.values) - tangent.shape[1], chi_square=float(distance @ distance),
     )  # fmt: skip

@@ -12,9 +12,10 @@ what it found must be tested by what does not know of this equation (`siq.quasip
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import scipy.linalg
@@ -60,6 +61,13 @@ class LibraryBasis:
     library: CandidateLibrary
     chosen: np.ndarray
 
+    @classmethod
+    def of_potential(cls, library: CandidateLibrary) -> LibraryBasis:
+        """All functions that V may use; the constant means nothing to V and is left out."""
+        allowed = library.in_potential.copy()
+        allowed[library.constant] = False
+        return cls(library, np.flatnonzero(allowed))
+
     @property
     def size(self) -> int:
         """Number of functions, m."""
@@ -102,13 +110,6 @@ class LibraryBasis:
         )
 
 
-def potential_basis(library: CandidateLibrary) -> LibraryBasis:
-    """All functions that V may use; the constant means nothing to V and is left out."""
-    allowed = library.in_potential.copy()
-    allowed[library.constant] = False
-    return LibraryBasis(library, np.flatnonzero(allowed))
-
-
 @dataclass(frozen=True)
 class PowerBasis:
     """Products of powers of ``(x - center)/scale``, with exponents of the shape ``(m, d)``."""
@@ -117,6 +118,19 @@ class PowerBasis:
     center: np.ndarray
     scale: np.ndarray
     exponents: np.ndarray
+
+    @classmethod
+    def up_to(
+        cls, degree: int, symbols: tuple[sympy.Symbol, ...], center: np.ndarray, scale: np.ndarray
+    ) -> PowerBasis:
+        """All powers of degree 2 up to `degree` about a center; the quadratic ones come first."""
+        exponents = [row for row in monomial_exponents(len(symbols), degree) if sum(row) >= 2]
+        return cls(symbols, np.asarray(center, dtype=float), scale, np.array(exponents))
+
+    @classmethod
+    def from_data(cls, data: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...]) -> PowerBasis:
+        """The powers that `Expansion.powers` wrote."""
+        return cls(symbols, *(np.array(data[name]) for name in ("center", "scale", "exponents")))
 
     @property
     def size(self) -> int:
@@ -177,11 +191,18 @@ class PowerBasis:
         return result.T
 
 
+@dataclass(frozen=True, eq=False)
 class Expansion:
     """V = Σ c_k φ_k: the functions φ of a basis, with coefficients of the shape ``(m,)``."""
 
     basis: PowerBasis
     coefficients: np.ndarray
+
+    @property
+    def powers(self) -> dict[str, Any]:
+        """Center, scale, exponents and coefficients as plain data."""
+        parts = {name: getattr(self.basis, name).tolist() for name in ("center", "scale", "exponents")}
+        return parts | {"coefficients": self.coefficients.tolist()}
 
     @property
     def degree(self) -> int:
@@ -213,14 +234,6 @@ def affordable_degree(dimension: int, degree: int) -> int:
     return degree
 
 
-def power_basis(
-    symbols: tuple[sympy.Symbol, ...], center: np.ndarray, scale: np.ndarray, *, degree: int
-) -> PowerBasis:
-    """All powers of degree 2 up to `degree` about a center; the quadratic ones come first."""
-    exponents = [row for row in monomial_exponents(len(symbols), degree) if sum(row) >= 2]
-    return PowerBasis(symbols, np.asarray(center, dtype=float), scale, np.array(exponents))
-
-
 @dataclass(frozen=True)
 class HamiltonJacobi:
     """The equation at some points.
@@ -246,6 +259,21 @@ class HamiltonJacobi:
     weight: np.ndarray
     measure: Diffusion
 
+    @classmethod
+    def at(
+        cls, basis: Basis, x: np.ndarray, dynamics: Dynamics, *, attractor: np.ndarray | None = None
+    ) -> HamiltonJacobi:
+        """The equation at those of some points, shape ``(n, d)``, where f does not vanish.
+
+        Where D has no inverse, the attractor, shape ``(d,)``, tells in which metric that is seen.
+        """
+        flow, noise = dynamics.drift(x), dynamics.diffusion
+        measure = noise if attractor is None else measure_at(dynamics, attractor)
+        speed = np.sqrt(measure.squared_speed(x, flow))
+        moving = speed > 1e-9 * speed.max()
+        x, flow, speed = x[moving], flow[moving], speed[moving]
+        return cls(x, basis.gradients(x), flow, noise, 1 / speed, measure)
+
     def residual(self, coefficients: np.ndarray) -> np.ndarray:
         """Weighted ``∇V·(f + D∇V)``, shape ``(n,)``."""
         gradient = self.slopes(coefficients)
@@ -262,6 +290,11 @@ class HamiltonJacobi:
         n, d, m = self.gradients.shape
         slopes: np.ndarray = (self.gradients.reshape(n * d, m) @ coefficients).reshape(n, d)
         return slopes
+
+    def relative_residuals(self, coefficients: np.ndarray) -> np.ndarray:
+        """``∣∇V·(f + D∇V)∣ / (∣∇V∣ ∣f∣)`` at the points, shape ``(n,)``."""
+        size = np.sqrt(self.measure.contract(self.points, self.slopes(coefficients)))
+        return np.asarray(np.abs(self.residual(coefficients)) / np.where(size > 0, size, np.inf))
 
     def size(self, coefficients: np.ndarray) -> float:
         """Rms of ∇V over the points, in the metric of the noise."""
@@ -282,187 +315,121 @@ class HamiltonJacobi:
         """The equation with some of the functions only."""
         return replace(self, gradients=self.gradients[:, :, rows])
 
+    def robust_fit(
+        self,
+        start: np.ndarray,
+        free: np.ndarray,
+        *,
+        rounds: int,
+        finest: float,
+        steps: int,
+        orthonormal: bool = False,
+    ) -> np.ndarray:
+        """Coefficients by Gauss–Newton with weights that fall with the square of the residual (Cauchy's).
 
-def relative_residuals(equation: HamiltonJacobi, coefficients: np.ndarray) -> np.ndarray:
-    """``∣∇V·(f + D∇V)∣ / (∣∇V∣ ∣f∣)`` at the points, shape ``(n,)``."""
-    slope = equation.slopes(coefficients)
-    size = np.sqrt(equation.measure.contract(equation.points, slope))
-    return np.asarray(np.abs(equation.residual(coefficients)) / np.where(size > 0, size, np.inf))
+        Where V stops to be smooth, by caustics or by a kink, the residual is large and counts for nothing,
+        instead of spoiling the formula elsewhere.
 
+        Parameters
+        ----------
+        start, free
+            Coefficients to start from, and a mask of those that may change: shape ``(m,)``.
+        rounds, steps
+            How often the weights are made, and the most steps of Gauss–Newton with each of them.
+        finest
+            Residual below which nothing is an outlier.
+        orthonormal
+            Whether to fit combinations of functions that are orthonormal over the points.
+        """
+        equation, theta, moving = self, start, free
+        if orthonormal:
+            equation, turned = _orthonormalised(self, free)
+            moving = np.arange(turned.shape[1]) < turned.shape[1] - int((~free).sum())
+            theta = np.linalg.lstsq(turned[free], start[free], rcond=None)[0]
+            theta[~moving] = start[~free]
+        for _ in range(rounds):
+            rest = equation.relative_residuals(theta)
+            scale = max(OUTLIER_SCALE * float(np.median(rest)), finest)
+            weighted = replace(equation, weight=equation.weight / np.sqrt(1 + (rest / scale) ** 2))
+            theta, _ = weighted.gauss_newton(theta, free=moving, steps=steps)
+        return np.asarray(turned @ theta) if orthonormal else theta
 
-@dataclass(frozen=True)
-class _Solution:
-    """Coefficients where Gauss–Newton ended, and whether its last step was too small to matter.
+    def gauss_newton(
+        self,
+        start: np.ndarray,
+        *,
+        free: np.ndarray | None = None,
+        steps: int = 60,
+        tolerance: float = 1e-13,
+    ) -> tuple[np.ndarray, float]:
+        """Coefficients with the least squares of the residual, relative to the size of ∇V; and what is left.
 
-    The residual is the root mean square of the weighted one, divided by that of ∇V: the mean of
-    ``∣∇V·(f + D∇V)∣ / (∣∇V∣ ∣f∣)``.
-    """
+        The residual alone would draw a bad start to V = 0, which solves the equation, too. What is left is
+        the root mean square of the weighted one over that of ∇V; infinite for V = 0, or all but 0.
 
-    coefficients: np.ndarray
-    residual: float
-    converged: bool
+        Parameters
+        ----------
+        start, free
+            Coefficients to start from, and a mask of those that may change, by default all: shape ``(m,)``.
+        steps, tolerance
+            Most steps, and the relative change of the coefficients at which to end.
+        """
+        coefficients = start.copy()
+        free = np.ones(len(start), dtype=bool) if free is None else free
+        scale = self.sizes()
+        scale = np.where(scale > 0, scale, 1.0)
 
+        def relative(current: np.ndarray) -> tuple[np.ndarray, float]:
+            """The residual over rms of ∇V, shape ``(n,)``, and that rms."""
+            size = self.size(current)
+            return self.residual(current) / max(size, 1e-300), size
 
-def equation_at(
-    basis: Basis, x: np.ndarray, dynamics: Dynamics, *, attractor: np.ndarray | None = None
-) -> HamiltonJacobi:
-    """The equation at those of some points, shape ``(n, d)``, where f does not vanish.
-
-    Where D has no inverse, the attractor, shape ``(d,)``, tells in which metric that is seen.
-    """
-    flow, noise = dynamics.drift(x), dynamics.diffusion
-    measure = noise if attractor is None else measure_at(dynamics, attractor)
-    speed = np.sqrt(measure.squared_speed(x, flow))
-    moving = speed > 1e-9 * speed.max()
-    return HamiltonJacobi(
-        x[moving], basis.gradients(x[moving]), flow[moving], noise, 1 / speed[moving], measure
-    )
-
-
-def gauss_newton(
-    equation: HamiltonJacobi,
-    start: np.ndarray,
-    *,
-    free: np.ndarray | None = None,
-    steps: int = 60,
-    tolerance: float = 1e-13,
-) -> _Solution:
-    """Minimise the sum of squares of the residual, relative to the size of ∇V.
-
-    The residual alone would draw a bad start to V = 0, which solves the equation, too.
-
-    Parameters
-    ----------
-    equation
-        At points.
-    start
-        Coefficients to start from, shape ``(m,)``.
-    free
-        Which coefficients may change, as a mask; default all.
-    steps, tolerance
-        Most steps, and the relative change of the coefficients at which to end.
-    """
-    coefficients = start.copy()
-    free = np.ones(len(start), dtype=bool) if free is None else free
-    scale = equation.sizes()
-    scale = np.where(scale > 0, scale, 1.0)
-
-    def relative(current: np.ndarray) -> tuple[np.ndarray, float]:
-        """The residual over rms of ∇V, shape ``(n,)``, and that rms."""
-        size = equation.size(current)
-        return equation.residual(current) / max(size, 1e-300), size
-
-    residual, size = relative(coefficients)
-    converged = not free.any()
-    for _ in range(steps if free.any() else 0):
-        if size == 0:
-            converged = True
-            break
-        slant = equation.size_jacobian(coefficients)[free]
-        jacobian = equation.jacobian(coefficients)[:, free] - np.outer(residual, slant)
-        step = _least_squares(jacobian / (size * scale[free]), -residual) / scale[free]
-        length = 1.0
-        while True:
-            trial = coefficients.copy()
-            trial[free] += length * step
-            attempt, size = relative(trial)
-            if np.linalg.norm(attempt) < np.linalg.norm(residual) or length < 1e-3:
+        residual, size = relative(coefficients)
+        for _ in range(steps if free.any() else 0):
+            if size == 0:
                 break
-            length /= 2
-        improved = np.linalg.norm(attempt) < np.linalg.norm(residual)
-        change = np.linalg.norm(length * step * scale[free])
-        reached = np.linalg.norm(coefficients * scale)
-        if improved:
-            gain = 1 - float(np.linalg.norm(attempt)) / max(float(np.linalg.norm(residual)), 1e-300)
-            coefficients, residual = trial, attempt
-        if not improved or change <= tolerance * reached or gain < 1e-7:
-            converged = True
-            break
-    return _Solution(coefficients, _relative_residual(equation, coefficients), converged)
-
-
-def _least_squares(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """One step; directions that the points do not determine are left as they are.
-
-    By the normal equations, ten times as fast, where these are good enough: the next step corrects this one.
-    """
-    try:
-        factor, lower = scipy.linalg.cho_factor(matrix.T @ matrix, check_finite=False)
-    except scipy.linalg.LinAlgError:
-        pass
-    else:
-        diagonal = np.diag(factor)
-        if diagonal.min() > DIAGONAL_RATIO * diagonal.max():
-            found: np.ndarray = scipy.linalg.cho_solve((factor, lower), matrix.T @ right, check_finite=False)
-            return found
-    return np.linalg.lstsq(matrix, right, rcond=1e-11)[0]
-
-
-def _relative_residual(equation: HamiltonJacobi, coefficients: np.ndarray) -> float:
-    """Rms of the weighted residual over rms of ∇V; infinite for V = 0, or all but 0."""
-    gradient = equation.slopes(coefficients)
-    squared = equation.measure.contract(equation.points, gradient)
-    if not np.sqrt((equation.weight**2 * squared).mean()) > MIN_SLOPE:
-        return np.inf
-    return float(np.sqrt((equation.residual(coefficients) ** 2).mean() / squared.mean()))
-
-
-def left_inverse(jacobian: np.ndarray) -> np.ndarray:
-    """The inverse of least squares, shape ``(m, n)``, of columns that may be of very different sizes."""
-    scale = np.linalg.norm(jacobian, axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
-    return np.asarray(np.linalg.pinv(jacobian / scale, rcond=1e-11) / scale[:, None])
-
-
-def robust_fit(
-    equation: HamiltonJacobi,
-    start: np.ndarray,
-    free: np.ndarray,
-    *,
-    rounds: int,
-    finest: float,
-    steps: int,
-    orthonormal: bool = False,
-) -> np.ndarray:
-    """Coefficients by Gauss–Newton with weights that fall with the square of the residual (Cauchy's).
-
-    Where V stops to be smooth, by caustics or by a kink, the residual is large and counts for nothing,
-    instead of spoiling the formula elsewhere.
-
-    Parameters
-    ----------
-    equation, start
-        At points, and coefficients to start from, shape ``(m,)``.
-    free
-        Which coefficients may change, as a mask.
-    rounds, steps
-        How often the weights are made, and the most steps of Gauss–Newton with each of them.
-    finest
-        Residual below which nothing is an outlier.
-    orthonormal
-        Whether to fit combinations of functions that are orthonormal over the points.
-    """
-    theta, moving = start, free
-    if orthonormal:
-        equation, turned = _orthonormalised(equation, free)
-        moving = np.arange(turned.shape[1]) < turned.shape[1] - int((~free).sum())
-        theta = np.linalg.lstsq(turned[free], start[free], rcond=None)[0]
-        theta[~moving] = start[~free]
-    for _ in range(rounds):
-        rest = relative_residuals(equation, theta)
-        scale = max(OUTLIER_SCALE * float(np.median(rest)), finest)
-        weighted = replace(equation, weight=equation.weight / np.sqrt(1 + (rest / scale) ** 2))
-        theta = gauss_newton(weighted, theta, free=moving, steps=steps).coefficients
-    return np.asarray(turned @ theta) if orthonormal else theta
+            slant = self.size_jacobian(coefficients)[free]
+            jacobian = self.jacobian(coefficients)[:, free] - np.outer(residual, slant)
+            matrix = jacobian / (size * scale[free])
+            step = None
+            try:  # the normal equations, ten times as fast, where they do: the next step corrects this one
+                factor, lower = scipy.linalg.cho_factor(matrix.T @ matrix, check_finite=False)
+                diagonal = np.diag(factor)
+                if diagonal.min() > DIAGONAL_RATIO * diagonal.max():
+                    right = matrix.T @ -residual
+                    step = scipy.linalg.cho_solve((factor, lower), right, check_finite=False)
+            except scipy.linalg.LinAlgError:
+                pass
+            if step is None:  # directions that the points do not determine are left as they are
+                step = np.linalg.lstsq(matrix, -residual, rcond=1e-11)[0]
+            step = step / scale[free]
+            length = 1.0
+            while True:
+                trial = coefficients.copy()
+                trial[free] += length * step
+                attempt, size = relative(trial)
+                if np.linalg.norm(attempt) < np.linalg.norm(residual) or length < 1e-3:
+                    break
+                length /= 2
+            improved = np.linalg.norm(attempt) < np.linalg.norm(residual)
+            change = np.linalg.norm(length * step * scale[free])
+            reached = np.linalg.norm(coefficients * scale)
+            if improved:
+                gain = 1 - float(np.linalg.norm(attempt)) / max(float(np.linalg.norm(residual)), 1e-300)
+                coefficients, residual = trial, attempt
+            if not improved or change <= tolerance * reached or gain < 1e-7:
+                break
+        squared = self.measure.contract(self.points, self.slopes(coefficients))
+        if not np.sqrt((self.weight**2 * squared).mean()) > MIN_SLOPE:
+            return coefficients, np.inf
+        return coefficients, float(np.sqrt((self.residual(coefficients) ** 2).mean() / squared.mean()))
 
 
 def _orthonormalised(equation: HamiltonJacobi, free: np.ndarray) -> tuple[HamiltonJacobi, np.ndarray]:
-    """The equation in combinations of the free functions whose gradients are orthonormal over the points.
+    """The equation in combinations of the free functions whose gradients are orthonormal, and their matrix.
 
-    Powers are all but dependent over a sublevel set that is narrow, or bent; their combinations are not, and
-    Gauss–Newton then gets on by the normal equations. Combinations that the points leave open are left out;
-    the functions that are not free stay and come last. Also returned is the matrix, ``(m, k + s)``, by which
-    the new coefficients are multiplied to give the old ones.
+    Powers are all but dependent over a sublevel set that is narrow, or bent; their combinations are not.
+    Those that the points leave open are left out; functions that are not free stay and come last.
     """
     roots = equation.measure.root_at(equation.points)
     stacked = np.einsum("nij,nim->njm", roots, equation.gradients[:, :, free], optimize=True)

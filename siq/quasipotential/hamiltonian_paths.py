@@ -43,11 +43,10 @@ from scipy.interpolate import Akima1DInterpolator, PchipInterpolator
 from siq.errors import NumericalFailure
 from siq.quasipotential.characteristics import HamiltonianFlow, crossed
 from siq.quasipotential.path_chains import MinimumActionPath
-from siq.quasipotential.power_series import cubic_series, quasipotential_series
+from siq.quasipotential.power_series import local_series
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import classify, hessian_at
 
-MOST_STATES_OF_DEGREE_4 = 8  # beyond, the power series is of degree 3
 REST = 1e-5  # |f| at an equilibrium, in units of the flow
 MOST_NODES = 50_000  # numerical, a guard on memory
 MESH_GROWTH, ENOUGH_NODES = 6, 1000  # times the nodes of a guess, or so many: a finer mesh has no solution
@@ -92,12 +91,7 @@ class _HamiltonianProblem:
         self.flow = HamiltonianFlow(dynamics, attractor, level)
         self.dimension = dynamics.dimension
         self.end = self.flow.inverse @ offset
-        many = self.dimension > MOST_STATES_OF_DEGREE_4
-        self.series = (
-            cubic_series(dynamics, attractor)
-            if many
-            else quasipotential_series(dynamics, attractor, degree=4)
-        )
+        self.series = local_series(dynamics, attractor)
         self.growth = self.flow.jacobian + 2 * self.flow.diffusion[0]  # of what leaves A: ẏ = (J + 2DM) y
         self.fastest = float(np.abs(np.linalg.eigvals(self.growth)).max())
         self.unstable: float | None = None
@@ -232,17 +226,13 @@ def hamiltonian_paths(
 
     Parameters
     ----------
-    dynamics
-        f and D, twice differentiable.
-    attractor, end
-        Shape ``(d,)``; the end is mostly a saddle.
-    beside
+    dynamics, attractor, end
+        f and D, twice differentiable; and two states, shape ``(d,)``, the end mostly a saddle.
+    beside, curves
         A trajectory of f from the saddle to the attractor, shape ``(k, d)``: tells from where the saddle is
-        approached, and is itself a curve for the end to move along.
+        approached, and is itself a curve for the end to move along; and further curves from attractor to end.
     tolerance
         Of the action, relative.
-    curves
-        Further curves from the attractor to the end, shape ``(k, d)`` each.
 
     Raises
     ------
@@ -276,7 +266,16 @@ def hamiltonian_paths(
         finished(backwards)
     share = np.linspace(0, 1, 201)[:, None]
     given = [(one - problem.flow.center) @ problem.flow.inverse.T for one in curves]
-    for last in _last_states(problem, beside):
+    # The end is moved to the end itself, or to states before the saddle on the side of A.
+    lasts = [problem.end]
+    if problem.unstable is not None:
+        side = np.sign(problem.left @ -problem.end)
+        if beside is not None:
+            down = (beside - problem.flow.center) @ problem.flow.inverse.T
+            far = np.flatnonzero(np.linalg.norm(down - problem.end, axis=1) >= APPROACH)
+            side = np.sign(problem.left @ (down[far[0]] - problem.end))
+        lasts = [problem.end + side * APPROACH * one / np.linalg.norm(one) for one in problem.arrivals]
+    for last in lasts:
         solutions = list(known)
         across = np.linalg.svd(last[None])[2][1 : BENDS // 2 + 1]
         bent = [
@@ -289,9 +288,7 @@ def hamiltonian_paths(
                 finished(solution)
         if not found and beside is not None and problem.unstable is not None:
             # The way down taken backwards: V falls along it, so that it crosses no ridge, but it may wind.
-            down = (beside - problem.flow.center) @ problem.flow.inverse.T
-            far = down[np.linalg.norm(down - problem.end, axis=1) >= APPROACH]
-            finished(_followed(problem, np.vstack([far[::-1], last])))
+            finished(_followed(problem, np.vstack([down[far][::-1], last])))
         if found:
             break
     if not found:
@@ -299,18 +296,6 @@ def hamiltonian_paths(
             f"no solution of Hamilton's equations was found from {attractor.tolist()} to {end.tolist()}"
         )
     return sorted(found, key=lambda path: (not path.smooth, path.action))
-
-
-def _last_states(problem: _HamiltonianProblem, beside: np.ndarray | None) -> list[np.ndarray]:
-    """Where the end is moved to: itself, or states before the saddle on the side of A."""
-    if problem.unstable is None:
-        return [problem.end]
-    side = np.sign(problem.left @ -problem.end)
-    if beside is not None:
-        down = (beside - problem.flow.center) @ problem.flow.inverse.T
-        far = np.flatnonzero(np.linalg.norm(down - problem.end, axis=1) >= APPROACH)
-        side = np.sign(problem.left @ (down[far[0]] - problem.end))
-    return [problem.end + side * APPROACH * one / np.linalg.norm(one) for one in problem.arrivals]
 
 
 def _followed(problem: _HamiltonianProblem, curve: np.ndarray) -> _Solution | None:
@@ -402,15 +387,19 @@ def _onward(problem: _HamiltonianProblem, solution: _Solution, distance: float) 
 def _reversed_motion(problem: _HamiltonianProblem, beside: np.ndarray | None) -> _Solution | None:
     """A first guess of the path to a saddle, which ends before it: the way down with velocities reversed.
 
-    `beside` is a trajectory of f from the saddle to the attractor, shape ``(k, d)``. There is none where
-    states are not positions and their velocities, noise acts on others than velocities, or the way down is
-    not known.
+    None where states are not positions and their velocities, noise acts on others than velocities, or the way
+    down is not known.
     """
     dynamics, flow = problem.flow.dynamics, problem.flow
-    places = _velocities_of(dynamics)
-    if places is None or beside is None or problem.unstable is None:
+    if beside is None or problem.unstable is None:
         return None
-    positions, velocities = places
+    symbols, noise_formulas = list(dynamics.symbols), dynamics.diffusion.formulas
+    defined = [(at, symbols.index(one)) for at, one in enumerate(dynamics.formulas) if one in symbols]
+    positions, velocities = np.array(defined, dtype=int).reshape(-1, 2).T
+    if not np.array_equal(np.sort(np.r_[positions, velocities]), np.arange(len(symbols))):
+        return None
+    if any(noise_formulas[place][place] != 0 for place in positions):  # noise acts on velocities alone
+        return None
     far = np.flatnonzero(
         np.linalg.norm((beside - flow.center) @ flow.inverse.T - problem.end, axis=1) >= APPROACH
     )
@@ -449,24 +438,6 @@ def _reversed_motion(problem: _HamiltonianProblem, beside: np.ndarray | None) ->
     times = step * np.arange(1 - len(x), 1)
     guess = _interpolated(times, np.concatenate([y, q], axis=1))
     return _Solution(guess.at, times[::-REVERSED_PACE][::-1])
-
-
-def _velocities_of(dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray] | None:
-    """The places of positions and of their velocities, in the same order; None where there are other states.
-
-    Noise acts on velocities alone.
-    """
-    symbols = list(dynamics.symbols)
-    defined = [
-        (place, symbols.index(formula))
-        for place, formula in enumerate(dynamics.formulas)
-        if formula in symbols
-    ]
-    positions, velocities = np.array(defined, dtype=int).reshape(-1, 2).T
-    if not np.array_equal(np.sort(np.r_[positions, velocities]), np.arange(len(symbols))):
-        return None
-    noise = dynamics.diffusion.formulas
-    return None if any(noise[place][place] != 0 for place in positions) else (positions, velocities)
 
 
 def _finished(

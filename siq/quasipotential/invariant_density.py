@@ -7,8 +7,8 @@ as ε → 0: the density has a prefactor that depends on the state, and Z is wro
 Eq. eq:invariant_dist).
 
 States that occur in one term together form a block, and the integrand is the product over the blocks. A state
-by itself is integrated adaptively, two or three on a tensor product of Gauss–Legendre nodes. The density of
-wells, each with a formula of its own, is that of `siq.quasipotential.cell_density`.
+by itself is integrated panel by panel, two or three on a tensor product of Gauss–Legendre nodes. The density
+of wells, each with a formula of its own, is that of `siq.quasipotential.cell_density`.
 """
 
 from __future__ import annotations
@@ -20,9 +20,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.integrate
 import scipy.interpolate
-import scipy.optimize
 import scipy.special
 import sympy
 
@@ -32,8 +30,7 @@ from siq.systems.formulas import compile_formulas
 WALKER_GROUPS = 100  # among which the sampling error is estimated
 BINS = 40  # along each of the states
 LARGEST_BLOCK = 3  # states; beyond, a tensor product of nodes is out of reach
-SCAN_POINTS = 2001  # where the wells of a one-dimensional integral are looked for
-MOST_WELLS = 50  # of them
+PANELS = 200  # of the integral over a single state: U may be known to vary within a thousandth of the box
 QUADRATURE_TOLERANCE = 1e-6  # relative: what a quadrature's own estimate of its error may be
 
 
@@ -64,6 +61,40 @@ class DensityComparison:
     x1_edges: np.ndarray
     x2_edges: np.ndarray
     histogram: np.ndarray
+
+    @classmethod
+    def of_bins(
+        cls,
+        bin_of: np.ndarray,
+        expected: np.ndarray,
+        edges: Sequence[np.ndarray],
+        *,
+        counted: np.ndarray | None = None,
+    ) -> DensityComparison:
+        """From the bin of every sample, shape ``(times, walkers)``, and the probability of each bin.
+
+        A bin is the row of the second state times the bins of the first, plus the column; the last one is
+        what lies outside the box. `counted` masks the samples that count; by default all.
+        """
+        walkers, width = bin_of.shape[-1], len(expected)
+        groups = min(WALKER_GROUPS, walkers)
+        group_of = np.broadcast_to(np.arange(walkers) * groups // walkers, bin_of.shape)
+        label = group_of * width + bin_of
+        counts = np.bincount(label.ravel() if counted is None else label[counted], minlength=groups * width)
+        counts = counts.reshape(groups, width)
+        observed = counts.sum(axis=0) / max(counts.sum(), 1)
+        shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
+        # The mean of |x| for a normal x is sqrt(2/π) times its standard deviation.
+        errors = shares.std(axis=0, ddof=1) / math.sqrt(groups) if groups > 1 else np.full(width, np.nan)
+        area = math.prod(one[1] - one[0] for one in edges)
+        return cls(
+            total_variation=float(np.abs(observed - expected).sum() / 2),
+            sampling_floor=float(math.sqrt(2 / math.pi) * errors.sum() / 2),
+            outside=float(observed[-1]) if counted is None else 1 - float(counted.mean()),
+            x1_edges=edges[0],
+            x2_edges=edges[1] if len(edges) > 1 else np.zeros(0),
+            histogram=observed[:-1].reshape(-1, len(edges[0]) - 1) / area,
+        )
 
 
 @dataclass(frozen=True)
@@ -130,50 +161,12 @@ class StationaryDensity:
                 for low, high in itertools.pairwise(edges[1])
                 for left, right in itertools.pairwise(edges[0])
             ]
-        return compare_shares(bin_of, np.append(expected, 0.0), edges)
-
-
-def compare_shares(
-    bin_of: np.ndarray,
-    expected: np.ndarray,
-    edges: Sequence[np.ndarray],
-    *,
-    counted: np.ndarray | None = None,
-) -> DensityComparison:
-    """Compare the shares of samples in bins with their probabilities.
-
-    `bin_of` is the bin of every sample, shape ``(times, walkers)``: row of the second state times the bins of
-    the first, plus the column; the last bin is what lies outside the box. `counted` are the samples that
-    count, of the same shape; by default all.
-    """
-    walkers, width = bin_of.shape[-1], len(expected)
-    groups = min(WALKER_GROUPS, walkers)
-    group_of = np.broadcast_to(np.arange(walkers) * groups // walkers, bin_of.shape)
-    label = group_of * width + bin_of
-    counts = np.bincount(label.ravel() if counted is None else label[counted], minlength=groups * width)
-    counts = counts.reshape(groups, width)
-    observed = counts.sum(axis=0) / max(counts.sum(), 1)
-    shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
-    # The mean of |x| for a normal x is sqrt(2/π) times its standard deviation.
-    errors = shares.std(axis=0, ddof=1) / math.sqrt(groups) if groups > 1 else np.full(width, np.nan)
-    area = math.prod(one[1] - one[0] for one in edges)
-    return DensityComparison(
-        total_variation=float(np.abs(observed - expected).sum() / 2),
-        sampling_floor=float(math.sqrt(2 / math.pi) * errors.sum() / 2),
-        outside=float(observed[-1]) if counted is None else 1 - float(counted.mean()),
-        x1_edges=edges[0],
-        x2_edges=edges[1] if len(edges) > 1 else np.zeros(0),
-        histogram=observed[:-1].reshape(-1, len(edges[0]) - 1) / area,
-    )
+        return DensityComparison.of_bins(bin_of, np.append(expected, 0.0), edges)
 
 
 @dataclass(frozen=True)
 class _Block:
-    """The terms of U that couple some states, over these states' part of the box.
-
-    They stand in the unit of ε; states and symbols are those of k states, in the order of the state vector,
-    and `nodes` are Gauss–Legendre nodes along each of them.
-    """
+    """The terms of U, in the unit of ε, that couple some states, over these states' part of the box."""
 
     expression: sympy.Expr
     states: tuple[int, ...]
@@ -199,37 +192,24 @@ class _Block:
     @cached_property
     def log_integral(self) -> float:
         """Log ∫ exp(-U/ε) over the block's part of the box."""
-        if len(self.states) > 1:
-            fine, coarse = (self._log_integral_tensor(count) for count in (self.nodes, 3 * self.nodes // 4))
-            _check_convergence(abs(fine - coarse))
-            return fine
+        fine, coarse = (self._log_integral(count) for count in (self.nodes, 3 * self.nodes // 4))
+        if not abs(fine - coarse) <= QUADRATURE_TOLERANCE:
+            raise NumericalFailure(
+                f"the integral of exp(-U/ε) has not converged (relative error {abs(fine - coarse):.1e}); take"
+                " more nodes or a smaller box"
+            )
+        return fine
 
-        def value(x: float) -> float:
-            return float(self.exponent(np.array([[x]]))[0])
-
-        lower, upper = self.box[0]
-        grid = np.linspace(lower, upper, SCAN_POINTS)
-        values = self.exponent(grid[None])
-        lowest = _lowest_inside(values)
-        # A narrow well between the nodes of the first rule would be overlooked: tell where the wells are.
-        inside = np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] < values[2:])) + 1
-        wells = []
-        for index in inside[np.argsort(values[inside])[:MOST_WELLS]]:
-            between = (grid[index - 1], grid[index + 1])
-            found = scipy.optimize.minimize_scalar(value, bounds=between, options={"xatol": 1e-12})
-            wells.append(float(found.x))
-            lowest = min(lowest, float(found.fun))
-        total, error = scipy.integrate.quad(
-            lambda x: math.exp(lowest - value(x)), lower, upper,
-            points=wells or None, limit=500, epsabs=0.0, epsrel=1e-12, full_output=1,
-        )[:2]  # fmt: skip
-        _check_convergence(error / total if total > 0 else math.inf)
-        return math.log(total) - lowest
-
-    def _log_integral_tensor(self, count: int) -> float:
-        rules = [_gauss_legendre(bounds, count) for bounds in self.box]
+    def _log_integral(self, count: int) -> float:
+        # A narrow well of a single state must not fall between the nodes.
+        panels = PANELS if len(self.states) == 1 else 1
+        rules = [_gauss_legendre(bounds, count, panels) for bounds in self.box]
         values = self.exponent(np.stack(np.meshgrid(*(rule[0] for rule in rules), indexing="ij")))
-        lowest = _lowest_inside(values)
+        lowest = float(values.min())
+        if values[(slice(1, -1),) * values.ndim].min() > lowest:
+            raise NumericalFailure(
+                "the quasipotential is lowest at the rim of the box; exp(-U/ε) peaks there"
+            )
         density = np.exp(lowest - values)
         for _, weights in reversed(rules):
             density = density @ weights
@@ -257,10 +237,7 @@ def _split_into_blocks(
     box: np.ndarray,
     nodes: int,
 ) -> tuple[float, list[_Block]]:
-    """Split U into a constant, in the unit of ε, and blocks that have no state in common.
-
-    A state that U does not hold is a block by itself.
-    """
+    """U as a constant, in the unit of ε, and blocks without common states; one not in U is a block."""
     if not 0 < intensity < math.inf:
         raise ValueError(f"the noise intensity ({intensity}) must be positive")
     constant, groups = 0.0, [({symbol}, sympy.S.Zero) for symbol in symbols]
@@ -293,26 +270,12 @@ def _split_into_blocks(
     return constant, blocks
 
 
-def _gauss_legendre(bounds: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _gauss_legendre(bounds: np.ndarray, count: int, panels: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights, so many in each of some equal panels."""
     nodes, weights = scipy.special.roots_legendre(count)
-    half = (bounds[1] - bounds[0]) / 2
-    return bounds[0] + half * (nodes + 1), half * weights
-
-
-def _lowest_inside(values: np.ndarray) -> float:
-    """Smallest value; refused where it lies at the rim, as for a formula that falls towards -∞ there."""
-    lowest = float(values.min())
-    if values[(slice(1, -1),) * values.ndim].min() > lowest:
-        raise NumericalFailure("the quasipotential is lowest at the rim of the box; exp(-U/ε) peaks there")
-    return lowest
-
-
-def _check_convergence(error: float) -> None:
-    if not error <= QUADRATURE_TOLERANCE:
-        raise NumericalFailure(
-            f"the integral of exp(-U/ε) has not converged (relative error {error:.1e}); take more nodes or"
-            " a smaller box"
-        )
+    edges = np.linspace(*bounds, panels + 1)
+    half = (edges[1] - edges[0]) / 2
+    return (edges[:-1, None] + half * (nodes + 1)).ravel(), np.tile(half * weights, panels)
 
 
 def normalisation_bessel(
@@ -382,15 +345,16 @@ def normalisation_bessel(
     return float(along * across * np.exp(exponent))
 
 
-def normalisation_quadrature(
+def marginal_density(
     quasipotential: sympy.Expr,
     symbols: Sequence[sympy.Symbol],
     *,
     intensity: float,
     box: np.ndarray,
+    points: int = 201,
     nodes: int = 128,
-) -> float:
-    """Z over a box by quadrature, ``∫ exp(-U/ε) dx``.
+) -> StationaryDensity:
+    """The density of the first two states, or of the only one, the others integrated out; with Z of all.
 
     Parameters
     ----------
@@ -402,14 +366,11 @@ def normalisation_quadrature(
         ε, in the unit of U.
     box
         Shape ``(d, 2)``, in the states' units. For Z over all of space it must hold all of the density.
+    points
+        Grid points along each of the two.
     nodes
-        Gauss–Legendre nodes along each state of a block of two or three; a state by itself is integrated
-        adaptively.
-
-    Returns
-    -------
-    float
-        Z, in the product of the states' units.
+        Gauss–Legendre nodes along each state of a block of two or three, and in each of the panels of a state
+        by itself.
 
     Raises
     ------
@@ -420,45 +381,12 @@ def normalisation_quadrature(
         quadrature has not converged.
     """
     constant, blocks = _split_into_blocks(quasipotential, symbols, intensity=intensity, box=box, nodes=nodes)
-    return float(np.exp(sum(block.log_integral for block in blocks) - constant / intensity))
-
-
-def marginal_density(
-    quasipotential: sympy.Expr,
-    symbols: Sequence[sympy.Symbol],
-    *,
-    intensity: float,
-    box: np.ndarray,
-    plane: tuple[int, ...] | None = None,
-    points: int = 201,
-    nodes: int = 128,
-) -> StationaryDensity:
-    """The density on a plane of two states, ``∫ Z⁻¹ exp(-U/ε)`` over the others within a box, or of one.
-
-    Parameters
-    ----------
-    quasipotential, symbols, intensity, box, nodes
-        As for `normalisation_quadrature`.
-    plane
-        Indices of the two states, by default of the first two; of a single state there is but ``(0,)``.
-    points
-        Grid points along each.
-
-    Raises
-    ------
-    ValueError
-        When ε is not positive, or `plane` does not name two of the states.
-    NumericalFailure
-        As `normalisation_quadrature`.
-    """
-    shown = min(len(symbols), 2)
-    plane = tuple(range(shown)) if plane is None else plane
-    if len(set(plane)) != shown or not set(plane) <= set(range(len(symbols))):
-        raise ValueError(f"{plane} are not two of {len(symbols)} states")
-    _, blocks = _split_into_blocks(quasipotential, symbols, intensity=intensity, box=box, nodes=nodes)
+    total = float(np.exp(sum(block.log_integral for block in blocks) - constant / intensity))
+    plane = tuple(range(min(len(symbols), 2)))
     axes = {state: np.linspace(box[state][0], box[state][1], points) for state in plane}
-    if shown == 1:
-        return StationaryDensity(plane, intensity, axes[0], np.zeros(0), blocks[0].marginal(axes)[None])
+    if len(plane) == 1:
+        values = blocks[0].marginal(axes)[None]
+        return StationaryDensity(plane, intensity, axes[0], np.zeros(0), values, total)
     values = np.ones((points, points))
     for block in blocks:
         kept = [state for state in plane if state in block.states]
@@ -466,5 +394,5 @@ def marginal_density(
         if len(kept) == 2:
             values = values * density.T
         elif kept:
-            values = values * (density[None, :] if kept[0] == plane[0] else density[:, None])
-    return StationaryDensity(plane, intensity, axes[plane[0]], axes[plane[1]], values)
+            values = values * (density[None, :] if kept[0] == 0 else density[:, None])
+    return StationaryDensity(plane, intensity, axes[0], axes[1], values, total)

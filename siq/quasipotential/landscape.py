@@ -134,23 +134,11 @@ def least_over_wells(values: np.ndarray) -> np.ndarray:
 
 
 def heights_of_attractors(barriers: np.ndarray) -> np.ndarray:
-    """U at the attractors from the barriers between them.
+    """U at the attractors, shape ``(k,)``, the lowest being zero, from the barriers between them.
 
-    Parameters
-    ----------
-    barriers
-        Shape ``(k, k)``: the lowest barrier of U on the way from i to j in one step, infinite where there
-        is none.
-
-    Returns
-    -------
-    numpy.ndarray
-        Shape ``(k,)``, the lowest being zero.
-
-    Raises
-    ------
-    NumericalFailure
-        When transitions do not connect the attractors, or there are too many of them.
+    The barriers, ``(k, k)``, are the lowest of U on the way from i to j in one step, infinite where there is
+    none. It fails (`NumericalFailure`) when they do not connect the attractors, or there are too many of
+    them.
     """
     count = len(barriers)
     if count > MOST_WELLS:

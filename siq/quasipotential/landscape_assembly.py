@@ -33,11 +33,11 @@ from siq.quasipotential.landscape import (
     NoLandscape,
     heights_of_attractors,
 )
-from siq.quasipotential.path_chains import evenly
+from siq.quasipotential.path_chains import MinimumActionPath, evenly
 from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.refinement import RefinementOptions
 from siq.quasipotential.transitions import Transition, position_standard_errors, transitions, ways_out
-from siq.quasipotential.wells import Depth, Well, WellOptions, local_well, surveyed
+from siq.quasipotential.wells import Well, WellOptions, local_well
 from siq.remarks import Remark, sentence
 from siq.systems.basins import follow
 from siq.systems.cards import load_system
@@ -93,16 +93,11 @@ def find_landscape(
 
     Parameters
     ----------
-    found
-        The identified f with its uncertainty.
-    portrait
-        Attractors, saddles and basins of f; see `siq.systems.phase_portrait.phase_portrait`.
-    wells
-        V about the attractors as refinement found it; by default the local route finds it here.
-    certificate
-        Of these wells.
-    options
-        Of the local route.
+    found, portrait
+        The identified f with its uncertainty, and its attractors, saddles and basins.
+    wells, certificate
+        V about the attractors as refinement found it, and its certificate; by default the local route finds V
+        here, by the options.
     noise
         That drives the system, where it is known.
     seed
@@ -120,7 +115,7 @@ def find_landscape(
             for well in wells
             if np.abs((well.attractor - one.position) / width).max() < ATTRACTOR_MATCH_TOLERANCE
         ]
-        kept.append(surveyed(given[0], found.dynamics, portrait, index) if given else None)
+        kept.append(given[0].surveyed(found.dynamics, portrait, index) if given else None)
         if not given:
             remarks.append(Remark("quasipotential.no_refined_formula", {"place": _place(one.position)}))
     ways = transitions(found, ways_out(found.dynamics, portrait), kept)
@@ -130,24 +125,10 @@ def find_landscape(
 def landscape_from_equations(
     system: str | Path | Dynamics, settings: EquationSettings | None = None, *, formulas: bool = True
 ) -> Landscape:
-    """The landscape of given equations: no recordings, no sampling, no training.
+    """The landscape of given equations; see `siq.Landscape.from_equations`.
 
-    Parameters
-    ----------
-    system
-        A system card, or f and D with their domain.
-    settings
-        Of all steps.
-    formulas
-        Whether U is written as a formula. Barriers and times follow from the paths alone, which takes a small
-        part of the time.
-
-    Raises
-    ------
-    InputError
-        For a card that cannot be read, or a system that has no quasipotential.
-    NoLandscape
-        When it has no attractor in its domain.
+    Without `formulas` U is not written as a formula: barriers and times follow from the paths alone, which
+    takes a small part of the time.
     """
     system, settings = usable_system(system), settings or EquationSettings()
     many = system.dimension > MOST_SEARCHED
@@ -175,28 +156,29 @@ def landscape_from_equations(
         remarks.append(Remark("quasipotential.too_many_states", {"states": system.dimension}))
     elif formulas and points:
         draw, seed = generator(settings.seed, Purpose.LANDSCAPE), settings.seed
-        lowest = [_lowest(ways, index) for index in range(points)]
+        # Of each well the way out with the least action.
+        known = sorted(
+            (way for way in ways if way.path), key=lambda way: way.path.action if way.path else 0.0
+        )
+        lowest = [next((way for way in known if way.start == index), None) for index in range(points)]
         portrait = _with_states_along_paths(system, portrait, lowest, draw)
         wells = [
             _local_well(
                 system, portrait, index, settings.refinement, seed, remarks,
-                depth=None if way is None or way.path is None else Depth(
-                    way.saddle, way.path.uphill.points, way.path.uphill.values / 2, way.path.uphill.momenta
-                ),
+                saddle=None if way is None else way.saddle, path=None if way is None else way.path,
             )
             for index, way in enumerate(lowest)
         ]  # fmt: skip
         sought = [well for well in wells if well is not None]
         boxes = [np.stack([well.points.min(axis=0), well.points.max(axis=0)], axis=1) for well in sought]
         unseen = [spread_evenly(box, UNSEEN_STATES, generator=draw) for box in (system.box, *boxes)]
-        depths = [np.inf if way is None or way.path is None else way.path.uphill.action / 2 for way in lowest]
+        depths = [np.inf if way is None or way.path is None else way.path.action / 2 for way in lowest]
         evidence = Evidence(
             found, portrait, np.concatenate(unseen), options=settings.certificate, seed=seed,
             references=references_about(system, portrait, depths=depths, seed=seed),
         )  # fmt: skip
         certificate = certify(sought, evidence)
-        caustics = caustics_below(system, sought, portrait, certificate.error, seed=seed)
-        remarks += [Remark("quasipotential.reason", {"reason": one}) for one in caustics]
+        remarks += caustics_below(system, sought, portrait, certificate.error, seed=seed)
     wells += [None] * len(portrait.cycles)
     noises = settings.landscape.noise_intensities
     return _assembled(
@@ -306,11 +288,14 @@ def _local_well(
     seed: int,
     remarks: list[Remark],
     *,
-    depth: Depth | None = None,
+    saddle: Equilibrium | Cycle | None = None,
+    path: MinimumActionPath | None = None,
 ) -> Well | None:
     """V about one attractor; a remark where none was found."""
     try:
-        return local_well(dynamics, portrait, index, options=options or WellOptions(), seed=seed, depth=depth)
+        return local_well(
+            dynamics, portrait, index, options=options or WellOptions(), seed=seed, saddle=saddle, path=path
+        )
     except NumericalFailure as error:
         values = {"place": _place(portrait.attractors[index].position), "reason": str(error)}
         remarks.append(Remark("quasipotential.no_formula", values))
@@ -319,12 +304,6 @@ def _local_well(
 
 def _place(position: np.ndarray) -> list[float]:
     return [float(value) for value in position.round(4)]
-
-
-def _lowest(ways: Sequence[Transition], index: int) -> Transition | None:
-    """The way out of a well with the least action, None where there is none."""
-    mine = [way for way in ways if way.start == index and way.path is not None]
-    return min(mine, key=lambda way: way.path.uphill.action if way.path else np.inf, default=None)
 
 
 def _with_states_along_paths(
@@ -336,8 +315,8 @@ def _with_states_along_paths(
         if way is None or way.path is None or system.dimension == 1:
             continue
         extent = np.linalg.inv(np.linalg.cholesky(hessian_at(system, one.position)))
-        extent *= np.sqrt(way.path.uphill.action)
-        along = evenly(way.path.uphill.points, STATES_ALONG_PATH)
+        extent *= np.sqrt(way.path.action)
+        along = evenly(way.path.points, STATES_ALONG_PATH)
         starts = [along + share * draw.standard_normal(along.shape) @ extent for share in PATH_NEIGHBOURHOOD]
         ways = follow(system, np.concatenate(starts), portrait.attractors, box=portrait.box)
         center = portrait.attractors[index].position

@@ -15,7 +15,7 @@ compared: of the D of both no more may differ than the errors of one that was es
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -26,11 +26,10 @@ from siq.errors import InputError, NumericalFailure
 from siq.inference.field_estimate import STANDARD_ERRORS, FieldEstimate
 from siq.numerics.files import whole_file
 from siq.numerics.text import place_text
-from siq.quasipotential.characteristics import adapted_fan, lowest_sheet, value_near
+from siq.quasipotential.characteristics import adapted_fan
 from siq.quasipotential.landscape import Landscape, heights_of_attractors, least_over_wells
 from siq.quasipotential.paths import minimum_action_path
 from siq.quasipotential.rates import NoiseStrength, mean_residence_time
-from siq.quasipotential.wells import Well
 from siq.remarks import Remark, sentence
 from siq.systems.cycles import Cycle
 from siq.systems.diffusion import Diffusion
@@ -102,6 +101,34 @@ class ReferenceLandscape:
         """The global U on the mesh, shape ``(n,)``."""
         return least_over_wells(self.mesh + self.heights[:, None])
 
+    @property
+    def level(self) -> float:
+        """The level below which landscapes are compared by default: somewhat above the highest saddle."""
+        tops = self.heights + self.barriers
+        return float(OVERALL_LEVEL * tops[np.isfinite(tops)].max(initial=0.0))
+
+    @classmethod
+    def missing(cls, dimension: int, reason: str) -> ReferenceLandscape:
+        """An empty reference, with the reason why there is none."""
+        of_none, nothing, none = np.zeros((0, dimension)), np.zeros(0), np.zeros((0, 0))
+        return cls(of_none, of_none, none, none, nothing, nothing, nothing, reason)
+
+    def write(self, path: str | Path) -> None:
+        """Write the references as a NumPy archive of plain arrays, whole or not at all."""
+        arrays = {field.name: getattr(self, field.name) for field in fields(self)}
+        with whole_file(path) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+
+    @classmethod
+    def read(cls, path: str | Path) -> ReferenceLandscape:
+        """Read what `write` wrote, or refuse the file with an `InputError`."""
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                arrays = {name: archive[name] for name in archive.files}
+                return cls(**arrays | {"reason": str(arrays["reason"])})
+        except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile):
+            raise InputError(path, "", "it is no reference landscape", "make it again") from None
+
 
 def reference_landscape(
     dynamics: Dynamics,
@@ -116,12 +143,8 @@ def reference_landscape(
 
     Parameters
     ----------
-    dynamics
-        The exact f.
-    portrait
-        Its attractors and saddles.
-    box
-        Shape ``(d, 2)``: the region of interest.
+    dynamics, portrait, box
+        The exact f, its attractors and saddles, and the region of interest, shape ``(d, 2)``.
     reach
         Level up to which curves are followed, as a share of each well's lowest barrier.
     generator
@@ -161,7 +184,7 @@ def reference_landscape(
         )
         for one, level in zip(attractors, levels, strict=True)
     ]  # fmt: skip
-    sheets = [lowest_sheet(fan) for fan in fans]
+    sheets = [fan.lowest_sheet() for fan in fans]
     if dynamics.dimension <= 2:
         axes = [np.linspace(low, high, GRID_POINTS) for low, high in box]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dynamics.dimension)
@@ -170,7 +193,7 @@ def reference_landscape(
         points = known[generator.permutation(len(known))[:SCATTERED_POINTS]]
     values = np.stack(
         [
-            2 * value_near(fan, points, sheet=sheet, distance=CURVE_DISTANCE)
+            2 * fan.value_near(points, sheet=sheet, distance=CURVE_DISTANCE)
             for fan, sheet in zip(fans, sheets, strict=True)
         ]
     )
@@ -196,81 +219,20 @@ def reference_landscape(
     return ReferenceLandscape(attractors, points, values, on_mesh, barriers, mesh_barriers, heights)
 
 
-def no_reference(dimension: int, reason: str) -> ReferenceLandscape:
-    """An empty reference, with the reason why there is none."""
-    of_none, nothing = np.zeros((0, dimension)), np.zeros(0)
-    return ReferenceLandscape(
-        of_none, of_none, np.zeros((0, 0)), np.zeros((0, 0)), nothing, nothing, nothing, reason
-    )
-
-
-def write_reference(path: str | Path, reference: ReferenceLandscape) -> None:
-    """Write references as a NumPy archive of plain arrays, whole or not at all."""
-    arrays = {field.name: getattr(reference, field.name) for field in fields(reference)}
-    with whole_file(path) as partial, partial.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
-
-
-def read_reference(path: str | Path) -> ReferenceLandscape:
-    """Read what `write_reference` wrote, or refuse the file with an `InputError`."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-            return ReferenceLandscape(**arrays | {"reason": str(arrays["reason"])})
-    except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile):
-        raise InputError(path, "", "it is no reference landscape", "make it again") from None
-
-
-@dataclass(frozen=True)
-class ErrorInRegion:
-    """One estimate of U against the reference in one region.
-
-    Attributes
-    ----------
-    region
-        In words.
-    points
-        Number of points of the region.
-    covered
-        Share of them at which the estimate says something.
-    error
-        Relative L2 error of U there.
-    error_everywhere
-        The same of the formula at every point, whether it is to be believed or not; NaN for other estimates.
-    """
-
-    region: str
-    points: int
-    covered: float
-    error: float
-    error_everywhere: float = float("nan")
-
-
-def _compare_wells(reference: ReferenceLandscape, wells: Mapping[int, Well]) -> list[ErrorInRegion]:
-    """Formulas of wells against characteristics, each below a share of its barrier.
-
-    They have the index of the reference's attractor. A well without a formula counts as not covered.
-    """
-    rows = []
-    for index in range(len(reference.attractors)):
-        inside = reference.below(index, WELL_SHARE)
-        exact = reference.characteristics[index][inside]
-        values, everywhere = np.full(len(exact), np.nan), np.nan
-        if index in wells:
-            x = reference.points[inside]
-            values = 2 * wells[index].known_values(x)
-            everywhere = _relative_l2(2 * wells[index].values(x), exact)
-        rows.append(_compared(_well_region(index), values, exact, everywhere))
-    return rows
-
-
 def compare_estimate(
     reference: ReferenceLandscape, potential: Potential, *, below: float | None
-) -> list[ErrorInRegion]:
+) -> list[dict[str, object]]:
     """One estimate of U: in each well from its attractor upwards, and over all wells below a level.
 
     A constant means nothing to U. In a well the estimate is zero at the attractor; over all wells it is
     shifted by the median of its difference, so that no single point decides.
+
+    Returns
+    -------
+    list of dict
+        Rows with the columns ``region points covered error error_everywhere``: the region in words and its
+        number of points; the share of them at which the estimate says something, and its relative L2 error
+        there; and that of the formula at every point, whether it is to be believed or not, NaN of others.
     """
     rows = []
     values = potential(reference.points)
@@ -279,69 +241,63 @@ def compare_estimate(
         at = float(potential(attractor[None])[0])
         exact = reference.characteristics[index][inside]
         rows.append(_compared(_well_region(index), values[inside] - at, exact))
-    rows.append(_compare_overall(reference, values, below=below, shifted=True))
+    rows.append(_compare_overall(reference.values, values, below or reference.level, shifted=True))
     return rows
-
-
-def _compare_overall(
-    reference: ReferenceLandscape, values: np.ndarray, *, below: float | None, shifted: bool = False
-) -> ErrorInRegion:
-    """Values of U at the reference's points, over all wells below a level."""
-    exact = reference.values
-    level = overall_level(reference) if below is None else below
-    inside = np.nan_to_num(exact, nan=np.inf) < level
-    own = values[inside]
-    if shifted:
-        own = own - np.nanmedian(own - exact[inside])
-    return _compared(f"U < {level:.4g}", own, exact[inside])
 
 
 def compare_landscape(
     reference: ReferenceLandscape, landscape: Landscape, *, below: float | None
-) -> list[ErrorInRegion]:
-    """Local formulas, their minimum over all wells below a level, and barriers, against a reference."""
+) -> list[dict[str, object]]:
+    """Local formulas, their minimum over all wells below a level, and barriers; rows as `compare_estimate`.
+
+    A well without a formula counts as not covered.
+    """
     width, pairs = np.ptp(reference.points, axis=0), dict[int, int]()
     for place, one in enumerate(landscape.attractors):
         distance = np.abs((reference.attractors - one.position) / width).max(axis=1)
         if distance.min() < ATTRACTOR_MATCH_TOLERANCE:
             pairs[int(np.argmin(distance))] = place
-    local = {index: well for index, place in pairs.items() if (well := landscape.wells[place]) is not None}
-    rows = _compare_wells(reference, local)
+    rows = []
+    for index in range(len(reference.attractors)):
+        inside = reference.below(index, WELL_SHARE)
+        exact = reference.characteristics[index][inside]
+        values, everywhere = np.full(len(exact), np.nan), np.nan
+        if index in pairs and (well := landscape.wells[pairs[index]]) is not None:
+            x = reference.points[inside]
+            values = 2 * well.known_values(x)
+            everywhere = _relative_l2(2 * well.values(x), exact)
+        rows.append(_compared(_well_region(index), values, exact, everywhere))
     if (whole := landscape.global_quasipotential) is not None:
-        rows.append(_compare_overall(reference, whole(reference.points), below=below))
+        rows.append(_compare_overall(reference.values, whole(reference.points), below or reference.level))
     for index, place in pairs.items():
         barriers = [way.barrier for way in landscape.transitions if way.start == place]
         lowest = min((one for one in barriers if np.isfinite(one) and one), default=np.nan)
         error = float(abs(lowest / reference.barriers[index] - 1))
-        rows.append(ErrorInRegion(f"barrier from A{index + 1}", 1, float(np.isfinite(error)), error))
+        rows.append(_compared_barrier(index, error, covered=float(np.isfinite(error))))
     return rows
 
 
-def compare_mesh(reference: ReferenceLandscape, *, below: float | None) -> list[ErrorInRegion]:
+def compare_mesh(reference: ReferenceLandscape, *, below: float | None) -> list[dict[str, object]]:
     """The reference's own mesh against its characteristics, and its barriers against the least action."""
     errors = np.abs(reference.mesh_barriers / reference.barriers - 1)
-    return [
-        _compare_overall(reference, reference.mesh_values, below=below),
-        *(
-            ErrorInRegion(f"barrier from A{index + 1}", 1, 1.0, float(one))
-            for index, one in enumerate(errors)
-        ),
-    ]
+    overall = _compare_overall(reference.values, reference.mesh_values, below or reference.level)
+    return [overall, *(_compared_barrier(index, float(one)) for index, one in enumerate(errors))]
 
 
-def compare_with_mesh(values: np.ndarray, mesh: np.ndarray, *, below: float) -> ErrorInRegion:
+def compare_with_mesh(values: np.ndarray, mesh: np.ndarray, *, below: float) -> dict[str, object]:
     """An estimate of U against a mesh that is known up to a constant, below a level above its minimum."""
-    exact = mesh - np.nanmin(mesh)
-    inside = np.nan_to_num(exact, nan=np.inf) < below
-    own, exact = values[inside], exact[inside]
-    error = _relative_l2(own - np.median(own - exact), exact)
-    return ErrorInRegion(f"U < {below:.4g}", int(inside.sum()), 1.0, error)
+    return _compare_overall(mesh - np.nanmin(mesh), values, below, shifted=True)
 
 
-def overall_level(reference: ReferenceLandscape) -> float:
-    """The level below which landscapes are compared by default: somewhat above the highest saddle."""
-    tops = reference.heights + reference.barriers
-    return float(OVERALL_LEVEL * tops[np.isfinite(tops)].max(initial=0.0))
+def _compare_overall(
+    exact: np.ndarray, values: np.ndarray, level: float, *, shifted: bool = False
+) -> dict[str, object]:
+    """Values of U over all wells below a level."""
+    inside = np.nan_to_num(exact, nan=np.inf) < level
+    own = values[inside]
+    if shifted:
+        own = own - np.nanmedian(own - exact[inside])
+    return _compared(f"U < {level:.4g}", own, exact[inside])
 
 
 def _relative_l2(values: np.ndarray, exact: np.ndarray) -> float:
@@ -354,12 +310,18 @@ def _well_region(index: int) -> str:
     return f"A{index + 1}, below {WELL_SHARE:g} of its barrier"
 
 
+def _compared_barrier(index: int, error: float, *, covered: float = 1.0) -> dict[str, object]:
+    row = {"region": f"barrier from A{index + 1}", "points": 1, "covered": covered}
+    return row | {"error": error, "error_everywhere": np.nan}
+
+
 def _compared(
     region: str, values: np.ndarray, exact: np.ndarray, everywhere: float = np.nan
-) -> ErrorInRegion:
+) -> dict[str, object]:
     known = np.isfinite(values)
-    covered = float(known.mean()) if len(values) else 0.0
-    return ErrorInRegion(region, len(exact), covered, _relative_l2(values[known], exact[known]), everywhere)
+    covered, error = float(known.mean()) if len(values) else 0.0, _relative_l2(values[known], exact[known])
+    row = {"region": region, "points": len(exact), "covered": covered}
+    return row | {"error": error, "error_everywhere": everywhere}
 
 
 COLUMNS = (
@@ -370,20 +332,7 @@ COLUMNS = (
 
 
 def compare_with(equations: Landscape, learned: Landscape, *, noise: float | None = None) -> pd.DataFrame:
-    """The table of `siq.Landscape.compare_with`.
-
-    Parameters
-    ----------
-    equations, learned
-        The landscapes by either.
-    noise
-        ε of mean times; None for none.
-
-    Raises
-    ------
-    ValueError
-        When the states are not the same, or D is not.
-    """
+    """The table of `siq.Landscape.compare_with`."""
     table = pd.DataFrame(
         differences(equations, learned, noises=() if noise is None else (noise,)), columns=list(COLUMNS)
     )
@@ -401,22 +350,39 @@ def differences(
     ``quantity`` is ``barrier``, ``prefactor`` or ``mean time``; of a row that is missed it is empty, and
     ``note`` says what is missing. Numbers that are not known are NaN.
 
-    Parameters
-    ----------
-    equations, trajectories
-        The landscapes; the equations have a domain.
-    noises
-        ε for which mean times are compared.
-
-    Raises
-    ------
-    ValueError
-        When the states are not the same.
+    The equations have a domain; `noises` are the ε for which mean times are compared. Landscapes of other
+    states are refused with a `ValueError`.
     """
     if equations.dynamics.states != trajectories.dynamics.states:
         raise ValueError("the landscapes are of different states")
     pairs = _matched_attractors(equations, trajectories)
-    rows = _differences_of_ways(equations, trajectories, pairs)
+    back = {place: index for index, place in pairs.items()}
+
+    def named(start: int | None, end: int | None) -> str:
+        first = "a further state" if start is None else f"A{start + 1}"
+        last = "outside" if end is None else "a further state" if end < 0 else f"A{end + 1}"
+        return f"{first} to {last}"
+
+    # Barrier and prefactor of every way out, first those of the equations, then what these have not.
+    left, rows = list(trajectories.transitions), []
+    for way in equations.transitions:
+        item = named(way.start, way.end)
+        ends = (pairs.get(way.start), None if way.end is None else pairs.get(way.end, -1))
+        same = [one for one in left if (one.start, one.end) == ends]
+        if not same:
+            rows.append(_difference(item, "barrier", way.barrier, note=sentence(NOT_SHOWN)))
+            continue
+        nearest = min(same, key=lambda one: float(np.linalg.norm(one.place - way.place)))
+        left = [one for one in left if one is not nearest]
+        rows.append(_difference(item, "barrier", way.barrier, nearest.barrier, nearest.error))
+        law, learned = (np.nan if one.rate is None else _known(one.rate.prefactor) for one in (way, nearest))
+        error = np.nan if nearest.rate is None else learned * _known(nearest.rate.prefactor_error)  # of ln K
+        note = "; ".join(way.notes) if np.isnan(law) else ""
+        rows.append(_difference(item, "prefactor", law, learned, error, note=note))
+    for way in left:
+        item = named(back.get(way.start), None if way.end is None else back.get(way.end, -1))
+        further = Remark("quasipotential.not_of_the_equations")
+        rows.append(_difference(item, "barrier", np.nan, way.barrier, note=sentence(further)))
     for index, one in enumerate(equations.attractors):
         for noise in noises:
             # The law is the same for both, so that its error is not counted.
@@ -483,40 +449,6 @@ def _matched_attractors(equations: Landscape, trajectories: Landscape) -> dict[i
     return {index: place for index, (_, place) in nearest.items()}
 
 
-def _differences_of_ways(
-    equations: Landscape, trajectories: Landscape, pairs: Mapping[int, int]
-) -> list[dict[str, object]]:
-    """Barrier and prefactor of every way out, first those of the equations, then what these have not."""
-
-    def named(start: int | None, end: int | None) -> str:
-        first = "a further state" if start is None else f"A{start + 1}"
-        last = "outside" if end is None else "a further state" if end < 0 else f"A{end + 1}"
-        return f"{first} to {last}"
-
-    left, rows = list(trajectories.transitions), []
-    for way in equations.transitions:
-        item = named(way.start, way.end)
-        ends = (pairs.get(way.start), None if way.end is None else pairs.get(way.end, -1))
-        same = [one for one in left if (one.start, one.end) == ends]
-        if not same:
-            rows.append(_difference(item, "barrier", way.barrier, note=sentence(NOT_SHOWN)))
-            continue
-        distances = [float(np.linalg.norm(one.place - way.place)) for one in same]
-        own = same[int(np.argmin(distances))]
-        left = [one for one in left if one is not own]
-        rows.append(_difference(item, "barrier", way.barrier, own.barrier, own.error))
-        exact, found = (np.nan if one.rate is None else _known(one.rate.prefactor) for one in (way, own))
-        error = np.nan if own.rate is None else found * _known(own.rate.prefactor_error)  # that of ln K
-        note = "; ".join(way.notes) if np.isnan(exact) else ""
-        rows.append(_difference(item, "prefactor", exact, found, error, note=note))
-    back = {place: index for index, place in pairs.items()}
-    for own in left:
-        item = named(back.get(own.start), None if own.end is None else back.get(own.end, -1))
-        further = Remark("quasipotential.not_of_the_equations")
-        rows.append(_difference(item, "barrier", np.nan, own.barrier, note=sentence(further)))
-    return rows
-
-
 def _known(value: float | None) -> float:
     return np.nan if value is None else float(value)
 
@@ -524,10 +456,7 @@ def _known(value: float | None) -> float:
 def _check_same_noise(
     equations: Dynamics, trajectories: Dynamics, x: np.ndarray, *, found: FieldEstimate | None
 ) -> None:
-    """Refuse two landscapes whose D are not the same at states ``(n, d)``, and U with them.
-
-    The D of `found`, an identified f, may have been estimated and has errors then.
-    """
+    """Refuse two landscapes whose D are not the same at states ``(n, d)``, but for the errors of `found`."""
     one, other, d = equations.diffusion, trajectories.diffusion, equations.dimension
     # Unit vectors and their sums tell a symmetric matrix; in the unit of the noise, or states would differ.
     sides = np.array([np.eye(d)[[i, j]].sum(axis=0) for i, j in zip(*np.triu_indices(d), strict=True)])

@@ -17,13 +17,12 @@ import numpy as np
 
 from siq.data.two_states import DwellCount
 from siq.errors import InputError
-from siq.inference.field_estimate import Verdict
 from siq.numerics.files import whole_file
 from siq.quasipotential.certificate import Certificate
-from siq.quasipotential.formulas import basis_from_data, powers_to_data
+from siq.quasipotential.hamilton_jacobi import PowerBasis
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.occupancy import VisitTest
-from siq.quasipotential.path_chains import MinimumActionPath, TransitionPath
+from siq.quasipotential.path_chains import MinimumActionPath
 from siq.quasipotential.rates import EnergyLossPerCycle, EscapeRate, NoiseStrength
 from siq.quasipotential.transitions import Transition
 from siq.quasipotential.wells import Well
@@ -62,7 +61,22 @@ def landscape_data(landscape: Landscape) -> dict[str, Any]:
             )
         ],
         "transitions": [_transition_data(one) for one in landscape.transitions],
-        "visits": [_visits_data(one) for one in landscape.visits],
+        "visits": [
+            {
+                "well": one.well,
+                "visits": one.whole.visits,
+                "time": one.whole.time,
+                "counted": _number(one.whole.mean),
+                "lowest": one.whole.limits[0],
+                "highest": _number(one.whole.limits[1]),
+                "predicted": one.predicted,
+                "error": one.predicted * one.error,
+                "method": one.method,
+                "held_out": asdict(one.held_out),
+                "probability": one.probability,
+            }
+            for one in landscape.visits
+        ],
         "remarks": [one.as_data() for one in landscape.remarks],
     }
     if landscape.given:  # no other file could hold its certificate
@@ -72,7 +86,7 @@ def landscape_data(landscape: Landscape) -> dict[str, Any]:
 
 
 def _transition_data(one: Transition) -> dict[str, Any]:
-    rate, path = one.rate, None if one.path is None else one.path.uphill
+    rate, path = one.rate, one.path
     return {
         "start": one.start,
         "end": one.end,
@@ -90,7 +104,7 @@ def _transition_data(one: Transition) -> dict[str, Any]:
         "noise_leverage": one.leverage,
         "exponent": None if rate is None else rate.exponent,
         "uphill": None if path is None else path.points.tolist(),
-        "downhill": None if one.path is None else one.path.downhill.tolist(),
+        "downhill": None if path is None or path.downhill is None else path.downhill.tolist(),
         "path": None
         if path is None
         else {
@@ -104,22 +118,12 @@ def _transition_data(one: Transition) -> dict[str, Any]:
     } | ({"over_cycle": one.saddle.period} if isinstance(one.saddle, Cycle) else {})
 
 
-def _visits_data(one: VisitTest) -> dict[str, Any]:
-    lowest, highest = one.whole.limits
-    return {
-        "well": one.well, "visits": one.whole.visits, "time": one.whole.time,
-        "counted": _number(one.whole.mean), "lowest": lowest, "highest": _number(highest),
-        "predicted": one.predicted, "error": one.predicted * one.error, "method": one.method,
-        "held_out": asdict(one.held_out), "probability": one.probability,
-    }  # fmt: skip
-
-
 def _cycle_data(one: Cycle) -> dict[str, Any]:
     return {"period": one.period, "multipliers": _pairs(one.multipliers), "points": _rounded(one.points)}
 
 
 def _well_data(well: Well) -> dict[str, Any]:
-    return powers_to_data(well) | {
+    return well.powers | {
         "level": well.reach,
         "depth": well.level,
         "saddle": None if well.saddle is None else well.saddle.tolist(),
@@ -192,10 +196,21 @@ def landscape_from_data(data: Mapping[str, Any], dynamics: Dynamics) -> Landscap
         tuple(transitions),
         np.array([_known(one["height"]) for one in wells]),
         tuple(map(Remark.from_data, data["remarks"])),
-        _certificate_from_data(data.get("certificate")),
+        None if data.get("certificate") is None else Certificate.from_data(data["certificate"]),
         np.array(errors, dtype=float) if errors and None not in errors else None,
         None if data.get("noise") is None else NoiseStrength(**data["noise"]),
-        visits=tuple(_visits_from_data(one) for one in data.get("visits") or ()),
+        visits=tuple(
+            VisitTest(
+                one["well"],
+                DwellCount(**one["held_out"]),
+                DwellCount(one["visits"], one["time"]),
+                one["predicted"],
+                one["error"] / one["predicted"],
+                one["method"],
+                one["probability"],
+            )
+            for one in data.get("visits") or ()
+        ),
         given=bool(data.get("given")),
         parting=parting,
     )
@@ -206,12 +221,11 @@ def _transition_from_data(
 ) -> Transition:
     path, rate, kept = None, None, one["path"]
     if kept is not None:
-        uphill = MinimumActionPath(
+        path = MinimumActionPath(
             np.array(one["uphill"]), np.array(kept["momenta"]), np.array(kept["values"]),
-            one["minimum_action"], rivals=tuple(kept["rivals"]),
+            one["minimum_action"], rivals=tuple(kept["rivals"]), downhill=np.array(one["downhill"]),
             **{name: kept[name] for name in PATH_FIGURES},
         )  # fmt: skip
-        path = TransitionPath(uphill, np.array(one["downhill"]))
     if one["prefactor"] is not None:
         rate = EscapeRate(
             one["minimum_action"], one["prefactor"], one["exponent"],
@@ -226,35 +240,17 @@ def _transition_from_data(
     )  # fmt: skip
 
 
-def _visits_from_data(one: Mapping[str, Any]) -> VisitTest:
-    return VisitTest(
-        one["well"], DwellCount(**one["held_out"]), DwellCount(one["visits"], one["time"]), one["predicted"],
-        one["error"] / one["predicted"], one["method"], one["probability"],
-    )  # fmt: skip
-
-
 def _well_from_data(data: Mapping[str, Any], dynamics: Dynamics) -> Well | None:
     powers, d = data["V"], dynamics.dimension
     if powers is None:
         return None
     return Well(
-        dynamics, np.array(data["attractor"]), basis_from_data(powers, dynamics.symbols),
-        np.array(powers["coefficients"]), powers["depth"],
+        PowerBasis.from_data(powers, dynamics.symbols), np.array(powers["coefficients"]),
+        dynamics, np.array(data["attractor"]), powers["depth"],
         None if powers["saddle"] is None else np.array(powers["saddle"]), powers["residual"],
         np.array(powers["points"]).reshape(-1, d), powers["level"], powers["tolerance"],
         np.array(powers["elsewhere"]).reshape(-1, d),
     )  # fmt: skip
-
-
-def _certificate_from_data(data: Mapping[str, Any] | None) -> Certificate | None:
-    if data is None:
-        return None
-    tests = {
-        name: Verdict(_known(one["value"]), one["limit"], one["passed"], one["reason"])
-        for name, one in data["tests"].items()
-    }
-    error = np.inf if data["stated_error"] is None else data["stated_error"]
-    return Certificate(tests, error, data["reason"], data["scope"], data["tested_on"])
 
 
 def _complex(pairs: Sequence[Sequence[float]]) -> np.ndarray:

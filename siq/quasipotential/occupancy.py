@@ -38,7 +38,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise, product
 
 import numpy as np
-from scipy import sparse, stats
+from scipy import sparse, special, stats
 from scipy.sparse.linalg import splu
 
 from siq.data.preparation import joined
@@ -86,23 +86,66 @@ COMPARED_PLACES = 200  # at which distribution functions are compared
 MEAN_DISTANCE = 0.8687  # of Kolmogorov's statistic: √(π/2) ln 2
 
 
-@dataclass(frozen=True)
 class _CellProcess:
-    """The Markov jump process between the cells of a box.
+    """The Markov jump process between the cells of a box, of one or two states, that nothing leaves.
 
-    Attributes
-    ----------
-    points
-        Centres of the n cells, shape ``(n, d)``.
-    rates
-        Generator, sparse ``(n, n)``: row i holds the rates out of cell i, and minus their sum.
-    density
-        Invariant probability of each cell, shape ``(n,)``.
+    `points` are the centres of the n cells, ``(n, d)``; `rates` is the sparse generator, row i holding the
+    rates out of cell i; `density` are the invariant probabilities, ``(n,)``.
     """
 
-    points: np.ndarray
-    rates: sparse.csr_matrix
-    density: np.ndarray
+    def __init__(
+        self, dynamics: Dynamics, intensity: float, box: np.ndarray, *, cells: int | None = None
+    ) -> None:
+        dimension = dynamics.dimension
+        if dimension not in CELLS:
+            raise NumericalFailure("the Fokker–Planck operator is solved for one and two states only")
+        count = CELLS[dimension] if cells is None else cells
+        # A unit lower triangular change of states after which D has no mixed terms in the middle.
+        # With mixed terms it is the parallelogram's hull that is covered. A D(x) that was learned may be
+        # no covariance far from recordings: cells where that is so are left out.
+        shear, matrix = np.eye(dimension), dynamics.diffusion.at(box.mean(axis=1)[None])[0]
+        if dimension == 2 and abs(matrix[0, 1]) > 1e-12 * np.sqrt(matrix[0, 0] * matrix[1, 1]):
+            shear[1, 0] = matrix[0, 1] / matrix[0, 0]
+        corners = np.array(list(product(*box))) @ np.linalg.inv(shear).T
+        plain = np.array_equal(shear, np.eye(dimension))
+        sides = box if plain else np.stack([corners.min(axis=0), corners.max(axis=0)], axis=1)
+        axes = [low + (high - low) * (np.arange(count) + 0.5) / count for low, high in sides]
+        steps = (sides[:, 1] - sides[:, 0]) / count
+        y = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dimension)
+        inverse = np.linalg.inv(shear)
+
+        def tensors(points: np.ndarray) -> np.ndarray:
+            return np.asarray(inverse @ dynamics.diffusion.at(points @ shear.T) @ inverse.T)
+
+        floor = LEAST_NOISE * float(np.linalg.eigvalsh(tensors(y)).max())
+
+        def noise(points: np.ndarray) -> np.ndarray:
+            matrices = tensors(points)
+            levels, vectors = np.linalg.eigh(matrices)
+            if not (levels >= floor).all():  # nothing is weaker than the floor
+                matrices = np.einsum("nik,nk,njk->nij", vectors, np.maximum(levels, floor), vectors)
+            return 0.5 * intensity * matrices
+
+        def flow(points: np.ndarray) -> np.ndarray:
+            return np.asarray(dynamics.drift(points @ shear.T) @ inverse.T)
+
+        usable = np.linalg.eigvalsh(tensors(y))[:, 0] > floor
+        if not usable.any():
+            raise NumericalFailure(
+                "the noise does not reach every state: no Fokker–Planck operator is solved"
+            )
+        # The generator of the largest set of usable cells that are connected.
+        places = np.flatnonzero(usable)
+        inner = _rates(flow, noise, y, steps, count)[places][:, places]
+        _, piece = sparse.csgraph.connected_components(inner, directed=True, connection="strong")
+        largest = piece == np.argmax(np.bincount(piece))
+        places, inner = places[largest], inner[largest][:, largest]
+        rates = (inner - sparse.diags(np.asarray(inner.sum(axis=1)).ravel())).tocsr()
+        y, density = y[places], _invariant_density(rates)
+        tensor, drift = np.diagonal(noise(y), axis1=1, axis2=2), flow(y)
+        if float((density[:, None] * np.abs(drift) * steps / tensor).sum(axis=0).max()) > COARSE:
+            raise NumericalFailure("the noise is too weak for a grid: the wells are narrower than its cells")
+        self.points, self.rates, self.density = y @ shear.T, rates, density
 
     def last_visited(self, cores: np.ndarray, which: int) -> np.ndarray:
         """Probability that core `which` was the last of all that was visited: shape ``(n,)``.
@@ -126,64 +169,6 @@ class _CellProcess:
         others = ((cores >= 0) & (cores != which)).astype(float)
         flow = float(own @ (self.rates @ others))
         return float(own.sum() / flow) if flow > 0 else float("inf")
-
-
-def _cell_process(
-    dynamics: Dynamics, intensity: float, box: np.ndarray, *, cells: int | None = None
-) -> _CellProcess:
-    """The process between cells of a box that nothing leaves, with its invariant density.
-
-    In two states with mixed terms of D it is the parallelogram's hull that is covered. A formula of D that
-    was learned from recordings may be no covariance far from them: cells where that is so are left out. It
-    is refused (`NumericalFailure`) with more than two states, and where the noise is too weak for so few
-    cells along each state, or does not reach a state.
-    """
-    dimension = dynamics.dimension
-    if dimension not in CELLS:
-        raise NumericalFailure("the Fokker–Planck operator is solved for one and two states only")
-    count = CELLS[dimension] if cells is None else cells
-    # A unit lower triangular change of states after which D has no mixed terms in the middle.
-    shear, matrix = np.eye(dimension), dynamics.diffusion.at(box.mean(axis=1)[None])[0]
-    if dimension == 2 and abs(matrix[0, 1]) > 1e-12 * np.sqrt(matrix[0, 0] * matrix[1, 1]):
-        shear[1, 0] = matrix[0, 1] / matrix[0, 0]
-    corners = np.array(list(product(*box))) @ np.linalg.inv(shear).T
-    plain = np.array_equal(shear, np.eye(dimension))
-    sides = box if plain else np.stack([corners.min(axis=0), corners.max(axis=0)], axis=1)
-    axes = [low + (high - low) * (np.arange(count) + 0.5) / count for low, high in sides]
-    steps = (sides[:, 1] - sides[:, 0]) / count
-    y = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dimension)
-    inverse = np.linalg.inv(shear)
-
-    def tensors(points: np.ndarray) -> np.ndarray:
-        return np.asarray(inverse @ dynamics.diffusion.at(points @ shear.T) @ inverse.T)
-
-    floor = LEAST_NOISE * float(np.linalg.eigvalsh(tensors(y)).max())
-
-    def noise(points: np.ndarray) -> np.ndarray:
-        matrices = tensors(points)
-        levels, vectors = np.linalg.eigh(matrices)
-        if not (levels >= floor).all():  # nothing is weaker than the floor
-            matrices = np.einsum("nik,nk,njk->nij", vectors, np.maximum(levels, floor), vectors)
-        return 0.5 * intensity * matrices
-
-    def flow(points: np.ndarray) -> np.ndarray:
-        return np.asarray(dynamics.drift(points @ shear.T) @ inverse.T)
-
-    usable = np.linalg.eigvalsh(tensors(y))[:, 0] > floor
-    if not usable.any():
-        raise NumericalFailure("the noise does not reach every state: no Fokker–Planck operator is solved")
-    # The generator of the largest set of usable cells that are connected.
-    places = np.flatnonzero(usable)
-    inner = _rates(flow, noise, y, steps, count)[places][:, places]
-    _, piece = sparse.csgraph.connected_components(inner, directed=True, connection="strong")
-    largest = piece == np.argmax(np.bincount(piece))
-    places, inner = places[largest], inner[largest][:, largest]
-    rates = (inner - sparse.diags(np.asarray(inner.sum(axis=1)).ravel())).tocsr()
-    y, density = y[places], _invariant_density(rates)
-    tensor, drift = np.diagonal(noise(y), axis1=1, axis2=2), flow(y)
-    if float((density[:, None] * np.abs(drift) * steps / tensor).sum(axis=0).max()) > COARSE:
-        raise NumericalFailure("the noise is too weak for a grid: the wells are narrower than its cells")
-    return _CellProcess(y @ shear.T, rates, density)
 
 
 def _rates(
@@ -217,7 +202,7 @@ def _rates(
         z = np.clip(drift * h / spread, -STEEP, STEEP)
         rows += [left, right]
         columns += [right, left]
-        values += [spread / h**2 * _bernoulli(-z), spread / h**2 * _bernoulli(z)]
+        values += [spread / h**2 / special.exprel(-z), spread / h**2 / special.exprel(z)]  # B = 1/exprel
     if dimension == 2:
         for sign in (1, -1):
             low = index[:-1, :-1] if sign > 0 else index[:-1, 1:]
@@ -231,13 +216,6 @@ def _rates(
     return sparse.csr_matrix(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(len(y), len(y))
     )
-
-
-def _bernoulli(z: np.ndarray) -> np.ndarray:
-    """``z/(eᶻ - 1)``."""
-    small = np.abs(z) < 1e-6
-    with np.errstate(over="ignore"):
-        return np.where(small, 1 - z / 2, z / np.expm1(np.where(small, 1.0, z)))
 
 
 def _invariant_density(rates: sparse.csr_matrix) -> np.ndarray:
@@ -263,30 +241,16 @@ def _invariant_density(rates: sparse.csr_matrix) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Cores:
-    """The cores of wells: where ``(x - A)ᵀ M (x - A)``, U to the second order, is below a level.
-
-    Attributes
-    ----------
-    attractors
-        Shape ``(k, d)``.
-    hessians
-        M, of V: ``(k, d, d)``.
-    levels
-        Shape ``(k,)``.
-    """
+    """The cores of wells: where ``(x - A)ᵀ M (x - A)``, U to the second order, is below a level."""
 
     attractors: np.ndarray
     hessians: np.ndarray
     levels: np.ndarray
 
     def as_sampled(self, dynamics: Dynamics, intensity: float, step: float) -> _Cores:
-        """_Cores that a state meets all the time as often as it is seen in these at samples a step apart.
-
-        Between two samples a state may come into a core and leave it unseen. A random walk meets a boundary
-        as Brownian motion meets one that lies `OVERSHOOT` standard deviations of a step farther on (Chernoff;
-        Siegmund, Sequential Analysis, 1985): the cores are smaller by so much. The step is that along the
-        metric of the core, ``√(ε h tr(MD)/d)``.
-        """
+        """Cores that a state meets all the time as often as it is seen in these at samples a step apart."""
+        # A random walk meets a boundary as Brownian motion meets one that lies OVERSHOOT standard deviations
+        # of a step farther on (Chernoff; Siegmund, Sequential Analysis, 1985), √(ε h tr(MD)/d) in the metric.
         levels = []
         for place, hessian, level in zip(self.attractors, self.hessians, self.levels, strict=True):
             spread = np.trace(hessian @ dynamics.diffusion.at(place[None])[0]) / len(place)
@@ -306,50 +270,6 @@ class _Cores:
         return found
 
 
-@dataclass(frozen=True, eq=False)
-class _CellVisits:
-    """The operator of one f, with the probability of each cell to belong to a visit of each well."""
-
-    process: _CellProcess
-    last: tuple[np.ndarray, ...]
-    means: np.ndarray
-
-    def distribution(self, well: int, state: int, places: np.ndarray, blur: float = 0.0) -> np.ndarray:
-        """Distribution function of a state at places ``(m,)`` during visits to a well.
-
-        `blur` is the standard deviation of measurement noise.
-        """
-        at, group = np.unique(np.round(self.process.points[:, state], 12), return_inverse=True)
-        mass = np.bincount(group, weights=self.process.density * self.last[well])
-        if len(at) > MOST_PLACES:
-            mass, edges = np.histogram(at, bins=MOST_PLACES, weights=mass)
-            at = (edges[1:] + edges[:-1]) / 2
-        spread = np.hypot(blur, float(np.median(np.diff(at))) / np.sqrt(12))  # a cell is no point
-        return np.asarray(stats.norm.cdf((places[:, None] - at) / spread) @ (mass / mass.sum()))
-
-
-@dataclass(frozen=True, eq=False)
-class _PredictedVisits:
-    """Mean times of visits to the wells, core to core, as f, D and ε predict them.
-
-    Attributes
-    ----------
-    times
-        Well, mean time and its relative standard error, of the wells for which something is known.
-    method
-        ``operator`` or ``law``.
-    processes
-        The operator of f, and of draws of it; empty where the law was used.
-    notes
-        What is not known, in words.
-    """
-
-    times: tuple[tuple[int, float, float], ...]
-    method: str
-    processes: tuple[_CellVisits, ...] = ()
-    notes: tuple[str, ...] = ()
-
-
 def _cores_about(dynamics: Dynamics, portrait: PhasePortrait, intensity: float) -> _Cores:
     """The core of each attractor: U below ε, or below half of what it is at the next saddle or attractor."""
     attractors = np.array([one.position for one in portrait.attractors])
@@ -366,10 +286,11 @@ def _cores_about(dynamics: Dynamics, portrait: PhasePortrait, intensity: float) 
 
 def _predicted_visits(
     found: FieldEstimate, portrait: PhasePortrait, noise: NoiseStrength, cores: _Cores, *, seed: int = 0
-) -> _PredictedVisits:
-    """Mean times of visits to every well, by the operator where it can be solved, or else by the law.
+) -> tuple[list[tuple[int, float, float]], list[_CellVisits], list[str]]:
+    """Well, mean time of visits and its relative error by f, D and ε, core to core, where that is known.
 
-    Errors are those of f and ε, drawn from their distributions by the seed.
+    It is by the operator of f and of draws of it, which is returned too, or else by the law; and what is not
+    known, in words.
     """
     notes: list[str] = []
     dynamics, width = found.dynamics, portrait.box[:, 1] - portrait.box[:, 0]
@@ -377,23 +298,19 @@ def _predicted_visits(
         cells = CELLS[dynamics.dimension]
         box = portrait.box + margin * np.stack([-width, width], axis=1)
         try:
-            processes = [_visits(dynamics, noise.intensity, box, cores, cells)]
+            processes = [_CellVisits(dynamics, noise.intensity, box, cores, cells)]
             generator = np.random.default_rng(seed)
             for _ in range(DRAWS[dynamics.dimension]):
                 drawn = _drawn_system(found, generator=generator)
                 strength = np.exp(noise.standard_error / noise.intensity * generator.standard_normal())
                 coarse = round(COARSER * cells)
-                processes.append(_visits(drawn, noise.intensity * float(strength), box, cores, coarse))
+                processes.append(_CellVisits(drawn, noise.intensity * float(strength), box, cores, coarse))
         except (NumericalFailure, np.linalg.LinAlgError, RuntimeError, ValueError) as error:
             notes.append(str(error))
             continue
-        errors = np.log([one.means for one in processes[1:]]).std(axis=0, ddof=1)
-        times = [
-            (well, float(mean), float(error))
-            for well, (mean, error) in enumerate(zip(processes[0].means, errors, strict=True))
-            if np.isfinite(mean) and np.isfinite(error)
-        ]
-        return _PredictedVisits(tuple(times), "operator", tuple(processes))
+        means, errors = processes[0].means, np.log([one.means for one in processes[1:]]).std(axis=0, ddof=1)
+        known = np.flatnonzero(np.isfinite(means) & np.isfinite(errors))
+        return [(int(well), float(means[well]), float(errors[well])) for well in known], processes, []
     ways = transitions(found, ways_out(dynamics, portrait), [None] * len(cores.attractors))
     times, missing = [], []
     for well, one in enumerate(portrait.attractors):
@@ -404,7 +321,7 @@ def _predicted_visits(
             times.append((well, mean_time.value, mean_time.error))
     if missing:
         notes.append(f"no law says how long {' and '.join(missing)} lasts")
-    return _PredictedVisits(tuple(times), "law", notes=tuple(notes))
+    return times, [], notes
 
 
 def _drawn_system(found: FieldEstimate, *, generator: np.random.Generator) -> Dynamics:
@@ -424,15 +341,28 @@ def _drawn_system(found: FieldEstimate, *, generator: np.random.Generator) -> Dy
     return field_dynamics(found.library, support, values, diffusion=diffusion)
 
 
-def _visits(dynamics: Dynamics, intensity: float, box: np.ndarray, cores: _Cores, cells: int) -> _CellVisits:
-    process = _cell_process(dynamics, intensity, box, cells=cells)
-    core = cores.of(process.points)
-    count = len(cores.attractors)
-    if len(np.unique(core[core >= 0])) < count:
-        raise NumericalFailure("the core of a well is smaller than a cell of the grid")
-    last = tuple(process.last_visited(core, well) for well in range(count))
-    means = np.array([process.mean_visit(core, well) for well in range(count)])
-    return _CellVisits(process, last, means)
+class _CellVisits:
+    """The operator of one f, with the probability of each cell to belong to a visit of each well."""
+
+    def __init__(
+        self, dynamics: Dynamics, intensity: float, box: np.ndarray, cores: _Cores, cells: int
+    ) -> None:
+        self.process = _CellProcess(dynamics, intensity, box, cells=cells)
+        core, wells = cores.of(self.process.points), range(len(cores.attractors))
+        if len(np.unique(core[core >= 0])) < len(wells):
+            raise NumericalFailure("the core of a well is smaller than a cell of the grid")
+        self.last = [self.process.last_visited(core, well) for well in wells]
+        self.means = np.array([self.process.mean_visit(core, well) for well in wells])
+
+    def distribution(self, well: int, state: int, places: np.ndarray, blur: float = 0.0) -> np.ndarray:
+        """Distribution function of a state during visits to a well, blurred by measurement noise."""
+        at, group = np.unique(np.round(self.process.points[:, state], 12), return_inverse=True)
+        mass = np.bincount(group, weights=self.process.density * self.last[well])
+        if len(at) > MOST_PLACES:
+            mass, edges = np.histogram(at, bins=MOST_PLACES, weights=mass)
+            at = (edges[1:] + edges[:-1]) / 2
+        spread = np.hypot(blur, float(np.median(np.diff(at))) / np.sqrt(12))  # a cell is no point
+        return np.asarray(stats.norm.cdf((places[:, None] - at) / spread) @ (mass / mass.sum()))
 
 
 @dataclass(frozen=True)
@@ -476,8 +406,6 @@ class DensityTest:
         The largest difference of the two distribution functions.
     independent
         How many independent samples the held-out recordings hold.
-    error
-        The distance that the uncertainty of f alone would make, in the mean.
     probability
         Of as large a distance, were the prediction true within its error.
     edges, counted, predicted
@@ -488,7 +416,6 @@ class DensityTest:
     state: int
     distance: float
     independent: float
-    error: float
     probability: float
     edges: np.ndarray
     counted: np.ndarray
@@ -505,8 +432,6 @@ class OccupancyCheck:
         As counted, and as predicted.
     missing
         Why neither is compared, in words; None where they are.
-    notes
-        What is not known, in words.
     unseen
         Two states between which the record hops, where a single one was identified; None elsewhere.
     """
@@ -514,24 +439,13 @@ class OccupancyCheck:
     visits: tuple[VisitTest, ...] = ()
     densities: tuple[DensityTest, ...] = ()
     missing: str | None = None
-    notes: tuple[str, ...] = ()
     unseen: Switching | None = None
 
-    @property
-    def hops(self) -> int:
-        """How many were seen on all recordings."""
-        return sum(one.whole.visits for one in self.visits)
-
     def verdict(self, *, false_alarms: float) -> Verdict | None:
-        """The verdict for the certificate; None where there is no test.
+        """The verdict for the certificate, refused by chance with a probability `false_alarms`; None without.
 
         Its figure is how many powers of ten the least probability lies below 1, times the number of figures
         compared.
-
-        Parameters
-        ----------
-        false_alarms
-            Probability with which chance alone refuses what is right.
         """
         if self.unseen is not None:
             rarity, limit = -float(np.log10(self.unseen.probability)), -float(np.log10(SIGNIFICANCE))
@@ -571,14 +485,10 @@ def check_occupancy(
 
     Parameters
     ----------
-    found, portrait
-        f with its uncertainty, and what follows from it.
-    noise
-        ε, None where the recordings show none.
-    recordings
-        All of them.
-    held_out
-        Mask over ``recordings.labels``: those that no fit saw.
+    found, portrait, noise
+        f with its uncertainty, what follows from it, and ε, None where the recordings show none.
+    recordings, held_out
+        All of them, and a mask over their labels: those that no fit saw.
     sensor
         Standard deviation of each state's sensor noise, shape ``(d,)``; None where there is none.
     seed
@@ -608,16 +518,16 @@ def check_occupancy(
     if found.dynamics.dimension not in CELLS and not any(one.visits for one in whole):
         return OccupancyCheck(missing="the recordings do not hop")
     sampled = cores.as_sampled(found.dynamics, noise.intensity, usual_step(recordings))
-    prediction = _predicted_visits(found, portrait, noise, sampled, seed=seed)
+    times, processes, notes = _predicted_visits(found, portrait, noise, sampled, seed=seed)
+    method = "operator" if processes else "law"
     tested = tuple(
         VisitTest(
-            well, held[well], whole[well], mean, error, prediction.method,
-            _probability_of(held[well], mean, error),
+            well, held[well], whole[well], mean, error, method, _probability_of(held[well], mean, error)
         )
-        for well, mean, error in prediction.times
-    )  # fmt: skip
+        for well, mean, error in times
+    )
     if not tested:
-        return OccupancyCheck(missing=f"no dwell time is predicted: {'; '.join(prediction.notes)}")
+        return OccupancyCheck(missing=f"no dwell time is predicted: {'; '.join(notes)}")
     chance = min(_probability_of(one.whole, one.predicted, one.error) for one in tested)
     if not any(one.visits for one in whole) and chance > NO_HOP_PROBABILITY:
         return OccupancyCheck(missing="the recordings do not hop, nor should they have in their time")
@@ -625,7 +535,7 @@ def check_occupancy(
     used, densities = np.zeros(len(visits), dtype=bool), []
     for run in apart:
         used[run] = True
-    for well, *_ in prediction.times if prediction.processes else ():
+    for well, *_ in times if processes else ():
         rows = np.flatnonzero(used & (visits == well))
         if len(rows) < MIN_INDEPENDENT_SAMPLES:
             continue
@@ -635,9 +545,26 @@ def check_occupancy(
             x = recordings.values[rows, state]
             blur = 0.0 if sensor is None else float(sensor[state])
             independent = len(x) / (2 * correlated_samples(x, pieces))
-            if independent >= MIN_INDEPENDENT_SAMPLES and np.ptp(x) > 0:
-                densities.append(_density(prediction, well, state, x, float(independent), blur))
-    return OccupancyCheck(tested, tuple(densities), notes=prediction.notes)
+            if independent < MIN_INDEPENDENT_SAMPLES or not np.ptp(x) > 0:
+                continue
+            places = np.quantile(x, np.linspace(0.005, 0.995, COMPARED_PLACES))
+            counted = np.searchsorted(np.sort(x), places, side="right") / len(x)
+            predicted, *drawn = (one.distribution(well, state, places, blur) for one in processes)
+            distance = float(np.abs(counted - predicted).max())
+            error = float(np.mean([np.abs(one - predicted).max() for one in drawn])) if drawn else 0.0
+            # The mean distance of n samples is 0.87/√n: an error of the prediction is as if there were fewer.
+            effective = 1 / (1 / independent + (error / MEAN_DISTANCE) ** 2)
+            edges = np.linspace(x.min(), x.max(), BINS + 1)
+            share = np.diff(processes[0].distribution(well, state, edges, blur))
+            width = edges[1] - edges[0]
+            counts = np.histogram(x, bins=edges)[0] / (len(x) * width)
+            probability = float(stats.kstwobign.sf(distance * np.sqrt(effective)))
+            densities.append(
+                DensityTest(
+                    well, state, distance, float(independent), probability, edges, counts, share / width
+                )
+            )
+    return OccupancyCheck(tested, tuple(densities))
 
 
 def _probability_of(count: DwellCount, mean: float, error: float) -> float:
@@ -650,32 +577,3 @@ def _probability_of(count: DwellCount, mean: float, error: float) -> float:
     fewer = float(weights @ stats.poisson.cdf(count.visits, expected))
     more = float(weights @ stats.poisson.sf(count.visits - 1, expected))
     return min(2 * min(fewer, more), 1.0)
-
-
-def _density(
-    prediction: _PredictedVisits, well: int, state: int, x: np.ndarray, independent: float, blur: float
-) -> DensityTest:
-    """The distribution of a state during the visits to one well, by so many independent samples."""
-    main, *others = prediction.processes
-    places = np.quantile(x, np.linspace(0.005, 0.995, COMPARED_PLACES))
-    counted = np.searchsorted(np.sort(x), places, side="right") / len(x)
-    foreseen = main.distribution(well, state, places, blur)
-    distance = float(np.abs(counted - foreseen).max())
-    drawn = [np.abs(one.distribution(well, state, places, blur) - foreseen).max() for one in others]
-    error = float(np.mean(drawn)) if drawn else 0.0
-    # The mean distance of n samples is 0.87/√n: an error of the prediction is as if there were fewer.
-    effective = 1 / (1 / independent + (error / MEAN_DISTANCE) ** 2)
-    edges = np.linspace(x.min(), x.max(), BINS + 1)
-    share = np.diff(main.distribution(well, state, edges, blur))
-    width = edges[1] - edges[0]
-    return DensityTest(
-        well,
-        state,
-        distance,
-        independent,
-        error,
-        float(stats.kstwobign.sf(distance * np.sqrt(effective))),
-        edges,
-        np.histogram(x, bins=edges)[0] / (len(x) * width),
-        share / width,
-    )

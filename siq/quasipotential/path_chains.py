@@ -91,6 +91,9 @@ class MinimumActionPath:
         where it does not come to. None of a chain.
     smooth
         Whether no neighbouring solution crosses the path; only then it is a minimum.
+    downhill
+        Shape ``(m, d)``: how f leads on from the end to another attractor, without any action. None where
+        that was not asked for.
     """
 
     points: np.ndarray
@@ -103,41 +106,11 @@ class MinimumActionPath:
     rivals: tuple[float, ...] = ()
     times: np.ndarray | None = None
     smooth: bool = True
-
-
-@dataclass(frozen=True)
-class TransitionPath:
-    """The most probable way from one attractor to another: up to a saddle, and down without noise.
-
-    Attributes
-    ----------
-    uphill
-        From the attractor to the saddle.
-    downhill
-        Shape ``(n, d)``: the trajectory of f from the saddle to the other attractor, whose action is zero.
-    """
-
-    uphill: MinimumActionPath
-    downhill: np.ndarray
-
-    @property
-    def points(self) -> np.ndarray:
-        """All points, shape ``(m, d)``; the saddle stands there once."""
-        return np.vstack([self.uphill.points, self.downhill[1:]])
+    downhill: np.ndarray | None = None
 
 
 class _Tube:
-    """The quadratic cost about a cycle, in the units of a problem.
-
-    Parameters
-    ----------
-    points
-        Shape ``(n, d)``: of the cycle.
-    hessians
-        Shape ``(n, d, d)``: the cost is ``ρ·Hρ``.
-    period
-        Of the cycle.
-    """
+    """The quadratic cost ``ρ·Hρ`` about a cycle, in the units of a problem."""
 
     def __init__(self, points: np.ndarray, hessians: np.ndarray, period: float) -> None:
         n, self.period = len(points), period
@@ -370,38 +343,107 @@ class PathProblem:
             except NumericalFailure:
                 return np.inf
 
+    def spaced(self, y: np.ndarray, count: int, level: float) -> np.ndarray:
+        """A chain along another one, which begins where the level is as given and is spaced for accuracy.
+
+        Near an attractor the segments are in proportion to the distance from it, in the metric of M, since
+        the path may wind.
+        """
+        if self.hessian is not None and self.level(y[:1])[0] > level > 0:
+            y = np.vstack([_spiral(self, y[0], level / self.level(y[:1])[0]), y])
+        if level > 0 and isinstance(self.begin, _Tube):
+            y = np.vstack([_winding(self, self.begin, y[0], level, -1.0)[::-1], y])
+        if level > 0 and self.finish is not None:
+            y = np.vstack([y, _winding(self, self.finish, y[-1], level, 1.0)])
+        length = np.r_[0, np.cumsum(np.linalg.norm(np.diff(y, axis=0), axis=1))]
+        apart = np.append(np.diff(length) > COINCIDENCE * length[-1], True)
+        length, y = length[apart], y[apart]
+        curve = Akima1DInterpolator(length, y)
+        dense = np.interp(np.arange(0, len(y) - 0.95, 0.1), np.arange(len(y)), length)
+        y = curve(dense)
+        if self.begin is not None:
+            first = max(int(np.flatnonzero(self.level(y) <= level).max(initial=0)), 0)
+            dense, y = dense[first:], y[first:]
+        if self.finish is not None:
+            beyond = np.flatnonzero(self.finish.level(y) > level).max(initial=len(y) - 3) + 2
+            dense, y = dense[:beyond], y[:beyond]
+        measure = np.r_[0, np.cumsum(_relative_lengths(self, y))]
+        return curve(np.interp(np.linspace(0, measure[-1], count), measure, dense))
+
+    def descended(self, y: np.ndarray, count: int, action: float, *, first: bool = False) -> DiscretisedPath:
+        """Move a chain of `count` points along y down to a minimum of S, by steps across the chain.
+
+        `action` is about that of the path, and decides where the chain begins. A `first` chain, far from a
+        minimum, is spaced anew where it has become uneven, and pushed off where it rests at a saddle of S.
+        """
+        level = START_LEVEL * action
+        # Share of S that a step must still gain: of tubes, the third order that their cost leaves out.
+        fine = START_LEVEL**1.5 if self.flat > 0 else FINE
+        y = self.spaced(y, count, level)
+        if y.shape[1] == 1:
+            return DiscretisedPath(y, self.action(y), True)
+        action, shift, spacings, kicks = self.action(y), 1.0, 0, 0
+        for _ in range(MOST_STEPS):
+            across = _Across(self, y)
+            resting = (COARSE if first else fine) * action + np.finfo(float).eps * across.effort
+            gained, expected = 0.0, np.inf
+            while shift < LARGEST_SHIFT:
+                step = across.step(shift)
+                if step is not None:
+                    new = across.moved(step)
+                    expected = -0.5 * float(across.slope @ step)
+                    gained = action - self.action(new)
+                    if gained > LEAST_GAIN * expected or expected < resting:
+                        break
+                shift = max(4 * shift, SMALLEST_SHIFT)
+            else:
+                break
+            if gained > 0:
+                y, action = new, action - gained
+            if expected > resting:
+                shift *= 0.2 if gained > GOOD_GAIN * expected else 1.0
+                shift = max(shift if shift > 1e-8 else 0.0, self.flat)
+                measure = _relative_lengths(self, y)
+                if first and spacings < MOST_RESPACINGS and measure.max() > UNEVEN * measure.min():
+                    y = self.spaced(y, count, level)
+                    action, spacings = self.action(y), spacings + 1
+            elif across.step(self.flat) is None:
+                if not first or kicks == MOST_KICKS:
+                    break
+                kicks += 1
+                lower = min((across.moved(push) for push in across.kicks()), key=self.action)
+                if self.action(lower) >= action:
+                    break
+                y, action, shift = lower, self.action(lower), 1.0
+            elif shift <= SMALLEST_SHIFT:
+                return DiscretisedPath(y, action, True)
+            else:
+                shift = self.flat
+        return DiscretisedPath(y, action, False)
+
+    def first_chains(self) -> tuple[list[np.ndarray], float]:
+        """First chains, and by how many radian the first of them turns, in the metric of M.
+
+        That would be the right one were f linear: ``ẋ = (J + 2DM) x``, backwards from the end.
+        """
+        share = np.linspace(0, 1, 201)[:, None]
+        line = share * self.end
+        chains = [line]
+        # The columns of the right factor span what is across the line.
+        across = np.linalg.svd(self.end[None])[2][1 : MOST_BENDS + 1]
+        chains += [line + BEND * side * np.sin(np.pi * share) * way for way in across for side in (1, -1)]
+        if self.hessian is None:
+            return chains, 0.0
+        linear = np.vstack([_spiral(self, self.end, START_LEVEL), self.end])
+        forward = np.diff(linear @ np.linalg.cholesky(self.hessian), axis=0)
+        forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+        turns = np.arccos(np.clip(np.sum(forward[1:] * forward[:-1], axis=1), -1, 1))
+        return [linear, *chains], float(turns.sum())
+
 
 def products(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Of each matrix with its vector: ``(n, d, d)`` and ``(n, d)`` to ``(n, d)``."""
     return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
-
-
-def spaced(problem: PathProblem, y: np.ndarray, count: int, level: float) -> np.ndarray:
-    """A chain along another one, which begins where the level is as given and is spaced for accuracy.
-
-    Near an attractor the segments are in proportion to the distance from it, in the metric of M, since the
-    path may wind.
-    """
-    if problem.hessian is not None and problem.level(y[:1])[0] > level > 0:
-        y = np.vstack([_spiral(problem, y[0], level / problem.level(y[:1])[0]), y])
-    if level > 0 and isinstance(problem.begin, _Tube):
-        y = np.vstack([_winding(problem, problem.begin, y[0], level, -1.0)[::-1], y])
-    if level > 0 and problem.finish is not None:
-        y = np.vstack([y, _winding(problem, problem.finish, y[-1], level, 1.0)])
-    length = np.r_[0, np.cumsum(np.linalg.norm(np.diff(y, axis=0), axis=1))]
-    apart = np.append(np.diff(length) > COINCIDENCE * length[-1], True)
-    length, y = length[apart], y[apart]
-    curve = Akima1DInterpolator(length, y)
-    dense = np.interp(np.arange(0, len(y) - 0.95, 0.1), np.arange(len(y)), length)
-    y = curve(dense)
-    if problem.begin is not None:
-        first = max(int(np.flatnonzero(problem.level(y) <= level).max(initial=0)), 0)
-        dense, y = dense[first:], y[first:]
-    if problem.finish is not None:
-        beyond = np.flatnonzero(problem.finish.level(y) > level).max(initial=len(y) - 3) + 2
-        dense, y = dense[:beyond], y[:beyond]
-    measure = np.r_[0, np.cumsum(_relative_lengths(problem, y))]
-    return curve(np.interp(np.linspace(0, measure[-1], count), measure, dense))
 
 
 def _relative_lengths(problem: PathProblem, y: np.ndarray) -> np.ndarray:
@@ -454,73 +496,6 @@ def evenly(points: np.ndarray, count: int) -> np.ndarray:
     along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
     places = np.linspace(0, along[-1], count)
     return np.stack([np.interp(places, along, column) for column in points.T], axis=1)
-
-
-def descended(
-    problem: PathProblem, y: np.ndarray, count: int, action: float, *, first: bool = False
-) -> DiscretisedPath:
-    """Move a chain of `count` points down to a minimum of S, by steps across the chain.
-
-    A `first` chain is spaced anew where it has become uneven, and pushed off where it rests at a saddle
-    of S.
-
-    Parameters
-    ----------
-    problem
-        The action.
-    y
-        Points along which the chain is laid, in any number.
-    count
-        Number of points of the chain.
-    action
-        About that of the path; it decides where the chain begins.
-    first
-        Whether it starts far from a minimum.
-    """
-    level = START_LEVEL * action
-    # Share of S that a step must still gain: of tubes, the third order that their cost leaves out.
-    fine = START_LEVEL**1.5 if problem.flat > 0 else FINE
-    y = spaced(problem, y, count, level)
-    if y.shape[1] == 1:
-        return DiscretisedPath(y, problem.action(y), True)
-    action, shift, spacings, kicks = problem.action(y), 1.0, 0, 0
-    for _ in range(MOST_STEPS):
-        across = _Across(problem, y)
-        resting = (COARSE if first else fine) * action + np.finfo(float).eps * across.effort
-        gained, expected = 0.0, np.inf
-        while shift < LARGEST_SHIFT:
-            step = across.step(shift)
-            if step is not None:
-                new = across.moved(step)
-                expected = -0.5 * float(across.slope @ step)
-                gained = action - problem.action(new)
-                if gained > LEAST_GAIN * expected or expected < resting:
-                    break
-            shift = max(4 * shift, SMALLEST_SHIFT)
-        else:
-            break
-        if gained > 0:
-            y, action = new, action - gained
-        if expected > resting:
-            shift *= 0.2 if gained > GOOD_GAIN * expected else 1.0
-            shift = max(shift if shift > 1e-8 else 0.0, problem.flat)
-            measure = _relative_lengths(problem, y)
-            if first and spacings < MOST_RESPACINGS and measure.max() > UNEVEN * measure.min():
-                y = spaced(problem, y, count, level)
-                action, spacings = problem.action(y), spacings + 1
-        elif across.step(problem.flat) is None:
-            if not first or kicks == MOST_KICKS:
-                break
-            kicks += 1
-            lower = min((across.moved(push) for push in across.kicks()), key=problem.action)
-            if problem.action(lower) >= action:
-                break
-            y, action, shift = lower, problem.action(lower), 1.0
-        elif shift <= SMALLEST_SHIFT:
-            return DiscretisedPath(y, action, True)
-        else:
-            shift = problem.flat
-    return DiscretisedPath(y, action, False)
 
 
 class _Across:
@@ -622,8 +597,8 @@ def _banded(
 ) -> np.ndarray:
     """The matrix of the moves ``normal`` from point `start` on, in the lower form of scipy's solvers.
 
-    It is made of second derivatives of the segments, ``(n - 1, d, d)`` each: by middles, by differences and
-    middles, and by differences. `ends` are added to the blocks of the first point and of the last.
+    It is made of second derivatives of the segments by middles, by differences and middles, and by
+    differences. `ends` are added to the blocks of the first point and of the last.
     """
     count, _, m = normal.shape
     transposed = mixed.transpose(0, 2, 1)
@@ -645,23 +620,3 @@ def _banded(
         for row in range(m):
             matrix[m + row - column, column::m][: count - 1] = below[:, row, column]
     return matrix
-
-
-def first_chains(problem: PathProblem) -> tuple[list[np.ndarray], float]:
-    """First chains, and by how many radian the first of them turns, in the metric of M.
-
-    That would be the right one were f linear: ``ẋ = (J + 2DM) x``, backwards from the end.
-    """
-    share = np.linspace(0, 1, 201)[:, None]
-    line = share * problem.end
-    chains = [line]
-    # The columns of the right factor span what is across the line.
-    across = np.linalg.svd(problem.end[None])[2][1 : MOST_BENDS + 1]
-    chains += [line + BEND * side * np.sin(np.pi * share) * way for way in across for side in (1, -1)]
-    if problem.hessian is None:
-        return chains, 0.0
-    linear = np.vstack([_spiral(problem, problem.end, START_LEVEL), problem.end])
-    forward = np.diff(linear @ np.linalg.cholesky(problem.hessian), axis=0)
-    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    turns = np.arccos(np.clip(np.sum(forward[1:] * forward[:-1], axis=1), -1, 1))
-    return [linear, *chains], float(turns.sum())

@@ -29,17 +29,13 @@ from siq.quasipotential.path_chains import (
     DiscretisedPath,
     MinimumActionPath,
     PathProblem,
-    TransitionPath,
-    descended,
     evenly,
-    first_chains,
     products,
-    spaced,
 )
 from siq.systems.basins import ends_of
 from siq.systems.cycles import Cycle, hessians_along, unstable_direction
 from siq.systems.dynamics import Dynamics
-from siq.systems.equilibria import Equilibrium, measure_at
+from siq.systems.equilibria import measure_at
 from siq.systems.phase_portrait import PhasePortrait
 
 DESCENT_POINTS = 4000  # of a way down that Hamilton's equations are told, which may wind
@@ -120,10 +116,21 @@ def minimum_action_path(
     if not dynamics.diffusion.regular:
         if isinstance(start, Cycle) or isinstance(end, Cycle):
             raise NumericalFailure("paths from and to cycles need noise on every state of its own")
-        return _by_hamilton(dynamics, start, end, tolerance, initial or ())
+        try:
+            beside: np.ndarray | None = descent(dynamics, end, start, DESCENT_POINTS)
+        except NumericalFailure:  # the end is no saddle, or one from which f leads elsewhere
+            beside = None
+        found = hamiltonian_paths(
+            dynamics, start, end, beside=beside, tolerance=tolerance, curves=initial or ()
+        )
+        return replace(
+            found[0],
+            converged=found[0].converged and found[0].action <= min(one.action for one in found),
+            rivals=tuple(one.action for one in found[1:] if one.smooth),
+        )
     problem = PathProblem(dynamics, start, end)
     if problem.flat == 0:
-        own, turning = first_chains(problem)
+        own, turning = problem.first_chains()
     else:
         own = [problem.scaled(one) for one in _first_guesses(problem, start, end)]
         turning = max((_turning(chain) for chain in own), default=0.0)
@@ -131,10 +138,10 @@ def minimum_action_path(
     count = min(max(nodes, int(turning / TURN)), MOST_NODES // 4)
     chains: list[DiscretisedPath] = []
     for guess in guesses:
-        action = problem.action(spaced(problem, guess, count, 0.0))
+        action = problem.action(problem.spaced(guess, count, 0.0))
         if not np.isfinite(action):
             continue
-        chain = descended(problem, guess, count, action, first=True)
+        chain = problem.descended(guess, count, action, first=True)
         if np.isfinite(chain.action):
             chains.append(chain)
     if not chains:
@@ -143,11 +150,11 @@ def minimum_action_path(
             f"no path from {problem.start.tolist()} to {last.tolist()} was found that has a finite action"
         )
     chains.sort(key=lambda one: one.action)
-    fine, known = descended(problem, chains[0].points, count, chains[0].action), False
+    fine, known = problem.descended(chains[0].points, count, chains[0].action), False
     while not known and 2 * len(fine.points) < MOST_NODES:
         coarse = fine
-        fine = descended(
-            problem, coarse.points, 2 * len(coarse.points) - 1, coarse.action, first=not coarse.minimum
+        fine = problem.descended(
+            coarse.points, 2 * len(coarse.points) - 1, coarse.action, first=not coarse.minimum
         )
         error = abs(fine.action - coarse.action) / 3
         known = error <= max(tolerance * fine.action, NO_ACTION * problem.segments(fine.points).effort)
@@ -236,52 +243,48 @@ def _other_minima(chains: Sequence[DiscretisedPath], best: DiscretisedPath) -> l
     return rivals
 
 
-def _by_hamilton(
-    dynamics: Dynamics, start: np.ndarray, end: np.ndarray, tolerance: float, curves: Sequence[np.ndarray]
-) -> MinimumActionPath:
-    """The path where noise acts on some states only."""
-    try:
-        beside: np.ndarray | None = descent(dynamics, end, start, DESCENT_POINTS)
-    except NumericalFailure:  # the end is no saddle, or one from which f leads elsewhere
-        beside = None
-    found = hamiltonian_paths(dynamics, start, end, beside=beside, tolerance=tolerance, curves=curves)
-    best = found[0]
-    return replace(
-        best,
-        converged=best.converged and best.action <= min(one.action for one in found),
-        rivals=tuple(one.action for one in found[1:] if one.smooth),
-    )
-
-
 def transition_path(
     dynamics: Dynamics,
-    attractor: np.ndarray,
-    saddle: np.ndarray,
-    target: np.ndarray,
+    start: np.ndarray | Cycle,
+    over: np.ndarray | Cycle,
+    end: np.ndarray | Cycle | None,
     *,
+    box: np.ndarray | None = None,
     nodes: int = 100,
     tolerance: float = 1e-4,
     initial: Sequence[np.ndarray] | None = None,
-) -> TransitionPath:
-    """The most probable way from an attractor over a saddle to another attractor.
+) -> MinimumActionPath:
+    """The path of least action to what parts two basins, with the way that f leads on from there.
 
     Parameters
     ----------
     dynamics, nodes, tolerance, initial
         As for `minimum_action_path`; `nodes` is the number of points downhill, too.
-    attractor, saddle, target
-        Shape ``(d,)`` each; the saddle has one unstable direction.
+    start
+        An attractor, shape ``(d,)``, or a stable cycle.
+    over
+        A saddle with one unstable direction, or an unstable cycle.
+    end
+        The other attractor, or stable cycle; None where f leads out of the region.
+    box
+        Shape ``(d, 2)``: of the states, in whose widths ways about cycles are measured.
 
     Raises
     ------
     NumericalFailure
         When f leads from the saddle to the target on neither side, or for want of an uphill path.
     """
-    downhill = descent(dynamics, np.asarray(saddle, float), np.asarray(target, float), nodes)
-    uphill = minimum_action_path(
-        dynamics, attractor, saddle, nodes=nodes, tolerance=tolerance, initial=initial
-    )
-    return TransitionPath(uphill, downhill)
+    about_cycle = any(isinstance(one, Cycle) for one in (start, over, end))
+    downhill = None
+    if end is not None and not about_cycle:
+        downhill = descent(dynamics, np.asarray(over, float), np.asarray(end, float), nodes)
+    uphill = minimum_action_path(dynamics, start, over, nodes=nodes, tolerance=tolerance, initial=initial)
+    if end is None:
+        downhill = uphill.points[-1:] if isinstance(over, Cycle) else np.asarray(over, float)[None]
+    elif about_cycle:
+        assert box is not None
+        downhill = _downhill(dynamics, over, uphill.points[-1], end, box)
+    return replace(uphill, downhill=downhill)
 
 
 def descent(dynamics: Dynamics, saddle: np.ndarray, target: np.ndarray, nodes: int) -> np.ndarray:
@@ -327,72 +330,34 @@ def both_sides(dynamics: Dynamics, cycle: Cycle, portrait: PhasePortrait) -> np.
     return ends_of(dynamics, starts, portrait.attractors, portrait.cycles, box=portrait.box)
 
 
-def way_about_cycles(
-    dynamics: Dynamics,
-    portrait: PhasePortrait,
-    start: int,
-    over: Equilibrium | Cycle,
-    end: int | None,
-    *,
-    tolerance: float,
-) -> TransitionPath:
-    """The path of least action to what parts two basins, and the way on.
-
-    Parameters
-    ----------
-    dynamics
-        f and D.
-    portrait
-        What is stable.
-    start, end
-        Numbers of attractors, of cycles after those of points; the end is None where f leads out of the
-        region.
-    over
-        The saddle, or the unstable cycle.
-    tolerance
-        Of the action.
-
-    Raises
-    ------
-    NumericalFailure
-        When there is no such path that could be found.
-    """
-    settled: list[np.ndarray | Cycle] = [*(one.position for one in portrait.attractors), *portrait.cycles]
-    last = over if isinstance(over, Cycle) else over.position
-    uphill = minimum_action_path(dynamics, settled[start], last, tolerance=tolerance)
-    if end is None:
-        return TransitionPath(uphill, uphill.points[-1:])
-    return TransitionPath(uphill, _downhill(dynamics, over, uphill.points[-1], settled[end], portrait.box))
-
-
-def _states_beside(dynamics: Dynamics, over: Equilibrium | Cycle, place: int, box: np.ndarray) -> np.ndarray:
+def _states_beside(dynamics: Dynamics, over: np.ndarray | Cycle, place: int, box: np.ndarray) -> np.ndarray:
     """Two states on either side of a saddle, or of a point of an unstable cycle."""
     width = np.ptp(box, axis=1)
     if isinstance(over, Cycle):
         direction, position = unstable_direction(dynamics, over, place, scale=width), over.points[place]
     else:
-        values, vectors = np.linalg.eig(dynamics.jacobian(over.position[None])[0])
-        direction, position = vectors[:, np.argmax(values.real)].real, over.position
+        values, vectors = np.linalg.eig(dynamics.jacobian(over[None])[0])
+        direction, position = vectors[:, np.argmax(values.real)].real, over
     direction = SEPARATRIX_OFFSET * direction / np.abs(direction / width).max()
     return np.stack([position + direction, position - direction])
 
 
 def _downhill(
     dynamics: Dynamics,
-    over: Equilibrium | Cycle,
+    over: np.ndarray | Cycle,
     begin: np.ndarray,
     target: np.ndarray | Cycle,
     box: np.ndarray,
 ) -> np.ndarray:
+    """The way that f leads on where the one or the other is a cycle."""
     width = np.ptp(box, axis=1)
     place = 0
     if isinstance(over, Cycle):
         place = int(np.argmin(np.linalg.norm((over.points - begin) / width, axis=1)))
     cycle = target if isinstance(target, Cycle) else over
-    if isinstance(cycle, Cycle):
-        period = cycle.period
-    else:
+    if not isinstance(cycle, Cycle):
         raise ValueError("neither end is a cycle")
+    period = cycle.period
 
     def rates(_: float, y: np.ndarray) -> np.ndarray:
         return np.asarray(dynamics.drift((y * width)[None])[0] / width)
@@ -424,15 +389,28 @@ def _first_guesses(
     problem: PathProblem, start: np.ndarray | Cycle, end: np.ndarray | Cycle
 ) -> list[np.ndarray]:
     """Curves from beside a start to an end, one of them a cycle, by rising action."""
+    d, unit, draw = len(problem.units), problem.units, np.random.default_rng(0)
+    inverse = np.linalg.inv(unit)
+    # States on all sides of the start, and the momenta there.
     if isinstance(start, Cycle):
-        hessians = hessians_along(problem.dynamics, start)
+        rows = np.linspace(0, len(start.points), PHASES, endpoint=False).astype(int)
+        hessians = hessians_along(problem.dynamics, start)[rows]
+        # The axes of the curvature, of which the first one is along the flow, and directions between them.
+        across = np.linalg.eigh(unit.T @ hessians @ unit)[1].transpose(0, 2, 1)[:, 1:]
+        between = draw.standard_normal((SIDES * (d - 2), d - 1))
+        sides = np.concatenate([np.eye(d - 1), -np.eye(d - 1), between])
+        sides /= np.linalg.norm(sides, axis=1, keepdims=True)
+        offset = GUESS_START * np.einsum("sa,nai->nsi", sides, across) @ unit.T
+        momenta = np.einsum("nij,nsj->nsi", hessians, offset).reshape(-1, d)
+        states = (start.points[rows][:, None] + offset).reshape(-1, d)
     elif problem.hessian is not None:
-        hessians = problem.inverse.T @ problem.hessian @ problem.inverse * problem.unit
+        directions = draw.standard_normal((GUESSES_PER_STATE * (d - 1), d))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        offset = GUESS_START * directions @ unit.T
+        states = start + offset
+        momenta = offset @ (problem.inverse.T @ problem.hessian @ problem.inverse * problem.unit)
     else:
         raise NumericalFailure("a path to a cycle has to begin at an attractor")
-    unit = problem.units
-    inverse = np.linalg.inv(unit)
-    states, momenta = _states_around(start, hessians, unit)
     ways, actions = _hamiltonian_trajectories(problem.dynamics, states, momenta, inverse)
     target = cKDTree((end.points if isinstance(end, Cycle) else end[None]) @ inverse.T)
     found = []
@@ -459,29 +437,6 @@ def _first_guesses(
                 new.append(one)
         chosen += new
     return [curve for _, _, curve in chosen]
-
-
-def _states_around(
-    start: np.ndarray | Cycle, hessians: np.ndarray, unit: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """States on all sides of a start, and the momenta there."""
-    d = len(unit)
-    draw = np.random.default_rng(0)
-    if isinstance(start, Cycle):
-        rows = np.linspace(0, len(start.points), PHASES, endpoint=False).astype(int)
-        # The axes of the curvature, of which the first one is along the flow, and directions between them.
-        across = np.linalg.eigh(unit.T @ hessians[rows] @ unit)[1].transpose(0, 2, 1)[:, 1:]
-        between = draw.standard_normal((SIDES * (d - 2), d - 1))
-        sides = np.concatenate([np.eye(d - 1), -np.eye(d - 1), between])
-        sides /= np.linalg.norm(sides, axis=1, keepdims=True)
-        offset = GUESS_START * np.einsum("sa,nai->nsi", sides, across) @ unit.T
-        momenta = np.einsum("nij,nsj->nsi", hessians[rows], offset)
-        states = start.points[rows][:, None] + offset
-        return states.reshape(-1, d), momenta.reshape(-1, d)
-    directions = draw.standard_normal((GUESSES_PER_STATE * (d - 1), d))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    offset = GUESS_START * directions @ unit.T
-    return start + offset, offset @ hessians
 
 
 def _hamiltonian_trajectories(

@@ -16,7 +16,7 @@ Of many states the third powers alone are affordable. With ``V = ½ yᵀMy + ⅙
     T(y, y, By) = -(My)·F(y, y) - 2 (My)ᵀ(∂D·y)(My),    B = J + 2DM,
 
 F being the second derivatives of f. In Schur's form of B, which is triangular, each T_i follows from those
-before it by Sylvester's equation. So `cubic_series` takes d⁴ operations, where the system above has d³/6
+before it by Sylvester's equation. So `_cubic_series` takes d⁴ operations, where the system above has d³/6
 unknowns. Eigenvectors would do, too, but those of a long chain that turns are all but parallel.
 """
 
@@ -38,6 +38,8 @@ from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import classify, hessian_at
 from siq.systems.formulas import compile_formulas
 
+MOST_STATES_OF_DEGREE_4 = 8  # beyond, the local series is of degree 3
+
 
 @dataclass(frozen=True)
 class _CubicSeries:
@@ -57,8 +59,15 @@ class _CubicSeries:
         return np.asarray(self.square + np.einsum("ijk,nk->nij", self.cube, x - self.center))
 
 
-def cubic_series(dynamics: Dynamics, attractor: np.ndarray) -> _CubicSeries:
-    """V about an attractor, shape ``(d,)``, to its third powers."""
+def local_series(dynamics: Dynamics, attractor: np.ndarray) -> Expansion | _CubicSeries:
+    """V about an attractor, shape ``(d,)``, to its fourth powers; to its third where states are many."""
+    if dynamics.dimension <= MOST_STATES_OF_DEGREE_4:
+        return quasipotential_series(dynamics, attractor, degree=4)
+    return _cubic_series(dynamics, attractor)
+
+
+def _cubic_series(dynamics: Dynamics, attractor: np.ndarray) -> _CubicSeries:
+    """V to its third powers."""
     place = attractor[None]
     square, noise = hessian_at(dynamics, attractor), dynamics.diffusion
     flow = dynamics.jacobian(place)[0] + 2 * noise.at(place)[0] @ square
@@ -79,15 +88,7 @@ def cubic_series(dynamics: Dynamics, attractor: np.ndarray) -> _CubicSeries:
     return _CubicSeries(attractor, square, np.ascontiguousarray(whole.real))
 
 
-@dataclass(frozen=True)
-class PowerSeries(Expansion):
-    """A Taylor polynomial about ``basis.center``, in the units of the states."""
-
-    basis: PowerBasis
-    coefficients: np.ndarray
-
-
-def quasipotential_series(dynamics: Dynamics, attractor: np.ndarray, *, degree: int) -> PowerSeries:
+def quasipotential_series(dynamics: Dynamics, attractor: np.ndarray, *, degree: int) -> Expansion:
     """Taylor polynomial of V at an attractor, V being zero there.
 
     Parameters
@@ -101,7 +102,7 @@ def quasipotential_series(dynamics: Dynamics, attractor: np.ndarray, *, degree: 
 
     Returns
     -------
-    PowerSeries
+    Expansion
         All terms of degree 2 to `degree`. This is V, not U = 2V; and it is the Taylor polynomial, which is
         exact at A and useless beyond its radius of convergence, not the best polynomial over a region.
 
@@ -154,7 +155,7 @@ def quasipotential_series(dynamics: Dynamics, attractor: np.ndarray, *, degree: 
         parts[k] = np.linalg.solve(basis.advection(flow, k), -known)
         gradients[k] = basis.gradient(parts[k], k)
     exponents = np.concatenate([basis.exponents[k] for k in parts])
-    return PowerSeries(
+    return Expansion(
         PowerBasis(dynamics.symbols, center, np.ones(len(center)), exponents),
         np.concatenate([part / basis.scales(k, scale) for k, part in parts.items()]),
     )

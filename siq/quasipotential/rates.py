@@ -62,7 +62,7 @@ from siq.errors import NumericalFailure
 from siq.inference.field_estimate import AnyField, GivenField
 from siq.quasipotential.path_chains import MinimumActionPath, PathProblem
 from siq.quasipotential.paths import minimum_action_path
-from siq.quasipotential.power_series import cubic_series, quasipotential_series
+from siq.quasipotential.power_series import MOST_STATES_OF_DEGREE_4, local_series
 from siq.remarks import Remark
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import classify, hessian_at, measure_at
@@ -75,7 +75,6 @@ ORBIT_STEPS = 2000  # in each distance from saddle to attractor, in search of th
 ORBIT_REACH = 20.0  # of these distances, up to which it is sought
 
 SERIES_RADIUS = {4: 0.01, 3: 0.003}  # of the distance from A to S, in the metric of M: V is its power series
-MOST_STATES_OF_DEGREE_4 = 8  # beyond, the power series is of degree 3
 SADDLE_RADIUS = 0.003  # of the distance: from there at the latest the integrand is continued to S
 RICCATI_STEP = 0.2  # in units of the largest rate
 MOST_RICCATI_STEPS = 1e6  # numerical, a guard
@@ -278,6 +277,35 @@ class EscapeRate:
             )
         return time
 
+    def mean_exit_time(self, noise: NoiseStrength) -> MeanTime | None:
+        """The mean time over one saddle with its errors; None where the law gives none.
+
+        Where the error of the prefactor is not known it is taken to be relatively as uncertain as ΔU, since
+        both follow from f to the first order.
+
+        Examples
+        --------
+        >>> rate = EscapeRate(barrier=0.5, prefactor=4.0, standard_error=0.01)
+        >>> found = rate.mean_exit_time(NoiseStrength(0.1))
+        >>> round(found.value, 1), round(found.data_error, 3), found.law_error
+        (593.7, 0.102, 0.2)
+        """
+        try:
+            value = self.mean_time(noise.intensity)
+        except NumericalFailure:
+            return None
+        if not np.isfinite(value):
+            return None
+        height = self.barrier / noise.intensity
+        relative = self.standard_error / self.barrier
+        of_prefactor = relative if self.prefactor_error is None else self.prefactor_error
+        of_noise = height * self.leverage * noise.standard_error / noise.intensity
+        squares = float(np.nansum(np.square((height * relative, of_prefactor, of_noise))))
+        together = 2 * self.covariance / noise.intensity
+        # By rounding, or by what is in one error alone, the two could cancel by more than there is.
+        error = float(np.sqrt(max(squares + together, np.nan_to_num(of_noise) ** 2)))
+        return MeanTime(value, error, 1 / height)
+
 
 def escape_rate(
     dynamics: Dynamics,
@@ -347,9 +375,8 @@ def escape_rate(
 class _Frame:
     """A path with Hessians along it, in units in which D at A, the distance from A to S and ∂f/∂x are one.
 
-    A D without inverse is replaced in these units (`siq.systems.equilibria.measure_at`). The points, with
-    momenta and velocities, are those from close to A to the neighbourhood of S; `at_attractor` and
-    `at_saddle` are the Hessians of V.
+    The points, with momenta and velocities, are those from close to A to the neighbourhood of S. A D without
+    inverse is replaced in these units (`siq.systems.equilibria.measure_at`).
     """
 
     def __init__(self, dynamics: Dynamics, path: MinimumActionPath) -> None:
@@ -367,10 +394,7 @@ class _Frame:
         self.stable = float(-rates[1:].real.max(initial=-np.inf))
         self.problem = problem
         self.white = problem.constant and dynamics.diffusion.regular  # then D is the unit matrix
-        many = dynamics.dimension > MOST_STATES_OF_DEGREE_4
-        self.series = (
-            cubic_series(dynamics, start) if many else quasipotential_series(dynamics, start, degree=4)
-        )
+        self.series = local_series(dynamics, start)
         self.at_attractor = problem.hessian
         self.at_saddle = None
         if not self.resonant:
@@ -379,7 +403,14 @@ class _Frame:
         momenta = path.momenta @ problem.units / problem.unit
         level = np.einsum("ni,ij,nj->n", points, self.at_attractor, points)
         used = np.linalg.norm(points - problem.end, axis=1) > SADDLE_RADIUS
-        used[: int(np.sum(level < SERIES_RADIUS[3 if many else 4] ** 2 * level[-1]))] = False
+        used[
+            : int(
+                np.sum(
+                    level
+                    < SERIES_RADIUS[3 if dynamics.dimension > MOST_STATES_OF_DEGREE_4 else 4] ** 2 * level[-1]
+                )
+            )
+        ] = False
         self._lay_grid(points[used], momenta[used])
 
     def _lay_grid(self, points: np.ndarray, momenta: np.ndarray) -> None:
@@ -512,18 +543,18 @@ def _imposed(m: np.ndarray, velocity: np.ndarray, force: np.ndarray) -> np.ndarr
     return across @ m @ across + mixed + mixed.T - (u @ w) * np.outer(u, u)
 
 
-def prefactor_error(found: AnyField, path: MinimumActionPath, *, seed: int = 0) -> tuple[float | None, float]:
+def prefactor_error(found: AnyField, path: MinimumActionPath) -> tuple[float | None, float]:
     """Standard error of ln K of a way out from that of f and D, and its covariance with ΔU.
 
     Both are zero where f carries no noise; the first is None where the law holds for too few of the changed
-    f. The seed is that of the axes, where there are more than `MAX_COVARIANCE_AXES`.
+    f.
     """
     if isinstance(found, GivenField) or found.noise_free:
         return 0.0, 0.0
     covariance = found.covariance
     if found.noise is not None:
         covariance = scipy.linalg.block_diag(covariance, found.noise.covariance)
-    axes = _covariance_axes(covariance, np.random.default_rng(seed))
+    axes = _covariance_axes(covariance, np.random.default_rng(0))
     count = len(found.values)
 
     def law(change: np.ndarray) -> tuple[float, float] | None:
@@ -559,8 +590,7 @@ def prefactor_error(found: AnyField, path: MinimumActionPath, *, seed: int = 0) 
 def _covariance_axes(covariance: np.ndarray, draw: np.random.Generator) -> Sequence[np.ndarray]:
     """Changes of the p coefficients whose outer products add up to the covariance.
 
-    Of more than `MAX_COVARIANCE_AXES` a random rotation is taken of which the first ones, made longer, have
-    the covariance in the mean.
+    Of many a random rotation is taken of which the first ones, made longer, have the covariance in the mean.
     """
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -622,35 +652,6 @@ class MeanTime:
         return self.value / factor, self.value * factor
 
 
-def mean_exit_time(rate: EscapeRate, noise: NoiseStrength) -> MeanTime | None:
-    """The mean time over one saddle with its errors; None where the law gives none.
-
-    Where the error of the prefactor is not known it is taken to be relatively as uncertain as ΔU, since both
-    follow from f to the first order.
-
-    Examples
-    --------
-    >>> rate = EscapeRate(barrier=0.5, prefactor=4.0, standard_error=0.01)
-    >>> found = mean_exit_time(rate, NoiseStrength(0.1))
-    >>> round(found.value, 1), round(found.data_error, 3), found.law_error
-    (593.7, 0.102, 0.2)
-    """
-    try:
-        value = rate.mean_time(noise.intensity)
-    except NumericalFailure:
-        return None
-    if not np.isfinite(value):
-        return None
-    height = rate.barrier / noise.intensity
-    relative = rate.standard_error / rate.barrier
-    of_prefactor = relative if rate.prefactor_error is None else rate.prefactor_error
-    of_noise = height * rate.leverage * noise.standard_error / noise.intensity
-    squares = float(np.nansum(np.square((height * relative, of_prefactor, of_noise))))
-    together = 2 * rate.covariance / noise.intensity
-    # By rounding, or by what is in one error alone, the two could cancel by more than there is.
-    return MeanTime(value, float(np.sqrt(max(squares + together, np.nan_to_num(of_noise) ** 2))), 1 / height)
-
-
 def mean_residence_time(exits: Sequence[EscapeRate], noise: NoiseStrength | None) -> MeanTime | None:
     """The mean time in a well with these ways out, whose rates add; None where no way out has a rate.
 
@@ -658,7 +659,7 @@ def mean_residence_time(exits: Sequence[EscapeRate], noise: NoiseStrength | None
     """
     if noise is None:
         return None
-    times = [mean_exit_time(one, noise) for one in exits]
+    times = [one.mean_exit_time(noise) for one in exits]
     known = [one for one in times if one is not None]
     if not known:
         return None

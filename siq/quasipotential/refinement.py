@@ -15,7 +15,6 @@ passes was thereby selected for agreement: that of a certificate is a test of co
 
 from __future__ import annotations
 
-import itertools
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -58,29 +57,24 @@ from siq.quasipotential.formulas import (
     term_coefficients,
 )
 from siq.quasipotential.global_formula import (
-    GlobalPotential,
-    RegionFormula,
+    GlobalFormula,
     fit_values,
-    fit_wells,
-    network_starts,
     refine_globally,
     with_circulation,
 )
-from siq.quasipotential.hamilton_jacobi import affordable_degree, potential_basis
+from siq.quasipotential.hamilton_jacobi import LibraryBasis, affordable_degree
 from siq.quasipotential.occupancy import OccupancyCheck, check_occupancy
 from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.wells import Well, WellOptions, fit_well, local_well
-from siq.remarks import sentence
+from siq.remarks import Remark, sentence
 from siq.systems.phase_portrait import PhasePortrait, RecordedRegion, evenly_spread, phase_portrait
 
 logger = logging.getLogger(__name__)
 
 Route = Literal["network", "local"]
 
+LOWER_PARTS = (0.7, 0.5, 0.3)  # of the points, by V
 NETWORK_DEGREE = 8  # highest power of a well by the network route, whose start knows no more
-ON_SOME = "noise acts on some states only: V has one formula for each well, and none over all of them"
-ELSEWHERE = "where D depends on the state no single formula is sought: each well has its own"
-NOT_ORTHOGONAL = "V and g have no exactly orthogonal form on their terms: they are fitted one by one"
 
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -127,35 +121,28 @@ class Refined:
     Attributes
     ----------
     found
-        The identified f.
-    library
-        The functions of a formula for the region: those of f and of V together.
-    residual
-        Relative Hamilton–Jacobi residual of V there.
+        The identified f, over the functions of a formula for the region: those of f and of V together.
     wells, network_wells
         By the local route, one for each attractor; and by the network route, where it found no formula for
         the region.
-    notes
-        What could not be done, in words.
+    remarks
+        What could not be done.
     formula
         V and g where one formula holds over the whole region.
     """
 
     found: FieldEstimate
-    library: CandidateLibrary
-    residual: float
     wells: tuple[Well, ...]
     network_wells: tuple[Well, ...] = ()
-    notes: tuple[str, ...] = ()
-    formula: RegionFormula | None = None
+    remarks: tuple[Remark, ...] = ()
+    formula: GlobalFormula | None = None
 
 
 def _formula_library(found: FieldEstimate, options: RefinementOptions) -> CandidateLibrary:
     """The functions in which one formula of V is sought for the whole region.
 
     No polynomial V has a higher degree than f has, and one: of ``∇V·(f + D∇V) = 0`` the highest powers would
-    be those of ``∇V·D∇V``, which cannot vanish where D is regular. Where V is no polynomial, a quartic is the
-    least that has two wells; so this is the default, unless the options name a degree and functions.
+    be those of ``∇V·D∇V``, which cannot vanish where D is regular. A quartic is the least that has two wells.
     """
     degree = options.formula_degree
     if degree is None:
@@ -176,44 +163,33 @@ def refine(
 ) -> Refined:
     """Follow the routes that the options name.
 
-    Parameters
-    ----------
-    found, portrait
-        The identified f, with its attractors, saddles and basins.
-    formula
-        The regression's coefficients of V over the library of the formula, shape ``(q,)``: the start of the
-        network route.
-    network
-        V_θ, points ``(n, d)`` to values ``(n,)``: its second start, where the formula leads nowhere.
-    points
-        Recorded states over which one formula is sought, shape ``(n, d)``.
-    options
-        The routes, and what they keep.
-    seed
-        Decides which points are used where there are too many.
+    The network route starts from `formula`, the regression's coefficients of V over the library of the
+    formula, shape ``(q,)``, and where that leads nowhere from `network`, V_θ at points. One formula is sought
+    over the recorded states `points`, shape ``(n, d)``. The seed decides which points are used where there
+    are too many.
     """
-    notes: list[str] = []
+    remarks: list[Remark] = []
     routes = options.with_routes(networks=network is not None).routes or ()
     library = _formula_library(found, options)
     found = _over_library(found, library)
     wells: tuple[Well, ...] = ()
     if "local" in routes:
-        wells, notes = local_wells(found, portrait, options=options, seed=seed)
+        wells, remarks = local_wells(found, portrait, options=options, seed=seed)
     # The errors of f make some of the residual with which one formula is believed to hold.
     errors = np.abs(np.sqrt(np.diag(found.covariance)) / found.values)
     noise = 0.0 if found.noise_free else 3 * float(np.sqrt((errors**2).mean()))
     limit = options.single_formula + noise
-    best: GlobalPotential | None = None
+    best: GlobalFormula | None = None
 
     def good() -> bool:
-        return best is not None and bool(best.coefficients.any()) and best.residual < limit
+        return best is not None and bool(best.potential.any()) and best.residual < limit
 
     def seek(starts: Iterable[np.ndarray]) -> None:
         """Refine starts until one is good enough, or else keep that of the smallest residual."""
         nonlocal best
         for start in starts:
             trial = refine_globally(
-                start, library, found, points,
+                start, found, points,
                 false_terms=options.false_terms, precision=options.precision,
             )  # fmt: skip
             if best is None or trial.residual < best.residual:
@@ -221,12 +197,22 @@ def refine(
             if good():
                 break
 
+    def of_wells(group: Sequence[Well]) -> np.ndarray:
+        inside = [well.inside() for well in group]
+        return fit_values(library, inside, [well.values(x) for well, x in zip(group, inside, strict=True)])
+
     network_wells: Sequence[Well] = ()
     if "network" in routes:
-        starts: Iterable[np.ndarray] = [] if formula is None else [formula]
-        if network is not None:
-            starts = itertools.chain(starts, network_starts(library, found, points, network(points)))
-        seek(starts)
+        seek([] if formula is None else [formula])
+        if network is not None and not good():
+            values = network(points)
+            seek([fit_values(library, [points], [values])])
+            # Networks are worst where recordings are few, far out, and Gauss–Newton may follow them to a
+            # false solution; further starts are refined on lower and lower parts of V first.
+            for part in (values <= np.quantile(values, share) for share in LOWER_PARTS):
+                if part.sum() > 2 * library.size and not good():
+                    start = fit_values(library, [points[part]], [values[part]])
+                    seek([refine_globally(start, found, points[part], sparse=False).potential])
         if network is not None and not good():
             # In powers no higher than the local route took.
             degree = max((well.degree for well in wells), default=NETWORK_DEGREE)
@@ -241,19 +227,19 @@ def refine(
                         )
                     )  # fmt: skip
                 except NumericalFailure as error:
-                    notes.append(f"network route: {error}")
+                    remarks.append(_failed("network", error))
     elif wells:
         network_wells = wells
     if not found.diffusion.constant:  # g = f + D∇V would need functions that no library has
-        notes.append(ELSEWHERE)
+        remarks.append(Remark("quasipotential.no_single_formula_for_noise_of_the_state"))
     elif not found.diffusion.regular:  # the equation of Hamilton and Jacobi is weighed by its inverse
-        notes.append(ON_SOME)
+        remarks.append(Remark("quasipotential.noise_on_some_states_only"))
     else:
         if network_wells and not good():
             # Refined one by one, the wells may turn out to share one formula. All of them together make the
             # start: one alone does not tell an odd power from an even one, and goes on wrongly in the others.
             groups = [network_wells, *([well] for well in network_wells if len(network_wells) > 1)]
-            seek(fit_wells(library, group) for group in groups)
+            seek(map(of_wells, groups))
         if best is not None and good():
             whole = with_circulation(
                 best, found, points, false_terms=options.false_terms, precision=options.precision,
@@ -261,13 +247,10 @@ def refine(
             )  # fmt: skip
             if whole is not None:
                 if not (whole.joint or found.noise_free):
-                    notes.append(NOT_ORTHOGONAL)
-                return Refined(found, library, best.residual, wells, (), tuple(notes), whole)
-        notes.append("no single formula in this library holds over the whole recorded region")
-    return Refined(
-        found, library, np.inf if best is None else best.residual, tuple(wells),
-        tuple(network_wells) if "network" in routes else (), tuple(notes),
-    )  # fmt: skip
+                    remarks.append(Remark("quasipotential.not_orthogonal"))
+                return Refined(found, wells, (), tuple(remarks), whole)
+        remarks.append(Remark("quasipotential.no_single_formula"))
+    return Refined(found, wells, tuple(network_wells) if "network" in routes else (), tuple(remarks))
 
 
 def _over_library(found: FieldEstimate, library: CandidateLibrary) -> FieldEstimate:
@@ -297,15 +280,19 @@ def local_wells(
     *,
     options: RefinementOptions,
     seed: int = 0,
-) -> tuple[tuple[Well, ...], list[str]]:
-    """The local route: V about each attractor, and where that was not possible, in words."""
-    wells, notes = [], []
+) -> tuple[tuple[Well, ...], list[Remark]]:
+    """The local route: V about each attractor, and where that was not possible."""
+    wells, remarks = [], []
     for index in range(len(portrait.attractors)):
         try:
             wells.append(local_well(found.dynamics, portrait, index, options=options, seed=seed))
         except NumericalFailure as error:
-            notes.append(f"local route: {error}")
-    return tuple(wells), notes
+            remarks.append(_failed("local", error))
+    return tuple(wells), remarks
+
+
+def _failed(route: Route, error: NumericalFailure) -> Remark:
+    return Remark("quasipotential.route_failed", {"route": route, "reason": str(error)})
 
 
 def _refined_decomposition(refined: Refined, points: np.ndarray) -> SymbolicDecomposition:
@@ -314,7 +301,8 @@ def _refined_decomposition(refined: Refined, points: np.ndarray) -> SymbolicDeco
     f is that which was identified, so that f = -D∇V + g is a statement and no definition. Where there is
     one attractor only, its well's formula stands for the whole where no other was found.
     """
-    library, found, formula = refined.library, refined.found, refined.formula
+    found, formula = refined.found, refined.formula
+    library = found.library
     wells = refined.wells or refined.network_wells
 
     def named(errors: np.ndarray) -> dict[str, float]:
@@ -326,14 +314,15 @@ def _refined_decomposition(refined: Refined, points: np.ndarray) -> SymbolicDeco
     errors = by_component("f", found.standard_errors)
     if formula is None:
         return SymbolicDecomposition(library.symbols, None, (), found.dynamics.formulas, wells, errors)
+    assert formula.circulatory is not None and formula.circulatory_errors is not None
     formulas = decomposition_from_coefficients(
         library, potential=formula.potential, circulatory=formula.circulatory,
         vector_field=np.zeros_like(formula.circulatory), points=points,
     )  # fmt: skip
     # The constant is minus the minimum; at the minimum its own place does not matter to first order.
     at = library.evaluate(points[np.argmin(library.evaluate(points) @ formula.potential)][None])[0]
-    constant = float(np.sqrt(at @ formula.potential_covariance @ at))
-    of_potential = named(np.sqrt(np.diag(formula.potential_covariance))) | {"1": constant}
+    constant = float(np.sqrt(at @ formula.covariance @ at))
+    of_potential = named(np.sqrt(np.diag(formula.covariance))) | {"1": constant}
     errors |= {"V": of_potential, "U": {term: 2 * error for term, error in of_potential.items()}}
     errors |= by_component("g", formula.circulatory_errors)
     return replace(formulas, vector_field=found.dynamics.formulas, wells=wells, standard_errors=errors)
@@ -342,16 +331,8 @@ def _refined_decomposition(refined: Refined, points: np.ndarray) -> SymbolicDeco
 class RefinementContext:
     """Everything that the refinement of a run goes by.
 
-    Parameters
-    ----------
-    recordings, found, networks
-        Trajectories, the identified f, and the trained networks, None for none.
-    number, seed
-        Of the run, and of the study.
-    pair_step
-        Time between the samples of a pair.
-    refinement, limits
-        How V is refined, without named routes by those that there are; and the limits of its tests.
+    Trajectories, the identified f and the trained networks, if any; the number of the run and the seed of the
+    study; the time between the samples of a pair; how V is refined, and the limits of its tests.
 
     Attributes
     ----------
@@ -417,12 +398,72 @@ class RefinementContext:
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             return OccupancyCheck(missing=str(error))
 
+    def refine_and_certify(self, regressed: SymbolicDecomposition | None) -> Refinement:
+        """Refined formulas of the run with their certificate, from those of a regression, if any."""
+        formula = None
+        if regressed is not None and regressed.potential is not None:
+            named = term_coefficients(regressed.potential)
+            library = _formula_library(self.found, self.options)
+            formula = np.array([named.get(name, 0.0) for name in library.names])
+        network = None if self.networks is None else _potential_of(self.networks)
+        refined, formulas, certificate = _refined_by_routes(self, self.options, network, formula)
+        caustics = caustics_below(
+            self.found.dynamics, refined.wells or refined.network_wells, self.portrait, certificate.error,
+            seed=self.number,
+        )  # fmt: skip
+        record = self.record_test()
+        verdict = record.verdict(false_alarms=self.limits.false_alarms)
+        if verdict is not None:
+            reason = certificate.reason
+            if not verdict.passed:
+                reason = "; ".join(one for one in (reason, verdict.reason) if one)
+            certificate = replace(certificate, tests={**certificate.tests, "record": verdict}, reason=reason)
+        return Refinement(formulas, certificate, record, (*refined.remarks, *caustics))
+
+    def control(
+        self, refined: SymbolicDecomposition | None, certificate: Certificate | None
+    ) -> dict[str, Any]:
+        """Refine networks with their weights in random order, and test the result as the real one is.
+
+        Gauss–Newton from a random start ends nowhere, at a false solution that is as exact as the true one,
+        or at the true one. The tests have to refuse the first two; `same_as_refined` tells the third.
+
+        Returns
+        -------
+        dict
+            A certificate as it stands in `model.json`. `same_as_refined` among its tests has the largest
+            relative difference from the refined V in any well; it takes no part in whether it is certified.
+        """
+        assert self.networks is not None
+        draw = generator(self.seed, self.number, Purpose.SHUFFLE)
+        randomised = _potential_of(shuffled(self.networks, generator=draw))
+        options = replace(self.options, routes=("network",))
+        try:
+            _, formulas, made = _refined_by_routes(self, options, randomised, None)
+        except (NumericalFailure, np.linalg.LinAlgError) as error:
+            nothing = Verdict.refused(
+                f"refinement from random weights led to no V: {error}", self.limits.hamilton_jacobi
+            )
+            return uncertified(nothing.reason) | {"tests": {"hamilton_jacobi": nothing.as_data()}}
+        data = made.as_data()
+        if refined is None or certificate is None:
+            return data
+        difference = _difference(formulas, refined, self.evidence.references)
+        explained = MIN_DIFFERENCE + sum(one.error for one in (made, certificate) if np.isfinite(one.error))
+        verdict = Verdict.of(difference, explained, "it is another V than the refined one")
+        if made.certified:
+            data["reason"] = (
+                "refinement from random weights led to the same V" if verdict.passed else
+                "a V from random weights was certified that is not the refined one: one of the two is false"
+            )  # fmt: skip
+        data["tests"]["same_as_refined"] = verdict.as_data()
+        return data
+
 
 def _every_well_held_out(portrait: PhasePortrait, pairs: SnapshotPairs, mask: np.ndarray) -> np.ndarray:
     """Held-out recordings as a mask, more of them where those that there are never come into some well.
 
-    Recordings under noise may stay in one well for good, and the test of motion in another would have nothing
-    to go by. They are chosen by where they are, not by where they go: the fit of V knows no increments.
+    They are chosen by where they are, not by where they go: the fit of V knows no increments.
     """
     mask = mask.copy()
     some = pairs.take(np.arange(0, len(pairs.h), max(len(pairs.h) // MAX_PAIRS, 1)))
@@ -454,13 +495,13 @@ def _refined_by_routes(
     certificate = certify(
         formulas, context.evidence, others=refined.wells, compared=compared,
         relative_error=0.0 if refined.formula is None or context.found.noise_free
-        else refined.formula.relative_error(refined.library.evaluate(context.points)),
+        else refined.formula.relative_error(refined.found.library.evaluate(context.points)),
     )  # fmt: skip
     if certificate.certified or not refined.wells:
         return refined, formulas, certificate
     # One formula for all wells is an extra. What refuses it is no word against the wells.
-    note = f"no single formula holds over the wells: {certificate.reason}"
-    alone = replace(refined, formula=None, notes=(*refined.notes, note))
+    refused = Remark("quasipotential.single_formula_refused", {"reason": certificate.reason})
+    alone = replace(refined, formula=None, remarks=(*refined.remarks, refused))
     of_wells = certify(wells, context.evidence, others=others, compared=compared)
     if not of_wells.certified:
         return refined, formulas, certificate
@@ -477,94 +518,19 @@ class Refinement:
         V, g and f, and whether to believe them.
     record
         The test of f against hops and histogram of the recordings.
-    portrait
-        Attractors of f, saddles and basins, as the formulas were found with them.
-    notes
-        What could not be done, and caustics, in words.
+    remarks
+        What could not be done, and caustics.
     """
 
     formulas: SymbolicDecomposition
     certificate: Certificate
     record: OccupancyCheck
-    portrait: PhasePortrait
-    notes: tuple[str, ...] = ()
-
-
-def refine_and_certify(context: RefinementContext, regressed: SymbolicDecomposition | None) -> Refinement:
-    """Refined formulas of a run with their certificate, from those of a regression where there are some."""
-    formula = None
-    if regressed is not None and regressed.potential is not None:
-        named = term_coefficients(regressed.potential)
-        library = _formula_library(context.found, context.options)
-        formula = np.array([named.get(name, 0.0) for name in library.names])
-    network = None if context.networks is None else _potential_of(context.networks)
-    refined, formulas, certificate = _refined_by_routes(context, context.options, network, formula)
-    caustics = caustics_below(
-        context.found.dynamics, refined.wells or refined.network_wells, context.portrait, certificate.error,
-        seed=context.number,
-    )  # fmt: skip
-    record = context.record_test()
-    verdict = record.verdict(false_alarms=context.limits.false_alarms)
-    if verdict is not None:
-        reason = certificate.reason
-        if not verdict.passed:
-            reason = "; ".join(one for one in (reason, verdict.reason) if one)
-        certificate = replace(certificate, tests={**certificate.tests, "record": verdict}, reason=reason)
-    return Refinement(formulas, certificate, record, context.portrait, (*refined.notes, *caustics))
+    remarks: tuple[Remark, ...] = ()
 
 
 def _potential_of(networks: TrainedNetworks) -> Function:
     """V_θ, points ``(n, d)`` to values ``(n,)``."""
     return lambda x: networks.evaluate(x).potential
-
-
-def control(
-    context: RefinementContext,
-    refined: SymbolicDecomposition | None,
-    certificate: Certificate | None,
-) -> dict[str, Any]:
-    """Refine networks with their weights in random order, and test the result as the real one is.
-
-    Gauss–Newton from a random start ends nowhere, at a false solution that is as exact as the true one, or at
-    the true one. The tests have to refuse the first two; `same_as_refined` tells the third.
-
-    Parameters
-    ----------
-    context
-        Of the real refinement, with its networks.
-    refined, certificate
-        The refined formulas with their certificate, None where there are none.
-
-    Returns
-    -------
-    dict
-        A certificate as it stands in `model.json`. `same_as_refined` among its tests has the largest
-        relative difference from the refined V in any well; it takes no part in whether it is certified.
-    """
-    assert context.networks is not None
-    draw = generator(context.seed, context.number, Purpose.SHUFFLE)
-    randomised = _potential_of(shuffled(context.networks, generator=draw))
-    options = replace(context.options, routes=("network",))
-    try:
-        _, formulas, made = _refined_by_routes(context, options, randomised, None)
-    except (NumericalFailure, np.linalg.LinAlgError) as error:
-        nothing = Verdict.refused(
-            f"refinement from random weights led to no V: {error}", context.limits.hamilton_jacobi
-        )
-        return uncertified(nothing.reason) | {"tests": {"hamilton_jacobi": nothing.as_data()}}
-    data = made.as_data()
-    if refined is None or certificate is None:
-        return data
-    difference = _difference(formulas, refined, context.evidence.references)
-    explained = MIN_DIFFERENCE + sum(one.error for one in (made, certificate) if np.isfinite(one.error))
-    verdict = Verdict.of(difference, explained, "it is another V than the refined one")
-    if made.certified:
-        data["reason"] = (
-            "refinement from random weights led to the same V" if verdict.passed else
-            "a V from random weights was certified that is not the refined one: one of the two is false"
-        )  # fmt: skip
-    data["tests"]["same_as_refined"] = verdict.as_data()
-    return data
 
 
 def _difference(
@@ -574,7 +540,7 @@ def _difference(
 
     def about(formulas: SymbolicDecomposition, attractor: np.ndarray) -> Function | None:
         if formulas.potential is not None:
-            return lambda x: np.asarray(formulas.evaluate(np.ascontiguousarray(x.T))[0])
+            return formulas.values
         return next((one.values for one in formulas.wells if np.array_equal(one.attractor, attractor)), None)
 
     worst = 0.0 if references else np.inf
@@ -623,10 +589,10 @@ class TrainingCheck:
         points = self.portrait.points
         values = potential(points)
         below = values <= np.quantile(values, CHECK_SHARE)
-        start = fit_values(self.library, points[below], values[below])
-        result = refine_globally(start, self.library, self.found, points[below], sparse=False)
-        basis = potential_basis(self.library)
-        own = result.coefficients[basis.chosen]
+        start = fit_values(self.library, [points[below]], [values[below]])
+        result = refine_globally(start, self.found, points[below], sparse=False)
+        basis = LibraryBasis.of_potential(self.library)
+        own = result.potential[basis.chosen]
         worst = check_agreement(lambda x: basis.values(x) @ own, self.wells, limit=0.0).value
         logger.info("check of one formula: residual %.1e, difference %.1e", result.residual, worst)
         return result.residual < self.options.residual / 10 and worst < self.options.difference

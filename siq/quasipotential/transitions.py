@@ -23,14 +23,8 @@ import numpy as np
 from siq.errors import NumericalFailure
 from siq.inference.diffusion_model import defined_states
 from siq.inference.field_estimate import AnyField, GivenField
-from siq.quasipotential.path_chains import MinimumActionPath, TransitionPath
-from siq.quasipotential.paths import (
-    both_sides,
-    descent,
-    minimum_action_path,
-    transition_path,
-    way_about_cycles,
-)
+from siq.quasipotential.path_chains import MinimumActionPath
+from siq.quasipotential.paths import both_sides, descent, transition_path
 from siq.quasipotential.rates import EscapeRate, escape_rate, prefactor_error
 from siq.quasipotential.wells import Well
 from siq.remarks import Remark, sentence
@@ -86,7 +80,7 @@ class Transition:
     start: int
     end: int | None
     saddle: Equilibrium | Cycle
-    path: TransitionPath | None
+    path: MinimumActionPath | None
     barrier: float = np.nan
     formula_share: float = np.nan
     standard_error: float = np.nan
@@ -105,24 +99,25 @@ class Transition:
     def place(self) -> np.ndarray:
         """Where the path ends: at the saddle, or at a state of the unstable cycle. Shape ``(d,)``."""
         over_cycle = isinstance(self.saddle, Cycle) and self.path is not None
-        return self.path.uphill.points[-1] if over_cycle and self.path else self.saddle.position
+        return self.path.points[-1] if over_cycle and self.path else self.saddle.position
 
     @property
     def uphill(self) -> np.ndarray:
         """The path of least action up to the saddle, shape ``(n, d)``; empty where none was found."""
-        return np.zeros((0, len(self.saddle.position))) if self.path is None else self.path.uphill.points
+        return np.zeros((0, len(self.saddle.position))) if self.path is None else self.path.points
 
     @property
     def downhill(self) -> np.ndarray:
         """The way down from there without noise, likewise."""
-        return np.zeros((0, len(self.saddle.position))) if self.path is None else self.path.downhill
+        down = None if self.path is None else self.path.downhill
+        return np.zeros((0, len(self.saddle.position))) if down is None else down
 
     @property
     def error(self) -> float:
         """Standard error of the barrier: from f, and by how much the formula and the path alone differ."""
         if self.path is None:
             return self.standard_error
-        return float(np.hypot(self.standard_error, self.barrier - self.by_rivals - self.path.uphill.action))
+        return float(np.hypot(self.standard_error, self.barrier - self.by_rivals - self.path.action))
 
     @property
     def exit(self) -> EscapeRate:
@@ -146,64 +141,46 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
         Whether a saddle behind which lies no attractor of the region is a way out, too: of a given f the
         path up to it is as good as any other. Of an identified one nothing is known beyond.
     """
-    ways: list[Transition] = []
-    nothing: tuple[Remark, ...] = ()
     points, box, cycles = len(portrait.attractors), portrait.box, portrait.cycles
+    settled: list[np.ndarray | Cycle] = [*(one.position for one in portrait.attractors), *cycles]
+    ways: list[Transition] = []
+
+    def add(start: int, over: Equilibrium | Cycle, end: int | None) -> None:
+        first, last = settled[start], over if isinstance(over, Cycle) else over.position
+        beyond = None if end is None else settled[end]
+        kind = "unstable cycle" if isinstance(over, Cycle) else "saddle"
+        remarks = () if end is not None else (Remark("quasipotential.leads_out", {"over": kind}),)
+        about_points = all(isinstance(one, np.ndarray) for one in (first, last, beyond))
+        guesses, path = None, None
+        try:
+            if about_points and dynamics.dimension > MOST_STATES_OF_BENT_GUESSES:
+                assert isinstance(first, np.ndarray) and isinstance(last, np.ndarray)
+                # The way down taken backwards, and the straight line.
+                guesses = [descent(dynamics, last, first, GUESS_POINTS)[::-1], np.stack([first, last])]
+            path = transition_path(
+                dynamics, first, last, beyond, box=box, tolerance=PATH_TOLERANCE, initial=guesses
+            )
+        except NumericalFailure as error:
+            remarks = (Remark("quasipotential.no_path", {"reason": str(error)}),)
+        ways.append(Transition(start, end, over, path, remarks=remarks, from_cycle=start >= points))
+
     for cycle in portrait.parting:
         sides = [int(one) for one in both_sides(dynamics, cycle, portrait)]
         for start, beyond in (sides, sides[::-1]) if sides[0] != sides[1] else ():
-            if start < 0:
-                continue
-            end, remarks = None if beyond < 0 else beyond, nothing
-            if end is None:
-                remarks = (Remark("quasipotential.leads_out", {"over": "unstable cycle"}),)
-            try:
-                path = way_about_cycles(dynamics, portrait, start, cycle, end, tolerance=PATH_TOLERANCE)
-                ways.append(Transition(start, end, cycle, path, remarks=remarks))
-            except NumericalFailure as error:
-                ways.append(_without_path(start, end, cycle, error))
-    settled: list[np.ndarray | Cycle] = [*(one.position for one in portrait.attractors), *cycles]
-    for index in range(points + len(cycles)):
+            if start >= 0:
+                add(start, cycle, None if beyond < 0 else beyond)
+    for index in range(len(settled)):
         for saddle in portrait.saddles[index]:
             reached = sides_of(dynamics, saddle, portrait.attractors, box=box, cycles=cycles)
             end = min(set(reached[reached >= 0].tolist()) - {index}, default=None)
-            remarks = nothing
             if end is None and not beyond_region:
-                remark = Remark("quasipotential.nothing_beyond_saddle")
-                ways.append(Transition(index, None, saddle, None, remarks=(remark,)))
-                continue
-            if end is None and (reached == index).all():  # it parts no wells
-                continue
-            try:
-                if end is None:
-                    uphill = minimum_action_path(
-                        dynamics, settled[index], saddle.position, tolerance=PATH_TOLERANCE
-                    )
-                    path = TransitionPath(uphill, saddle.position[None])
-                    remarks = (Remark("quasipotential.leads_out", {"over": "saddle"}),)
-                elif max(index, end) >= points:
-                    path = way_about_cycles(dynamics, portrait, index, saddle, end, tolerance=PATH_TOLERANCE)
-                else:
-                    attractor, guesses = portrait.attractors[index].position, None
-                    if dynamics.dimension > MOST_STATES_OF_BENT_GUESSES:
-                        # The way down taken backwards, and the straight line.
-                        down = descent(dynamics, saddle.position, attractor, GUESS_POINTS)
-                        guesses = [down[::-1], np.stack([attractor, saddle.position])]
-                    path = transition_path(
-                        dynamics, attractor, saddle.position, portrait.attractors[end].position,
-                        tolerance=PATH_TOLERANCE, initial=guesses,
-                    )  # fmt: skip
-                ways.append(Transition(index, end, saddle, path, remarks=remarks))
-            except NumericalFailure as error:
-                ways.append(_without_path(index, end, saddle, error))
-    return [replace(way, from_cycle=way.start >= points) for way in ways]
-
-
-def _without_path(
-    start: int, end: int | None, saddle: Equilibrium | Cycle, error: NumericalFailure
-) -> Transition:
-    remark = Remark("quasipotential.no_path", {"reason": str(error)})
-    return Transition(start, end, saddle, None, remarks=(remark,))
+                remarks = (Remark("quasipotential.nothing_beyond_saddle"),)
+                ways.append(
+                    Transition(index, None, saddle, None, remarks=remarks, from_cycle=index >= points)
+                )
+            elif end is not None or not (reached == index).all():  # else it parts no wells
+                add(index, saddle, end)
+    return ways
 
 
 def missing_diffusion(dynamics: Dynamics) -> str | None:
@@ -244,29 +221,29 @@ def transitions(
             found_ways.append(way)
             continue
         remarks, rate = list(way.remarks), None
-        if not path.uphill.converged:
+        if not path.converged:
             remarks.append(Remark("quasipotential.path_not_converged"))
         try:
             if way.from_cycle or isinstance(way.saddle, Cycle):
                 raise NumericalFailure("no law is implemented for ways that begin or end on a cycle")
             if missing is not None:
                 raise NumericalFailure(missing)
-            rate = escape_rate(found.dynamics, path.uphill, beyond=way.end is not None)
+            rate = escape_rate(found.dynamics, path, beyond=way.end is not None)
             remarks += rate.remarks
-            error, covariance = prefactor_error(found, path.uphill)
+            error, covariance = prefactor_error(found, path)
             rate = replace(rate, prefactor_error=error, covariance=covariance)
         except (NumericalFailure, np.linalg.LinAlgError) as failure:
             remarks.append(Remark("quasipotential.no_escape_time", {"reason": str(failure)}))
-        barrier, share = path.uphill.action, 0.0
+        barrier, share = path.action, 0.0
         if well is not None:
             barrier, share = _barrier_by_formula(path, well)
-            if abs(barrier / path.uphill.action - 1) > NOTEWORTHY_DIFFERENCE:
+            if abs(barrier / path.action - 1) > NOTEWORTHY_DIFFERENCE:
                 remarks.append(Remark("quasipotential.formula_differs_from_path"))
-            if isinstance(found, GivenField) and path.uphill.converged:  # nothing about f is to be averaged
-                barrier, share = path.uphill.action, 0.0
+            if isinstance(found, GivenField) and path.converged:  # nothing about f is to be averaged
+                barrier, share = path.action, 0.0
         logger.info(
             "barrier of U from attractor %d: %.5g by formula, %.5g by the path",
-            way.start, barrier, path.uphill.action,
+            way.start, barrier, path.action,
         )  # fmt: skip
         spread, by_rivals = barrier_uncertainty(path, found)
         if abs(by_rivals) > NOTEWORTHY_CHANGE * spread:
@@ -275,29 +252,29 @@ def transitions(
             replace(
                 way, barrier=barrier + by_rivals, formula_share=share, standard_error=spread, rate=rate,
                 remarks=tuple({str(one): one for one in remarks}.values()), by_rivals=by_rivals,
-                leverage=noise_leverage(path.uphill, found.dynamics),
+                leverage=noise_leverage(path, found.dynamics),
             )
         )  # fmt: skip
     return found_ways
 
 
-def _barrier_by_formula(path: TransitionPath, well: Well) -> tuple[float, float]:
+def _barrier_by_formula(path: MinimumActionPath, well: Well) -> tuple[float, float]:
     """The barrier of U by a formula and the end of the path, and the share that the formula accounts for."""
-    points, action = path.uphill.points, path.uphill.values
+    points, action = path.points, path.values
     formula = 2 * well.known_values(points)
     known = np.flatnonzero(np.isfinite(formula))
     if not len(known):
-        return float(path.uphill.action), 0.0
+        return float(path.action), 0.0
     last = known[-1]
-    barrier = formula[last] + path.uphill.action - action[last]
+    barrier = formula[last] + path.action - action[last]
     return float(barrier), float(formula[last] / barrier)
 
 
-def barrier_uncertainty(path: TransitionPath, found: AnyField) -> tuple[float, float]:
+def barrier_uncertainty(path: MinimumActionPath, found: AnyField) -> tuple[float, float]:
     """Standard error of a barrier of U from that of f, to first order, and what alternative terms add."""
     if isinstance(found, GivenField):
         return 0.0, 0.0
-    middle, force, spent = _pieces(path.uphill, found.dynamics)
+    middle, force, spent = _pieces(path, found.dynamics)
     terms = found.library.evaluate(middle)
     slope = -2 * np.einsum("n,nq,nd->qd", spent, terms, force)
     variance, by_rivals = float(found.variance(slope, of_mean=True)), float(found.bias(slope))

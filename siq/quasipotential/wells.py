@@ -32,14 +32,11 @@ from siq.errors import NumericalFailure
 from siq.quasipotential.hamilton_jacobi import (
     SINGULAR_RATIO,
     Expansion,
+    HamiltonJacobi,
     PowerBasis,
     affordable_degree,
-    equation_at,
-    gauss_newton,
-    power_basis,
-    relative_residuals,
-    robust_fit,
 )
+from siq.quasipotential.path_chains import MinimumActionPath
 from siq.systems.basins import Basin
 from siq.systems.cycles import Cycle
 from siq.systems.diffusion import Diffusion
@@ -81,10 +78,10 @@ class Well(Expansion):
 
     Attributes
     ----------
-    dynamics, attractor
-        f and D, and where V is zero, shape ``(d,)``.
     basis, coefficients
         The powers about the attractor, and their coefficients, shape ``(m,)``.
+    dynamics, attractor
+        f and D, and where V is zero, shape ``(d,)``.
     level, saddle
         V of the lowest saddle and its position; of the last point that recordings reach, and None, where they
         end before one.
@@ -103,8 +100,6 @@ class Well(Expansion):
 
     dynamics: Dynamics
     attractor: np.ndarray
-    basis: PowerBasis
-    coefficients: np.ndarray
     level: float
     saddle: np.ndarray | None
     residual: float
@@ -118,10 +113,9 @@ class Well(Expansion):
         if not self.reach:
             object.__setattr__(self, "reach", self.level)
 
-    @property
-    def inside(self) -> np.ndarray:
-        """The points of the fit below the level, shape ``(m, d)``."""
-        return np.asarray(self.points[self.values(self.points) < self.level])
+    def inside(self, share: float = 1.0) -> np.ndarray:
+        """The points of the fit below a share of the level, shape ``(m, d)``."""
+        return np.asarray(self.points[self.values(self.points) < share * self.level])
 
     def known_values(self, x: np.ndarray) -> np.ndarray:
         """V at points ``(n, d)``: shape ``(n,)``, NaN where the formula is not to be believed."""
@@ -216,24 +210,16 @@ class Well(Expansion):
         """Source of the functions ``V`` and ``V_gradient`` in Julia."""
         return self.formula.source("julia")
 
-
-@dataclass(frozen=True, eq=False)
-class Depth:
-    """How deep a well is, as the path of least action to its lowest saddle, or bounding cycle, tells.
-
-    `points`, ``(n, d)``, lie along the path; `values`, ``(n,)``, and `slopes`, ``(n, d)``, are V and ∇V
-    there.
-    """
-
-    saddle: Equilibrium | Cycle
-    points: np.ndarray
-    values: np.ndarray
-    slopes: np.ndarray
-
-    @property
-    def value(self) -> float:
-        """V at the saddle."""
-        return float(self.values[-1])
+    def surveyed(self, dynamics: Dynamics, portrait: PhasePortrait, index: int) -> Well:
+        """A formula read from a file, with the recorded states that tell where it holds."""
+        basin = portrait.basins[index]
+        along = self.values(basin.states.reshape(-1, basin.states.shape[2])).reshape(basin.states.shape[:2])
+        return replace(
+            self,
+            dynamics=dynamics,
+            points=basin.points(basin.below(along, self.reach)),
+            elsewhere=portrait.states_elsewhere(index),
+        )
 
 
 FIRST_LEVEL_SHARE = 0.05  # of a known depth: the first level
@@ -297,7 +283,8 @@ def local_well(
     *,
     options: WellOptions,
     seed: int = 0,
-    depth: Depth | None = None,
+    saddle: Equilibrium | Cycle | None = None,
+    path: MinimumActionPath | None = None,
 ) -> Well:
     """V about one attractor, of the lowest degree that no other betters by much.
 
@@ -305,13 +292,11 @@ def local_well(
     ----------
     dynamics, portrait, index
         f and D, their attractors, saddles and basins, and which attractor.
-    options
-        Degrees, reach and tolerance.
-    seed
-        Decides which points are used where there are too many.
-    depth
-        The lowest saddle with V there, where the path of least action has told it before, as it does for
-        given equations.
+    options, seed
+        Degrees, reach and tolerance; and what decides which points are used where there are too many.
+    saddle, path
+        The lowest saddle, or bounding cycle, and the path of least action to it, where that has told V there
+        before, as it does for given equations.
 
     Raises
     ------
@@ -319,7 +304,8 @@ def local_well(
         When no degree gives a formula.
     """
     attractor, basin = portrait.attractors[index], portrait.basins[index]
-    saddles = portrait.saddles[index] if depth is None else [depth.saddle]
+    saddles = portrait.saddles[index] if saddle is None else [saddle]
+    depth = None if path is None else float(path.values[-1]) / 2
     rows = np.arange(len(basin.chosen))
     kept = rows[rows % HELD_OUT_STRIDE != 0]
     wells: list[Well] = []
@@ -332,17 +318,17 @@ def local_well(
             if depth is None or not wells:
                 well = _grow_well(
                     dynamics, attractor, basin, saddles, degree=degree, generator=generator,
-                    depth=None if depth is None else depth.value,
+                    depth=depth,
                 )  # fmt: skip
             else:  # the same formula in powers up to a higher degree; the lower ones come first
                 lower = wells[-1]
-                basis = power_basis(lower.basis.symbols, lower.basis.center, lower.basis.scale, degree=degree)
+                basis = PowerBasis.up_to(degree, lower.basis.symbols, lower.basis.center, lower.basis.scale)
                 padding = np.zeros(basis.size - lower.basis.size)
                 coefficients = np.concatenate([lower.coefficients, padding])
                 well = replace(lower, basis=basis, coefficients=coefficients)
             if depth is not None:
-                start, goal = well, options.reach * depth.value
-                told = {"goal": goal, "rows": kept, "depth": depth, "generator": generator}
+                start, goal = well, options.reach * depth
+                told = {"goal": goal, "rows": kept, "path": path, "generator": generator}
                 well = _extend_well(start, basin, **told)
                 if (
                     wells and not well.residual < RUNAWAY_RATIO * wells[-1].residual
@@ -399,20 +385,14 @@ def _grow_well(
     generator: np.random.Generator,
     depth: float | None = None,
 ) -> Well:
-    """V about an attractor up to its lowest saddle, from M outwards.
-
-    `basin` has the recorded points that lead to the attractor, beyond which the well cannot reach, and
-    `saddles` those next to it. Where the path of least action has told the depth V of the lowest saddle
-    before, that saddle is the only one. Fails with `NumericalFailure` when too few states lead to the
-    attractor, or the powers can follow V neither up to a saddle nor to the end of the recorded region.
-    """
+    """V about an attractor up to the lowest of the saddles, from M outwards; `depth` is V there, if known."""
     hessian = hessian_at(dynamics, attractor.position)
     extent = np.sqrt(np.diag(np.linalg.inv(hessian)))
     flat = basin.states.reshape(-1, basin.states.shape[2])
     offsets = flat - attractor.position
     quadratic = 0.5 * np.einsum("ni,ij,nj->n", offsets, hessian, offsets).reshape(basin.states.shape[:2])
     size = np.quantile(quadratic[:, 0], 0.5) if depth is None else depth
-    basis = power_basis(dynamics.symbols, attractor.position, extent * np.sqrt(2 * size), degree=degree)
+    basis = PowerBasis.up_to(degree, dynamics.symbols, attractor.position, extent * np.sqrt(2 * size))
     order = basis.exponents.sum(axis=1)
     free = order > 2
     coefficients = np.zeros(basis.size)
@@ -448,8 +428,8 @@ def _grown(
 ) -> Well:
     """V grown from a start, level by level, to its lowest saddle or to the end of the recorded region.
 
-    `metric` is the Hessian of V at the attractor, in which distances are measured; `fitted` has the rows of
-    ``basin.chosen`` on which the start was fitted. The other arguments are as for `_grow_well`.
+    `metric` is M, in which distances are measured; `fitted` has the rows of ``basin.chosen`` on which the
+    start was fitted.
     """
     attractor = basis.center
     place = f"the attractor near {attractor.round(4)}"
@@ -490,10 +470,11 @@ def _grown(
                 f"V about {place} leaves the recorded states: it came from {before} to {len(points)} and"
                 f" needs {2 * basis.size}"
             )
-        equation = equation_at(basis, points, dynamics, attractor=attractor)
+        equation = HamiltonJacobi.at(basis, points, dynamics, attractor=attractor)
         steps, tolerance = (40, 1e-13) if last else (8, COARSE_TOLERANCE)
-        solution = gauss_newton(equation, coefficients, free=free, steps=steps, tolerance=tolerance)
-        coefficients, residual = solution.coefficients, solution.residual
+        coefficients, residual = equation.gauss_newton(
+            coefficients, free=free, steps=steps, tolerance=tolerance
+        )
         values = along(coefficients)
         recorded = _recorded(basin.starts(values), len(attractor))
         # Far from the points of the fit V is an extrapolation: a saddle that seems to lie lower than points
@@ -527,7 +508,7 @@ def _grown(
     ):
         degree = int(basis.exponents.sum(axis=1).max())
         raise NumericalFailure(f"powers of degree {degree} do not follow V from {place} up to a saddle")
-    return Well(dynamics, attractor, basis, coefficients, level, saddle, residual, points)
+    return Well(basis, coefficients, dynamics, attractor, level, saddle, residual, points)
 
 
 def _recorded(starts: np.ndarray, dimension: int) -> float:
@@ -569,9 +550,8 @@ def fit_well(
             rows = np.sort(generator.choice(rows, MAX_POINTS, replace=False))
         points = basin.points(rows)
         scale = np.abs(points - attractor.position).max(axis=0, initial=0.0)
-        basis = power_basis(
-            dynamics.symbols, attractor.position, np.where(scale > 0, scale, 1.0), degree=degree
-        )
+        scale = np.where(scale > 0, scale, 1.0)
+        basis = PowerBasis.up_to(degree, dynamics.symbols, attractor.position, scale)
         if len(points) < 2 * basis.size:
             failure = failure or NumericalFailure(
                 f"the networks leave only {len(points)} recorded states below the saddle of the attractor"
@@ -582,10 +562,9 @@ def fit_well(
         low = basis.exponents.sum(axis=1) <= START_DEGREE
         start = np.zeros(basis.size)
         start[low] = np.linalg.lstsq(basis.values(points)[:, low], potential(points) - lowest, rcond=1e-10)[0]
-        equation = equation_at(basis, points, dynamics)
-        start = gauss_newton(equation, start, free=low, steps=steps).coefficients
-        solution = gauss_newton(equation, start, steps=steps)
-        start = solution.coefficients
+        equation = HamiltonJacobi.at(basis, points, dynamics)
+        start, _ = equation.gauss_newton(start, free=low, steps=steps)
+        start, residual = equation.gauss_newton(start, steps=steps)
         metric = basis.hessians(attractor.position[None])[0] @ start
         curvature = np.linalg.eigvalsh(metric * np.outer(basis.scale, basis.scale))
         # Up to half of these states, but no fewer than the coefficients need: a start that just has enough of
@@ -595,11 +574,7 @@ def fit_well(
         enough = max(len(heights) // 2, 2 * basis.size)
         first = float(heights[min(enough, len(heights) - 1)]) * (1 + COARSE_TOLERANCE)
         # V = 0 is a solution too, and what tends to it has a residual as large as itself.
-        if (
-            not solution.residual < MAX_RESIDUAL
-            or curvature[0] <= MIN_CURVATURE * curvature[-1]
-            or first <= 0
-        ):
+        if not residual < MAX_RESIDUAL or curvature[0] <= MIN_CURVATURE * curvature[-1] or first <= 0:
             failure = NumericalFailure(
                 f"the networks' V leads to none with a minimum at the attractor near"
                 f" {attractor.position.round(4)}"
@@ -622,59 +597,61 @@ def _extend_well(
     *,
     goal: float,
     rows: np.ndarray | None = None,
-    depth: Depth | None = None,
+    path: MinimumActionPath | None = None,
     generator: np.random.Generator | None = None,
     by_path: bool = True,
 ) -> Well:
     """Take a formula on, from its well to a higher level `goal`, by robust fits of the equation.
 
-    Only states that lead to the attractor are asked: across the ridge another well begins. Where the depth of
-    the well is known before, the formula may be one of lower powers in a basis of higher ones, and the fit
-    begins with ∇V along the path, unless `by_path` is false.
+    Only states that lead to the attractor are asked: across the ridge another well begins. Where the path to
+    the saddle is known the formula may be one of lower powers in a basis of higher ones, and begins with ∇V
+    along it.
     """
     allowed = np.arange(len(basin.chosen)) if rows is None else rows
     functions = well.basis.values(basin.states.reshape(-1, basin.states.shape[2]))
     shape, free = basin.states.shape[:2], well.basis.exponents.sum(axis=1) > 2
     coefficients, level = well.coefficients, min(0.9 * well.level, goal)
-    options, rounds = (ROBUST_FIT, 4) if depth is None else (FIT_TO_KNOWN_DEPTH, 3)
-    if depth is not None:
+    options, rounds = (ROBUST_FIT, 4) if path is None else (FIT_TO_KNOWN_DEPTH, 3)
+    if path is not None:
         metric = np.linalg.cholesky(hessian_at(well.dynamics, well.attractor))
         places = basin.points(np.arange(len(basin.chosen))) @ metric
         lower = (functions @ coefficients).reshape(shape)
         fitted = basin.below(lower, level)
         # Where the well narrows towards its saddle, V in lower powers may be far off, and few states below.
-        distance, nearest = cKDTree(depth.points @ metric).query(places)
-        beside = np.where(distance < PATH_DISTANCE * np.sqrt(2 * depth.value), depth.values[nearest], np.inf)
+        distance, nearest = cKDTree(path.points @ metric).query(places)
+        beside = np.where(
+            distance < PATH_DISTANCE * np.sqrt(path.values[-1]), path.values[nearest] / 2, np.inf
+        )
         if by_path:
-            coefficients = _towards_path(well, basin.points(fitted), depth, free)
+            coefficients = _towards_path(well, basin.points(fitted), path, free)
     while True:
         chosen = basin.below((functions @ coefficients).reshape(shape), level)
-        if depth is not None:
+        if path is not None:
             chosen = np.intersect1d(chosen, basin.below(lower, RUNAWAY_LEVEL * level))
             if len(fitted) and len(chosen):
                 away = cKDTree(places[fitted]).query(places[chosen])[0]
                 chosen = chosen[away < POINT_REACH * np.sqrt(2 * level)]
             fitted = chosen = np.union1d(chosen, np.flatnonzero(beside < level))
         chosen = used = np.intersect1d(chosen, allowed)
-        if depth is not None and len(used) > MAX_POINTS_TO_KNOWN_DEPTH:
+        if path is not None and len(used) > MAX_POINTS_TO_KNOWN_DEPTH:
             assert generator is not None
             used = np.sort(generator.choice(used, MAX_POINTS_TO_KNOWN_DEPTH, replace=False))
-        if depth is not None and len(used) < 2 * well.basis.size:
+        if path is not None and len(used) < 2 * well.basis.size:
             raise NumericalFailure(
                 f"V about the attractor near {well.attractor.round(4)} is told by {len(used)} states alone"
             )
-        equation = equation_at(well.basis, basin.points(used), well.dynamics, attractor=well.attractor)
+        equation = HamiltonJacobi.at(well.basis, basin.points(used), well.dynamics, attractor=well.attractor)
         # On the way up one round keeps the formula close enough to be taken further.
         last = level >= goal
-        coefficients = robust_fit(equation, coefficients, free, rounds=rounds if last else 1, **options)
+        coefficients = equation.robust_fit(coefficients, free, rounds=rounds if last else 1, **options)
         if last:
             break
         level = min(goal, ROBUST_GROWTH * level)
-    residual = float(np.median(relative_residuals(equation, coefficients)))
-    if depth is not None and not np.isfinite(residual):
+    residual = float(np.median(equation.relative_residuals(coefficients)))
+    if path is not None and not np.isfinite(residual):
         raise NumericalFailure(f"powers of degree {well.degree} do not follow V to its saddle")
-    top = well.level if depth is None else depth.value
-    if depth is None and well.saddle is not None:
+    top = well.level if path is None else float(path.values[-1]) / 2
+    if path is None and well.saddle is not None:
         # A formula that goes on smoothly behind a kink is above V, never below.
         top = min(top, float(well.basis.values(well.saddle[None])[0] @ coefficients))
     return replace(
@@ -682,14 +659,12 @@ def _extend_well(
     )
 
 
-def _towards_path(well: Well, x: np.ndarray, depth: Depth, free: np.ndarray) -> np.ndarray:
-    """Coefficients of a formula that stays as it is at points, but for the path, whose ∇V is known.
-
-    They are but a start: the equation alone is fitted from there.
-    """
+def _towards_path(well: Well, x: np.ndarray, path: MinimumActionPath, free: np.ndarray) -> np.ndarray:
+    """A start: the formula as it is at points, but for the path, whose ∇V is known."""
     noise = measure_at(well.dynamics, well.attractor)
-    rising = (depth.values > PATH_FROM * depth.value) & (depth.values < PATH_TO * depth.value)
-    where, slopes = depth.points[rising], depth.slopes[rising]
+    values = path.values / 2
+    rising = (values > PATH_FROM * values[-1]) & (values < PATH_TO * values[-1])
+    where, slopes = path.points[rising], path.momenta[rising]
     if not len(where) or not len(x):
         return well.coefficients
     old, along = well.basis.gradients(x), well.basis.gradients(where)
@@ -711,15 +686,3 @@ def _towards_path(well: Well, x: np.ndarray, depth: Depth, free: np.ndarray) -> 
     coefficients = well.coefficients.copy()
     coefficients[free] += np.linalg.lstsq(matrix / scale, right, rcond=SINGULAR_RATIO)[0] / scale
     return coefficients
-
-
-def surveyed(well: Well, dynamics: Dynamics, portrait: PhasePortrait, index: int) -> Well:
-    """A formula read from a file, with the recorded states that tell where it holds."""
-    basin = portrait.basins[index]
-    along = well.values(basin.states.reshape(-1, basin.states.shape[2])).reshape(basin.states.shape[:2])
-    return replace(
-        well,
-        dynamics=dynamics,
-        points=basin.points(basin.below(along, well.reach)),
-        elsewhere=portrait.states_elsewhere(index),
-    )

@@ -18,7 +18,7 @@ import pandas as pd
 from siq.data.two_states import RecordStates
 from siq.numerics.text import MINUS, range_text, unit_text, value_text
 from siq.quasipotential.landscape import Landscape
-from siq.quasipotential.rates import NoiseStrength, mean_exit_time
+from siq.quasipotential.rates import NoiseStrength
 from siq.report.formatting import (
     counted_text,
     paragraphs,
@@ -125,8 +125,8 @@ def exits_table(summary: LandscapeSummary) -> tuple[pd.DataFrame, pd.DataFrame]:
     rows, numbers = [], []
     for way in summary.ways:
         known = math.isfinite(way.barrier)
-        law, action = way.exit, None if way.path is None else way.path.uphill.action
-        mean = None if summary.noise is None or not known else mean_exit_time(law, summary.noise)
+        law, action = way.exit, None if way.path is None else way.path.action
+        mean = None if summary.noise is None or not known else law.mean_exit_time(summary.noise)
         start, end = well_name(way.start), "" if way.end is None else well_name(way.end)
         place = _place(summary, way.place)
         if isinstance(way.saddle, Cycle):

@@ -253,7 +253,7 @@ class LandscapeSummary:
         if self.formula is not None and self.points is not None:
             low, high = self.points.min(axis=0), self.points.max(axis=0)
             inside = ((x >= low) & (x <= high)).all(axis=1)
-            return np.where(inside, 2 * self.formula.evaluate(np.ascontiguousarray(x.T))[0], np.nan)
+            return np.where(inside, 2 * self.formula.values(x), np.nan)
         known = [(w.height, v) for w, v in zip(self.wells, self.formulas, strict=False) if v is not None]
         if not known:
             return np.full(len(x), np.nan)
@@ -428,7 +428,7 @@ def summarise(
         places = np.array([one.position for one in attractors])
         low, high = points.min(axis=0), points.max(axis=0)
         inside = ((places >= low) & (places <= high)).all(axis=1)
-        heights = np.where(inside, 2 * formula.evaluate(np.ascontiguousarray(places.T))[0], np.nan)
+        heights = np.where(inside, 2 * formula.values(places), np.nan)
         heights = heights - heights.min() if np.isfinite(heights).all() else heights
     matched = bool(len(heights)) and bool(np.isfinite(heights).all())
     heights = heights if matched else np.zeros(len(attractors))

@@ -47,6 +47,11 @@ class Neighbourhood:
     hessian: np.ndarray
     level: float
 
+    @classmethod
+    def about(cls, dynamics: Dynamics, attractor: np.ndarray, *, level: float) -> Neighbourhood:
+        """The ellipsoid on which V, to second order, has a level (of V, not of U = 2V)."""
+        return cls(np.asarray(attractor, dtype=float), hessian_at(dynamics, attractor), level)
+
     def height(self, x: np.ndarray) -> np.ndarray:
         """The quadratic form in units of the level: components ``(d, n)`` to ``(n,)``."""
         y = x - self.center[:, None]
@@ -95,11 +100,6 @@ class EscapeTimes:
         return self.mean / np.sqrt(self.escapes) if self.escapes else np.inf
 
 
-def neighbourhood(dynamics: Dynamics, attractor: np.ndarray, *, level: float) -> Neighbourhood:
-    """The ellipsoid about an attractor on which V, to second order, has a level (of V, not of U = 2V)."""
-    return Neighbourhood(np.asarray(attractor, dtype=float), hessian_at(dynamics, attractor), level)
-
-
 def simulate_escapes(
     dynamics: Dynamics,
     start: np.ndarray,
@@ -116,20 +116,14 @@ def simulate_escapes(
 
     Parameters
     ----------
-    dynamics
-        f and D.
-    start
-        Shape ``(d,)``, mostly an attractor; or ``(walkers, d)``, a start for each.
-    targets
-        About the other attractors.
-    intensity
-        ε, in the unit of U.
+    dynamics, intensity
+        f and D, and ε, in the unit of U.
+    start, targets
+        Shape ``(d,)``, mostly an attractor, or a start for each walker; and neighbourhoods of the others.
     longest
         Time after which those who are left count as censored; a few of the expected mean times.
-    generator
-        Source of the noise.
-    walkers
-        Their number.
+    generator, walkers
+        Source of the noise, and how many there are.
     step
         Step h; by default a tenth of the shortest time of f at the start and the targets.
     confirm
@@ -151,7 +145,8 @@ def simulate_escapes(
         step = STEP / float(np.abs(np.linalg.eigvals(dynamics.jacobian(centers))).max())
     function = dynamics.drift_of_components
     draw = noise_source(dynamics.diffusion, intensity=intensity, step=step, generator=generator)
-    settling = [_settling_steps(dynamics, one, step) if confirm else 0 for one in targets]
+    slowest = [np.abs(np.linalg.eigvals(one).real).min() for one in dynamics.jacobian(centers[1:])]
+    settling = [int(np.ceil(LONGEST_SETTLING / one / step)) if confirm else 0 for one in slowest]
     x = starts.T.copy()
     steps = int(np.ceil(longest / step))
     times, reached = [np.zeros(0)], [np.zeros(0, dtype=int)]
@@ -174,11 +169,6 @@ def simulate_escapes(
     if lost:
         raise NumericalFailure(f"{lost} of {walkers} walkers run to infinity; take a smaller step")
     return EscapeTimes(np.concatenate(times), np.concatenate(reached), x.shape[1], steps * step)
-
-
-def _settling_steps(dynamics: Dynamics, target: Neighbourhood, step: float) -> int:
-    rates = np.linalg.eigvals(dynamics.jacobian(target.center[None])[0]).real
-    return int(np.ceil(LONGEST_SETTLING / np.abs(rates).min() / step))
 
 
 def _settles(function: Field, x: np.ndarray, target: Neighbourhood, step: float, steps: int) -> np.ndarray:

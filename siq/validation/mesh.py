@@ -32,6 +32,7 @@ D. Dahiya, M. Cameron, J. Sci. Comput. 75 (2018) 1351: ordered line integral met
 
 from __future__ import annotations
 
+import heapq
 import logging
 import math
 from collections.abc import Callable, Sequence
@@ -65,8 +66,8 @@ class MeshQuasipotential:
     attractor
         A, shape ``(2,)``, where V is zero.
     level
-        The highest V reached. Unless a boundary was passed over, all states of lower V that are connected
-        with A have been reached.
+        The highest V reached, in the unit of f·x/D. Unless a boundary was passed over, all states of lower V
+        that are connected with A have been reached.
     stop
         Why the work ended: the boundary of the mesh was next, or a value above the level asked for, or
         no node was left.
@@ -81,16 +82,11 @@ class MeshQuasipotential:
     stop: Stop
     reach: int
 
-    def evaluate(self, x: np.ndarray, *, degree: Literal[1, 3] = 3) -> np.ndarray:
+    def evaluate(self, x: np.ndarray) -> np.ndarray:
         """V at points, interpolated: ``(n, 2)`` to ``(n,)``.
 
-        Parameters
-        ----------
-        x
-            In the states' units.
-        degree
-            Of the interpolating polynomial along each state. Where not all nodes are known that a cubic
-            needs, it is 1; where not even those are, and outside the box, V is NaN.
+        By a cubic along each state, linear where not all nodes are known that a cubic needs; where not even
+        those are, and outside the box, V is NaN.
         """
         where = np.stack([(x[:, k] - axis[0]) / (axis[1] - axis[0]) for k, axis in enumerate(self.axes)])
         last = np.array(self.values.shape)[:, None] - 1
@@ -98,10 +94,8 @@ class MeshQuasipotential:
         where = np.clip(np.where(outside, 0.0, where), 0, last)
         nearest = np.round(where)
         where = np.where(np.abs(where - nearest) < 1e-9, nearest, where)  # or rounding would ask a neighbour
-        values = self._interpolated(where, 1)
-        if degree == 3:
-            cubic = self._interpolated(where, 3)
-            values = np.where(np.isfinite(cubic), cubic, values)
+        values, cubic = self._interpolated(where, 1), self._interpolated(where, 3)
+        values = np.where(np.isfinite(cubic), cubic, values)
         return np.where(outside, np.nan, values)
 
     def _interpolated(self, where: np.ndarray, degree: int) -> np.ndarray:
@@ -129,15 +123,33 @@ LINEAR_RANGE = 1e-3  # of the starting ellipse: where f counts as linear
 DIRECTIONS = 360  # numerical: of the starting ellipse, a degree apart
 
 
-def _turning_near(
+def _start(
     drift: Callable[[np.ndarray], np.ndarray],
     attractor: np.ndarray,
     hessian: np.ndarray,
-    rim: float,
+    box: np.ndarray,
     widths: np.ndarray,
     diffusion: Diffusion,
-) -> float:
-    """Refuse a state that is no equilibrium, or an M that is not its own; r, how fast f turns there."""
+) -> tuple[float, float]:
+    """V at the rim of the starting ellipse, and r, how fast f turns there; wrong input is refused."""
+    scale = np.sqrt(np.abs(np.diag(hessian)))
+    ratio = hessian / np.maximum(np.outer(scale, scale), np.finfo(float).tiny)
+    if not np.allclose(ratio, ratio.T) or np.diag(hessian).min() <= 0 or np.linalg.eigvalsh(ratio)[0] <= 0:
+        raise ValueError(f"the hessian {hessian.tolist()} is not symmetric and positive definite")
+    noise = diffusion.frozen(attractor)
+    if not noise.regular:
+        raise ValueError(f"the diffusion {noise.matrix.tolist()} at the attractor is not positive definite")
+    if np.any((attractor <= box[:, 0]) | (attractor >= box[:, 1])):
+        raise ValueError(f"the attractor {attractor.tolist()} is not inside the box {box.tolist()}")
+    form = hessian * np.outer(widths, widths)  # M, of displacements in mesh widths
+    rim = START_HALF_AXIS**2 * np.linalg.eigvalsh(form)[-1] / 2
+    half = np.sqrt(2 * rim * np.diag(np.linalg.inv(form)))
+    room = np.minimum(attractor - box[:, 0], box[:, 1] - attractor) / widths
+    if np.any(half + 1 >= room):
+        raise ValueError(
+            f"the start around the attractor takes {np.ceil(half).tolist()} mesh widths, to the box's ends "
+            f"there are {np.floor(room).tolist()}; take more nodes or a larger box"
+        )
     angles = np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     # In mesh widths: states may differ in size by many orders.
@@ -160,17 +172,11 @@ def _turning_near(
         )
     velocity, slope = (force + 2 * push) / widths, momentum * widths
     lengths = np.linalg.norm(velocity, axis=1) * np.linalg.norm(slope, axis=1)
-    return float((lengths / np.sum(velocity * slope, axis=1)).max())
+    return float(rim), float((lengths / np.sum(velocity * slope, axis=1)).max())
 
 
 def _metric_roots(diffusion: Diffusion, x: np.ndarray) -> np.ndarray:
-    """R with ``RᵀR = D⁻¹`` at points ``(n, 2)``, exact in powers of two: R₁₁, R₂₁, R₂₂, shape ``(n, 3)``.
-
-    Raises
-    ------
-    NumericalFailure
-        Where D is not positive definite.
-    """
+    """R with ``RᵀR = D⁻¹`` at points ``(n, 2)``, exact in powers of two: R₁₁, R₂₁, R₂₂, shape ``(n, 3)``."""
     root = diffusion.root_at(x)
     a, b, c = root[:, 0, 0], root[:, 1, 0], root[:, 1, 1]
     return np.stack([1 / a, -b / (a * c), 1 / c], axis=1)
@@ -202,29 +208,11 @@ STOPS: tuple[Stop, ...] = ("boundary", "level", "everywhere")
 
 
 class _Mesh(NamedTuple):
-    """The state of the march, for the compiled functions; displacements are in mesh widths.
+    """The state of the march, for the compiled functions; displacements are in mesh widths."""
 
-    Attributes
-    ----------
-    values
-        U, shape ``(nx, ny)``.
-    status
-        `UNKNOWN`, `CONSIDERED`, `FRONT` or `ACCEPTED`.
-    lowest, source
-        The lowest value by a segment from a single node, and that node as ``i * ny + j``.
-    drift
-        R f at the nodes and half-way, shape ``(2 nx - 1, 2 ny - 1, 2)``.
-    roots
-        R, with which lengths in ``D⁻¹`` become plain ones: R₁₁, R₂₁ and R₂₂ where `drift` is, shape
-        ``(2 nx - 1, 2 ny - 1, 3)``; ``(1, 1, 3)`` of a D that is the same everywhere.
-    varies
-        1 where D depends on the state, 0 elsewhere.
-    reach
-        Longest segment.
-    refined
-        Whether to work with second differences and all pairs.
-    """
-
+    # U, `UNKNOWN` and so on, and the lowest value from a single node with that node as i * ny + j: (nx, ny).
+    # R f and R₁₁, R₂₁, R₂₂, with which lengths in D⁻¹ become plain ones, at the nodes and half-way:
+    # (2 nx - 1, 2 ny - 1, 2 or 3), the latter (1, 1, 3) where D is the same everywhere, and varies is 0.
     values: np.ndarray
     status: np.ndarray
     lowest: np.ndarray
@@ -236,18 +224,11 @@ class _Mesh(NamedTuple):
     refined: bool
 
 
-class _Heap(NamedTuple):
-    """Considered nodes, the lowest first: ``nodes`` by place, ``places`` by node, and how many, ``(1,)``."""
-
-    nodes: np.ndarray
-    places: np.ndarray
-    size: np.ndarray
-
-
 @machine_code
-def _march(mesh: _Mesh, heap: _Heap, top: float, stop_at_boundary: bool) -> tuple[int, float]:
+def _march(mesh: _Mesh, top: float, stop_at_boundary: bool) -> tuple[int, float]:
     """Work through the mesh; the index in `STOPS`, and the highest U that is known."""
     nx, ny = mesh.values.shape
+    heap = [(math.inf, -1)]  # considered nodes by value; a node whose value fell stands there again
     for i in range(nx):
         for j in range(ny):
             if mesh.status[i, j] == FRONT:
@@ -256,15 +237,19 @@ def _march(mesh: _Mesh, heap: _Heap, top: float, stop_at_boundary: bool) -> tupl
         for j in range(ny):
             _leave_front(mesh, i, j)
     stop, highest = 2, 0.0
-    while heap.size[0] > 0:
-        i, j = heap.nodes[0] // ny, heap.nodes[0] % ny
+    while True:
+        _, node = heapq.heappop(heap)
+        if node < 0:
+            break
+        i, j = node // ny, node % ny
+        if mesh.status[i, j] != CONSIDERED:
+            continue
         if mesh.values[i, j] > top:
             stop = 1
             break
         if stop_at_boundary and (i == 0 or j == 0 or i == nx - 1 or j == ny - 1):
             stop = 0
             break
-        _take_lowest(heap, mesh.values)
         mesh.status[i, j] = FRONT
         highest = max(highest, mesh.values[i, j])
         for a in range(max(i - 1, 0), min(i + 2, nx)):
@@ -279,17 +264,14 @@ def _march(mesh: _Mesh, heap: _Heap, top: float, stop_at_boundary: bool) -> tupl
 
 
 @machine_code
-def _consider_around(mesh: _Mesh, heap: _Heap, i: int, j: int) -> None:
+def _consider_around(mesh: _Mesh, heap: list[tuple[float, int]], i: int, j: int) -> None:
     """Give the unknown neighbours of a new node of the front their first values."""
     nx, ny = mesh.values.shape
     for a in range(max(i - 1, 0), min(i + 2, nx)):
         for b in range(max(j - 1, 0), min(j + 2, ny)):
             if mesh.status[a, b] == UNKNOWN:
                 _consider(mesh, a, b)
-                position = heap.size[0]
-                heap.size[0] += 1
-                heap.nodes[position] = a * ny + b
-                _rise(heap, mesh.values, position)
+                heapq.heappush(heap, (mesh.values[a, b], a * ny + b))
 
 
 @machine_code
@@ -309,7 +291,7 @@ def _consider(mesh: _Mesh, i: int, j: int) -> None:
 
 
 @machine_code
-def _improve(mesh: _Mesh, heap: _Heap, a: int, b: int, i: int, j: int) -> None:
+def _improve(mesh: _Mesh, heap: list[tuple[float, int]], a: int, b: int, i: int, j: int) -> None:
     """Lower the value of the node (i, j), if segments from near the new node (a, b) of the front do."""
     ny = mesh.values.shape[1]
     value = mesh.values[a, b] + _action(mesh, a, b, i, j)
@@ -324,7 +306,7 @@ def _improve(mesh: _Mesh, heap: _Heap, a: int, b: int, i: int, j: int) -> None:
         value = _from_between(mesh, c, d, a, b, i, j) if abs(a - c) + abs(b - d) == 1 else math.inf
     if value < mesh.values[i, j]:
         mesh.values[i, j] = value
-        _rise(heap, mesh.values, heap.places[i * ny + j])
+        heapq.heappush(heap, (value, i * ny + j))
 
 
 @machine_code
@@ -369,12 +351,10 @@ def _action(mesh: _Mesh, a: int, b: int, i: int, j: int) -> float:
 
 @machine_code
 def _from_between(mesh: _Mesh, a: int, b: int, c: int, d: int, i: int, j: int) -> float:
-    """The least value of (i, j) by segments from between (a, b) and (c, d), infinite if there is none.
-
-    At either end of the pair the segment from a single node has the same value, so that only a minimum
-    inside counts. R and R f in the middle of the segment are linear between their values for the two ends,
-    so that R times the segment is a parabola of λ.
-    """
+    """The least value of (i, j) by segments from between (a, b) and (c, d), infinite if there is none."""
+    # At either end of the pair the segment from a single node has the same value: only a minimum inside
+    # counts. R and R f in its middle are linear between those of the ends, so that R times the segment is a
+    # parabola of λ.
     r, s, t = mesh.roots[mesh.varies * (a + i), mesh.varies * (b + j)]
     dr, ds, dt = mesh.roots[mesh.varies * (c + i), mesh.varies * (d + j)]
     dr, ds, dt = dr - r, ds - s, dt - t
@@ -386,17 +366,18 @@ def _from_between(mesh: _Mesh, a: int, b: int, c: int, d: int, i: int, j: int) -
     rise = mesh.values[c, d] - mesh.values[a, b]
     bend = _second_difference(mesh, a, b, c, d) if mesh.refined else 0.0
 
-    low, low_slope = 0.0, _slope(0.0, u, v, du, dv, ddu, ddv, p, q, dp, dq, rise, bend)
+    terms = u, v, du, dv, ddu, ddv, p, q, dp, dq, rise, bend
+    low, low_slope = 0.0, _slope(0.0, terms)
     if low_slope >= 0:
         return math.inf
-    high, high_slope = 1.0, _slope(1.0, u, v, du, dv, ddu, ddv, p, q, dp, dq, rise, bend)
+    high, high_slope = 1.0, _slope(1.0, terms)
     if high_slope <= 0:
         return math.inf
     share, last = 0.5, 0
     for _ in range(MAX_SECANTS):
         before = share
         share = (low * high_slope - high * low_slope) / (high_slope - low_slope)
-        slope = _slope(share, u, v, du, dv, ddu, ddv, p, q, dp, dq, rise, bend)
+        slope = _slope(share, terms)
         if abs(share - before) < SHARE_TOLERANCE:
             break
         # Of an end that stays twice in a row the slope is halved (Illinois), or the other would creep.
@@ -415,22 +396,9 @@ def _from_between(mesh: _Mesh, a: int, b: int, c: int, d: int, i: int, j: int) -
 
 
 @machine_code
-def _slope(
-    share: float,
-    u: float,
-    v: float,
-    du: float,
-    dv: float,
-    ddu: float,
-    ddv: float,
-    p: float,
-    q: float,
-    dp: float,
-    dq: float,
-    rise: float,
-    bend: float,
-) -> float:
+def _slope(share: float, terms: tuple[float, ...]) -> float:
     """Derivative by λ of the value that `_from_between` minimises."""
+    u, v, du, dv, ddu, ddv, p, q, dp, dq, rise, bend = terms
     u, v = u + share * (du + share * ddu), v + share * (dv + share * ddv)
     du, dv = du + 2 * share * ddu, dv + 2 * share * ddv
     p, q = p + share * dp, q + share * dq
@@ -457,48 +425,6 @@ def _second_difference(mesh: _Mesh, a: int, b: int, c: int, d: int) -> float:
     return smaller
 
 
-@machine_code
-def _rise(heap: _Heap, values: np.ndarray, position: int) -> None:
-    """Move the node at a place up until its parent is lower."""
-    ny = values.shape[1]
-    node = heap.nodes[position]
-    value = values[node // ny, node % ny]
-    while position > 0:
-        parent = heap.nodes[(position - 1) // 2]
-        if values[parent // ny, parent % ny] <= value:
-            break
-        heap.nodes[position] = parent
-        heap.places[parent] = position
-        position = (position - 1) // 2
-    heap.nodes[position] = node
-    heap.places[node] = position
-
-
-@machine_code
-def _take_lowest(heap: _Heap, values: np.ndarray) -> None:
-    """Remove the first node; the last takes its place and moves down."""
-    ny = values.shape[1]
-    heap.size[0] -= 1
-    size = heap.size[0]
-    node = heap.nodes[size]
-    value = values[node // ny, node % ny]
-    position = 0
-    while 2 * position + 1 < size:
-        child = 2 * position + 1
-        below = heap.nodes[child]
-        if child + 1 < size:
-            beside = heap.nodes[child + 1]
-            if values[beside // ny, beside % ny] < values[below // ny, below % ny]:
-                child, below = child + 1, beside
-        if values[below // ny, below % ny] >= value:
-            break
-        heap.nodes[position] = below
-        heap.places[below] = position
-        position = child
-    heap.nodes[position] = node
-    heap.places[node] = position
-
-
 STRAIGHT_REACH = 3.0  # mesh widths that suffice where f does not turn
 LONGEST_DEFAULT_REACH = 60  # mesh widths, beyond which the reach is not set unasked
 CHUNK = 1 << 18  # points at which f is evaluated in one call
@@ -517,17 +443,19 @@ def mesh_quasipotential(
     stop_at_boundary: bool = True,
     as_published: bool = False,
 ) -> MeshQuasipotential:
-    """V with respect to an attractor, on a mesh.
+    """V with respect to an attractor, or to a stable limit cycle, on a mesh.
 
     Parameters
     ----------
     drift
         f: points as rows, ``(n, 2)`` to ``(n, 2)``. It is evaluated at the nodes and half-way between them.
     attractor
-        A, shape ``(2,)``, a stable equilibrium inside the box; it need not be a node.
+        A, shape ``(2,)``, a stable equilibrium inside the box; it need not be a node. Or states along a
+        cycle, shape ``(n, 2)``, closer to each other than mesh widths; then the reach has to be given.
     hessian
         M, shape ``(2, 2)``: the Hessian of V (not of U) at A, such as `siq.systems.equilibria.hessian_at`.
-        Within an ellipse of a few mesh widths V is ``½ (x - A)·M (x - A)``.
+        Within an ellipse of a few mesh widths V is ``½ (x - A)·M (x - A)``. Of a cycle ``(n, 2, 2)``, each
+        for the places next to its state.
     box
         Shape ``(2, 2)``: the ends of the mesh, a row for each state, in the states' units.
     shape
@@ -549,11 +477,6 @@ def mesh_quasipotential(
         Linear interpolation along the front; pairs are tried at the best single node only, without
         diagonal ones; and by default the authors' reach, ``10 + 4 (log₂ N - 7)``.
 
-    Returns
-    -------
-    MeshQuasipotential
-        V, not U, in the unit of f·x/D.
-
     Raises
     ------
     ValueError
@@ -573,109 +496,66 @@ def mesh_quasipotential(
     all compiles, which takes seconds; the code is kept for later sessions.
     """
     attractor, hessian, box = (np.asarray(one, dtype=float) for one in (attractor, hessian, box))
-    for name, array, wanted in (
-        ("attractor", attractor, (2,)),
-        ("hessian", hessian, (2, 2)),
-        ("box", box, (2, 2)),
-    ):
-        if array.shape != wanted or not np.isfinite(array).all():
-            raise ValueError(f"the {name} must be finite numbers of shape {wanted}: the mesh has two states")
+    cycle = attractor if attractor.ndim == 2 else None
+    wanted = {"attractor": (2,), "hessian": (2, 2), "box": (2, 2)}
+    if cycle is not None:
+        wanted |= {"attractor": (len(cycle), 2), "hessian": (len(cycle), 2, 2)}
+    for (name, form), array in zip(wanted.items(), (attractor, hessian, box), strict=True):
+        if array.shape != form or not np.isfinite(array).all():
+            raise ValueError(f"the {name} must be finite numbers of shape {form}: the mesh has two states")
     if diffusion.dimension != 2:  # asked before D is evaluated, which takes a state of its own dimension
         raise ValueError(f"the diffusion is one of {diffusion.dimension} states: the mesh has two")
     if len(shape) != 2 or min(shape) < MIN_NODES:
         raise ValueError(f"a mesh of {shape} nodes is too coarse; give at least {MIN_NODES} along each state")
-    scale = np.sqrt(np.abs(np.diag(hessian)))
-    ratio = hessian / np.maximum(np.outer(scale, scale), np.finfo(float).tiny)
-    if not np.allclose(ratio, ratio.T) or np.diag(hessian).min() <= 0 or np.linalg.eigvalsh(ratio)[0] <= 0:
-        raise ValueError(f"the hessian {hessian.tolist()} is not symmetric and positive definite")
-    noise = diffusion.frozen(attractor)
-    if not noise.regular:
-        raise ValueError(f"the diffusion {noise.matrix.tolist()} at the attractor is not positive definite")
     if np.any(box[:, 0] >= box[:, 1]):
         raise ValueError(f"the box {box.tolist()} needs a lower and an upper end for each state")
-    if np.any((attractor <= box[:, 0]) | (attractor >= box[:, 1])):
-        raise ValueError(f"the attractor {attractor.tolist()} is not inside the box {box.tolist()}")
     if reach is not None and reach < 2:
         raise ValueError(f"a reach of {reach} mesh widths is too short; give at least 2")
     if level is not None and not level > 0:
         raise ValueError(f"the level {level} must be positive: V is zero at the attractor")
     axes = tuple(np.linspace(low, high, count) for (low, high), count in zip(box, shape, strict=True))
     widths = (box[:, 1] - box[:, 0]) / (np.array(shape) - 1)
-    form = hessian * np.outer(widths, widths)  # M, of displacements in mesh widths
-    rim = START_HALF_AXIS**2 * np.linalg.eigvalsh(form)[-1] / 2
-    half = np.sqrt(2 * rim * np.diag(np.linalg.inv(form)))
-    room = np.minimum(attractor - box[:, 0], box[:, 1] - attractor) / widths
-    if np.any(half + 1 >= room):
-        raise ValueError(
-            f"the start around the attractor takes {np.ceil(half).tolist()} mesh widths, to the box's ends "
-            f"there are {np.floor(room).tolist()}; take more nodes or a larger box"
-        )
-    if level is not None and rim >= level:
-        raise ValueError(
-            f"V is {rim:.3g} at the rim of the start, above the level {level:.3g}; take more nodes"
-        )
-    turning = _turning_near(drift, attractor, hessian, rim, widths, diffusion)
-    if reach is None:
-        published = max(round(10 + 4 * (math.log2(max(shape)) - 7)), 2)
-        reach = (
-            published if as_published else min(math.ceil(STRAIGHT_REACH + turning / 2), LONGEST_DEFAULT_REACH)
-        )
-
-    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - attractor
-    start = np.einsum("abi,ij,abj->ab", x, hessian, x) / 2
-    begin = np.where(start <= rim, start, np.inf)
-    return _marched(
-        drift,
-        attractor,
-        begin,
-        axes,
-        box,
-        diffusion,
-        reach,
-        level,
-        stop_at_boundary,
-        refined=not as_published,
-    )
-
-
-def mesh_quasipotential_of_cycle(
-    drift: Callable[[np.ndarray], np.ndarray],
-    points: np.ndarray,
-    *,
-    hessians: np.ndarray,
-    box: np.ndarray,
-    shape: tuple[int, int],
-    diffusion: Diffusion,
-    reach: int,
-    stop_at_boundary: bool = True,
-) -> MeshQuasipotential:
-    """V with respect to a stable limit cycle, on a mesh.
-
-    Parameters
-    ----------
-    drift, box, shape, diffusion, reach, stop_at_boundary
-        As for `mesh_quasipotential`.
-    points
-        Shape ``(n, 2)``: states along the cycle, closer to each other than mesh widths.
-    hessians
-        Shape ``(n, 2, 2)``: the Hessian of V (not of U) there. Within a few mesh widths of the cycle V is
-        ``½ (x - x_k)·H_k (x - x_k)``, x_k being the next of the points.
-
-    Raises
-    ------
-    NumericalFailure
-        When f is not finite, or D not positive definite, everywhere in the box.
-    """
-    axes = tuple(np.linspace(low, high, count) for (low, high), count in zip(box, shape, strict=True))
-    widths = (box[:, 1] - box[:, 0]) / (np.array(shape) - 1)
-    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    away, which = cKDTree(points / widths).query(x / widths)
-    offset = x - points[which]
-    start = np.einsum("ni,nij,nj->n", offset, hessians[which], offset) / 2
-    begin = np.where(away <= START_HALF_AXIS, start, np.inf).reshape(shape)
-    return _marched(
-        drift, points[0], begin, axes, box, diffusion, reach, None, stop_at_boundary, refined=True
-    )
+    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    if cycle is not None:
+        if reach is None:
+            raise ValueError("about a cycle the reach has to be given")
+        away, which = cKDTree(cycle / widths).query(x / widths)
+        start = np.einsum("abi,abij,abj->ab", x - cycle[which], hessian[which], x - cycle[which]) / 2
+        begin = np.where(away <= START_HALF_AXIS, start, np.inf)
+        attractor = cycle[0]
+    else:
+        rim, turning = _start(drift, attractor, hessian, box, widths, diffusion)
+        if level is not None and rim >= level:
+            raise ValueError(
+                f"V is {rim:.3g} at the rim of the start, above the level {level:.3g}; take more nodes"
+            )
+        if reach is None and as_published:
+            reach = max(round(10 + 4 * (math.log2(max(shape)) - 7)), 2)
+        elif reach is None:
+            reach = min(math.ceil(STRAIGHT_REACH + turning / 2), LONGEST_DEFAULT_REACH)
+        start = np.einsum("abi,ij,abj->ab", x - attractor, hessian, x - attractor) / 2
+        begin = np.where(start <= rim, start, np.inf)
+    finer = tuple(np.linspace(low, high, 2 * n - 1) for (low, high), n in zip(box, shape, strict=True))
+    if diffusion.constant:
+        roots = _metric_roots(diffusion, attractor[None])[None]
+    else:
+        roots = _by_rows(lambda x: _metric_roots(diffusion, x), finer)
+    roots = roots * widths[[0, 0, 1]]
+    small = math.frexp(np.abs(roots).max())[1]
+    roots = np.ldexp(roots, -small)
+    flow = _by_rows(lambda x: _drift_values(drift, x), finer)
+    flow = (_square(roots) @ (flow / widths)[..., None])[..., 0]
+    fast = math.frexp(np.abs(flow).max())[1]
+    flow = np.ldexp(flow, -fast)
+    unit = math.ldexp(0.5, 2 * small + fast)  # V of one unit of U within the mesh
+    values = begin / unit
+    status = np.where(np.isfinite(begin), FRONT, UNKNOWN).astype(np.int8)
+    lowest, source = np.full(shape, np.inf), np.full(shape, -1)
+    varies = int(not diffusion.constant)
+    mesh = _Mesh(values, status, lowest, source, flow, roots, varies, reach, not as_published)
+    stop, highest = _march(mesh, math.inf if level is None else level / unit, stop_at_boundary)
+    known = np.where(mesh.status >= FRONT, unit * values, np.nan)
+    return MeshQuasipotential((axes[0], axes[1]), known, attractor, unit * highest, STOPS[stop], reach)
 
 
 def mesh_potential(
@@ -693,54 +573,6 @@ def mesh_potential(
     except NumericalFailure as reason:
         LOGGER.info("no mesh about %s: %s", attractor, reason)
         return None
-
-
-def _marched(
-    drift: Callable[[np.ndarray], np.ndarray],
-    attractor: np.ndarray,
-    begin: np.ndarray,
-    axes: tuple[np.ndarray, ...],
-    box: np.ndarray,
-    diffusion: Diffusion,
-    reach: int,
-    level: float | None,
-    stop_at_boundary: bool,
-    *,
-    refined: bool,
-) -> MeshQuasipotential:
-    """V on the mesh from where it is known, `begin` being infinite elsewhere."""
-    shape = begin.shape
-    widths = (box[:, 1] - box[:, 0]) / (np.array(shape) - 1)
-    finer = tuple(np.linspace(low, high, 2 * n - 1) for (low, high), n in zip(box, shape, strict=True))
-    if diffusion.constant:
-        roots = _metric_roots(diffusion, attractor[None])[None]
-    else:
-        roots = _by_rows(lambda x: _metric_roots(diffusion, x), finer)
-    roots = roots * widths[[0, 0, 1]]
-    small = math.frexp(np.abs(roots).max())[1]
-    roots = np.ldexp(roots, -small)
-    flow = _by_rows(lambda x: _drift_values(drift, x), finer)
-    flow = (_square(roots) @ (flow / widths)[..., None])[..., 0]
-    fast = math.frexp(np.abs(flow).max())[1]
-    flow = np.ldexp(flow, -fast)
-    unit = math.ldexp(0.5, 2 * small + fast)  # V of one unit of U within the mesh
-    known = np.isfinite(begin)
-    values = begin / unit
-    mesh = _Mesh(
-        values=values,
-        status=np.where(known, FRONT, UNKNOWN).astype(np.int8),
-        lowest=np.full(shape, np.inf),
-        source=np.full(shape, -1),
-        drift=flow,
-        roots=roots,
-        varies=int(not diffusion.constant),
-        reach=reach,
-        refined=refined,
-    )
-    heap = _Heap(np.empty(values.size, dtype=int), np.empty(values.size, dtype=int), np.zeros(1, dtype=int))
-    stop, highest = _march(mesh, heap, math.inf if level is None else level / unit, stop_at_boundary)
-    known = np.where(mesh.status >= FRONT, unit * values, np.nan)
-    return MeshQuasipotential((axes[0], axes[1]), known, attractor, unit * highest, STOPS[stop], reach)
 
 
 def _by_rows(function: Callable[[np.ndarray], np.ndarray], axes: Sequence[np.ndarray]) -> np.ndarray:

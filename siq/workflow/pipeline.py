@@ -34,7 +34,7 @@ from siq.quasipotential.landscape import Landscape, NoLandscape
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.occupancy import OccupancyCheck, VisitTest
 from siq.quasipotential.rates import NoiseStrength
-from siq.quasipotential.refinement import Refinement, RefinementContext, control, refine_and_certify
+from siq.quasipotential.refinement import Refinement, RefinementContext
 from siq.quasipotential.wells import Well
 from siq.remarks import Remark, sentence
 from siq.systems.diffusion import Diffusion
@@ -239,11 +239,12 @@ def refine_run(
             )  # fmt: skip
             if regressed is not None:
                 certificates[Method.REGRESSION] = certify(regressed, context.evidence).as_data()
-            refinement = refine_and_certify(context, regressed)
+            refinement = context.refine_and_certify(regressed)
             certificate = refinement.certificate
             formulas[Method.REFINED] = refinement.formulas
             certificates[Method.REFINED] = certificate.as_data() | {
-                "notes": [*lost, *refinement.notes], "no_record_test": refinement.record.missing or ""
+                "notes": [*lost, *map(sentence, refinement.remarks)],
+                "no_record_test": refinement.record.missing or "",
             }  # fmt: skip
             status = Status.OK if certificate.certified else Status.WARNING
             reason = [] if certificate.certified else [*lost, certificate.reason]
@@ -252,7 +253,7 @@ def refine_run(
             outcome = Outcome(number, Step.REFINE, Status.FAILED, "; ".join([*lost, str(error)]))
     if context is not None and networks is not None:
         theirs = (None, None) if refinement is None else (refinement.formulas, refinement.certificate)
-        certificates[Method.CONTROL] = control(context, *theirs)
+        certificates[Method.CONTROL] = context.control(*theirs)
     for method in formulas.keys() - certificates.keys():
         certificates[method] = uncertified(f"no test was made: {outcome.reason}")
     portrait = None if context is None else context.portrait

@@ -11,7 +11,7 @@ import pytest
 from known_systems import double_well, exact_field, portrait_of
 from matplotlib.figure import Figure
 
-from siq.quasipotential.cell_density import known_density, lowest_possible, sample_potential
+from siq.quasipotential.cell_density import SampledPotential
 from siq.quasipotential.invariant_density import StationaryDensity
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
@@ -67,8 +67,8 @@ def test_the_errors_are_a_curve_too(figures: dict[str, Figure | None]) -> None:
 def test_the_density_is_a_curve_over_a_histogram() -> None:
     potential = landscape().global_quasipotential
     assert potential is not None
-    fine, coarse = (sample_potential(potential, KNOWN.domain, cells=cells) for cells in (400, 200))
-    found = known_density(fine, coarse, lowest_possible(coarse, KNOWN.dynamics), intensity=0.1)
+    fine, coarse = (SampledPotential.of(potential, KNOWN.domain, cells=cells) for cells in (400, 200))
+    found = fine.density(coarse, coarse.lowest_possible(KNOWN.dynamics), intensity=0.1)
     whole = found.marginal()
     samples = np.random.default_rng(0).normal(-1, 0.1, (1, 4, 200))
     smooth = StationaryDensity((0,), 0.1, whole.x1, whole.x2, np.exp(-(whole.x1[None] ** 2)))

@@ -87,7 +87,7 @@ def test_barriers_of_the_identified_particle_hold() -> None:
     for way in ways:
         assert way.path is not None
         error, _ = barrier_uncertainty(way.path, field)
-        assert abs(way.path.uphill.action - FRICTION / 2) < 3.5 * error < 0.1  # ΔU = 2γ ΔΦ
+        assert abs(way.path.action - FRICTION / 2) < 3.5 * error < 0.1  # ΔU = 2γ ΔΦ
 
 
 def test_it_is_kept_in_a_file(tmp_path: Path) -> None:

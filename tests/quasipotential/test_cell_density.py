@@ -14,15 +14,13 @@ from known_systems import double_well, potential_gradient, potential_values
 from known_wells import matched, stationary
 
 from siq.errors import NumericalFailure
+from siq.numerics.integration import heun_step
 from siq.quasipotential.cell_density import (
     SampledPotential,
-    known_density,
-    lowest_possible,
-    sample_potential,
     shares_by_rates,
-    walk,
 )
 from siq.systems.dynamics import Dynamics
+from siq.systems.simulation import simulate_stationary
 from workflow.figures.study import _project_landscape
 
 KNOWN, POTENTIAL = matched("double well")
@@ -48,8 +46,8 @@ def exact_normalisation(intensity: float) -> float:
 
 @pytest.fixture(scope="module")
 def sampled() -> tuple[SampledPotential, SampledPotential, np.ndarray]:
-    coarse = sample_potential(POTENTIAL, BOX, cells=100)
-    return sample_potential(POTENTIAL, BOX, cells=200), coarse, lowest_possible(coarse, KNOWN.dynamics)
+    coarse = SampledPotential.of(POTENTIAL, BOX, cells=100)
+    return SampledPotential.of(POTENTIAL, BOX, cells=200), coarse, coarse.lowest_possible(KNOWN.dynamics)
 
 
 def grid(one: SampledPotential) -> np.ndarray:
@@ -78,7 +76,7 @@ def test_u_is_nowhere_below_what_it_cannot_be_below(sampled) -> None:
 
 @pytest.mark.parametrize("intensity", INTENSITIES)
 def test_the_exact_constant_lies_between_the_known_part_and_its_bound(sampled, intensity: float) -> None:
-    density = known_density(*sampled, intensity=intensity)
+    density = SampledPotential.density(*sampled, intensity=intensity)
     truth = exact_normalisation(intensity)
     assert density.change < 0.01
     assert density.normalisation <= truth * (1 + 1e-3)
@@ -90,18 +88,16 @@ def test_the_exact_constant_lies_between_the_known_part_and_its_bound(sampled, i
 
 
 def test_the_bound_falls_with_the_noise(sampled) -> None:
-    unknown = [known_density(*sampled, intensity=one).unknown for one in (0.02, *INTENSITIES)]
+    unknown = [SampledPotential.density(*sampled, intensity=one).unknown for one in (0.02, *INTENSITIES)]
     assert unknown[0] < 1e-6 and (np.diff(unknown) > 0).all() and unknown[-1] < 1
 
 
 def test_outside_the_known_region_the_marginal_is_not_known(sampled) -> None:
     fine = sampled[0]
-    marginal = known_density(*sampled, intensity=0.1).marginal()
+    marginal = SampledPotential.density(*sampled, intensity=0.1).marginal()
     np.testing.assert_array_equal(np.isnan(marginal.values), ~fine.known.T)
     assert np.nansum(marginal.values) * fine.widths.prod() == pytest.approx(1)
     np.testing.assert_allclose(marginal.x1, fine.axes[0])
-    other = known_density(*sampled, intensity=0.1).marginal(plane=(1, 0))
-    np.testing.assert_array_equal(other.values, marginal.values.T)
 
 
 def of_values(values: np.ndarray, box: np.ndarray) -> SampledPotential:
@@ -109,21 +105,21 @@ def of_values(values: np.ndarray, box: np.ndarray) -> SampledPotential:
 
 
 def test_three_states_are_integrated_and_projected() -> None:
-    box = np.array([[-3.0, 3.0], [-2.0, 2.0], [-3.0, 2.0]])
+    box = np.array([[-3.0, 3.0], [-3.0, 2.0], [-2.0, 2.0]])
 
     def of(cells: int) -> SampledPotential:
         empty = of_values(np.full((cells,) * 3, np.nan), box)
-        x, y, z = empty.middles(np.ones((cells,) * 3, dtype=bool))
+        x, z, y = empty.middles(np.ones((cells,) * 3, dtype=bool))
         values = (x**2 + 2 * y**2 + z**2 + x * z).reshape((cells,) * 3)
         return of_values(np.where(values < 2.5, values, np.nan), box)
 
     fine, coarse = of(80), of(40)
     dynamics = Dynamics.of(symbols := sympy.symbols("x y z", real=True), tuple(-s for s in symbols))
-    density = known_density(fine, coarse, lowest_possible(coarse, dynamics), intensity=0.25)
+    density = fine.density(coarse, coarse.lowest_possible(dynamics), intensity=0.25)
     gaussian = (0.25 * np.pi) ** 1.5 / np.sqrt(2 * 0.75)
     assert density.normalisation < gaussian < density.normalisation / (1 - density.unknown)
     assert density.normalisation == pytest.approx(gaussian, rel=1e-3)
-    marginal = density.marginal(plane=(0, 2))
+    marginal = density.marginal()
     first, second = np.meshgrid(marginal.x1, marginal.x2)
     expected = np.exp(-(first**2 + second**2 + first * second) / 0.25) / (0.25 * np.pi / np.sqrt(0.75))
     np.testing.assert_allclose(np.nan_to_num(marginal.values), expected, atol=2e-3 * expected.max())
@@ -138,7 +134,7 @@ def test_a_hole_has_the_level_of_its_own_rim() -> None:
     one = of_values(np.where((values < 2.0) & ~hole, values, np.nan), box)
     symbols = sympy.symbols("x y", real=True)
     still = Dynamics.of(symbols, (sympy.S.Zero * symbols[0], sympy.S.Zero * symbols[1]))
-    rims = lowest_possible(one, still)
+    rims = one.lowest_possible(still)
     assert rims[hole].min() == pytest.approx(0.6**2, abs=0.25)  # cells are 0.05 wide
     assert rims[hole].max() < 0.6**2
     assert rims[values > 2.1].min() == pytest.approx(2.0, abs=0.4)
@@ -153,7 +149,7 @@ def test_where_f_enters_higher_than_the_lowest_of_the_rim_more_is_known() -> Non
     symbols = sympy.symbols("x y", real=True)
     still = Dynamics.of(symbols, (sympy.S.Zero * symbols[0], sympy.S.Zero * symbols[1]))
     rims, down = (
-        lowest_possible(one, each) for each in (still, Dynamics.of(symbols, (-symbols[0], -symbols[1])))
+        one.lowest_possible(each) for each in (still, Dynamics.of(symbols, (-symbols[0], -symbols[1])))
     )
     outside = ~one.known
     assert np.ptp(rims[outside]) == 0 and rims[outside].min() == pytest.approx(1.0, abs=0.3)
@@ -170,7 +166,7 @@ def test_islands_that_no_attractor_hangs_together_with_are_not_believed() -> Non
 
     attractor = SimpleNamespace(attractor=np.zeros(2))
     stub = SimpleNamespace(by_well=by_well, wells=(attractor,))
-    found = sample_potential(stub, np.array([[-2.0, 2.0]] * 2), cells=80)
+    found = SampledPotential.of(stub, np.array([[-2.0, 2.0]] * 2), cells=80)
     assert np.nanmin(found.values) >= 0
     assert found.middles(found.known)[0].max() < 1
 
@@ -199,25 +195,25 @@ def test_the_components_of_the_wells_are_those_of_the_system() -> None:
 def test_what_cannot_be_done_is_told(sampled) -> None:
     fine, coarse, lowest = sampled
     with pytest.raises(ValueError, match="must be positive"):
-        known_density(fine, coarse, lowest, intensity=0.0)
+        fine.density(coarse, lowest, intensity=0.0)
     with pytest.raises(NumericalFailure, match="too narrow"):
-        known_density(fine, coarse, lowest, intensity=1e-4)
+        fine.density(coarse, lowest, intensity=1e-4)
     with pytest.raises(NumericalFailure, match="three states at most"):
-        sample_potential(POTENTIAL, np.array([[-1.0, 1.0]] * 4))
+        SampledPotential.of(POTENTIAL, np.array([[-1.0, 1.0]] * 4))
     nothing = of_values(np.full((8, 8), np.nan), BOX)
     with pytest.raises(NumericalFailure, match="known nowhere"):
-        known_density(nothing, nothing, np.full((8, 8), 1.0), intensity=0.1)
+        nothing.density(nothing, np.full((8, 8), 1.0), intensity=0.1)
 
 
 def test_walkers_start_as_the_density_says_and_stay_so(sampled) -> None:
-    density, fine = known_density(*sampled, intensity=0.15), sampled[0]
+    density, fine = SampledPotential.density(*sampled, intensity=0.15), sampled[0]
     draw = np.random.default_rng(0)
     start = density.starting_states(2000, generator=draw)
     first = fine.simulated_shares(start, start[:, None])
     np.testing.assert_allclose(first[0], density.shares, atol=2 / 2000)
-    samples = walk(
-        KNOWN.dynamics, start, intensity=0.15, burn_in=200, steps=2000, thin=100,
-        generator=draw,
+    samples = simulate_stationary(
+        KNOWN.dynamics, start=start, step=0.02, rule=heun_step, intensity=0.15,
+        burn_in=200, steps=2000, thin=100, generator=draw,
     )  # fmt: skip
     compared = density.compare(samples, bins=20)
     assert compared.total_variation < 1.6 * compared.sampling_floor < 0.06
@@ -226,16 +222,16 @@ def test_walkers_start_as_the_density_says_and_stay_so(sampled) -> None:
     later = fine.simulated_shares(start, samples)
     np.testing.assert_allclose(later[0], density.shares, atol=0.03)
     assert (later[1] > 0.02).all()
-    wrong = known_density(*sampled, intensity=0.2)
+    wrong = SampledPotential.density(*sampled, intensity=0.2)
     assert wrong.compare(samples, bins=20).total_variation > 2 * compared.total_variation
 
 
 def test_walkers_stay_in_their_wells_at_small_noise(sampled) -> None:
-    density, fine = known_density(*sampled, intensity=0.02), sampled[0]
+    density, fine = SampledPotential.density(*sampled, intensity=0.02), sampled[0]
     start = density.starting_states(300, generator=np.random.default_rng(1))
-    samples = walk(
-        KNOWN.dynamics, start, intensity=0.02, burn_in=0, steps=300, thin=100,
-        generator=np.random.default_rng(2),
+    samples = simulate_stationary(
+        KNOWN.dynamics, start=start, step=0.02, rule=heun_step, intensity=0.02,
+        burn_in=0, steps=300, thin=100, generator=np.random.default_rng(2),
     )  # fmt: skip
     assert np.nanmax(fine.simulated_shares(start, samples)[1]) == 0
 
@@ -244,9 +240,9 @@ def test_without_a_step_bias_the_variance_of_a_turning_system_is_that_of_its_noi
     x, y = symbols = sympy.symbols("x y", real=True)
     dynamics = Dynamics.of(symbols, (-x + 8 * y, -y - 8 * x))  # turns eight times while it descends
     start = np.random.default_rng(0).normal(scale=0.5**0.5, size=(2, 4000))
-    samples = walk(
-        dynamics, start, intensity=1.0, burn_in=0, steps=600, thin=60,
-        generator=np.random.default_rng(1),
+    samples = simulate_stationary(
+        dynamics, start=start, step=0.1 / np.sqrt(130), rule=heun_step, intensity=1.0,
+        burn_in=0, steps=600, thin=60, generator=np.random.default_rng(1),
     )  # fmt: skip
     assert samples[:, -1].var() == pytest.approx(0.5, rel=0.05)
 

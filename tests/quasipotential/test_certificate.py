@@ -53,10 +53,8 @@ from siq.quasipotential.certificate_tests import (
     _check_branch,
     _check_characteristics,
     check_agreement,
-    check_hamilton_jacobi,
-    stated_error,
 )
-from siq.quasipotential.characteristics import Fan, adapted_fan, lowest_sheet
+from siq.quasipotential.characteristics import Fan, adapted_fan
 from siq.quasipotential.formulas import exact_decomposition
 from siq.quasipotential.global_formula import fit_values, refine_globally
 from siq.quasipotential.hamilton_jacobi import LibraryBasis
@@ -388,7 +386,7 @@ def test_every_other_invariant_subspace_is_refused(dimension: int, rotation: flo
         coefficients = np.array([float(as_dict.get(term, 0)) for term in library.terms])
         own = coefficients[1:]
         candidate = replace(in_basis(basis, own, points, portrait), references=references_of(known))
-        equation = check_hamilton_jacobi(candidate, found, CertificateOptions())
+        equation = candidate.check_hamilton_jacobi(found, CertificateOptions())
         branch = _check_branch(candidate, found, CertificateOptions())
         followed, _ = _check_characteristics(candidate, found, CertificateOptions(), error=1e-6)
         if np.allclose(hessian, true, rtol=1e-6, atol=1e-8):
@@ -415,16 +413,16 @@ def test_a_network_trained_for_too_short_ends_in_an_exact_false_solution(seed: i
     # V as a short training leaves it: hardly any curvature along y - z, and everything a little wrong.
     network = 0.9 * ((points[:, 0] ** 2 - 1) ** 2 / 2 + (points[:, 1] + points[:, 2]) ** 2 / 4)
     network += 0.03 * np.sin(points @ direction) + 0.02 * (points[:, 1] - points[:, 2]) ** 2
-    start = fit_values(found.library, points, network)
-    refined = refine_globally(start, found.library, found, points, sparse=False)
+    start = fit_values(found.library, [points], [network])
+    refined = refine_globally(start, found, points, sparse=False)
     rough, exact = (
         certified(known, over_terms(found, coefficients), found=found)
-        for coefficients in (start, refined.coefficients)
+        for coefficients in (start, refined.potential)
     )
     assert {"hamilton_jacobi", "branch", "error"} <= refusals(rough)
     # Refined it solves the equation to rounding, and is off by three quarters.
     assert refined.residual < 1e-12
-    own, true = found.library.evaluate(points) @ refined.coefficients, potential_values(known, points)
+    own, true = found.library.evaluate(points) @ refined.potential, potential_values(known, points)
     assert np.std(own - true) > 0.5 * np.std(true)
     assert "branch" in refusals(exact)
     assert "hamilton_jacobi" not in refusals(exact)
@@ -448,10 +446,10 @@ def test_a_randomised_network_is_refused(seed: int) -> None:
         random, potential=tuple((3 * weights, 3 * biases) for weights, biases in random.potential)
     )
     values = random.evaluate(points).potential
-    start = fit_values(found.library, points, values)
+    start = fit_values(found.library, [points], [values])
     plain, refined = (
         certified(known, over_terms(found, coefficients), found=found)
-        for coefficients in (start, refine_globally(start, found.library, found, points).coefficients)
+        for coefficients in (start, refine_globally(start, found, points).potential)
     )
     assert not plain.certified
     assert {"hamilton_jacobi", "branch"} & refusals(plain)
@@ -637,7 +635,7 @@ def test_the_error_that_is_stated_lies_above_the_true_one(beta: float, barrier: 
     )  # fmt: skip
     certificate = certify([well], evidence_of(known, share=1.0, held_out=600, count=400))
     fan = fan_of(beta, barrier / 2)
-    kept = lowest_sheet(fan)
+    kept = fan.lowest_sheet()
     at, exact = fan.points[kept], fan.values[kept]
     inside = exact < 0.9 * barrier / 2
     at, exact = at[inside], exact[inside]
@@ -655,7 +653,7 @@ def test_without_an_attractor_no_error_can_be_stated() -> None:
         values=lambda at: potential_values(known, at), gradients=lambda at: at, hessians=lambda at: at,
         circulatory=None, points=uniform_points(known, 20), attractors=(),
     )  # fmt: skip
-    assert stated_error(candidate, exact_field(known, 3)) == np.inf
+    assert candidate.stated_error(exact_field(known, 3)) == np.inf
 
 
 def test_a_phase_portrait_with_a_fault_refuses_whatever_else_passes() -> None:
@@ -730,5 +728,5 @@ def test_where_they_are_few_characteristics_give_more_and_it_is_said(
 def test_a_formula_answers_where_it_claims_to_hold(well: Well, reference: Reference) -> None:
     # An other curvature across: the residual is large, and the formula claims hardly anything.
     wrong = np.where(well.basis.exponents[:, 1] == 2, 3.0, 1.0) * well.coefficients
-    other = Well(well.dynamics, well.attractor, well.basis, wrong, well.level, well.saddle, 1.0, well.points)
+    other = Well(well.basis, wrong, well.dynamics, well.attractor, well.level, well.saddle, 1.0, well.points)
     assert _candidate_in_well(other, evidence_in_well(400, reference)).claimed < 0.5

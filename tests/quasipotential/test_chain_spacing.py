@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.quasipotential.path_chains import PathProblem, spaced
+from siq.quasipotential.path_chains import PathProblem
 from siq.systems.cycles import closed_orbit
 from siq.systems.dynamics import Dynamics
 
@@ -43,8 +43,8 @@ def test_points_that_coincide_are_one(from_a_point: PathProblem, repeated: list[
     alone = bow(from_a_point)
     several = np.insert(alone, repeated, alone[repeated] + moved, axis=0)
     for level in (0.0, 1e-6):
-        chain = spaced(from_a_point, several, 50, level)
-        np.testing.assert_allclose(chain, spaced(from_a_point, alone, 50, level), atol=1e-12)
+        chain = from_a_point.spaced(several, 50, level)
+        np.testing.assert_allclose(chain, from_a_point.spaced(alone, 50, level), atol=1e-12)
 
 
 def test_a_long_chain_may_end_on_a_step_below_its_rounding(from_a_point: PathProblem) -> None:
@@ -52,8 +52,8 @@ def test_a_long_chain_may_end_on_a_step_below_its_rounding(from_a_point: PathPro
     phase = np.linspace(0, 60, 4000)[:, None]
     wound = from_a_point.end + np.hstack([np.cos(phase), np.sin(phase)]) * phase / 5
     several = np.vstack([wound, wound[-1] + [0.0, 2e-14]])
-    chain = spaced(from_a_point, several, 50, 0.0)
-    np.testing.assert_allclose(chain, spaced(from_a_point, wound, 50, 0.0), atol=1e-9)
+    chain = from_a_point.spaced(several, 50, 0.0)
+    np.testing.assert_allclose(chain, from_a_point.spaced(wound, 50, 0.0), atol=1e-9)
 
 
 def test_a_way_that_has_arrived_on_a_tube_does_not_wind_on(to_a_cycle: PathProblem) -> None:
@@ -62,6 +62,6 @@ def test_a_way_that_has_arrived_on_a_tube_does_not_wind_on(to_a_cycle: PathProbl
     alone = bow(to_a_cycle)
     alone[-1] = 0.99 * to_a_cycle.end
     level = float(np.nextafter(to_a_cycle.finish.level(alone[-1:])[0], 0))
-    chain = spaced(to_a_cycle, alone, 50, level)
+    chain = to_a_cycle.spaced(alone, 50, level)
     assert np.isfinite(chain).all() and (np.linalg.norm(np.diff(chain, axis=0), axis=1) > 0).all()
     np.testing.assert_allclose(chain[-1], alone[-1], atol=1e-9)

@@ -32,11 +32,8 @@ from siq.quasipotential.characteristics import (
     _potential_slopes,
     adapted_fan,
     characteristics,
-    first_caustic,
-    lowest_sheet,
     potential_errors,
     relative_error,
-    value_near,
 )
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
@@ -82,7 +79,7 @@ def test_a_linear_system_has_its_quadratic_form(dimension: int, start_degree: in
     np.testing.assert_allclose(fan.momenta, potential_gradient(known, fan.points), rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(fan.hessians, np.broadcast_to(fan.hessian, fan.hessians.shape), atol=1e-8)
     np.testing.assert_allclose(fan.values[fan.last], 0.5, rtol=1e-7)
-    assert first_caustic(fan) is None
+    assert fan.first_caustic() is None
 
 
 def test_the_archetype_has_its_exact_values(archetype: Dynamics) -> None:
@@ -96,8 +93,8 @@ def test_the_archetype_has_its_exact_values(archetype: Dynamics) -> None:
         rounds=1,
     )
     np.testing.assert_allclose(2 * fan.values, _exact_values(exact_archetype(), fan.points.T), atol=2e-7)
-    assert first_caustic(fan) is None
-    assert lowest_sheet(fan).all()
+    assert fan.first_caustic() is None
+    assert fan.lowest_sheet().all()
 
 
 def test_momenta_and_curvatures_are_the_derivatives_of_the_value() -> None:
@@ -149,19 +146,19 @@ def focus_on_the_axis(beta: float) -> float:
 def test_no_caustic_below_the_saddle_where_the_path_keeps_to_the_axis(beta: float) -> None:
     fan = fan_of(maier_stein(beta), level=0.999 * SADDLE_LEVEL, box=WELL)
     assert (fan.ends == End.LEVEL).all()
-    assert first_caustic(fan) is None
-    assert lowest_sheet(fan).all()
+    assert fan.first_caustic() is None
+    assert fan.lowest_sheet().all()
 
 
 @pytest.mark.parametrize("beta", [5, 10])
 def test_the_caustic_is_found_on_the_axis(beta: float) -> None:
     fan = fan_of(maier_stein(beta), level=0.999 * SADDLE_LEVEL, box=WELL)
-    caustic = first_caustic(fan)
+    caustic = fan.first_caustic()
     assert caustic is not None
     x = focus_on_the_axis(beta)
     np.testing.assert_allclose(caustic[0], [x, 0], atol=1e-6)
     assert caustic[1] == pytest.approx((x**4 / 2 - x**2 + 0.5) / 2, abs=1e-6)
-    on_axis = fan.curve == int(fan.caustic_curves[np.argmin(fan.caustic_values)])
+    on_axis = fan.curve == int(np.flatnonzero(fan.ends == End.CAUSTIC)[np.argmin(fan.caustic_values)])
     assert fan.values[on_axis].max() < caustic[1]  # nothing beyond it is handed on
 
 
@@ -187,21 +184,21 @@ def test_directions_that_focus_at_once_are_seen_though_the_determinant_keeps_its
 
 
 def test_the_barrier_beyond_the_caustic_is_that_of_minimum_action(strong: Fan) -> None:
-    barrier = 2 * value_near(strong, np.zeros((1, 2)), sheet=lowest_sheet(strong), distance=0.2)[0]
+    barrier = 2 * strong.value_near(np.zeros((1, 2)), sheet=strong.lowest_sheet(), distance=0.2)[0]
     assert barrier == pytest.approx(0.34004, rel=1e-3)
 
 
 @pytest.mark.slow
 def test_the_barrier_a_little_above_the_critical_strength() -> None:
     fan = escape(5, level=0.245)
-    barrier = 2 * value_near(fan, np.zeros((1, 2)), sheet=lowest_sheet(fan), distance=0.2)[0]
+    barrier = 2 * fan.value_near(np.zeros((1, 2)), sheet=fan.lowest_sheet(), distance=0.2)[0]
     assert barrier == pytest.approx(0.4831, rel=1e-3)
 
 
 def test_curves_that_have_crossed_the_axis_are_not_on_the_lowest_sheet(strong: Fan) -> None:
-    caustic = first_caustic(strong)
+    caustic = strong.first_caustic()
     assert caustic is not None
-    sheet = lowest_sheet(strong)
+    sheet = strong.lowest_sheet()
     side = np.sign((strong.points - strong.attractor) @ strong.metric.T[:, 1])
     began = side[np.searchsorted(strong.curve, np.arange(len(strong.directions)))]
     past = (strong.points[:, 0] > caustic[0][0]) & (strong.values > caustic[1])
@@ -212,7 +209,7 @@ def test_curves_that_have_crossed_the_axis_are_not_on_the_lowest_sheet(strong: F
     assert sheet.mean() > 0.9
     # By symmetry V is even in y, and so must be what is left.
     kept = strong.points[sheet]
-    mirrored = value_near(strong, kept * [1, -1], sheet=sheet)
+    mirrored = strong.value_near(kept * [1, -1], sheet=sheet)
     off_axis = np.isfinite(mirrored) & (np.abs(kept[:, 1]) > 0.03)
     np.testing.assert_allclose(mirrored[off_axis], strong.values[sheet][off_axis], atol=2e-3)
 
@@ -228,13 +225,13 @@ def test_values_near_a_fan_are_of_second_order() -> None:
         generator=np.random.default_rng(0),
         rounds=1,
     )
-    sheet = lowest_sheet(fan)
+    sheet = fan.lowest_sheet()
     assert sheet.all()
     within = np.random.default_rng(1).uniform(-0.5, 0.5, size=(200, 2))
     x = fan.attractor + within @ np.linalg.inv(fan.metric).T
     exact = potential_values(known, x) - potential_values(known, fan.attractor[None])
-    np.testing.assert_allclose(value_near(fan, x, sheet=sheet), exact, atol=1e-4)
-    assert np.isnan(value_near(fan, fan.attractor[None] + 50, sheet=sheet)).all()
+    np.testing.assert_allclose(fan.value_near(x, sheet=sheet), exact, atol=1e-4)
+    assert np.isnan(fan.value_near(fan.attractor[None] + 50, sheet=sheet)).all()
 
 
 def test_curves_end_at_the_box() -> None:
@@ -291,7 +288,9 @@ def test_joined_fans_count_their_curves_on() -> None:
     assert both.curve.max() == 9
     assert (np.diff(both.curve) >= 0).all()
     np.testing.assert_array_equal(both.points[both.curve == 9], second.points[second.curve == 1])
-    assert set(second.caustic_curves + 8) <= set(both.caustic_curves)
+    assert set(np.flatnonzero(second.ends == End.CAUSTIC) + 8) <= set(
+        np.flatnonzero(both.ends == End.CAUSTIC)
+    )
 
 
 X, Y = sympy.symbols("x y", real=True)

@@ -13,10 +13,9 @@ from siq.quasipotential.rates import (
     _depopulation_factor,
     _energy_loss_per_cycle,
     escape_rate,
-    mean_exit_time,
 )
 from siq.systems.dynamics import Dynamics
-from siq.validation.escapes import neighbourhood, simulate_escapes
+from siq.validation.escapes import Neighbourhood, simulate_escapes
 
 X, V, Y, W = sympy.symbols("x v y w", real=True)
 
@@ -53,7 +52,7 @@ def test_two_weakly_damped_particles_have_a_time_only_where_it_is_known() -> Non
         rate.mean_time(path.action / 2)
     assert np.isfinite(rate.mean_time(rate.turn.own / 20))
     way = EscapeRate(path.action, rate.prefactor, turn=rate.turn)
-    assert mean_exit_time(way, NoiseStrength(path.action / 2)) is None
+    assert way.mean_exit_time(NoiseStrength(path.action / 2)) is None
 
 
 @pytest.mark.slow
@@ -64,7 +63,7 @@ def test_simulated_escapes_last_as_long_as_the_law_says(friction: float, height:
     path = minimum_action_path(system, np.array([-1.0, 0.0]), np.zeros(2), tolerance=1e-5)
     rate, intensity = escape_rate(system, path), path.action / height
     expected = rate.mean_time(intensity)
-    there = neighbourhood(system, np.array([1.0, 0.0]), level=0.15 * path.action)
+    there = Neighbourhood.about(system, np.array([1.0, 0.0]), level=0.15 * path.action)
     seen = simulate_escapes(
         system, np.array([-1.0, 0.0]), [there], intensity=intensity, longest=3 * expected,
         generator=np.random.default_rng(1), walkers=600,

@@ -23,8 +23,7 @@ from known_systems import (
 from siq.inference.field_estimate import FieldEstimate
 from siq.inference.library import CandidateLibrary
 from siq.quasipotential.global_formula import (
-    GlobalPotential,
-    RegionFormula,
+    GlobalFormula,
     _fit_orthogonal,
     fit_values,
     refine_globally,
@@ -66,12 +65,12 @@ def rough_start(
 
 def refined(
     known: KnownSystem, start: np.ndarray, found: FieldEstimate, x: np.ndarray, **options: float
-) -> GlobalPotential:
-    return refine_globally(start, found.library, found, x, **options)
+) -> GlobalFormula:
+    return refine_globally(start, found, x, **options)
 
 
-def names(result: GlobalPotential) -> set[str]:
-    return {result.library.names[k] for k in np.flatnonzero(result.coefficients)}
+def names(library: CandidateLibrary, result: GlobalFormula) -> set[str]:
+    return {library.names[k] for k in np.flatnonzero(result.potential)}
 
 
 @pytest.mark.parametrize("known", SYSTEMS.values(), ids=SYSTEMS)
@@ -87,8 +86,8 @@ def test_dense_starts_that_are_off_by_a_fifth_lead_to_the_right_terms(known: Kno
             assert result.residual > 1e-3
             continue
         solved += 1
-        np.testing.assert_allclose(result.coefficients, exact, atol=1e-7)
-        assert names(result) == wanted
+        np.testing.assert_allclose(result.potential, exact, atol=1e-7)
+        assert names(found.library, result) == wanted
     assert solved >= 3
 
 
@@ -103,7 +102,9 @@ def test_without_sparsity_all_terms_stay() -> None:
     found, x = exact_field(known, 5), uniform_points(known, 400, share=0.6)
     result = refined(known, rough_start(known, found.library, x, 0), found, x, sparse=False)
     assert result.residual < 1e-10
-    assert np.count_nonzero(result.coefficients) > len(names(refined(known, result.coefficients, found, x)))
+    assert np.count_nonzero(result.potential) > len(
+        names(found.library, refined(known, result.potential, found, x))
+    )
 
 
 @pytest.mark.parametrize("units", [np.array([1e-3, 40.0]), np.array([1e-6, 1e3])])
@@ -132,8 +133,8 @@ def test_other_units_give_the_same_terms(units: np.ndarray) -> None:
     factors = np.prod(units ** powers.astype(float), axis=1)
     one = refined(known, start, found, x)
     two = refined(scaled, start / factors, other, x * units)
-    assert names(one) == names(two)
-    np.testing.assert_allclose(two.coefficients * factors, one.coefficients, atol=1e-8)
+    assert names(found.library, one) == names(found.library, two)
+    np.testing.assert_allclose(two.potential * factors, one.potential, atol=1e-8)
 
 
 @pytest.mark.parametrize("error", [1e-3, 1e-2])
@@ -151,9 +152,9 @@ def test_noise_in_f_brings_no_false_terms(name: str, error: float) -> None:
         coefficients[found.support[:, 1], found.support[:, 0]] = values
         mine = replace(found, coefficients=coefficients)
         result = refined(known, rough_start(known, found.library, x, seed, 0.05), mine, x)
-        right += names(result) == wanted
-        kept = np.flatnonzero(result.coefficients)
-        scores.append((result.coefficients - exact)[kept] / np.sqrt(np.diag(result.covariance))[kept])
+        right += names(found.library, result) == wanted
+        kept = np.flatnonzero(result.potential)
+        scores.append((result.potential - exact)[kept] / np.sqrt(np.diag(result.covariance))[kept])
     assert right == 8
     assert np.abs(np.concatenate(scores)).max() < 4.5
     assert 0.4 < np.sqrt((np.concatenate(scores) ** 2).mean()) < 1.5
@@ -163,14 +164,14 @@ def test_a_start_of_zero_stays_zero() -> None:
     known = SYSTEMS["Maier-Stein"]
     found, x = exact_field(known, 4), uniform_points(known, 200, share=0.6)
     result = refined(known, np.zeros(found.library.size), found, x)
-    assert not result.coefficients.any()
+    assert not result.potential.any()
     assert not result.residual < 1
 
 
 def test_values_of_a_potential_become_coefficients() -> None:
     known = SYSTEMS["archetype"]
     found, x = exact_field(known, 4), uniform_points(known, 300)
-    coefficients = fit_values(found.library, x, potential_values(known, x) + 17)
+    coefficients = fit_values(found.library, [x], [potential_values(known, x) + 17])
     np.testing.assert_allclose(coefficients, exact_coefficients(known, found.library), atol=1e-9)
 
 
@@ -178,7 +179,7 @@ def test_the_sensitivity_has_rows_for_the_terms_that_stay() -> None:
     known = SYSTEMS["double well"]
     found, x = exact_field(known, 4, relative_error=1e-3), uniform_points(known, 300, share=0.6)
     result = refined(known, exact_coefficients(known, found.library), found, x)
-    absent = result.coefficients == 0
+    absent = result.potential == 0
     assert not result.sensitivity[absent].any()
     assert not result.covariance[absent].any()
     assert not result.covariance[:, absent].any()
@@ -233,7 +234,7 @@ def drawn(found: FieldEstimate, seed: int) -> FieldEstimate:
 
 def fitted(
     known: KnownSystem, found: FieldEstimate, potential: np.ndarray, circulatory: np.ndarray
-) -> RegionFormula | None:
+) -> GlobalFormula | None:
     x = uniform_points(known, 300, share=0.6)
     return _fit_orthogonal(found, potential, circulatory, x)
 
@@ -281,14 +282,14 @@ def test_errors_are_as_large_as_stated_and_smaller_than_without_the_constraint(n
         found = drawn(center, seed)
         fit = _fit_orthogonal(found, potential, circulatory, x)
         assert fit is not None
-        stated = np.sqrt(np.diag(fit.potential_covariance))[terms]
+        stated = np.sqrt(np.diag(fit.covariance))[terms]
         error = (fit.potential - potential)[terms]
         scores.append(error / stated)
         errors.append(error)
         moving = fit.circulatory_errors > 0
         scores_of_g.append((fit.circulatory - circulatory)[moving] / fit.circulatory_errors[moving])
-        plain = refine_globally(potential, found.library, found, x, sparse=False)
-        others.append((plain.coefficients - potential)[terms])
+        plain = refine_globally(potential, found, x, sparse=False)
+        others.append((plain.potential - potential)[terms])
         chances.append(fit.probability)
     assert 0.8 < np.sqrt(np.mean(np.square(scores))) < 1.2
     if scores_of_g[0].size:
@@ -338,9 +339,7 @@ def test_more_terms_than_needed_cost_precision_only() -> None:
 
 
 def test_no_freedom_left_is_no_evidence() -> None:
-    fit = RegionFormula(
-        np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 1)), freedom=0, chi_square=0.0
-    )
+    fit = GlobalFormula(np.zeros(1), np.zeros((1, 1)), freedom=0, chi_square=0.0)
     assert fit.probability == 1.0
 
 
@@ -370,5 +369,5 @@ def test_other_units_give_the_same_fit(units: np.ndarray) -> None:
     assert two.chi_square == pytest.approx(one.chi_square, rel=1e-6)
     np.testing.assert_allclose(two.potential * factors, one.potential, atol=1e-9)
     np.testing.assert_allclose(two.circulatory * factors[:, None] / units, one.circulatory, atol=1e-9)
-    errors = np.sqrt(np.diag(one.potential_covariance))
-    np.testing.assert_allclose(np.sqrt(np.diag(two.potential_covariance)) * factors, errors, rtol=1e-5)
+    errors = np.sqrt(np.diag(one.covariance))
+    np.testing.assert_allclose(np.sqrt(np.diag(two.covariance)) * factors, errors, rtol=1e-5)

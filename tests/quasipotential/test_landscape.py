@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import Verdict
 from siq.quasipotential.certificate import Certificate
-from siq.quasipotential.formulas import model_to_data, read_model, write_model
+from siq.quasipotential.formulas import read_model, write_model
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_files import read_landscape, write_landscape
@@ -55,7 +55,7 @@ def test_the_wells_of_both_files_are_the_same(tmp_path: Path) -> None:
         options=RefinementOptions(routes=("local",), degrees=(4, 6)),
     )  # fmt: skip
     model = tmp_path / "model.json"
-    write_model(model, model_to_data({"refined": _refined_decomposition(refined, points)}, {}))
+    write_model(model, {"refined": _refined_decomposition(refined, points)}, {})
     # Another portrait, from other recorded states, as the landscape's own.
     landscape = find_landscape(found, portrait_of(known, 350), wells=read_model(model)[0]["refined"].wells)
     write_landscape(tmp_path / "quasipotential.json", landscape)

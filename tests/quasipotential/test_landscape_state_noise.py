@@ -7,7 +7,7 @@ import pytest
 from known_noise import exit_time, multiplicative, one_state, potential_of_one_state
 from known_systems import KnownSystem, portrait_of, potential_gradient, potential_values
 
-from siq.quasipotential.cell_density import known_density, lowest_possible, sample_potential
+from siq.quasipotential.cell_density import SampledPotential
 from siq.quasipotential.landscape import GlobalQuasipotential
 from siq.quasipotential.path_chains import PathProblem, _Across
 from siq.quasipotential.paths import minimum_action_path
@@ -129,9 +129,9 @@ def test_the_density_of_one_state_is_exact() -> None:
     heights = max(to_top) - np.array(to_top)
     potential = GlobalQuasipotential(wells, heights)
     box = np.array([[-1.4, 1.4]])
-    fine, coarse = (sample_potential(potential, box, cells=cells) for cells in (2000, 1000))
-    lowest = lowest_possible(coarse, known.dynamics)
-    density = known_density(fine, coarse, lowest, intensity=intensity)
+    fine, coarse = (SampledPotential.of(potential, box, cells=cells) for cells in (2000, 1000))
+    lowest = coarse.lowest_possible(known.dynamics)
+    density = fine.density(coarse, lowest, intensity=intensity)
     seen, x = fine.known, fine.axes[0]
     heights_at = np.array([2 * potential_of_one_state(known, 0.0, float(one)) for one in x[seen]])
     exact = np.exp(-heights_at / intensity) / known.dynamics.diffusion.at(x[seen][:, None])[:, 0, 0]

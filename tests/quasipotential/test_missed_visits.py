@@ -10,7 +10,7 @@ from siq.data.recordings import Recordings
 from siq.data.two_states import SIGNIFICANCE, DwellCount, continued_visits
 from siq.inference.field_estimate import FieldEstimate, FlowMap
 from siq.inference.library import IdentificationOptions, field_library
-from siq.quasipotential.occupancy import _cell_process, _cores_about, check_occupancy
+from siq.quasipotential.occupancy import _CellProcess, _cores_about, check_occupancy
 from siq.quasipotential.rates import NoiseStrength
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -59,7 +59,7 @@ def test_visits_are_foreseen_as_samples_show_them(intensity: float, step: float)
     visits = continued_visits(cores.of(values.reshape(-1, 1)), runs)
     counts = DwellCount.of_visits(np.tile(step * np.arange(800), 400), visits, runs)
     counted = sum(one.time for one in counts) / sum(one.visits for one in counts)
-    process = _cell_process(dynamics, intensity, np.array([[-3.5, 3.5]]))
+    process = _CellProcess(dynamics, intensity, np.array([[-3.5, 3.5]]))
     always, sampled = (
         process.mean_visit(one.of(process.points), 0)
         for one in (cores, cores.as_sampled(dynamics, intensity, step))
@@ -83,7 +83,7 @@ def test_a_state_that_the_record_shows_and_f_does_not_is_noticed() -> None:
     portrait = phase_portrait(both.dynamics, values[::20], seed=0)
     agreed = check_occupancy(both, portrait, NoiseStrength(0.3, 0.003), recordings, held)
     verdict = agreed.verdict(false_alarms=1e-4)
-    assert verdict is not None and verdict.passed and agreed.hops > 30
+    assert verdict is not None and verdict.passed and sum(one.whole.visits for one in agreed.visits) > 30
 
 
 def test_a_single_state_is_no_contradiction() -> None:
@@ -98,4 +98,4 @@ def test_a_single_state_is_no_contradiction() -> None:
         alone, portrait, NoiseStrength(0.1), recordings, np.zeros(len(recordings.labels), dtype=bool)
     )
     assert found.unseen is None and found.verdict(false_alarms=1e-4) is None
-    assert found.hops == 0
+    assert sum(one.whole.visits for one in found.visits) == 0

@@ -17,7 +17,8 @@ from known_systems import (
     potential_values,
 )
 
-from siq.quasipotential.power_series import PowerSeries, cubic_series, quasipotential_series
+from siq.quasipotential.hamilton_jacobi import Expansion
+from siq.quasipotential.power_series import _cubic_series, quasipotential_series
 from siq.systems.dynamics import Dynamics
 
 pytestmark = pytest.mark.portable
@@ -25,7 +26,7 @@ pytestmark = pytest.mark.portable
 x, y = (sympy.Symbol(name, real=True) for name in "xy")
 
 
-def series_of(known: KnownSystem, degree: int, which: int = -1) -> PowerSeries:
+def series_of(known: KnownSystem, degree: int, which: int = -1) -> Expansion:
     return quasipotential_series(known.dynamics, known.attractors[which], degree=degree)
 
 
@@ -148,7 +149,7 @@ def test_it_is_the_power_series_of_degree_three(dimension: int) -> None:
     attractor = known.attractors[0]
     x = attractor + np.random.default_rng(0).normal(size=(5, dimension))
     cubic, whole = (
-        cubic_series(known.dynamics, attractor),
+        _cubic_series(known.dynamics, attractor),
         quasipotential_series(known.dynamics, attractor, degree=3),
     )
     assert cubic.gradients(x) == pytest.approx(whole.gradients(x), abs=1e-10)
@@ -167,7 +168,7 @@ def test_of_a_long_chain_that_turns_it_is_exact() -> None:
     for place in range(count - 1):
         field[place] += slope[place + 1] / 2
         field[place + 1] -= slope[place] / 2
-    found = cubic_series(Dynamics.of(x, field), np.ones(count))
+    found = _cubic_series(Dynamics.of(x, field), np.ones(count))
     exact = np.zeros((count,) * 3)
     exact[np.arange(count), np.arange(count), np.arange(count)] = 6.0
     assert np.abs(found.cube - exact).max() < 1e-9

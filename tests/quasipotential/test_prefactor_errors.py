@@ -15,7 +15,6 @@ from siq.quasipotential.rates import (
     EscapeRate,
     NoiseStrength,
     _covariance_axes,
-    mean_exit_time,
     prefactor_error,
 )
 from siq.quasipotential.transitions import noise_leverage
@@ -57,13 +56,9 @@ def test_axes_make_up_the_covariance() -> None:
 
 
 def test_barrier_and_prefactor_err_together() -> None:
-    apart = mean_exit_time(
-        EscapeRate(0.5, 4.0, standard_error=0.01, prefactor_error=0.08), NoiseStrength(0.1)
-    )
-    against = mean_exit_time(
-        EscapeRate(0.5, 4.0, standard_error=0.01, prefactor_error=0.08, covariance=-0.01 * 0.08),
-        NoiseStrength(0.1),
-    )
+    rate = EscapeRate(0.5, 4.0, standard_error=0.01, prefactor_error=0.08)
+    apart = rate.mean_exit_time(NoiseStrength(0.1))
+    against = replace(rate, covariance=-0.01 * 0.08).mean_exit_time(NoiseStrength(0.1))
     assert apart is not None and against is not None
     assert apart.data_error == pytest.approx(np.hypot(0.1, 0.08))
     assert against.data_error == pytest.approx(0.02)
@@ -75,7 +70,7 @@ def test_an_estimated_noise_counts_by_the_states_that_the_path_takes(
     found, path = well
     assert noise_leverage(path, found.dynamics) == pytest.approx(np.sqrt(2), rel=1e-3)
     way = EscapeRate(0.5, 4.0, prefactor_error=0.0, leverage=float(np.sqrt(2)))
-    time = mean_exit_time(way, NoiseStrength(0.1, 0.001))
+    time = way.mean_exit_time(NoiseStrength(0.1, 0.001))
     assert time is not None and time.data_error == pytest.approx(5 * 0.01 * np.sqrt(2))
 
 

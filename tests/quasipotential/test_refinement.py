@@ -15,8 +15,9 @@ from siq.inference.field_estimate import Verdict
 from siq.networks.decomposition import CheckOptions
 from siq.quasipotential import refinement
 from siq.quasipotential.certificate import Certificate
-from siq.quasipotential.global_formula import RegionFormula
+from siq.quasipotential.global_formula import GlobalFormula
 from siq.quasipotential.refinement import Refined, RefinementOptions, TrainingCheck, _every_well_held_out
+from siq.remarks import has_code
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import phase_portrait
 
@@ -77,8 +78,8 @@ def test_the_wells_carry_the_certificate_where_one_formula_is_refused(
     monkeypatch: pytest.MonkeyPatch, formula: Verdict, wells: Verdict, scope: str, whole: bool
 ) -> None:
     well: Any = object()
-    one = RegionFormula(np.ones(1), np.ones((1, 1)), np.eye(1), np.ones((1, 1)), joint=True)
-    found = Refined(SimpleNamespace(noise_free=True), None, 0.01, (well,), formula=one)  # type: ignore[arg-type]
+    one = GlobalFormula(np.ones(1), np.eye(1), joint=True)
+    found = Refined(SimpleNamespace(noise_free=True), (well,), formula=one)  # type: ignore[arg-type]
     monkeypatch.setattr(refinement, "refine", lambda *_, **__: found)
     monkeypatch.setattr(refinement, "_formula_library", lambda *_: None)
     monkeypatch.setattr(
@@ -94,7 +95,7 @@ def test_the_wells_carry_the_certificate_where_one_formula_is_refused(
     assert made.scope == scope
     assert (formulas.potential is not None) == whole
     assert made.certified == (PASSED in (formula, wells))
-    assert any("no single formula" in note for note in refined.notes) == (not whole)
+    assert has_code(refined.remarks, "quasipotential.single_formula_refused") == (not whole)
 
 
 def test_recordings_of_every_well_are_held_out_where_they_stay_in_theirs() -> None:

@@ -8,29 +8,29 @@ import scipy.optimize
 from known_systems import double_well, exact_field, portrait_of
 
 from siq.quasipotential.landscape_assembly import find_landscape
-from siq.quasipotential.rates import EscapeRate, MeanTime, NoiseStrength, mean_exit_time, mean_residence_time
+from siq.quasipotential.rates import EscapeRate, MeanTime, NoiseStrength, mean_residence_time
 from siq.quasipotential.transitions import position_standard_errors
 from siq.quasipotential.wells import WellOptions
 from siq.systems.dynamics import Dynamics
 
 
 def test_the_time_over_one_saddle_is_the_law() -> None:
-    found = mean_exit_time(EscapeRate(0.5, 4.0), NoiseStrength(0.1))
+    found = EscapeRate(0.5, 4.0).mean_exit_time(NoiseStrength(0.1))
     assert found is not None
     assert found.value == pytest.approx(4 * np.exp(5))
     assert found.data_error == 0 and found.law_error == pytest.approx(0.2)
 
 
 def test_its_error_follows_from_the_barrier_and_from_the_noise() -> None:
-    of_barrier = mean_exit_time(EscapeRate(0.5, 4.0, standard_error=0.01), NoiseStrength(0.1))
-    of_noise = mean_exit_time(EscapeRate(0.5, 4.0), NoiseStrength(0.1, 0.002))
+    of_barrier = EscapeRate(0.5, 4.0, standard_error=0.01).mean_exit_time(NoiseStrength(0.1))
+    of_noise = EscapeRate(0.5, 4.0).mean_exit_time(NoiseStrength(0.1, 0.002))
     assert of_barrier is not None and of_noise is not None
     # d ln T = dΔU/ε, and the prefactor's share beside it; d ln T = (ΔU/ε) dε/ε.
     assert of_barrier.data_error == pytest.approx(np.hypot(0.1, 0.02))
     assert of_noise.data_error == pytest.approx(5 * 0.02)
-    changed = mean_exit_time(EscapeRate(0.5, 4.0), NoiseStrength(0.1 * 1.0001))
+    changed = EscapeRate(0.5, 4.0).mean_exit_time(NoiseStrength(0.1 * 1.0001))
     assert changed is not None
-    exact = mean_exit_time(EscapeRate(0.5, 4.0), NoiseStrength(0.1))
+    exact = EscapeRate(0.5, 4.0).mean_exit_time(NoiseStrength(0.1))
     assert exact is not None and np.log(exact.value / changed.value) == pytest.approx(5e-4, rel=1e-3)
 
 
@@ -53,8 +53,8 @@ def test_a_way_out_without_a_rate_makes_the_time_an_upper_bound(way: EscapeRate)
 
 def test_there_is_no_time_without_noise_and_none_under_a_noise_above_the_barrier() -> None:
     assert mean_residence_time([EscapeRate(0.5, 4.0)], None) is None
-    assert mean_exit_time(EscapeRate(0.5, 4.0), NoiseStrength(0.6)) is None
-    assert mean_exit_time(EscapeRate(0.5, 4.0), NoiseStrength(1e-6)) is None  # more than a number can hold
+    assert EscapeRate(0.5, 4.0).mean_exit_time(NoiseStrength(0.6)) is None
+    assert EscapeRate(0.5, 4.0).mean_exit_time(NoiseStrength(1e-6)) is None  # more than a number can hold
 
 
 def test_a_time_is_positive_however_uncertain() -> None:

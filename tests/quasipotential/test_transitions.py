@@ -19,7 +19,7 @@ from known_systems import (
 
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
-from siq.quasipotential.path_chains import TransitionPath
+from siq.quasipotential.path_chains import MinimumActionPath
 from siq.quasipotential.paths import minimum_action_path
 from siq.quasipotential.transitions import (
     Transition,
@@ -105,12 +105,12 @@ def test_barriers_are_those_of_the_exact_potential(name: str) -> None:
         exact = exact_barrier(known, found, way)
         assert way.barrier == pytest.approx(exact, rel=1e-6)
         assert way.path is not None
-        assert way.path.uphill.action == pytest.approx(exact, rel=1e-5)
+        assert way.path.action == pytest.approx(exact, rel=1e-5)
         assert 0.95 < way.formula_share <= 1 + 1e-9
         assert way.rate is not None
-        assert way.rate.barrier == way.path.uphill.action
+        assert way.rate.barrier == way.path.action
         np.testing.assert_allclose(
-            way.path.points[[0, -1]],
+            np.stack([way.path.points[0], way.path.downhill[-1]]),
             np.stack([found.attractors[i].position for i in (way.start, way.end or 0)]),
             atol=1e-6,
         )
@@ -129,7 +129,7 @@ def test_the_barrier_of_the_archetype_is_one() -> None:
 def test_without_a_formula_the_path_alone_tells_the_barrier() -> None:
     for way in ways("double well", with_formulas=False):
         assert way.path is not None
-        assert way.barrier == way.path.uphill.action
+        assert way.barrier == way.path.action
         assert way.formula_share == 0
 
 
@@ -137,7 +137,7 @@ def test_a_formula_that_is_believed_nowhere_leaves_the_path() -> None:
     (way, _), (local, _) = ways("double well", with_formulas=True), formulas("double well")
     assert way.path is not None
     nowhere = replace(local, tolerance=-1.0)
-    assert _barrier_by_formula(way.path, nowhere) == (way.path.uphill.action, 0.0)
+    assert _barrier_by_formula(way.path, nowhere) == (way.path.action, 0.0)
 
 
 def test_a_barrier_is_put_together_where_the_formula_ends() -> None:
@@ -147,7 +147,7 @@ def test_a_barrier_is_put_together_where_the_formula_ends() -> None:
     well = replace(local, coefficients=1.1 * local.coefficients, reach=0.11, tolerance=0.2)
     barrier, share = _barrier_by_formula(way.path, well)
     assert 0.2 < share * barrier <= 0.22  # the last node of the path below the level
-    exact = way.path.uphill.action
+    exact = way.path.action
     assert barrier == pytest.approx(exact + share * barrier * (1 - 1 / 1.1), rel=1e-3)
 
 
@@ -182,7 +182,7 @@ def barrier_slope(found: FieldEstimate, way: Transition, attractor: np.ndarray, 
         dynamics = found.dynamics.with_values(values)
         return minimum_action_path(
             dynamics, settled(dynamics, attractor), settled(dynamics, way.saddle.position),
-            initial=[way.path.uphill.points],  # type: ignore[union-attr]
+            initial=[way.path.points],  # type: ignore[union-attr]
         ).action  # fmt: skip
 
     return (action(step) - action(-step)) / (2 * step)
@@ -250,7 +250,7 @@ def test_a_saddle_that_leads_out_of_the_region_has_no_end() -> None:
 def test_a_path_that_is_not_found_is_told_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
     known = SYSTEMS["double well"]
 
-    def fails(*_: object, **__: object) -> TransitionPath:
+    def fails(*_: object, **__: object) -> MinimumActionPath:
         raise NumericalFailure("no path has a finite action")
 
     monkeypatch.setattr("siq.quasipotential.transitions.transition_path", fails)

@@ -16,7 +16,7 @@ from siq.systems.cycles import Cycle, closed_orbit, hessians_along
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
 from siq.systems.phase_portrait import phase_portrait
-from siq.validation.mesh import mesh_quasipotential_of_cycle
+from siq.validation.mesh import mesh_quasipotential
 
 x, y, z = (sympy.Symbol(name, real=True) for name in "xyz")
 INNER, OUTER = 0.6, 1.0
@@ -97,7 +97,7 @@ def test_the_way_out_of_a_cycle_over_a_saddle_is_exact(turn: float) -> None:
     (cycle,), (way,) = landscape.cycles, landscape.transitions
     assert cycle.stable and cycle is landscape.attractors[0]
     assert way.barrier == pytest.approx(exact, rel=1e-6)
-    assert way.end is None and way.path is not None and way.path.uphill.converged
+    assert way.end is None and way.path is not None and way.path.converged
     assert way.rate is None and any("no law is implemented" in note for note in way.notes)
     assert np.isnan(landscape.dwell_times(noise=exact / 10)["mean_time"]).all()
     assert "one attractor, a limit cycle of period" in landscape.report()
@@ -129,10 +129,10 @@ def test_u_about_the_cycle_of_van_der_pol_is_that_of_the_mesh() -> None:
     (cycle,) = phase_portrait(system).cycles
     points, hessians = finer(cycle.points), finer(hessians_along(system, cycle))
     box = np.array([[-3.5, 3.5], [-4.5, 4.5]])
-    mesh = mesh_quasipotential_of_cycle(
+    mesh = mesh_quasipotential(
         system.drift,
         points,
-        hessians=hessians,
+        hessian=hessians,
         box=box,
         shape=(401, 401),
         diffusion=system.diffusion,
@@ -160,8 +160,8 @@ def test_an_oscillation_beside_rest_has_the_barriers_of_characteristics_and_of_t
     inwards = minimum_action_path(system, portrait.attractors[0].position, parting)
     assert inwards.action == pytest.approx(lowest_crossing(system, parting), rel=1e-4)
     outwards = minimum_action_path(system, cycle, parting)
-    mesh = mesh_quasipotential_of_cycle(
-        system.drift, finer(cycle.points), hessians=finer(hessians_along(system, cycle)),
+    mesh = mesh_quasipotential(
+        system.drift, finer(cycle.points), hessian=finer(hessians_along(system, cycle)),
         box=np.array([[-3.0, 3.0]] * 2), shape=(401, 401), diffusion=system.diffusion, reach=9,
     )  # fmt: skip
     assert outwards.action == pytest.approx(2 * np.nanmin(mesh.evaluate(parting.points)), rel=5e-3)

@@ -13,7 +13,6 @@ import pytest
 from known_systems import double_well, exact_field, portrait_of
 
 from siq.quasipotential.landscape_assembly import find_landscape
-from siq.quasipotential.path_chains import TransitionPath
 from siq.quasipotential.wells import WellOptions
 from siq.report.page import UNKNOWN, interactive_view
 from siq.report.summary import LandscapeSummary, summarise
@@ -88,9 +87,7 @@ def test_of_many_states_four_are_shown_and_the_others_held_at_the_saddle() -> No
         ways=tuple(
             replace(
                 way, saddle=replace(way.saddle, position=longer(way.place)),
-                path=TransitionPath(
-                    replace(way.path.uphill, points=longer(way.uphill)), longer(way.downhill)
-                ),
+                path=replace(way.path, points=longer(way.uphill), downhill=longer(way.downhill)),
             )
             for way in three.ways if way.path is not None
         ),

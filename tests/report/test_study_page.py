@@ -11,7 +11,7 @@ import pytest
 import sympy
 from told_landscapes import NOISE, landscape, record_row, told, unseen_row
 
-from siq.quasipotential.formulas import SymbolicDecomposition, exact_decomposition, model_to_data, write_model
+from siq.quasipotential.formulas import SymbolicDecomposition, exact_decomposition, write_model
 from siq.report.formatting import texts
 from siq.report.page import ReportContent, ReportSection, render_report
 from siq.report.study_page import LEADING, StudyResults, study_page
@@ -68,7 +68,7 @@ def page_of(
     paths, coefficients, rrmse, tests, outcomes = [], [], [], [], []
     for run in range(runs):
         path = folder / f"{run}.json"
-        write_model(path, model_to_data(found, certificates))
+        write_model(path, found, certificates)
         paths.append(str(path))
         for name, one in found.items():
             coefficients.append(

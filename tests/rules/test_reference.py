@@ -11,7 +11,7 @@ import pytest
 import sympy
 from known_systems import as_system, limit_cycle
 
-from siq.quasipotential.landscape_comparison import read_reference, write_reference
+from siq.quasipotential.landscape_comparison import ReferenceLandscape
 from siq.report.study_page import _without_landscape
 from siq.systems.dynamics import Dynamics
 from siq.workflow.study import PipelineSettings, StateSpace
@@ -43,8 +43,8 @@ ONE_WELL = system((-X, -2 * Y), [[-1.0, 1.0], [-1.0, 1.0]])
     ],
 )
 def test_without_wells_there_is_a_reason_and_no_rows(card: Dynamics, reason: str, tmp_path: Path) -> None:
-    write_reference(tmp_path / "reference.npz", comparison.reference_of_card(SETTINGS, card))
-    found = read_reference(tmp_path / "reference.npz")
+    comparison.reference_of_card(SETTINGS, card).write(tmp_path / "reference.npz")
+    found = ReferenceLandscape.read(tmp_path / "reference.npz")
     assert reason in found.reason and found.attractors.shape == (0, 2)
     settings = PipelineSettings(seed=1)
     table = comparison.run_landscape_errors(settings, found, [], {})
@@ -58,8 +58,8 @@ def test_without_wells_there_is_a_reason_and_no_rows(card: Dynamics, reason: str
 
 def test_a_reference_that_exists_has_no_reason(tmp_path: Path) -> None:
     wells = system((X - X**3,), [[-1.6, 1.6]])
-    write_reference(tmp_path / "reference.npz", comparison.reference_of_card(SETTINGS, wells))
-    found = read_reference(tmp_path / "reference.npz")
+    comparison.reference_of_card(SETTINGS, wells).write(tmp_path / "reference.npz")
+    found = ReferenceLandscape.read(tmp_path / "reference.npz")
     assert found.reason == "" and len(found.attractors) == 2
 
 

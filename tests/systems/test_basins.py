@@ -63,7 +63,7 @@ def test_a_chain_of_ten_has_exact_barriers_and_prefactors() -> None:
         rate = way.saddle.eigenvalues[0].real
         exact = 2 * np.pi / rate * np.sqrt(abs(determinants[0]) / determinants[1])
         assert way.rate is not None and way.rate.prefactor == pytest.approx(exact, rel=0.01)
-        assert way.path is not None and way.path.uphill.residual < 1e-4
+        assert way.path is not None and way.path.residual < 1e-4
 
 
 def test_a_front_that_crosses_a_long_chain_is_followed_until_it_has_arrived() -> None:

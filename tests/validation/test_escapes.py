@@ -10,7 +10,7 @@ from known_systems import KnownSystem, archetype, double_well
 from siq.errors import NumericalFailure
 from siq.quasipotential.rates import escape_rate
 from siq.systems.dynamics import Dynamics
-from siq.validation.escapes import EscapeTimes, Neighbourhood, neighbourhood, simulate_escapes
+from siq.validation.escapes import EscapeTimes, Neighbourhood, simulate_escapes
 
 
 def escapes_of(
@@ -23,7 +23,7 @@ def escapes_of(
     seed: int = 0,
     **options: object,
 ) -> EscapeTimes:
-    target = neighbourhood(known.dynamics, known.attractors[1 - which], level=level)
+    target = Neighbourhood.about(known.dynamics, known.attractors[1 - which], level=level)
     return simulate_escapes(
         known.dynamics,
         known.attractors[which],

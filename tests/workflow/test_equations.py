@@ -261,7 +261,7 @@ def test_a_damped_particle_has_its_energy_as_a_formula() -> None:
     (way,) = landscape.transitions
     assert way.end is None and way.barrier == pytest.approx(2 * friction / noise / 6, rel=1e-6)
     well = landscape.potential()
-    x = well.inside
+    x = well.inside()
     energy = friction / noise * (x[:, 1] ** 2 / 2 + x[:, 0] ** 2 / 2 - x[:, 0] ** 3 / 3)
     np.testing.assert_allclose(well.values(x), energy, atol=1e-10)
     # Kramers, with both frequencies 1: half of what reaches the saddle in the mean comes back.
@@ -284,9 +284,9 @@ def test_formulas_hold_where_noise_acts_on_one_state_and_nothing_is_conserved(ca
     landscape = Landscape.from_equations(system)
     assert landscape.certificate is not None and landscape.certificate.certified
     for way in landscape.transitions:
-        assert way.path is not None and way.path.uphill.converged
+        assert way.path is not None and way.path.converged
         well = landscape.potential(way.start)
-        points = well.inside[:: len(well.inside) // 5]
+        points = well.inside()[:: len(well.inside()) // 5]
         for end in points[np.abs(points - well.attractor).max(axis=1) > 0.1]:
             path = minimum_action_path(system, well.attractor, end)
             error = max(landscape.certificate.error, 1e-5) * well.level

@@ -13,7 +13,7 @@ from siq.data.recordings import Recordings
 from siq.errors import NumericalFailure
 from siq.networks.decomposition import CheckOptions, TrainedNetworks, TrainingOptions
 from siq.networks.regression import RegressionOptions
-from siq.quasipotential.formulas import exact_decomposition, model_to_data
+from siq.quasipotential.formulas import decomposition_data, exact_decomposition
 from siq.quasipotential.refinement import RefinementOptions
 from siq.systems.simulation import SimulationOptions
 from siq.workflow import pipeline, training
@@ -121,10 +121,7 @@ def test_the_regression_does_not_steer_the_refined_formulas(
     one, other = (
         analyse(recordings, replace(settings, regression=each), device="cpu").refined for each in told
     )
-    first, second = (
-        model_to_data({"refined": each.formulas[Method.REFINED]}, {"refined": {}})["methods"]["refined"]
-        for each in (one, other)
-    )
+    first, second = (decomposition_data(each.formulas[Method.REFINED]) for each in (one, other))
     assert first["V"]["exponents"] == second["V"]["exponents"]
     # With networks the regression is where the search begins; it ends at the same V, to its own rounding.
     np.testing.assert_allclose(first["V"]["coefficients"], second["V"]["coefficients"], rtol=1e-8)

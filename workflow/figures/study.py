@@ -17,7 +17,7 @@ from siq.networks.regression import highest_used, points_below
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import GlobalQuasipotential, Landscape
-from siq.quasipotential.landscape_comparison import Potential, ReferenceLandscape, overall_level
+from siq.quasipotential.landscape_comparison import Potential, ReferenceLandscape
 from siq.report.plots.prediction import residuals_figure
 from siq.report.plots.quasipotential import quasipotential_figure
 from siq.report.plots.sweep import plot_sweep
@@ -143,14 +143,14 @@ def landscape_figures(
         return figures
     names, x, potential = landscape.dynamics.states, reference.points, landscape.global_quasipotential
     assert potential is not None  # U is known over all wells
-    below = compare_below or overall_level(reference)
+    below = compare_below or reference.level
     inside = np.nan_to_num(reference.values, nan=np.inf) < below
     ours = {"characteristics": reference.values, "mesh": reference.mesh_values}
     if networks is not None:
         ours["networks"] = 2 * networks.evaluate(x).potential
     regression = (formulas or {}).get(Method.REGRESSION)
     if regression is not None and regression.potential is not None:
-        ours[str(Method.REGRESSION)] = 2 * regression.evaluate(np.ascontiguousarray(x.T))[0]
+        ours[str(Method.REGRESSION)] = 2 * regression.values(x)
     ours["local formulas"] = potential(x)
     maps = {"landscape_errors": _shifted(ours, inside, of_any_constant=("networks", str(Method.REGRESSION)))}
     symbols = [sympy.Symbol(name, real=True) for name in names]
