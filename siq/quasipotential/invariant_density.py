@@ -273,7 +273,7 @@ def _split_into_blocks(
 def _gauss_legendre(bounds: np.ndarray, count: int, panels: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Nodes and weights, so many in each of some equal panels."""
     nodes, weights = scipy.special.roots_legendre(count)
-    edges = np.linspace(*bounds, panels + 1)
+    edges = np.linspace(bounds[0], bounds[1], panels + 1)
     half = (edges[1] - edges[0]) / 2
     return (edges[:-1, None] + half * (nodes + 1)).ravel(), np.tile(half * weights, panels)
 

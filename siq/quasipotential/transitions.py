@@ -165,8 +165,8 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
         ways.append(Transition(start, end, over, path, remarks=remarks, from_cycle=start >= points))
 
     for cycle in portrait.parting:
-        sides = [int(one) for one in both_sides(dynamics, cycle, portrait)]
-        for start, beyond in (sides, sides[::-1]) if sides[0] != sides[1] else ():
+        ends = [int(one) for one in both_sides(dynamics, cycle, portrait)]
+        for start, beyond in (ends, ends[::-1]) if ends[0] != ends[1] else ():
             if start >= 0:
                 add(start, cycle, None if beyond < 0 else beyond)
     for index in range(len(settled)):
