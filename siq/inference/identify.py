@@ -269,17 +269,18 @@ class _Case:
         noise, pairs = found.diagnosis, len(self._pairs(self.recordings).h)
         assert noise is not None and noise.measurement_error is not None
         forced = bool(found.noise_rate.any())
+        different = len({unit for unit in self.units if unit}) > 1
+        if found.hidden_velocities and not forced and different:
+            raise NumericalFailure(
+                "no process noise is seen that would show D, and the positions have different units, so that"
+                " no unit matrix can stand for it; scale them to one unit"
+            )
         sizes = zip(noise.measurement, self.recordings.titles, strict=True)
         sensors = [{"size": float(size), "state": name} for size, name in sizes]
         remarks = [Remark("inference.measurement_noise", {"sensors": sensors})]
         if found.hidden_velocities:
             remarks = [Remark("inference.hidden_velocities", {"sensors": sensors, "process_noise": forced})]
             source = DiffusionSource.OF_VELOCITIES if forced else DiffusionSource.UNIT_OF_VELOCITIES
-            if not forced and len({unit for unit in self.units if unit}) > 1:
-                raise NumericalFailure(
-                    "no process noise is seen that would show D, and the positions have different units, so"
-                    " that no unit matrix can stand for it; scale them to one unit"
-                )
         else:
             first = found
             found, source = self._with_diffusion(found, pairs)
