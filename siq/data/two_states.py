@@ -399,7 +399,7 @@ class Switching:
         return self.probability < SIGNIFICANCE and self.hops > 0
 
 
-def switching(recordings: Recordings, *, generator: np.random.Generator | None = None) -> Switching | None:
+def switching(recordings: Recordings) -> Switching | None:
     """The two states that the recordings show best; None where they are too short to tell anything.
 
     Every state is looked at by itself, and the one in which the record is pushed apart most clearly is taken.
@@ -409,8 +409,6 @@ def switching(recordings: Recordings, *, generator: np.random.Generator | None =
     ----------
     recordings
         Trajectories, of any number.
-    generator
-        Where surrogates come from; by default always the same ones.
 
     Examples
     --------
@@ -426,8 +424,7 @@ def switching(recordings: Recordings, *, generator: np.random.Generator | None =
     >>> found.supported, [round(level, 1) for level in found.levels]
     (True, [-0.9, 0.8])
     """
-    runs = runs_of(recordings)
-    generator = np.random.default_rng(0) if generator is None else generator
+    runs, generator = runs_of(recordings), np.random.default_rng(0)  # always the same surrogates
     tests: dict[int, tuple[float, float, float]] = {}  # probability, less the depth, relaxation
     for place, column in enumerate(recordings.values.T):
         relaxation = relaxation_samples(column, runs)

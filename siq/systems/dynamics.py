@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
@@ -55,45 +54,13 @@ class Signals:
     t: np.ndarray
 
 
-class _Operation(IntEnum):
-    """Operations of a tape, on one register or two."""
-
-    ADD = 0
-    MULTIPLY = 1
-    INVERT = 2
-    WHOLE_POWER = 3
-    POWER = 4
-    SQRT = 5
-    SIN = 6
-    COS = 7
-    TAN = 8
-    EXP = 9
-    LOG = 10
-    TANH = 11
-    ATAN = 12
-    ABS = 13
-    SIGN = 14
-    MAX = 15
-    MIN = 16
-
-
+# Operations of a tape, by the numbers that `siq.inference.trajectories` knows.
+_INVERT, _WHOLE_POWER, _POWER, _SQRT = 2, 3, 4, 5
+_CHAINS = {sympy.Add: 0, sympy.Mul: 1, sympy.Max: 15, sympy.Min: 16}
 _FUNCTIONS = {
-    sympy.sin: _Operation.SIN,
-    sympy.cos: _Operation.COS,
-    sympy.tan: _Operation.TAN,
-    sympy.exp: _Operation.EXP,
-    sympy.log: _Operation.LOG,
-    sympy.tanh: _Operation.TANH,
-    sympy.atan: _Operation.ATAN,
-    sympy.Abs: _Operation.ABS,
-    sympy.sign: _Operation.SIGN,
-}
-_CHAINS = {
-    sympy.Add: _Operation.ADD,
-    sympy.Mul: _Operation.MULTIPLY,
-    sympy.Max: _Operation.MAX,
-    sympy.Min: _Operation.MIN,
-}
+    sympy.sin: 6, sympy.cos: 7, sympy.tan: 8, sympy.exp: 9, sympy.log: 10, sympy.tanh: 11, sympy.atan: 12,
+    sympy.Abs: 13, sympy.sign: 14,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -134,8 +101,8 @@ class Tape:
         start = np.concatenate([np.zeros(len(arguments)), list(constants.values())])
         operations: list[tuple[int, int, int]] = []
 
-        def add(operation: _Operation, one: int, other: int) -> int:
-            operations.append((int(operation), one, other))
+        def add(operation: int, one: int, other: int) -> int:
+            operations.append((operation, one, other))
             return len(start) + len(operations) - 1
 
         def register(formula: sympy.Expr) -> int:
@@ -158,12 +125,12 @@ class Tape:
             place = register(base)
             if exponent.is_Integer:
                 if abs(int(exponent)) > 1:
-                    place = add(_Operation.WHOLE_POWER, place, abs(int(exponent)))
+                    place = add(_WHOLE_POWER, place, abs(int(exponent)))
             elif abs(exponent) == sympy.S.Half:
-                place = add(_Operation.SQRT, place, 0)
+                place = add(_SQRT, place, 0)
             else:
-                return add(_Operation.POWER, place, register(exponent))
-            return place if exponent > 0 else add(_Operation.INVERT, place, 0)
+                return add(_POWER, place, register(exponent))
+            return place if exponent > 0 else add(_INVERT, place, 0)
 
         try:
             results = [register(formula) for formula in formulas]

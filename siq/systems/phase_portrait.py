@@ -50,6 +50,7 @@ from siq.systems.equilibria import (
 UNSETTLED = 0.02  # share of the states: as many may be slow, on the ridge between two wells
 NEIGHBOUR_SPACINGS = 2.5  # of the spacing of recorded states: further away nothing was recorded
 SPACING = 0.04  # of each state's range: states that cover the recorded region evenly
+MOST_SPREAD = 4000  # of these states
 # From recorded states.
 RECORDED_STARTS = 1500  # from which f is followed
 NEWTON_STARTS = 400
@@ -151,7 +152,7 @@ class PhasePortrait:
         return Remark("systems.unsettled", values)
 
 
-def evenly_spread(x: np.ndarray, *, generator: np.random.Generator, most: int = 4000) -> np.ndarray:
+def evenly_spread(x: np.ndarray, *, generator: np.random.Generator) -> np.ndarray:
     """Rows of states that cover the recorded region evenly, about a twentieth of each state's range apart.
 
     One state has so many as two have, several hundred: a twentieth apart they would be too few to tell V.
@@ -159,10 +160,10 @@ def evenly_spread(x: np.ndarray, *, generator: np.random.Generator, most: int = 
     width, dimension = np.ptp(x, axis=0), x.shape[1]
     rows = representative_subset(
         x / np.where(width > 0, width, 1.0),
-        distance=max(SPACING ** max(1.0, 2 / dimension), 0.5 * most ** (-1 / dimension)),
+        distance=max(SPACING ** max(1.0, 2 / dimension), 0.5 * MOST_SPREAD ** (-1 / dimension)),
         generator=generator,
     )
-    return np.sort(generator.choice(rows, most, replace=False)) if len(rows) > most else rows
+    return np.sort(generator.choice(rows, MOST_SPREAD, replace=False)) if len(rows) > MOST_SPREAD else rows
 
 
 def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed: int = 0) -> PhasePortrait:
