@@ -129,13 +129,9 @@ def run_landscape_errors(
         if landscape is not None:
             compared = compare_landscape(reference, landscape, below=below)
             tables.append(_rows(number, "local formulas", compared))
-        sources: dict[str, Potential] = {
-            method: lambda x, one=one: 2 * one.values(x)
-            for method, one in formulas.items()
-            if one.potential is not None
-        }
+        sources = {method: _of_formula(one) for method, one in formulas.items() if one.potential is not None}
         if networks is not None:
-            sources["networks"] = lambda x, one=networks: 2 * one.evaluate(x).potential
+            sources["networks"] = _of_networks(networks)
         for source, potential in sources.items():
             tables.append(_rows(number, source, compare_estimate(reference, potential, below=below)))
     if np.isfinite(reference.mesh).any():
@@ -160,6 +156,16 @@ def run_landscape_errors(
 
 def _rows(number: int, source: str, comparisons: Sequence[Mapping[str, object]]) -> pd.DataFrame:
     return as_table(TABLE, [{"run": number, "source": source, **one} for one in comparisons])
+
+
+def _of_formula(one: SymbolicDecomposition) -> Potential:
+    """U of a formula as a function of points in rows."""
+    return lambda x: 2 * one.values(x)
+
+
+def _of_networks(one: TrainedNetworks) -> Potential:
+    """U of networks as a function of points in rows."""
+    return lambda x: 2 * one.evaluate(x).potential
 
 
 WALKERS = 400

@@ -14,6 +14,7 @@ from siq.inference.library import CandidateLibrary
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.wells import WellOptions
+from siq.remarks import sentence
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import TIME, Dynamics, symbol
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
@@ -146,7 +147,8 @@ def _landscape(
         field = identified(model.with_diffusion(noise))
         setting = phase_portrait(field.dynamics, points, seed=seed)
         if not setting.attractors:
-            return None, [setting.fault() or "no well is found"]
+            fault = setting.fault()
+            return None, ["no well is found" if fault is None else sentence(fault)]
         found = find_landscape(field, setting, seed=seed, options=WellOptions(degrees=DEGREES))
     except (NumericalFailure, np.linalg.LinAlgError, ValueError) as error:
         return None, [str(error)]

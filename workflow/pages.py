@@ -69,7 +69,6 @@ def figures(given: Given, settings: PipelineSettings) -> Any:
     from siq.quasipotential.landscape_files import read_landscape
     from siq.report.page import inspection_drawn, interactive_view
     from siq.report.summary import summarise
-    from siq.workflow.models import shown_formula
     from siq.workflow.tables import Method
     from workflow.figures import study as report
     from workflow.files import read_states
@@ -77,7 +76,7 @@ def figures(given: Given, settings: PipelineSettings) -> Any:
 
     source, models = given.files, model_files(given)
     tables = {name: getattr(given, name) for name in report.DRAWN_TABLES}
-    chosen = shown_formula(tables["rrmse"], models)
+    chosen = models.representative(tables["rrmse"])
     of_landscape = chosen.run is None or chosen.method == Method.REGRESSION
     shown = report.representative_run(chosen, models, _first_stored(given) if of_landscape else None)
     run, card = shown.number, given.path("card")
@@ -167,14 +166,13 @@ def _density_source(given: Given) -> tuple[int, str, Any] | None:
     one, otherwise the published method's formula.
     """
     from siq.quasipotential.landscape_files import read_landscape
-    from siq.workflow.models import shown_formula
     from siq.workflow.tables import Method
 
     if not given.path("model"):
         stored = read_landscape(given.files["quasipotential"], dynamics=given.card)
         return None if stored is None else (0, "local formulas", stored)
     models = model_files(given)
-    shown = shown_formula(given.rrmse, models)
+    shown = models.representative(given.rrmse)
     if shown.run is None or shown.method == Method.REGRESSION:
         complete = _first_stored(given)
         if complete is not None:
@@ -198,12 +196,11 @@ def page(given: Given, settings: PipelineSettings) -> Any:
     from siq.report.page import read_inspection, render_report
     from siq.report.study_page import StudyResults, answer_data, study_page
     from siq.report.summary import summarise
-    from siq.workflow.models import shown_formula
     from workflow.scoring import exact_answer
 
     source, study = given.files, _study(given)
     tables, models, card = _tables(given), model_files(given), given.path("card")
-    shown = shown_formula(tables["rrmse"], models)
+    shown = models.representative(tables["rrmse"])
     shown = shown if shown.run is not None else models.first_wells()
     overview = given.overview
     run = shown.run if shown.run is not None else (overview or {}).get("run", 0)

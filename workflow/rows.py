@@ -14,6 +14,7 @@ from siq.quasipotential.occupancy import OccupancyCheck
 from siq.quasipotential.rates import MeanTime, mean_residence_time
 from siq.quasipotential.wells import best_trial
 from siq.systems.cycles import Cycle
+from siq.systems.equilibria import Equilibrium
 from siq.workflow.tables import as_table
 
 
@@ -93,14 +94,15 @@ def landscape_rows(run: int, found: Landscape | None, remark: str | None = None)
         tops[place(way.saddle.position)] = min(top, tops.get(place(way.saddle.position), np.inf))
     noise = found.noise
     rows: list[dict[str, object]] = []
-    for one in (*found.equilibria, *found.cycles, *found.parting):
+    rest: list[Equilibrium | Cycle] = [*found.equilibria, *found.cycles, *found.parting]
+    for one in rest:
+        further: dict[str, object] = {}
         if isinstance(one, Cycle):  # one of its states, the Floquet exponents
             index = next((at for at, other in enumerate(found.attractors) if other is one), None)
             multipliers = ", ".join(_complex(value) for value in one.multipliers)
             further = {"note": f"period {one.period:.8g}, Floquet multipliers {multipliers}"}
         else:
             index = heights.get(place(one.position))
-            further = {}
             if index is not None:
                 further = _time(found, mean_residence_time(found.exits(index), noise))
         rows.append(

@@ -201,11 +201,10 @@ def landscape(given: Given, settings: PipelineSettings) -> Any:
 def overview(given: Given, settings: PipelineSettings) -> Any:
     """The landscape that the page opens with, found for this run alone where the study asks for none."""
     from siq.quasipotential.landscape_files import landscape_data
-    from siq.workflow.models import shown_formula
     from siq.workflow.pipeline import landscape_of_run
 
     models = model_files(given)
-    shown = shown_formula(given.rrmse, models)
+    shown = models.representative(given.rrmse)
     number = shown.run if shown.run is not None else models.first_wells().run
     if given.options["every_run"]:  # that of the formulas, or else the first that has an attractor
         stored = given.quasipotential

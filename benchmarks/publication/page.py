@@ -34,7 +34,7 @@ from siq.report.landscape import in_words
 from siq.report.page import ReportFigure, ReportSection, ReportTable, render_template
 from siq.report.study_page import errors_over_runs
 from siq.systems.dynamics import Dynamics
-from siq.workflow.models import ModelFiles, shown_formula
+from siq.workflow.models import ModelFiles
 from siq.workflow.tables import Method, as_table
 from workflow.files import read_table
 from workflow.published import PublishedFigure
@@ -141,7 +141,7 @@ def _equations_table(study: Results) -> ReportTable | None:
     x = x[points_below(potential, level=study.settings.regression.level)]
     exact = study.system.drift(x)
     found = {"published": own_equations(published, x, exact)}
-    run = shown_formula(study.table("rrmse"), study.models).run or 0
+    run = study.models.representative(study.table("rrmse")).run or 0
     for method, one in study.models.formulas(run).items():
         if one.potential is not None:
             found[f"{method}, run {run}"] = own_equations(one, x, exact)

@@ -40,7 +40,7 @@ def plot_official_tests(runs: pd.DataFrame, *, unit: str, time_unit: str) -> Fig
         for name, colour in (("recalibrated", BLUE), ("augmented", VERMILLION)):
             error = np.where(rows["scored"], rows[name].to_numpy(float) - measured, np.nan)
             lower.plot(*envelope(t, error), color=colour, linewidth=0.8)
-        upper.set_ylabel(with_unit(output, unit))
+        upper.set_ylabel(with_unit(str(output), unit))
         lower.set_ylabel(with_unit("off by", unit))
         lower.set_xlabel(with_unit("$t$", time_unit))
     handles = [

@@ -56,7 +56,7 @@ from siq.report.page import (
 from siq.report.summary import LandscapeSummary, well_name
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
-from siq.workflow.models import ModelFiles, Shown
+from siq.workflow.models import ModelFiles, RepresentativeFormula
 from siq.workflow.study import Study, SweepOptions
 from siq.workflow.tables import Method, Outcome, Status, Step, why_no_landscape
 
@@ -110,7 +110,7 @@ class StudyResults:
     vectors: Mapping[str, bytes]
     landscape: LandscapeSummary | None = None
     models: ModelFiles = field(default_factory=lambda: ModelFiles(()))
-    shown: Shown = field(default_factory=lambda: Shown(0, Method.REFINED))
+    shown: RepresentativeFormula = field(default_factory=lambda: RepresentativeFormula(0, Method.REFINED))
     exact: SymbolicDecomposition | None = None
     record: FieldEstimate | None = None
     interactive: Markup | None = None

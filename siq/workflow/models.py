@@ -15,6 +15,14 @@ from siq.workflow.tables import METHODS, Method
 
 
 @dataclass(frozen=True)
+class RepresentativeFormula:
+    """A run, and the method of it whose formula is shown; None where no run has a formula."""
+
+    run: int | None
+    method: Method
+
+
+@dataclass(frozen=True)
 class ModelFiles:
     """The `model.json` of every run; formulas are parsed for the runs that are shown alone."""
 
@@ -33,13 +41,28 @@ class ModelFiles:
         have = [one.get(method, {}) for one in self._methods]
         return [run for run, one in enumerate(have) if one.get("V") or one.get("wells")]
 
-    def first_wells(self) -> Shown:
+    def representative(self, rrmse: pd.DataFrame) -> RepresentativeFormula:
+        """The formula that is shown: refined where any run has one, otherwise as published.
+
+        Of the runs with such a formula it is the median by error where errors are known, otherwise the first.
+        """
+        for method in reversed(METHODS):
+            with_formula = self.with_formula(method)
+            if with_formula:
+                mine = rrmse[(rrmse["method"] == method) & rrmse["run"].isin(with_formula)]
+                ranked = mine.dropna(subset="rrmse").sort_values("rrmse")
+                if len(ranked):
+                    return RepresentativeFormula(int(ranked["run"].iloc[(len(ranked) - 1) // 2]), method)
+                return RepresentativeFormula(with_formula[0], method)
+        return RepresentativeFormula(None, METHODS[0])
+
+    def first_wells(self) -> RepresentativeFormula:
         """The first run that has a formula about each attractor, where none has a single one."""
         for run, methods in enumerate(self._methods):
             for method, one in methods.items():
                 if one.get("wells"):
-                    return Shown(run, Method(method))
-        return Shown(None, METHODS[0])
+                    return RepresentativeFormula(run, Method(method))
+        return RepresentativeFormula(None, METHODS[0])
 
     def formulas(self, run: int) -> dict[str, SymbolicDecomposition]:
         """The formulas of a run by method."""
@@ -48,27 +71,3 @@ class ModelFiles:
     def certificates(self, run: int) -> dict[str, Any]:
         """Their certificates."""
         return read_model(self.paths[run])[1]
-
-
-@dataclass(frozen=True)
-class Shown:
-    """A run, and the method of it whose formula is shown; None where no run has a formula."""
-
-    run: int | None
-    method: Method
-
-
-def shown_formula(rrmse: pd.DataFrame, models: ModelFiles) -> Shown:
-    """The run and the method whose formula is shown: refined where any run has one, otherwise as published.
-
-    Of the runs with such a formula it is the median by error where errors are known, otherwise the first.
-    """
-    for method in reversed(METHODS):
-        with_formula = models.with_formula(method)
-        if with_formula:
-            mine = rrmse[(rrmse["method"] == method) & rrmse["run"].isin(with_formula)]
-            ranked = mine.dropna(subset="rrmse").sort_values("rrmse")
-            if len(ranked):
-                return Shown(int(ranked["run"].iloc[(len(ranked) - 1) // 2]), method)
-            return Shown(with_formula[0], method)
-    return Shown(None, METHODS[0])

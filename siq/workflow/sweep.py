@@ -259,7 +259,7 @@ def _seeds(
     points: Sequence[SweptPoint],
     limits: tuple[float, float],
     along: int,
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Folds and Hopf points on all lines along one parameter."""
     other = 1 - along
     for value in sorted({point.values[other] for point in points}):

@@ -17,7 +17,7 @@ from siq.report.page import ReportContent, ReportSection, render_report
 from siq.report.study_page import LEADING, StudyResults, study_page
 from siq.report.summary import summarise
 from siq.systems.dynamics import Dynamics
-from siq.workflow.models import ModelFiles, shown_formula
+from siq.workflow.models import ModelFiles
 from siq.workflow.study import Study
 from siq.workflow.tables import COLUMNS, Method, as_table
 from workflow.scoring import _coefficient_table, summary_table
@@ -97,7 +97,7 @@ def page_of(
     asked = Study.model_validate({"name": "mine", "runs": runs, "recordings": {"file": "mine.csv"}} | study)
     results = StudyResults(
         tables, Path("results/mine/tables"), images=dict.fromkeys(images, PNG), vectors={}, models=models,
-        shown=shown_formula(tables["rrmse"], models), exact=exact,
+        shown=models.representative(tables["rrmse"]), exact=exact,
         landscape=None if overview is None else summarise(told(overview)), inspection=inspection,
     )  # fmt: skip
     return study_page(asked, results, command="siq run mine.yaml", versions={"siq": "1"})

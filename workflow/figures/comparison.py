@@ -323,7 +323,8 @@ def plot_error_maps(
     lowest, top = float(np.nanmin(reference)), float(np.nanmax(reference))
     top = top if top > lowest else lowest + (abs(lowest) or 1.0)  # a flat landscape has levels, too
     # The bottom is zero to rounding, and a level below it would have no meaning.
-    levels = MaxNLocator(LEVELS).tick_values(0.0 if abs(lowest) < 1e-3 * (top - lowest) else lowest, top)
+    bottom = 0.0 if abs(lowest) < 1e-3 * (top - lowest) else lowest
+    levels = np.asarray(MaxNLocator(LEVELS).tick_values(bottom, top))
     norm = BoundaryNorm(levels, 256, extend="both")
     differences = [np.abs(values - reference) / highest for values in list(fields.values())[1:]]
     for axes, (name, values) in zip(panels[:, 0], fields.items(), strict=True):

@@ -25,7 +25,7 @@ from siq.report.summary import LandscapeSummary, energy_unit
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import compile_formulas
 from siq.systems.simulation import simulate_snapshots
-from siq.workflow.models import ModelFiles, Shown
+from siq.workflow.models import ModelFiles, RepresentativeFormula
 from siq.workflow.study import PipelineSettings, StateSpace, Study, SweepOptions
 from siq.workflow.tables import METHODS, Method
 from workflow.figures.comparison import plot_degrees, plot_error_curves, plot_error_maps, plot_escape
@@ -247,14 +247,14 @@ DRAWN_TABLES = ("coefficients", "rrmse", "training", "prediction", "record", "re
 
 
 def representative_run(
-    shown: Shown, models: ModelFiles, complete: tuple[int, Landscape] | None
+    shown: RepresentativeFormula, models: ModelFiles, complete: tuple[int, Landscape] | None
 ) -> RepresentativeRun:
     """The refined formula, or else the landscape, or else the formula as published.
 
     Parameters
     ----------
     shown
-        The formula that is shown, see `siq.workflow.models.shown_formula`.
+        The formula that is shown, see `siq.workflow.models.ModelFiles.representative`.
     models
         The formulas of all runs.
     complete
