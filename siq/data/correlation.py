@@ -115,6 +115,11 @@ class MarkovLag:
         return self.kind in ("blur", "coloured", "either", "memory") and self.lag is not None
 
     @property
+    def may_hop(self) -> bool:
+        """Whether it may hop between states; what relaxes without noise does not."""
+        return self.kind not in ("none", "unknown")
+
+    @property
     def time(self) -> float:
         """The lag in the unit of time; NaN where there is none."""
         return float("nan") if self.lag is None else self.lag * self.step

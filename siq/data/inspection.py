@@ -29,7 +29,6 @@ from siq.data.recordings import (
     LONGEST_STEP,
     SINGLE_RECORDING_REMEDY,
     Recordings,
-    recordings_of,
 )
 from siq.data.two_states import RecordStates, Switching, switching
 from siq.remarks import Remark, sentence
@@ -47,7 +46,6 @@ VALUES_SAMPLED = 2000  # looked at, for how many of them differ
 MIN_REPETITIONS = 4  # of the values of a label
 NEGLIGIBLE_ROUNDING = 1e-6  # of the range of a state
 COARSE_STEP = 0.5  # relaxation times: over a longer step most of what f does is forgotten
-WITHOUT_TRANSITIONS = ("none", "unknown")  # kinds of memory: what relaxes without noise does not hop
 
 
 class Span(NamedTuple):
@@ -288,7 +286,7 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
     >>> found.memory.kind, found.memory.lag
     ('white', 0)
     """
-    recordings = recordings_of(source)
+    recordings = Recordings.of(source)
     named = "the recordings" if isinstance(source, Recordings) else "the table"
     counts = np.bincount(recordings.recording)
     first = np.cumsum(counts) - counts
@@ -319,14 +317,8 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
         gaps=len(gaps) - near,
         memory=memory,
         coverage=_coverage(recordings.values[:, :2]),
-        switching=None if memory.kind in WITHOUT_TRANSITIONS else switching(recordings),
+        switching=switching(recordings) if memory.may_hop else None,
     )
-
-
-def seen_states(recordings: Recordings) -> RecordStates | None:
-    """The two states that recordings show by themselves, without the rest of an inspection."""
-    found = None if markov_lag(recordings).kind in WITHOUT_TRANSITIONS else switching(recordings)
-    return None if found is None else found.summary(recordings)
 
 
 def _span(values: np.ndarray | Sequence[float]) -> Span:

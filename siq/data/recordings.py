@@ -81,6 +81,19 @@ class Recordings:
         return tuple(map(sentence, self.remarks))
 
     @classmethod
+    def of(cls, source: str | Path | Recordings | pd.DataFrame) -> Recordings:
+        """Recordings, whatever they are in: a file or a folder, a table in memory, or recordings as they are.
+
+        Raises
+        ------
+        InputError
+            For the first thing that cannot be read; see `read_recordings` and `from_frame`.
+        """
+        if isinstance(source, Recordings):
+            return source
+        return read_recordings(source) if isinstance(source, str | Path) else cls.from_frame(source)
+
+    @classmethod
     def from_frame(
         cls,
         frame: pd.DataFrame,
@@ -242,6 +255,26 @@ class Recordings:
         count = len(self.labels)
         return self.select(generator.integers(count, size=count))
 
+    def held_out(self, *, generator: np.random.Generator, share: float = HELD_OUT_SHARE) -> np.ndarray:
+        """A random part of the recordings, as a mask over `labels`.
+
+        Copies of a resampled recording stay together: none is held out while another is fitted.
+
+        Raises
+        ------
+        NumericalFailure
+            When all recordings are copies of one, so that none can be held out.
+        """
+        groups = parent_recordings(self.labels)
+        names = np.unique(groups)
+        if len(names) < 2:
+            raise NumericalFailure(
+                "there is only one recording, and it shows no process noise or is too short to be divided, so"
+                f" that none can be held out; {SINGLE_RECORDING_REMEDY}"
+            )
+        count = min(max(round(share * len(names)), 1), len(names) - 1)
+        return np.isin(groups, generator.permutation(names)[:count])
+
 
 @dataclass(frozen=True)
 class SnapshotPairs:
@@ -304,19 +337,6 @@ def read_recordings(
     from siq.data.tables import read_tables  # which imports pyarrow
 
     return read_tables(path, columns=columns, units=units, gaps=gaps)
-
-
-def recordings_of(source: str | Path | Recordings | pd.DataFrame) -> Recordings:
-    """Recordings, whatever they are in: a file or a folder, a table in memory, or recordings as they are.
-
-    Raises
-    ------
-    InputError
-        For the first thing that cannot be read; see `read_recordings` and `Recordings.from_frame`.
-    """
-    if isinstance(source, Recordings):
-        return source
-    return read_recordings(source) if isinstance(source, str | Path) else Recordings.from_frame(source)
 
 
 def write_recordings(path: str | Path, recordings: Recordings) -> None:
@@ -420,26 +440,3 @@ def parent_recordings(labels: tuple[str, ...]) -> np.ndarray:
         original, _, copy = label.rpartition("#")
         parents.append(position[original if copy.isdigit() and original in position else label])
     return np.array(parents, dtype=np.int64)
-
-
-def held_out_recordings(
-    recordings: Recordings, *, generator: np.random.Generator, share: float = HELD_OUT_SHARE
-) -> np.ndarray:
-    """A random part of the recordings, as a mask over ``recordings.labels``.
-
-    Copies of a resampled recording stay together: none is held out while another is fitted.
-
-    Raises
-    ------
-    NumericalFailure
-        When all recordings are copies of one, so that none can be held out.
-    """
-    groups = parent_recordings(recordings.labels)
-    names = np.unique(groups)
-    if len(names) < 2:
-        raise NumericalFailure(
-            "there is only one recording, and it shows no process noise or is too short to be divided, so"
-            f" that none can be held out; {SINGLE_RECORDING_REMEDY}"
-        )
-    count = min(max(round(share * len(names)), 1), len(names) - 1)
-    return np.isin(groups, generator.permutation(names)[:count])

@@ -31,6 +31,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import stats
 
+from siq.data.correlation import markov_lag
 from siq.data.recordings import Recordings
 from siq.data.stationarity import (
     MOST_STRETCHES,
@@ -413,7 +414,8 @@ def switching(recordings: Recordings) -> Switching | None:
     Examples
     --------
     >>> import numpy as np
-    >>> from siq.data.recordings import Recordings
+    >>> from siq.data.correlation import markov_lag
+    from siq.data.recordings import Recordings
     >>> generator = np.random.default_rng(1)
     >>> x = np.empty((20_000, 1))
     >>> x[0] = 1.0
@@ -480,6 +482,12 @@ class RecordStates:
     counts: tuple[DwellCount, DwellCount]
     edges: np.ndarray
     density: np.ndarray
+
+    @classmethod
+    def of(cls, recordings: Recordings) -> RecordStates | None:
+        """What recordings show; None where they are too short to tell anything, or have no noise."""
+        found = switching(recordings) if markov_lag(recordings).may_hop else None
+        return None if found is None else found.summary(recordings)
 
     @property
     def transitions(self) -> int:

@@ -25,7 +25,6 @@ from siq.data.preparation import joined
 from siq.data.recordings import (
     Recordings,
     SnapshotPairs,
-    held_out_recordings,
     snapshot_pairs,
 )
 from siq.errors import NumericalFailure
@@ -182,7 +181,7 @@ class _Case:
         self.recordings, self.library, self.options, self.draw = recordings, library, options, draw
         self.given, self.units, self.limits = given, units, limits
         self.pair_step, self.integrator_step = pair_step, integrator_step
-        held = held_out_recordings(recordings, generator=draw(Purpose.HOLD_OUT))
+        held = recordings.held_out(generator=draw(Purpose.HOLD_OUT))
         self.training = recordings.select(np.flatnonzero(~held))
         self.held_out = recordings.select(np.flatnonzero(held))
 

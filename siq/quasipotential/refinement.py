@@ -25,7 +25,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
-from siq.data.recordings import Recordings, SnapshotPairs, held_out_recordings, snapshot_pairs
+from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.inference.kalman_identification import filtered_recordings
@@ -359,7 +359,7 @@ class RefinementContext:
         self.found, self.networks = found, networks
         self.number, self.seed, self.limits = number, seed, limits
         self.options = refinement.with_routes(networks=networks is not None)
-        mask = held_out_recordings(recordings, generator=generator(seed, number, Purpose.HOLD_OUT))
+        mask = recordings.held_out(generator=generator(seed, number, Purpose.HOLD_OUT))
         if found.sensor_variance is not None or found.hidden_velocities:
             # Of measured values the increments do not have the mean of f.
             recordings = filtered_recordings(found, recordings, pair_step=pair_step)

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from siq.data.inspection import seen_states
 from siq.data.preparation import in_stretches, joined, without_slow_drift
-from siq.data.recordings import Recordings, recordings_of, snapshot_pairs
+from siq.data.recordings import Recordings, snapshot_pairs
+from siq.data.two_states import RecordStates
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
 from siq.inference.identify import identify
@@ -400,14 +400,14 @@ def landscape_from_recordings(
     hidden_velocities: bool = False,
 ) -> Landscape:
     """The landscape that recordings show; see `siq.Landscape.from_recordings`."""
-    settings, trajectories = settings or PipelineSettings(), recordings_of(recordings)
+    settings, trajectories = settings or PipelineSettings(), Recordings.of(recordings)
     if hidden_velocities:
         settings = replace(settings, identification=replace(settings.identification, hidden_velocities=True))
     analysis = analyse(trajectories, settings)
     found = None if analysis.landscape is None else analysis.landscape.result
     certified = found is not None and found.certificate is not None and found.certificate.certified
     whole = certified and found is not None and len(found.attractors) > 1
-    seen = None if whole else seen_states(joined(trajectories))
+    seen = None if whole else RecordStates.of(joined(trajectories))
     if found is None:
         raise NoLandscape(why_no_landscape(analysis.outcomes), seen, analysis.dynamics)
     return replace(found, recorded_states=seen)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from siq.data.recordings import Recordings, held_out_recordings
+from siq.data.recordings import Recordings
 from siq.errors import NumericalFailure
 
 
@@ -16,7 +16,7 @@ def recordings(count: int) -> Recordings:
 
 
 def held(data: Recordings, seed: int, **options: float) -> np.ndarray:
-    return held_out_recordings(data, generator=np.random.default_rng(seed), **options)
+    return data.held_out(generator=np.random.default_rng(seed), **options)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from siq.data.recordings import Recordings, held_out_recordings
+from siq.data.recordings import Recordings
 from siq.data.two_states import DwellCount
 from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.quasipotential.occupancy import (
@@ -40,7 +40,7 @@ def recorded() -> RECORDED:
     found = pipeline.identify_run(PipelineSettings(), recordings, number=0)
     assert found.result is not None
     portrait = phase_portrait(found.result.dynamics, recordings.values[::40], seed=0)
-    return recordings, found.result, portrait, held_out_recordings(recordings, generator=generator)
+    return recordings, found.result, portrait, recordings.held_out(generator=generator)
 
 
 def compared(recorded: RECORDED, intensity: float = INTENSITY) -> OccupancyCheck:
