@@ -30,7 +30,7 @@ from siq.report.plots.style import (
 )
 
 if TYPE_CHECKING:  # to draw a density takes none of what it takes to compute one
-    from siq.quasipotential.invariant_density import StationaryDensity
+    from siq.quasipotential.invariant_density import DensityComparison, StationaryDensity
 
 
 COLOUR_MAP = "viridis"
@@ -142,13 +142,23 @@ def _draw_density(axes: Axes, density: StationaryDensity, colours: dict[str, Any
     axes.contourf(
         density.x1, density.x2, density.values, levels=_levels(density), extend="max", **colours
     )  # fmt: skip
+    # The hatched region needs a line of its own, and so Z gets one too.
+    return _title(density, ", " if density.unknown is None else "\n")
+
+
+def _title(density: StationaryDensity, before_z: str) -> str:
     title = r"$\varepsilon$ = " + magnitude_label(density.intensity)
     if density.normalisation is not None:
-        # The hatched region needs a line of its own, and so Z gets one too.
-        title += ", " if density.unknown is None else "\n"
-        title += "$Z$ = " + magnitude_label(density.normalisation, digits=4)
+        title += f"{before_z}$Z$ = " + magnitude_label(density.normalisation, digits=4)
     if density.unknown is not None:
         title += f"\nhatched: at most {100 * density.unknown:.2g} %"
+    return title
+
+
+def _distance(comparison: DensityComparison, words: str) -> str:
+    title = f"{words} {comparison.total_variation:.2g}"
+    if np.isfinite(comparison.sampling_floor):
+        title += f"\n(sampling alone: {comparison.sampling_floor:.2g})"
     return title
 
 
@@ -165,10 +175,7 @@ def _draw_histogram(axes: Axes, density: StationaryDensity, colours: dict[str, A
     )  # fmt: skip
     levels = float(np.nanmax(density.values)) * np.array(LINES)
     axes.contour(density.x1, density.x2, density.values, levels=levels, colors=VERMILLION, linewidths=0.7)
-    title = f"simulation; total\nvariation {comparison.total_variation:.2g}"
-    if np.isfinite(comparison.sampling_floor):
-        title += f"\n(sampling alone: {comparison.sampling_floor:.2g})"
-    return title
+    return _distance(comparison, "simulation; total\nvariation")
 
 
 @drawn_in_style
@@ -189,15 +196,9 @@ def plot_invariant_curves(panels: Sequence[StationaryDensity], *, state: str, un
         axes.set_xlabel(
             scaled_label(axes.xaxis, f"${name_label(state)}$", unit, float(np.abs(panel.x1).max()))
         )
-        title = f"({ascii_lowercase[place % 26]}) " + r"$\varepsilon$ = " + magnitude_label(panel.intensity)
-        if panel.normalisation is not None:
-            title += "\n$Z$ = " + magnitude_label(panel.normalisation, digits=4)
-        if panel.unknown is not None:
-            title += f"\nhatched: at most {100 * panel.unknown:.2g} %"
+        title = f"({ascii_lowercase[place % 26]}) " + _title(panel, "\n")
         if comparison is not None:
-            title += f"\ntotal variation {comparison.total_variation:.2g}"
-            if np.isfinite(comparison.sampling_floor):
-                title += f"\n(sampling alone: {comparison.sampling_floor:.2g})"
+            title += "\n" + _distance(comparison, "total variation")
         axes.set_title(title, loc="left")
         if place % 2 == 0:
             axes.set_ylabel(f"density {'' if unit in ('1', '') else unit_label(f'per {unit}')}")
@@ -208,11 +209,10 @@ def plot_invariant_curves(panels: Sequence[StationaryDensity], *, state: str, un
     return figure
 
 
-def _hatch_stretches(axes: Axes, x: np.ndarray, values: np.ndarray) -> list[Any]:
+def _hatch_stretches(axes: Axes, x: np.ndarray, values: np.ndarray) -> None:
     edges = np.flatnonzero(np.diff(np.r_[False, np.isnan(values), False].astype(int)))
     for begin, end in edges.reshape(-1, 2):
         axes.axvspan(x[begin], x[min(end, len(x) - 1)], zorder=-1, **UNKNOWN)
-    return [Patch(label="$U$ is not known", **UNKNOWN)] if len(edges) else []
 
 
 def hatch_unknown(axes: Axes, zorder: float = -1) -> None:

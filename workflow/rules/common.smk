@@ -106,22 +106,12 @@ def with_card(pattern):
     return file_where(lambda study: study.recordings is None, pattern)
 
 
-def with_landscape(pattern):
-    """Input function: a file of studies that ask for their landscape."""
-    return file_where(lambda study: study.landscape is not None, pattern)
-
-
 def landscape_table(name):
     """Input function: a table that a landscape with a card has."""
     return file_where(
         lambda study: study.landscape is not None and study.recordings is None,
         f"results/{{study}}/tables/{name}.parquet",
     )
-
-
-def with_equations(pattern):
-    """Input function: a file of studies that compare with the equations of their card."""
-    return file_where(lambda study: study.beside_equations, pattern)
 
 
 def block_of(wildcards):

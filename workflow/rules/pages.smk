@@ -49,13 +49,17 @@ rule page:
         overview="results/{study}/overview.json",
         field=all_runs("results/{study}/runs/{run}/vector_field.json"),
         drawn="results/{study}/drawn/study",
-        drawn_landscape=with_landscape("results/{study}/drawn/landscape"),
+        drawn_landscape=file_where(
+            lambda study: study.landscape is not None,
+            "results/{study}/drawn/landscape",
+        ),
         drawn_density="results/{study}/drawn/invariant",
         landscape="results/{study}/tables/landscape.parquet",
         landscape_errors=landscape_table("landscape_errors"),
         escape=landscape_table("escape"),
-        beside_equations=with_equations(
-            "results/{study}/tables/beside_equations.parquet"
+        beside_equations=file_where(
+            lambda study: study.beside_equations,
+            "results/{study}/tables/beside_equations.parquet",
         ),
         card=card_if_any,
         published=published_if_any,
