@@ -186,11 +186,9 @@ class Inspection:
                 "lowest": state.lowest, "highest": state.highest, "values": state.values,
                 "rounding_step": step if rounded else None, "rounding_error": error,
                 "decimals": decimals_of(step) if rounded and step is not None else None,
-                "process": floor.process if floor else 0.0, "sensor": floor.sensor if floor else 0.0,
-                "process_error": floor.process_error if floor else 0.0,
-                "sensor_error": floor.sensor_error if floor else 0.0,
             }  # fmt: skip
-            found.append(Remark("data.state", values))
+            noise = vars(floor or NoiseFloor(0.0, 0.0, 0.0, 0.0))
+            found.append(Remark("data.state", values | noise))
         return found
 
     def _findings(self) -> list[Remark]:
