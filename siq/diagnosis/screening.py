@@ -470,9 +470,9 @@ def screen_all(
         except NUMERICAL_ERRORS as error:
             for probe in some:
                 untried[probe.candidate.label] = NotFitted.of(probe.candidate, error)
-    most = max((result.gain for _, result in screened), default=0.0)
+    promised = max((result.gain for _, result in screened), default=0.0)
     screened = [
-        (probe, replace(result, gain=max(most, result.gain)))
+        (probe, replace(result, gain=max(promised, result.gain)))
         if probe.recorded and result.finite and probe.candidate.label not in fruitless
         else (probe, result)
         for probe, result in screened

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -116,8 +115,9 @@ class Bumps:
         lengths = np.array(shares) * np.ptp(courses, axis=1)
         limits = np.stack([courses.min(axis=1), courses.max(axis=1)])
         if len(shares) == 1:
+            (lower,), (upper,) = limits
             count = int(np.ceil(1 / (BUMP_SPACING * shares[0]))) + 1
-            centres = np.linspace(*limits[:, 0], count)[:most, None]
+            centres = np.linspace(lower, upper, count)[:most, None]
         else:
             apart = BUMP_SPACING * np.sqrt(len(shares))
             scaled = courses / lengths[:, None]
@@ -418,7 +418,7 @@ class Smoothness:
         # as the likeliest level leaves them with such a function, at all levels.
         grid = Grid(data, fit.substeps if known else min(fit.substeps, PROBE_SUBSTEPS))
         response = probe_response(fit, grid, PlaceColumns(fit.model, grid, [place], [fine]))
-        levels: list[tuple[float, Sequence[np.ndarray | float]]] = []
+        levels: list[tuple[float, np.ndarray, np.ndarray, float, float, float]] = []
         highest, correlated = -np.inf, 1.0
         for level in levels_of(fit):
             try:
@@ -430,7 +430,7 @@ class Smoothness:
                 continue
             total, freedom = float(left @ left), white.degrees_of_freedom - parameters
             likelihood = profile_likelihood(total, freedom, white.log_determinant)
-            levels.append((level, (columns.T @ columns, columns.T @ left, total, freedom, likelihood)))
+            levels.append((level, columns.T @ columns, columns.T @ left, total, freedom, likelihood))
             basis = orthonormal(columns)
             rest = left - basis @ (basis.T @ left)
             likelihood = profile_likelihood(float(rest @ rest), freedom, white.log_determinant)
@@ -439,18 +439,19 @@ class Smoothness:
                 correlated = correlation_time_of(rest, white.recording, outputs=len(fit.model.outputs))
         alone, values = -np.inf, list[np.ndarray]()
         highest, best = -np.inf, None
-        for level, told in levels:
-            gram, overlap, total, freedom, likelihood = (each / correlated for each in told)
+        for level, gram, overlap, total, degrees, likelihood in levels:
+            gram, overlap, total = gram / correlated, overlap / correlated, total / correlated
+            degrees, likelihood = degrees / correlated, likelihood / correlated
             alone = max(alone, likelihood)
             for shares, shape in zip(choices, shapes, strict=True):
                 gained, scale, rest = evidences_by_size(
-                    shape.T @ gram @ shape, shape.T @ overlap, total, freedom=freedom
+                    shape.T @ gram @ shape, shape.T @ overlap, total, freedom=degrees
                 )
                 values.append(likelihood + gained)
                 size = int(np.argmax(gained))
                 if values[-1][size] > highest:
                     # The scale of the noise was at its best, too, and the size is one in units of it.
-                    highest, noise = values[-1][size], float(rest[size] / freedom)
+                    highest, noise = values[-1][size], float(rest[size] / degrees)
                     deviation = float(np.sqrt(scale[size] * noise))
                     best = cls(
                         place, courses, shares, deviation, noise, level, correlated,
