@@ -7,11 +7,13 @@ found.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import sympy
 
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
-from siq.diagnosis.evidence import BUDGET_SPENT, log_evidences, residuals
+from siq.diagnosis.evidence import BUDGET_SPENT, FittedCandidate, log_evidences, residuals
 from siq.diagnosis.investigation import HeldOutRuns
 from siq.diagnosis.mechanisms import PROCESS_NOISE
 from siq.diagnosis.naming import Investigation
@@ -31,7 +33,7 @@ from siq.diagnosis.statement import (
     UpperBound,
 )
 from siq.diagnosis.study import MismatchVerdict
-from siq.diagnosis.terms import CURVE, SURFACE
+from siq.diagnosis.terms import SURFACE
 from siq.diagnosis.unnamed_models import AugmentedModel
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
@@ -189,8 +191,6 @@ def _found_mechanisms(investigation: Investigation, card: Fit | None) -> tuple[S
             ),
         )
     labels = [each.best.candidate.label for each in search.found]
-    final = search.fit if card is None else card
-    errors, known = _standard_errors(final), {entry.name: entry for entry in final.model.parameters}
     stated = []
     for place, (found, odds) in enumerate(zip(search.found, investigation.log_odds, strict=True)):
         trial, candidate = found.best, found.best.candidate
@@ -207,19 +207,12 @@ def _found_mechanisms(investigation: Investigation, card: Fit | None) -> tuple[S
         ]
         alike = {each.name for each in rivals if each.standing == "same"} - {candidate.name}
         stated.append(
-            StatedTerm(
-                name=candidate.name,
-                label=candidate.label,
-                terms={name: str(formula) for name, formula in candidate.changes},
-                parameters={
-                    name: Estimate(known[name].value, errors.get(name), known[name].unit)
-                    for name in candidate.new
-                    if name in known
-                },
-                evidence=Evidence.of(trial, odds),
+            _stated(
+                trial,
+                search.fit if card is None else card,
+                log_odds=odds,
                 share_of_excess=investigation.remainder.share,
                 indistinguishable_from=tuple(sorted(alike)) if investigation.verdict.names else None,
-                equations=candidate.equations,
                 beside=tuple(labels[:place]),
                 rivals=tuple(sorted(rivals, key=lambda each: -each.delta_chi2)),
             )
@@ -227,66 +220,65 @@ def _found_mechanisms(investigation: Investigation, card: Fit | None) -> tuple[S
     return tuple(stated)
 
 
-def _stated_function(part: Term, fit: Fit, beside: tuple[str, ...]) -> StatedTerm:
-    """A part of the model of what has no name, with its curve or surface and their standard errors."""
-    trial, candidate, place, smooth = part.trial, part.trial.candidate, part.place, part.smooth
-    errors, known = _standard_errors(fit), {entry.name: entry for entry in fit.model.parameters}
-    free = list(errors)
-    changed = [name for name, _ in candidate.changes]
-
-    def along(weights: np.ndarray) -> np.ndarray:
-        """Standard errors of weighted sums ``(k, c)`` of the amplitudes, shape ``(k,)``."""
-        rows = [free.index(name) for name in candidate.amplitudes]
-        variances = np.einsum("kc,cd,kd->k", weights, fit.covariance[np.ix_(rows, rows)], weights)
-        return np.sqrt(np.maximum(variances, 0.0))
-
-    curve = surface = None
-    if place is not None and part.kind != SURFACE and (part.kind == CURVE or len(place.words) == 1):
-        amplitudes = np.array([known[name].value for name in candidate.amplitudes])
-        if smooth is not None:
-            lower, upper = smooth.limits[:, 0]
-            knots = np.linspace(lower, upper, GRID_POINTS)
-            values, weights = smooth.along(amplitudes, knots[None])
-        else:  # of a formula: what a unit of each coefficient is at the knots
-            knots = place.knots
-            name, formula = candidate.changes[0]
-            factor = dict((*place.equations, *place.outputs))[name]
-            columns = []
-            for amplitude in candidate.amplitudes:
-                term = _in_coordinate(formula.diff(symbol(amplitude)) / factor, place.coordinates[0])
-                value = compile_values([term], [COORDINATE], common=False)(knots)[0]
-                columns.append(np.broadcast_to(np.asarray(value, dtype=float), knots.shape))
-            weights = np.stack(columns, axis=1)
-            values = weights @ amplitudes
-        curve = DescribedCurve(
-            place.words[0], tuple(knots.tolist()), tuple(values.tolist()), tuple(along(weights).tolist())
-        )
-    elif smooth is not None and part.kind == SURFACE:
-        amplitudes = np.array([known[name].value for name in candidate.amplitudes])
-        at = [np.linspace(lower, upper, GRID_POINTS) for lower, upper in smooth.limits.T]
-        courses = np.stack([each.ravel() for each in np.meshgrid(*at, indexing="ij")])
-        values, weights = smooth.along(amplitudes, courses)
-        rows = [
-            tuple(map(tuple, each.reshape(GRID_POINTS, GRID_POINTS).tolist()))
-            for each in (values, along(weights))
-        ]
-        words = smooth.place.words
-        surface = DescribedSurface(
-            (words[0], words[1]), (tuple(at[0].tolist()), tuple(at[1].tolist())), rows[0], rows[1]
-        )
+def _stated(trial: FittedCandidate, fit: Fit, *, log_odds: float | None = None, **further: Any) -> StatedTerm:
+    """What was fitted, with the estimates of a fit that has it."""
+    candidate, errors = trial.candidate, _standard_errors(fit)
+    known = {entry.name: entry for entry in fit.model.parameters}
     return StatedTerm(
         name=candidate.name,
         label=candidate.label,
-        kind=part.kind,
         terms={name: str(formula) for name, formula in candidate.changes},
         parameters={
-            name: Estimate(known[name].value, errors.get(name), known[name].unit) for name in candidate.new
+            name: Estimate(known[name].value, errors.get(name), known[name].unit)
+            for name in candidate.new
+            if name in known
         },
-        evidence=Evidence.of(trial),
+        evidence=Evidence.of(trial, log_odds),
         equations=candidate.equations,
-        outputs=()
-        if candidate.equations
-        else tuple(name for name in changed if name in fit.model.output_names),
+        **further,
+    )
+
+
+def _stated_function(part: Term, fit: Fit, beside: tuple[str, ...]) -> StatedTerm:
+    """A part of the model of what has no name, with its curve or surface and their standard errors."""
+    candidate, place, smooth = part.trial.candidate, part.place, part.smooth
+    known = {entry.name: entry.value for entry in fit.model.parameters}
+    amplitudes = np.array([known[name] for name in candidate.amplitudes])
+    curve = surface = None
+    at: list[np.ndarray] = []
+    if smooth is not None:
+        at = [np.linspace(lower, upper, GRID_POINTS) for lower, upper in smooth.limits.T]
+        courses = np.stack([each.ravel() for each in np.meshgrid(*at, indexing="ij")])
+        values, weights = smooth.along(amplitudes, courses)
+    elif place is not None and len(place.words) == 1:  # a formula: what a unit of each coefficient is
+        at = [place.knots]
+        name, formula = candidate.changes[0]
+        factor = dict((*place.equations, *place.outputs))[name]
+        columns = []
+        for amplitude in candidate.amplitudes:
+            term = _in_coordinate(formula.diff(symbol(amplitude)) / factor, place.coordinates[0])
+            value = compile_values([term], [COORDINATE], common=False)(at[0])[0]
+            columns.append(np.broadcast_to(np.asarray(value, dtype=float), at[0].shape))
+        weights = np.stack(columns, axis=1)
+        values = weights @ amplitudes
+    if place is not None and at:
+        rows = [list(_standard_errors(fit)).index(name) for name in candidate.amplitudes]
+        variances = np.einsum("kc,cd,kd->k", weights, fit.covariance[np.ix_(rows, rows)], weights)
+        shape = [len(each) for each in at]
+        shaped = [each.reshape(shape) for each in (values, np.sqrt(np.maximum(variances, 0.0)))]
+        if part.kind == SURFACE:
+            value, error = (tuple(map(tuple, each.tolist())) for each in shaped)
+            grid = (tuple(at[0].tolist()), tuple(at[1].tolist()))
+            surface = DescribedSurface((place.words[0], place.words[1]), grid, value, error)
+        else:
+            value, error = (tuple(each.tolist()) for each in shaped)
+            curve = DescribedCurve(place.words[0], tuple(at[0].tolist()), value, error)
+    measured = [name for name, _ in candidate.changes if name in fit.model.output_names]
+    return _stated(
+        part.trial,
+        fit,
+        kind=part.kind,
+        outputs=() if candidate.equations else tuple(measured),
         coordinates=tuple(candidate.coordinate.split(", ")) if place is None else place.words,
         curve=curve,
         surface=surface,
