@@ -199,17 +199,8 @@ def diagnose(
 def _completed(model: Dynamics, x: np.ndarray, *, process: np.ndarray | None = None) -> Dynamics:
     """A fitted simulation as a dynamics of its own.
 
-    Parameters
-    ----------
-    model
-        With the estimates as its parameters' values.
-    x
-        States along the recordings, shape ``(n, d)``: measured ones as they were measured or smoothed, hidden
-        ones as the fit has them. A state without a domain, such as one that a mechanism brings, gets the
-        range of these.
-    process
-        Intensity of process noise on each state, per time, shape ``(d,)``, where it is part of what was
-        found. It becomes its D, with zeros for states that nothing drives.
+    A state without a domain gets the range of the states ``(n, d)`` along the recordings; process noise with
+    intensities ``(d,)`` becomes its D, with zeros for states that nothing drives.
     """
     limits = np.stack([x.min(axis=0), x.max(axis=0)], axis=1)
     limits[limits[:, 0] == limits[:, 1]] = np.nan  # of a state that rests nothing is known
@@ -293,8 +284,8 @@ def tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
         ``curves``: what is missing against each coordinate, in the unit of the equation.
         ``candidates``: every mechanism that was fitted, and every probe that was only screened, with what it
         gains ``beside`` the mechanisms that were in place. Stages: ``found``; fitted in its place: ``same``,
-        ``needless`` and ``less`` (see `siq.diagnosis.statement.Rival`); screened: ``further``, on top of
-        all that was found, and ``instead``, in the place of the last that was found.
+        ``needless`` and ``less`` (see `siq.diagnosis.statement.Alternative`); screened: ``further``, on top
+        of all that was found, and ``instead``, in the place of the last that was found.
         ``held_out``: recordings and their three simulations.
         ``forces``: what the recalibrated simulation lacks at each sample, as far as process noise was
         admitted.

@@ -65,7 +65,7 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class Rival:
+class Alternative:
     """A mechanism that was fitted in the place of one that was found.
 
     Attributes
@@ -171,10 +171,10 @@ class StatedTerm:
     curve: DescribedCurve | None = None
     surface: DescribedSurface | None = None
     beside: tuple[str, ...] = ()
-    rivals: tuple[Rival, ...] = ()
+    rivals: tuple[Alternative, ...] = ()
 
-    def rival_names(self, standing: Standing) -> list[str]:
-        """Names of rivals, each once; their labels where the name alone is that of the mechanism itself."""
+    def alternative_names(self, standing: Standing) -> list[str]:
+        """Names of alternatives, each once; their labels where the name alone is the mechanism's own."""
         names = (
             each.label if each.name in (self.name, GENERIC) else each.name
             for each in self.rivals

@@ -20,6 +20,7 @@ from siq.diagnosis.naming import Investigation
 from siq.diagnosis.residual_structure import Structure
 from siq.diagnosis.smooth_functions import Term
 from siq.diagnosis.statement import (
+    Alternative,
     DescribedCurve,
     DescribedSurface,
     Description,
@@ -27,7 +28,6 @@ from siq.diagnosis.statement import (
     Evidence,
     Location,
     Recalibrated,
-    Rival,
     StatedTerm,
     Statement,
     UpperBound,
@@ -195,7 +195,7 @@ def _found_mechanisms(investigation: Investigation, card: Fit | None) -> tuple[S
     for place, (found, odds) in enumerate(zip(search.found, investigation.log_odds, strict=True)):
         trial, candidate = found.best, found.best.candidate
         rivals = [
-            Rival(
+            Alternative(
                 other.candidate.name,
                 other.candidate.label,
                 other.delta_chi2,

@@ -13,12 +13,12 @@ import pytest
 from siq.diagnosis.holdout import HeldOutErrors
 from siq.diagnosis.mechanisms import PROCESS_NOISE
 from siq.diagnosis.statement import (
+    Alternative,
     Description,
     Estimate,
     Evidence,
     Location,
     Recalibrated,
-    Rival,
     StatedTerm,
     Statement,
 )
@@ -43,7 +43,7 @@ def mechanism_of(draw: np.random.Generator, number: int) -> StatedTerm:
             standing = "less"
         else:
             standing = "needless" if further > 0 and other - gain < 2 * further else "same"
-        rivals.append(Rival(str(name), f"{name} in w{number}", other, further, standing))
+        rivals.append(Alternative(str(name), f"{name} in w{number}", other, further, standing))
     parameters = {
         f"c_{k}": Estimate(float(draw.normal()), float(draw.uniform(1e-3, 1)), "m/s**2")
         for k in range(draw.integers(0, 3))
