@@ -118,8 +118,9 @@ def run(snakemake: Any) -> None:
     log = Path(job.log)
     log.parent.mkdir(parents=True, exist_ok=True)
     logging.basicConfig(
-        filename=log, filemode="w", level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s"
-    )
+        filename=log, filemode="w", level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s",
+        force=True,
+    )  # fmt: skip
     logging.captureWarnings(True)
     logging.info("%s%s", GIVEN, json.dumps(vars(job)))
     try:

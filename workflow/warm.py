@@ -1,9 +1,11 @@
 """A warm interpreter: every job of a workflow starts where its imports are done already.
 
-A step of a run takes seconds, and the imports of numpy, sympy, torch and pysindy as long again. So one
-process imports them, once for each task; every job is a fork of it. `serve` is that process,
-which the Snakefile starts; `run_warm` is what a script calls first. Files, rules and jobs stay one a run.
-Where there is no such process, as on systems that cannot fork, a script runs as it would by itself.
+A step of a run takes seconds, and the imports of numpy, sympy, torch and pysindy as long again; and what is
+worked out once for a library of functions serves every run. So one process imports them, and jobs that run at
+the same time are forks of it. A fork whose job ends well takes the next one, so that there are as many as
+jobs run at once. `serve` is that process, which the Snakefile starts; `run_warm` is what a script calls
+first. Files, rules and jobs stay one a run. Where there is no such process, as on systems that cannot fork, a
+script runs as it would by itself.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import importlib
 import json
 import os
 import runpy
+import select
 import shutil
 import signal
 import socket
@@ -21,6 +24,7 @@ import sys
 import tempfile
 import threading
 import traceback
+import warnings
 from pathlib import Path
 from typing import TypedDict
 
@@ -91,33 +95,50 @@ def run_warm(task: str) -> None:
         "path": sys.path,
         "environment": dict(os.environ),
     }
-    payload = json.dumps(request).encode()
-    socket.send_fds(connection, [len(payload).to_bytes(8, "big")], [0, 1, 2])
-    connection.sendall(payload)
+    _send(connection, request, [0, 1, 2])
     signal.signal(signal.SIGTERM, lambda *_: os._exit(128 + signal.SIGTERM))  # the fork sees us gone
     code = connection.recv(1)
     os._exit(code[0] if code else 1)
 
 
 def serve(listening: socket.socket, folder: Path) -> None:
-    """Fork a job for every script that connects, until standard input ends; then remove the folder."""
+    """Give every script that connects to a fork, until standard input ends; then remove the folder."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the workflow, which then ends
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # finished jobs are reaped by the system
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # forks that have ended are reaped by the system
     threading.Thread(target=_end_with_workflow, args=(folder,), daemon=True).start()
+    forks: dict[socket.socket, bool] = {}  # whether each is at work
     while True:
+        ready, _, _ = select.select([listening, *forks], [], [])
+        for fork in set(ready) & set(forks):
+            with contextlib.suppress(OSError):
+                forks[fork] = not fork.recv(1)
+            if forks[fork]:  # it has ended with its job
+                del forks[fork]
+                fork.close()
+        if listening not in ready:
+            continue
         connection, _ = listening.accept()
         try:
-            header, descriptors, _, _ = socket.recv_fds(connection, 8, STREAMS)
-            request: Request = json.loads(_received(connection, int.from_bytes(header, "big")))
+            request, descriptors = _received(connection)
         except (OSError, ValueError):  # a job that was killed while it asked
             connection.close()
             continue
         sys.path[:] = request["path"]
-        with contextlib.suppress(Exception):  # the job says itself what is wrong
-            _load(request["task"])
-        if os.fork() == 0:
-            listening.close()
-            _become(request, descriptors, connection)
+        idle = next((fork for fork, busy in forks.items() if not busy), None)
+        if idle is None:
+            with contextlib.suppress(Exception):  # the job says itself what is wrong
+                _load(request["task"])
+            idle, ours = socket.socketpair()
+            if os.fork() == 0:
+                for each in (listening, connection, idle, *forks):
+                    each.close()
+                for descriptor in descriptors:
+                    os.close(descriptor)
+                _work(ours)
+            ours.close()
+        forks[idle] = True
+        with contextlib.suppress(OSError):  # one that was killed; the script sees its connection end
+            _send(idle, request, [*descriptors, connection.fileno()])
         for descriptor in descriptors:
             os.close(descriptor)
         connection.close()
@@ -139,32 +160,58 @@ def _end_with_workflow(folder: Path) -> None:
     os._exit(0)
 
 
-def _received(connection: socket.socket, size: int) -> bytes:
-    if size > LONGEST_REQUEST:
-        raise ValueError("the request is too long")
+def _send(connection: socket.socket, request: Request, descriptors: list[int]) -> None:
+    payload = json.dumps(request).encode()
+    socket.send_fds(connection, [len(payload).to_bytes(8, "big")], descriptors)
+    connection.sendall(payload)
+
+
+def _received(connection: socket.socket) -> tuple[Request, list[int]]:
+    """A request, and the descriptors that came with it: the streams of a job, and its script's connection."""
+    header, descriptors, _, _ = socket.recv_fds(connection, 8, STREAMS + 1)
+    size = int.from_bytes(header, "big")
+    if not header or size > LONGEST_REQUEST:
+        raise ValueError("there is no request, or it is too long")
     payload = b""
     while len(payload) < size:
         part = connection.recv(size - len(payload))
         if not part:
             raise OSError("the job is gone")
         payload += part
-    return payload
+    return json.loads(payload), list(descriptors)
 
 
-def _become(request: Request, streams: list[int], connection: socket.socket) -> None:
+def _work(server: socket.socket) -> None:
+    """Run one job after the other, until one fails or the warm interpreter ends."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    null, code = os.open(os.devnull, os.O_RDWR), 0
+    while not code:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        try:
+            request, (*streams, script) = _received(server)
+        except (OSError, ValueError):
+            break
+        code = _run_job(request, streams, socket.socket(fileno=script), null=null)
+        if not code:
+            with contextlib.suppress(OSError):
+                server.sendall(b"1")
+    os._exit(code)
+
+
+def _run_job(request: Request, streams: list[int], connection: socket.socket, *, null: int) -> int:
     """Be the job: its folder, environment and streams, its script, its exit code."""
-    code = 1
+    code, ended = 1, threading.Event()
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         for place, descriptor in enumerate(streams):
             os.dup2(descriptor, place)
             os.close(descriptor)
         os.chdir(request["folder"])
         os.environ.clear()
         os.environ.update(request["environment"])
-        sys.argv = [request["script"]]
-        threading.Thread(target=_end_with_job, args=(connection,), daemon=True).start()
+        sys.path[:], sys.argv = request["path"], [request["script"]]
+        warnings.simplefilter("default", append=True)  # what a job before was warned of is news to this one
+        threading.Thread(target=_end_with_script, args=(connection, ended), daemon=True).start()
         runpy.run_path(request["script"], run_name="__main__")
         code = 0
     except SystemExit as end:
@@ -175,16 +222,21 @@ def _become(request: Request, streams: list[int], connection: socket.socket) -> 
         with contextlib.suppress(Exception):
             sys.stdout.flush()
             sys.stderr.flush()
+        for place in range(STREAMS):  # whoever reads what the script says waits for its end
+            os.dup2(null, place)
+        ended.set()
         with contextlib.suppress(OSError):
             connection.sendall(bytes([code % 256]))
-        os._exit(code % 256)
+    return code % 256
 
 
-def _end_with_job(connection: socket.socket) -> None:
-    """A job that is killed takes its fork along."""
+def _end_with_script(connection: socket.socket, ended: threading.Event) -> None:
+    """A job whose script is killed ends with it."""
     with contextlib.suppress(OSError):
         connection.recv(1)
-    os._exit(1)
+    if not ended.is_set():
+        os._exit(1)
+    connection.close()
 
 
 if __name__ == "__main__":

@@ -51,6 +51,23 @@ def test_a_script_runs_in_a_fork_with_its_own_folder_streams_and_environment(
     assert output.split() == [str(interpreter.pid), str(tmp_path), "own"]
 
 
+def test_a_fork_whose_job_ends_well_takes_the_next_one_and_another_does_not(
+    interpreter: subprocess.Popen[bytes], tmp_path: Path
+) -> None:
+    tell = (
+        "import os, warnings\nprint(os.getpid(), os.environ.get('MINE'), flush=True)\nwarnings.warn('once')\n"
+    )
+    ends = (("", "own"), ("raise SystemExit(3)", "mine"), ("", "other"))
+    told = [
+        start(tmp_path / f"script{place}.py", tell + end, MINE=mine).communicate(timeout=60)[0]
+        for place, (end, mine) in enumerate(ends)
+    ]
+    (first, *_), (second, *_), (third, *_) = (each.split() for each in told)
+    assert first == second != third
+    for (_, mine), each in zip(ends, told, strict=True):
+        assert each.split()[1] == mine and "UserWarning: once" in each
+
+
 @pytest.mark.parametrize(
     ("body", "code"), [("", 0), ("raise SystemExit(3)", 3), ("raise SystemExit('no')", 1)]
 )
