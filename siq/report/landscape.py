@@ -66,8 +66,37 @@ def _complex_text(value: complex) -> str:
     return f"{value_text(value.real)} {MINUS if value.imag < 0 else '+'} {value_text(abs(value.imag))} i"
 
 
-def wells_table(summary: LandscapeSummary) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """The wells for a reader, a column for each, and the same as numbers, a row for each."""
+def landscape_tables(
+    summary: LandscapeSummary | None, noises: Sequence[float] = ()
+) -> dict[str, tuple[pd.DataFrame, pd.DataFrame | None]]:
+    """The tables of a landscape, each as it is shown and as numbers; empty of one without stable states.
+
+    Parameters
+    ----------
+    summary
+        The landscape, None where there is none.
+    noises
+        Strengths ε for which mean times are told.
+
+    Returns
+    -------
+    dict
+        ``wells``: a column for each, and as numbers a row for each. ``exits``: a row for every way out of
+        every well. ``equilibria``: all states at which f vanishes, with the eigenvalues of f there.
+        ``cycles``: the unstable ones. ``times``: how long each well lasts under the noise strengths.
+    """
+    if summary is None or not summary.wells:
+        return dict.fromkeys(("wells", "exits", "equilibria", "cycles", "times"), (pd.DataFrame(), None))
+    return {
+        "wells": _wells_table(summary),
+        "exits": _exits_table(summary),
+        "equilibria": (_equilibria_table(summary), None),
+        "cycles": (_cycles_table(summary), None),
+        "times": (_times_table(summary, noises if summary.has_times else ()), None),
+    }
+
+
+def _wells_table(summary: LandscapeSummary) -> tuple[pd.DataFrame, pd.DataFrame]:
     wells, noise, time_unit = summary.wells, summary.noise, summary.time_unit
     rows: dict[str, list[str]] = {}
     numbers = []
@@ -120,8 +149,7 @@ def wells_table(summary: LandscapeSummary) -> tuple[pd.DataFrame, pd.DataFrame]:
     return table, pd.DataFrame(numbers).dropna(axis=1, how="all")
 
 
-def exits_table(summary: LandscapeSummary) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """One row for every way out of every well: for a reader, and as numbers."""
+def _exits_table(summary: LandscapeSummary) -> tuple[pd.DataFrame, pd.DataFrame]:
     rows, numbers = [], []
     for way in summary.ways:
         known = math.isfinite(way.barrier)
@@ -160,8 +188,7 @@ def _place(summary: LandscapeSummary, position: np.ndarray) -> str:
     return "(" + ", ".join(value_text(value) for value in values) + ")"
 
 
-def cycles_table(summary: LandscapeSummary) -> pd.DataFrame:
-    """The unstable cycles, a row for each."""
+def _cycles_table(summary: LandscapeSummary) -> pd.DataFrame:
     rows = []
     for one in summary.unstable_cycles:
         reach = [
@@ -175,8 +202,7 @@ def cycles_table(summary: LandscapeSummary) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def equilibria_table(summary: LandscapeSummary) -> pd.DataFrame:
-    """All states at which f vanishes, with the eigenvalues of f there."""
+def _equilibria_table(summary: LandscapeSummary) -> pd.DataFrame:
     kinds = texts("tables")["equilibria"]
     time = unit_text(summary.time_unit)
     names = summary.names
@@ -193,11 +219,10 @@ def equilibria_table(summary: LandscapeSummary) -> pd.DataFrame:
         for one in summary.equilibria
     ]
     frame = pd.DataFrame(rows)
-    return frame if any(frame["name"]) else frame.drop(columns="name")
+    return frame if frame.empty or any(frame["name"]) else frame.drop(columns="name")
 
 
-def times_table(summary: LandscapeSummary, noises: Sequence[float]) -> pd.DataFrame:
-    """How long each well lasts under some noise strengths."""
+def _times_table(summary: LandscapeSummary, noises: Sequence[float]) -> pd.DataFrame:
     rows = []
     for strength in noises:
         row = {with_unit("noise strength ε", summary.energy_unit): value_text(strength)}
@@ -310,7 +335,8 @@ def _report(landscape: Landscape) -> tuple[list[str], list[tuple[str, pd.DataFra
     written = certificate is not None or any(well is not None for well in landscape.wells)
     verdict = _certificate_line(certificate) if written else "U is not written as a formula."
     words = texts("tables")
-    tables = [(words["wells"], wells_table(summary)[0])] if summary.wells else []
+    wells, _ = landscape_tables(summary)["wells"]
+    tables = [] if wells.empty else [(words["wells"], wells)]
     if landscape.transitions:
         ways = landscape.barriers().rename(columns={"start": "from", "end": "to"})
         for end in ("from", "to"):

@@ -205,7 +205,8 @@ class _PageWriter:
         self, heading: str, *, folded: bool = False, listing: str = "", caller: Callable[[], str]
     ) -> str:
         """A section; one without content is left out."""
-        self._section = parts = {"formulas": [], "tables": [], "figures": [], "notes": []}
+        parts: dict[str, list[Any]] = {"formulas": [], "tables": [], "figures": [], "notes": []}
+        self._section = parts
         text = in_paragraphs(caller())
         if text or listing or any(parts.values()):
             made = ReportSection(heading, text, folded=folded, listing=listing, **parts)

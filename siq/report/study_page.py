@@ -10,7 +10,7 @@ import ast
 import os
 import platform
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -39,13 +39,9 @@ from siq.report.formatting import (
 from siq.report.landscape import (
     answer_lines,
     comparison_table,
-    cycles_table,
-    equilibria_table,
-    exits_table,
     in_words,
+    landscape_tables,
     record_table,
-    times_table,
-    wells_table,
 )
 from siq.report.page import (
     FormulaRow,
@@ -158,7 +154,6 @@ def study_page(
     method, several, beside_paper = shown.method, study.runs > 1, study.published is not None
     certificate = results.certificates.get(str(method))
     certified = certificate is not None and bool(certificate["certified"])
-    wells = None if summary is None or not summary.wells else summary
     noises = () if study.landscape is None else study.landscape.noise_intensities
     headings, table = texts("help")["headings"], results.table
     record, compared, landscape = table("record"), table("beside_equations"), table("landscape")
@@ -172,7 +167,7 @@ def study_page(
     density = given is not None and table("invariant") is None and "invariant" in results.tables
     escape, errors = table("escape"), table("landscape_errors")
     invariant, shares = table("invariant"), None if density else table("well_shares")
-    swept = [] if table("sweep") is None else results.tables["sweep"]["well"]
+    swept: Iterable[int] = () if table("sweep") is None else results.tables["sweep"]["well"]
     named = ", ".join(f"{name} {version}" for name, version in versions.items())
     machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
 
@@ -196,7 +191,7 @@ def study_page(
         figures=figures,
         certified=0 if rrmse is None else int(rrmse[rrmse["method"] == method]["certified"].sum()),
         refusals=list(dict(zip(refused["test"], refused["reason"], strict=True)).values()),
-        wells=(None, None) if wells is None else wells_table(wells),
+        landscape=landscape_tables(summary, noises),
         formulas=_formulas(results),
         coefficients=_coefficients(results),
         record=record,
@@ -214,10 +209,6 @@ def study_page(
         time_unit=results.time_unit,
         troubled=_troubled(study, results),
         remarks=_remarks(results),
-        exits=exits_table(wells) if wells is not None and wells.ways else (None, None),
-        equilibria=None if wells is None else equilibria_table(wells),
-        cycles=None if wells is None else cycles_table(wells),
-        times=times_table(wells, noises) if wells is not None and wells.has_times else None,
         barriers_over_runs=_barriers_over_runs(landscape),
         invariant_missing=density,
         invariant=None if invariant is None else in_words(invariant.rename(columns=headings)),

@@ -16,7 +16,7 @@ from siq.quasipotential.landscape_files import landscape_data
 from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.wells import WellOptions
 from siq.remarks import Remark
-from siq.report.landscape import answer_lines, equilibria_table, exits_table, times_table, wells_table
+from siq.report.landscape import answer_lines, landscape_tables
 from siq.report.summary import summarise, well_name
 
 
@@ -38,7 +38,9 @@ def test_two_wells_without_noise_have_depths_and_a_way_to_times() -> None:
     )
     (remark,) = remarks(data)
     assert "noise_intensities" in remark and "follow" in remark
-    assert not any("lasts" in text for text in wells_table(summarise(told(data)))[0]["stable state"])
+    assert not any(
+        "lasts" in text for text in landscape_tables(summarise(told(data)))["wells"][0]["stable state"]
+    )
 
 
 def test_like_wells_are_told_once() -> None:
@@ -51,7 +53,7 @@ def test_under_noise_every_well_lasts_as_the_law_says() -> None:
     data = landscape([[-0.5], [0.5]], [0.8, 0.9], noise=NOISE)
     mean = summarise(told(data)).wells[0].time(summarise(told(data)).noise)
     assert mean is not None and mean.value == pytest.approx(4 * math.exp(8))
-    table, numbers = wells_table(summarise(told(data)))
+    table, numbers = landscape_tables(summarise(told(data)))["wells"]
     assert list(numbers["mean_time"]) == pytest.approx([4 * math.exp(8), 4 * math.exp(9)])
     assert "lasts (s)" in list(table["stable state"]) and "ΔU/ε" in list(table["stable state"])
     assert "± " in headline(data) and " s" in headline(data)
@@ -96,7 +98,7 @@ def test_more_wells_than_a_sentence_can_list_are_told_by_their_ends() -> None:
     data = landscape([[float(k)] for k in range(5)], [0.1, 0.5, 0.2, 0.3, 0.4])
     said = headline(data)
     assert "five stable states" in said and "the deepest, B at" in said and "the shallowest, A, " in said
-    assert list(wells_table(summarise(told(data)))[0]["stable state"]) == [
+    assert list(landscape_tables(summarise(told(data)))["wells"][0]["stable state"]) == [
         "A",
         "B",
         "C",
@@ -119,19 +121,20 @@ def test_what_rounding_left_of_zero_is_zero() -> None:
     data = landscape([[-1.0, 4.94066e-324], [1.0, 1e-13]], [0.25, 0.25])
     for well in data["wells"]:
         well["standard_errors"] = [1e-12, 1e-12]
-    table, _ = wells_table(summarise(told(data)))
+    table, _ = landscape_tables(summarise(told(data)))["wells"]
     assert list(table.set_index("stable state").loc["y (µm)"]) == ["0", "0"]
     assert "e-3" not in headline(data)
 
 
 def test_ways_equilibria_and_times_for_given_noises_are_tables() -> None:
     summary = summarise(told(landscape([[-0.5], [0.5]], [0.25, 0.35])))
-    times = times_table(summary, (0.05, 0.3))
+    tables = landscape_tables(summary, (0.05, 0.3))
+    times, _ = tables["times"]
     assert list(times.columns)[1:] == ["A lasts (s)", "B lasts (s)"]
     assert times.iloc[1, 1] == "too strong a noise" and times.iloc[0, 1] != ""
-    shown, numbers = exits_table(summary)
+    shown, numbers = tables["exits"]
     assert list(shown["way"]) == ["A to B", "B to A"] and list(numbers["barrier"]) == [0.25, 0.35]
-    assert list(equilibria_table(summary)["what"]) == ["stable state", "stable state"]
+    assert list(tables["equilibria"][0]["what"]) == ["stable state", "stable state"]
 
 
 @pytest.mark.parametrize("noise", [None, NoiseStrength(0.05, 0.001, "estimated")])
@@ -168,7 +171,7 @@ def test_a_barrier_below_the_law_tells_of_visits() -> None:
     assert any("A is less than 3 times" in one and "Fokker–Planck operator" in one for one in lines)
     assert any("barrier out of A is not resolved" in one for one in lines)
     assert not any("orders of magnitude" in one for one in lines)
-    table, numbers = wells_table(summarise(told(data)))
+    table, numbers = landscape_tables(summarise(told(data)))["wells"]
     assert "mean visit, counted (s)" in list(table["stable state"]) and len(numbers) == 2
 
 

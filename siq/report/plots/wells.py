@@ -227,7 +227,7 @@ def _share_of_action(landscape: LandscapeSummary, path: np.ndarray) -> np.ndarra
     return np.asarray(spent / spent[-1]) if spent[-1] > 0 else None
 
 
-def _look(place: int, *parts: str) -> dict[str, str]:
+def _look(place: int, *parts: str) -> dict[str, Any]:
     """Some of the ``color``, ``linestyle`` and ``marker`` of a well or a way."""
     looks = {"color": COLOURS, "linestyle": LINE_STYLES, "marker": MARKERS}
     return {part: looks[part][place % len(looks[part])] for part in parts}
