@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -421,6 +422,7 @@ def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) ->
     )
 
 
+@lru_cache(maxsize=16)
 def parent_recordings(labels: tuple[str, ...]) -> np.ndarray:
     """Index of the recording that each is, or is a copy of: ``r07#2`` is a copy where there is an ``r07``.
 
@@ -439,4 +441,6 @@ def parent_recordings(labels: tuple[str, ...]) -> np.ndarray:
     for label in labels:
         original, _, copy = label.rpartition("#")
         parents.append(position[original if copy.isdigit() and original in position else label])
-    return np.array(parents, dtype=np.int64)
+    found = np.array(parents, dtype=np.int64)
+    found.flags.writeable = False  # every caller has the same array
+    return found

@@ -331,10 +331,6 @@ def predict(dynamics: Dynamics, recordings: Recordings) -> np.ndarray:
     predicted = np.full_like(recordings.values, np.nan)
     predicted[starts] = recordings.values[starts]
     x = recordings.values[starts].T.copy()
-
-    def velocity(components: np.ndarray) -> np.ndarray:
-        return dynamics.drift(components.T).T
-
     with np.errstate(over="ignore", invalid="ignore"):
         for place in range(1, int(lengths.max())):
             near = (np.abs(x - center[:, None]) < RUNAWAY_WIDTHS * width[:, None]).all(axis=0)
@@ -346,9 +342,9 @@ def predict(dynamics: Dynamics, recordings: Recordings) -> np.ndarray:
             steps = max(int(np.ceil(gap.max() * rate / STEP_ACCURACY)), 1)
             if steps > MAX_STEPS:
                 break
-            part = x[:, going]
+            part = np.ascontiguousarray(x[:, going])
             for _ in range(steps):
-                part = runge_kutta_step(velocity, part, gap / steps)
+                part = runge_kutta_step(dynamics.drift_of_components, part, gap / steps)
             x[:, going] = part
             predicted[rows] = part.T
     return predicted

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Annotated
 
 import numpy as np
@@ -77,6 +77,17 @@ class CandidateLibrary:
     @cached_property
     def _function(self) -> Callable[[np.ndarray], np.ndarray]:
         return compile_formulas(self.terms, self.symbols)
+
+    def second_derivatives(self, places: Sequence[int]) -> list[list[sympy.Expr]]:
+        """∂²θ_k/∂x_i∂x_j of some functions, k by k: i goes slowest, then j."""
+        known = self._second_derivatives
+        for k in set(places) - set(known):
+            known[k] = [self.terms[k].diff(a, b) for a in self.symbols for b in self.symbols]
+        return [known[k] for k in places]
+
+    @cached_property
+    def _second_derivatives(self) -> dict[int, list[sympy.Expr]]:
+        return {}
 
     def downhill(self, diffusion: Diffusion) -> np.ndarray:
         """D∇V by the coefficients of V, shape ``(d, q, q)``: [i, k, j] is θ_k's share of (D∇θ_j)_i."""
@@ -165,6 +176,18 @@ def candidate_library(
     siq.systems.formulas.FormulaError
         When a further function is not a formula of the states, or is there already.
     """
+    return _candidate_library(tuple(states), degree, potential_degree, circulatory_degree, tuple(further))
+
+
+@lru_cache(maxsize=64)
+def _candidate_library(
+    states: tuple[str, ...],
+    degree: int,
+    potential_degree: int | None,
+    circulatory_degree: int | None,
+    further: tuple[str, ...],
+) -> CandidateLibrary:
+    """`candidate_library`, once for the same functions: every step of a run asks for them, and every run."""
     symbols = tuple(sympy.Symbol(name, real=True) for name in states)
     exponents = monomial_exponents(len(states), degree)
     terms = [sympy.Mul(*(s**e for s, e in zip(symbols, row, strict=True))) for row in exponents]
@@ -200,14 +223,10 @@ def candidate_library(
     for (i, j), combination in columns.items():
         for function, coefficient in combination.items():
             derivatives[position[function], i, j] = coefficient
-    return CandidateLibrary(
-        states=tuple(states),
-        symbols=symbols,
-        terms=tuple(terms),
-        in_potential=np.array(in_potential),
-        in_circulatory=np.array(in_circulatory),
-        derivatives=derivatives,
-    )
+    arrays = (np.array(in_potential), np.array(in_circulatory), derivatives)
+    for array in arrays:
+        array.flags.writeable = False
+    return CandidateLibrary(states, symbols, tuple(terms), *arrays)
 
 
 def joint_library(

@@ -221,11 +221,10 @@ class _PairRegression:
 
     def _curvature(self, x0: np.ndarray, noise_rate: np.ndarray) -> np.ndarray:
         """Σ_jk (εD)_jk ∂²θ/∂x_j∂x_k of the active functions, shape ``(active, n)``."""
-        symbols = self.library.symbols
-        d = len(symbols)
+        d = self.library.dimension
         if self._second is None:
-            second = [self.library.terms[k].diff(a, b) for a in symbols for b in symbols for k in self.active]
-            self._second = compile_formulas(second, symbols)
+            by_states = zip(*self.library.second_derivatives(self.active.tolist()), strict=True)
+            self._second = compile_formulas([each for row in by_states for each in row], self.library.symbols)
         values = self._second(x0).reshape(d, d, len(self.active), -1)
         return np.einsum("ij,ijkn->kn", noise_rate, values)
 

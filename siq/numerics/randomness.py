@@ -143,8 +143,9 @@ def _sequential_visit(points: np.ndarray, distance: float) -> np.ndarray:
     pairs = pairs[np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1) < distance]
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
     alive = np.ones(len(points), dtype=bool)
-    starts = np.searchsorted(pairs[:, 0], np.arange(len(points) + 1))
-    for index in range(len(points)):
-        if alive[index] and starts[index] < starts[index + 1]:
-            alive[pairs[starts[index] : starts[index + 1], 1]] = False
+    firsts, starts = np.unique(pairs[:, 0], return_index=True)
+    bounds, others = [*starts.tolist(), len(pairs)], np.ascontiguousarray(pairs[:, 1])
+    for place, index in enumerate(firsts.tolist()):
+        if alive[index]:
+            alive[others[bounds[place] : bounds[place + 1]]] = False
     return np.flatnonzero(alive)

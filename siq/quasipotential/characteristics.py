@@ -74,31 +74,35 @@ class HamiltonianFlow:
     def rates(self, state: np.ndarray) -> np.ndarray:
         """Time derivative of rows."""
         y, q, _, x_tangents, p_tangents = self.parts(state)
-        turned, diffusion, bend = self.linear(y, q)
+        x = self.points(y)
+        turned, diffusion, bend = self.linear(y, q, x)
         new = np.empty_like(state)
         y_rate, q_rate, v_rate, x_rate, p_rate = self.parts(new)
-        y_rate[...], q_rate[...], v_rate[...] = self.velocities(y, q, turned)
+        y_rate[...], q_rate[...], v_rate[...] = self.velocities(y, q, turned, x)
         x_rate[...] = turned @ x_tangents + 2 * diffusion @ p_tangents
         p_rate[...] = -turned.transpose(0, 2, 1) @ p_tangents - bend @ x_tangents
         return new
 
     def velocities(
-        self, y: np.ndarray, q: np.ndarray, turned: np.ndarray | None = None
+        self, y: np.ndarray, q: np.ndarray, turned: np.ndarray | None = None, x: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """ẏ, q̇ and v̇ at positions and momenta ``(n, d)``; `turned` as of `linear`, where it is known."""
-        force = self.dynamics.drift(self.points(y)) @ self.inverse.T
+        """ẏ, q̇ and v̇ at positions and momenta ``(n, d)``; `turned` as of `linear`, and x, where known."""
+        x = self.points(y) if x is None else x
+        force = self.dynamics.drift(x) @ self.inverse.T
         push = (self.at(y) @ q[:, :, None])[:, :, 0]
         if turned is None:
-            turned = self.inverse @ self.dynamics.jacobian(self.points(y)) @ self.units
+            turned = self.inverse @ self.dynamics.jacobian(x) @ self.units
             turned = turned if self.constant else turned + 2 * self.noise.turn(y, q)
         pulled = -(turned.transpose(0, 2, 1) @ q[:, :, None])[:, :, 0]
         if not self.constant:  # of which the turn has twice as much
             pulled += self.noise.contract(y, q, 1)
         return force + 2 * push, pulled, 2 * np.sum(q * push, axis=1)
 
-    def linear(self, y: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """G, D and the matrix before X in Ṗ, at positions and momenta: ``(n, d, d)`` each."""
-        x, p = self.points(y), 2 * self.level * q @ self.inverse
+    def linear(
+        self, y: np.ndarray, q: np.ndarray, x: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """G, D and the matrix before X in Ṗ, at positions and momenta: ``(n, d, d)`` each; see `at`."""
+        x, p = self.points(y) if x is None else x, 2 * self.level * q @ self.inverse
         turned = self.inverse @ self.dynamics.jacobian(x) @ self.units
         bend = self.units.T @ self.dynamics.bend(x, p) @ self.units / (2 * self.level)
         if self.constant:
@@ -106,9 +110,9 @@ class HamiltonianFlow:
         return turned + 2 * self.noise.turn(y, q), self.at(y), bend + self.noise.contract(y, q, 2)
 
     def at(self, y: np.ndarray) -> np.ndarray:
-        """D at positions, ``(n, d, d)``."""
+        """D at positions, ``(n, d, d)``; where it is the same everywhere, ``(1, d, d)``."""
         if self.constant:
-            return np.broadcast_to(self.diffusion, (len(y), self.dimension, self.dimension))
+            return self.diffusion
         return self.noise.at(y)
 
     def points(self, y: np.ndarray) -> np.ndarray:

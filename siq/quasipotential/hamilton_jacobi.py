@@ -95,9 +95,8 @@ class LibraryBasis:
 
     @cached_property
     def _second(self):  # type: ignore[no-untyped-def]
-        symbols = self.library.symbols
-        second = [self.library.terms[k].diff(a, b) for k in self.chosen for a in symbols for b in symbols]
-        return compile_formulas(second, symbols)
+        second = self.library.second_derivatives(self.chosen.tolist())
+        return compile_formulas([each for row in second for each in row], self.library.symbols)
 
     def expression(self, coefficients: np.ndarray) -> sympy.Expr:
         """The sum as a formula of the states."""

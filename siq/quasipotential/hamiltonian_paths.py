@@ -130,7 +130,7 @@ class _HamiltonianProblem:
     def matrices(self, z: np.ndarray) -> np.ndarray:
         """Their derivatives, ``(2d, n)`` to ``(2d, 2d, n)``."""
         turned, noise, bend = self.flow.linear(z[: self.dimension].T, z[self.dimension :].T)
-        top = np.concatenate([turned, 2 * noise], axis=2)
+        top = np.concatenate([turned, np.broadcast_to(2 * noise, turned.shape)], axis=2)
         return np.concatenate(
             [top, np.concatenate([-bend, -turned.transpose(0, 2, 1)], axis=2)], axis=1
         ).transpose(1, 2, 0)
