@@ -264,15 +264,15 @@ def _stated_function(part: Term, fit: Fit, beside: tuple[str, ...]) -> StatedTer
     if place is not None and at:
         rows = [list(_standard_errors(fit)).index(name) for name in candidate.amplitudes]
         variances = np.einsum("kc,cd,kd->k", weights, fit.covariance[np.ix_(rows, rows)], weights)
-        shape = [len(each) for each in at]
-        shaped = [each.reshape(shape) for each in (values, np.sqrt(np.maximum(variances, 0.0)))]
+        shape, deviations = [len(each) for each in at], np.sqrt(np.maximum(variances, 0.0))
+        shaped = [each.reshape(shape).tolist() for each in (values, deviations)]
         if part.kind == SURFACE:
-            value, error = (tuple(map(tuple, each.tolist())) for each in shaped)
             grid = (tuple(at[0].tolist()), tuple(at[1].tolist()))
-            surface = DescribedSurface((place.words[0], place.words[1]), grid, value, error)
+            surface = DescribedSurface(
+                (place.words[0], place.words[1]), grid, *(tuple(map(tuple, each)) for each in shaped)
+            )
         else:
-            value, error = (tuple(each.tolist()) for each in shaped)
-            curve = DescribedCurve(place.words[0], tuple(at[0].tolist()), value, error)
+            curve = DescribedCurve(place.words[0], tuple(at[0].tolist()), *map(tuple, shaped))
     measured = [name for name, _ in candidate.changes if name in fit.model.output_names]
     return _stated(
         part.trial,
