@@ -27,7 +27,9 @@ SMALLEST_FACTOR, LARGEST_FACTOR = 0.2, 5.0
 ORDER = 8  # of the rule
 
 
-def dormand_prince_step(rates: Rates, state: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def dormand_prince_step(
+    rates: Rates, state: np.ndarray, step: np.ndarray, *, first: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Advance every row by its own step with the rule of Dormand and Prince of order 8.
 
     Parameters
@@ -38,6 +40,8 @@ def dormand_prince_step(rates: Rates, state: np.ndarray, step: np.ndarray) -> tu
         Shape ``(n, s)``.
     step
         Shape ``(n,)``, in time units.
+    first
+        The time derivative at `state`, where it is known.
 
     Returns
     -------
@@ -55,7 +59,7 @@ def dormand_prince_step(rates: Rates, state: np.ndarray, step: np.ndarray) -> tu
     def combine(weights: np.ndarray) -> np.ndarray:
         return (weights @ stages[: len(weights)]).reshape(state.shape)
 
-    stages[0] = rates(state).ravel()
+    stages[0] = (rates(state) if first is None else first).ravel()
     for index in range(1, DOP853.n_stages):
         stages[index] = rates(state + h * combine(DOP853.A[index, :index])).ravel()
     new = state + h * combine(DOP853.B)

@@ -357,11 +357,12 @@ def characteristics(
     for _ in range(most_steps):
         if not len(running):
             break
-        y_rate = flow.parts(flow.rates(states[running]))[0]
+        rates = flow.rates(states[running])
+        y_rate = flow.parts(rates)[0]
         step = np.minimum(steps[running], spacing / np.maximum(norm(y_rate), 1e-300))
         step = np.minimum(step, time_limit - times[running])
         with np.errstate(all="ignore"):
-            new, error = dormand_prince_step(flow.rates, states[running], step)
+            new, error = dormand_prince_step(flow.rates, states[running], step, first=rates)
             size = relative(error, states[running])
         accepted = size <= 1
         steps[running] = next_step(step, size)
@@ -384,12 +385,13 @@ def characteristics(
     # The last states before the ends within a step are found by halving it.
     crossing = np.flatnonzero(last_steps)
     before, low, high = states[crossing], np.zeros(len(crossing)), last_steps[crossing]
+    advance = partial(dormand_prince_step, flow.rates, before, first=flow.rates(before))
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        found = reason(before, dormand_prince_step(flow.rates, before, middle)[0])
+        found = reason(before, advance(middle)[0])
         low, high = np.where(found >= 0, low, middle), np.where(found >= 0, middle, high)
-    kept.append(dormand_prince_step(flow.rates, before, low)[0])
-    ends[crossing] = reason(before, dormand_prince_step(flow.rates, before, high)[0])
+    kept.append(advance(low)[0])
+    ends[crossing] = reason(before, advance(high)[0])
     curve = np.concatenate([*kept_curves, crossing])
     order = np.argsort(curve, kind="stable")
     curve = curve[order]

@@ -460,9 +460,10 @@ def _hamiltonian_trajectories(
     steps = np.full(n, longest / rate)
     for _ in range(MOST_GUESS_STEPS):
         with np.errstate(all="ignore"):
-            speed = np.linalg.norm(rates(z[alive])[:, :d] @ inverse.T, axis=1)
+            at = rates(z[alive])
+            speed = np.linalg.norm(at[:, :d] @ inverse.T, axis=1)
             step = np.minimum(steps[alive], longest / np.maximum(speed, 1e-300))
-            moved, error = dormand_prince_step(rates, z[alive], step)
+            moved, error = dormand_prince_step(rates, z[alive], step, first=at)
             relative = np.abs(error[:, :d] @ inverse.T).max(axis=1) / GUESS_ACCURACY
         steps[alive] = next_step(step, relative)
         taken = np.isfinite(moved).all(axis=1) & (relative <= 1)
