@@ -28,12 +28,13 @@ from siq.inference.kalman_filter import (
     Grid,
     Linearisation,
     Noise,
+    Whitened,
     linearise,
     solve,
     substeps_needed,
     whiten,
 )
-from siq.inference.measurements import Expectations, Measurements
+from siq.inference.measurements import Measurements, expectations
 from siq.systems.dynamics import Dynamics
 
 PIECE = 500  # samples in one stretch, so that its unknown first state hardly matters
@@ -75,12 +76,19 @@ def first_noise(model: Dynamics, data: Measurements, x: np.ndarray) -> Noise:
     return Noise(data.with_known_noise(data.roughness), np.where(model.kinematic, 0.0, process))
 
 
+def _stacked(white: Whitened, expected: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Columns ``(n, p)`` and innovations ``(n,)`` with one row more for each expectation."""
+    if not len(expected[0]):
+        return white.columns, white.innovations
+    return np.concatenate([white.columns, expected[0]]), np.concatenate([white.innovations, expected[1]])
+
+
 def _estimate_noise(
     linearisation: Linearisation,
     data: Measurements,
     start: Noise,
     *,
-    expected: Expectations,
+    expected: tuple[np.ndarray, np.ndarray],
     charge: Callable[[float], None] | None = None,
     coarse: bool = False,
 ) -> Noise:
@@ -89,7 +97,7 @@ def _estimate_noise(
     # it, and a fit returns here once they have settled.
     known, driven, outputs = data.known_sensors, start.driven, len(start.measurement)
     white = whiten(linearisation, data, start)
-    columns, innovations = expected.stacked_on(white.columns, white.innovations)
+    columns, innovations = _stacked(white, expected)
     whole = linearisation.with_parameters_changed(solve(columns, innovations)[0])
     count = len(data.t)
     # Pieces spread over all recordings, where there are many more samples than are needed.
@@ -246,7 +254,7 @@ def _noise_along(
     noise: Noise,
     estimate_process: bool,
     *,
-    expected: Expectations,
+    expected: tuple[np.ndarray, np.ndarray],
     charge: Callable[[float], None] | None = None,
     coarse: bool = False,
 ) -> Noise:
@@ -257,8 +265,8 @@ def _noise_along(
     if driven and data.sensor_noise is not None:
         return noise
     white = whiten(linearisation, data, noise)
-    change, covariance = solve(*expected.stacked_on(white.columns, white.innovations))
-    determined = len(change) - float(np.einsum("rp,pq,rq->", expected.rows, covariance, expected.rows))
+    change, covariance = solve(*_stacked(white, expected))
+    determined = len(change) - float(np.einsum("rp,pq,rq->", expected[0], covariance, expected[0]))
     left = (white.innovations - white.columns @ change).reshape(len(data.t), -1)
     known = white.known.reshape(left.shape)
     # Each output has its share of the initial states and parameters.
@@ -362,7 +370,7 @@ def fit_of_states(
     at = _Iterate(model.values, x, linearise(model, Grid(data, substeps), model.values, x), x)
 
     def fit() -> Fit:
-        known = _noise_along(at.along, data, noise, False, expected=Expectations.of(model))
+        known = _noise_along(at.along, data, noise, False, expected=expectations(model))
         return _fit_at(model, data, at, known, substeps, converged=converged, resolution=INEXACT)
 
     return _or_fault(model, at, noise, substeps, fit)
@@ -380,8 +388,8 @@ def _fit_at(
 ) -> Fit:
     """The fit whose iteration ended at parameters, states and noise."""
     white = whiten(at.along, data, noise)
-    expected = Expectations.of(model, at.values)
-    columns, innovations = expected.stacked_on(white.columns, white.innovations)
+    expected = expectations(model, at.values)
+    columns, innovations = _stacked(white, expected)
     change, covariance = solve(columns, innovations, least=resolution)
     # The last change is below the errors. The likelihood is that of the states in hand, not of a forecast.
     total = float(innovations @ innovations)
@@ -511,7 +519,7 @@ class _Shooting:
                 rows, middle = self.grid.rows, now.x.copy()
                 middle[rows] += (now.x[rows + 1] + now.along.gap[rows] - now.x[rows]) / 2
                 noise = noise.along(middle, now.spread, data.step)
-            expected = Expectations.of(model, now.values)
+            expected = expectations(model, now.values)
             if iteration in (0, 2) or settled_noise:
                 noise = _noise_along(
                     now.along, data, noise, estimate_process, expected=expected, charge=self.charge,
@@ -519,7 +527,7 @@ class _Shooting:
                 )  # fmt: skip
             self.charge()
             white = whiten(now.along, data, noise)
-            columns, innovations = expected.stacked_on(white.columns, white.innovations)
+            columns, innovations = _stacked(white, expected)
             change, _ = solve(columns, innovations, least=self.resolution)
             explained = white.columns @ change
             left = white.innovations - explained

@@ -292,58 +292,42 @@ def _filled(column: np.ndarray) -> np.ndarray:
     return np.interp(np.arange(len(column)), np.flatnonzero(known), column[known])
 
 
-@dataclass(frozen=True)
-class Expectations:
+def expectations(model: Dynamics, values: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Priors of changes of the free parameters: combinations of them are normal, of unit width.
 
-    Attributes
+    Parameters
     ----------
-    rows
-        The combinations, shape ``(r, p)``.
-    deviations
-        How far the values in hand fall short of what is expected of each, shape ``(r,)``.
+    model
+        Says what is expected of parameters, of each by itself and of several together.
+    values
+        Of all parameters; by default the model's own.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        The combinations, shape ``(r, p)``, and how far the values fall short of what is expected of each,
+        shape ``(r,)``.
     """
-
-    rows: np.ndarray
-    deviations: np.ndarray
-
-    @classmethod
-    def of(cls, model: Dynamics, values: np.ndarray | None = None) -> Expectations:
-        """Those of a model's free parameters, each by itself, and of several together.
-
-        Parameters
-        ----------
-        model
-            Says what is expected.
-        values
-            Of all parameters; by default the model's own.
-        """
-        now = (model.values if values is None else values)[list(model.free)]
-        free = {model.parameters[place].name: column for column, place in enumerate(model.free)}
-        fixed = {each.name: each.value for each in model.parameters}
-        rows, middle = [np.zeros((0, len(free)))], [np.zeros(0)]
-        for column in free.values():
-            expected = model.parameters[model.free[column]].expected
-            if expected:
-                rows.append(np.zeros((1, len(free))))
-                rows[-1][0, column] = 1 / abs(expected)
-                middle.append(np.array([np.sign(expected)]))
-        for each in model.expected_together:
-            mine = [place for place, name in enumerate(each.names) if name in free]
-            if mine:
-                rows.append(np.zeros((len(each.roots), len(free))))
-                roots = np.sqrt(each.weight) * each.roots
-                rows[-1][:, [free[each.names[place]] for place in mine]] = roots[:, mine]
-                known = [0.0 if name in free else fixed[name] for name in each.names]
-                middle.append(-roots @ np.array(known))
-        together = np.concatenate(rows)
-        return cls(together, np.concatenate(middle) - together @ now)
-
-    def stacked_on(self, columns: np.ndarray, innovations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Columns ``(n, p)`` and innovations ``(n,)`` with one row more for each expectation."""
-        if not len(self.rows):
-            return columns, innovations
-        return np.concatenate([columns, self.rows]), np.concatenate([innovations, self.deviations])
+    now = (model.values if values is None else values)[list(model.free)]
+    free = {model.parameters[place].name: column for column, place in enumerate(model.free)}
+    fixed = {each.name: each.value for each in model.parameters}
+    rows, middle = [np.zeros((0, len(free)))], [np.zeros(0)]
+    for column in free.values():
+        expected = model.parameters[model.free[column]].expected
+        if expected:
+            rows.append(np.zeros((1, len(free))))
+            rows[-1][0, column] = 1 / abs(expected)
+            middle.append(np.array([np.sign(expected)]))
+    for each in model.expected_together:
+        mine = [place for place, name in enumerate(each.names) if name in free]
+        if mine:
+            rows.append(np.zeros((len(each.roots), len(free))))
+            roots = np.sqrt(each.weight) * each.roots
+            rows[-1][:, [free[each.names[place]] for place in mine]] = roots[:, mine]
+            known = [0.0 if name in free else fixed[name] for name in each.names]
+            middle.append(-roots @ np.array(known))
+    together = np.concatenate(rows)
+    return together, np.concatenate(middle) - together @ now
 
 
 def with_expectations(model: Dynamics) -> Dynamics:

@@ -20,7 +20,7 @@ import sympy
 from siq.inference.budget import Budget, evaluation
 from siq.inference.kalman_filter import Grid, Linearisation, Noise, integrate_intervals, linearise
 from siq.inference.maximum_likelihood import Fit, fit_by_multiple_shooting, fit_of_states
-from siq.inference.measurements import Expectations, Measurements, first_states
+from siq.inference.measurements import Measurements, expectations, first_states
 from siq.numerics.integration import machine_code
 from siq.systems.dynamics import Dynamics, Tape, symbol
 from siq.systems.formulas import compile_values
@@ -235,7 +235,7 @@ def fit_trajectories(
         states = run(model.with_values(values), grid, begin)
         outputs = model.functions.outputs(states.T, grid.at_samples(model.lags(values)), values).T
         left = ((outputs - data.outputs) / np.sqrt(noise.measurement))[np.isfinite(data.outputs)]
-        expected = Expectations.of(model, values).deviations
+        _, expected = expectations(model, values)
         return states, float(left @ left + expected @ expected)
 
     with np.errstate(all="ignore"):
@@ -246,8 +246,7 @@ def fit_trajectories(
                 budget.charge(work * (RUN if normal is not None else 1.0 + RUN))
             if normal is None:
                 along = linearise(model, grid, values, states)
-                expected = Expectations.of(model, values)
-                normal = _NormalEquations(along, data, noise.measurement, expected)
+                normal = _NormalEquations(along, data, noise.measurement, expectations(model, values))
             change, moved, foreseen = normal.step(damping)
             new = values.copy()
             new[free] += change
@@ -279,7 +278,11 @@ class _NormalEquations:
     """
 
     def __init__(
-        self, along: Linearisation, data: Measurements, variance: np.ndarray, expected: Expectations
+        self,
+        along: Linearisation,
+        data: Measurements,
+        variance: np.ndarray,
+        expected: tuple[np.ndarray, np.ndarray],
     ) -> None:
         along = replace(along, gap=np.zeros_like(along.gap))
         still = np.zeros((1, *along.transition.shape[1:]))
@@ -302,8 +305,9 @@ class _NormalEquations:
             self.shared_target += columns.T @ left
             self.between[place], self.own[place] = columns.T @ states, states.T @ states
             self.own_target[place] = states.T @ left
-        self.shared += expected.rows.T @ expected.rows
-        self.shared_target += expected.rows.T @ expected.deviations
+        rows, deviations = expected
+        self.shared += rows.T @ rows
+        self.shared_target += rows.T @ deviations
 
     def step(self, damping: float) -> tuple[np.ndarray, np.ndarray, float]:
         """Changes of parameters ``(p,)`` and initial states ``(r, d)``, and what they gain if all is linear.

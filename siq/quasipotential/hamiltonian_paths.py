@@ -91,7 +91,7 @@ class _HamiltonianProblem:
         self.flow = HamiltonianFlow(dynamics, attractor, level)
         self.dimension = dynamics.dimension
         self.end = self.flow.inverse @ offset
-        self.series = local_series(dynamics, attractor)
+        self.gradients, self.hessians = local_series(dynamics, attractor)
         self.growth = self.flow.jacobian + 2 * self.flow.diffusion[0]  # of what leaves A: ẏ = (J + 2DM) y
         self.fastest = float(np.abs(np.linalg.eigvals(self.growth)).max())
         self.unstable: float | None = None
@@ -137,13 +137,11 @@ class _HamiltonianProblem:
 
     def slope(self, y: np.ndarray) -> np.ndarray:
         """Q of the power series at points, ``(n, d)``."""
-        return np.asarray(
-            self.series.gradients(self.flow.points(y)) @ self.flow.units / (2 * self.flow.level)
-        )
+        return np.asarray(self.gradients(self.flow.points(y)) @ self.flow.units / (2 * self.flow.level))
 
     def curvature(self, y: np.ndarray) -> np.ndarray:
         """∂q/∂y of the power series at points, ``(n, d, d)``."""
-        hessians = self.series.hessians(self.flow.points(y))
+        hessians = self.hessians(self.flow.points(y))
         return np.asarray(self.flow.units.T @ hessians @ self.flow.units / (2 * self.flow.level))
 
     def fixed(self, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -216,15 +216,6 @@ class Segments:
         return float(np.sum(self.speed * self.length))
 
 
-@dataclass(frozen=True)
-class DiscretisedPath:
-    """Points ``(n, d)`` in the units of a problem, their action, and whether it is a minimum."""
-
-    points: np.ndarray
-    action: float
-    minimum: bool
-
-
 class PathProblem:
     """Chains between two states, in units in which D at the start, their distance and ∂f/∂x are of size one.
 
@@ -370,8 +361,10 @@ class PathProblem:
         measure = np.r_[0, np.cumsum(_relative_lengths(self, y))]
         return curve(np.interp(np.linspace(0, measure[-1], count), measure, dense))
 
-    def descended(self, y: np.ndarray, count: int, action: float, *, first: bool = False) -> DiscretisedPath:
-        """Move a chain of `count` points along y down to a minimum of S, by steps across the chain.
+    def descended(
+        self, y: np.ndarray, count: int, action: float, *, first: bool = False
+    ) -> tuple[np.ndarray, float, bool]:
+        """A chain of `count` points moved along y down to a minimum of S, its action, and whether it is one.
 
         `action` is about that of the path, and decides where the chain begins. A `first` chain, far from a
         minimum, is spaced anew where it has become uneven, and pushed off where it rests at a saddle of S.
@@ -381,7 +374,7 @@ class PathProblem:
         fine = START_LEVEL**1.5 if self.flat > 0 else FINE
         y = self.spaced(y, count, level)
         if y.shape[1] == 1:
-            return DiscretisedPath(y, self.action(y), True)
+            return y, self.action(y), True
         action, shift, spacings, kicks = self.action(y), 1.0, 0, 0
         for _ in range(MOST_STEPS):
             across = _Across(self, y)
@@ -416,10 +409,10 @@ class PathProblem:
                     break
                 y, action, shift = lower, self.action(lower), 1.0
             elif shift <= SMALLEST_SHIFT:
-                return DiscretisedPath(y, action, True)
+                return y, action, True
             else:
                 shift = self.flat
-        return DiscretisedPath(y, action, False)
+        return y, action, False
 
     def first_chains(self) -> tuple[list[np.ndarray], float]:
         """First chains, and by how many radian the first of them turns, in the metric of M.

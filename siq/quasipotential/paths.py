@@ -26,7 +26,6 @@ from siq.quasipotential.hamiltonian_paths import hamiltonian_paths
 from siq.quasipotential.path_chains import (
     MOST_NODES,
     NO_ACTION,
-    DiscretisedPath,
     MinimumActionPath,
     PathProblem,
     evenly,
@@ -136,31 +135,27 @@ def minimum_action_path(
         turning = max((_turning(chain) for chain in own), default=0.0)
     guesses = own if initial is None else [problem.scaled(np.asarray(one, dtype=float)) for one in initial]
     count = min(max(nodes, int(turning / TURN)), MOST_NODES // 4)
-    chains: list[DiscretisedPath] = []
+    chains: list[tuple[np.ndarray, float, bool]] = []
     for guess in guesses:
         action = problem.action(problem.spaced(guess, count, 0.0))
-        if not np.isfinite(action):
-            continue
-        chain = problem.descended(guess, count, action, first=True)
-        if np.isfinite(chain.action):
-            chains.append(chain)
+        if np.isfinite(action):
+            chains.append(problem.descended(guess, count, action, first=True))
+    chains = sorted((one for one in chains if np.isfinite(one[1])), key=lambda one: one[1])
     if not chains:
         last = problem.unscaled(problem.end[None])[0]
         raise NumericalFailure(
             f"no path from {problem.start.tolist()} to {last.tolist()} was found that has a finite action"
         )
-    chains.sort(key=lambda one: one.action)
-    fine, known = problem.descended(chains[0].points, count, chains[0].action), False
-    while not known and 2 * len(fine.points) < MOST_NODES:
-        coarse = fine
-        fine = problem.descended(
-            coarse.points, 2 * len(coarse.points) - 1, coarse.action, first=not coarse.minimum
-        )
-        error = abs(fine.action - coarse.action) / 3
-        known = error <= max(tolerance * fine.action, NO_ACTION * problem.segments(fine.points).effort)
-    line = _extrapolated(problem, coarse, fine)
+    (fine, action, minimum), known = problem.descended(chains[0][0], count, chains[0][1]), False
+    while not known and 2 * len(fine) < MOST_NODES:
+        coarse, before = fine, action
+        fine, action, minimum = problem.descended(coarse, 2 * len(coarse) - 1, before, first=not minimum)
+        error = abs(action - before) / 3
+        known = error <= max(tolerance * action, NO_ACTION * problem.segments(fine).effort)
+    line = _extrapolated(problem, (coarse, before), (fine, action))
     # Rivals have the error of short chains, which they share with the first one.
-    shares = [one.action / max(chains[0].action, np.finfo(float).tiny) for one in _other_minima(chains, fine)]
+    lowest = max(chains[0][1], np.finfo(float).tiny)
+    shares = [one / lowest for one in _other_minima(chains, fine)]
     points, momenta = np.split(line[:, :-1], 2, axis=1)
     return MinimumActionPath(
         points=problem.unscaled(points),
@@ -169,14 +164,14 @@ def minimum_action_path(
         action=problem.unit * float(line[-1, -1]),
         error=problem.unit * error,
         residual=_hamiltonian_residual(problem, line),
-        converged=fine.minimum and known,
+        converged=minimum and known,
         rivals=tuple(float(problem.unit * line[-1, -1] * share) for share in shares),
     )
 
 
-def _path_nodes(problem: PathProblem, chain: DiscretisedPath) -> np.ndarray:
+def _path_nodes(problem: PathProblem, y: np.ndarray) -> np.ndarray:
     """Points, momenta, and actions up to there, shape ``(n, 2d + 1)``."""
-    y, parts = chain.points, problem.segments(chain.points)
+    parts = problem.segments(y)
     # Momenta of the middles, carried over half a segment with ṗ = -Jᵀp - p·(∂D)p; both sides agree at a
     # minimum.
     times = (parts.length / parts.speed)[:, None]
@@ -203,18 +198,20 @@ def _hamiltonian_residual(problem: PathProblem, nodes: np.ndarray) -> float:
     return float(np.abs(drift + push).max() / scale)
 
 
-def _extrapolated(problem: PathProblem, coarse: DiscretisedPath, fine: DiscretisedPath) -> np.ndarray:
-    """Nodes without the error of second order, from a chain and one with half its spacing.
+def _extrapolated(
+    problem: PathProblem, coarse: tuple[np.ndarray, float], fine: tuple[np.ndarray, float]
+) -> np.ndarray:
+    """Nodes without the error of second order, from a chain with its action and one with half its spacing.
 
     Where the two differ by more than their errors, by a turn about the attractor say, they do not match, and
     the finer one stands for itself.
     """
-    action = max((4 * fine.action - coarse.action) / 3, 0.0)
-    second = _path_nodes(problem, fine)
-    nodes = (4 * second[::2] - _path_nodes(problem, coarse)) / 3
+    action = max((4 * fine[1] - coarse[1]) / 3, 0.0)
+    second = _path_nodes(problem, fine[0])
+    nodes = (4 * second[::2] - _path_nodes(problem, coarse[0])) / 3
     if not _hamiltonian_residual(problem, nodes) < _hamiltonian_residual(problem, second):
         nodes = second
-        nodes[:, -1] *= action / max(fine.action, np.finfo(float).tiny)
+        nodes[:, -1] *= action / max(fine[1], np.finfo(float).tiny)
     d, ends = problem.end.size, np.zeros((2, nodes.shape[1]))
     if problem.finish is not None:
         ends[1, :d] = problem.finish.closest(nodes[-1:, :d])[0]
@@ -227,19 +224,17 @@ def _extrapolated(problem: PathProblem, coarse: DiscretisedPath, fine: Discretis
     return np.vstack([ends[:1], nodes])
 
 
-def _other_minima(chains: Sequence[DiscretisedPath], best: DiscretisedPath) -> list[DiscretisedPath]:
-    """The minima that lie apart from the first chain, from what has become of it, and from each other."""
+def _other_minima(chains: Sequence[tuple[np.ndarray, float, bool]], best: np.ndarray) -> list[float]:
+    """Actions of minima that lie apart from the first chain, from what it has become, and from each other."""
 
-    def tree(chain: DiscretisedPath) -> cKDTree:
-        length = np.linalg.norm(np.diff(chain.points, axis=0), axis=1).sum()
-        return cKDTree(evenly(chain.points, int(5 * length / SAME_PATH) + 2))
+    def tree(y: np.ndarray) -> cKDTree:
+        return cKDTree(evenly(y, int(5 * np.linalg.norm(np.diff(y, axis=0), axis=1).sum() / SAME_PATH) + 2))
 
-    rivals: list[DiscretisedPath] = []
-    trees = [tree(chains[0]), tree(best)]
-    for chain in chains[1:]:
-        if chain.minimum and all(other.query(chain.points)[0].max() > SAME_PATH for other in trees):
-            rivals.append(chain)
-            trees.append(tree(chain))
+    rivals, trees = [], [tree(chains[0][0]), tree(best)]
+    for y, action, minimum in chains[1:]:
+        if minimum and all(other.query(y)[0].max() > SAME_PATH for other in trees):
+            rivals.append(action)
+            trees.append(tree(y))
     return rivals
 
 

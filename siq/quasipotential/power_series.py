@@ -23,8 +23,7 @@ unknowns. Eigenvectors would do, too, but those of a long chain that turns are a
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import scipy.linalg
@@ -41,33 +40,28 @@ from siq.systems.formulas import compile_formulas
 MOST_STATES_OF_DEGREE_4 = 8  # beyond, the local series is of degree 3
 
 
-@dataclass(frozen=True)
-class _CubicSeries:
-    """``½ yᵀMy + ⅙ T(y, y, y)``: M of the shape ``(d, d)``, T of ``(d, d, d)``."""
-
-    center: np.ndarray
-    square: np.ndarray
-    cube: np.ndarray
-
-    def gradients(self, x: np.ndarray) -> np.ndarray:
-        """First derivatives at points: ``(n, d)`` to ``(n, d)``."""
-        y = x - self.center
-        return np.asarray(y @ self.square + np.einsum("ijk,nj,nk->ni", self.cube, y, y, optimize=True) / 2)
-
-    def hessians(self, x: np.ndarray) -> np.ndarray:
-        """Second derivatives at points: ``(n, d)`` to ``(n, d, d)``."""
-        return np.asarray(self.square + np.einsum("ijk,nk->nij", self.cube, x - self.center))
+Function = Callable[[np.ndarray], np.ndarray]
 
 
-def local_series(dynamics: Dynamics, attractor: np.ndarray) -> Expansion | _CubicSeries:
-    """V about an attractor, shape ``(d,)``, to its fourth powers; to its third where states are many."""
+def local_series(dynamics: Dynamics, attractor: np.ndarray) -> tuple[Function, Function]:
+    """∇V and ∇²V about an attractor, shape ``(d,)``: points ``(n, d)`` to ``(n, d)`` and ``(n, d, d)``.
+
+    They are those of V to its fourth powers; to its third where states are many.
+    """
     if dynamics.dimension <= MOST_STATES_OF_DEGREE_4:
-        return quasipotential_series(dynamics, attractor, degree=4)
-    return _cubic_series(dynamics, attractor)
+        series = quasipotential_series(dynamics, attractor, degree=4)
+        return series.gradients, series.hessians
+    square, cube = _cubic_series(dynamics, attractor)
+
+    def gradients(x: np.ndarray) -> np.ndarray:
+        y = x - attractor
+        return np.asarray(y @ square + np.einsum("ijk,nj,nk->ni", cube, y, y, optimize=True) / 2)
+
+    return gradients, lambda x: np.asarray(square + np.einsum("ijk,nk->nij", cube, x - attractor))
 
 
-def _cubic_series(dynamics: Dynamics, attractor: np.ndarray) -> _CubicSeries:
-    """V to its third powers."""
+def _cubic_series(dynamics: Dynamics, attractor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """M and T of V to its third powers, ``½ yᵀMy + ⅙ T(y, y, y)``: ``(d, d)`` and ``(d, d, d)``."""
     place = attractor[None]
     square, noise = hessian_at(dynamics, attractor), dynamics.diffusion
     flow = dynamics.jacobian(place)[0] + 2 * noise.at(place)[0] @ square
@@ -85,7 +79,7 @@ def _cubic_series(dynamics: Dynamics, attractor: np.ndarray) -> _CubicSeries:
         cube[i] = scipy.linalg.solve_sylvester(triangle.T + triangle[i, i] * one, triangle, rest)
     back = unitary.conj()
     whole = np.einsum("ijk,ai,bj,ck->abc", cube, back, back, back, optimize=True)
-    return _CubicSeries(attractor, square, np.ascontiguousarray(whole.real))
+    return square, np.ascontiguousarray(whole.real)
 
 
 def quasipotential_series(dynamics: Dynamics, attractor: np.ndarray, *, degree: int) -> Expansion:

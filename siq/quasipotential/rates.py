@@ -394,7 +394,7 @@ class _Frame:
         self.stable = float(-rates[1:].real.max(initial=-np.inf))
         self.problem = problem
         self.white = problem.constant and dynamics.diffusion.regular  # then D is the unit matrix
-        self.series = local_series(dynamics, start)
+        self.gradients, self.hessians = local_series(dynamics, start)
         self.at_attractor = problem.hessian
         self.at_saddle = None
         if not self.resonant:
@@ -484,8 +484,8 @@ class _Frame:
         here = np.zeros((1, len(problem.end)))
         flow = problem.jacobian(here)[0] + 2 * self.diffusion(here)[0] @ self.at_attractor
         y = np.linalg.solve(flow, self.points[0]) * np.array([[1.0], [-1.0]])
-        p = self.series.gradients(problem.unscaled(y)) @ problem.units / problem.unit
-        odd = self.rise(y, p, self.curvature(self.series.hessians, y))
+        p = self.gradients(problem.unscaled(y)) @ problem.units / problem.unit
+        odd = self.rise(y, p, self.curvature(self.hessians, y))
         rise = self.rise(self.points[::2], self.momenta[::2], curvatures)
         density = rise / np.linalg.norm(self.velocities[::2], axis=1)
         rest = float(np.linalg.norm(self.points[-1] - problem.end))
@@ -515,7 +515,7 @@ class _Frame:
             product = m @ jacobians[index]
             return -self.pace[index] * (product + product.T + 2 * m @ noise[index] @ m + bends[index])
 
-        m = _imposed(self.curvature(self.series.hessians, self.points[:1])[0], self.velocities[0], forces[0])
+        m = _imposed(self.curvature(self.hessians, self.points[:1])[0], self.velocities[0], forces[0])
         kept = [m]
         for index in range(0, len(self.points) - 2, 2):
             h = self.grid[index + 2] - self.grid[index]

@@ -9,8 +9,9 @@ import sympy
 
 from siq.diagnosis.study import comparison_of
 from siq.inference.budget import Budget, BudgetSpent
-from siq.inference.kalman_filter import Noise
-from siq.inference.measurements import Expectations, Measurements, with_expectations
+from siq.inference.kalman_filter import Noise, Whitened
+from siq.inference.maximum_likelihood import _stacked
+from siq.inference.measurements import Measurements, expectations, with_expectations
 from siq.inference.recalibration import recalibrate
 from siq.inference.trajectories import (
     _initial_states,
@@ -76,11 +77,12 @@ def test_whole_trajectories_end_where_steps_at_all_samples_do() -> None:
 
 def test_nothing_is_expected_of_fixed_parameters_and_of_zeros() -> None:
     named = with_expectations(model(b=0.0))
-    expected = Expectations.of(named, np.array([0.0, 7.0, 4.0]))
-    np.testing.assert_array_equal(expected.rows, [[1.0, 0.0, 0.0], [0.0, 0.0, 0.5]])
-    np.testing.assert_array_equal(expected.deviations, [1.0, -1.0])
-    columns, innovations = np.ones((5, 3)), np.ones(5)
-    assert Expectations.of(model()).stacked_on(columns, innovations) == (columns, innovations)
+    rows, deviations = expectations(named, np.array([0.0, 7.0, 4.0]))
+    np.testing.assert_array_equal(rows, [[1.0, 0.0, 0.0], [0.0, 0.0, 0.5]])
+    np.testing.assert_array_equal(deviations, [1.0, -1.0])
+    white = Whitened(np.ones(5), np.ones((5, 3)), np.zeros(5, int), np.ones(5, bool), 5, 0.0)
+    columns, innovations = _stacked(white, expectations(model()))
+    assert columns is white.columns and innovations is white.innovations
 
 
 def test_expectations_do_not_depend_on_units() -> None:

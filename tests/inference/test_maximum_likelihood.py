@@ -15,7 +15,7 @@ from siq.inference.maximum_likelihood import (
     first_noise,
     fit_by_multiple_shooting,
 )
-from siq.inference.measurements import Expectations, Measurements, _course_of_input, first_states
+from siq.inference.measurements import Measurements, _course_of_input, expectations, first_states
 from siq.numerics.files import Document, validate
 from siq.systems.cards import SystemCard, build_system
 from siq.systems.dynamics import Dynamics
@@ -236,7 +236,7 @@ def test_random_forces_are_measured_and_do_not_bias_the_parameters() -> None:
 def test_the_search_for_noise_ends_where_the_likelihood_is_highest() -> None:
     data = oscillations(recordings=6, samples=60, noise=0.03, seed=4, drive=0.02)
     found = fitted(data, estimate_process=True)
-    best = _estimate_noise(found.linearisation, data, found.noise, expected=Expectations.of(found.model))
+    best = _estimate_noise(found.linearisation, data, found.noise, expected=expectations(found.model))
     top = log_likelihood(found.linearisation, data, best)
     for factor in (0.7, 1.4):
         assert log_likelihood(found.linearisation, data, best.scaled(factor)) < top
@@ -250,7 +250,7 @@ def test_of_many_samples_some_tell_the_noise_and_all_correct_it() -> None:
     x = first_states(model, data)
     line, start = linearise(model, Grid(data, 1), model.values, x), first_noise(model, data, x)
     work: list[float] = []
-    expected = Expectations.of(model)
+    expected = expectations(model)
     best = _estimate_noise(line, data, start, expected=expected, charge=work.append)
     rough = _estimate_noise(line, data, start, expected=expected, coarse=True)
     top = log_likelihood(line, data, best)

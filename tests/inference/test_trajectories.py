@@ -10,7 +10,7 @@ import sympy
 
 from siq.inference.kalman_filter import Grid, Noise, integrate_intervals, linearise
 from siq.inference.maximum_likelihood import fit_by_multiple_shooting
-from siq.inference.measurements import Expectations, Measurements, _course_of_input, first_states
+from siq.inference.measurements import Measurements, _course_of_input, expectations, first_states
 from siq.inference.recalibration import fit_with_and_without_process_noise
 from siq.inference.trajectories import (
     _NormalEquations,
@@ -85,7 +85,7 @@ def test_the_normal_equations_are_those_of_differences_of_trajectories() -> None
     left = (data.outputs - states[:, :1])[:, 0] / 0.5
     gram, target = whole.T @ whole, whole.T @ left
     along = linearise(model, Grid(data, 2), model.values, states)
-    found = _NormalEquations(along, data, np.array([0.25]), Expectations.of(model))
+    found = _NormalEquations(along, data, np.array([0.25]), expectations(model))
     size = np.abs(gram).max()
     assert found.shared == pytest.approx(gram[:3, :3], abs=1e-3 * size)
     assert found.own == pytest.approx(np.stack([gram[3:5, 3:5], gram[5:, 5:]]), abs=1e-3 * size)
