@@ -27,7 +27,6 @@ import sympy
 
 from siq.errors import Fault, InputError, NumericalFailure
 from siq.inference.library import CandidateLibrary, IdentificationOptions, field_dynamics, field_library
-from siq.inference.selection import ModelAverage
 from siq.numerics.files import whole_file
 from siq.numerics.integration import runge_kutta_step
 from siq.remarks import Remark, sentence
@@ -387,7 +386,8 @@ class FieldEstimate:
     diffusion
         D, which recordings do not tell apart from ε: of these only the product, `noise_rate`, is identified.
     alternatives
-        What other terms that fit nearly as well make of f. None where nobody asked.
+        What other terms that fit nearly as well make of f: bias ``(q, d)`` and spread ``(r, q, d)``, see
+        `siq.inference.selection.model_average`. None where nobody asked.
     stability
         Shape ``(p,)``: the share of resampled recordings in which each term would be chosen
         (`siq.inference.selection`). None where nobody asked.
@@ -411,7 +411,7 @@ class FieldEstimate:
     residual_ratio: float
     flow: FlowMap
     diffusion: Diffusion
-    alternatives: ModelAverage | None = None
+    alternatives: tuple[np.ndarray, np.ndarray] | None = None
     stability: np.ndarray | None = None
     noise: NoiseFormula | None = None
     constant_noise: NoiseFormula | None = None
@@ -501,7 +501,16 @@ class FieldEstimate:
         """
         if self.alternatives is None:
             return np.zeros(slopes.shape[:-2])
-        return np.asarray(np.einsum("...qd,qd->...", slopes, self.alternatives.bias))
+        return np.asarray(np.einsum("...qd,qd->...", slopes, self.alternatives[0]))
+
+    def drawn_alternatives(self, count: int, *, generator: np.random.Generator) -> np.ndarray:
+        """Changes of f by other terms, beside those of its own coefficients: shape ``(count, q, d)``."""
+        if self.alternatives is None:
+            return np.zeros((count, *self.coefficients.shape))
+        bias, spread = self.alternatives
+        return np.asarray(
+            bias + np.tensordot(generator.standard_normal((count, len(spread))), spread, axes=1)
+        )
 
     def variance(self, slopes: np.ndarray, *, of_mean: bool = False) -> np.ndarray:
         """Variance of what follows from f to first order, by its coefficients and by which terms there are.
@@ -513,7 +522,7 @@ class FieldEstimate:
         own = slopes[..., terms, components]
         total = np.einsum("...p,pr,...r->...", own, self.covariance, own)
         if self.alternatives is not None:
-            changes = np.tensordot(slopes, self.alternatives.spread, axes=([-2, -1], [-2, -1]))
+            changes = np.tensordot(slopes, self.alternatives[1], axes=([-2, -1], [-2, -1]))
             total = total + (changes**2).sum(axis=-1)
             if not of_mean:
                 total = total + self.bias(slopes) ** 2
@@ -619,7 +628,7 @@ def write_field(path: str | Path, estimate: FieldEstimate, options: Identificati
             for (i, k), value, error, share in terms
         ],
         "covariance": estimate.covariance.tolist(),
-        "alternatives": average and {"bias": average.bias.tolist(), "spread": average.spread.tolist()},
+        "alternatives": average and {"bias": average[0].tolist(), "spread": average[1].tolist()},
         "noise_rate": estimate.noise_rate.tolist(),
         "residual_ratio": estimate.residual_ratio,
         "diffusion": estimate.diffusion.rows,
@@ -663,7 +672,7 @@ def read_field(path: str | Path) -> FieldEstimate | None:
             library, support, np.array([float(row["coefficient"]) for row in rows]),
             np.array(data["covariance"]), np.array(data["noise_rate"]), float(data["residual_ratio"]),
             FlowMap(**data["flow"]), Diffusion.of_rows(library.symbols, data["diffusion"]),
-            average and ModelAverage(
+            average and (
                 np.array(average["bias"]).reshape(shape), np.array(average["spread"]).reshape(-1, *shape)
             ),
             None if None in shares else np.array(shares, dtype=float), *formulas,

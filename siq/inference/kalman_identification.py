@@ -32,11 +32,11 @@ from siq.inference.observation import ObservationModel, moved_by, smoothed_motio
 from siq.inference.recalibration import drop_insignificant_process_noise, process_noise_needed
 from siq.inference.selection import (
     LinearProblem,
-    ModelAverage,
     blocks_of,
     chosen_terms,
     critical_values,
     fit_significant,
+    model_average,
     stability,
     triangles,
 )
@@ -156,7 +156,7 @@ def identify_by_likelihood(
     shares = stability(parts, lambda triangle: [problem_of(triangle)], support, generator=generator)
     return replace(
         found,
-        alternatives=ModelAverage.of([problem], support, library),
+        alternatives=model_average([problem], support, library),
         stability=np.concatenate([np.ones(len(observation.definitions)), shares]),
     )
 

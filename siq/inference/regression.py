@@ -38,13 +38,13 @@ from siq.inference.field_estimate import NOISE_FREE, FieldEstimate, FlowMap
 from siq.inference.library import CandidateLibrary, IdentificationOptions
 from siq.inference.selection import (
     LinearProblem,
-    ModelAverage,
     all_coefficients,
     best_support,
     blocks_of,
     chosen_terms,
     critical_values,
     fit_significant,
+    model_average,
     stability,
     strong_terms,
     triangles,
@@ -390,7 +390,7 @@ def identify_vector_field(
 
     # With the final support and flow a term may turn out to be superfluous after all.
     found, support = fit_significant(fit, chosen)
-    return found if noise_free else replace(found, alternatives=ModelAverage.of(problems, support, library))
+    return found if noise_free else replace(found, alternatives=model_average(problems, support, library))
 
 
 def _fit_support(found: FieldEstimate, regression: _PairRegression) -> FieldEstimate:
@@ -538,7 +538,7 @@ def _identify_weighted(found: FieldEstimate, pairs: SnapshotPairs, *, false_term
     kept = problem.places(support)
     start = np.linalg.lstsq(triangle[:, kept], triangle[:, -1], rcond=None)[0]
     found = refit(found.with_values(support, start, covariance=np.eye(len(support))), pairs)
-    return replace(found, alternatives=ModelAverage.of([problem], support, library))
+    return replace(found, alternatives=model_average([problem], support, library))
 
 
 def weighted_triangle(
@@ -618,7 +618,7 @@ def _identify_by_instruments(
         return found, np.abs(found.values) / np.sqrt(np.diag(found.covariance)) / critical[support[:, 1]]
 
     found, support = fit_significant(fit, chosen)
-    return replace(found, alternatives=ModelAverage.of(problems, support, library))
+    return replace(found, alternatives=model_average(problems, support, library))
 
 
 def _fit_by_instruments(

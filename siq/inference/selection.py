@@ -364,41 +364,33 @@ def stability(
     return counts / DRAWS
 
 
-@dataclass(frozen=True)
-class ModelAverage:
+def model_average(
+    problems: Sequence[LinearProblem], support: np.ndarray, library: CandidateLibrary
+) -> tuple[np.ndarray, np.ndarray]:
     """Bias and spread that the mean over supports adds to the f of the chosen one.
 
-    Attributes
+    Parameters
     ----------
-    bias
-        By how much f changes in the mean, shape ``(q, d)``.
-    spread
-        Changes whose outer products add up to the covariance about that mean, less the covariance of the
-        coefficients of the chosen support: shape ``(r, q, d)``.
+    problems
+        Independent of each other.
+    support
+        The chosen one.
+    library
+        The functions.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        By how much f changes in the mean, shape ``(q, d)``; and changes whose outer products add up to the
+        covariance about that mean, less that of the coefficients of the chosen support: ``(r, q, d)``.
     """
-
-    bias: np.ndarray
-    spread: np.ndarray
-
-    @classmethod
-    def of(
-        cls, problems: Sequence[LinearProblem], support: np.ndarray, library: CandidateLibrary
-    ) -> ModelAverage:
-        """The mean over supports of problems that are independent of each other, about a chosen support."""
-        bias, spread = np.zeros((library.size, library.dimension)), []
-        for problem in problems:
-            i, k = problem.labels.T
-            bias[k, i], changes = _mean_over_supports(
-                problem, problem.places(support), further=1 / len(problems)
-            )
-            spread.append(np.zeros((len(changes), *bias.shape)))
-            spread[-1][:, k, i] = changes
-        return cls(bias, np.concatenate(spread))
-
-    def drawn(self, count: int, *, generator: np.random.Generator) -> np.ndarray:
-        """Changes of f beside those of its own coefficients, shape ``(count, q, d)``."""
-        draws = generator.standard_normal((count, len(self.spread)))
-        return np.asarray(self.bias + np.tensordot(draws, self.spread, axes=1))
+    bias, spread = np.zeros((library.size, library.dimension)), []
+    for problem in problems:
+        i, k = problem.labels.T
+        bias[k, i], changes = _mean_over_supports(problem, problem.places(support), further=1 / len(problems))
+        spread.append(np.zeros((len(changes), *bias.shape)))
+        spread[-1][:, k, i] = changes
+    return bias, np.concatenate(spread)
 
 
 def _prices(critical: np.ndarray, *, further: float) -> np.ndarray:

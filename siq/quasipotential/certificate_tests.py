@@ -463,8 +463,7 @@ def _lost_shares(
     changes = np.zeros((EXISTENCE_DRAWS, library.size, library.dimension))
     own = normal_draws(np.zeros(len(found.support)), found.covariance, EXISTENCE_DRAWS, generator=generator)
     changes[:, found.support[:, 1], found.support[:, 0]] = own
-    if found.alternatives is not None:
-        changes += found.alternatives.drawn(EXISTENCE_DRAWS, generator=generator)
+    changes += found.drawn_alternatives(EXISTENCE_DRAWS, generator=generator)
     followed = [_followed(found, one, changes, width) for one in equilibria]
     places = np.array([place for place, _ in followed])
     lost = np.array([gone for _, gone in followed])

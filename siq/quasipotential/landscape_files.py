@@ -23,7 +23,7 @@ from siq.quasipotential.hamilton_jacobi import PowerBasis
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.occupancy import VisitTest
 from siq.quasipotential.path_chains import MinimumActionPath
-from siq.quasipotential.rates import EnergyLossPerCycle, EscapeRate, NoiseStrength
+from siq.quasipotential.rates import EscapeRate, NoiseStrength
 from siq.quasipotential.transitions import Transition
 from siq.quasipotential.wells import Well
 from siq.remarks import Remark
@@ -98,7 +98,9 @@ def _transition_data(one: Transition) -> dict[str, Any]:
         "by_rivals": _number(one.by_rivals),
         "minimum_action": None if path is None else path.action,
         "prefactor": None if rate is None else rate.prefactor,
-        "turn": None if rate is None or rate.turn is None else asdict(rate.turn),
+        "turn": None
+        if rate is None or rate.loss is None
+        else {"own": rate.loss, "beyond": rate.loss_beyond, "exact": rate.particle},
         "prefactor_error": None if rate is None else rate.prefactor_error,
         "prefactor_covariance": 0.0 if rate is None else rate.covariance,
         "noise_leverage": one.leverage,
@@ -230,7 +232,7 @@ def _transition_from_data(
         rate = EscapeRate(
             one["minimum_action"], one["prefactor"], one["exponent"],
             tuple(map(Remark.from_data, one["law_remarks"])),
-            EnergyLossPerCycle(**one["turn"]) if one["turn"] else None,
+            *(one["turn"][name] for name in ("own", "beyond", "exact") if one["turn"]),
             prefactor_error=one["prefactor_error"], covariance=one["prefactor_covariance"],
         )  # fmt: skip
     return Transition(

@@ -23,7 +23,7 @@ visited last (the solution of the time-reversed ``L̃ q = 0`` with q = 1 in this
 
 exactly, for any barrier (Vanden-Eijnden, *Transition path theory*, Lect. Notes Phys. 703 (2006) 453). In more
 than two states it is predicted by the law of Eyring and Kramers. A record knows only what it saw at its
-samples, and so the cores of the prediction are smaller by what a walk oversteps (`_Cores.as_sampled`).
+samples, and so the cores of the prediction are smaller by what a walk oversteps (`_as_sampled`).
 
 **Which error.** The same is computed for draws of f and ε from their distributions, with the cores where they
 are. n visits that ended in a time T were as likely as Poisson's law with the mean T/τ says, where τ is
@@ -239,49 +239,44 @@ def _invariant_density(rates: sparse.csr_matrix) -> np.ndarray:
     return np.asarray(found / found.sum())
 
 
-@dataclass(frozen=True, eq=False)
-class _Cores:
-    """The cores of wells: where ``(x - A)ᵀ M (x - A)``, U to the second order, is below a level."""
+_Cores = list[tuple[np.ndarray, np.ndarray, float]]
+"""A, M and a level for each well: its core is where ``(x - A)ᵀ M (x - A)``, about U, is below the level."""
 
-    attractors: np.ndarray
-    hessians: np.ndarray
-    levels: np.ndarray
 
-    def as_sampled(self, dynamics: Dynamics, intensity: float, step: float) -> _Cores:
-        """Cores that a state meets all the time as often as it is seen in these at samples a step apart."""
-        # A random walk meets a boundary as Brownian motion meets one that lies OVERSHOOT standard deviations
-        # of a step farther on (Chernoff; Siegmund, Sequential Analysis, 1985), √(ε h tr(MD)/d) in the metric.
-        levels = []
-        for place, hessian, level in zip(self.attractors, self.hessians, self.levels, strict=True):
-            spread = np.trace(hessian @ dynamics.diffusion.at(place[None])[0]) / len(place)
-            radius = np.sqrt(level) - OVERSHOOT * np.sqrt(intensity * step * max(float(spread), 0.0))
-            levels.append(max(radius, SMALLEST_CORE * np.sqrt(level)) ** 2)
-        return replace(self, levels=np.array(levels))
+def _as_sampled(cores: _Cores, dynamics: Dynamics, intensity: float, step: float) -> _Cores:
+    """Cores that a state meets all the time as often as it is seen in these at samples a step apart."""
+    # A random walk meets a boundary as Brownian motion meets one that lies OVERSHOOT standard deviations
+    # of a step farther on (Chernoff; Siegmund, Sequential Analysis, 1985), √(ε h tr(MD)/d) in the metric.
+    found = []
+    for place, hessian, level in cores:
+        spread = np.trace(hessian @ dynamics.diffusion.at(place[None])[0]) / len(place)
+        radius = np.sqrt(level) - OVERSHOOT * np.sqrt(intensity * step * max(float(spread), 0.0))
+        found.append((place, hessian, max(radius, SMALLEST_CORE * np.sqrt(level)) ** 2))
+    return found
 
-    def of(self, points: np.ndarray) -> np.ndarray:
-        """The core of each point ``(n, d)``, -1 between them: shape ``(n,)``."""
-        found, lowest = np.full(len(points), -1), np.full(len(points), np.inf)
-        cores = zip(self.attractors, self.hessians, self.levels, strict=True)
-        for place, (attractor, hessian, level) in enumerate(cores):
-            away = points - attractor
-            height = np.einsum("ni,ij,nj->n", away, hessian, away)
-            inside = (height <= level) & (height / level < lowest)
-            found[inside], lowest[inside] = place, (height / level)[inside]
-        return found
+
+def _core_of(cores: _Cores, points: np.ndarray) -> np.ndarray:
+    """The core of each point ``(n, d)``, -1 between them: shape ``(n,)``."""
+    found, lowest = np.full(len(points), -1), np.full(len(points), np.inf)
+    for place, (attractor, hessian, level) in enumerate(cores):
+        away = points - attractor
+        height = np.einsum("ni,ij,nj->n", away, hessian, away)
+        inside = (height <= level) & (height / level < lowest)
+        found[inside], lowest[inside] = place, (height / level)[inside]
+    return found
 
 
 def _cores_about(dynamics: Dynamics, portrait: PhasePortrait, intensity: float) -> _Cores:
     """The core of each attractor: U below ε, or below half of what it is at the next saddle or attractor."""
     attractors = np.array([one.position for one in portrait.attractors])
-    hessians, levels = [], []
+    cores = []
     for place, attractor in enumerate(attractors):
         hessian = hessian_at(dynamics, attractor)
         others = [*np.delete(attractors, place, axis=0), *(one.position for one in portrait.saddles[place])]
         away = np.array(others) - attractor
         lowest = float(np.einsum("ni,ij,nj->n", away, hessian, away).min())
-        hessians.append(hessian)
-        levels.append(min(intensity, CORE_SHARE * lowest))
-    return _Cores(attractors, np.array(hessians), np.array(levels))
+        cores.append((attractor, hessian, min(intensity, CORE_SHARE * lowest)))
+    return cores
 
 
 def _predicted_visits(
@@ -311,7 +306,7 @@ def _predicted_visits(
         means, errors = processes[0].means, np.log([one.means for one in processes[1:]]).std(axis=0, ddof=1)
         known = np.flatnonzero(np.isfinite(means) & np.isfinite(errors))
         return [(int(well), float(means[well]), float(errors[well])) for well in known], processes, []
-    ways = transitions(found, ways_out(dynamics, portrait), [None] * len(cores.attractors))
+    ways = transitions(found, ways_out(dynamics, portrait), [None] * len(cores))
     times, missing = [], []
     for well, one in enumerate(portrait.attractors):
         mean_time = mean_residence_time([way.exit for way in ways if way.start == well], noise)
@@ -329,8 +324,7 @@ def _drawn_system(found: FieldEstimate, *, generator: np.random.Generator) -> Dy
     coefficients = np.zeros_like(found.coefficients)
     own = normal_draws(found.values, found.covariance, 1, generator=generator)[0]
     coefficients[found.support[:, 1], found.support[:, 0]] = own
-    if found.alternatives is not None:
-        coefficients += found.alternatives.drawn(1, generator=generator)[0]
+    coefficients += found.drawn_alternatives(1, generator=generator)[0]
     support = np.argwhere(coefficients.T != 0)
     diffusion = found.diffusion
     if found.noise is not None:
@@ -348,7 +342,7 @@ class _CellVisits:
         self, dynamics: Dynamics, intensity: float, box: np.ndarray, cores: _Cores, cells: int
     ) -> None:
         self.process = _CellProcess(dynamics, intensity, box, cells=cells)
-        core, wells = cores.of(self.process.points), range(len(cores.attractors))
+        core, wells = _core_of(cores, self.process.points), range(len(cores))
         if len(np.unique(core[core >= 0])) < len(wells):
             raise NumericalFailure("the core of a well is smaller than a cell of the grid")
         self.last = [self.process.last_visited(core, well) for well in wells]
@@ -510,14 +504,14 @@ def check_occupancy(
         )
     cores = _cores_about(found.dynamics, portrait, noise.intensity)
     runs = runs_of(recordings)
-    visits = continued_visits(cores.of(recordings.values), runs_of(joined(recordings)))
+    visits = continued_visits(_core_of(cores, recordings.values), runs_of(joined(recordings)))
     apart = [run for run in runs if held_out[recordings.recording[run.start]]]
     states = len(portrait.attractors)
     whole = DwellCount.of_visits(recordings.t, visits, runs_of(joined(recordings)), states=states)
     held = DwellCount.of_visits(recordings.t, visits, apart, states=states)
     if found.dynamics.dimension not in CELLS and not any(one.visits for one in whole):
         return OccupancyCheck(missing="the recordings do not hop")
-    sampled = cores.as_sampled(found.dynamics, noise.intensity, usual_step(recordings))
+    sampled = _as_sampled(cores, found.dynamics, noise.intensity, usual_step(recordings))
     times, processes, notes = _predicted_visits(found, portrait, noise, sampled, seed=seed)
     method = "operator" if processes else "law"
     tested = tuple(

@@ -92,43 +92,6 @@ NEWTON_TOLERANCE = 1e-9  # of the distance from attractor to saddle
 EQUILIBRIUM_REACH = 0.5  # of that distance: an equilibrium that moves by more is another one
 
 
-@dataclass(frozen=True)
-class EnergyLossPerCycle:
-    """What one cycle at the height of the saddle loses of U by friction.
-
-    Attributes
-    ----------
-    own
-        In the well that is left.
-    beyond
-        In the well beyond the saddle; None where there is none, or it is not known.
-    exact
-        Whether the system is a damped particle in one dimension, so that the rate is known for any noise.
-    """
-
-    own: float
-    beyond: float | None = None
-    exact: bool = False
-
-    def factor(self, intensity: float) -> float:
-        """By which factor the rate of escape is lower than by the law; NaN where that is not known.
-
-        Examples
-        --------
-        >>> round(EnergyLossPerCycle(1.0, exact=True).factor(0.01), 3)
-        1.0
-        >>> round(EnergyLossPerCycle(1.0, 1.0, exact=True).factor(1.0), 3)
-        0.306
-        """
-        own = _depopulation_factor(self.own / intensity)
-        if not self.exact:
-            return 1.0 if own >= LEAST_DEPOPULATION else np.nan
-        if self.beyond is None:
-            return own
-        both = _depopulation_factor((self.own + self.beyond) / intensity)
-        return own * _depopulation_factor(self.beyond / intensity) / both
-
-
 def _depopulation_factor(loss: float) -> float:
     """Υ of Mel'nikov and Meshkov for a loss in units of ε: the loss itself, where it is small, up to 1."""
 
@@ -140,27 +103,25 @@ def _depopulation_factor(loss: float) -> float:
 
 def _energy_loss_per_cycle(
     dynamics: Dynamics, path: MinimumActionPath, *, beyond: bool
-) -> EnergyLossPerCycle | None:
-    """The loss of U in one cycle, None where nothing turns, or noise acts on every state.
+) -> tuple[float | None, float | None, bool]:
+    """The losses of U in one cycle, as `EscapeRate` has them; nothing turns where noise acts on every state.
 
     `beyond` says whether beyond the saddle lies a well, from which states may come back.
     """
     if dynamics.diffusion.regular:
-        return None
+        return None, None, False
     loss = _particle_loss(dynamics)
     if loss is not None:
         saddle, attractor = path.points[-1], path.points[0]
-        return EnergyLossPerCycle(
-            loss(saddle, attractor), loss(saddle, 2 * saddle - attractor) if beyond else None, exact=True
-        )
+        return loss(saddle, attractor), loss(saddle, 2 * saddle - attractor) if beyond else None, True
     away = np.linalg.norm((path.points - path.points[-1]) / np.ptp(path.points, axis=0), axis=1)[::-1]
     back = np.flatnonzero((away < RETURN_DISTANCE * np.maximum.accumulate(away)) & (np.arange(len(away)) > 0))
     if not len(back):
-        return None
+        return None, None, False
     nearest = int(back[0])
     while nearest + 1 < len(away) and away[nearest + 1] < away[nearest]:
         nearest += 1
-    return EnergyLossPerCycle(float(path.action - path.values[::-1][nearest]))
+    return float(path.action - path.values[::-1][nearest]), None, False
 
 
 def _particle_loss(dynamics: Dynamics) -> Callable[[np.ndarray, np.ndarray], float] | None:
@@ -230,8 +191,12 @@ class EscapeRate:
         ``∫ c dt`` along the path; zero if D is constant and g has no divergence there.
     remarks
         What speaks against the law here without refuting it.
-    turn
-        What one cycle about the well loses of U, where noise acts on some states only and they turn.
+    loss, loss_beyond
+        What one cycle at the height of the saddle loses of U by friction, in the well that is left, where
+        noise acts on some states only and they turn; and in the well beyond, where there is one. None where
+        not known.
+    particle
+        Whether the system is a damped particle in one dimension, so that the rate is known for any noise.
     standard_error
         Of ΔU.
     prefactor_error, covariance
@@ -244,11 +209,33 @@ class EscapeRate:
     prefactor: float
     exponent: float = 0.0
     remarks: tuple[Remark, ...] = ()
-    turn: EnergyLossPerCycle | None = None
+    loss: float | None = None
+    loss_beyond: float | None = None
+    particle: bool = False
     standard_error: float = 0.0
     prefactor_error: float | None = None
     covariance: float = 0.0
     leverage: float = 1.0
+
+    def slowing(self, intensity: float) -> float:
+        """By which factor weak damping makes escape rarer than by the law; NaN where that is not known.
+
+        Examples
+        --------
+        >>> round(EscapeRate(2.0, 4.0, loss=1.0, particle=True).slowing(0.01), 3)
+        1.0
+        >>> round(EscapeRate(2.0, 4.0, loss=1.0, loss_beyond=1.0, particle=True).slowing(1.0), 3)
+        0.306
+        """
+        if self.loss is None:
+            return 1.0
+        own = _depopulation_factor(self.loss / intensity)
+        if not self.particle:
+            return 1.0 if own >= LEAST_DEPOPULATION else np.nan
+        if self.loss_beyond is None:
+            return own
+        both = _depopulation_factor((self.loss + self.loss_beyond) / intensity)
+        return own * _depopulation_factor(self.loss_beyond / intensity) / both
 
     def mean_time(self, intensity: float) -> float:
         """E[τ] for the noise intensity ε, with a relative error of O(ε/ΔU).
@@ -267,12 +254,11 @@ class EscapeRate:
                 f" {intensity:.4g}"
             )
         with np.errstate(over="ignore"):
-            slower = 1.0 if self.turn is None else self.turn.factor(intensity)
+            slower = self.slowing(intensity)
             time = float(self.prefactor * np.exp(self.barrier / intensity) / slower)
         if not np.isfinite(slower):
-            assert self.turn is not None
             raise NumericalFailure(
-                f"damping is too weak for the escape law: in one turn U = {self.turn.own:.3g} is lost, and"
+                f"damping is too weak for the escape law: in one turn U = {self.loss:.3g} is lost, and"
                 f" ε = {intensity:.4g} is not far below; simulate, or give a smaller ε"
             )
         return time
@@ -364,12 +350,12 @@ def escape_rate(
     at_saddle = frame.continued(curvatures) if frame.at_saddle is None else frame.at_saddle
     ratio = abs(np.linalg.det(at_saddle)) / np.linalg.det(frame.at_attractor)
     prefactor = 2 * np.pi / (frame.unstable * frame.problem.rate) * np.sqrt(ratio) * np.exp(exponent)
-    turn = _energy_loss_per_cycle(dynamics, path, beyond=beyond)
-    if turn is not None and not turn.exact:
-        remarks.append(Remark("quasipotential.law_limited_by_turning", {"loss": turn.own}))
-    elif turn is not None and turn.own < path.action:
-        remarks.append(Remark("quasipotential.law_of_weak_damping", {"loss": turn.own}))
-    return EscapeRate(path.action, float(prefactor), exponent, tuple(remarks), turn)
+    loss, loss_beyond, particle = _energy_loss_per_cycle(dynamics, path, beyond=beyond)
+    if loss is not None and not particle:
+        remarks.append(Remark("quasipotential.law_limited_by_turning", {"loss": loss}))
+    elif loss is not None and loss < path.action:
+        remarks.append(Remark("quasipotential.law_of_weak_damping", {"loss": loss}))
+    return EscapeRate(path.action, float(prefactor), exponent, tuple(remarks), loss, loss_beyond, particle)
 
 
 class _Frame:

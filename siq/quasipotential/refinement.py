@@ -31,7 +31,6 @@ from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.inference.kalman_identification import filtered_recordings
 from siq.inference.library import CandidateLibrary, joint_library
 from siq.inference.regression import coarse_pairs
-from siq.inference.selection import ModelAverage
 from siq.networks.decomposition import CheckOptions, TrainedNetworks, shuffled
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.certificate import (
@@ -267,10 +266,9 @@ def _over_library(found: FieldEstimate, library: CandidateLibrary) -> FieldEstim
     average = found.alternatives
     if average is not None:
         places = [position[term] for term in found.library.terms]
-        mean = np.zeros_like(coefficients)
-        spread = np.zeros((len(average.spread), *coefficients.shape))
-        mean[places], spread[:, places] = average.bias, average.spread
-        average = ModelAverage(mean, spread)
+        bias, spread = np.zeros_like(coefficients), np.zeros((len(average[1]), *coefficients.shape))
+        bias[places], spread[:, places] = average
+        average = bias, spread
     return replace(found, library=library, coefficients=coefficients, support=support, alternatives=average)
 
 

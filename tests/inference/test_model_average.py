@@ -1,19 +1,22 @@
 from __future__ import annotations
 
 import itertools
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from siq.inference.field_estimate import FieldEstimate
 from siq.inference.library import candidate_library
 from siq.inference.selection import (
     LinearProblem,
-    ModelAverage,
     _improved_support,
     _mean_over_supports,
     _prices,
     all_coefficients,
     critical_values,
+    model_average,
     strong_terms,
 )
 
@@ -99,6 +102,11 @@ def test_barriers_hold_the_truth_however_strong_a_term_is(strength: float) -> No
     assert np.mean(together) > 0.94 or np.mean(together) > np.mean(alone) + 0.1
 
 
+def drawn(average: tuple[np.ndarray, np.ndarray], count: int) -> np.ndarray:
+    found: Any = SimpleNamespace(alternatives=average)
+    return FieldEstimate.drawn_alternatives(found, count, generator=np.random.default_rng(0))
+
+
 def test_one_problem_of_two_equations_is_the_same_as_both() -> None:
     draw = np.random.default_rng(2)
     truth = np.array([0.0, 9.0, 0.0, -9.0, 0.0, 0.0])
@@ -110,16 +118,15 @@ def test_one_problem_of_two_equations_is_the_same_as_both() -> None:
     )  # fmt: skip
     support = np.array([(0, 1), (0, 3), (1, 1), (1, 3)])
     planar = candidate_library(["x", "y"], degree=2)  # six functions, too
-    apart, joint = (ModelAverage.of(these, support, planar) for these in (ones, [together]))
+    apart, joint = (model_average(these, support, planar) for these in (ones, [together]))
     scale = np.linalg.norm(ones[0].columns, axis=0)[:, None]
     # What is cut off as unlikely is not quite the same.
-    assert joint.bias * scale == pytest.approx(apart.bias * scale, abs=0.15)
-    draws = [one.drawn(4000, generator=np.random.default_rng(0)) * scale for one in (apart, joint)]
+    assert joint[0] * scale == pytest.approx(apart[0] * scale, abs=0.15)
+    draws = [drawn(one, 4000) * scale for one in (apart, joint)]
     assert draws[0].std(axis=0) == pytest.approx(draws[1].std(axis=0), rel=0.3)
 
 
 def test_draws_have_the_mean_and_the_spread() -> None:
-    rivals = ModelAverage(np.full((6, 1), 2.0), np.eye(6)[:, :, None])
-    draws = rivals.drawn(20_000, generator=np.random.default_rng(0))
+    draws = drawn((np.full((6, 1), 2.0), np.eye(6)[:, :, None]), 20_000)
     assert draws.mean(axis=0) == pytest.approx(np.full((6, 1), 2.0), abs=0.05)
     assert draws.std(axis=0) == pytest.approx(np.ones((6, 1)), rel=0.05)

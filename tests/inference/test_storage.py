@@ -20,7 +20,6 @@ from siq.inference.field_estimate import (
     write_field,
 )
 from siq.inference.library import IdentificationOptions, field_library
-from siq.inference.selection import ModelAverage
 from siq.remarks import Remark
 from siq.systems.diffusion import Diffusion
 
@@ -39,7 +38,7 @@ def record() -> FieldEstimate:
     return FieldEstimate(
         library, coefficients, support, factor @ factor.T, np.diag([0.1, 1 / 3]), 1e-7 / 3,
         FlowMap(steps=3, euler=True), Diffusion(np.array([[2.0, 0.3], [0.3, 1 / 3]])),
-        ModelAverage(draw.normal(size=coefficients.shape), draw.normal(size=(3, *coefficients.shape))),
+        (draw.normal(size=coefficients.shape), draw.normal(size=(3, *coefficients.shape))),
         draw.uniform(size=4), formula,
         diagnosis=NoiseDiagnosis(
             "measurement", 0.1, np.eye(2), 1 / 3, -7.0, np.array([0.1, 0.0]), np.array([0.01, 0.0]), pairs=7,
@@ -71,8 +70,9 @@ def test_a_field_comes_back_to_the_last_bit(written: Path) -> None:
     assert copy.diagnosis is not None and original.diagnosis is not None
     assert copy.diagnosis.as_data() == original.diagnosis.as_data()
     assert copy.noise is not None and original.noise is not None and copy.alternatives is not None
+    assert original.alternatives is not None
     assert copy.noise.as_data() == original.noise.as_data()
-    np.testing.assert_array_equal(copy.alternatives.spread, original.alternatives.spread)
+    np.testing.assert_array_equal(copy.alternatives[1], original.alternatives[1])
     np.testing.assert_array_equal(copy.stability, original.stability)
     x = np.random.default_rng(1).normal(size=(5, 2))
     np.testing.assert_array_equal(copy.dynamics.drift(x), original.dynamics.drift(x))

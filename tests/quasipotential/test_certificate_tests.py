@@ -25,7 +25,6 @@ from scipy.special import ndtr
 
 from siq.data.recordings import SnapshotPairs
 from siq.inference.field_estimate import FieldEstimate, Verdict
-from siq.inference.selection import ModelAverage
 from siq.quasipotential.certificate import Certificate, _follow_well
 from siq.quasipotential.certificate_tests import (
     LEVEL_SHARE,
@@ -273,7 +272,7 @@ def test_rivals_of_the_terms_count() -> None:
     doubt = np.zeros((1, found.library.size, 2))
     doubt[0, list(found.library.terms).index(X), 0] = 0.2
     shares = _lost_shares(
-        replace(found, alternatives=ModelAverage(0 * doubt[0], doubt)), portrait.attractors, box=portrait.box
+        replace(found, alternatives=(0 * doubt[0], doubt)), portrait.attractors, box=portrait.box
     )
     assert shares == pytest.approx(np.full(2, ndtr(-1.0)), abs=CHANCE / 2)
 

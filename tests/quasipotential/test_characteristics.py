@@ -23,7 +23,6 @@ from scipy.integrate import solve_ivp
 
 from siq.inference.diffusion_model import constant_noise
 from siq.inference.field_estimate import FieldEstimate, NoiseFormula
-from siq.inference.selection import ModelAverage
 from siq.quasipotential.characteristics import (
     End,
     Fan,
@@ -346,14 +345,10 @@ def test_what_rivals_would_change_adds_to_the_error() -> None:
     doubt = np.zeros((1, found.library.size, 2))
     doubt[0, list(found.library.names).index("x"), 0] = 0.1
     plain = potential_errors(found, gradient, STABLE, POINTS)
-    doubted = potential_errors(
-        replace(found, alternatives=ModelAverage(0 * doubt[0], doubt)), gradient, STABLE, POINTS
-    )
+    doubted = potential_errors(replace(found, alternatives=(0 * doubt[0], doubt)), gradient, STABLE, POINTS)
     expected = np.hypot(plain, 0.1 * np.abs(POINTS[:, 0] ** 2 - 1) / 2)
     assert doubted == pytest.approx(expected, rel=0.03, abs=1e-5)
-    moved = potential_errors(
-        replace(found, alternatives=ModelAverage(doubt[0], 0 * doubt)), gradient, STABLE, POINTS
-    )
+    moved = potential_errors(replace(found, alternatives=(doubt[0], 0 * doubt)), gradient, STABLE, POINTS)
     assert moved == pytest.approx(expected, rel=0.03, abs=1e-5)
 
 

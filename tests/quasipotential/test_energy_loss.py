@@ -7,7 +7,6 @@ import sympy
 from siq.errors import NumericalFailure
 from siq.quasipotential.paths import minimum_action_path
 from siq.quasipotential.rates import (
-    EnergyLossPerCycle,
     EscapeRate,
     NoiseStrength,
     _depopulation_factor,
@@ -20,12 +19,16 @@ from siq.validation.escapes import Neighbourhood, simulate_escapes
 X, V, Y, W = sympy.symbols("x v y w", real=True)
 
 
+def particle_rate(loss: float) -> EscapeRate:
+    return EscapeRate(2.0, 4.0, loss=loss, loss_beyond=loss, particle=True)
+
+
 def test_strong_losses_leave_the_law_as_it_is_and_weak_ones_limit_the_rate() -> None:
     assert _depopulation_factor(100.0) == pytest.approx(1, abs=1e-9)
     assert _depopulation_factor(1e-4) == pytest.approx(1e-4, rel=0.01)  # the rate of energy diffusion
-    assert EnergyLossPerCycle(100.0, 100.0, exact=True).factor(1.0) == pytest.approx(1, abs=1e-9)
+    assert particle_rate(100.0).slowing(1.0) == pytest.approx(1, abs=1e-9)
     # Of two wells half of what crosses comes back.
-    assert EnergyLossPerCycle(1e-4, 1e-4, exact=True).factor(1.0) == pytest.approx(0.5e-4, rel=0.01)
+    assert particle_rate(1e-4).slowing(1.0) == pytest.approx(0.5e-4, rel=0.01)
 
 
 @pytest.mark.parametrize("speed", [1.0, 3.0])
@@ -36,9 +39,9 @@ def test_the_loss_of_a_cubic_well_is_exact(speed: float) -> None:
         (X, V), (speed * V, -friction * V - (X - X**2) / speed), diffusion=np.diag([0.0, noise])
     )
     path = minimum_action_path(system, np.zeros(2), np.array([1.0, 0.0]))
-    loss = _energy_loss_per_cycle(system, path, beyond=False)
-    assert loss is not None and loss.exact and loss.beyond is None
-    assert loss.own == pytest.approx(2 * friction**2 / noise * 1.2 / speed**2, rel=1e-4)
+    loss, beyond, exact = _energy_loss_per_cycle(system, path, beyond=False)
+    assert exact and beyond is None
+    assert loss == pytest.approx(2 * friction**2 / noise * 1.2 / speed**2, rel=1e-4)
 
 
 def test_two_weakly_damped_particles_have_a_time_only_where_it_is_known() -> None:
@@ -47,11 +50,11 @@ def test_two_weakly_damped_particles_have_a_time_only_where_it_is_known() -> Non
     start = np.array([np.sqrt(2 / 3), np.sqrt(2 / 3) / 3, 0.0, 0.0])
     path = minimum_action_path(system, start, np.zeros(4))
     rate = escape_rate(system, path)
-    assert rate.turn is not None and not rate.turn.exact and 0 < rate.turn.own < path.action
+    assert rate.loss is not None and not rate.particle and 0 < rate.loss < path.action
     with pytest.raises(NumericalFailure, match="damping is too weak"):
         rate.mean_time(path.action / 2)
-    assert np.isfinite(rate.mean_time(rate.turn.own / 20))
-    way = EscapeRate(path.action, rate.prefactor, turn=rate.turn)
+    assert np.isfinite(rate.mean_time(rate.loss / 20))
+    way = EscapeRate(path.action, rate.prefactor, loss=rate.loss)
     assert way.mean_exit_time(NoiseStrength(path.action / 2)) is None
 
 

@@ -11,7 +11,7 @@ from siq.data.recordings import Recordings
 from siq.data.stationarity import runs_of
 from siq.data.two_states import DwellCount, continued_visits
 from siq.errors import NumericalFailure
-from siq.quasipotential.occupancy import _CellProcess, _Cores
+from siq.quasipotential.occupancy import _CellProcess, _core_of
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 
@@ -25,7 +25,7 @@ HALF = 0.1  # width of a core
 
 
 def cores(points: np.ndarray) -> np.ndarray:
-    return _Cores(WELLS[:, None], np.ones((2, 1, 1)), np.full(2, HALF**2)).of(points)
+    return _core_of([(well, np.eye(1), HALF**2) for well in WELLS[:, None]], points)
 
 
 @pytest.mark.parametrize("intensity", [0.05, 0.15, 0.4])
@@ -83,13 +83,12 @@ def test_two_states_against_a_simulation() -> None:
         seen[k] = state
         kick = np.sqrt(intensity * step) * generator.standard_normal(state.shape)
         state = state + step * system.drift(state) + kick
-    attractors, hessians = np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([2 * np.eye(2)] * 2)
-    levels = np.full(2, 0.4)
+    about = [(well, 2 * np.eye(2), 0.4) for well in np.array([[-1.0, 0.0], [1.0, 0.0]])]
     recordings = Recordings.from_arrays(step * np.arange(steps), seen.transpose(1, 0, 2), names=["x", "y"])
-    visits = continued_visits(_Cores(attractors, hessians, levels).of(recordings.values), runs_of(recordings))
+    visits = continued_visits(_core_of(about, recordings.values), runs_of(recordings))
     counts = DwellCount.of_visits(recordings.t, visits, runs_of(recordings))
     process = _CellProcess(system, intensity, np.array([[-2.4, 2.4], [-2.2, 2.2]]), cells=100)
-    core = _Cores(attractors, hessians, levels).of(process.points)
+    core = _core_of(about, process.points)
     for well, count in enumerate(counts):
         error = np.hypot(count.relative_error, 0.03)  # of the simulation's own step, and of the cells
         assert process.mean_visit(core, well) == pytest.approx(count.mean, rel=3 * error)

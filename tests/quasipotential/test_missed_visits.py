@@ -10,7 +10,7 @@ from siq.data.recordings import Recordings
 from siq.data.two_states import SIGNIFICANCE, DwellCount, continued_visits
 from siq.inference.field_estimate import FieldEstimate, FlowMap
 from siq.inference.library import IdentificationOptions, field_library
-from siq.quasipotential.occupancy import _CellProcess, _cores_about, check_occupancy
+from siq.quasipotential.occupancy import _as_sampled, _CellProcess, _core_of, _cores_about, check_occupancy
 from siq.quasipotential.rates import NoiseStrength
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -56,13 +56,13 @@ def test_visits_are_foreseen_as_samples_show_them(intensity: float, step: float)
     cores = _cores_about(dynamics, portrait, intensity)
     values = record(intensity, step, 800, recordings=400, substeps=10)
     runs = [slice(start, start + 800) for start in range(0, values.size, 800)]
-    visits = continued_visits(cores.of(values.reshape(-1, 1)), runs)
+    visits = continued_visits(_core_of(cores, values.reshape(-1, 1)), runs)
     counts = DwellCount.of_visits(np.tile(step * np.arange(800), 400), visits, runs)
     counted = sum(one.time for one in counts) / sum(one.visits for one in counts)
     process = _CellProcess(dynamics, intensity, np.array([[-3.5, 3.5]]))
     always, sampled = (
-        process.mean_visit(one.of(process.points), 0)
-        for one in (cores, cores.as_sampled(dynamics, intensity, step))
+        process.mean_visit(_core_of(one, process.points), 0)
+        for one in (cores, _as_sampled(cores, dynamics, intensity, step))
     )
     assert sampled == pytest.approx(counted, rel=0.04)
     assert counted > 1.1 * always  # samples miss visits
