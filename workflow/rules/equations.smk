@@ -6,7 +6,7 @@ ruleorder: equations_page > page
 ruleorder: equations_invariant > invariant
 
 
-rule equations:
+use rule run_task as equations with:
     input:
         card=card_if_any,
     output:
@@ -21,14 +21,10 @@ rule equations:
         "results/{study}/benchmarks/equations.tsv"
     wildcard_constraints:
         study=STUDIES.pattern_of("equations"),
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("equations"),
     message:
         "{wildcards.study}: finding the landscape of the equations"
-    script:
-        "../scripts/run_task.py"
 
 
 use rule invariant as equations_invariant with:
@@ -61,7 +57,7 @@ use rule page as equations_page with:
         captions=CAPTIONS,  # of Snakemake's own report
 
 
-rule sweep_point:
+use rule run_task as sweep_point with:
     input:
         card=card_if_any,
     output:
@@ -73,17 +69,13 @@ rule sweep_point:
     wildcard_constraints:
         study=STUDIES.pattern_of("equations"),
         point=r"\w+=[-+.e\d]+(,\w+=[-+.e\d]+)?",
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("sweep_point"),
     message:
         "{wildcards.study}: the landscape at {wildcards.point}"
-    script:
-        "../scripts/run_task.py"
 
 
-rule sweep:
+use rule run_task as sweep with:
     input:
         card=card_if_any,
         points=points_of_sweep,
@@ -99,11 +91,7 @@ rule sweep:
         "results/{study}/benchmarks/sweep.tsv"
     wildcard_constraints:
         study=STUDIES.pattern_of("equations"),
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("sweep"),
     message:
         "{wildcards.study}: branches, barriers and times against the parameter"
-    script:
-        "../scripts/run_task.py"

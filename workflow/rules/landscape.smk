@@ -1,7 +1,7 @@
 # The landscape of every run: equilibria, a formula for each well, barriers, paths; and what it is held against.
 
 
-rule landscape:
+use rule run_task as landscape with:
     input:
         recordings="results/{study}/runs/{run}/recordings.parquet",
         field="results/{study}/runs/{run}/vector_field.json",
@@ -15,17 +15,13 @@ rule landscape:
         "results/{study}/logs/{run}/landscape.log",
     benchmark:
         "results/{study}/benchmarks/{run}/landscape.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("landscape"),
     message:
         "{wildcards.study}, run {wildcards.run}: finding the landscape"
-    script:
-        "../scripts/run_task.py"
 
 
-rule overview:
+use rule run_task as overview with:
     # The landscape of the run that is shown; where the study asks for none, it is found for this run alone.
     input:
         rrmse="results/{study}/tables/rrmse.parquet",
@@ -39,17 +35,13 @@ rule overview:
         "results/{study}/logs/overview.log",
     benchmark:
         "results/{study}/benchmarks/overview.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("overview"),
     message:
         "{wildcards.study}: choosing the landscape that the page opens with"
-    script:
-        "../scripts/run_task.py"
 
 
-rule reference:
+use rule run_task as reference with:
     # What methods say of the card's own vector field that share no code with ours.
     input:
         card=card_if_any,
@@ -59,17 +51,13 @@ rule reference:
         "results/{study}/logs/reference.log",
     benchmark:
         "results/{study}/benchmarks/reference.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("reference"),
     message:
         "{wildcards.study}: computing references for the landscape"
-    script:
-        "../scripts/run_task.py"
 
 
-rule landscape_errors:
+use rule run_task as landscape_errors with:
     input:
         reference="results/{study}/reference.npz",
         field=all_runs("results/{study}/runs/{run}/vector_field.json"),
@@ -86,17 +74,13 @@ rule landscape_errors:
         "results/{study}/logs/landscape_errors.log",
     benchmark:
         "results/{study}/benchmarks/landscape_errors.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("landscape_errors"),
     message:
         "{wildcards.study}: holding the landscapes against the references"
-    script:
-        "../scripts/run_task.py"
 
 
-rule beside_equations:
+use rule run_task as beside_equations with:
     # The landscape of the card's own equations beside those of the runs: scoring alone.
     input:
         quasipotential=all_runs("results/{study}/runs/{run}/quasipotential.json"),
@@ -108,17 +92,13 @@ rule beside_equations:
         "results/{study}/logs/beside_equations.log",
     benchmark:
         "results/{study}/benchmarks/beside_equations.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("beside_equations"),
     message:
         "{wildcards.study}: holding the landscapes against that of the equations"
-    script:
-        "../scripts/run_task.py"
 
 
-rule escapes:
+use rule run_task as escapes with:
     input:
         quasipotential=all_runs("results/{study}/runs/{run}/quasipotential.json"),
         card=card_if_any,
@@ -129,17 +109,13 @@ rule escapes:
         "results/{study}/logs/escapes.log",
     benchmark:
         "results/{study}/benchmarks/escapes.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("escapes"),
     message:
         "{wildcards.study}: simulating escapes"
-    script:
-        "../scripts/run_task.py"
 
 
-rule landscape_figures:
+use rule run_task as landscape_figures with:
     input:
         reference=with_card("results/{study}/reference.npz"),
         escape=with_card("results/{study}/tables/escape.parquet"),
@@ -158,17 +134,13 @@ rule landscape_figures:
         "results/{study}/logs/landscape_figures.log",
     benchmark:
         "results/{study}/benchmarks/landscape_figures.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("landscape_figures"),
     message:
         "{wildcards.study}: drawing the landscape"
-    script:
-        "../scripts/run_task.py"
 
 
-rule invariant:
+use rule run_task as invariant with:
     input:
         rrmse="results/{study}/tables/rrmse.parquet",
         model=all_runs("results/{study}/runs/{run}/model.json"),
@@ -186,11 +158,7 @@ rule invariant:
         "results/{study}/logs/invariant.log",
     benchmark:
         "results/{study}/benchmarks/invariant.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("invariant"),
     message:
         "{wildcards.study}: computing the invariant distribution"
-    script:
-        "../scripts/run_task.py"

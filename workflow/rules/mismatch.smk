@@ -22,7 +22,7 @@ rule diagnose:
         diagnosed_pages,
 
 
-rule benchmark_recordings:
+use rule run_task as benchmark_recordings with:
     input:
         file=raw_file,
     output:
@@ -31,17 +31,13 @@ rule benchmark_recordings:
         "results/recordings/logs/{benchmark}.log",
     benchmark:
         "results/recordings/benchmarks/{benchmark}.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("benchmark_recordings"),
     message:
         "{wildcards.benchmark}: reading the recordings of the benchmark"
-    script:
-        "../scripts/run_task.py"
 
 
-rule diagnosis:
+use rule run_task as diagnosis with:
     input:
         card=case_file("card"),
         recordings=case_file("recordings"),
@@ -63,18 +59,14 @@ rule diagnosis:
         "results/mismatch/{case}/logs/diagnosis.log",
     benchmark:
         "results/mismatch/{case}/benchmarks/diagnosis.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("diagnosis"),
         content=lambda wildcards: case_of(wildcards).content,
     message:
         "{wildcards.case}: looking for what the simulation lacks"
-    script:
-        "../scripts/run_task.py"
 
 
-rule mismatch_landscape:
+use rule run_task as mismatch_landscape with:
     input:
         verdict="results/mismatch/{case}/verdict.json",
         card=case_file("card"),
@@ -93,17 +85,13 @@ rule mismatch_landscape:
         "results/mismatch/{case}/logs/landscape.log",
     benchmark:
         "results/mismatch/{case}/benchmarks/landscape.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("mismatch_landscape"),
     message:
         "{wildcards.case}: working out what that does to wells and escape times"
-    script:
-        "../scripts/run_task.py"
 
 
-rule official_tests:
+use rule run_task as official_tests with:
     input:
         card=case_file("card"),
         recordings=case_file("recordings"),
@@ -120,18 +108,14 @@ rule official_tests:
         "results/mismatch/{case}/logs/official_tests.log",
     benchmark:
         "results/mismatch/{case}/benchmarks/official_tests.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("official_tests"),
         benchmark=lambda wildcards: case_of(wildcards).benchmark,
     message:
         "{wildcards.case}: scoring the simulations in the official tests"
-    script:
-        "../scripts/run_task.py"
 
 
-rule official_summary:
+use rule run_task as official_summary with:
     input:
         tables=expand(
             "results/mismatch/{case}/tables/official_tests.parquet", case=BENCHMARKS
@@ -150,18 +134,14 @@ rule official_summary:
         "results/official/logs/official_summary.log",
     benchmark:
         "results/official/benchmarks/official_summary.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("official_summary"),
         benchmarks=list(BENCHMARKS),
     message:
         "putting the official tests of all benchmarks into one table"
-    script:
-        "../scripts/run_task.py"
 
 
-rule mismatch_figures:
+use rule run_task as mismatch_figures with:
     input:
         verdict="results/mismatch/{case}/verdict.json",
         card=case_file("card"),
@@ -179,17 +159,13 @@ rule mismatch_figures:
         "results/mismatch/{case}/logs/mismatch_figures.log",
     benchmark:
         "results/mismatch/{case}/benchmarks/mismatch_figures.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("mismatch_figures"),
     message:
         "{wildcards.case}: drawing what is missing"
-    script:
-        "../scripts/run_task.py"
 
 
-rule mismatch_page:
+use rule run_task as mismatch_page with:
     input:
         verdict="results/mismatch/{case}/verdict.json",
         card=case_file("card"),
@@ -214,13 +190,9 @@ rule mismatch_page:
         "results/mismatch/{case}/logs/mismatch_page.log",
     benchmark:
         "results/mismatch/{case}/benchmarks/mismatch_page.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("mismatch_page"),
         title=lambda wildcards: case_of(wildcards).title,
         command=lambda wildcards: case_of(wildcards).command,
     message:
         "{wildcards.case}: writing the report"
-    script:
-        "../scripts/run_task.py"

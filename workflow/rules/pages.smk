@@ -1,7 +1,7 @@
 # Figures, and the pages that people read; recordings to try things with.
 
 
-rule figures:
+use rule run_task as figures with:
     input:
         coefficients="results/{study}/tables/coefficients.parquet",
         rrmse="results/{study}/tables/rrmse.parquet",
@@ -24,17 +24,13 @@ rule figures:
         "results/{study}/logs/figures.log",
     benchmark:
         "results/{study}/benchmarks/figures.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("figures"),
     message:
         "{wildcards.study}: drawing the figures"
-    script:
-        "../scripts/run_task.py"
 
 
-rule page:
+use rule run_task as page with:
     input:
         summary="results/{study}/tables/summary.parquet",
         rrmse="results/{study}/tables/rrmse.parquet",
@@ -84,18 +80,14 @@ rule page:
         "results/{study}/logs/page.log",
     benchmark:
         "results/{study}/benchmarks/page.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("page"),
         captions=CAPTIONS,  # of Snakemake's own report
     message:
         "{wildcards.study}: writing the page"
-    script:
-        "../scripts/run_task.py"
 
 
-rule reproduction:
+use rule run_task as reproduction with:
     input:
         summaries=expand("results/{study}/tables/summary.parquet", study=REPRODUCED),
         reports=expand("results/{study}/report.html", study=REPRODUCED),
@@ -111,19 +103,15 @@ rule reproduction:
         "results/logs/reproduction.log",
     benchmark:
         "results/benchmarks/reproduction.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("reproduction"),
         names=REPRODUCED,
         studies=reproduced_settings,
     message:
         "writing the page of the reproduction"
-    script:
-        "../scripts/run_task.py"
 
 
-rule example_recordings:
+use rule run_task as example_recordings with:
     input:
         card=ancient(str(config_path("systems", "archetype3d.yaml"))),
     output:
@@ -132,8 +120,6 @@ rule example_recordings:
         "results/examples/logs/archetype3d.log",
     benchmark:
         "results/examples/benchmarks/archetype3d.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("example_recordings"),
         seed=0,
@@ -141,22 +127,16 @@ rule example_recordings:
         simulation={"trajectories": 400, "pairs": 50},
     message:
         "simulating the example recordings"
-    script:
-        "../scripts/run_task.py"
 
 
-rule example_hopping:
+use rule run_task as example_hopping with:
     output:
         text="results/examples/double-well.csv",
     log:
         "results/examples/logs/double-well.log",
     benchmark:
         "results/examples/benchmarks/double-well.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("example_hopping"),
     message:
         "simulating hopping recordings of a noisy camera"
-    script:
-        "../scripts/run_task.py"

@@ -38,7 +38,7 @@ rule blind_test:
         "results/blind-test/report.html",
 
 
-rule conceal:
+use rule run_task as conceal with:
     # The keys end with the job; only their digests are left.
     output:
         cases=directory("results/proof/{proof}/cases/{batch}"),
@@ -47,19 +47,15 @@ rule conceal:
         "results/proof/{proof}/logs/conceal/{batch}.log",
     benchmark:
         "results/proof/{proof}/benchmarks/conceal/{batch}.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("conceal"),
         settings=proof_settings,
         foreign=is_foreign,
     message:
         "{wildcards.proof}, batch {wildcards.batch}: concealing effects"
-    script:
-        "../scripts/run_task.py"
 
 
-rule published_digests:
+use rule run_task as published_digests with:
     input:
         digests=all_batches("results/proof/{proof}/digests/{batch}.json"),
     output:
@@ -68,17 +64,13 @@ rule published_digests:
         "results/proof/{proof}/logs/published_digests.log",
     benchmark:
         "results/proof/{proof}/benchmarks/published_digests.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("published_digests"),
     message:
         "{wildcards.proof}: publishing the digests of all keys"
-    script:
-        "../scripts/run_task.py"
 
 
-rule blind_diagnosis:
+use rule run_task as blind_diagnosis with:
     # Sees cases, and that digests were published; neither keys nor the seed that they follow from.
     input:
         cases="results/proof/{proof}/cases/{batch}",
@@ -90,17 +82,13 @@ rule blind_diagnosis:
         "results/proof/{proof}/logs/blind_diagnosis/{batch}.log",
     benchmark:
         "results/proof/{proof}/benchmarks/blind_diagnosis/{batch}.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("blind_diagnosis"),
     message:
         "{wildcards.proof}, batch {wildcards.batch}: diagnosing"
-    script:
-        "../scripts/run_task.py"
 
 
-rule open_keys:
+use rule run_task as open_keys with:
     # Keys come into being again when every diagnosis has ended, and go when the scores are known.
     input:
         digests="results/proof/{proof}/digests.json",
@@ -111,19 +99,15 @@ rule open_keys:
         "results/proof/{proof}/logs/open_keys/{batch}.log",
     benchmark:
         "results/proof/{proof}/benchmarks/open_keys/{batch}.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("open_keys"),
         settings=proof_settings,
         foreign=is_foreign,
     message:
         "{wildcards.proof}, batch {wildcards.batch}: opening the keys"
-    script:
-        "../scripts/run_task.py"
 
 
-rule score_batch:
+use rule run_task as score_batch with:
     input:
         cases="results/proof/{proof}/cases/{batch}",
         opened="results/proof/{proof}/keys/{batch}",
@@ -135,18 +119,14 @@ rule score_batch:
         "results/proof/{proof}/logs/score/{batch}.log",
     benchmark:
         "results/proof/{proof}/benchmarks/score/{batch}.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("score_batch"),
         foreign=is_foreign,
     message:
         "{wildcards.proof}, batch {wildcards.batch}: holding verdicts against keys"
-    script:
-        "../scripts/run_task.py"
 
 
-rule collect_scores:
+use rule run_task as collect_scores with:
     input:
         scores=all_batches("results/proof/{proof}/scores/{batch}.parquet"),
     output:
@@ -156,18 +136,14 @@ rule collect_scores:
         "results/proof/{proof}/logs/collect_scores.log",
     benchmark:
         "results/proof/{proof}/benchmarks/collect_scores.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("collect_scores"),
         foreign=is_foreign,
     message:
         "{wildcards.proof}: collecting scores"
-    script:
-        "../scripts/run_task.py"
 
 
-rule score_proof:
+use rule run_task as score_proof with:
     input:
         scores="results/proof/{proof}/tables/score.parquet",
     output:
@@ -185,8 +161,6 @@ rule score_proof:
         "results/proof/{proof}/logs/page.log",
     benchmark:
         "results/proof/{proof}/benchmarks/page.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("score_proof"),
         title=lambda wildcards: PROOF_TITLES[wildcards.proof],
@@ -194,8 +168,6 @@ rule score_proof:
         command=lambda wildcards: f"snakemake --cores 2 {wildcards.proof}",
     message:
         "{wildcards.proof}: writing the report"
-    script:
-        "../scripts/run_task.py"
 
 
 use rule score_proof as score_foreign with:
@@ -219,7 +191,7 @@ use rule score_proof as score_foreign with:
         command=lambda wildcards: f"snakemake --cores 2 {wildcards.proof}",
 
 
-rule score_case:
+use rule run_task as score_case with:
     input:
         card=case_file("card"),
         recordings=case_file("recordings"),
@@ -234,16 +206,12 @@ rule score_case:
         "results/blind-test/logs/score/{case}.log",
     benchmark:
         "results/blind-test/benchmarks/score/{case}.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("score_case"),
         foreign=False,
         content=lambda wildcards: case_of(wildcards).content,
     message:
         "{wildcards.case}: holding the verdict against the key"
-    script:
-        "../scripts/run_task.py"
 
 
 use rule collect_scores as score_cases with:

@@ -2,7 +2,17 @@
 # every run, collect all of them. A rule says which files its task reads and makes; the tasks are in workflow/steps.py.
 
 
-rule draw:
+rule run_task:
+    # What every rule shares that has a task: nothing asks for this one.
+    log:
+        "results/logs/run_task.log",
+    conda:
+        "../envs/siq.yaml"
+    script:
+        "../scripts/run_task.py"
+
+
+use rule run_task as draw with:
     # One rule for both entrances: whatever follows cannot tell them apart.
     input:
         source=data_source,
@@ -14,17 +24,13 @@ rule draw:
         "results/{study}/logs/{run}/draw.log",
     benchmark:
         "results/{study}/benchmarks/{run}/draw.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("draw"),
     message:
         "{wildcards.study}, run {wildcards.run}: drawing trajectories"
-    script:
-        "../scripts/run_task.py"
 
 
-rule identify:
+use rule run_task as identify with:
     input:
         recordings="results/{study}/runs/{run}/recordings.parquet",
     output:
@@ -34,17 +40,13 @@ rule identify:
         "results/{study}/logs/{run}/identify.log",
     benchmark:
         "results/{study}/benchmarks/{run}/identify.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("identify"),
     message:
         "{wildcards.study}, run {wildcards.run}: identifying the vector field"
-    script:
-        "../scripts/run_task.py"
 
 
-rule train:
+use rule run_task as train with:
     input:
         recordings=of_every_run("recordings.parquet"),
         field=of_every_run("vector_field.json"),
@@ -56,17 +58,13 @@ rule train:
         "results/{study}/logs/{block}/train.log",
     benchmark:
         "results/{study}/benchmarks/{block}/train.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("train"),
     message:
         "{wildcards.study}, runs {wildcards.block}: training the networks"
-    script:
-        "../scripts/run_task.py"
 
 
-rule regress:
+use rule run_task as regress with:
     input:
         recordings="results/{study}/runs/{run}/recordings.parquet",
         networks=of_block("networks.npz"),
@@ -78,17 +76,13 @@ rule regress:
         "results/{study}/logs/{run}/regress.log",
     benchmark:
         "results/{study}/benchmarks/{run}/regress.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("regress"),
     message:
         "{wildcards.study}, run {wildcards.run}: regressing formulas"
-    script:
-        "../scripts/run_task.py"
 
 
-rule refine:
+use rule run_task as refine with:
     input:
         recordings="results/{study}/runs/{run}/recordings.parquet",
         field="results/{study}/runs/{run}/vector_field.json",
@@ -105,17 +99,13 @@ rule refine:
         "results/{study}/logs/{run}/refine.log",
     benchmark:
         "results/{study}/benchmarks/{run}/refine.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("refine"),
     message:
         "{wildcards.study}, run {wildcards.run}: refining and certifying the formulas"
-    script:
-        "../scripts/run_task.py"
 
 
-rule score:
+use rule run_task as score with:
     input:
         model="results/{study}/runs/{run}/model.json",
         train_outcome=of_block("train.json"),
@@ -131,17 +121,13 @@ rule score:
         "results/{study}/logs/{run}/score.log",
     benchmark:
         "results/{study}/benchmarks/{run}/score.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("score"),
     message:
         "{wildcards.study}, run {wildcards.run}: scoring"
-    script:
-        "../scripts/run_task.py"
 
 
-rule collect:
+use rule run_task as collect with:
     input:
         coefficients=all_runs("results/{study}/runs/{run}/coefficients.parquet"),
         rrmse=all_runs("results/{study}/runs/{run}/rrmse.parquet"),
@@ -178,12 +164,8 @@ rule collect:
         "results/{study}/logs/collect.log",
     benchmark:
         "results/{study}/benchmarks/collect.tsv"
-    conda:
-        "../envs/siq.yaml"
     params:
         **task("collect"),
         benchmarks="results/{study}/benchmarks",
     message:
         "{wildcards.study}: collecting the tables of all runs"
-    script:
-        "../scripts/run_task.py"
