@@ -4,10 +4,8 @@ from workflow.cases import Cases
 
 MISMATCH_TABLES = ["curves", "candidates", "held_out", "forces", "noise"]
 
-try:
+with bad_input_told():
     CASES = Cases(config)
-except InputError as error:
-    say_and_stop(error)
 
 
 wildcard_constraints:
@@ -15,12 +13,10 @@ wildcard_constraints:
     benchmark="|".join(BENCHMARKS),
 
 
+@bad_input_told()
 def case_of(wildcards):
     """The case of a job, checked when it is first asked for."""
-    try:
-        return CASES[wildcards.case]
-    except InputError as error:
-        say_and_stop(error)
+    return CASES[wildcards.case]
 
 
 def case_file(name):
@@ -35,11 +31,9 @@ def case_file(name):
     return file
 
 
+@bad_input_told()
 def raw_file(wildcards):
-    try:
-        return CASES.raw_file(wildcards.benchmark)
-    except InputError as error:
-        say_and_stop(error)
+    return CASES.raw_file(wildcards.benchmark)
 
 
 def scores_if_any(wildcards):
@@ -49,21 +43,15 @@ def scores_if_any(wildcards):
     return f"results/mismatch/{wildcards.case}/tables/official_tests.parquet"
 
 
+@bad_input_told()
 def mismatch_pages(wildcards):
     """Input function: pages of the studies that can run; of the others it says what is missing."""
-    try:
-        names, missing = CASES.listed()
-    except InputError as error:
-        say_and_stop(error)
+    names, missing = CASES.listed()
     for sentence in missing:
         print(sentence, file=sys.stderr)
     return expand("results/mismatch/{case}/report.html", case=names)
 
 
-def diagnosed_pages(wildcards):
-    """Input function: the page of every case of the folder."""
-    try:
-        names = CASES.in_folder()
-    except InputError as error:
-        say_and_stop(error)
-    return expand("results/mismatch/{case}/report.html", case=names)
+def of_folder(pattern):
+    """Input function: a file of every case of the folder."""
+    return bad_input_told()(lambda wildcards: expand(pattern, case=CASES.in_folder()))

@@ -1,5 +1,6 @@
 # Helpers of the rules: studies and their parameters, tasks and their versions, one workflow at a time.
 import sys
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
@@ -24,21 +25,24 @@ def say_and_stop(error):
     sys.exit(1)
 
 
+@contextmanager
+def bad_input_told(refused=InputError):
+    """What is wrong with the input is said, and ends the workflow."""
+    try:
+        yield
+    except refused as error:
+        say_and_stop(error)
+
+
 prepare_environment()
 
-try:
+with bad_input_told():
     STUDIES = Studies(config, configfiles=workflow.configfiles)
-except InputError as error:
-    say_and_stop(error)
 
 
 REPRODUCED = ["archetype3d", "archetype3d-noise", "archetype4d", "resonator"]
-CAPTIONS = {
-    name: caption["text"] for name, caption in texts("captions")["figures"].items()
-}
-PLACES = {
-    name: caption["part"] for name, caption in texts("captions")["figures"].items()
-}
+FIGURES = texts("captions")["figures"]
+CAPTIONS = {name: caption["text"] for name, caption in FIGURES.items()}
 
 
 wildcard_constraints:
@@ -47,12 +51,10 @@ wildcard_constraints:
     block="[0-9]+-[0-9]+",
 
 
+@bad_input_told()
 def study_of(wildcards):
     """The study of a job, checked when it is first asked for."""
-    try:
-        return STUDIES[wildcards.study]
-    except InputError as error:
-        say_and_stop(error)
+    return STUDIES[wildcards.study]
 
 
 def statistics_studies():
@@ -164,22 +166,18 @@ def data_source(wildcards):
     return study.source()
 
 
+@bad_input_told()
 def files_in_folder(wildcards):
     """Input function: the files of a folder of recordings, so that a change of one is seen; of a file none."""
     folder = Path(study_of(wildcards).source())
-    try:
-        return [str(file) for file in files_of(folder)] if folder.is_dir() else []
-    except InputError as error:
-        say_and_stop(error)
+    return [str(file) for file in files_of(folder)] if folder.is_dir() else []
 
 
 @cache
+@bad_input_told((InputError, ValueError))
 def check_recordings(name):
     """Refuse bad recordings once, before any job starts."""
-    try:
-        STUDIES[name].check_recordings()
-    except (InputError, ValueError) as error:
-        say_and_stop(error)
+    STUDIES[name].check_recordings()
 
 
 def of_every_run(name):
@@ -290,7 +288,7 @@ PARTS = {
 
 def figure_part(wildcards):
     """The part of Snakemake's report in which a figure stands, as on the page."""
-    return PARTS[PLACES.get(wildcards.name, "workings")]
+    return PARTS[FIGURES.get(wildcards.name, {"part": "workings"})["part"]]
 
 
 def figure_labels(wildcards):

@@ -19,7 +19,7 @@ rule mismatch:
 
 rule diagnose:
     input:
-        diagnosed_pages,
+        of_folder("results/mismatch/{case}/report.html"),
 
 
 use rule run_task as benchmark_recordings with:

@@ -6,31 +6,17 @@ ruleorder: score_foreign > score_proof
 
 
 localrules:
-    proof,
-    proof_full,
-    proof_foreign,
-    proof_foreign_small,
     blind_test,
 
 
-rule proof:
-    input:
-        "results/proof/proof/report.html",
+for name in PROOF_SETS:
 
-
-rule proof_full:
-    input:
-        "results/proof/proof_full/report.html",
-
-
-rule proof_foreign:
-    input:
-        "results/proof/proof_foreign/report.html",
-
-
-rule proof_foreign_small:
-    input:
-        "results/proof/proof_foreign_small/report.html",
+    rule:
+        name:
+            name
+        input:
+            f"results/proof/{name}/report.html",
+        localrule: True
 
 
 rule blind_test:
@@ -147,12 +133,7 @@ use rule run_task as score_proof with:
     input:
         scores="results/proof/{proof}/tables/score.parquet",
     output:
-        html=report(
-            "results/proof/{proof}/report.html",
-            caption="../report/proof.rst",
-            category="Blind test of the diagnosis",
-            labels={"shows": "{proof}", "kind": "page"},
-        ),
+        html=proof_page(),
         figure="results/proof/{proof}/figures/verdicts.svg",
         png="results/proof/{proof}/figures/verdicts.png",
         targets="results/proof/{proof}/tables/targets.parquet",
@@ -172,12 +153,7 @@ use rule run_task as score_proof with:
 
 use rule score_proof as score_foreign with:
     output:
-        html=report(
-            "results/proof/{proof}/report.html",
-            caption="../report/proof.rst",
-            category="Blind test of the diagnosis",
-            labels={"shows": "{proof}", "kind": "page"},
-        ),
+        html=proof_page(),
         figure="results/proof/{proof}/figures/gains.svg",
         png="results/proof/{proof}/figures/gains.png",
         targets="results/proof/{proof}/tables/targets.parquet",
@@ -216,7 +192,7 @@ use rule run_task as score_case with:
 
 use rule collect_scores as score_cases with:
     input:
-        scores=all_blind_scores,
+        scores=of_folder("results/blind-test/scores/{case}.parquet"),
     output:
         table="results/blind-test/tables/score.parquet",
         csv="results/blind-test/tables/score.csv",

@@ -4,10 +4,8 @@ from benchmarks.proof.batches import FOREIGN, load_proofs
 
 DICTIONARY = str(Path(siq.__file__).parent / "diagnosis" / "mechanisms.yaml")
 
-try:
+with bad_input_told():
     PROOF_SETS = load_proofs(config_path("proof.yaml"))
-except InputError as error:
-    say_and_stop(error)
 
 PROOF_TITLES = {
     "proof": "Proof of the diagnosis",
@@ -27,6 +25,16 @@ def is_foreign(wildcards):
     return wildcards.proof in FOREIGN
 
 
+def proof_page():
+    """The page of a set of cases, as Snakemake's own report lists it."""
+    return report(
+        "results/proof/{proof}/report.html",
+        caption="../report/proof.rst",
+        category="Blind test of the diagnosis",
+        labels={"shows": "{proof}", "kind": "page"},
+    )
+
+
 def all_batches(pattern):
     """Input function: one file for every batch of the set."""
     return lambda wildcards: expand(
@@ -34,14 +42,6 @@ def all_batches(pattern):
         proof=wildcards.proof,
         batch=PROOF_SETS[wildcards.proof].batch_names(),
     )
-
-
-def blind_names():
-    """Names of the cases that somebody else made."""
-    try:
-        return CASES.in_folder()
-    except InputError as error:
-        say_and_stop(error)
 
 
 def key_of(wildcards):
@@ -58,11 +58,6 @@ def key_of(wildcards):
             f"{folder}, {wildcards.case}.json: the case has no key; add it, or take the case away."
         )
     return found
-
-
-def all_blind_scores(wildcards):
-    """Input function: the score of every case of the folder."""
-    return expand("results/blind-test/scores/{case}.parquet", case=blind_names())
 
 
 wildcard_constraints:
