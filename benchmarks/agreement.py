@@ -150,9 +150,7 @@ def main() -> None:
             for trained in networks_of(known, steps):
                 counted["trainings"] += 1
                 try:
-                    network = about_attractors(
-                        found, portrait, lambda x, one=trained: one.evaluate(x).potential
-                    )
+                    network = about_attractors(found, portrait, trained.potential_at)
                 except (NumericalFailure, np.linalg.LinAlgError):
                     network = None
                 if network is not None:

@@ -131,7 +131,7 @@ def run_landscape_errors(
             tables.append(_rows(number, "local formulas", compared))
         sources = {method: _of_formula(one) for method, one in formulas.items() if one.potential is not None}
         if networks is not None:
-            sources["networks"] = _of_networks(networks)
+            sources["networks"] = lambda x, of=networks: 2 * of.potential_at(x)
         for source, potential in sources.items():
             tables.append(_rows(number, source, compare_estimate(reference, potential, below=below)))
     if np.isfinite(reference.mesh).any():
@@ -161,11 +161,6 @@ def _rows(number: int, source: str, comparisons: Sequence[Mapping[str, object]])
 def _of_formula(one: SymbolicDecomposition) -> Potential:
     """U of a formula as a function of points in rows."""
     return lambda x: 2 * one.values(x)
-
-
-def _of_networks(one: TrainedNetworks) -> Potential:
-    """U of networks as a function of points in rows."""
-    return lambda x: 2 * one.evaluate(x).potential
 
 
 WALKERS = 400

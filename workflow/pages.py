@@ -77,7 +77,7 @@ def figures(given: Given, settings: PipelineSettings) -> Any:
     source, models = given.files, model_files(given)
     tables = {name: getattr(given, name) for name in report.DRAWN_TABLES}
     chosen = models.representative(tables["rrmse"])
-    of_landscape = chosen.run is None or chosen.method == Method.REGRESSION
+    of_landscape = chosen[0] is None or chosen[1] == Method.REGRESSION
     shown = report.representative_run(chosen, models, _first_stored(given) if of_landscape else None)
     run, card = shown.number, given.path("card")
     shown = replace(
@@ -172,14 +172,12 @@ def _density_source(given: Given) -> tuple[int, str, Any] | None:
         stored = read_landscape(given.files["quasipotential"], dynamics=given.card)
         return None if stored is None else (0, "local formulas", stored)
     models = model_files(given)
-    shown = models.representative(given.rrmse)
-    if shown.run is None or shown.method == Method.REGRESSION:
+    run, method = models.representative(given.rrmse)
+    if run is None or method == Method.REGRESSION:
         complete = _first_stored(given)
         if complete is not None:
             return complete[0], "local formulas", complete[1]
-    if shown.run is None:
-        return None
-    return shown.run, shown.method, models.formulas(shown.run)[shown.method]
+    return None if run is None else (run, method, models.formulas(run)[method])
 
 
 @task(
@@ -201,9 +199,9 @@ def page(given: Given, settings: PipelineSettings) -> Any:
     source, study = given.files, _study(given)
     tables, models, card = _tables(given), model_files(given), given.path("card")
     shown = models.representative(tables["rrmse"])
-    shown = shown if shown.run is not None else models.first_wells()
+    shown = shown if shown[0] is not None else models.first_wells()
     overview = given.overview
-    run = shown.run if shown.run is not None else (overview or {}).get("run", 0)
+    run = shown[0] if shown[0] is not None else (overview or {}).get("run", 0)
     landscape = None
     if overview is not None:
         number = overview["run"]

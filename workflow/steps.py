@@ -204,8 +204,8 @@ def overview(given: Given, settings: PipelineSettings) -> Any:
     from siq.workflow.pipeline import landscape_of_run
 
     models = model_files(given)
-    shown = models.representative(given.rrmse)
-    number = shown.run if shown.run is not None else models.first_wells().run
+    number = models.representative(given.rrmse)[0]
+    number = number if number is not None else models.first_wells()[0]
     if given.options["every_run"]:  # that of the formulas, or else the first that has an attractor
         stored = given.quasipotential
         order = [*([] if number is None else [number]), *range(len(stored))]

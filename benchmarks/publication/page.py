@@ -141,7 +141,7 @@ def _equations_table(study: Results) -> ReportTable | None:
     x = x[points_below(potential, level=study.settings.regression.level)]
     exact = study.system.drift(x)
     found = {"published": own_equations(published, x, exact)}
-    run = study.models.representative(study.table("rrmse")).run or 0
+    run = study.models.representative(study.table("rrmse"))[0] or 0
     for method, one in study.models.formulas(run).items():
         if one.potential is not None:
             found[f"{method}, run {run}"] = own_equations(one, x, exact)

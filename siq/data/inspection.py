@@ -218,9 +218,9 @@ class Inspection:
             if hops.supported and fewest:
                 values = {"transitions": fewest, "relative_error": float(1 / np.sqrt(fewest))}
                 found.append(Remark("data.few_transitions", values))
-            drift = hops.background
-            values = {"state": titles[hops.state], "range": drift.range}
-            found.append(Remark("data.drift", values) if drift.half_periods else Remark("data.stationary"))
+            values = {"state": titles[hops.state], "range": float(np.ptp(hops.background))}
+            drifts = bool(hops.background.any())
+            found.append(Remark("data.drift", values) if drifts else Remark("data.stationary"))
         sparse = self.coverage < SPARSE_COVERAGE and len(titles) > 1
         values = {"share": self.coverage, "states": list(titles[:2]), "sparse": sparse}
         return [*found, Remark("data.coverage", values)]

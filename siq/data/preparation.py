@@ -202,15 +202,15 @@ def without_slow_drift(recordings: Recordings) -> Recordings:
     found = switching(recordings)
     flat, remarks = recordings.values.copy(), list(recordings.remarks)
     for state, values in enumerate(recordings.values.T):
-        background = background_of(recordings, values)
+        background, _ = background_of(recordings, values)
         if found is not None and found.supported and state == found.state:
             background = found.background
-        if not background.half_periods:
+        if not background.any():
             continue
-        flat[:, state] -= background.values
+        flat[:, state] -= background
         told = {
             "column": recordings.titles[state],
-            "range": background.range,
+            "range": float(np.ptp(background)),
             "unit": recordings.units[state],
         }
         remarks.append(Remark("data.drift_taken_off", told))

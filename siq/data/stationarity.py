@@ -13,7 +13,6 @@ Three times of a record differ by orders of magnitude, and each has its use:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -29,29 +28,6 @@ STEP_TOLERANCE = 0.01  # of a step: stretches end where a step differs by more
 MOST_STRETCHES = 4000  # looked at
 MOST_HALF_PERIODS = 8  # of the background in a record: what returns more often is part of the system
 FALSE_DRIFT_RATE = 1e-3  # probability with which a record without a background is said to have one
-
-
-@dataclass(frozen=True)
-class Background:
-    """A slow drift of what was measured, less its mean over the record.
-
-    Attributes
-    ----------
-    values
-        Shape ``(n,)``, at the samples; zero where no drift is seen.
-    half_periods
-        How many the fastest cosine has in a recording; 0 where no drift is seen.
-    range
-        From the lowest to the highest value.
-    """
-
-    values: np.ndarray
-    half_periods: int
-
-    @property
-    def range(self) -> float:
-        """From the lowest to the highest value, in the unit of the state."""
-        return float(np.ptp(self.values)) if self.half_periods else 0.0
 
 
 def usual_step(recordings: Recordings) -> float:
@@ -166,7 +142,7 @@ def correlated_samples(values: np.ndarray, runs: list[slice]) -> float:
     return max(float(kept.sum()) - 0.5, 0.5)
 
 
-def background_of(recordings: Recordings, values: np.ndarray) -> Background:
+def background_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, int]:
     """The slow drift of a series, common to all that it does: of a hopping record, less its levels.
 
     Every recording has cosines of its own, ``cos(πkt/T)`` with k from 1 to the number of half periods.
@@ -177,9 +153,16 @@ def background_of(recordings: Recordings, values: np.ndarray) -> Background:
         Whose times and divisions these are.
     values
         Shape ``(n,)``.
+
+    Returns
+    -------
+    drift
+        Shape ``(n,)``, less its mean over the record; zero where none is seen.
+    half_periods
+        How many the fastest cosine has in a recording; 0 where none is seen.
     """
     runs = runs_of(recordings)
-    nothing = Background(np.zeros(len(values)), 0)
+    nothing = (np.zeros(len(values)), 0)
     best, found = 0.0, nothing
     spread = float(np.var(values))
     if spread <= 0:
@@ -196,7 +179,7 @@ def background_of(recordings: Recordings, values: np.ndarray) -> Background:
         # Twice the gain in the logarithm of the likelihood, less what chance gives it with this probability.
         surplus = gain - used * np.log(independent) - 2 * np.log(1 / FALSE_DRIFT_RATE)
         if surplus > best:
-            best, found = surplus, Background(fitted - fitted.mean(), half_periods)
+            best, found = surplus, (fitted - fitted.mean(), half_periods)
     return found
 
 

@@ -35,7 +35,6 @@ from siq.data.correlation import markov_lag
 from siq.data.recordings import Recordings
 from siq.data.stationarity import (
     MOST_STRETCHES,
-    Background,
     background_of,
     relaxation_samples,
     runs_of,
@@ -53,13 +52,13 @@ MOST_ITERATIONS = 200  # of its estimation, at most
 
 def _two_levels(
     recordings: Recordings, values: np.ndarray, runs: list[slice], relaxation: float
-) -> tuple[Background, tuple[float, float]]:
+) -> tuple[np.ndarray, tuple[float, float]]:
     """Two levels over a common background: each in turn, until neither changes."""
     width = max(int(AVERAGING_TIME * relaxation), 1)
-    background = Background(np.zeros(len(values)), 0)
+    background, half_periods = np.zeros(len(values)), 0
     levels = (0.0, 0.0)
     for _ in range(5):
-        flat = values - background.values
+        flat = values - background
         begins = stretches_of(runs, width)
         means = flat[begins[:, None] + np.arange(width)].mean(axis=1)
         first = np.append(True, np.diff(begins) != width)
@@ -70,11 +69,9 @@ def _two_levels(
         share[begins[:, None] + np.arange(width)] = weights[:, order[1]][:, None]
         known = np.isfinite(share)
         share = np.interp(np.arange(len(share)), np.flatnonzero(known), share[known])
-        found = background_of(recordings, values - (1 - share) * levels[0] - share * levels[1])
-        unchanged = found.half_periods == background.half_periods and (
-            np.abs(found.values - background.values).max() <= 0.01 * spread.min()
-        )
-        background = found
+        found, number = background_of(recordings, values - (1 - share) * levels[0] - share * levels[1])
+        unchanged = number == half_periods and np.abs(found - background).max() <= 0.01 * spread.min()
+        background, half_periods = found, number
         if unchanged:
             break
     return background, levels
@@ -365,7 +362,7 @@ class Switching:
     visits
         Shape ``(n,)``: 0 or 1 at each sample, -1 before the record has reached a level.
     background
-        What drifts slowly below both levels.
+        What drifts slowly below both levels, shape ``(n,)``; zero where nothing does.
     probability
         Of so much with a single state over a slowly drifting background, both tests and all states counted.
     """
@@ -374,7 +371,7 @@ class Switching:
     levels: tuple[float, float]
     counts: tuple[DwellCount, DwellCount]
     visits: np.ndarray
-    background: Background
+    background: np.ndarray
     probability: float
 
     def summary(self, recordings: Recordings) -> RecordStates:
@@ -382,7 +379,7 @@ class Switching:
 
         Where a background drifts slowly it is taken off the histogram, as it is off the levels.
         """
-        values = recordings.values[:, self.state] - self.background.values
+        values = recordings.values[:, self.state] - self.background
         density, edges = np.histogram(values, bins=BINS, density=True)
         return RecordStates(
             recordings.titles[self.state], recordings.units[self.state], recordings.time_unit,
@@ -445,7 +442,7 @@ def switching(recordings: Recordings) -> Switching | None:
     probability, _, relaxation = tests[state]
     values = recordings.values[:, state]
     background, levels = _two_levels(recordings, values, runs, relaxation)
-    visits = _counted_visits(values - background.values, runs, levels)
+    visits = _counted_visits(values - background, runs, levels)
     lower, upper = DwellCount.of_visits(recordings.t, visits, runs)
     chance = min(2 * probability * len(tests), 1.0)
     return Switching(state, levels, (lower, upper), visits, background, chance)

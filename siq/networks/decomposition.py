@@ -164,15 +164,6 @@ Layer = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
-class PointValues:
-    """The decomposition at points: V ``(n,)``, g and f ``(n, d)``."""
-
-    potential: np.ndarray
-    circulatory: np.ndarray
-    vector_field: np.ndarray
-
-
-@dataclass(frozen=True)
 class TrainedNetworks:
     """An orthogonal decomposition ``f = -D∇V + g`` given by two tanh networks.
 
@@ -201,13 +192,11 @@ class TrainedNetworks:
     circulatory_scale: np.ndarray
     diffusion: np.ndarray
 
-    def evaluate(self, x: np.ndarray) -> PointValues:
-        """V, g and f at points ``(n, d)`` in the units of the states."""
+    def evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """V ``(n,)``, g and f ``(n, d)`` at points ``(n, d)`` in the units of the states."""
         pieces = [self._evaluate(x[begin : begin + CHUNK]) for begin in range(0, len(x), CHUNK)]
         potential, circulatory, vector_field = zip(*pieces or [self._evaluate(x)], strict=True)
-        return PointValues(
-            np.concatenate(potential), np.concatenate(circulatory), np.concatenate(vector_field)
-        )
+        return np.concatenate(potential), np.concatenate(circulatory), np.concatenate(vector_field)
 
     def potential_at(self, x: np.ndarray) -> np.ndarray:
         """V alone, shape ``(n,)``, at a third of the cost of `evaluate`."""

@@ -67,24 +67,6 @@ class Networks:
         return [tensor for layer in (*self.potential, *self.circulatory) for tensor in layer]
 
 
-@dataclass(frozen=True)
-class _Components:
-    """The decomposition at points, shapes ``(runs, n)`` for V and ``(runs, n, d)`` for the vectors."""
-
-    potential: Tensor
-    gradient: Tensor
-    circulatory: Tensor
-    vector_field: Tensor
-
-    def split(self, count: int) -> tuple[_Components, _Components]:
-        """The first `count` points, and the others."""
-        tensors = self.potential, self.gradient, self.circulatory, self.vector_field
-        first, others = (
-            [tensor[:, part] for tensor in tensors] for part in (slice(count), slice(count, None))
-        )
-        return _Components(*first), _Components(*others)
-
-
 def initial_layers(
     sizes: Sequence[int], *, generators: Sequence[np.random.Generator], dtype: torch.dtype
 ) -> tuple[Layer, ...]:
@@ -102,19 +84,17 @@ def initial_layers(
     return tuple(layers)
 
 
-def evaluate(networks: Networks, x: Tensor) -> _Components:
-    """V, ∇V, g and f = -D∇V + g at points ``(runs, n, d)``, in the units of the states.
+def evaluate(networks: Networks, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """V ``(runs, n)``, ∇V, g and f = -D∇V + g ``(runs, n, d)`` at points ``(runs, n, d)``.
 
-    ∇V is the gradient with respect to x, not to the normalised y.
+    All are in the units of the states: ∇V is the gradient with respect to x, not to the normalised y.
     """
     y = (x - networks.mean) / networks.scale
     value, gradient = _value_and_gradient(networks.potential, y)
     potential = networks.potential_scale * (value + (y * y).sum(dim=-1, keepdim=True))
     gradient = networks.potential_scale / networks.scale * (gradient + 2 * y)
     circulatory = networks.circulatory_scale * _hidden(networks.circulatory, y)[-1]
-    return _Components(
-        potential.squeeze(-1), gradient, circulatory, circulatory - gradient @ networks.diffusion
-    )
+    return potential.squeeze(-1), gradient, circulatory, circulatory - gradient @ networks.diffusion
 
 
 def _mapped(function: Callable[..., Any], *sources: Networks | TrainedNetworks) -> dict[str, Any]:
@@ -199,7 +179,7 @@ def dynamics_loss(
 
 
 def orthogonality_loss(
-    components: _Components, diffusion: Tensor, precision: Tensor, *, asymmetry: float
+    gradient: Tensor, circulatory: Tensor, diffusion: Tensor, precision: Tensor, *, asymmetry: float
 ) -> Tensor:
     """Mean of w(z, δ), z being the cosine of the angle between ∇V and g: shape ``(runs,)``.
 
@@ -208,14 +188,13 @@ def orthogonality_loss(
 
     Parameters
     ----------
-    components
-        The decomposition on the representative points.
+    gradient, circulatory
+        ∇V and g at the representative points, shape ``(runs, n, d)``.
     diffusion, precision
         D and D⁻¹, shape ``(d, d)``.
     asymmetry
         δ.
     """
-    gradient, circulatory = components.gradient, components.circulatory
     product = (gradient * circulatory).sum(dim=-1)
     downhill_square = ((gradient @ diffusion) * gradient).sum(dim=-1)
     circulatory_square = ((circulatory @ precision) * circulatory).sum(dim=-1)

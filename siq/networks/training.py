@@ -232,18 +232,18 @@ def _initial_networks(
         one = select_run(networks, run)
         # A few thousand pairs fix a single number well; the whole data would only cost memory.
         rows = np.linspace(0, len(pairs.h) - 1, min(len(pairs.h), 20_000)).astype(int)
-        components = evaluate(one, torch.from_numpy(pairs.x0[rows]).to(dtype)[None])
+        _, slope, turning, _ = evaluate(one, torch.from_numpy(pairs.x0[rows]).to(dtype)[None])
         velocity = (pairs.xh[rows] - pairs.x0[rows]) / pairs.h[rows, None]
         speed = np.linalg.norm(velocity, axis=1)
         # ∇ with respect to y = (x - μ)/σ, as the paper writes it. Where the σ differ this makes V several
         # times larger than ∇ with respect to x would, and V then learns as fast as g does; with the
         # smaller scale training ends in a V that is flat along x.
-        downhill = torch.linalg.norm(components.gradient * one.scale, dim=-1)[0].numpy()
-        circulatory = torch.linalg.norm(components.circulatory, dim=-1)[0].numpy()
+        downhill = torch.linalg.norm(slope * one.scale, dim=-1)[0].numpy()
+        circulatory = torch.linalg.norm(turning, dim=-1)[0].numpy()
         along = float(downhill @ speed / (downhill @ downhill))
         if options.potential_from == "descent":
             # With which -D∇V comes closest to the velocities, unless these go up V on the whole.
-            gradient = components.gradient[0].double().numpy()
+            gradient = slope[0].double().numpy()
             size = diffusion.contract(pairs.x0[rows], gradient).sum()
             along = max(float(-(gradient * velocity).sum() / size), 0.0) or along
         potential_scales.append(along)
@@ -443,19 +443,19 @@ class _Objective:
         options = self.options
         if options.matching == "symmetric" and options.matching_order == 2:
             # One evaluation serves both terms: half the operations, and each twice as large.
-            both = evaluate(networks, torch.cat([(x0 + xh) / 2, points], dim=1))
-            predicted, at_points = both.split(x0.shape[1])
-            velocity = predicted.vector_field
+            count = x0.shape[1]
+            _, gradient, circulatory, field = evaluate(networks, torch.cat([(x0 + xh) / 2, points], dim=1))
+            velocity, gradient, circulatory = field[:, :count], gradient[:, count:], circulatory[:, count:]
         else:
             velocity = mean_velocity(
-                lambda x: evaluate(networks, x).vector_field,
+                lambda x: evaluate(networks, x)[-1],
                 x0, xh, h,
                 kind=options.matching, order=options.matching_order,
             )  # fmt: skip
-            at_points = evaluate(networks, points)
+            _, gradient, circulatory, _ = evaluate(networks, points)
         dynamics = dynamics_loss(velocity, observed, self.precision, slow=self.slow) / self.squares
         orthogonality = orthogonality_loss(
-            at_points, self.diffusion, self.precision, asymmetry=options.asymmetry
+            gradient, circulatory, self.diffusion, self.precision, asymmetry=options.asymmetry
         )
         return dynamics, orthogonality
 
@@ -499,45 +499,6 @@ LOGGED_LOSSES = 100  # times in a training at which its loss is logged
 MOST_STEPS_BETWEEN_CHECKPOINTS = 1000  # steps between two checkpoints, at most
 
 
-@dataclass(frozen=True)
-class Checkpoints:
-    """Files from which a killed training is resumed.
-
-    Attributes
-    ----------
-    folder
-        Where its files lie; None keeps nothing.
-    mark
-        Fingerprint of the data and settings: files of another training are passed over.
-    """
-
-    folder: Path | None
-    mark: str
-
-    def _file(self, name: str) -> Path | None:
-        return None if self.folder is None else self.folder / f"kept-{self.mark[:12]}-{name}.npz"
-
-    def state(self, attempt: int) -> TrainingState | None:
-        """How far an attempt had come."""
-        file = self._file(f"attempt{attempt}")
-        return None if file is None else _load_checkpoint(file, fingerprint=self.mark)
-
-    def keep_state(self, attempt: int, state: TrainingState) -> None:
-        """Keep how far an attempt has come."""
-        if (file := self._file(f"attempt{attempt}")) is not None:
-            _save_checkpoint(file, state, fingerprint=self.mark)
-
-    def passed(self, attempt: int, run: int) -> TrainedNetworks | None:
-        """Networks of a run that had passed the check in an attempt."""
-        file = self._file(f"attempt{attempt}-run{run}")
-        return load_networks(file) if file is not None and file.exists() else None
-
-    def keep_passed(self, attempt: int, run: int, networks: TrainedNetworks) -> None:
-        """Keep networks that have passed the check."""
-        if (file := self._file(f"attempt{attempt}-run{run}")) is not None:
-            save_networks(file, [networks])
-
-
 class Check(Protocol):
     """When the training of a run may end before its last step."""
 
@@ -557,8 +518,9 @@ class Block:
         Pairs by run; when the training of a run may end, for those where that is known.
     options, diffusion, seed
         What the networks are told, D, and the seed of the study.
-    checkpoints
-        What is left behind for a job that goes on from here.
+    folder, mark
+        Where files lie from which a killed training goes on, None for none; and the fingerprint of the data
+        and settings, by which files of another training are passed over.
     device
         Where it is computed.
     faults
@@ -573,13 +535,14 @@ class Block:
         options: TrainingOptions,
         diffusion: Diffusion,
         seed: int,
-        checkpoints: Checkpoints,
+        folder: Path | None,
+        mark: str,
         device: torch.device,
         faults: Mapping[int, str] | None = None,
     ) -> None:
         self.data, self.checks, self.options = data, checks, options
         self.diffusion, self.seed = diffusion, seed
-        self.checkpoints, self.device, self.faults = checkpoints, device, faults or {}
+        self.folder, self.mark, self.device, self.faults = folder, mark, device, faults or {}
         self.passed: dict[int, TrainedNetworks] = {}
         self.last: dict[int, TrainedNetworks] = {}
         self.failures: dict[int, str] = {}
@@ -599,16 +562,25 @@ class Block:
             if runs:
                 self._attempt(attempt, runs)
 
+    def _checkpoint(self, name: str) -> Path | None:
+        return None if self.folder is None else self.folder / f"kept-{self.mark[:12]}-{name}.npz"
+
+    def _keep(self, attempt: int, state: TrainingState) -> None:
+        if (file := self._checkpoint(f"attempt{attempt}")) is not None:
+            _save_checkpoint(file, state, fingerprint=self.mark)
+
     def _attempt(self, attempt: int, runs: list[int]) -> None:
         options = self.options.attempt(attempt)
         purpose = Purpose.TRAINING if attempt == 0 else f"{Purpose.TRAINING} {attempt}"
         seeds = [seed_sequence(self.seed, run, purpose) for run in runs]
         data = [_slowest_part(self.data[run], options.slowest_share) for run in runs]
-        state = self.checkpoints.state(attempt)
+        file = self._checkpoint(f"attempt{attempt}")
+        state = None if file is None else _load_checkpoint(file, fingerprint=self.mark)
         if state is None:
             state = start(data, options=options, diffusion=self.diffusion, seeds=seeds)
-        kept = ((run, self.checkpoints.passed(attempt, run)) for run in runs)
-        early = {run: one for run, one in kept if one is not None}  # before the job was killed
+        kept = {run: self._checkpoint(f"attempt{attempt}-run{run}") for run in runs}
+        # Networks that had passed the check before the job was killed.
+        early = {run: load_networks(file) for run, file in kept.items() if file is not None and file.exists()}
 
         def finished(step: int, networks: Networks) -> bool:
             for position, run in enumerate(runs):
@@ -616,7 +588,8 @@ class Block:
                     one = at_rest(networks, position)
                     if self.checks[run].passes(one):
                         early[run] = one
-                        self.checkpoints.keep_passed(attempt, run, one)
+                        if (file := kept[run]) is not None:
+                            save_networks(file, [one])
             return len(early) == len(runs)
 
         if len(early) < len(runs):
@@ -624,11 +597,11 @@ class Block:
                 state, data, options=options, seeds=seeds, device=self.device,
                 log_every=max(options.steps // LOGGED_LOSSES, 1),
                 checkpoint_every=min(MOST_STEPS_BETWEEN_CHECKPOINTS, max(options.steps // 10, 1)),
-                checkpoint=lambda state: self.checkpoints.keep_state(attempt, state),
+                checkpoint=lambda state: self._keep(attempt, state),
                 finished=finished,
             )  # fmt: skip
         # Checkpoints until all attempts are over: a killed job must not train this one again.
-        self.checkpoints.keep_state(attempt, state)
+        self._keep(attempt, state)
         self.passed |= early
         lost = _failed_runs(state)
         for position, run in enumerate(runs):

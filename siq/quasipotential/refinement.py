@@ -403,7 +403,7 @@ class RefinementContext:
             named = term_coefficients(regressed.potential)
             library = _formula_library(self.found, self.options)
             formula = np.array([named.get(name, 0.0) for name in library.names])
-        network = None if self.networks is None else _potential_of(self.networks)
+        network = None if self.networks is None else self.networks.potential_at
         refined, formulas, certificate = _refined_by_routes(self, self.options, network, formula)
         caustics = caustics_below(
             self.found.dynamics, refined.wells or refined.network_wells, self.portrait, certificate.error,
@@ -434,7 +434,7 @@ class RefinementContext:
         """
         assert self.networks is not None
         draw = generator(self.seed, self.number, Purpose.SHUFFLE)
-        randomised = _potential_of(shuffled(self.networks, generator=draw))
+        randomised = shuffled(self.networks, generator=draw).potential_at
         options = replace(self.options, routes=("network",))
         try:
             _, formulas, made = _refined_by_routes(self, options, randomised, None)
@@ -526,11 +526,6 @@ class Refinement:
     remarks: tuple[Remark, ...] = ()
 
 
-def _potential_of(networks: TrainedNetworks) -> Function:
-    """V_θ, points ``(n, d)`` to values ``(n,)``."""
-    return lambda x: networks.evaluate(x).potential
-
-
 def _difference(
     one: SymbolicDecomposition, two: SymbolicDecomposition, references: Sequence[Reference]
 ) -> float:
@@ -580,7 +575,7 @@ class TrainingCheck:
         """Whether refinement will succeed from the networks of one run."""
         if self.hopeless() is not None:
             return False
-        potential = _potential_of(networks)
+        potential = networks.potential_at
         return self._single_formula(potential) or self._by_wells(potential)
 
     def _single_formula(self, potential: Function) -> bool:

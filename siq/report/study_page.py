@@ -52,7 +52,7 @@ from siq.report.page import (
 from siq.report.summary import LandscapeSummary, well_name
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
-from siq.workflow.models import ModelFiles, RepresentativeFormula
+from siq.workflow.models import ModelFiles, Shown
 from siq.workflow.study import Study, SweepOptions
 from siq.workflow.tables import Method, Outcome, Status, Step, why_no_landscape
 
@@ -106,7 +106,7 @@ class StudyResults:
     vectors: Mapping[str, bytes]
     landscape: LandscapeSummary | None = None
     models: ModelFiles = field(default_factory=lambda: ModelFiles(()))
-    shown: RepresentativeFormula = field(default_factory=lambda: RepresentativeFormula(0, Method.REFINED))
+    shown: Shown = (0, Method.REFINED)
     exact: SymbolicDecomposition | None = None
     record: FieldEstimate | None = None
     interactive: Markup | None = None
@@ -131,7 +131,8 @@ class StudyResults:
         if self.system is not None:
             formulas = self.landscape is not None and any(w is not None for w in self.landscape.formulas)
             return {str(Method.REFINED): self.certificate} if formulas else {}
-        return {} if self.shown.run is None else self.models.certificates(self.shown.run)
+        run = self.shown[0]
+        return {} if run is None else self.models.certificates(run)
 
 
 def study_page(
@@ -150,19 +151,19 @@ def study_page(
     versions
         Of the programs that took part, by name.
     """
-    shown, summary, given = results.shown, results.landscape, results.system
-    method, several, beside_paper = shown.method, study.runs > 1, study.published is not None
+    (run, method), summary, given = results.shown, results.landscape, results.system
+    several, beside_paper = study.runs > 1, study.published is not None
     certificate = results.certificates.get(str(method))
     certified = certificate is not None and bool(certificate["certified"])
     noises = () if study.landscape is None else study.landscape.noise_intensities
     headings, table = texts("help")["headings"], results.table
     record, compared, landscape = table("record"), table("beside_equations"), table("landscape")
-    record = None if record is None else record[record["run"] == shown.run]
+    record = None if record is None else record[record["run"] == run]
     record = None if record is None or record.empty else record
     other = study.training is not None and method != Method.REGRESSION
     certificates, rrmse, timings = results.tables["certificates"], table("rrmse"), table("timings")
     refused = certificates[(certificates["method"] == method) & ~certificates["passed"].astype(bool)]
-    refused = refused[refused["run"] == shown.run]
+    refused = refused[refused["run"] == run]
     figures, lead = _figures(study, results)
     density = given is not None and table("invariant") is None and "invariant" in results.tables
     escape, errors = table("escape"), table("landscape_errors")
@@ -179,7 +180,7 @@ def study_page(
         results=results,
         s=summary,
         given=given is not None,
-        shown=shown,
+        run=run,
         method=str(method),
         beside_paper=beside_paper,
         command=command,
@@ -203,7 +204,7 @@ def study_page(
         compared=compared,
         comparison=None if compared is None else comparison_table(compared),
         compared_notes=[] if compared is None else _comparison_notes(compared),
-        tests=None if shown.run is None else _tests_table(certificates, shown.run, method),
+        tests=None if run is None else _tests_table(certificates, run, method),
         landscape_errors=None if errors is None else errors_over_runs(errors),
         escape=None if escape is None else escape.rename(columns=lambda name: name.replace("_", " ")),
         time_unit=results.time_unit,
@@ -325,7 +326,7 @@ def _formulas(results: StudyResults) -> list[FormulaRow]:
         rows = _formula_rows(found, None, results.landscape)
         rows[-1] = replace(rows[-1], note=words["given"])
         return [*rows, FormulaRow("D", _diffusion_mathml(system.diffusion), words["D"]["given"])]
-    rows, record = _formulas_by(results, results.shown.method), results.record
+    rows, record = _formulas_by(results, results.shown[1]), results.record
     if record is None:
         return rows
     if not rows:
@@ -342,7 +343,7 @@ def _diffusion_mathml(noise: Diffusion) -> Markup:
 
 def _formulas_by(results: StudyResults, method: Method) -> list[FormulaRow]:
     """The formulas of the run that is shown, as a method found them; none where it found none."""
-    run = results.shown.run
+    run = results.shown[0]
     found = {} if run is None else results.models.formulas(run)
     return _formula_rows(found[method], results.exact, results.landscape) if method in found else []
 
@@ -414,10 +415,10 @@ def _coefficients(results: StudyResults) -> tuple[pd.DataFrame, pd.DataFrame] | 
 
     Those of g follow from the others, and stand in the download alone.
     """
-    coefficients, shown = results.table("coefficients"), results.shown
+    coefficients, (run, method) = results.table("coefficients"), results.shown
     if coefficients is None:
         return None
-    mine = coefficients[(coefficients["run"] == shown.run) & (coefficients["method"] == str(shown.method))]
+    mine = coefficients[(coefficients["run"] == run) & (coefficients["method"] == str(method))]
     of_potential = mine["component"] == "U"
     largest = mine[of_potential]["estimate"].abs().max()
     rounded = of_potential & (mine["term"] == "1") & (mine["estimate"].abs() < ROUNDED_COEFFICIENT * largest)

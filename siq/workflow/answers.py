@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
@@ -26,25 +25,6 @@ class Exit(IntEnum):
     INTERRUPTED = 130
 
 
-@dataclass(frozen=True)
-class Told:
-    """What the terminal says at the end.
-
-    Attributes
-    ----------
-    lines
-        The answer, and what has to be known of it.
-    page
-        The page to read.
-    code
-        How the command ends.
-    """
-
-    lines: tuple[str, ...]
-    page: Path
-    code: Exit
-
-
 CERTIFIED = {
     "all": "Every formula passed its certificate.",
     "some": "Some of the formulas passed their certificates; the page says which.",
@@ -52,8 +32,8 @@ CERTIFIED = {
 }
 
 
-def answer_of_page(page: Path) -> Told:
-    """What to say of a page, from the file ``answer.json`` beside it.
+def answer_of_page(page: Path) -> tuple[list[str], Exit]:
+    """What to say of a page and how to end, from the file ``answer.json`` beside it.
 
     Parameters
     ----------
@@ -63,25 +43,22 @@ def answer_of_page(page: Path) -> Told:
     try:
         answer = json.loads((page.parent / "answer.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):  # a page of an earlier version: it is there, and that is all we know
-        return Told((), page, Exit.ANSWERED)
-    return _of_diagnosis(answer, page) if "verdict" in answer else _of_study(answer, page)
+        return [], Exit.ANSWERED
+    if "verdict" not in answer:
+        return _of_study(answer)
+    return [str(answer["sentence"])], Exit.ANSWERED if answer.get("compared", True) else Exit.NO_ANSWER
 
 
-def _of_study(answer: Mapping[str, Any], page: Path) -> Told:
+def _of_study(answer: Mapping[str, Any]) -> tuple[list[str], Exit]:
     sentence = str(answer["sentence"])
+    lines = [sentence] if sentence else []
     if not answer["formulas"]:
         why = "No formula was found; the page says at which step, and what to do."
-        return Told((sentence, why) if sentence else (why,), page, Exit.NO_ANSWER)
-    lines = [sentence] if sentence else []
+        return [*lines, why], Exit.NO_ANSWER
     if answer["runs"] == 1 and answer["certified"] == "all":
         lines.append("The formula passed its certificate.")
     else:
         lines.append(CERTIFIED[answer["certified"]])
     if answer["failed"]:
         lines.append(f"{answer['failed']} of {answer['runs']} runs failed at some step.")
-    return Told(tuple(lines), page, Exit.ANSWERED)
-
-
-def _of_diagnosis(answer: Mapping[str, Any], page: Path) -> Told:
-    code = Exit.ANSWERED if answer.get("compared", True) else Exit.NO_ANSWER
-    return Told((str(answer["sentence"]),), page, code)
+    return lines, Exit.ANSWERED

@@ -503,11 +503,11 @@ def _answered(request: Request, pages: Sequence[Path]) -> Exit:
         if not request.verbose:
             print(f"{steps} steps would run." if steps else "Nothing would run: all is up to date.")
         return Exit.ANSWERED
-    told = [answer_of_page(page) for page in pages if page.is_file()]
+    told = {page: answer_of_page(page) for page in pages if page.is_file()}
     if not steps and not request.verbose:
         print("Nothing has changed since the last time; this is the answer that you have.", file=sys.stderr)
-    for one in told:
-        for line in (*one.lines, f"The page to read: {one.page}"):
+    for page, (lines, _) in told.items():
+        for line in (*lines, f"The page to read: {page}"):
             if line not in said:
                 print(line)
-    return max((one.code for one in told), default=Exit.FAULT)
+    return max((code for _, code in told.values()), default=Exit.FAULT)

@@ -13,13 +13,8 @@ import pandas as pd
 from siq.quasipotential.formulas import SymbolicDecomposition, read_model
 from siq.workflow.tables import METHODS, Method
 
-
-@dataclass(frozen=True)
-class RepresentativeFormula:
-    """A run, and the method of it whose formula is shown; None where no run has a formula."""
-
-    run: int | None
-    method: Method
+Shown = tuple[int | None, Method]
+"""A run, and the method of it whose formula is shown; None where no run has a formula."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +36,7 @@ class ModelFiles:
         have = [one.get(method, {}) for one in self._methods]
         return [run for run, one in enumerate(have) if one.get("V") or one.get("wells")]
 
-    def representative(self, rrmse: pd.DataFrame) -> RepresentativeFormula:
+    def representative(self, rrmse: pd.DataFrame) -> Shown:
         """The formula that is shown: refined where any run has one, otherwise as published.
 
         Of the runs with such a formula it is the median by error where errors are known, otherwise the first.
@@ -52,17 +47,17 @@ class ModelFiles:
                 mine = rrmse[(rrmse["method"] == method) & rrmse["run"].isin(with_formula)]
                 ranked = mine.dropna(subset="rrmse").sort_values("rrmse")
                 if len(ranked):
-                    return RepresentativeFormula(int(ranked["run"].iloc[(len(ranked) - 1) // 2]), method)
-                return RepresentativeFormula(with_formula[0], method)
-        return RepresentativeFormula(None, METHODS[0])
+                    return int(ranked["run"].iloc[(len(ranked) - 1) // 2]), method
+                return with_formula[0], method
+        return None, METHODS[0]
 
-    def first_wells(self) -> RepresentativeFormula:
+    def first_wells(self) -> Shown:
         """The first run that has a formula about each attractor, where none has a single one."""
         for run, methods in enumerate(self._methods):
             for method, one in methods.items():
                 if one.get("wells"):
-                    return RepresentativeFormula(run, Method(method))
-        return RepresentativeFormula(None, METHODS[0])
+                    return run, Method(method)
+        return None, METHODS[0]
 
     def formulas(self, run: int) -> dict[str, SymbolicDecomposition]:
         """The formulas of a run by method."""

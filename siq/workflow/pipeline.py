@@ -138,8 +138,8 @@ def _regressed(
 ) -> tuple[SymbolicDecomposition, RegressionResult]:
     options = settings.regression
     points = snapshot_pairs(recordings, pair_step=settings.sampling.pair_step).x0
-    values = networks.evaluate(points)
-    below = points_below(values.potential, level=options.level)
+    potential, circulatory, vector_field = networks.evaluate(points)
+    below = points_below(potential, level=options.level)
     library = candidate_library(
         recordings.names,
         degree=options.degree,
@@ -150,9 +150,9 @@ def _regressed(
     result = sparse_decomposition(
         library,
         points[below],
-        values.potential[below],
-        values.circulatory[below],
-        values.vector_field[below],
+        potential[below],
+        circulatory[below],
+        vector_field[below],
         # D that nobody gave is that of the networks, in their precision.
         diffusion=settings.space.constant_noise(points.shape[1]) or Diffusion(networks.diffusion),
         options=options,

@@ -18,7 +18,7 @@ from siq.data.recordings import Recordings, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
 from siq.networks.decomposition import TrainedNetworks
-from siq.networks.training import Block, Checkpoints, TrainingData, choose_device, prepare_data
+from siq.networks.training import Block, TrainingData, choose_device, prepare_data
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.refinement import TrainingCheck
 from siq.systems.diffusion import Diffusion
@@ -77,7 +77,8 @@ def train_block(
         options=settings.training,
         diffusion=_diffusion(settings, runs, data),
         seed=settings.seed,
-        checkpoints=Checkpoints(folder, _fingerprint(settings, runs, data)),
+        folder=folder,
+        mark=_fingerprint(settings, runs, data),
         device=choose_device(device),
         faults=faults,
     )

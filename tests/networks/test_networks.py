@@ -55,20 +55,18 @@ def test_the_gradient_by_hand_is_that_of_automatic_differentiation(
 ) -> None:
     nets = networks(dimension, widths=widths)
     x = points(2, dimension).requires_grad_()
-    components = evaluate(nets, x)
-    (expected,) = torch.autograd.grad(components.potential.sum(), x)
-    torch.testing.assert_close(components.gradient, expected, rtol=1e-12, atol=1e-14)
+    potential, gradient, _, _ = evaluate(nets, x)
+    (expected,) = torch.autograd.grad(potential.sum(), x)
+    torch.testing.assert_close(gradient, expected, rtol=1e-12, atol=1e-14)
 
 
 def test_the_gradient_of_the_gradient_reaches_the_weights() -> None:
     nets = networks()
     parameters = [tensor.requires_grad_() for tensor in nets.parameters()]
     x = points(2, 3).requires_grad_()
-    components = evaluate(nets, x)
-    mine = torch.autograd.grad(
-        components.gradient.square().sum(), parameters[:6], retain_graph=True, allow_unused=True
-    )
-    (by_autograd,) = torch.autograd.grad(components.potential.sum(), x, create_graph=True)
+    potential, gradient, _, _ = evaluate(nets, x)
+    mine = torch.autograd.grad(gradient.square().sum(), parameters[:6], retain_graph=True, allow_unused=True)
+    (by_autograd,) = torch.autograd.grad(potential.sum(), x, create_graph=True)
     expected = torch.autograd.grad(by_autograd.square().sum(), parameters[:6], allow_unused=True)
     for left, right in zip(mine[:5], expected[:5], strict=True):  # the last bias shifts V only
         torch.testing.assert_close(left, right, rtol=1e-9, atol=1e-13)
@@ -77,17 +75,17 @@ def test_the_gradient_of_the_gradient_reaches_the_weights() -> None:
 def test_values_are_the_formulas_of_the_paper() -> None:
     nets = networks(diffusion=FULL)
     x = points(2, 3)
-    components = evaluate(nets, x)
+    v, gradient, g, f = evaluate(nets, x)
     for run in range(2):
         y = (x[run] - nets.mean[run]).numpy() / nets.scale[run].numpy()
         potential = nets.potential_scale[run].numpy() * (
             tanh_network(nets.potential, y, run) + (y**2).sum(axis=1, keepdims=True)
         )
-        np.testing.assert_allclose(components.potential[run], potential[:, 0], rtol=1e-12)
+        np.testing.assert_allclose(v[run], potential[:, 0], rtol=1e-12)
         circulatory = nets.circulatory_scale[run].numpy() * tanh_network(nets.circulatory, y, run)
-        np.testing.assert_allclose(components.circulatory[run], circulatory, rtol=1e-12)
-        expected = components.circulatory[run].numpy() - components.gradient[run].numpy() @ FULL.T
-        np.testing.assert_allclose(components.vector_field[run], expected, rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(g[run], circulatory, rtol=1e-12)
+        expected = g[run].numpy() - gradient[run].numpy() @ FULL.T
+        np.testing.assert_allclose(f[run], expected, rtol=1e-12, atol=1e-14)
 
 
 def test_two_runs_together_equal_each_alone() -> None:
@@ -96,10 +94,8 @@ def test_two_runs_together_equal_each_alone() -> None:
     together = evaluate(nets, x)
     for run in range(2):
         alone = evaluate(select_run(nets, run), x[run : run + 1])
-        for name in ("potential", "gradient", "circulatory", "vector_field"):
-            torch.testing.assert_close(
-                getattr(together, name)[run], getattr(alone, name)[0], rtol=1e-13, atol=1e-14
-            )
+        for both, single in zip(together, alone, strict=True):
+            torch.testing.assert_close(both[run], single[0], rtol=1e-13, atol=1e-14)
 
 
 def test_runs_differ_and_do_not_depend_on_their_neighbours() -> None:
@@ -116,18 +112,16 @@ def test_networks_at_rest_have_the_values_of_those_in_training(monkeypatch: pyte
     x = generator(2).normal(size=(25, 3))
     for run in range(2):
         one = at_rest(nets, run)
-        components = evaluate(select_run(nets, run), torch.from_numpy(x)[None])
+        potential, _, circulatory, field = evaluate(select_run(nets, run), torch.from_numpy(x)[None])
         whole = one.evaluate(x)
         with monkeypatch.context() as patch:
             patch.setattr(decomposition, "CHUNK", 7)
             pieces = one.evaluate(x)
-            np.testing.assert_allclose(one.potential_at(x), whole.potential, rtol=1e-12)
-        for name in ("potential", "circulatory", "vector_field"):
-            np.testing.assert_allclose(getattr(pieces, name), getattr(whole, name), rtol=1e-12, atol=1e-14)
-            np.testing.assert_allclose(
-                getattr(whole, name), getattr(components, name)[0], rtol=1e-12, atol=1e-14
-            )
-    assert one.evaluate(x[:0]).vector_field.shape == (0, 3)
+            np.testing.assert_allclose(one.potential_at(x), whole[0], rtol=1e-12)
+        for piece, values, expected in zip(pieces, whole, (potential, circulatory, field), strict=True):
+            np.testing.assert_allclose(piece, values, rtol=1e-12, atol=1e-14)
+            np.testing.assert_allclose(values, expected[0], rtol=1e-12, atol=1e-14)
+    assert one.evaluate(x[:0])[-1].shape == (0, 3)
     assert one.potential_at(x[:0]).shape == (0,)
 
 
@@ -206,6 +200,6 @@ def test_the_initial_potential_may_be_as_steep_as_the_descent_within_a_fast_rota
         nets = _initial_networks(
             [data], options=options, diffusion=Diffusion.identity(2), generators=[generator(1)]
         )
-        gradient = evaluate(nets, torch.from_numpy(x0)[None]).gradient[0].numpy()
+        gradient = evaluate(nets, torch.from_numpy(x0)[None])[1][0].numpy()
         slopes[source] = np.linalg.norm(gradient, axis=1).mean() / np.linalg.norm(x0, axis=1).mean()
     assert slopes["descent"] < 0.2 < 1 < slopes["speed"]

@@ -13,7 +13,7 @@ from known_settings import PAPER
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.errors import InputError, NumericalFailure
 from siq.networks.decomposition import TrainingOptions, load_networks, pack, save_networks
-from siq.networks.networks import _Components, at_rest, dynamics_loss, orthogonality_loss
+from siq.networks.networks import at_rest, dynamics_loss, orthogonality_loss
 from siq.networks.training import (
     HISTORY,
     TrainingData,
@@ -307,10 +307,6 @@ def test_a_single_recording_is_a_numerical_failure() -> None:
 # Loss
 
 
-def components(gradient: torch.Tensor, circulatory: torch.Tensor) -> _Components:
-    return _Components(gradient[..., 0], gradient, circulatory, circulatory - gradient)
-
-
 def vectors(seed: int) -> torch.Tensor:
     return torch.from_numpy(generator(seed).normal(size=(2, 40, 2)))
 
@@ -320,12 +316,12 @@ IDENTITY = torch.eye(2, dtype=torch.float64)
 
 def test_the_orthogonality_loss_is_the_asymmetric_square_of_the_cosine() -> None:
     v, g = vectors(0), vectors(1)
-    found = orthogonality_loss(components(v, g), IDENTITY, IDENTITY, asymmetry=0.1)
+    found = orthogonality_loss(v, g, IDENTITY, IDENTITY, asymmetry=0.1)
     z = ((v * g).sum(-1) / v.norm(dim=-1) / g.norm(dim=-1)).numpy()
     np.testing.assert_allclose(found, np.where(z >= 0, z**2, 0.1 * z**2).mean(axis=1), rtol=1e-12)
     one_way = torch.tensor([[[1.0, 0.0]]], dtype=torch.float64)
     for factor, expected in ((2.0, 1.0), (-2.0, 0.1)):
-        value = orthogonality_loss(components(one_way, factor * one_way), IDENTITY, IDENTITY, asymmetry=0.1)
+        value = orthogonality_loss(one_way, factor * one_way, IDENTITY, IDENTITY, asymmetry=0.1)
         assert value.tolist() == pytest.approx([expected])
 
 
@@ -340,7 +336,7 @@ def test_the_losses_do_not_change_with_the_units_of_the_states() -> None:
         v_new = v if scale is IDENTITY else v @ inverse
         values.append(
             (
-                orthogonality_loss(components(v_new, g @ scale), metric, precision, asymmetry=0.1),
+                orthogonality_loss(v_new, g @ scale, metric, precision, asymmetry=0.1),
                 dynamics_loss(g @ scale, observed @ scale, precision),
             )
         )
@@ -364,7 +360,7 @@ def test_a_vanishing_component_costs_nothing_and_has_finite_derivatives(
     v, g = vectors(0).to(dtype), vectors(1).to(dtype)
     v = (0 * v if which in ("gradient", "both") else v).requires_grad_()
     g = (0 * g if which in ("circulatory", "both") else g).requires_grad_()
-    loss = orthogonality_loss(components(v, g), IDENTITY.to(dtype), IDENTITY.to(dtype), asymmetry=0.1)
+    loss = orthogonality_loss(v, g, IDENTITY.to(dtype), IDENTITY.to(dtype), asymmetry=0.1)
     assert loss.tolist() == [0.0, 0.0]
     loss.sum().backward()
     assert torch.isfinite(v.grad).all()
@@ -375,8 +371,8 @@ def test_a_vanishing_component_costs_nothing_and_has_finite_derivatives(
 @pytest.mark.parametrize("size", [1e-6, 1e-3, 1e3, 1e6])
 def test_the_angle_does_not_depend_on_how_long_the_vectors_are(dtype: torch.dtype, size: float) -> None:
     v, g, unit = vectors(0).to(dtype), vectors(1).to(dtype), IDENTITY.to(dtype)
-    before = orthogonality_loss(components(v, g), unit, unit, asymmetry=0.1)
-    after = orthogonality_loss(components(size * v, size * g), unit, unit, asymmetry=0.1)
+    before = orthogonality_loss(v, g, unit, unit, asymmetry=0.1)
+    after = orthogonality_loss(size * v, size * g, unit, unit, asymmetry=0.1)
     torch.testing.assert_close(before, after, rtol=1e-4, atol=0)
 
 

@@ -445,7 +445,7 @@ def test_a_randomised_network_is_refused(seed: int) -> None:
     random = replace(
         random, potential=tuple((3 * weights, 3 * biases) for weights, biases in random.potential)
     )
-    values = random.evaluate(points).potential
+    values = random.potential_at(points)
     start = fit_values(found.library, [points], [values])
     plain, refined = (
         certified(known, over_terms(found, coefficients), found=found)

@@ -115,5 +115,5 @@ def test_the_answer_beside_a_page_is_told_and_gives_the_code(
     tmp_path: Path, answer: dict[str, Any], code: Exit, words: str
 ) -> None:
     (tmp_path / "answer.json").write_text(json.dumps({"sentence": "Two states."} | answer))
-    told = answer_of_page(tmp_path / "report.html")
-    assert told.code == code and words in " ".join(told.lines) and told.lines[0] == "Two states."
+    lines, told = answer_of_page(tmp_path / "report.html")
+    assert told == code and words in " ".join(lines) and lines[0] == "Two states."

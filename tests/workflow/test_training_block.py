@@ -12,7 +12,7 @@ from known_settings import PAPER
 
 from siq.data.recordings import SnapshotPairs
 from siq.networks.decomposition import CheckOptions, TrainedNetworks, pack
-from siq.networks.training import Block, Checkpoints, prepare_data
+from siq.networks.training import Block, prepare_data
 from siq.systems.diffusion import Diffusion
 from siq.workflow.tables import Status
 from siq.workflow.training import _outcome_of, clean
@@ -59,7 +59,7 @@ def same(left: TrainedNetworks, right: TrainedNetworks) -> bool:
 def block(folder: Path | None, checks: dict[int, Check], **further) -> Block:
     return Block(
         {run: data(run) for run in (0, 1)}, checks, options=TRAINING, diffusion=Diffusion.identity(2), seed=3,
-        checkpoints=Checkpoints(folder, "m" * 20), device=torch.device("cpu"), **further,
+        folder=folder, mark="m" * 20, device=torch.device("cpu"), **further,
     )  # type: ignore[arg-type]  # fmt: skip
 
 

@@ -25,7 +25,7 @@ from siq.report.summary import LandscapeSummary, energy_unit
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import compile_formulas
 from siq.systems.simulation import simulate_snapshots
-from siq.workflow.models import ModelFiles, RepresentativeFormula
+from siq.workflow.models import ModelFiles, Shown
 from siq.workflow.study import PipelineSettings, StateSpace, Study, SweepOptions
 from siq.workflow.tables import METHODS, Method
 from workflow.figures.comparison import plot_degrees, plot_error_curves, plot_error_maps, plot_escape
@@ -147,7 +147,7 @@ def landscape_figures(
     inside = np.nan_to_num(reference.values, nan=np.inf) < below
     ours = {"characteristics": reference.values, "mesh": reference.mesh_values}
     if networks is not None:
-        ours["networks"] = 2 * networks.evaluate(x).potential
+        ours["networks"] = 2 * networks.potential_at(x)
     regression = (formulas or {}).get(Method.REGRESSION)
     if regression is not None and regression.potential is not None:
         ours[str(Method.REGRESSION)] = 2 * regression.values(x)
@@ -247,7 +247,7 @@ DRAWN_TABLES = ("coefficients", "rrmse", "training", "prediction", "record", "re
 
 
 def representative_run(
-    shown: RepresentativeFormula, models: ModelFiles, complete: tuple[int, Landscape] | None
+    shown: Shown, models: ModelFiles, complete: tuple[int, Landscape] | None
 ) -> RepresentativeRun:
     """The refined formula, or else the landscape, or else the formula as published.
 
@@ -260,15 +260,15 @@ def representative_run(
     complete
         A run with a U over all wells; asked for where no refined formula holds.
     """
-    run, landscape = shown.run, None
+    (run, method), landscape = shown, None
     if complete is not None:
         run, landscape = complete[0], complete[1].global_quasipotential
     if run is None:
         return RepresentativeRun(0, None, None, None)
     formulas = models.formulas(run)
-    own = formulas.get(Method.REFINED, formulas.get(shown.method))
+    own = formulas.get(Method.REFINED, formulas.get(method))
     dynamics = None if own is None else Dynamics.of(own.symbols, own.vector_field)
-    return RepresentativeRun(run, formulas.get(shown.method), landscape, dynamics)
+    return RepresentativeRun(run, formulas.get(method), landscape, dynamics)
 
 
 def study_figures(
@@ -411,13 +411,13 @@ def _dataset(
     if networks is None:
         return plain
     level = settings.regression.level
-    potential = networks.evaluate(x).potential
+    potential = networks.potential_at(x)
     marked = replace(plain, below=points_below(potential, level=level))
     if x.shape[1] != 2:
         return marked
     across, upwards = np.linspace(x.min(axis=0), x.max(axis=0), GRID).T
     grid = np.stack(np.meshgrid(across, upwards), axis=-1).reshape(-1, 2)
-    values = networks.evaluate(grid).potential.reshape(GRID, GRID)
+    values = networks.potential_at(grid).reshape(GRID, GRID)
     return replace(
         marked, axes=(across, upwards), potential=values, threshold=highest_used(potential, level=level)
     )

@@ -305,12 +305,11 @@ def say_what_has_no_answer():
         for output in job.output
         if str(output).endswith("report.html")
     ]
-    unanswered = [
-        told for told in map(answer_of_page, pages) if told.code == Exit.NO_ANSWER
-    ]
-    for told in unanswered:
-        print(*told.lines, f"The page to read: {told.page}", sep="\n", file=sys.stderr)
-    if unanswered:
+    told = {page: answer_of_page(page) for page in pages}
+    for page, (lines, code) in told.items():
+        if code == Exit.NO_ANSWER:
+            print(*lines, f"The page to read: {page}", sep="\n", file=sys.stderr)
+    if Exit.NO_ANSWER in [code for _, code in told.values()]:
         sys.exit(int(Exit.NO_ANSWER))
 
 
