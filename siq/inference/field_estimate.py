@@ -596,20 +596,13 @@ def _spread_out(library: CandidateLibrary, support: np.ndarray, values: np.ndarr
     return matrix
 
 
-@dataclass(frozen=True, eq=False)
-class GivenField:
-    """f and D as somebody gave them."""
-
-    dynamics: Dynamics
-
-    @property
-    def diffusion(self) -> Diffusion:
-        """D."""
-        return self.dynamics.diffusion
+AnyField = FieldEstimate | Dynamics
+"""f and D with what is not known of them, or as somebody gave them."""
 
 
-AnyField = FieldEstimate | GivenField
-"""f with what is not known of it."""
+def dynamics_of(found: AnyField) -> Dynamics:
+    """f and D alone."""
+    return found if isinstance(found, Dynamics) else found.dynamics
 
 
 def write_field(path: str | Path, estimate: FieldEstimate, options: IdentificationOptions) -> None:

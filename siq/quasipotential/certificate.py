@@ -22,7 +22,7 @@ import numpy as np
 
 from siq.data.recordings import SnapshotPairs
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import AnyField, GivenField, Verdict
+from siq.inference.field_estimate import AnyField, Verdict
 from siq.numerics.randomness import representative_subset
 from siq.quasipotential.certificate_tests import (
     ERROR_POINTS,
@@ -185,7 +185,7 @@ def certify(
     from_field = 0.0
     for number, candidate in enumerate(candidates):
         if candidate.claimed < MIN_CLAIMED_SHARE:
-            advice = "" if isinstance(found, GivenField) else "record more there, or "
+            advice = "" if isinstance(found, Dynamics) else "record more there, or "
             reason = (
                 f"V claims to hold at {candidate.claimed:.0%} of the held-out states in the well about"
                 f" {_position_text(wells[number].attractor)}: {advice}raise refinement.degrees"
@@ -217,7 +217,7 @@ def certify(
         reason = "" if known else "f is not known well enough to tell V: record more"
     value = own_error if known else from_field
     tests["error"] = Verdict(value, options.error, own_error <= options.error and known, reason)
-    if not isinstance(found, GivenField):
+    if not isinstance(found, Dynamics):
         if portrait.attractors:
             tests["existence"] = check_existence(found, portrait, seed=seed)
         # Both routes share the error of f, and have the rest of their own. One that cannot be stated explains

@@ -41,7 +41,7 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from siq.data.recordings import SnapshotPairs
 from siq.inference.checks import PredictionLimits
-from siq.inference.field_estimate import AnyField, FieldEstimate, GivenField, Verdict
+from siq.inference.field_estimate import AnyField, FieldEstimate, Verdict, dynamics_of
 from siq.numerics.randomness import normal_draws
 from siq.numerics.text import percent, place_text
 from siq.quasipotential.characteristics import ascending_integrals, fastest_rate
@@ -169,15 +169,15 @@ class Candidate:
         """
         if not self.attractors:
             return np.inf
-        generator = np.random.default_rng(seed)
+        dynamics, generator = dynamics_of(found), np.random.default_rng(seed)
         rows = generator.choice(len(self.points), min(ERROR_POINTS, len(self.points)), replace=False)
         x = self.points[rows]
         places = np.concatenate([self.points, [one.position for one in self.attractors]])
         integral = _residual_integral(
-            self.gradients, found.dynamics, x,
+            self.gradients, dynamics, x,
             box=np.stack([places.min(axis=0), places.max(axis=0)], axis=1),
             slowest=min(-one.eigenvalues.real.max() for one in self.attractors),
-            fastest=fastest_rate(found.dynamics, x, np.ptp(x, axis=0)),
+            fastest=fastest_rate(dynamics, x, np.ptp(x, axis=0)),
         )  # fmt: skip
         values = self.values(x)
         lowest = min(float(self.values(one.position[None])[0]) for one in self.attractors)
@@ -199,7 +199,7 @@ class Candidate:
             "hamilton_jacobi": self.check_hamilton_jacobi(found, options),
             "branch": _check_branch(self, found, options, seed=seed),
         }
-        if self.pairs is not None and not isinstance(found, GivenField):
+        if self.pairs is not None and not isinstance(found, Dynamics):
             tests["descent"] = _check_descent(self, found, options, error=error)
         tests["characteristics"] = followed
         if self.circulatory is not None:
@@ -211,11 +211,11 @@ class Candidate:
 
         The cosine of ∇V and g would be 0/0 for gradient systems, in which g vanishes; this measure is not.
         """
-        x, measure = self.points, found.diffusion
-        flow, gradient = found.dynamics.drift(x), self.gradients(x)
+        x, dynamics, measure = self.points, dynamics_of(found), found.diffusion
+        flow, gradient = dynamics.drift(x), self.gradients(x)
         down = found.diffusion.push(x, gradient)
         if self.attractors:
-            measure = measure_at(found.dynamics, self.attractors[0].position)
+            measure = measure_at(dynamics, self.attractors[0].position)
         slope = np.sqrt(np.maximum(measure.contract(x, gradient), 0))
         speed, fall = (np.sqrt(measure.squared_speed(x, one)) for one in (flow, down))
         # Where V falls it falls by f: a V that hardly varies while states move is no potential.
@@ -234,7 +234,7 @@ def _check_identity(candidate: Candidate, found: AnyField, options: CertificateO
     """Whether the stored V and g make up the f that was identified without them."""
     assert candidate.circulatory is not None
     x, noise = candidate.points, found.diffusion
-    flow = found.dynamics.drift(x)
+    flow = dynamics_of(found).drift(x)
     built = candidate.circulatory(x) - noise.push(x, candidate.gradients(x))
     squares = noise.squared_speed(x, flow - built).mean()
     value = float(np.sqrt(squares / noise.squared_speed(x, flow).mean()))
@@ -244,7 +244,7 @@ def _check_identity(candidate: Candidate, found: AnyField, options: CertificateO
 
 def _relative_error_of_drift(found: AnyField, points: np.ndarray, measure: Diffusion) -> float:
     """Rms over points of the standard error of f, over rms of f, speeds being measured by D or by another."""
-    if isinstance(found, GivenField) or found.noise_free:
+    if isinstance(found, Dynamics) or found.noise_free:
         return 0.0
     components, functions = found.support.T
     terms = found.library.evaluate(points)[:, functions]
@@ -265,7 +265,7 @@ def _check_branch(
         return Verdict.refused("there is no stable equilibrium at which V could be tested", options.branch)
     worst, allowed, place = 0.0, options.branch, candidate.attractors[0]
     for one in candidate.attractors:
-        expected = hessian_at(found.dynamics, one.position)
+        expected = hessian_at(dynamics_of(found), one.position)
         root = np.linalg.inv(np.linalg.cholesky(expected))
 
         def deviation(hessian: np.ndarray, expected: np.ndarray, root: np.ndarray) -> float:
@@ -274,7 +274,7 @@ def _check_branch(
 
         value = deviation(candidate.hessians(one.position[None])[0], expected, root)
         bound = options.branch
-        if not isinstance(found, GivenField) and not found.noise_free:
+        if not isinstance(found, Dynamics) and not found.noise_free:
             # The standard deviation of M over draws of f, whose attractor is found again by Newton's method.
             draws = normal_draws(
                 found.values, found.covariance, FIELD_DRAWS, generator=np.random.default_rng(seed)

@@ -35,7 +35,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
-from siq.inference.field_estimate import AnyField, FieldEstimate, GivenField
+from siq.inference.field_estimate import AnyField, FieldEstimate
 from siq.numerics.integration import dormand_prince_step, next_step
 from siq.quasipotential.power_series import quasipotential_series
 from siq.systems.dynamics import Dynamics
@@ -620,7 +620,7 @@ def potential_errors(found: AnyField, gradient: Function, attractor: np.ndarray,
     `gradient` is ∇V, points ``(n, d)`` to ``(n, d)``. They are zero where f carries no noise, and NaN where
     no ascending path comes from the attractor.
     """
-    if isinstance(found, GivenField) or found.noise_free or not len(x):
+    if isinstance(found, Dynamics) or found.noise_free or not len(x):
         return np.zeros(len(x))
     of_field, of_noise = _potential_slopes(found, gradient, attractor, x)
     return np.asarray(np.sqrt(found.variance(of_field) + found.noise_variance(of_noise)))
@@ -633,7 +633,7 @@ def relative_error(
 
     Infinite where the errors of more than a tenth of the points cannot be told.
     """
-    if isinstance(found, GivenField) or found.noise_free or not len(x):
+    if isinstance(found, Dynamics) or found.noise_free or not len(x):
         return 0.0
     errors = potential_errors(found, gradient, attractor, x)
     known = np.isfinite(errors)

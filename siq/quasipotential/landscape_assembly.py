@@ -17,7 +17,7 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from siq.errors import InputError, NumericalFailure
-from siq.inference.field_estimate import AnyField, FieldEstimate, GivenField
+from siq.inference.field_estimate import AnyField, FieldEstimate, dynamics_of
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.certificate import (
     Certificate,
@@ -149,7 +149,7 @@ def landscape_from_equations(
             remarks.append(Remark("quasipotential.cycles_need_noise_on_every_state"))
         elif system.dimension > 2:
             remarks.append(Remark("quasipotential.unstable_cycles_sought_along_boundaries"))
-    found, ways = GivenField(system), ways_out(system, portrait, beyond_region=True)
+    ways = ways_out(system, portrait, beyond_region=True)
     wells: list[Well | None] = [None] * points
     certificate = None
     if many and formulas and points:
@@ -174,7 +174,7 @@ def landscape_from_equations(
         unseen = [spread_evenly(box, UNSEEN_STATES, generator=draw) for box in (system.box, *boxes)]
         depths = [np.inf if way is None or way.path is None else way.path.action / 2 for way in lowest]
         evidence = Evidence(
-            found, portrait, np.concatenate(unseen), options=settings.certificate, seed=seed,
+            system, portrait, np.concatenate(unseen), options=settings.certificate, seed=seed,
             references=references_about(system, portrait, depths=depths, seed=seed),
         )  # fmt: skip
         certificate = certify(sought, evidence)
@@ -182,7 +182,7 @@ def landscape_from_equations(
     wells += [None] * len(portrait.cycles)
     noises = settings.landscape.noise_intensities
     return _assembled(
-        found, portrait, wells, transitions(found, ways, wells), remarks, certificate=certificate,
+        system, portrait, wells, transitions(system, ways, wells), remarks, certificate=certificate,
         noise=NoiseStrength(noises[0]) if noises else None,
     )  # fmt: skip
 
@@ -263,7 +263,7 @@ def _assembled(
         remarks.append(Remark("quasipotential.reason", {"reason": str(error)}))
         heights = np.full(len(settled), np.nan)
     return Landscape(
-        found.dynamics,
+        dynamics_of(found),
         portrait.equilibria,
         settled,
         np.array([float((ends == index).mean()) for index in range(len(settled))]),
@@ -274,8 +274,8 @@ def _assembled(
         certificate,
         np.array([position_standard_errors(found, one.position) for one in settled]),
         noise,
-        None if isinstance(found, GivenField) else found,
-        given=isinstance(found, GivenField),
+        None if isinstance(found, Dynamics) else found,
+        given=isinstance(found, Dynamics),
         parting=portrait.parting,
     )
 

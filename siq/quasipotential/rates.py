@@ -59,7 +59,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import AnyField, GivenField
+from siq.inference.field_estimate import AnyField
 from siq.quasipotential.path_chains import MinimumActionPath, PathProblem
 from siq.quasipotential.paths import minimum_action_path
 from siq.quasipotential.power_series import MOST_STATES_OF_DEGREE_4, local_series
@@ -535,7 +535,7 @@ def prefactor_error(found: AnyField, path: MinimumActionPath) -> tuple[float | N
     Both are zero where f carries no noise; the first is None where the law holds for too few of the changed
     f.
     """
-    if isinstance(found, GivenField) or found.noise_free:
+    if isinstance(found, Dynamics) or found.noise_free:
         return 0.0, 0.0
     covariance = found.covariance
     if found.noise is not None:

@@ -22,7 +22,7 @@ import numpy as np
 
 from siq.errors import NumericalFailure
 from siq.inference.diffusion_model import defined_states
-from siq.inference.field_estimate import AnyField, GivenField
+from siq.inference.field_estimate import AnyField, dynamics_of
 from siq.quasipotential.path_chains import MinimumActionPath
 from siq.quasipotential.paths import both_sides, descent, transition_path
 from siq.quasipotential.rates import EscapeRate, escape_rate, prefactor_error
@@ -213,8 +213,8 @@ def transitions(
     wells
         The formula about each attractor, cycles after points; None where there is none.
     """
-    found_ways = []
-    missing = missing_diffusion(found.dynamics)
+    found_ways, dynamics = [], dynamics_of(found)
+    missing = missing_diffusion(dynamics)
     for way in ways:
         path, well = way.path, wells[way.start]
         if path is None:
@@ -228,7 +228,7 @@ def transitions(
                 raise NumericalFailure("no law is implemented for ways that begin or end on a cycle")
             if missing is not None:
                 raise NumericalFailure(missing)
-            rate = escape_rate(found.dynamics, path, beyond=way.end is not None)
+            rate = escape_rate(dynamics, path, beyond=way.end is not None)
             remarks += rate.remarks
             error, covariance = prefactor_error(found, path)
             rate = replace(rate, prefactor_error=error, covariance=covariance)
@@ -239,7 +239,7 @@ def transitions(
             barrier, share = _barrier_by_formula(path, well)
             if abs(barrier / path.action - 1) > NOTEWORTHY_DIFFERENCE:
                 remarks.append(Remark("quasipotential.formula_differs_from_path"))
-            if isinstance(found, GivenField) and path.converged:  # nothing about f is to be averaged
+            if isinstance(found, Dynamics) and path.converged:  # nothing about f is to be averaged
                 barrier, share = path.action, 0.0
         logger.info(
             "barrier of U from attractor %d: %.5g by formula, %.5g by the path",
@@ -252,7 +252,7 @@ def transitions(
             replace(
                 way, barrier=barrier + by_rivals, formula_share=share, standard_error=spread, rate=rate,
                 remarks=tuple({str(one): one for one in remarks}.values()), by_rivals=by_rivals,
-                leverage=noise_leverage(path, found.dynamics),
+                leverage=noise_leverage(path, dynamics),
             )
         )  # fmt: skip
     return found_ways
@@ -272,7 +272,7 @@ def _barrier_by_formula(path: MinimumActionPath, well: Well) -> tuple[float, flo
 
 def barrier_uncertainty(path: MinimumActionPath, found: AnyField) -> tuple[float, float]:
     """Standard error of a barrier of U from that of f, to first order, and what alternative terms add."""
-    if isinstance(found, GivenField):
+    if isinstance(found, Dynamics):
         return 0.0, 0.0
     middle, force, spent = _pieces(path, found.dynamics)
     terms = found.library.evaluate(middle)
@@ -313,7 +313,7 @@ def _pieces(path: MinimumActionPath, dynamics: Dynamics) -> tuple[np.ndarray, np
 
 def position_standard_errors(found: AnyField, position: np.ndarray) -> np.ndarray:
     """Standard errors of an equilibrium's position, shape ``(d,)``: of f = 0 follows δx = -J⁻¹ δf."""
-    if isinstance(found, GivenField):
+    if isinstance(found, Dynamics):
         return np.zeros(len(position))
     terms = found.library.evaluate(position[None])[0]
     try:

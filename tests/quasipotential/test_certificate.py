@@ -32,7 +32,7 @@ from known_systems import (
 
 from siq.data.recordings import Recordings, SnapshotPairs
 from siq.inference.checks import PredictionLimits, check_prediction, prediction_errors
-from siq.inference.field_estimate import FieldEstimate, GivenField, Verdict
+from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.inference.library import candidate_library, monomial_exponents
 from siq.networks.decomposition import shuffled
 from siq.networks.networks import Networks, at_rest, initial_layers
@@ -691,7 +691,7 @@ def evidence_in_well(count: int, reference: Reference | None) -> Evidence:
     xh = x0 + 0.01 * KNOWN.dynamics.drift(x0)
     pairs = SnapshotPairs(x0, xh, np.full(count, 0.01), np.arange(count))
     references = () if reference is None else (reference,)
-    return Evidence(GivenField(KNOWN.dynamics), PORTRAIT, x0, pairs, references)
+    return Evidence(KNOWN.dynamics, PORTRAIT, x0, pairs, references)
 
 
 def test_a_basin_is_told_by_recorded_descents() -> None:
