@@ -2,6 +2,7 @@
 from benchmarks.publication.public_recordings import BENCHMARKS
 from workflow.cases import Cases
 
+MISMATCH = "results/mismatch/{case}/tables"
 MISMATCH_TABLES = ["curves", "candidates", "held_out", "forces", "noise"]
 
 with bad_input_told():

@@ -41,6 +41,8 @@ with bad_input_told():
 
 
 REPRODUCED = ["archetype3d", "archetype3d-noise", "archetype4d", "resonator"]
+RUN_TABLES = ["coefficients", "rrmse", "prediction", "certificates"]
+RUN_TABLES += ["record", "record_density"]
 FIGURES = texts("captions")["figures"]
 CAPTIONS = {name: caption["text"] for name, caption in FIGURES.items()}
 
@@ -67,6 +69,11 @@ def task(name):
     if options := TASKS[name].options:
         params["options"] = lambda wildcards: study_of(wildcards).options(options)
     return params
+
+
+def tables(*names, of="results/{study}/tables"):
+    """Files of tables by their names, of a study where nothing else is said."""
+    return {name: f"{of}/{name}.parquet" for name in names}
 
 
 def points_of_sweep(wildcards):

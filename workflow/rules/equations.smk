@@ -10,11 +10,8 @@ use rule run_task as equations with:
     input:
         card=card_if_any,
     output:
+        **tables("landscape", "degrees", "certificates", "outcomes"),
         quasipotential="results/{study}/quasipotential.json",
-        landscape="results/{study}/tables/landscape.parquet",
-        degrees="results/{study}/tables/degrees.parquet",
-        certificates="results/{study}/tables/certificates.parquet",
-        outcomes="results/{study}/tables/outcomes.parquet",
     log:
         "results/{study}/logs/equations.log",
     benchmark:
@@ -37,12 +34,9 @@ use rule invariant as equations_invariant with:
 
 use rule page as equations_page with:
     input:
+        **tables("landscape", "degrees", "certificates", "outcomes"),
         card=card_if_any,
         quasipotential="results/{study}/quasipotential.json",
-        landscape="results/{study}/tables/landscape.parquet",
-        degrees="results/{study}/tables/degrees.parquet",
-        certificates="results/{study}/tables/certificates.parquet",
-        outcomes="results/{study}/tables/outcomes.parquet",
         sweep=with_sweep("sweep"),
         branches=with_sweep("branches"),
         bifurcations=with_sweep("bifurcations"),
@@ -80,11 +74,8 @@ use rule run_task as sweep with:
         card=card_if_any,
         points=points_of_sweep,
     output:
-        sweep="results/{study}/tables/sweep.parquet",
-        sweep_ways="results/{study}/tables/sweep_ways.parquet",
-        branches="results/{study}/tables/branches.parquet",
-        bifurcations="results/{study}/tables/bifurcations.parquet",
-        bifurcation_curves="results/{study}/tables/bifurcation_curves.parquet",
+        **tables("sweep", "sweep_ways", "branches"),
+        **tables("bifurcations", "bifurcation_curves"),
     log:
         "results/{study}/logs/sweep.log",
     benchmark:

@@ -47,14 +47,10 @@ use rule run_task as diagnosis with:
             "results/mismatch/{{case}}/tables/{table}.csv",
             table=MISMATCH_TABLES,
         ),
+        **tables(*MISMATCH_TABLES, of=MISMATCH),
         verdict="results/mismatch/{case}/verdict.json",
         system="results/mismatch/{case}/system.yaml",
         recalibrated="results/mismatch/{case}/recalibrated.yaml",
-        curves="results/mismatch/{case}/tables/curves.parquet",
-        candidates="results/mismatch/{case}/tables/candidates.parquet",
-        held_out="results/mismatch/{case}/tables/held_out.parquet",
-        forces="results/mismatch/{case}/tables/forces.parquet",
-        noise="results/mismatch/{case}/tables/noise.parquet",
     log:
         "results/mismatch/{case}/logs/diagnosis.log",
     benchmark:
@@ -78,8 +74,7 @@ use rule run_task as mismatch_landscape with:
             "results/mismatch/{{case}}/tables/{table}.csv",
             table=["wells", "escape"],
         ),
-        wells="results/mismatch/{case}/tables/wells.parquet",
-        escape="results/mismatch/{case}/tables/escape.parquet",
+        **tables("wells", "escape", of=MISMATCH),
         notes="results/mismatch/{case}/landscape.json",
     log:
         "results/mismatch/{case}/logs/landscape.log",
@@ -143,15 +138,10 @@ use rule run_task as official_summary with:
 
 use rule run_task as mismatch_figures with:
     input:
+        **tables(*MISMATCH_TABLES, "escape", of=MISMATCH),
         verdict="results/mismatch/{case}/verdict.json",
         card=case_file("card"),
         system="results/mismatch/{case}/system.yaml",
-        curves="results/mismatch/{case}/tables/curves.parquet",
-        candidates="results/mismatch/{case}/tables/candidates.parquet",
-        held_out="results/mismatch/{case}/tables/held_out.parquet",
-        forces="results/mismatch/{case}/tables/forces.parquet",
-        noise="results/mismatch/{case}/tables/noise.parquet",
-        escape="results/mismatch/{case}/tables/escape.parquet",
     output:
         # Which figures there are depends on what was found.
         folder=directory("results/mismatch/{case}/figures"),
@@ -167,16 +157,13 @@ use rule run_task as mismatch_figures with:
 
 use rule run_task as mismatch_page with:
     input:
+        **tables("candidates", "wells", "escape", "held_out", of=MISMATCH),
         verdict="results/mismatch/{case}/verdict.json",
         card=case_file("card"),
         study=case_file("study"),
         system="results/mismatch/{case}/system.yaml",
-        candidates="results/mismatch/{case}/tables/candidates.parquet",
-        wells="results/mismatch/{case}/tables/wells.parquet",
-        escape="results/mismatch/{case}/tables/escape.parquet",
         notes="results/mismatch/{case}/landscape.json",
         scores=scores_if_any,
-        held_out="results/mismatch/{case}/tables/held_out.parquet",
         figures="results/mismatch/{case}/figures",
     output:
         html=report(

@@ -3,12 +3,8 @@
 
 use rule run_task as figures with:
     input:
-        coefficients="results/{study}/tables/coefficients.parquet",
-        rrmse="results/{study}/tables/rrmse.parquet",
-        training="results/{study}/tables/training.parquet",
-        prediction="results/{study}/tables/prediction.parquet",
-        record="results/{study}/tables/record.parquet",
-        record_density="results/{study}/tables/record_density.parquet",
+        **tables("coefficients", "rrmse", "training", "prediction"),
+        **tables("record", "record_density"),
         model=all_runs("results/{study}/runs/{run}/model.json"),
         recordings=all_runs("results/{study}/runs/{run}/recordings.parquet"),
         networks=networks_of_runs("networks.npz"),
@@ -32,16 +28,11 @@ use rule run_task as figures with:
 
 use rule run_task as page with:
     input:
-        summary="results/{study}/tables/summary.parquet",
-        rrmse="results/{study}/tables/rrmse.parquet",
-        certificates="results/{study}/tables/certificates.parquet",
-        coefficients="results/{study}/tables/coefficients.parquet",
-        outcomes="results/{study}/tables/outcomes.parquet",
-        record="results/{study}/tables/record.parquet",
-        timings="results/{study}/tables/timings.parquet",
+        **tables("summary", "rrmse", "certificates", "coefficients"),
+        **tables(
+            "outcomes", "record", "timings", "landscape", "invariant", "well_shares"
+        ),
         model=all_runs("results/{study}/runs/{run}/model.json"),
-        invariant="results/{study}/tables/invariant.parquet",
-        well_shares="results/{study}/tables/well_shares.parquet",
         overview="results/{study}/overview.json",
         field=all_runs("results/{study}/runs/{run}/vector_field.json"),
         drawn="results/{study}/drawn/study",
@@ -50,7 +41,6 @@ use rule run_task as page with:
             "results/{study}/drawn/landscape",
         ),
         drawn_density="results/{study}/drawn/invariant",
-        landscape="results/{study}/tables/landscape.parquet",
         landscape_errors=landscape_table("landscape_errors"),
         escape=landscape_table("escape"),
         beside_equations=file_where(
