@@ -8,7 +8,8 @@ import numpy as np
 from known_systems import KnownSystem, double_well, maier_stein, portrait_of, potential_values
 
 from siq.quasipotential.landscape import GlobalQuasipotential, heights_of_attractors
-from siq.quasipotential.wells import WellOptions, local_well
+from siq.quasipotential.refinement import RefinementOptions
+from siq.quasipotential.wells import local_well
 
 
 def stationary(rates: np.ndarray) -> np.ndarray:
@@ -29,7 +30,7 @@ def matched(which: str) -> tuple[KnownSystem, GlobalQuasipotential]:
     """The global U of a system, from local formulas and the exact barriers."""
     known = {"double well": double_well(2), "Maier-Stein": maier_stein(1)}[which]
     found = portrait_of(known, 400, share=0.8)
-    options = WellOptions(degrees=(4,))
+    options = RefinementOptions(degrees=(4,))
     local = [local_well(known.dynamics, found, index, options=options) for index in range(2)]
     (saddle,) = found.saddles[0]
     top = potential_values(known, saddle.position[None])[0]

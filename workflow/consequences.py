@@ -13,7 +13,7 @@ from siq.inference.field_estimate import FieldEstimate, FlowMap
 from siq.inference.library import CandidateLibrary
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
-from siq.quasipotential.wells import WellOptions
+from siq.quasipotential.refinement import RefinementOptions
 from siq.remarks import sentence
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import TIME, Dynamics, symbol
@@ -149,7 +149,7 @@ def _landscape(
         if not setting.attractors:
             fault = setting.fault()
             return None, ["no well is found" if fault is None else sentence(fault)]
-        found = find_landscape(field, setting, seed=seed, options=WellOptions(degrees=DEGREES))
+        found = find_landscape(field, setting, seed=seed, options=RefinementOptions(degrees=DEGREES))
     except (NumericalFailure, np.linalg.LinAlgError, ValueError) as error:
         return None, [str(error)]
     return found, list(found.notes)

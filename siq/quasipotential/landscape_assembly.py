@@ -37,7 +37,7 @@ from siq.quasipotential.path_chains import MinimumActionPath, evenly
 from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.refinement import RefinementOptions
 from siq.quasipotential.transitions import Transition, position_standard_errors, transitions, ways_out
-from siq.quasipotential.wells import Well, WellOptions, local_well
+from siq.quasipotential.wells import Well, local_well
 from siq.remarks import Remark, sentence
 from siq.systems.basins import follow
 from siq.systems.cards import load_system
@@ -85,7 +85,7 @@ def find_landscape(
     *,
     wells: Sequence[Well] | None = None,
     certificate: Certificate | None = None,
-    options: WellOptions | None = None,
+    options: RefinementOptions = RefinementOptions(),  # noqa: B008 (frozen)
     noise: NoiseStrength | None = None,
     seed: int = 0,
 ) -> Landscape:
@@ -284,7 +284,7 @@ def _local_well(
     dynamics: Dynamics,
     portrait: PhasePortrait,
     index: int,
-    options: WellOptions | None,
+    options: RefinementOptions,
     seed: int,
     remarks: list[Remark],
     *,
@@ -293,9 +293,7 @@ def _local_well(
 ) -> Well | None:
     """V about one attractor; a remark where none was found."""
     try:
-        return local_well(
-            dynamics, portrait, index, options=options or WellOptions(), seed=seed, saddle=saddle, path=path
-        )
+        return local_well(dynamics, portrait, index, options=options, seed=seed, saddle=saddle, path=path)
     except NumericalFailure as error:
         values = {"place": _place(portrait.attractors[index].position), "reason": str(error)}
         remarks.append(Remark("quasipotential.no_formula", values))

@@ -64,26 +64,33 @@ from siq.quasipotential.global_formula import (
 from siq.quasipotential.hamilton_jacobi import LibraryBasis, affordable_degree
 from siq.quasipotential.occupancy import OccupancyCheck, check_occupancy
 from siq.quasipotential.rates import NoiseStrength
-from siq.quasipotential.wells import Well, WellOptions, fit_well, local_well
+from siq.quasipotential.wells import MIN_OUTLIER_RESIDUAL, RESIDUAL_TOLERANCE, Well, fit_well, local_well
 from siq.remarks import Remark, sentence
 from siq.systems.phase_portrait import PhasePortrait, RecordedRegion, evenly_spread, phase_portrait
 
 logger = logging.getLogger(__name__)
 
 Route = Literal["network", "local"]
+Degree = Annotated[int, Field(ge=2, le=16)]
 
 LOWER_PARTS = (0.7, 0.5, 0.3)  # of the points, by V
 NETWORK_DEGREE = 8  # highest power of a well by the network route, whose start knows no more
 
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class RefinementOptions(WellOptions):
+class RefinementOptions:
     """How V is refined, about each attractor and over the whole region.
 
     Attributes
     ----------
-    degrees, accuracy, reach, tolerance
-        Of the local route; see `siq.quasipotential.wells.WellOptions`.
+    degrees
+        Highest powers about an attractor that are tried, one after the other.
+    accuracy
+        Relative Hamilton–Jacobi residual below which no higher power is tried.
+    reach
+        Level up to which a formula is sought, as a share of V at the lowest saddle.
+    tolerance
+        Largest relative Hamilton–Jacobi residual at a point where a formula is believed.
     routes
         ``network``, ``local``, or both, which are then compared with each other. By default both where
         networks are asked for, and otherwise the local one; see `with_routes`.
@@ -100,6 +107,10 @@ class RefinementOptions(WellOptions):
         Terms that contribute less than this share are dropped in any case.
     """
 
+    degrees: Annotated[tuple[Degree, ...], Field(min_length=1)] = (4, 6, 8, 10, 12)
+    accuracy: Annotated[float, Field(gt=0)] = MIN_OUTLIER_RESIDUAL
+    reach: Annotated[float, Field(gt=0, le=3)] = 1.2
+    tolerance: Annotated[float, Field(gt=0, lt=1)] = RESIDUAL_TOLERANCE
     routes: Annotated[tuple[Route, ...], Field(min_length=1)] | None = None
     formula_degree: Annotated[int, Field(ge=1, le=12)] | None = None
     functions: tuple[str, ...] = ()

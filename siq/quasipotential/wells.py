@@ -20,12 +20,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import sympy
-from pydantic import ConfigDict, Field
-from pydantic.dataclasses import dataclass as pydantic_dataclass
 from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
@@ -44,6 +42,9 @@ from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, hessian_at, measure_at
 from siq.systems.formulas import DIGITS, Formula
 from siq.systems.phase_portrait import PhasePortrait, RecordedRegion
+
+if TYPE_CHECKING:
+    from siq.quasipotential.refinement import RefinementOptions
 
 RESIDUAL_TOLERANCE = 0.05  # residual up to which a formula is believed: V is then off by some per cent
 ROUNDING_SHARE = 1e-16  # of what is usual: |∇V| |f| so close to the attractor says nothing
@@ -251,37 +252,12 @@ MAX_IDLE_DEGREES = 2  # higher degrees in a row that do not improve: there is no
 HELD_OUT_STRIDE = 4  # every so manieth point is kept for choosing the degree
 
 
-Degree = Annotated[int, Field(ge=2, le=16)]
-
-
-@pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class WellOptions:
-    """How V about an attractor is sought, and where it is believed.
-
-    Attributes
-    ----------
-    degrees
-        Highest powers that are tried, one after the other.
-    accuracy
-        Relative Hamilton–Jacobi residual below which no higher power is tried.
-    reach
-        Level up to which a formula is sought, as a share of V at the lowest saddle.
-    tolerance
-        Largest relative Hamilton–Jacobi residual at a point where a formula is believed.
-    """
-
-    degrees: Annotated[tuple[Degree, ...], Field(min_length=1)] = (4, 6, 8, 10, 12)
-    accuracy: Annotated[float, Field(gt=0)] = MIN_OUTLIER_RESIDUAL
-    reach: Annotated[float, Field(gt=0, le=3)] = 1.2
-    tolerance: Annotated[float, Field(gt=0, lt=1)] = RESIDUAL_TOLERANCE
-
-
 def local_well(
     dynamics: Dynamics,
     portrait: PhasePortrait,
     index: int,
     *,
-    options: WellOptions,
+    options: RefinementOptions,
     seed: int = 0,
     saddle: Equilibrium | Cycle | None = None,
     path: MinimumActionPath | None = None,

@@ -17,7 +17,7 @@ from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_comparison import reference_landscape
 from siq.quasipotential.landscape_files import read_landscape, write_landscape
-from siq.quasipotential.wells import WellOptions
+from siq.quasipotential.refinement import RefinementOptions
 from siq.workflow.study import StateSpace
 from siq.workflow.tables import as_table
 from workflow.figures.density import plot_invariant_distribution
@@ -34,7 +34,7 @@ def words(figure: Figure) -> str:
 @functools.cache
 def landscape() -> Landscape:
     return find_landscape(
-        exact_field(KNOWN, 3), portrait_of(KNOWN, share=0.9), options=WellOptions(degrees=(4,))
+        exact_field(KNOWN, 3), portrait_of(KNOWN, share=0.9), options=RefinementOptions(degrees=(4,))
     )
 
 

@@ -24,7 +24,8 @@ from siq.quasipotential.formulas import (
     term_coefficients,
     write_model,
 )
-from siq.quasipotential.wells import WellOptions, local_well
+from siq.quasipotential.refinement import RefinementOptions
+from siq.quasipotential.wells import local_well
 from siq.systems.dynamics import Dynamics
 
 x, y = (sympy.Symbol(name, real=True) for name in "xy")
@@ -185,7 +186,7 @@ def test_a_model_comes_back_equal_to_the_last_bit(tmp_path: Path, potential: sym
 
 def test_wells_come_back_with_all_that_was_found_of_them(tmp_path: Path) -> None:
     known = maier_stein(3)
-    well = local_well(known.dynamics, portrait_of(known), 0, options=WellOptions(degrees=(4, 6)))
+    well = local_well(known.dynamics, portrait_of(known), 0, options=RefinementOptions(degrees=(4, 6)))
     one = SymbolicDecomposition((x, y), None, (), known.dynamics.formulas, (well,))
     (again,) = saved(tmp_path / "model.json", one).wells
     points = well.points[::20]

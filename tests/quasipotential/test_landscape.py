@@ -27,7 +27,6 @@ from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_files import read_landscape, write_landscape
 from siq.quasipotential.refinement import RefinementOptions, _refined_decomposition, refine
-from siq.quasipotential.wells import WellOptions
 from siq.remarks import Remark, has_code
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -39,7 +38,7 @@ def double() -> Landscape:
     known = double_well(2)
     return find_landscape(
         exact_field(known, 3, relative_error=1e-3), portrait_of(known, 250, share=0.8),
-        options=WellOptions(degrees=(4,)),
+        options=RefinementOptions(degrees=(4,)),
     )  # fmt: skip
 
 
@@ -161,7 +160,7 @@ def test_a_landscape_is_drawn_on_given_axes_and_on_new_ones(dimension: int) -> N
     landscape = double()
     if dimension == 3:
         landscape = find_landscape(
-            exact_field(known, 3), portrait_of(known, 250, share=0.8), options=WellOptions(degrees=(4,))
+            exact_field(known, 3), portrait_of(known, 250, share=0.8), options=RefinementOptions(degrees=(4,))
         )
     assert landscape.plot(axes) is axes
     assert axes.get_xlabel() == "$x$" and axes.get_ylabel() in ("$y$", "$z$")

@@ -19,7 +19,7 @@ from siq.quasipotential.landscape_assembly import find_landscape, landscape_from
 from siq.quasipotential.landscape_files import landscape_data, read_landscape, write_landscape
 from siq.quasipotential.occupancy import VisitTest
 from siq.quasipotential.rates import NoiseStrength
-from siq.quasipotential.wells import WellOptions
+from siq.quasipotential.refinement import RefinementOptions
 from siq.remarks import Remark
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
@@ -31,7 +31,7 @@ def learned() -> Landscape:
     known = maier_stein(3)
     found = find_landscape(
         exact_field(known, 3, relative_error=1e-3), portrait_of(known, 250, share=0.8),
-        options=WellOptions(degrees=(4,)), noise=NoiseStrength(0.1, 0.01, "estimated"),
+        options=RefinementOptions(degrees=(4,)), noise=NoiseStrength(0.1, 0.01, "estimated"),
     )  # fmt: skip
     visits = (VisitTest(1, DwellCount(0, 3.5), DwellCount(4, 80.0), 21.0, 0.25, "operator", 0.6),)
     return replace(found.in_units(["m", "m"], time="s"), visits=visits)

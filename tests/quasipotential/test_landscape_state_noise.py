@@ -12,7 +12,8 @@ from siq.quasipotential.landscape import GlobalQuasipotential
 from siq.quasipotential.path_chains import PathProblem, _Across
 from siq.quasipotential.paths import minimum_action_path
 from siq.quasipotential.rates import escape_rate
-from siq.quasipotential.wells import WellOptions, local_well
+from siq.quasipotential.refinement import RefinementOptions
+from siq.quasipotential.wells import local_well
 from siq.systems.equilibria import find_equilibria
 
 pytestmark = pytest.mark.portable
@@ -122,9 +123,8 @@ def test_the_density_of_one_state_is_exact() -> None:
     """``p ~ exp(∫ 2f/(εD) dx)/D`` for Itô's noise, at any ε."""
     known, intensity = one_state(), 0.1
     portrait = portrait_of(known, 600)  # with half as many, rounding decides about the powers of degree 10
-    wells = tuple(
-        local_well(known.dynamics, portrait, index, options=WellOptions(degrees=(10,))) for index in (0, 1)
-    )
+    options = RefinementOptions(degrees=(10,))
+    wells = tuple(local_well(known.dynamics, portrait, index, options=options) for index in (0, 1))
     to_top = [2 * potential_of_one_state(known, float(one.attractor[0]), 0.0) for one in wells]
     heights = max(to_top) - np.array(to_top)
     potential = GlobalQuasipotential(wells, heights)

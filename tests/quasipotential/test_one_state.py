@@ -19,7 +19,7 @@ from siq.quasipotential.invariant_density import marginal_density
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_comparison import reference_landscape
-from siq.quasipotential.wells import WellOptions
+from siq.quasipotential.refinement import RefinementOptions
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import find_equilibria
 
@@ -83,7 +83,7 @@ def test_equal_wells_have_a_barrier_of_a_half() -> None:
     dynamics = Dynamics.of((X,), (X - X**3,))
     known = KnownSystem(dynamics, X**4 / 4 - X**2 / 2, np.array([[-1.0], [1.0]]), np.array([[-1.6, 1.6]]))
     barriers = find_landscape(
-        exact_field(known, 3), portrait_of(known), options=WellOptions(degrees=(4,))
+        exact_field(known, 3), portrait_of(known), options=RefinementOptions(degrees=(4,))
     ).barriers()
     np.testing.assert_allclose(barriers["barrier"], [0.5, 0.5], rtol=1e-9)
 
@@ -115,7 +115,7 @@ def test_times_are_those_of_kramers(diffusion: float) -> None:
     # V = -∫f/D: more noise makes a lower landscape of the same f.
     known = known.with_diffusion(diffusion * np.eye(1))._replace(potential=known.potential / diffusion)
     landscape = find_landscape(
-        exact_field(known, 3), portrait_of(known, share=0.8), options=WellOptions(degrees=(4,))
+        exact_field(known, 3), portrait_of(known, share=0.8), options=RefinementOptions(degrees=(4,))
     )
     at = np.sort(np.roots([1, 0, -1, 0.1]).real)
     slopes = np.abs(known.dynamics.jacobian(at[:, None])[:, 0, 0])

@@ -29,7 +29,7 @@ def check_of(known: KnownSystem, degree: int = 3) -> TrainingCheck:
 
 def verdict(checked: TrainingCheck, potential) -> bool:
     """Whether the check passes for networks whose V is a given function."""
-    networks = SimpleNamespace(evaluate=lambda x: SimpleNamespace(potential=potential(x)))
+    networks = SimpleNamespace(potential_at=potential)
     return checked.passes(networks)  # type: ignore[arg-type]
 
 

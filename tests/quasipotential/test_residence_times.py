@@ -9,8 +9,8 @@ from known_systems import double_well, exact_field, portrait_of
 
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.rates import EscapeRate, MeanTime, NoiseStrength, mean_residence_time
+from siq.quasipotential.refinement import RefinementOptions
 from siq.quasipotential.transitions import position_standard_errors
-from siq.quasipotential.wells import WellOptions
 from siq.systems.dynamics import Dynamics
 
 
@@ -66,7 +66,7 @@ def test_a_landscape_gives_the_dwell_times_of_the_noise_it_knows() -> None:
     known = double_well(2)
     found = find_landscape(
         exact_field(known, 3, relative_error=1e-3), portrait_of(known, 250, share=0.8),
-        options=WellOptions(degrees=(4,)), noise=NoiseStrength(0.05, 0.001, "estimated"),
+        options=RefinementOptions(degrees=(4,)), noise=NoiseStrength(0.05, 0.001, "estimated"),
     )  # fmt: skip
     table = found.dwell_times()
     assert list(table["attractor"]) == [0, 1] and (table["mean_time"] > 0).all()

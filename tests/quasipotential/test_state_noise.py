@@ -8,7 +8,8 @@ from known_noise import multiplicative, one_state, potential_of_one_state
 from known_systems import portrait_of, potential_values, uniform_points
 
 from siq.quasipotential.formulas import downhill_formulas
-from siq.quasipotential.wells import WellOptions, local_well
+from siq.quasipotential.refinement import RefinementOptions
+from siq.quasipotential.wells import local_well
 from siq.systems.equilibria import hessian_at
 
 pytestmark = pytest.mark.portable
@@ -19,7 +20,7 @@ def test_the_given_potential_is_found(dimension: int) -> None:
     known = multiplicative(dimension)
     portrait = portrait_of(known, 300, share=0.8)
     assert len(portrait.attractors) == 2
-    well = local_well(known.dynamics, portrait, 1, options=WellOptions(degrees=(4,)))
+    well = local_well(known.dynamics, portrait, 1, options=RefinementOptions(degrees=(4,)))
     assert well.level == pytest.approx(0.25, rel=1e-6)  # of V at the saddle
     x = uniform_points(known, 2000, seed=3, share=0.8)
     x = x[well.reaches(x)]
@@ -33,7 +34,7 @@ def test_of_one_state_it_is_the_quadrature() -> None:
     known = one_state()
     portrait = portrait_of(known, 600)  # with half as many, rounding decides about the powers of degree 10
     for index, attractor in enumerate(portrait.attractors):
-        well = local_well(known.dynamics, portrait, index, options=WellOptions())
+        well = local_well(known.dynamics, portrait, index, options=RefinementOptions())
         start = float(attractor.position[0])
         for share in (0.3, 0.6, 0.9):
             expected = potential_of_one_state(known, start, (1 - share) * start)

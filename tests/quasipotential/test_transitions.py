@@ -21,6 +21,7 @@ from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
 from siq.quasipotential.path_chains import MinimumActionPath
 from siq.quasipotential.paths import minimum_action_path
+from siq.quasipotential.refinement import RefinementOptions
 from siq.quasipotential.transitions import (
     Transition,
     _barrier_by_formula,
@@ -29,7 +30,7 @@ from siq.quasipotential.transitions import (
     transitions,
     ways_out,
 )
-from siq.quasipotential.wells import Well, WellOptions, local_well
+from siq.quasipotential.wells import Well, local_well
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import PhasePortrait, phase_portrait
@@ -66,7 +67,7 @@ SYSTEMS = {
 def formulas(name: str) -> tuple[Well, ...]:
     known = SYSTEMS[name]
     found = portrait_of(known, 250, share=0.8)
-    options = WellOptions(degrees=(4,))
+    options = RefinementOptions(degrees=(4,))
     return tuple(local_well(known.dynamics, found, index, options=options) for index in range(2))
 
 

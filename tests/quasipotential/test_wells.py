@@ -32,7 +32,6 @@ from siq.quasipotential.refinement import RefinementOptions, refine
 from siq.quasipotential.wells import (
     DegreeTrial,
     Well,
-    WellOptions,
     _extend_well,
     _grow_well,
     best_trial,
@@ -370,7 +369,7 @@ def landscape(known: KnownSystem, *, share: float = 0.8) -> PhasePortrait:
 def quartic(name: str, index: int, reach: float) -> Well:
     """V about an attractor of a system whose V is a quartic, found once."""
     known = SYSTEMS[name]
-    options = WellOptions(degrees=(4,), reach=reach)
+    options = RefinementOptions(degrees=(4,), reach=reach)
     return local_well(known.dynamics, landscape(known), index, options=options)
 
 
@@ -416,7 +415,7 @@ def test_in_the_well_v_is_exact_and_known(name: str, index: int) -> None:
 
 def test_three_states_are_no_different() -> None:
     known = double_well(3)
-    local = local_well(known.dynamics, landscape(known), 1, options=WellOptions(degrees=(4,)))
+    local = local_well(known.dynamics, landscape(known), 1, options=RefinementOptions(degrees=(4,)))
     x = local.points
     values = local.known_values(x)
     assert np.isfinite(values).all()
@@ -646,7 +645,7 @@ def test_trials_without_any_point_do_not_break_the_choice() -> None:
 
 
 def test_a_quadratic_v_needs_no_quartic_and_a_quartic_needs_its_own() -> None:
-    options = WellOptions(degrees=(2, 3, 4, 6), accuracy=1e-300)
+    options = RefinementOptions(degrees=(2, 3, 4, 6), accuracy=1e-300)
     for known, degree in ((SYSTEMS["linear"], 2), (SYSTEMS["double well"], 4)):
         local = local_well(known.dynamics, landscape(known), 0, options=options)
         trials = local.trials
@@ -657,7 +656,7 @@ def test_a_quadratic_v_needs_no_quartic_and_a_quartic_needs_its_own() -> None:
 
 def test_degrees_beyond_what_is_affordable_are_not_tried() -> None:
     known = double_well(3)
-    options = WellOptions(degrees=(4, 16))
+    options = RefinementOptions(degrees=(4, 16))
     trials = local_well(known.dynamics, landscape(known), 1, options=options).trials
     assert [one.degree for one in trials] == [4]
 
@@ -670,7 +669,7 @@ def test_without_recorded_states_there_is_no_formula() -> None:
     with pytest.raises(NumericalFailure, match="recorded states lead to the attractor"):
         local_well(
             known.dynamics, replace(found, basins=(few, found.basins[1])), 0,
-            options=WellOptions(degrees=(4, 6)),
+            options=RefinementOptions(degrees=(4, 6)),
         )  # fmt: skip
 
 
@@ -679,7 +678,7 @@ def test_without_recorded_states_there_is_no_formula() -> None:
 )
 def test_options_without_sense_are_refused(field: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
-        WellOptions(**field)
+        RefinementOptions(**field)
 
 
 def in_other_units(known: KnownSystem, scale: np.ndarray, speed: float, noise: float) -> KnownSystem:
@@ -713,7 +712,7 @@ def test_units_change_neither_the_residual_nor_the_degree(
     known = maier_stein(3)
     other = in_other_units(known, np.array(scale), speed, noise)
     points = uniform_points(known, 250)
-    options = WellOptions(degrees=(4, 6, 8))
+    options = RefinementOptions(degrees=(4, 6, 8))
 
     def found(system: KnownSystem, x: np.ndarray) -> Well:
         marked = phase_portrait(system.dynamics, x)
@@ -745,7 +744,7 @@ def test_wells_of_the_resonator_are_those_of_the_characteristics(
     places = np.array([one.position for one in found.attractors])
     index = int(np.argmin(np.linalg.norm(places - np.array(position), axis=1)))
     np.testing.assert_allclose(places[index], position, atol=1e-4)
-    local = local_well(card, found, index, options=WellOptions(degrees=(10,)))
+    local = local_well(card, found, index, options=RefinementOptions(degrees=(10,)))
     fan = adapted_fan(
         card, places[index], level=0.9 * barrier / 2, box=card.box,
         generator=np.random.default_rng(0), count=48, most=200, rounds=4,

@@ -13,7 +13,7 @@ import pytest
 from known_systems import double_well, exact_field, portrait_of
 
 from siq.quasipotential.landscape_assembly import find_landscape
-from siq.quasipotential.wells import WellOptions
+from siq.quasipotential.refinement import RefinementOptions
 from siq.report.page import UNKNOWN, interactive_view
 from siq.report.summary import LandscapeSummary, summarise
 
@@ -22,7 +22,7 @@ from siq.report.summary import LandscapeSummary, summarise
 def landscape(dimension: int) -> LandscapeSummary:
     known = double_well(dimension)
     found = find_landscape(
-        exact_field(known, 3), portrait_of(known, 250, share=0.8), options=WellOptions(degrees=(4,))
+        exact_field(known, 3), portrait_of(known, 250, share=0.8), options=RefinementOptions(degrees=(4,))
     )
     return summarise(found)
 

@@ -14,7 +14,7 @@ from told_landscapes import NOISE, landscape, told
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_files import landscape_data
 from siq.quasipotential.rates import NoiseStrength
-from siq.quasipotential.wells import WellOptions
+from siq.quasipotential.refinement import RefinementOptions
 from siq.remarks import Remark
 from siq.report.landscape import answer_lines, landscape_tables
 from siq.report.summary import summarise, well_name
@@ -142,7 +142,7 @@ def test_text_and_page_say_the_same_sentence(noise: NoiseStrength | None) -> Non
     known = double_well(2)
     found = find_landscape(
         exact_field(known, 3, relative_error=1e-3), portrait_of(known, 250, share=0.8),
-        options=WellOptions(degrees=(4,)), noise=noise,
+        options=RefinementOptions(degrees=(4,)), noise=noise,
     )  # fmt: skip
     data = landscape_data(found)
     text = found.report()

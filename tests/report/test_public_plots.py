@@ -20,8 +20,8 @@ from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_files import landscape_data, landscape_from_data
+from siq.quasipotential.refinement import RefinementOptions
 from siq.quasipotential.transitions import Transition, barrier_uncertainty
-from siq.quasipotential.wells import WellOptions
 from siq.report.plots import prediction
 from siq.report.plots.quasipotential import _on_plane, quasipotential_figure
 from siq.report.plots.wells import _joined
@@ -32,7 +32,7 @@ from siq.report.summary import LandscapeSummary, summarise
 def landscape(dimension: int) -> Landscape:
     known = double_well(dimension)
     found = find_landscape(
-        exact_field(known, 3), portrait_of(known, 300, share=0.8), options=WellOptions(degrees=(4,))
+        exact_field(known, 3), portrait_of(known, 300, share=0.8), options=RefinementOptions(degrees=(4,))
     )
     return found.in_units(("um",) * dimension, time="s")
 
