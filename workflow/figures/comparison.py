@@ -21,9 +21,7 @@ from siq.numerics.text import unit_text
 from siq.report.plots.style import (
     BLACK,
     COLUMN_WIDTH,
-    CURVE_COLOURS,
     GREY,
-    LINE_STYLES,
     PAGE_WIDTH,
     counted,
     drawn_in_style,
@@ -76,14 +74,12 @@ def plot_error_curves(
     right.set_yscale("log")
     shares = []
     for place, (key, values) in enumerate(others):
-        look: dict[str, Any] = {
-            "color": CURVE_COLOURS[place % len(CURVE_COLOURS)],
-            "linestyle": LINE_STYLES[place % len(LINE_STYLES)],
-        }  # fmt: skip
-        left.plot(x, values, linewidth=1.2, label=key, **look)
+        colour, style, _ = look(place)
+        left.plot(x, values, color=colour, linestyle=style, linewidth=1.2, label=key)
         difference = np.abs(values - reference) / highest
         shares.append(float(np.nanmax(difference, initial=0.0)))
-        right.plot(x, np.where(difference > 0, difference, np.nan), linewidth=1.0, **look)
+        shown = np.where(difference > 0, difference, np.nan)
+        right.plot(x, shown, color=colour, linestyle=style, linewidth=1.0)
     largest = max(shares)
     if largest > 0:
         right.set_ylim(largest / 10 ** DECADES[1], 2 * largest)

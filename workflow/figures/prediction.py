@@ -20,15 +20,13 @@ from siq.report.plots.style import (
     BLACK,
     BLUE,
     COLUMN_WIDTH,
-    GREEN,
     GREY,
     ORANGE,
     PAGE_WIDTH,
-    PURPLE,
-    VERMILLION,
     axis_label,
     counted,
     drawn_in_style,
+    look,
     magnitude_label,
     mean_and_spread,
     unit_label,
@@ -38,7 +36,6 @@ TRAJECTORIES_SHOWN = 6
 BINS = 40
 OBSERVED: dict[str, Any] = {"color": ORANGE, "linewidth": 2.6, "alpha": 0.7}
 PREDICTED: dict[str, Any] = {"color": BLACK, "linewidth": 0.9, "linestyle": "--"}
-LINE_STYLES = ("-", "--", "-.", ":")
 
 
 @drawn_in_style
@@ -115,7 +112,6 @@ def _draw_errors(axes: Axes, errors: pd.DataFrame, published: tuple[float, float
     lowest, highest = positive.min(), positive.max()
     spread = max(highest / lowest, 1.1)  # errors that are all alike have no width of their own
     edges = np.geomspace(lowest / spread**0.02, highest * spread**0.02, BINS + 1)
-    colours = (BLUE, VERMILLION, GREEN, PURPLE)
     handles = []
     for place, (method, rows) in enumerate(errors.groupby("method", sort=False)):
         all_of = rows["error"].to_numpy(float)
@@ -125,7 +121,7 @@ def _draw_errors(axes: Axes, errors: pd.DataFrame, published: tuple[float, float
         notes += [f"{method}: {counted(zero, 'prediction')} with no error at all"] if zero else []
         if not (found > 0).any():
             continue
-        colour, style = colours[place % len(colours)], LINE_STYLES[place % len(LINE_STYLES)]
+        colour, style, _ = look(place)
         shares = np.histogram(found[found > 0], edges)[0] / len(all_of)
         axes.stairs(shares, edges, color=colour, linestyle=style, linewidth=1.2)
         axes.axvline(float(np.median(found)), color=colour, linestyle=style, linewidth=0.8)
