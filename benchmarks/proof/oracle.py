@@ -19,7 +19,7 @@ from siq.diagnosis.mechanisms import MechanismCandidate, build_candidate
 from siq.diagnosis.study import Comparison
 from siq.errors import NumericalFailure
 from siq.inference.recalibration import fit_with_process_noise_as_needed, recalibrate
-from siq.inference.trajectories import free_run, sharpened
+from siq.inference.trajectories import free_run, normalised_rms, sharpened
 from siq.systems.dynamics import Dynamics, symbol
 from siq.systems.formulas import compile_values, delay
 
@@ -88,7 +88,7 @@ def _oracle(case: Comparison, key: CaseKey) -> Oracle:
     run = free_run(
         best.model, case.kept, noise=recalibrated.noise, substeps=max(best.substeps, recalibrated.substeps)
     )
-    error = run.normalised_rms(case.kept.outputs)
+    error = normalised_rms(run, case.kept)
     return Oracle(
         float(gained) if key.effect.changes_equations else np.nan,
         np.nan if error is None else error,

@@ -11,7 +11,7 @@ import pandas as pd
 from benchmarks.publication.public_recordings import Benchmark
 from siq.inference.kalman_filter import Noise
 from siq.inference.measurements import Measurements
-from siq.inference.trajectories import free_run
+from siq.inference.trajectories import free_run, scored_rows
 from siq.systems.dynamics import Dynamics
 
 EXACT = 1e-3  # relative change of an error by halving the steps of the integration, below which they are fine
@@ -49,16 +49,16 @@ def scored_run(model: Dynamics, data: Measurements, *, variance: np.ndarray, win
         Samples at the begin that tell the initial state. They are not scored.
     """
     noise = Noise(np.asarray(variance, dtype=float), np.zeros(model.dimension))
-    substeps, before = 2, np.inf
+    substeps, before, scored = 2, np.inf, scored_rows(data, window)
     while True:
         run = free_run(model, data, noise=noise, substeps=substeps, told=window)
         with np.errstate(all="ignore"):  # what ran away has no error
-            squares = (run.outputs[run.scored] - data.outputs[run.scored]) ** 2
-        measured = np.isfinite(data.outputs[run.scored])
+            squares = (run[scored] - data.outputs[scored]) ** 2
+        measured = np.isfinite(data.outputs[scored])
         errors = np.sqrt([squares[known, place].mean() for place, known in enumerate(measured.T)])
         total = float(np.sqrt((errors**2 / noise.measurement).sum()))
         if abs(total - before) <= EXACT * total or 2 * substeps > FINEST:
-            return ScoredRun(run.outputs, errors)
+            return ScoredRun(run, errors)
         substeps, before = 2 * substeps, total
 
 

@@ -29,6 +29,7 @@ from siq.diagnosis.unnamed_models import fit_unnamed_models
 from siq.diagnosis.verdict import statement_of
 from siq.errors import InputError, NumericalFailure
 from siq.inference.budget import Budget
+from siq.inference.trajectories import scored_rows
 from siq.remarks import Remark
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -304,9 +305,9 @@ def tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
         pd.DataFrame(
             {
                 "recording": np.array(data.labels)[data.recording], "t": data.t, "output": name,
-                "measured": data.outputs[:, place], "before": shown.before.outputs[:, place],
-                "recalibrated": shown.recalibrated.outputs[:, place],
-                "augmented": shown.augmented.outputs[:, place], "scored": shown.before.scored,
+                "measured": data.outputs[:, place], "before": shown.before[:, place],
+                "recalibrated": shown.recalibrated[:, place],
+                "augmented": shown.augmented[:, place], "scored": scored_rows(data),
             }
         )
         for place, name in enumerate(case.system.output_names)

@@ -27,7 +27,7 @@ from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import fit_with_process_noise_as_needed
-from siq.inference.trajectories import FreeRun, free_run
+from siq.inference.trajectories import free_run, squared_errors
 
 LOGGER = logging.getLogger(__name__)
 Change = Literal["better", "same", "worse", "unknown"]
@@ -39,7 +39,7 @@ FOLDS = 4  # of which one is left out at a time: a quarter, as is held out by de
 MIN_STRETCH_SAMPLES = 16  # of a stretch that an initial state and an error can be told from
 
 
-def simulated(fit: Fit, data: Measurements, *, noise: Noise, substeps: int) -> FreeRun:
+def simulated(fit: Fit, data: Measurements, *, noise: Noise, substeps: int) -> np.ndarray:
     """A fit's free run of recordings, told how they begin and where it usually is.
 
     Parameters
@@ -94,7 +94,7 @@ class HeldOutErrors:
         ----------
         runs
             By their names above: normalised squared errors of the same values, sample by sample, shape
-            ``(values,)``; None where the simulation ran away (`FreeRun.squared_errors`).
+            ``(values,)``; None where the simulation ran away (`siq.inference.trajectories.squared_errors`).
         noise_floor
             See above.
         """
@@ -267,7 +267,7 @@ def errors_left_out(
                     )
                     model = replace(model, parameters=tuple(absent))
             run = simulated(again, out, noise=noise, substeps=fit.substeps)
-            own = run.squared_errors(out.outputs)
+            own = squared_errors(run, out)
         except NumericalFailure:
             return None
         # One that does not quite settle, as where a reading is cut off, is judged by what it predicts.

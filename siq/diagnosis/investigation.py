@@ -33,7 +33,7 @@ from siq.inference.budget import Budget
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, with_expectations
 from siq.inference.recalibration import covariance_with_unknown_process_noise, recalibrate
-from siq.inference.trajectories import FreeRun
+from siq.inference.trajectories import scored_rows, squared_errors
 from siq.remarks import Remark
 from siq.systems.dynamics import Dynamics
 
@@ -152,7 +152,7 @@ class HeldOutRuns:
     Attributes
     ----------
     before, recalibrated, augmented
-        The simulation as it is, with its parameters refitted, and with what was found.
+        Outputs ``(n, m)`` of the simulation as it is, with its parameters refitted, and with what was found.
     model
         The augmented simulation that was run.
     errors
@@ -167,9 +167,9 @@ class HeldOutRuns:
         Whether that model is part of the new card, since it makes predictions better.
     """
 
-    before: FreeRun
-    recalibrated: FreeRun
-    augmented: FreeRun
+    before: np.ndarray
+    recalibrated: np.ndarray
+    augmented: np.ndarray
     model: Dynamics
     errors: HeldOutErrors
     independent: bool = True
@@ -196,11 +196,11 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     search, learned, study = investigation.search, investigation.context.data, investigation.context.study
     noise, substeps = search.recalibrated.noise, max(search.fit.substeps, search.recalibrated.substeps)
 
-    def run(fit: Fit, of: Measurements) -> FreeRun:
+    def run(fit: Fit, of: Measurements) -> np.ndarray:
         return simulated(fit, of, noise=noise, substeps=substeps)
 
     def errors_of(fit: Fit, of: Measurements) -> np.ndarray | None:
-        return run(fit, of).squared_errors(of.outputs)
+        return squared_errors(run(fit, of), of)
 
     def mean_error(squares: np.ndarray | None) -> float:
         """Infinite where a simulation ran away."""
@@ -260,13 +260,13 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         described, fit = choices[adopted]
     before, refitted, augmented = (run(each, data) for each in (card, recalibrated, fit))
     squares = {
-        "before": before.squared_errors(data.outputs),
-        "recalibrated": refitted.squared_errors(data.outputs),
-        "augmented": augmented.squared_errors(data.outputs),
+        "before": squared_errors(before, data),
+        "recalibrated": squared_errors(refitted, data),
+        "augmented": squared_errors(augmented, data),
         "named": errors_of(plain, data) if named and adopted is not None else None,
     }
     # What a fit leaves may be more than noise; the one that leaves least is nearest to it.
-    spread = np.nanvar(data.outputs[before.scored], axis=0)
+    spread = np.nanvar(data.outputs[scored_rows(data)], axis=0)
     least = np.minimum(search.fit.noise.measurement, fit.noise.measurement)
     floor = float(np.sqrt(np.mean(least / np.where(spread > 0, spread, 1.0))))
     return HeldOutRuns(

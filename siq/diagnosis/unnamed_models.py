@@ -55,7 +55,7 @@ from siq.inference.recalibration import (
     fit_with_process_noise_as_needed,
     preferred_fit,
 )
-from siq.inference.trajectories import fit_trajectories, free_run
+from siq.inference.trajectories import fit_trajectories, free_run, normalised_rms
 from siq.systems.dynamics import Dynamics, symbol
 
 LOGGER = logging.getLogger(__name__)
@@ -125,7 +125,7 @@ def runs_freely(fit: Fit, alone: Fit, data: Measurements) -> bool:
     for each in (fit, alone):
         # Steps twice as fine: what depends on them is no property of the simulation.
         run = free_run(each.model, data, noise=each.noise, substeps=2 * each.substeps, usual=each.x)
-        errors.append(run.normalised_rms(data.outputs))
+        errors.append(normalised_rms(run, data))
     one, other = errors
     return one is not None and (other is None or one < other)
 

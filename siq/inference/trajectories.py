@@ -12,7 +12,7 @@ of its argument when it is evaluated, so that an integrator can follow it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import sympy
@@ -341,39 +341,37 @@ SHORTEST_PREFIX = 8  # samples
 PREFIX = 0.2  # of a recording
 
 
-@dataclass(frozen=True)
-class FreeRun:
-    """A simulation of held-out recordings.
+def _prefixes(data: Measurements, told: int | None) -> np.ndarray:
+    """Samples of each recording that tell its initial state and are not scored, see `free_run`."""
+    lengths = np.diff(data.first)
+    rows = np.maximum((PREFIX * lengths).astype(int), SHORTEST_PREFIX) if told is None else told
+    return np.asarray(np.minimum(rows, lengths - 1))
 
-    Attributes
-    ----------
-    outputs
-        Shape ``(n, m)``; NaN from where the simulation ran away.
-    scored
-        Rows behind the prefixes, shape ``(n,)``.
+
+def scored_rows(data: Measurements, told: int | None = None) -> np.ndarray:
+    """Mask of the samples behind the prefixes, shape ``(n,)``."""
+    within = np.arange(len(data.t)) - data.first[data.recording]
+    return np.asarray(within >= _prefixes(data, told)[data.recording])
+
+
+def squared_errors(run: np.ndarray, data: Measurements) -> np.ndarray | None:
+    """Squared errors of all scored values of a free run over the variance of each measured output.
+
+    Shape ``(values,)``, sample by sample; what was not measured is left out. None where it ran away.
     """
+    scored = scored_rows(data)
+    measured = data.outputs[scored]
+    error, known = run[scored] - measured, np.isfinite(measured)
+    if not np.isfinite(error[known]).all():
+        return None
+    spread = np.nanvar(measured, axis=0)
+    return np.asarray((error**2 / np.where(spread > 0, spread, 1.0))[known])
 
-    outputs: np.ndarray
-    scored: np.ndarray
 
-    def squared_errors(self, outputs: np.ndarray) -> np.ndarray | None:
-        """Squared errors of all scored values over the variance of each of the measured outputs ``(n, m)``.
-
-        Shape ``(values,)``, sample by sample; what was not measured is left out. None where a simulation ran
-        away.
-        """
-        measured = outputs[self.scored]
-        error = self.outputs[self.scored] - measured
-        known = np.isfinite(measured)
-        if not np.isfinite(error[known]).all():
-            return None
-        spread = np.nanvar(measured, axis=0)
-        return np.asarray((error**2 / np.where(spread > 0, spread, 1.0))[known])
-
-    def normalised_rms(self, outputs: np.ndarray) -> float | None:
-        """Root mean square error over that of the outputs about their mean, see `squared_errors`."""
-        squares = self.squared_errors(outputs)
-        return None if squares is None else float(np.sqrt(squares.mean()))
+def normalised_rms(run: np.ndarray, data: Measurements) -> float | None:
+    """Root mean square error over that of the outputs about their mean, see `squared_errors`."""
+    squares = squared_errors(run, data)
+    return None if squares is None else float(np.sqrt(squares.mean()))
 
 
 def free_run(
@@ -384,8 +382,10 @@ def free_run(
     substeps: int,
     told: int | None = None,
     usual: np.ndarray | None = None,
-) -> FreeRun:
-    """Simulate recordings from states that their prefixes tell.
+) -> np.ndarray:
+    """Outputs ``(n, m)`` of recordings simulated from states that their prefixes tell.
+
+    They are NaN from where the simulation ran away.
 
     Parameters
     ----------
@@ -401,18 +401,11 @@ def free_run(
         States along other recordings, shape ``(k, d)``: what a prefix does not tell is expected about their
         mean, anywhere within their range, as many recordings begin at its ends. By default nothing is.
     """
-    lengths = np.diff(data.first)
-    rows = np.maximum((PREFIX * lengths).astype(int), SHORTEST_PREFIX) if told is None else told
-    rows = np.minimum(rows, lengths - 1)
-    prefix = data.until(np.maximum(rows, 2))
+    prefix = data.until(np.maximum(_prefixes(data, told), 2))
     x = _initial_states(model, prefix, noise=noise, substeps=substeps, usual=usual)
     states = run(model, Grid(data, substeps), x)
     signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
-    within = np.arange(len(data.t)) - data.first[data.recording]
-    return FreeRun(
-        outputs=model.functions.outputs(states.T, signals, model.values).T,
-        scored=within >= rows[data.recording],
-    )
+    return np.asarray(model.functions.outputs(states.T, signals, model.values).T)
 
 
 def _initial_states(

@@ -229,10 +229,11 @@ def _transition_from_data(
             **{name: kept[name] for name in PATH_FIGURES},
         )  # fmt: skip
     if one["prefactor"] is not None:
+        turn = one["turn"] or {"own": None, "beyond": None, "exact": False}
         rate = EscapeRate(
             one["minimum_action"], one["prefactor"], one["exponent"],
             tuple(map(Remark.from_data, one["law_remarks"])),
-            *(one["turn"][name] for name in ("own", "beyond", "exact") if one["turn"]),
+            turn["own"], turn["beyond"], turn["exact"],
             prefactor_error=one["prefactor_error"], covariance=one["prefactor_covariance"],
         )  # fmt: skip
     return Transition(

@@ -17,6 +17,7 @@ from siq.inference.trajectories import (
     _initial_states,
     fit_trajectories,
     free_run,
+    normalised_rms,
 )
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter
@@ -102,7 +103,7 @@ def test_a_hidden_state_begins_where_it_usually_is_unless_the_prefix_tells() -> 
     # Where the prefix does tell it, a wrong expectation as wide as that does no harm.
     known = free_run(model(), data, noise=noise, substeps=2)
     expected = free_run(model(), data, noise=noise, substeps=2, usual=usual)
-    one, other = (each.normalised_rms(data.outputs) for each in (known, expected))
+    one, other = (normalised_rms(each, data) for each in (known, expected))
     assert one is not None and other == pytest.approx(one, rel=0.1)
 
 

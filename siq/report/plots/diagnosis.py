@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from siq.inference.trajectories import scored_rows
 from siq.report.diagnosis_page import largest_difference
 from siq.report.formatting import with_unit
 from siq.report.plots.quasipotential import add_legend, new_axes
@@ -373,14 +374,14 @@ def draw_errors(
 
 def _simulations(diagnosis: Diagnosis) -> list[tuple[np.ndarray, dict[str, Any]]]:
     names = [name for name in SIMULATED if name != "augmented" or diagnosis.mechanisms]
-    return [(getattr(diagnosis.held_out, name).outputs, SIMULATED[name]) for name in names]
+    return [(getattr(diagnosis.held_out, name), SIMULATED[name]) for name in names]
 
 
 def _shown(
     diagnosis: Diagnosis, output: str | None, recording: str | None
 ) -> tuple[Measurements, int, np.ndarray]:
     """The held-out recordings, the place of the output, and the rows that are drawn."""
-    case, runs = diagnosis.case.kept, diagnosis.held_out
+    case = diagnosis.case.kept
     names = diagnosis.case.system.output_names
     if output is not None and output not in names:
         raise ValueError(f"there is no output {output}; name one of {', '.join(names)}")
@@ -388,8 +389,9 @@ def _shown(
         raise ValueError(f"no recording {recording} was held out; name one of {', '.join(case.labels)}")
     place = 0 if output is None else names.index(output)
     parts = [np.arange(*ends) for ends in zip(case.first[:-1], case.first[1:], strict=True)]
-    parts = [part[runs.before.scored[part]] for part in parts]
-    error = np.abs(runs.before.outputs[:, place] - case.outputs[:, place])
+    scored = scored_rows(case)
+    parts = [part[scored[part]] for part in parts]
+    error = np.abs(diagnosis.held_out.before[:, place] - case.outputs[:, place])
     error = np.nan_to_num(error, nan=np.inf)
     worst = max(
         range(len(parts)), key=lambda one: float(np.median(error[parts[one]])) if len(parts[one]) else -1.0
