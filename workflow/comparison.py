@@ -129,9 +129,11 @@ def run_landscape_errors(
         if landscape is not None:
             compared = compare_landscape(reference, landscape, below=below)
             tables.append(_rows(number, "local formulas", compared))
-        sources = {method: _of_formula(one) for method, one in formulas.items() if one.potential is not None}
+        sources = {
+            method: _twice(one.values) for method, one in formulas.items() if one.potential is not None
+        }
         if networks is not None:
-            sources["networks"] = lambda x, of=networks: 2 * of.potential_at(x)
+            sources["networks"] = _twice(networks.potential_at)
         for source, potential in sources.items():
             tables.append(_rows(number, source, compare_estimate(reference, potential, below=below)))
     if np.isfinite(reference.mesh).any():
@@ -158,9 +160,9 @@ def _rows(number: int, source: str, comparisons: Sequence[Mapping[str, object]])
     return as_table(TABLE, [{"run": number, "source": source, **one} for one in comparisons])
 
 
-def _of_formula(one: SymbolicDecomposition) -> Potential:
-    """U of a formula as a function of points in rows."""
-    return lambda x: 2 * one.values(x)
+def _twice(potential: Potential) -> Potential:
+    """U of a V, both functions of points in rows."""
+    return lambda x: 2 * potential(x)
 
 
 WALKERS = 400
