@@ -505,8 +505,8 @@ class Check(Protocol):
     def hopeless(self) -> str | None:
         """Why no training can pass, in words; None where one can."""
 
-    def passes(self, networks: TrainedNetworks) -> bool:
-        """Whether the networks are good enough."""
+    def accepted(self, networks: TrainedNetworks) -> TrainedNetworks | None:
+        """The networks, or what they have led to, where they are good enough."""
 
 
 class Block:
@@ -585,8 +585,8 @@ class Block:
         def finished(step: int, networks: Networks) -> bool:
             for position, run in enumerate(runs):
                 if run in self.checks and run not in early:
-                    one = at_rest(networks, position)
-                    if self.checks[run].passes(one):
+                    one = self.checks[run].accepted(at_rest(networks, position))
+                    if one is not None:
                         early[run] = one
                         if (file := kept[run]) is not None:
                             save_networks(file, [one])

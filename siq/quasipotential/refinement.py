@@ -582,12 +582,12 @@ class TrainingCheck:
             return "the local route found no formula about some attractor"
         return None
 
-    def passes(self, networks: TrainedNetworks) -> bool:
-        """Whether refinement will succeed from the networks of one run."""
+    def accepted(self, networks: TrainedNetworks) -> TrainedNetworks | None:
+        """The networks of one run where refinement will succeed from them."""
         if self.hopeless() is not None:
-            return False
+            return None
         potential = networks.potential_at
-        return self._single_formula(potential) or self._by_wells(potential)
+        return networks if self._single_formula(potential) or self._by_wells(potential) else None
 
     def _single_formula(self, potential: Function) -> bool:
         points = self.portrait.points

@@ -1,0 +1,282 @@
+"""The decomposition over one hidden layer of random tanh units, of which the output weights are solved for.
+
+A short training of the two networks (paper, section 2.2) leaves V far from exact, but on the right branch of
+the Hamilton–Jacobi equation ``∇V·(f + D∇V) = 0``. From there on no steps of descent are needed. Over hidden
+units that are drawn at random and stay as they are (random features; Rahimi and Recht 2007, NeurIPS 20) f is
+linear in the output weights, and follows from the pairs by least squares; the equation is quadratic in those of
+V, and a few steps of Gauss–Newton end where it holds to a millionth; ``g = f + D∇V`` is linear again. What
+comes out are networks of the paper's form, ``V = η_v (V^NN(y) + |y|²)``, with one hidden layer.
+
+Neither the Hessian of V at the attractors nor an f that is identified elsewhere takes part. Whether the branch
+is the right one is asked where f comes to rest: about an attractor A the quasipotential has
+``∂f(A) + 2D ∂²V(A)`` with the eigenvalues of ``-∂f(A)ᵀ``, so that trajectories of least action leave it, and on a
+false branch, where V is flat along a direction, some of them do not.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+import sympy
+
+from siq.data.recordings import SnapshotPairs
+from siq.networks.decomposition import OutputWeightOptions, TrainedNetworks
+from siq.networks.training import TrainingData
+from siq.numerics.integration import runge_kutta_step
+from siq.quasipotential.hamilton_jacobi import HamiltonJacobi, relative_residuals, robust_fit
+from siq.systems.diffusion import Diffusion
+
+logger = logging.getLogger(__name__)
+
+SPREADS = (0.1, 0.2, 0.4, 0.8)  # of the units' weights on normalised states; the held-out pairs choose
+CORRECTIONS = 3  # of f for the integrator's error; each gains about two digits
+SINGULAR_RATIO = 1e-12  # damping of least squares: combinations of units that the points leave open
+SLOW_SHARE = 0.04  # of the points, by their speed: below it residuals are not divided by the speed alone
+RIDGE = 1e-8  # of the mean square gradient of a unit: how far the start may be from the networks' own V
+STEPS = 25  # of Gauss–Newton; a right start takes about ten
+SAME_POINT = 1e-3  # in standard deviations of the states: fixed points this near are one
+STARTS = 20  # slowest points from which fixed points of f are sought
+ESCAPE_SHARE = (
+    0.5  # of the slowest rate of approach: how fast paths of least action leave an attractor at least
+)
+
+
+@dataclass(frozen=True)
+class UnitBasis:
+    """Random tanh units ``tanh(y W + b)`` and ``|y|²`` of normalised states ``y = (x - μ)/σ``.
+
+    Attributes
+    ----------
+    weights, biases
+        W and b, shapes ``(d, units)`` and ``(units,)``.
+    mean, scale
+        μ and σ, shape ``(d,)``.
+    """
+
+    weights: np.ndarray
+    biases: np.ndarray
+    mean: np.ndarray
+    scale: np.ndarray
+
+    @property
+    def size(self) -> int:
+        """Number of functions, m."""
+        return len(self.biases) + 1
+
+    def hidden(self, x: np.ndarray) -> np.ndarray:
+        """The units alone, shape ``(n, units)``."""
+        return np.tanh(self._normalised(x) @ self.weights + self.biases)
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """Points ``(n, d)`` to values ``(n, m)``."""
+        return np.column_stack([self.hidden(x), (self._normalised(x) ** 2).sum(axis=1)])
+
+    def gradients(self, x: np.ndarray) -> np.ndarray:
+        """Points ``(n, d)`` to gradients ``(n, d, m)``."""
+        of_units = (1 - self.hidden(x) ** 2)[:, None] * (self.weights / self.scale[:, None])
+        return np.concatenate([of_units, (2 * self._normalised(x) / self.scale)[:, :, None]], axis=2)
+
+    def hessians(self, x: np.ndarray) -> np.ndarray:
+        """Points ``(n, d)`` to Hessians ``(n, d, d, m)``."""
+        hidden, slopes = self.hidden(x), self.weights / self.scale[:, None]
+        of_units = (-2 * hidden * (1 - hidden**2))[:, None, None] * slopes[:, None] * slopes
+        square = np.broadcast_to(np.diag(2 / self.scale**2)[:, :, None], (*of_units.shape[:3], 1))
+        return np.concatenate([of_units, square], axis=3)
+
+    def expression(self, coefficients: np.ndarray) -> sympy.Expr:
+        """The sum as a formula of ``x1 ... xd``; long, since every unit is in it."""
+        states = sympy.symbols(f"x1:{len(self.mean) + 1}")
+        y = [(x - float(m)) / float(s) for x, m, s in zip(states, self.mean, self.scale, strict=True)]
+        inside = [
+            sum(float(w) * z for w, z in zip(column, y, strict=True)) + float(b)
+            for column, b in zip(self.weights.T, self.biases, strict=True)
+        ]
+        functions = [*(sympy.tanh(each) for each in inside), sum(z**2 for z in y)]
+        return sympy.Add(*(float(c) * each for c, each in zip(coefficients, functions, strict=True)))
+
+    def _normalised(self, x: np.ndarray) -> np.ndarray:
+        return (x - self.mean) / self.scale
+
+
+@dataclass(frozen=True)
+class FieldOverUnits:
+    """A vector field linear in random units: ``f(x) = [tanh(y W + b), 1, y] C``.
+
+    Attributes
+    ----------
+    basis
+        The units.
+    coefficients
+        C, shape ``(units + 1 + d, d)``.
+    """
+
+    basis: UnitBasis
+    coefficients: np.ndarray
+
+    @staticmethod
+    def design(basis: UnitBasis, x: np.ndarray) -> np.ndarray:
+        """The functions at points, shape ``(n, units + 1 + d)``."""
+        return np.column_stack([basis.hidden(x), np.ones(len(x)), (x - basis.mean) / basis.scale])
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """f at points ``(n, d)``, shape ``(n, d)``."""
+        return self.design(self.basis, x) @ self.coefficients
+
+    def jacobian(self, x: np.ndarray) -> np.ndarray:
+        """∂f_i/∂x_j at points ``(n, d)``, shape ``(n, d, d)``."""
+        units = len(self.basis.biases)
+        slopes = self.basis.gradients(x)[:, :, :units] @ self.coefficients[:units]
+        return np.swapaxes(slopes + self.coefficients[units + 1 :] / self.basis.scale[:, None], 1, 2)
+
+
+class OutputWeights:
+    """The output weights of one run, solved for from where its networks have come.
+
+    Parameters
+    ----------
+    data
+        The pairs of the run.
+    diffusion
+        D, constant.
+    options
+        Number of units and of points, and what is asked of a solution.
+    generator
+        Draws the units, and the points where there are too many.
+    """
+
+    def __init__(
+        self,
+        data: TrainingData,
+        *,
+        diffusion: Diffusion,
+        options: OutputWeightOptions,
+        generator: np.random.Generator,
+    ) -> None:
+        self.diffusion, self.options = diffusion, options
+        pairs = data.representative
+        if len(pairs.h) > options.points:
+            pairs = pairs.take(np.sort(generator.choice(len(pairs.h), options.points, replace=False)))
+        others = data.held_out
+        if len(others.h) > options.points:
+            others = others.take(np.sort(generator.choice(len(others.h), options.points, replace=False)))
+        mean, scale = pairs.x0.mean(axis=0), pairs.x0.std(axis=0)
+        weights = generator.normal(size=(len(mean), options.units))
+        biases = generator.uniform(-2, 2, options.units)
+        observed, self.field_error = (others.xh - others.x0) / others.h[:, None], np.inf
+        for spread in SPREADS:
+            field = _field_over(UnitBasis(spread * weights, spread * biases, mean, scale), pairs)
+            rest = observed - _mean_velocity(field, others.x0, others.h)
+            error = float(np.sqrt((rest**2).sum() / (observed**2).sum()))
+            logger.info("units spread by %g: held-out error of f %.1e", spread, error)
+            if error < self.field_error:
+                self.field_error, self.field = error, field
+        self.points = pairs.x0
+        speed = diffusion.squared_speed(self.points, self.field(self.points))
+        # Where f vanishes so does what is divided by its speed; about fixed points everything counts alike.
+        weight = 1 / (speed + np.quantile(speed, SLOW_SHARE))
+        gradients, flow = self.field.basis.gradients(self.points), self.field(self.points)
+        self._equation = HamiltonJacobi(self.points, gradients, flow, diffusion, weight, diffusion)
+
+    def hopeless(self) -> str | None:
+        """Why no networks can lead to a solution, in words; None where they can."""
+        if not np.isfinite(self.field_error):
+            return "f over random units does not follow the pairs"
+        return None
+
+    def accepted(self, networks: TrainedNetworks) -> TrainedNetworks | None:
+        """Networks with the output weights solved for; None where they lead to a false branch."""
+        basis, equation = self.field.basis, self._equation
+        n, d, m = equation.gradients.shape
+        # V over the units as the networks have it, by its gradient; |y|² keeps the weight that it has there.
+        flat, values = equation.gradients.reshape(n * d, m), networks.evaluate(self.points)
+        slopes = (values.circulatory - values.vector_field) @ self.diffusion.precision
+        steepness = float(networks.potential_scale[0, 0])
+        units, rest = flat[:, :-1], slopes.ravel() - steepness * flat[:, -1]
+        start = np.linalg.solve(units.T @ units + RIDGE * n * np.eye(m - 1), units.T @ rest)
+        weights = robust_fit(
+            equation, np.append(start, steepness), np.arange(m) < m - 1,
+            rounds=1, finest=np.inf, steps=STEPS, orthonormal=True,
+        )  # fmt: skip
+        unweighted = replace(
+            equation, weight=1 / np.sqrt(self.diffusion.squared_speed(self.points, equation.flow))
+        )
+        residual = float(np.median(relative_residuals(unweighted, weights)))
+        logger.info("output weights: median Hamilton–Jacobi residual %.1e", residual)
+        if not (residual < self.options.residual and self._right_branch(weights)):
+            return None
+        circulatory = equation.flow + self.diffusion.push(self.points, equation.slopes(weights))
+        of_g = _LeastSquares(FieldOverUnits.design(basis, self.points)[:, :m]).solve(circulatory)
+        layers = (basis.weights, basis.biases[None])
+        return TrainedNetworks(
+            potential=(layers, (weights[:-1, None] / steepness, np.zeros((1, 1)))),
+            circulatory=(layers, (of_g[:-1], of_g[-1:])),
+            mean=basis.mean[None],
+            scale=basis.scale[None],
+            potential_scale=np.array([[steepness]]),
+            circulatory_scale=np.ones((1, 1)),
+            diffusion=self.diffusion.matrix,
+        )
+
+    def _right_branch(self, weights: np.ndarray) -> bool:
+        """Whether paths of least action leave every fixed point at which f comes to rest."""
+        for attractor in self._attractors:
+            slope = self.field.jacobian(attractor[None])[0]
+            curvature = self.field.basis.hessians(attractor[None])[0] @ weights
+            leaving = np.linalg.eigvals(slope + 2 * self.diffusion.matrix @ curvature).real.min()
+            approach = -np.linalg.eigvals(slope).real.max()
+            logger.info(
+                "about %s paths leave at rates of %.2g, f approaches at %.2g", attractor, leaving, approach
+            )
+            if leaving < ESCAPE_SHARE * approach:
+                return False
+        return True
+
+    @cached_property
+    def _attractors(self) -> list[np.ndarray]:
+        """Stable fixed points of f within the recorded states, from where these are slowest."""
+        speed = self.diffusion.squared_speed(self.points, self._equation.flow)
+        lower, upper = self.points.min(axis=0), self.points.max(axis=0)
+        found: list[np.ndarray] = []
+        for begin in self.points[np.argsort(speed)[:STARTS]]:
+            end = scipy.optimize.root(
+                lambda x: self.field(x[None])[0], begin, jac=lambda x: self.field.jacobian(x[None])[0]
+            )
+            stable = end.success and np.linalg.eigvals(self.field.jacobian(end.x[None])[0]).real.max() < 0
+            apart = [np.abs((end.x - other) / self.field.basis.scale).max() > SAME_POINT for other in found]
+            if stable and all(apart) and (end.x > lower).all() and (end.x < upper).all():
+                found.append(end.x)
+        return found
+
+
+class _LeastSquares:
+    """Least squares with one matrix ``(n, m)`` and many right-hand sides, slightly damped where it is singular."""
+
+    def __init__(self, matrix: np.ndarray) -> None:
+        self.rows, columns = matrix.shape
+        damping = SINGULAR_RATIO * np.linalg.norm(matrix)
+        self.q, self.r = np.linalg.qr(np.vstack([matrix, damping * np.eye(columns)]))
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """Coefficients ``(m, s)`` of right-hand sides ``(n, s)``."""
+        return np.asarray(scipy.linalg.solve_triangular(self.r, self.q[: self.rows].T @ right))
+
+
+def _field_over(basis: UnitBasis, pairs: SnapshotPairs) -> FieldOverUnits:
+    """f over the units from pairs: from the mean velocities, and then what the integrator is still off by."""
+    problem = _LeastSquares(FieldOverUnits.design(basis, pairs.x0))
+    velocity = (pairs.xh - pairs.x0) / pairs.h[:, None]
+    field = FieldOverUnits(basis, problem.solve(velocity))
+    for _ in range(CORRECTIONS):
+        rest = velocity - _mean_velocity(field, pairs.x0, pairs.h)
+        field = replace(field, coefficients=field.coefficients + problem.solve(rest))
+    return field
+
+
+def _mean_velocity(field: FieldOverUnits, x0: np.ndarray, h: np.ndarray) -> np.ndarray:
+    """(Φ_h(x0) - x0)/h by one step of the classical Runge–Kutta rule, shape ``(n, d)``."""
+    return (runge_kutta_step(lambda x: field(x.T).T, x0.T, h).T - x0) / h[:, None]
