@@ -22,6 +22,7 @@ class Purpose(StrEnum):
     HOLD_OUT = "hold out"
     DIVIDE = "divide"
     TRAINING = "training"
+    UNITS = "units"
     REFINE = "refine"
     SHUFFLE = "shuffle"
     LANDSCAPE = "landscape"

@@ -3,14 +3,14 @@
 A short training of the two networks (paper, section 2.2) leaves V far from exact, but on the right branch of
 the Hamilton–Jacobi equation ``∇V·(f + D∇V) = 0``. From there on no steps of descent are needed. Over hidden
 units that are drawn at random and stay as they are (random features; Rahimi and Recht 2007, NeurIPS 20) f is
-linear in the output weights, and follows from the pairs by least squares; the equation is quadratic in those of
-V, and a few steps of Gauss–Newton end where it holds to a millionth; ``g = f + D∇V`` is linear again. What
-comes out are networks of the paper's form, ``V = η_v (V^NN(y) + |y|²)``, with one hidden layer.
+linear in the output weights, and follows from the pairs by least squares; the equation is quadratic in those
+of V, and a few steps of Gauss–Newton end where it holds to a hundred-thousandth; ``g = f + D∇V`` is linear
+again. What comes out are networks of the paper's form, ``V = η_v (V^NN(y) + |y|²)``, with one hidden layer.
 
-Neither the Hessian of V at the attractors nor an f that is identified elsewhere takes part. Whether the branch
-is the right one is asked where f comes to rest: about an attractor A the quasipotential has
-``∂f(A) + 2D ∂²V(A)`` with the eigenvalues of ``-∂f(A)ᵀ``, so that trajectories of least action leave it, and on a
-false branch, where V is flat along a direction, some of them do not.
+Neither the Hessian of V at the attractors nor an f that is identified elsewhere takes part. Whether the
+branch is the right one is asked where f comes to rest: about an attractor A the quasipotential has
+``∂f(A) + 2D ∂²V(A)`` with the eigenvalues of ``-∂f(A)ᵀ``, so that paths of least action leave it. On a false
+branch, where V is flat along a direction, some of them do not.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from siq.data.recordings import SnapshotPairs
 from siq.networks.decomposition import OutputWeightOptions, TrainedNetworks
 from siq.networks.training import TrainingData
 from siq.numerics.integration import runge_kutta_step
-from siq.quasipotential.hamilton_jacobi import HamiltonJacobi, relative_residuals, robust_fit
+from siq.quasipotential.hamilton_jacobi import HamiltonJacobi
 from siq.systems.diffusion import Diffusion
 
 logger = logging.getLogger(__name__)
@@ -184,8 +184,8 @@ class OutputWeights:
 
     def hopeless(self) -> str | None:
         """Why no networks can lead to a solution, in words; None where they can."""
-        if not np.isfinite(self.field_error):
-            return "f over random units does not follow the pairs"
+        if not self.field_error < 1:
+            return "f over random units is as far from the held-out pairs as no f at all"
         return None
 
     def accepted(self, networks: TrainedNetworks) -> TrainedNetworks | None:
@@ -198,14 +198,14 @@ class OutputWeights:
         steepness = float(networks.potential_scale[0, 0])
         units, rest = flat[:, :-1], slopes.ravel() - steepness * flat[:, -1]
         start = np.linalg.solve(units.T @ units + RIDGE * n * np.eye(m - 1), units.T @ rest)
-        weights = robust_fit(
-            equation, np.append(start, steepness), np.arange(m) < m - 1,
+        weights = equation.robust_fit(
+            np.append(start, steepness), np.arange(m) < m - 1,
             rounds=1, finest=np.inf, steps=STEPS, orthonormal=True,
         )  # fmt: skip
         unweighted = replace(
             equation, weight=1 / np.sqrt(self.diffusion.squared_speed(self.points, equation.flow))
         )
-        residual = float(np.median(relative_residuals(unweighted, weights)))
+        residual = float(np.median(unweighted.relative_residuals(weights)))
         logger.info("output weights: median Hamilton–Jacobi residual %.1e", residual)
         if not (residual < self.options.residual and self._right_branch(weights)):
             return None
@@ -254,7 +254,7 @@ class OutputWeights:
 
 
 class _LeastSquares:
-    """Least squares with one matrix ``(n, m)`` and many right-hand sides, slightly damped where it is singular."""
+    """Least squares with one matrix ``(n, m)`` and many right-hand sides, damped where it is singular."""
 
     def __init__(self, matrix: np.ndarray) -> None:
         self.rows, columns = matrix.shape

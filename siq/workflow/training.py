@@ -18,8 +18,9 @@ from siq.data.recordings import Recordings, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
 from siq.networks.decomposition import TrainedNetworks
-from siq.networks.training import Block, TrainingData, choose_device, prepare_data
+from siq.networks.training import Block, Check, TrainingData, choose_device, prepare_data
 from siq.numerics.randomness import Purpose, generator
+from siq.quasipotential.output_weights import OutputWeights
 from siq.quasipotential.refinement import TrainingCheck
 from siq.systems.diffusion import Diffusion
 from siq.workflow.study import PipelineSettings
@@ -70,12 +71,13 @@ def train_block(
     data, results = _training_data(settings, runs)
     if not data:
         return results, [], as_table("training", [])
-    ready, faults = _checks(settings, runs, data)
+    diffusion = _diffusion(settings, runs, data)
+    ready, faults = _checks(settings, runs, data, diffusion)
     block = Block(
         data,
         ready,
         options=settings.training,
-        diffusion=_diffusion(settings, runs, data),
+        diffusion=diffusion,
         seed=settings.seed,
         folder=folder,
         mark=_fingerprint(settings, runs, data),
@@ -141,18 +143,20 @@ def _training_data(
 
 
 def _checks(
-    settings: PipelineSettings, runs: Runs, data: Mapping[int, TrainingData]
-) -> tuple[dict[int, TrainingCheck], dict[int, str]]:
-    """When the training of each run whose f is known may end; of those that have no check, why not."""
+    settings: PipelineSettings, runs: Runs, data: Mapping[int, TrainingData], diffusion: Diffusion
+) -> tuple[dict[int, Check], dict[int, str]]:
+    """When the training of each run may end; of those that have no check, why not."""
     assert settings.training is not None
-    ready, faults = {}, {}
+    ready, faults = dict[int, Check](), {}
+    options, of_weights = settings.training.check, settings.training.output_weights
     for number, part in data.items():
-        options, record = settings.training.check, runs[number][1]
-        if record is None or options is None:
-            continue
-        x = part.training.x0
+        record = runs[number][1]
         try:
-            ready[number] = TrainingCheck(record, x, options=options, seed=number)
+            if options is not None and of_weights is not None:
+                draw = generator(settings.seed, number, Purpose.UNITS)
+                ready[number] = OutputWeights(part, diffusion=diffusion, options=of_weights, generator=draw)
+            elif options is not None and record is not None:
+                ready[number] = TrainingCheck(record, part.training.x0, options=options, seed=number)
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             faults[number] = f"the check of the training could not be prepared: {error}"
     return ready, faults

@@ -42,13 +42,13 @@ class Check:
     def hopeless(self) -> None:
         return None
 
-    def passes(self, networks: TrainedNetworks) -> bool:
+    def accepted(self, networks: TrainedNetworks) -> TrainedNetworks | None:
         self.calls += 1
         if self.calls == self.dies_at:
             raise KeyboardInterrupt
         if self.like is not None:  # a pure function of the networks, as the real check is
-            return same(networks, self.like)
-        return self.calls == self.passes_at
+            return networks if same(networks, self.like) else None
+        return networks if self.calls == self.passes_at else None
 
 
 def same(left: TrainedNetworks, right: TrainedNetworks) -> bool:

@@ -1,0 +1,100 @@
+"""Output weights of random units: solved for far beyond a rough V, and refused on a false branch."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import sympy
+from known_systems import KnownSystem, archetype, linear_system, potential_gradient, potential_values
+
+from siq.data.recordings import SnapshotPairs
+from siq.networks.decomposition import OutputWeightOptions, TrainedNetworks, TrainingOptions
+from siq.networks.training import TrainingData, prepare_data
+from siq.numerics.integration import runge_kutta_step
+from siq.quasipotential.output_weights import OutputWeights, UnitBasis
+
+STEP = 0.01
+TIMES_BEFORE_SQUARES = 1.5  # |y|² of a network of its own, beside the units
+
+
+def pairs_of(known: KnownSystem, *, seed: int = 0) -> TrainingData:
+    """Pairs that start anywhere in the domain, as 50 recordings."""
+    x0 = np.random.default_rng(seed).uniform(*known.domain.T, (3000, len(known.domain)))
+    xh = runge_kutta_step(lambda x: known.dynamics.drift(x.T).T, x0.T, STEP).T
+    pairs = SnapshotPairs(x0, xh, np.full(len(x0), STEP), np.arange(len(x0)) // 60)
+    return prepare_data(pairs, options=TrainingOptions(), generator=np.random.default_rng(seed))
+
+
+def rough_networks(known: KnownSystem, factors: np.ndarray) -> TrainedNetworks:
+    """Stand-ins of networks: ∇V is the exact one times factors of the shape ``(d,)``, and up to 20 % off."""
+
+    def evaluate(x: np.ndarray) -> SimpleNamespace:
+        slope = potential_gradient(known, x) * factors * (1 + 0.2 * np.sin(2 * x))
+        return SimpleNamespace(circulatory=slope @ known.diffusion, vector_field=np.zeros_like(slope))
+
+    steepness = np.full((1, 1), TIMES_BEFORE_SQUARES)
+    return SimpleNamespace(evaluate=evaluate, potential_scale=steepness)  # type: ignore[return-value]
+
+
+def solver(known: KnownSystem, *, seed: int = 1) -> OutputWeights:
+    options = OutputWeightOptions(units=400, points=2000)
+    draw = np.random.default_rng(seed)
+    return OutputWeights(pairs_of(known), diffusion=known.dynamics.diffusion, options=options, generator=draw)
+
+
+def error_of(networks: TrainedNetworks, known: KnownSystem) -> float:
+    """Of V over the inner part of the domain, up to a constant and relative to how much V varies there."""
+    x = np.random.default_rng(9).uniform(*(0.8 * known.domain).T, (2000, len(known.domain)))
+    exact, potential = potential_values(known, x), networks.potential_at(x)
+    return float((potential - exact).std() / exact.std())
+
+
+@pytest.mark.parametrize("known", [archetype(2), archetype(3), linear_system(2), linear_system(3)])
+def test_a_rough_potential_leads_to_the_exact_one(known: KnownSystem) -> None:
+    networks = solver(known).accepted(rough_networks(known, np.ones(len(known.domain))))
+    assert networks is not None
+    assert error_of(networks, known) < 2e-3
+    x = known.attractors[:1] + 0.3
+    values = networks.evaluate(x)
+    assert values.vector_field == pytest.approx(known.dynamics.drift(x), rel=1e-2, abs=1e-2)
+    slope = potential_gradient(known, x)
+    assert values.circulatory == pytest.approx(
+        known.dynamics.drift(x) + slope @ known.diffusion, rel=1e-2, abs=1e-2
+    )
+
+
+@pytest.mark.parametrize("flat", [0, 1])
+def test_a_potential_that_is_flat_along_a_direction_is_refused(flat: int) -> None:
+    known = archetype(2)
+    factors = np.ones(2)
+    factors[flat] = 0.0
+    assert solver(known).accepted(rough_networks(known, factors)) is None
+
+
+def test_the_draw_decides_the_units_and_nothing_else_does() -> None:
+    known = archetype(2)
+    rough = rough_networks(known, np.ones(2))
+    one, again, other = (solver(known, seed=seed).accepted(rough) for seed in (1, 1, 2))
+    assert one is not None and again is not None and other is not None
+    x = np.random.default_rng(0).uniform(*known.domain.T, (50, 2))
+    assert np.array_equal(one.potential_at(x), again.potential_at(x))
+    assert not np.array_equal(one.potential_at(x), other.potential_at(x))
+
+
+def test_derivatives_of_units_are_those_of_their_formula() -> None:
+    draw = np.random.default_rng(3)
+    basis = UnitBasis(
+        draw.normal(size=(2, 4)), draw.normal(size=4), np.array([0.3, -1.0]), np.array([2.0, 0.5])
+    )
+    coefficients, point = draw.normal(size=basis.size), np.array([[0.7, -0.4]])
+    formula, states = basis.expression(coefficients), sympy.symbols("x1 x2")
+    at = dict(zip(states, point[0], strict=True))
+    assert (basis.values(point) @ coefficients)[0] == pytest.approx(float(formula.subs(at)))
+    for i, one in enumerate(states):
+        slope = float(formula.diff(one).subs(at))
+        assert (basis.gradients(point) @ coefficients)[0, i] == pytest.approx(slope)
+        for j, other in enumerate(states):
+            curvature = float(formula.diff(one, other).subs(at))
+            assert (basis.hessians(point) @ coefficients)[0, i, j] == pytest.approx(curvature)
