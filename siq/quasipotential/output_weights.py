@@ -193,8 +193,9 @@ class OutputWeights:
         basis, equation = self.field.basis, self._equation
         n, d, m = equation.gradients.shape
         # V over the units as the networks have it, by its gradient; |y|² keeps the weight that it has there.
-        flat, values = equation.gradients.reshape(n * d, m), networks.evaluate(self.points)
-        slopes = (values.circulatory - values.vector_field) @ self.diffusion.precision
+        flat = equation.gradients.reshape(n * d, m)
+        _, circulatory, vector_field = networks.evaluate(self.points)
+        slopes = (circulatory - vector_field) @ self.diffusion.precision
         steepness = float(networks.potential_scale[0, 0])
         units, rest = flat[:, :-1], slopes.ravel() - steepness * flat[:, -1]
         start = np.linalg.solve(units.T @ units + RIDGE * n * np.eye(m - 1), units.T @ rest)
