@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
-from siq.errors import InputError
+from siq.errors import Fault, InputError
 from siq.numerics.files import whole_file
 
 CHUNK = 4096  # points evaluated together: few enough for their activations to stay in the processor's cache
@@ -162,6 +162,15 @@ class TrainingOptions:
     potential_gain: Annotated[float, Field(gt=0)] = 3.0
     training_share: Annotated[float, Field(gt=0, lt=1)] = 0.7
     precision: Literal["float32", "float64"] = "float32"
+
+    @model_validator(mode="after")
+    def _consistent(self) -> TrainingOptions:
+        if self.output_weights is not None and self.check is None:
+            raise Fault(
+                "output weights are solved for when a training is checked, and this one never is",
+                "leave out 'check: null', or leave out 'output_weights'",
+            )
+        return self
 
     def attempt(self, number: int) -> TrainingOptions:
         """Options of a training that comes after `number` trainings that failed.

@@ -11,8 +11,14 @@ import torch
 from known_settings import PAPER
 
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
-from siq.errors import InputError, NumericalFailure
-from siq.networks.decomposition import TrainingOptions, load_networks, pack, save_networks
+from siq.errors import Fault, InputError, NumericalFailure
+from siq.networks.decomposition import (
+    OutputWeightOptions,
+    TrainingOptions,
+    load_networks,
+    pack,
+    save_networks,
+)
 from siq.networks.networks import at_rest, dynamics_loss, orthogonality_loss
 from siq.networks.training import (
     HISTORY,
@@ -428,3 +434,8 @@ def test_the_slowest_part_leaves_out_the_fastest_points_in_any_units() -> None:
     scaled = dataclasses.replace(whole.training, x0=whole.training.x0 * units, xh=whole.training.xh * units)
     again = _slowest_part(dataclasses.replace(whole, training=scaled), 0.5)
     np.testing.assert_array_equal(again.representative_rows, kept)
+
+
+def test_output_weights_need_a_check() -> None:
+    with pytest.raises(Fault, match="never is"):
+        TrainingOptions(check=None, output_weights=OutputWeightOptions())
