@@ -57,27 +57,6 @@ class CheckOptions:
 
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class OutputWeightOptions:
-    """How the output weights of random units are solved for once the networks are on the right branch.
-
-    See `siq.quasipotential.output_weights`.
-
-    Attributes
-    ----------
-    units
-        Tanh units of the one hidden layer.
-    points
-        Representative pairs that are used, at most.
-    residual
-        Largest median of ``|∇V·(f + D∇V)| / (|∇V| |f|)`` of a solution.
-    """
-
-    units: Annotated[int, Field(ge=10)] = 400
-    points: Annotated[int, Field(ge=100)] = 4000
-    residual: Annotated[float, Field(gt=0)] = 1e-3
-
-
-@pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class TrainingOptions:
     """How the networks are trained; every one of these changes the result.
 
@@ -93,8 +72,9 @@ class TrainingOptions:
     check
         When a training may end earlier; None takes all its steps.
     output_weights
-        If given, the check solves for the output weights of random units, and what it finds replaces the
-        networks: neither the local route nor the identified f takes part in a training.
+        Number of random tanh units whose output weights the check solves for, from where the networks have
+        come; what it finds replaces them (`siq.quasipotential.output_weights`), and neither the local route
+        nor the identified f takes part in the training. Left out, the check is that of `CheckOptions`.
     batch_size
         Pairs in the first term of the loss, and representative points in the second, per step.
     representative_share
@@ -143,7 +123,7 @@ class TrainingOptions:
     widths: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)] = (50, 50, 50)
     steps: Annotated[int, Field(ge=1)] = 4000
     check: CheckOptions | None = CheckOptions()
-    output_weights: OutputWeightOptions | None = None
+    output_weights: Annotated[int, Field(ge=10)] | None = None
     batch_size: Annotated[int, Field(ge=1)] = 256
     representative_share: Annotated[float, Field(ge=0, le=1)] = 1.0
     learning_rate: Annotated[float, Field(gt=0)] = 5e-3

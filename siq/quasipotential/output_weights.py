@@ -25,7 +25,7 @@ import scipy.optimize
 import sympy
 
 from siq.data.recordings import SnapshotPairs
-from siq.networks.decomposition import OutputWeightOptions, TrainedNetworks
+from siq.networks.decomposition import TrainedNetworks
 from siq.networks.training import TrainingData
 from siq.numerics.integration import runge_kutta_step
 from siq.quasipotential.hamilton_jacobi import HamiltonJacobi
@@ -38,6 +38,8 @@ CORRECTIONS = 3  # of f for the integrator's error; each gains about two digits
 SINGULAR_RATIO = 1e-12  # damping of least squares: combinations of units that the points leave open
 SLOW_SHARE = 0.04  # of the points, by their speed: below it residuals are not divided by the speed alone
 RIDGE = 1e-8  # of the mean square gradient of a unit: how far the start may be from the networks' own V
+MAX_RESIDUAL = 1e-3  # median of |∇V·(f + D∇V)|/(|∇V||f|): right branches end at 1e-5, wrong ones may at 1e-3
+POINTS_PER_UNIT = 10  # representative pairs that are used, at most
 STEPS = 25  # of Gauss–Newton; a right start takes about ten
 SAME_POINT = 1e-3  # in standard deviations of the states: fixed points this near are one
 STARTS = 20  # slowest points from which fixed points of f are sought
@@ -99,39 +101,18 @@ class UnitBasis:
         functions = [*(sympy.tanh(each) for each in inside), sum(z**2 for z in y)]
         return sympy.Add(*(float(c) * each for c, each in zip(coefficients, functions, strict=True)))
 
+    def design(self, x: np.ndarray) -> np.ndarray:
+        """Functions for f, ``[tanh(y W + b), 1, y]``: points ``(n, d)`` to ``(n, units + 1 + d)``."""
+        return np.column_stack([self.hidden(x), np.ones(len(x)), self._normalised(x)])
+
+    def field_jacobian(self, x: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+        """∂f_i/∂x_j of ``f = design(x) C`` at points ``(n, d)``, shape ``(n, d, d)``."""
+        units = len(self.biases)
+        slopes = self.gradients(x)[:, :, :units] @ coefficients[:units]
+        return np.swapaxes(slopes + coefficients[units + 1 :] / self.scale[:, None], 1, 2)
+
     def _normalised(self, x: np.ndarray) -> np.ndarray:
         return (x - self.mean) / self.scale
-
-
-@dataclass(frozen=True)
-class FieldOverUnits:
-    """A vector field linear in random units: ``f(x) = [tanh(y W + b), 1, y] C``.
-
-    Attributes
-    ----------
-    basis
-        The units.
-    coefficients
-        C, shape ``(units + 1 + d, d)``.
-    """
-
-    basis: UnitBasis
-    coefficients: np.ndarray
-
-    @staticmethod
-    def design(basis: UnitBasis, x: np.ndarray) -> np.ndarray:
-        """The functions at points, shape ``(n, units + 1 + d)``."""
-        return np.column_stack([basis.hidden(x), np.ones(len(x)), (x - basis.mean) / basis.scale])
-
-    def __call__(self, x: np.ndarray) -> np.ndarray:
-        """f at points ``(n, d)``, shape ``(n, d)``."""
-        return self.design(self.basis, x) @ self.coefficients
-
-    def jacobian(self, x: np.ndarray) -> np.ndarray:
-        """∂f_i/∂x_j at points ``(n, d)``, shape ``(n, d, d)``."""
-        units = len(self.basis.biases)
-        slopes = self.basis.gradients(x)[:, :, :units] @ self.coefficients[:units]
-        return np.swapaxes(slopes + self.coefficients[units + 1 :] / self.basis.scale[:, None], 1, 2)
 
 
 class OutputWeights:
@@ -143,8 +124,8 @@ class OutputWeights:
         The pairs of the run.
     diffusion
         D, constant.
-    options
-        Number of units and of points, and what is asked of a solution.
+    units
+        Number of units.
     generator
         Draws the units, and the points where there are too many.
     """
@@ -154,32 +135,34 @@ class OutputWeights:
         data: TrainingData,
         *,
         diffusion: Diffusion,
-        options: OutputWeightOptions,
+        units: int,
         generator: np.random.Generator,
     ) -> None:
-        self.diffusion, self.options = diffusion, options
-        pairs = data.representative
-        if len(pairs.h) > options.points:
-            pairs = pairs.take(np.sort(generator.choice(len(pairs.h), options.points, replace=False)))
+        self.diffusion = diffusion
+        pairs, most = data.representative, POINTS_PER_UNIT * units
+        if len(pairs.h) > most:
+            pairs = pairs.take(np.sort(generator.choice(len(pairs.h), most, replace=False)))
         others = data.held_out
-        if len(others.h) > options.points:
-            others = others.take(np.sort(generator.choice(len(others.h), options.points, replace=False)))
+        if len(others.h) > most:
+            others = others.take(np.sort(generator.choice(len(others.h), most, replace=False)))
         mean, scale = pairs.x0.mean(axis=0), pairs.x0.std(axis=0)
-        weights = generator.normal(size=(len(mean), options.units))
-        biases = generator.uniform(-2, 2, options.units)
+        weights = generator.normal(size=(len(mean), units))
+        biases = generator.uniform(-2, 2, units)
         observed, self.field_error = (others.xh - others.x0) / others.h[:, None], np.inf
         for spread in SPREADS:
-            field = _field_over(UnitBasis(spread * weights, spread * biases, mean, scale), pairs)
-            rest = observed - _mean_velocity(field, others.x0, others.h)
+            basis = UnitBasis(spread * weights, spread * biases, mean, scale)
+            coefficients = _field_coefficients(basis, pairs)
+            rest = observed - _mean_velocity(basis, coefficients, others.x0, others.h)
             error = float(np.sqrt((rest**2).sum() / (observed**2).sum()))
             logger.info("units spread by %g: held-out error of f %.1e", spread, error)
             if error < self.field_error:
-                self.field_error, self.field = error, field
+                self.field_error, self.basis, self.coefficients = error, basis, coefficients
         self.points = pairs.x0
-        speed = diffusion.squared_speed(self.points, self.field(self.points))
+        flow = self.basis.design(self.points) @ self.coefficients
+        speed = diffusion.squared_speed(self.points, flow)
         # Where f vanishes so does what is divided by its speed; about fixed points everything counts alike.
         weight = 1 / (speed + np.quantile(speed, SLOW_SHARE))
-        gradients, flow = self.field.basis.gradients(self.points), self.field(self.points)
+        gradients = self.basis.gradients(self.points)
         self._equation = HamiltonJacobi(self.points, gradients, flow, diffusion, weight, diffusion)
 
     def hopeless(self) -> str | None:
@@ -190,7 +173,7 @@ class OutputWeights:
 
     def accepted(self, networks: TrainedNetworks) -> TrainedNetworks | None:
         """Networks with the output weights solved for; None where they lead to a false branch."""
-        basis, equation = self.field.basis, self._equation
+        basis, equation = self.basis, self._equation
         n, d, m = equation.gradients.shape
         # V over the units as the networks have it, by its gradient; |y|² keeps the weight that it has there.
         flat = equation.gradients.reshape(n * d, m)
@@ -208,10 +191,10 @@ class OutputWeights:
         )
         residual = float(np.median(unweighted.relative_residuals(weights)))
         logger.info("output weights: median Hamilton–Jacobi residual %.1e", residual)
-        if not (residual < self.options.residual and self._right_branch(weights)):
+        if not (residual < MAX_RESIDUAL and self._right_branch(weights)):
             return None
         circulatory = equation.flow + self.diffusion.push(self.points, equation.slopes(weights))
-        of_g = _LeastSquares(FieldOverUnits.design(basis, self.points)[:, :m]).solve(circulatory)
+        of_g = _LeastSquares(basis.design(self.points)[:, :m]).solve(circulatory)
         layers = (basis.weights, basis.biases[None])
         return TrainedNetworks(
             potential=(layers, (weights[:-1, None] / steepness, np.zeros((1, 1)))),
@@ -226,8 +209,8 @@ class OutputWeights:
     def _right_branch(self, weights: np.ndarray) -> bool:
         """Whether paths of least action leave every fixed point at which f comes to rest."""
         for attractor in self._attractors:
-            slope = self.field.jacobian(attractor[None])[0]
-            curvature = self.field.basis.hessians(attractor[None])[0] @ weights
+            slope = self.basis.field_jacobian(attractor[None], self.coefficients)[0]
+            curvature = self.basis.hessians(attractor[None])[0] @ weights
             leaving = np.linalg.eigvals(slope + 2 * self.diffusion.matrix @ curvature).real.min()
             approach = -np.linalg.eigvals(slope).real.max()
             logger.info(
@@ -245,10 +228,13 @@ class OutputWeights:
         found: list[np.ndarray] = []
         for begin in self.points[np.argsort(speed)[:STARTS]]:
             end = scipy.optimize.root(
-                lambda x: self.field(x[None])[0], begin, jac=lambda x: self.field.jacobian(x[None])[0]
+                lambda x: self.basis.design(x[None])[0] @ self.coefficients,
+                begin,
+                jac=lambda x: self.basis.field_jacobian(x[None], self.coefficients)[0],
             )
-            stable = end.success and np.linalg.eigvals(self.field.jacobian(end.x[None])[0]).real.max() < 0
-            apart = [np.abs((end.x - other) / self.field.basis.scale).max() > SAME_POINT for other in found]
+            slope = self.basis.field_jacobian(end.x[None], self.coefficients)[0]
+            stable = end.success and np.linalg.eigvals(slope).real.max() < 0
+            apart = [np.abs((end.x - other) / self.basis.scale).max() > SAME_POINT for other in found]
             if stable and all(apart) and (end.x > lower).all() and (end.x < upper).all():
                 found.append(end.x)
         return found
@@ -267,17 +253,17 @@ class _LeastSquares:
         return np.asarray(scipy.linalg.solve_triangular(self.r, self.q[: self.rows].T @ right))
 
 
-def _field_over(basis: UnitBasis, pairs: SnapshotPairs) -> FieldOverUnits:
-    """f over the units from pairs: from the mean velocities, and then what the integrator is still off by."""
-    problem = _LeastSquares(FieldOverUnits.design(basis, pairs.x0))
+def _field_coefficients(basis: UnitBasis, pairs: SnapshotPairs) -> np.ndarray:
+    """C of ``f = design(x) C``, from mean velocities of pairs; then from what the integrator is off by."""
+    problem = _LeastSquares(basis.design(pairs.x0))
     velocity = (pairs.xh - pairs.x0) / pairs.h[:, None]
-    field = FieldOverUnits(basis, problem.solve(velocity))
+    coefficients = problem.solve(velocity)
     for _ in range(CORRECTIONS):
-        rest = velocity - _mean_velocity(field, pairs.x0, pairs.h)
-        field = replace(field, coefficients=field.coefficients + problem.solve(rest))
-    return field
+        rest = velocity - _mean_velocity(basis, coefficients, pairs.x0, pairs.h)
+        coefficients = coefficients + problem.solve(rest)
+    return coefficients
 
 
-def _mean_velocity(field: FieldOverUnits, x0: np.ndarray, h: np.ndarray) -> np.ndarray:
+def _mean_velocity(basis: UnitBasis, coefficients: np.ndarray, x0: np.ndarray, h: np.ndarray) -> np.ndarray:
     """(Φ_h(x0) - x0)/h by one step of the classical Runge–Kutta rule, shape ``(n, d)``."""
-    return (runge_kutta_step(lambda x: field(x.T).T, x0.T, h).T - x0) / h[:, None]
+    return (runge_kutta_step(lambda x: (basis.design(x.T) @ coefficients).T, x0.T, h).T - x0) / h[:, None]

@@ -148,13 +148,13 @@ def _checks(
     """When the training of each run may end; of those that have no check, why not."""
     assert settings.training is not None
     ready, faults = dict[int, Check](), {}
-    options, of_weights = settings.training.check, settings.training.output_weights
+    options, units = settings.training.check, settings.training.output_weights
     for number, part in data.items():
         record = runs[number][1]
         try:
-            if options is not None and of_weights is not None:
+            if options is not None and units is not None:
                 draw = generator(settings.seed, number, Purpose.UNITS)
-                ready[number] = OutputWeights(part, diffusion=diffusion, options=of_weights, generator=draw)
+                ready[number] = OutputWeights(part, diffusion=diffusion, units=units, generator=draw)
             elif options is not None and record is not None:
                 ready[number] = TrainingCheck(record, part.training.x0, options=options, seed=number)
         except (NumericalFailure, np.linalg.LinAlgError) as error:

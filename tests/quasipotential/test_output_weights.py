@@ -10,7 +10,7 @@ import sympy
 from known_systems import KnownSystem, archetype, linear_system, potential_gradient, potential_values
 
 from siq.data.recordings import SnapshotPairs
-from siq.networks.decomposition import OutputWeightOptions, TrainedNetworks, TrainingOptions
+from siq.networks.decomposition import TrainedNetworks, TrainingOptions
 from siq.networks.training import TrainingData, prepare_data
 from siq.numerics.integration import runge_kutta_step
 from siq.quasipotential.output_weights import OutputWeights, UnitBasis
@@ -39,9 +39,8 @@ def rough_networks(known: KnownSystem, factors: np.ndarray) -> TrainedNetworks:
 
 
 def solver(known: KnownSystem, *, seed: int = 1) -> OutputWeights:
-    options = OutputWeightOptions(units=400, points=2000)
     draw = np.random.default_rng(seed)
-    return OutputWeights(pairs_of(known), diffusion=known.dynamics.diffusion, options=options, generator=draw)
+    return OutputWeights(pairs_of(known), diffusion=known.dynamics.diffusion, units=400, generator=draw)
 
 
 def error_of(networks: TrainedNetworks, known: KnownSystem) -> float:
