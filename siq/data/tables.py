@@ -381,8 +381,12 @@ def _in_order(rows: _Rows, numbers: np.ndarray, labelled: bool, remarks: list[Re
             twice += len(piece) - len(once)
             parts.append(once)
             labels.append(label if len(pieces) == 1 else f"{label}/{number}" if label != "0" else str(number))
-    counted = (("data.rows_sorted", was_sorted), ("data.time_starts_over", begun), ("data.rows_twice", twice))
-    remarks += [Remark(code, {"count": count}) for code, count in counted if count]
+    counted = (
+        Remark("data.rows_sorted", {"count": was_sorted}),
+        Remark("data.time_starts_over", {"count": begun}),
+        Remark("data.rows_twice", {"count": twice}),
+    )
+    remarks += [remark for remark in counted if remark.values["count"]]
     lengths = [len(part) for part in parts]
     return _Rows(np.concatenate(parts), np.repeat(np.arange(len(parts)), lengths), tuple(labels))
 
