@@ -92,7 +92,7 @@ def identified(laboratory: Laboratory, seed: int) -> dict[str, Any]:
     began = time.process_time()
     step = identify_run(settings, recordings, number=0)
     seconds = time.process_time() - began
-    found = set() if step.record is None else {(int(i), int(k)) for i, k in step.record.support}
+    found = set() if step.result is None else {(int(i), int(k)) for i, k in step.result.support}
     true = set(true_terms(laboratory, library))
     return {
         "missing": _named(true - found, library),

@@ -412,7 +412,7 @@ def switching(recordings: Recordings) -> Switching | None:
     --------
     >>> import numpy as np
     >>> from siq.data.correlation import markov_lag
-    from siq.data.recordings import Recordings
+    >>> from siq.data.recordings import Recordings
     >>> generator = np.random.default_rng(1)
     >>> x = np.empty((20_000, 1))
     >>> x[0] = 1.0

@@ -18,6 +18,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
@@ -26,10 +27,12 @@ import sympy
 
 from siq.data.recordings import SnapshotPairs
 from siq.networks.decomposition import TrainedNetworks
-from siq.networks.training import TrainingData
 from siq.numerics.integration import runge_kutta_step
 from siq.quasipotential.hamilton_jacobi import HamiltonJacobi
 from siq.systems.diffusion import Diffusion
+
+if TYPE_CHECKING:  # needs torch, which the mathematics does without
+    from siq.networks.training import TrainingData
 
 logger = logging.getLogger(__name__)
 
