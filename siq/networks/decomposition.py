@@ -74,7 +74,8 @@ class TrainingOptions:
     output_weights
         Number of random tanh units whose output weights the check solves for, from where the networks have
         come; what it finds replaces them (`siq.quasipotential.output_weights`), and neither the local route
-        nor the identified f takes part in the training. Left out, the check is that of `CheckOptions`.
+        nor the identified f takes part in the training. Of `check` only `first`, `every` and `attempts` count
+        then. Left out, the check is the rehearsal that `CheckOptions` describes.
     batch_size
         Pairs in the first term of the loss, and representative points in the second, per step.
     representative_share

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 import scipy.linalg
@@ -70,8 +70,16 @@ class Equilibrium:
         return int((self.eigenvalues.real > 0).sum())
 
 
+class _VectorField(Protocol):
+    """f and its Jacobian: dynamics, or f that is linear in some functions."""
+
+    def drift(self, x: np.ndarray, /) -> np.ndarray: ...
+
+    def jacobian(self, x: np.ndarray, /) -> np.ndarray: ...
+
+
 def find_equilibria(
-    dynamics: Dynamics,
+    dynamics: _VectorField,
     points: np.ndarray,
     *,
     box: np.ndarray | None = None,
@@ -102,7 +110,7 @@ def find_equilibria(
 
 
 def distinct_roots(
-    dynamics: Dynamics,
+    dynamics: _VectorField,
     starts: np.ndarray,
     *,
     box: np.ndarray,
@@ -153,7 +161,11 @@ def distinct_roots(
 
 
 def _newton(
-    dynamics: Dynamics, starts: np.ndarray, low: np.ndarray, width: np.ndarray, known: Sequence[np.ndarray]
+    dynamics: _VectorField,
+    starts: np.ndarray,
+    low: np.ndarray,
+    width: np.ndarray,
+    known: Sequence[np.ndarray],
 ) -> np.ndarray:
     """Where Newton's method has come from some starts; what has run away is left out."""
     x = starts.copy()
@@ -179,7 +191,7 @@ def _newton(
 
 
 def _classified(
-    dynamics: Dynamics, positions: Sequence[np.ndarray], box: np.ndarray, rate: float
+    dynamics: _VectorField, positions: Sequence[np.ndarray], box: np.ndarray, rate: float
 ) -> list[Equilibrium]:
     """Equilibria at positions, by these along the first state."""
     width = np.where(box[:, 1] > box[:, 0], box[:, 1] - box[:, 0], 1.0)
@@ -187,14 +199,14 @@ def _classified(
     return [classify(dynamics, position, rate=rate) for position in ordered]
 
 
-def _rate_of(dynamics: Dynamics, points: np.ndarray) -> float:
+def _rate_of(dynamics: _VectorField, points: np.ndarray) -> float:
     """At which f crosses the box of some points ``(n, d)``, per unit of time: the median over them."""
     width = np.ptp(points, axis=0)
     speed = np.linalg.norm(dynamics.drift(points) / np.where(width > 0, width, 1.0), axis=1)
     return float(np.median(speed))
 
 
-def classify(dynamics: Dynamics, position: np.ndarray, *, rate: float = 0.0) -> Equilibrium:
+def classify(dynamics: _VectorField, position: np.ndarray, *, rate: float = 0.0) -> Equilibrium:
     """The equilibrium at a position, by the eigenvalues of the Jacobian there.
 
     Parameters

@@ -7,7 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import sympy
-from known_systems import KnownSystem, archetype, linear_system, potential_gradient, potential_values
+from known_systems import (
+    KnownSystem,
+    archetype,
+    limit_cycle,
+    linear_system,
+    potential_gradient,
+    potential_values,
+)
 
 from siq.data.recordings import SnapshotPairs
 from siq.networks.decomposition import TrainedNetworks, TrainingOptions
@@ -16,7 +23,7 @@ from siq.numerics.integration import runge_kutta_step
 from siq.quasipotential.output_weights import OutputWeights, UnitBasis
 
 STEP = 0.01
-TIMES_BEFORE_SQUARES = 1.5  # |y|² of a network of its own, beside the units
+STEEPNESS = 1.5  # η_v of the stand-ins, which V keeps
 
 
 def pairs_of(known: KnownSystem, *, seed: int = 0) -> TrainingData:
@@ -34,7 +41,7 @@ def rough_networks(known: KnownSystem, factors: np.ndarray) -> TrainedNetworks:
         slope = potential_gradient(known, x) * factors * (1 + 0.2 * np.sin(2 * x))
         return None, slope @ known.diffusion, np.zeros_like(slope)
 
-    steepness = np.full((1, 1), TIMES_BEFORE_SQUARES)
+    steepness = np.full((1, 1), STEEPNESS)
     return SimpleNamespace(evaluate=evaluate, potential_scale=steepness)  # type: ignore[return-value]
 
 
@@ -70,6 +77,13 @@ def test_a_potential_that_is_flat_along_a_direction_is_refused(flat: int) -> Non
     assert solver(known).accepted(rough_networks(known, factors)) is None
 
 
+def test_where_f_comes_to_rest_nowhere_the_branch_is_not_taken_on_trust() -> None:
+    known = limit_cycle()
+    solved = solver(known)
+    assert "leave out training.output_weights" in (solved.hopeless() or "")
+    assert solved.accepted(rough_networks(known, np.ones(2))) is None
+
+
 def test_the_draw_decides_the_units_and_nothing_else_does() -> None:
     known = archetype(2)
     rough = rough_networks(known, np.ones(2))
@@ -85,10 +99,16 @@ def test_derivatives_of_units_are_those_of_their_formula() -> None:
     basis = UnitBasis(
         draw.normal(size=(2, 4)), draw.normal(size=4), np.array([0.3, -1.0]), np.array([2.0, 0.5])
     )
-    coefficients, point = draw.normal(size=basis.size), np.array([[0.7, -0.4]])
-    formula, states = basis.expression(coefficients), sympy.symbols("x1 x2")
+    coefficients, point = draw.normal(size=5), np.array([[0.7, -0.4]])
+    states = sympy.symbols("x1 x2")
+    y = [(x - m) / s for x, m, s in zip(states, basis.mean, basis.scale, strict=True)]
+    units = [
+        sympy.tanh(y[0] * w0 + y[1] * w1 + b) for w0, w1, b in zip(*basis.weights, basis.biases, strict=True)
+    ]
+    square = coefficients[-1] * (y[0] ** 2 + y[1] ** 2)
+    formula = sum((c * each for c, each in zip(coefficients[:-1], units, strict=True)), square)
     at = dict(zip(states, point[0], strict=True))
-    assert (basis.values(point) @ coefficients)[0] == pytest.approx(float(formula.subs(at)))
+    assert (basis.hidden(point) @ coefficients[:-1])[0] == pytest.approx(float((formula - square).subs(at)))
     for i, one in enumerate(states):
         slope = float(formula.diff(one).subs(at))
         assert (basis.gradients(point) @ coefficients)[0, i] == pytest.approx(slope)
