@@ -228,7 +228,7 @@ def overview(given: Given, settings: PipelineSettings) -> Any:
 
 @task("card", options=("seed", "card"))
 def reference(given: Given, settings: PipelineSettings) -> Any:
-    """What methods say of the card's settings vector field that share no code with ours."""
+    """The answers of methods that share no code with ours, for the vector field of the card."""
     from workflow import comparison
 
     return {"reference": comparison.reference_of_card(settings, given.card)}
@@ -258,7 +258,7 @@ def landscape_errors(given: Given, settings: PipelineSettings) -> Any:
 
 @task("quasipotential", "card", options=("seed", "landscape", "card"))
 def beside_equations(given: Given, settings: PipelineSettings) -> Any:
-    """The landscape of the card's settings equations beside those of the runs: scoring alone."""
+    """The landscape of the card's equations, to compare those of the runs with: scoring alone."""
     from workflow import comparison
 
     table = comparison.run_beside_equations(settings, given.card, list(given.quasipotential))
