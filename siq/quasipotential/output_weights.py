@@ -136,9 +136,9 @@ class OutputWeights:
                 self.field_error, self.basis, self.coefficients = error, basis, coefficients
         self.points = pairs.x0
         flow = self.drift(self.points)
-        self.speed = np.sqrt(diffusion.squared_speed(self.points, flow))
+        self.squared_speed = diffusion.squared_speed(self.points, flow)
         # Where f vanishes so does what is divided by its speed; about fixed points everything counts alike.
-        weight = 1 / (self.speed**2 + np.quantile(self.speed**2, SLOW_SHARE))
+        weight = 1 / (self.squared_speed + np.quantile(self.squared_speed, SLOW_SHARE))
         gradients = self.basis.gradients(self.points)
         self._equation = HamiltonJacobi(self.points, gradients, flow, diffusion, weight, diffusion)
 
@@ -183,7 +183,7 @@ class OutputWeights:
             np.append(start, steepness), np.arange(m) < m - 1,
             rounds=1, finest=np.inf, steps=STEPS, orthonormal=True,
         )  # fmt: skip
-        unweighted = replace(equation, weight=1 / self.speed)
+        unweighted = replace(equation, weight=1 / np.sqrt(self.squared_speed))
         residual = float(np.median(unweighted.relative_residuals(weights)))
         logger.info("output weights: median Hamilton–Jacobi residual %.1e", residual)
         if not (residual < MAX_RESIDUAL and self._right_branch(weights)):
@@ -218,7 +218,7 @@ class OutputWeights:
     @cached_property
     def _attractors(self) -> list[np.ndarray]:
         """Stable fixed points of f within the recorded states."""
-        starts = self.points[np.argsort(self.speed)[:: max(len(self.points) // STARTS, 1)]]
+        starts = self.points[np.argsort(self.squared_speed)[:: max(len(self.points) // STARTS, 1)]]
         box = np.stack([self.points.min(axis=0), self.points.max(axis=0)], axis=1)
         found = find_equilibria(self, starts, box=box, margin=0.0)
         return [one.position for one in found if one.kind == "attractor"]
