@@ -12,7 +12,7 @@ J. D. Skufca, J. A. Yorke, B. Eckhardt, Phys. Rev. Lett. 96 (2006) 174101: edge 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -23,7 +23,7 @@ from siq.errors import NumericalFailure
 from siq.numerics.integration import dormand_prince_step, next_step
 from siq.numerics.randomness import representative_subset
 from siq.systems.dynamics import Dynamics
-from siq.systems.equilibria import Equilibrium, classify, distinct_roots, hessian_at
+from siq.systems.equilibria import Equilibrium, classify, crossing_rate, distinct_roots, hessian_at
 
 if TYPE_CHECKING:
     from siq.systems.cycles import Cycle
@@ -68,16 +68,10 @@ def follow(
     patience: int = 1,
     cycles: Sequence[Cycle] = (),
 ) -> Descents:
-    """Follow f from some points to the attractors.
+    """Follow f from starts ``(n, d)`` to where trajectories may end.
 
     Parameters
     ----------
-    dynamics
-        f.
-    starts
-        Shape ``(n, d)``.
-    attractors
-        Where trajectories may end.
     box
         Shape ``(d, 2)``: the recorded region. What leaves a box of three times this size has escaped.
     states
@@ -93,12 +87,9 @@ def follow(
     NumericalFailure
         When nothing moves: f is zero at most of the starts.
     """
-    width = box[:, 1] - box[:, 0]
-    middle = box.mean(axis=1)
+    width, middle = np.ptp(box, axis=1), box.mean(axis=1)
     rates = [-one.eigenvalues.real.max() for one in attractors]
-    slowest = (
-        min(rates) if rates else float(np.median(np.linalg.norm(dynamics.drift(starts) / width, axis=1)))
-    )
+    slowest = min(rates) if rates else crossing_rate(dynamics, starts, width)
     if not slowest > 0:
         raise NumericalFailure("f is zero at most of the states: nothing moves, and there is no landscape")
     horizon = patience * (SLOWEST_TIMES if rates else UNSETTLED_TIMES) / slowest
@@ -158,8 +149,7 @@ def sides_of(
 ) -> np.ndarray:
     """Where f leads from both sides of each unstable direction of a saddle, see `ends_of`."""
     values, vectors = np.linalg.eig(dynamics.jacobian(saddle.position[None])[0])
-    width = box[:, 1] - box[:, 0]
-    starts = []
+    width, starts = np.ptp(box, axis=1), []
     for vector in vectors[:, values.real > 0].T:
         direction = vector.real / np.abs(vector.real / width).max()
         starts += [saddle.position + 1e-3 * direction, saddle.position - 1e-3 * direction]
@@ -196,30 +186,18 @@ SADDLE_DISTANCE = 0.2  # of the box: so close to the edge a root of f has to be 
 
 def tracked_edge(
     dynamics: Dynamics,
-    low: np.ndarray,
-    high: np.ndarray,
     one: int,
-    ends: Callable[[np.ndarray], np.ndarray],
+    two: int,
+    attractors: Sequence[Equilibrium],
+    cycles: Sequence[Cycle] = (),
     *,
-    width: np.ndarray,
+    box: np.ndarray,
     generator: np.random.Generator,
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """States on the boundary of a basin as f moves along it, from a way between two attractors on.
+    """States on the boundary of a basin as f moves along it, from a way to another attractor on.
 
-    Parameters
-    ----------
-    dynamics
-        f.
-    low, high
-        Shape ``(d,)``: a state within the basin, and one beyond it.
-    one
-        The number of the basin.
-    ends
-        At which attractor each of some states ends.
-    width
-        Shape ``(d,)``: of the domain.
-    generator
-        Bends the first way between both, which symmetry may hold otherwise.
+    `one` is the number of the basin, `two` of the other attractor; those of cycles follow on. The generator
+    bends the first way between both, which symmetry may hold otherwise.
 
     Yields
     ------
@@ -228,8 +206,24 @@ def tracked_edge(
         ``(n, d)``, and the state from which the next one begins, ``(d,)``; first a single state alone. It
         ends where two states do not come apart.
     """
+    width = np.ptp(box, axis=1)
+    share = np.linspace(0, 1, BISECTION_STATES + 2)[:, None]
+
+    def bisected(low: np.ndarray, high: np.ndarray, bend: np.ndarray | float = 0.0) -> np.ndarray:
+        """Two states on either side of the boundary that all but agree, on a bent way: ``(2, d)``."""
+        way = low + share * (high - low) + np.sin(np.pi * share) * bend
+        while True:
+            # Where a front has to cross a chain, states are still on their way after any relaxation time.
+            other = np.flatnonzero(ends_of(dynamics, way[1:-1], attractors, cycles, box=box) != one)
+            last = int(other[0]) if len(other) else len(way) - 2
+            low, high = way[last], way[last + 1]
+            if (np.abs(high - low) / width).max() <= BISECTED_DISTANCE:
+                return np.stack([low, high])
+            way = low + share * (high - low)
+
+    places = [each.position for each in (*attractors, *cycles)]
     bend = FIRST_WAY_BEND * width * generator.standard_normal(len(width))
-    pair = _bisected(low, high, one, ends, width, bend)
+    pair = bisected(places[one], places[two], bend)
     yield np.zeros(1), pair.mean(axis=0)[None], pair.mean(axis=0)
     while True:
         step = 1e-3 / max(float(np.abs(dynamics.drift(pair) / width).max()), 1e-300)
@@ -247,28 +241,8 @@ def tracked_edge(
             step = float(next_step(np.full(2, step), relative).min())
         else:
             return
-        pair = _bisected(pair[0], pair[1], one, ends, width, np.zeros(len(width)))
+        pair = bisected(*pair)
         yield np.array(times), np.array(middles), pair.mean(axis=0)
-
-
-def _bisected(
-    low: np.ndarray,
-    high: np.ndarray,
-    one: int,
-    ends: Callable[[np.ndarray], np.ndarray],
-    width: np.ndarray,
-    bend: np.ndarray,
-) -> np.ndarray:
-    """Two states on either side of the boundary of a basin that all but agree, on a bent way: ``(2, d)``."""
-    share = np.linspace(0, 1, BISECTION_STATES + 2)[:, None]
-    way = low + share * (high - low) + np.sin(np.pi * share) * bend
-    while True:
-        other = np.flatnonzero(ends(way[1:-1]) != one)
-        last = int(other[0]) if len(other) else len(way) - 2
-        low, high = way[last], way[last + 1]
-        if (np.abs(high - low) / width).max() <= BISECTED_DISTANCE:
-            return np.stack([low, high])
-        way = low + share * (high - low)
 
 
 def edge_saddle(
@@ -280,39 +254,21 @@ def edge_saddle(
     box: np.ndarray,
     generator: np.random.Generator,
 ) -> Equilibrium | None:
-    """A saddle on the boundary of a basin, between two attractors; None where tracking comes to none.
-
-    Parameters
-    ----------
-    dynamics
-        f.
-    one, two, attractors
-        Which of the attractors; the boundary is that of the basin of `one`.
-    box
-        Shape ``(d, 2)``: the domain.
-    generator
-        Bends the first way.
-    """
-    width = np.ptp(box, axis=1)
-
-    def ends(x: np.ndarray) -> np.ndarray:
-        # Where a front has to cross a chain, states are still on their way after any relaxation time.
-        return follow(dynamics, x, attractors, box=box, states=2, patience=dynamics.dimension).ends
-
-    start, end = attractors[one].position, attractors[two].position
-    edge = tracked_edge(dynamics, start, end, one, ends, width=width, generator=generator)
+    """A saddle on the boundary of basin `one`, towards `two`; None where tracking comes to none."""
+    edge = tracked_edge(dynamics, one, two, attractors, box=box, generator=generator)
     for _, _, state in itertools.islice(edge, MAX_TRACKING_ROUNDS):
-        if (found := _saddle_near(dynamics, state, box, width)) is not None:
+        if (found := _saddle_near(dynamics, state, box)) is not None:
             return found
     return None
 
 
-def _saddle_near(dynamics: Dynamics, x: np.ndarray, box: np.ndarray, width: np.ndarray) -> Equilibrium | None:
+def _saddle_near(dynamics: Dynamics, x: np.ndarray, box: np.ndarray) -> Equilibrium | None:
     """The saddle with one unstable direction beside a state of the edge; None where none is found.
 
     A front in a long chain may stand at every site: then the edge hardly moves, and the root next to it may
     have a second direction that is all but neutral. Along this lie the saddles on either side.
     """
+    width = np.ptp(box, axis=1)
 
     def beside(start: np.ndarray) -> Equilibrium | None:
         """Where Newton's method comes to, or else Levenberg and Marquardt's, which may not run away."""
@@ -374,15 +330,7 @@ class Basin:
         return np.asarray(values[: self.spread, 0])
 
     def below(self, values: np.ndarray, level: float) -> np.ndarray:
-        """Rows of `chosen` from which the way down stays below a level.
-
-        Parameters
-        ----------
-        values
-            V along the descents, shape ``(n, k)``.
-        level
-            The level.
-        """
+        """Rows of `chosen` from which the way down stays below a level of V, along descents ``(n, k)``."""
         return np.flatnonzero(self.highest(values)[self.chosen[:, 0], self.chosen[:, 1]] < level)
 
     @staticmethod
@@ -416,25 +364,12 @@ def basin_of(
     generator: np.random.Generator,
     near: tuple[int, float] | None = None,
 ) -> Basin:
-    """The points from which f leads to an attractor.
+    """The points from which f leads to an attractor, by descents from points of the recorded box ``(d, 2)``.
 
-    Parameters
-    ----------
-    dynamics
-        f and D.
-    descents
-        From recorded points.
-    index, attractors
-        Which of the attractors.
-    box
-        Shape ``(d, 2)``: the recorded region.
-    generator
-        Draws further starts close to the attractor.
-    near
-        How many of these, and up to which level of ``½ (x - A)·M (x - A)``; by default as recordings need it.
+    Further starts are drawn close to the attractor: `near` says how many, and up to which level of
+    ``½ (x - A)·M (x - A)``; by default as recordings need it.
     """
-    center, d = attractors[index].position, len(box)
-    width = box[:, 1] - box[:, 0]
+    center, width, d = attractors[index].position, np.ptp(box, axis=1), len(box)
     recorded = descents.paths[descents.ends == index]
     # Recordings approach an attractor along its slow directions; V needs all of them. Of one state there is
     # but one, and more starts close by would only make light of those far out.

@@ -18,7 +18,7 @@ import sympy
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from siq.errors import Fault, InputError
+from siq.errors import Fault
 from siq.numerics.files import Document, read_document, validate
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import TIME, Dynamics, Input, Parameter, symbol
@@ -180,14 +180,7 @@ class SystemCard(_CardPart):
 
 
 def diffusion_rows(diffusion: DiffusionEntry, dimension: int) -> list[list[Formula]]:
-    """D as rows of numbers and formulas.
-
-    Parameters
-    ----------
-    diffusion
-        ``"identity"``, the diagonal, or the whole matrix, in the units of the states squared per time.
-    dimension
-        Number of states, d.
+    """D of d states as rows of numbers and formulas, from ``"identity"``, the diagonal, or the whole matrix.
 
     Raises
     ------
@@ -232,8 +225,7 @@ def build_system(document: Document, card: SystemCard) -> Dynamics:
         For a formula that is refused, as it stands or with the parameters' values.
     """
     outputs = card.outputs if card.outputs is not None else {name: name for name in card.states}
-    parse = _parser(document, card)
-    numbers = {symbol(name): exact_number(entry.value) for name, entry in card.parameters.items()}
+    parse, numbers = _parser(document, card)
     of_noise: set[str] = set()
 
     def inserted(text: Formula) -> sympy.Expr:
@@ -277,41 +269,30 @@ def load_exact(path: str | Path) -> sympy.Expr | None:
     text = card.exact.quasipotential
     if text is None:
         return None
-    exact = _parser(document, card)(("exact", "quasipotential"), text)
-    return exact.xreplace(
-        {symbol(name): exact_number(entry.value) for name, entry in card.parameters.items()}
-    )
+    parse, numbers = _parser(document, card)
+    return parse(("exact", "quasipotential"), text).xreplace(numbers)
 
 
-def _parser(document: Document, card: SystemCard) -> Callable[[tuple[str, ...], Formula], sympy.Expr]:
-    """Parser of the formulas of a card, which refuses them with their line."""
+def _parser(
+    document: Document, card: SystemCard
+) -> tuple[Callable[[tuple[str, ...], Formula], sympy.Expr], dict[sympy.Symbol, sympy.Expr]]:
+    """Parser of the formulas of a card, which refuses them with their line; and its parameters' values."""
     names = {name: symbol(name) for name in (*card.states, *card.inputs, *card.parameters)} | {"t": TIME}
-    numbers = names | {name: exact_number(entry.value) for name, entry in card.parameters.items()}
+    values = {name: exact_number(entry.value) for name, entry in card.parameters.items()}
 
     def parse(keys: tuple[str, ...], text: Formula) -> sympy.Expr:
         try:
             # A power may be too high, or a divisor zero, at the parameters' values alone.
-            parse_formula(text, numbers, inputs=tuple(card.inputs))
+            parse_formula(text, names | values, inputs=tuple(card.inputs))
             return parse_formula(text, names, inputs=tuple(card.inputs))
         except FormulaError as error:
-            raise InputError(document.file, document.place(keys), error.fault, error.remedy) from None
+            raise error.at(document.file, document.place(keys)) from None
 
-    return parse
+    return parse, {symbol(name): value for name, value in values.items()}
 
 
 def card_of(dynamics: Dynamics) -> str:
-    """Write a dynamics as a system card.
-
-    Parameters
-    ----------
-    dynamics
-        Its parameters' values are those of the card; a domain that nobody knows is left out.
-
-    Returns
-    -------
-    str
-        YAML.
-    """
+    """A system card, in YAML, with the parameters' values; a domain that nobody knows is left out."""
     name = dynamics.name or "system"
     data: dict[str, Any] = {
         "name": name,
@@ -339,9 +320,8 @@ def card_of(dynamics: Dynamics) -> str:
     }
     data["outputs"] = {output: str(formula) for output, formula in dynamics.outputs}
     rows = dynamics.diffusion.rows  # of which a diagonal, or 1, is written as that
-    places = range(len(rows))
-    diagonal = [rows[i][i] for i in places]
-    if any(rows[i][j] not in (0.0, "0") for i in places for j in places if i != j):
+    diagonal = [row[place] for place, row in enumerate(rows)]
+    if any(entry not in (0.0, "0") for i, row in enumerate(rows) for entry in row[:i] + row[i + 1 :]):
         data["diffusion"] = rows
     else:
         data["diffusion"] = "identity" if all(entry == 1.0 for entry in diagonal) else diagonal

@@ -35,7 +35,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 from scipy.optimize import brentq
@@ -63,16 +63,12 @@ class _Family:
     """f against some of its parameters, in shares z of the domain and of their ranges."""
 
     def __init__(self, dynamics: Dynamics, limits: Mapping[str, tuple[float, float]]) -> None:
-        known = [each.name for each in dynamics.parameters]
+        others = {each.name: exact_number(each.value) for each in dynamics.parameters}
         for name in limits:
-            if name not in known:
+            if others.pop(name, None) is None:
                 raise ValueError(f"there is no parameter '{name}'")
-        others = {
-            symbol(each.name): exact_number(each.value)
-            for each in dynamics.parameters
-            if each.name not in limits
-        }
-        formulas = [each.xreplace(others) for each in dynamics.equations]
+        inserted = {symbol(name): value for name, value in others.items()}
+        formulas = [each.xreplace(inserted) for each in dynamics.equations]
         box = np.vstack([dynamics.box, *limits.values()])
         self.d, self.count = dynamics.dimension, len(box)
         self.low, self.width = box[:, 0], np.ptp(box, axis=1)
@@ -299,13 +295,6 @@ def _solved(
     return None
 
 
-def _refined(equations: _Equilibria, y: np.ndarray) -> np.ndarray | None:
-    """The solution next to a guess, where no parameter is free; None where there is none close by."""
-    found = _solved(equations.residual, equations.slope, y)
-    close = found is not None and np.linalg.norm((found - y)[: equations.count]) < NEWTON_RADIUS
-    return found if close else None
-
-
 def _across(equations: _Equilibria, guess: np.ndarray, normal: np.ndarray) -> np.ndarray | None:
     """The point of the curve in the plane through a guess across a direction."""
     return _solved(
@@ -321,37 +310,14 @@ def _tangent(equations: _Equilibria, y: np.ndarray, ahead: np.ndarray) -> np.nda
     return np.asarray(tangent if tangent @ ahead >= 0 else -tangent)
 
 
-_Stop = Literal["", "lost", "long"]
-"""What stopped a curve before its end: its points could not be found, or were too many."""
-
-
-def _followed(
-    equations: _Equilibria, start: np.ndarray, ahead: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, _Stop]:
-    """A curve from end to end through a point: points and tangents ``(n, k)``, and what stopped it.
-
-    The tangent at the starting point is to the side of `ahead`.
-    """
-    forwards, closed, stop = _one_way(equations, start, ahead)
-    backwards = [start]
-    if not closed:
-        backwards, _, other = _one_way(equations, start, -ahead)
-        stop = stop or other
-    points = [*backwards[:0:-1], *forwards]
-    tangents, middle = [_tangent(equations.at(start), start, ahead)], len(backwards) - 1
-    for y in points[middle + 1 :]:
-        tangents.append(_tangent(equations.at(y), y, tangents[-1]))
-    for y in points[:middle][::-1]:
-        tangents.insert(0, _tangent(equations.at(y), y, tangents[0]))
-    if closed:
-        tangents[-1] = tangents[0]
-    return np.array(points), np.array(tangents), stop
+_Stop = dict[str, int | None]
+"""What stopped a curve before its end, as a remark says it: its points were too many, or none was found."""
 
 
 def _one_way(
     equations: _Equilibria, start: np.ndarray, ahead: np.ndarray
 ) -> tuple[list[np.ndarray], bool, _Stop]:
-    """Points of a curve from one on, whether it came back to it, and what stopped it."""
+    """Points of a curve from one on, whether it came back to it, and what stopped it: nothing at an end."""
     count = equations.count
     points, tangent, length = [start], ahead, LONGEST_STEP / 4
     first = _tangent(equations.at(start), start, ahead)[:count]
@@ -368,14 +334,14 @@ def _one_way(
         ):  # fmt: skip
             length /= 2
             if length < SHORTEST_STEP:
-                return points, False, "lost"
+                return points, False, {"most": None}
             continue
         if (limit := here.limit(y)) is not None:
             component, value = limit
             guess = last + (value - last[component]) / (y[component] - last[component]) * (y - last)
             met = _across(here, guess, np.eye(len(y))[component])
             near = met is not None and np.linalg.norm(met - guess) <= LONGEST_STEP
-            return [*points, met] if met is not None and near else points, False, ""
+            return [*points, met] if met is not None and near else points, False, {}
         points.append(y)
         # Whether the step passed the point from which the curve began, in the same direction.
         step = (y - last)[:count]
@@ -383,9 +349,9 @@ def _one_way(
         beside = np.linalg.norm((start - last)[:count] - share * step) < 0.1 * np.linalg.norm(step)
         same = after[:count] @ first > 0.9 * np.linalg.norm(after[:count]) * np.linalg.norm(first)
         if len(points) > 4 and 0 < share <= 1 and beside and same:
-            return [*points[:-1], start], True, ""
+            return [*points[:-1], start], True, {}
         length = min(1.5 * length, LONGEST_STEP)
-    return points, False, "long"
+    return points, False, {"most": MAX_POINTS}
 
 
 # Branches of equilibria, and what happens along them; curves of folds and of Hopf points.
@@ -478,14 +444,29 @@ class Branch:
 def _branch_through(
     equations: _Equilibria, start: np.ndarray | None, ahead: np.ndarray, known: Sequence[Branch]
 ) -> tuple[Branch | None, _Stop]:
-    """The branch through a point, unless it is known or lies outside; and what stopped it."""
+    """The branch through a point from end to end, unless it is known or lies outside; and what stopped it.
+
+    The tangent at the starting point is to the side of `ahead`.
+    """
     if start is None or _Equilibria.limit(equations, start) is not None:
-        return None, ""
+        return None, {}
     state, values = np.split(equations.family.natural(start[: equations.count]), [equations.d])
     if any(each.kind == equations.kind and each.index_of(state, values) is not None for each in known):
-        return None, ""
-    points, tangents, stop = _followed(equations.at(start), start, ahead)
-    return Branch(equations, points, tangents) if len(points) > 1 else None, stop
+        return None, {}
+    forwards, closed, stop = _one_way(equations, start, ahead)
+    backwards = [start]
+    if not closed:
+        backwards, _, other = _one_way(equations, start, -ahead)
+        stop = stop or other
+    points, middle = [*backwards[:0:-1], *forwards], len(backwards) - 1
+    tangents = [_tangent(equations.at(start), start, ahead)]
+    for y in points[middle + 1 :]:
+        tangents.append(_tangent(equations.at(y), y, tangents[-1]))
+    for y in points[:middle][::-1]:
+        tangents.insert(0, _tangent(equations.at(y), y, tangents[0]))
+    if closed:
+        tangents[-1] = tangents[0]
+    return Branch(equations, np.array(points), np.array(tangents)) if len(points) > 1 else None, stop
 
 
 def follow_branches(
@@ -494,24 +475,10 @@ def follow_branches(
     limits: tuple[float, float],
     seeds: Sequence[tuple[float, np.ndarray]],
 ) -> tuple[list[Branch], list[Bifurcation], list[Remark]]:
-    """Branches of equilibria within a range of a parameter and within the domain of the states.
+    """Branches of equilibria within a range of a parameter λ and within the domain of the states.
 
-    Parameters
-    ----------
-    dynamics
-        f with its domain and parameters.
-    parameter
-        Name of the parameter λ.
-    limits
-        The range of λ, lower before upper.
-    seeds
-        Known equilibria: the value of λ and the state, shape ``(d,)``. A branch through none of them is not
-        found.
-
-    Returns
-    -------
-    tuple
-        Each branch once; the bifurcations, by the value of λ; and what could not be followed.
+    Seeds are known equilibria: the value of λ and the state, shape ``(d,)``. A branch through none of them is
+    not found. Each branch is given once; the bifurcations, by the value of λ; and what could not be followed.
 
     Raises
     ------
@@ -539,7 +506,7 @@ def follow_branches(
         branch, stop = _branch_through(equations, start, along, branches)
         if stop:
             place = {"state": np.round(state, 4).tolist(), "parameter": parameter, "value": value}
-            remarks.append(Remark("systems.branch_not_followed", place | _stopped(stop)))
+            remarks.append(Remark("systems.branch_not_followed", place | stop))
         if branch is None:
             continue
         for one in _bifurcations(equations, branch, len(branches)):
@@ -551,10 +518,6 @@ def follow_branches(
         branches.append(branch)
     found.sort(key=lambda one: one.value)
     return branches, found, remarks
-
-
-def _stopped(stop: _Stop) -> dict[str, int | None]:
-    return {"most": MAX_POINTS if stop == "long" else None}
 
 
 def _bifurcations(equations: _Equilibria, branch: Branch, number: int) -> list[Bifurcation]:
@@ -587,14 +550,17 @@ def _bifurcations(equations: _Equilibria, branch: Branch, number: int) -> list[B
 
     def add(kind: type[_Equilibria], z: np.ndarray, *, surely: bool = True) -> bool:
         """Add the solution of equations next to a point; `surely` takes the point where there is none."""
-        near = kind.near(family, z)
-        solved = None if near is None else _refined(*near)
-        if near is None or (solved is None and not surely):
+        if (near := kind.near(family, z)) is None:
             return False
-        y = near[1] if solved is None else solved
+        system, guess = near
+        y = _solved(system.residual, system.slope, guess)
+        if y is None or np.linalg.norm((y - guess)[: family.count]) >= NEWTON_RADIUS:
+            if not surely:
+                return False
+            y = guess
         state, value = np.split(family.natural(y[: family.count]), [family.d])
         residual = float(np.abs(family.flow(y[: family.count])).max())
-        frequency = abs(near[0].frequency(y))
+        frequency = abs(system.frequency(y))
         found.append(Bifurcation(kind.kind, float(value[0]), state, number, frequency, residual))
         return True
 
@@ -621,20 +587,9 @@ def follow_curves(
 ) -> tuple[list[Branch], list[Remark]]:
     """Curves of folds and of Hopf points within the ranges of two parameters and the domain of the states.
 
-    Parameters
-    ----------
-    dynamics
-        f with its domain and parameters.
-    limits
-        The range of each of the two parameters by its name, lower before upper.
-    seeds
-        Known points of curves: the kind, ``fold`` or ``Hopf``, the values of the two parameters ``(2,)``, and
-        the state ``(d,)``. A curve through none of them is not found.
-
-    Returns
-    -------
-    tuple
-        Each curve once, in the order of the seeds; and what could not be followed.
+    Seeds are known points of curves: the kind, ``fold`` or ``Hopf``, the values of the two parameters
+    ``(2,)``, and the state ``(d,)``. A curve through none of them is not found. Each is given once, in the
+    order of the seeds; and what could not be followed.
 
     Raises
     ------
@@ -672,5 +627,5 @@ def follow_curves(
         curves.append(curve)
         if stop:
             place = {"kind": kind, "names": list(limits), "values": curve.values[0].tolist()}
-            remarks.append(Remark("systems.curve_not_followed", place | _stopped(stop)))
+            remarks.append(Remark("systems.curve_not_followed", place | stop))
     return curves, remarks

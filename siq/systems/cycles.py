@@ -32,6 +32,7 @@ exponent.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -112,18 +113,10 @@ class Cycle:
 
 
 def closed_orbit(dynamics: Dynamics, guess: np.ndarray, period: float, *, scale: np.ndarray) -> Cycle:
-    """The periodic orbit next to a guess, stable or not.
+    """The periodic orbit next to a guess of its states ``(n, d)`` and its period, stable or not.
 
-    Parameters
-    ----------
-    dynamics
-        f and D.
-    guess
-        Shape ``(n, d)``: states of about one period, at equal distances in time, the first one not repeated.
-    period
-        About that of the orbit.
-    scale
-        Shape ``(d,)``: the size of what is looked at, as the width of a domain.
+    The states have equal distances in time, and the first one is not repeated. The scale ``(d,)`` is the size
+    of what is looked at, as the width of a domain.
 
     Raises
     ------
@@ -140,7 +133,7 @@ def closed_orbit(dynamics: Dynamics, guess: np.ndarray, period: float, *, scale:
         phase = along @ ((x[0] - guess[0]) / scale)
         closed = max(np.abs(gap).max(), abs(phase) / np.linalg.norm(along)) < CLOSURE_TOLERANCE
         entries = [
-            (np.repeat(rows.ravel(), d), np.repeat(rows, d, axis=0), flows * scale / scale[:, None]),
+            (np.repeat(rows.ravel(), d), np.repeat(rows, d, axis=0), flows),
             (rows, np.roll(rows, -1, axis=0), -np.ones((n, d))),
             (rows, np.full((n, d), n * d), dynamics.drift(ends) / scale / n),
             (np.full(d, n * d), np.arange(d), along),
@@ -160,30 +153,19 @@ def closed_orbit(dynamics: Dynamics, guess: np.ndarray, period: float, *, scale:
     if not np.linalg.norm(flow, axis=1).min() * time > CLOSURE_TOLERANCE**0.5:
         raise NumericalFailure("the orbit has shrunk to an equilibrium")
     _, flows, _ = _parts(dynamics, x, time / n, scale)
-    product = np.eye(d - 1)
-    for one in _reduced(_across(flow), flows * scale / scale[:, None]):
+    product, rows = np.eye(d - 1), _across(flow)
+    for one in np.roll(rows, -1, axis=0) @ flows @ rows.transpose(0, 2, 1):
         product = one @ product
     multipliers = np.linalg.eigvals(product)
     return Cycle(x, time, multipliers[np.argsort(-np.abs(multipliers), kind="stable")])
 
 
 def hessians_along(dynamics: Dynamics, cycle: Cycle, *, reaching: bool = False) -> np.ndarray:
-    """The Hessian of V along a stable cycle, or of what it costs to reach an unstable one.
+    """The Hessian of V along a stable cycle, or of what it costs to reach an unstable one, if `reaching`.
 
-    Parameters
-    ----------
-    dynamics
-        f and D; noise has to reach every state.
-    cycle
-        The orbit.
-    reaching
-        Of an unstable cycle: half the Hessian of the least action of a path that ends on it is taken, as V
-        is half of U. It is zero for displacements that f brings back by itself.
-
-    Returns
-    -------
-    numpy.ndarray
-        Shape ``(n, d, d)``, at the points of the cycle; ``H f = 0``.
+    Shape ``(n, d, d)``, at the points of the cycle; ``H f = 0``. Of an unstable cycle half the Hessian of the
+    least action of a path that ends on it is taken, as V is half of U. It is zero for displacements that f
+    brings back by itself.
 
     Raises
     ------
@@ -195,12 +177,11 @@ def hessians_along(dynamics: Dynamics, cycle: Cycle, *, reaching: bool = False) 
     scale = np.ptp(cycle.points, axis=0)
     scale = np.where(scale > 1e-6 * scale.max(), scale, scale.max())  # a state may rest
     _, flows, noises = _parts(dynamics, cycle.points, cycle.period / len(cycle.points), scale)
-    flows, noises = flows * scale / scale[:, None], noises / np.outer(scale, scale)
     rows = _across(dynamics.drift(cycle.points) / scale)
     if reaching:
         rows = _unstable_rows(rows, flows, cycle.unstable)
     after = np.roll(rows, -1, axis=0)
-    steps = _reduced(rows, flows)
+    steps = after @ flows @ rows.transpose(0, 2, 1)
     spread = after @ noises @ after.transpose(0, 2, 1)
     if reaching:  # from each point back to the one before it
         back = np.linalg.inv(steps)
@@ -217,16 +198,12 @@ def unstable_direction(dynamics: Dynamics, cycle: Cycle, place: int = 0, *, scal
     """At one of the points of an unstable cycle, a displacement that grows: shape ``(d,)``, of one scale."""
     _, flows, _ = _parts(dynamics, cycle.points, cycle.period / len(cycle.points), scale)
     rows = _across(dynamics.drift(cycle.points) / scale)
-    return np.asarray(_unstable_rows(rows, flows * scale / scale[:, None], cycle.unstable)[place, 0] * scale)
+    return np.asarray(_unstable_rows(rows, flows, cycle.unstable)[place, 0] * scale)
 
 
 def _across(flow: np.ndarray) -> np.ndarray:
     """Orthonormal rows across f, shape ``(n, d - 1, d)``."""
     return np.linalg.svd(flow[:, None, :])[2][:, 1:]
-
-
-def _reduced(rows: np.ndarray, flows: np.ndarray) -> np.ndarray:
-    return np.asarray(np.roll(rows, -1, axis=0) @ flows @ rows.transpose(0, 2, 1))
 
 
 def _unstable_rows(across: np.ndarray, flows: np.ndarray, count: int) -> np.ndarray:
@@ -261,13 +238,16 @@ def _periodic(steps: np.ndarray, spread: np.ndarray) -> np.ndarray:
 def _parts(
     dynamics: Dynamics, x: np.ndarray, time: float, scale: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """After a time: states ``(n, d)``, their slopes ``∂φ/∂x``, the covariance of noise ``(n, d, d)``."""
+    """After a time: states ``(n, d)``; in units of the scale, slopes ``∂φ/∂x`` and covariances of noise."""
     n, d = x.shape
     unit = np.concatenate([scale, np.ones(d * d), np.outer(scale, scale).ravel()])
 
+    def parted(flat: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        at, flow, spread = np.split(flat.reshape(n, -1) * unit, [d, d + d * d], axis=1)
+        return at, flow.reshape(n, d, d), spread.reshape(n, d, d)
+
     def rates(_: float, flat: np.ndarray) -> np.ndarray:
-        z = flat.reshape(n, -1) * unit
-        at, flow, spread = z[:, :d], z[:, d : d + d * d].reshape(n, d, d), z[:, d + d * d :].reshape(n, d, d)
+        at, flow, spread = parted(flat)
         jacobian = dynamics.jacobian(at)
         turned = jacobian @ spread
         grown = turned + turned.transpose(0, 2, 1) + 2 * dynamics.diffusion.at(at)
@@ -278,8 +258,8 @@ def _parts(
     way = solve_ivp(rates, (0.0, time), begin.ravel(), method="DOP853", rtol=1e-11, atol=1e-13)
     if not way.success or not np.isfinite(way.y[:, -1]).all():
         raise NumericalFailure("f cannot be followed around the orbit")
-    end = way.y[:, -1].reshape(n, -1) * unit
-    return end[:, :d], end[:, d : d + d * d].reshape(n, d, d), end[:, d + d * d :].reshape(n, d, d)
+    end, flows, noises = parted(way.y[:, -1])
+    return end, flows * scale / scale[:, None], noises / np.outer(scale, scale)
 
 
 RETURNS = 40  # through the section, within which chaos has to have lost what was known at the start
@@ -322,22 +302,14 @@ class Recurrence:
 def recurrence_of(dynamics: Dynamics, starts: np.ndarray, *, box: np.ndarray, rate: float) -> Recurrence:
     """The long-term behaviour of the first of some trajectories that returns.
 
-    Parameters
-    ----------
-    dynamics
-        f.
-    starts
-        Shape ``(n, d)``, n ≥ 1: where trajectories are that have come to rest for a long time nowhere.
-    box
-        Shape ``(d, 2)``: the recorded region.
-    rate
-        At which f crosses it, per unit of time. What is far slower is coming to rest.
+    The starts ``(n, d)`` are states that have come to rest for a long time nowhere; f crosses the recorded
+    box ``(d, 2)`` at the rate, and what is far slower is coming to rest.
     """
     chosen = np.linspace(0, len(starts) - 1, min(MAX_STARTS, len(starts))).astype(int)
     found = Recurrence("none")
     for start in starts[chosen]:
         try:
-            found = _Motion(dynamics, start, box, rate).recurrence()
+            found = _recurrence_from(dynamics, start, box, rate)
         except _TooLongError:
             found = Recurrence("none")
         if found.kind != "none":
@@ -349,98 +321,81 @@ class _TooLongError(Exception):
     """f was evaluated so often that the trajectory is given up: it may be too stiff to be followed so."""
 
 
-class _Motion:
-    """One trajectory, in units of the box, so that states of any size count alike."""
+def _recurrence_from(dynamics: Dynamics, start: np.ndarray, box: np.ndarray, rate: float) -> Recurrence:
+    """One trajectory from return to return, in units of the box, so that states of any size count alike."""
+    d, width = len(start), np.ptp(box, axis=1)
+    start, middle = start / width, box.mean(axis=1) / width
+    evaluations = itertools.count(1)
 
-    def __init__(self, dynamics: Dynamics, start: np.ndarray, box: np.ndarray, rate: float) -> None:
-        self.dynamics, self.dimension = dynamics, len(start)
-        self.width = box[:, 1] - box[:, 0]
-        self.middle = box.mean(axis=1) / self.width
-        self.start = start / self.width
-        self.across = self.drift(self.start)
-        self.speed, self.rate, self.evaluations = float(np.linalg.norm(self.across)), rate, 0
+    def drift(y: np.ndarray) -> np.ndarray:
+        return np.asarray(dynamics.drift((y * width)[None])[0] / width)
 
-    def drift(self, y: np.ndarray) -> np.ndarray:
-        return np.asarray(self.dynamics.drift((y * self.width)[None])[0] / self.width)
-
-    def linearised(self, z: np.ndarray) -> np.ndarray:
-        """Time derivative of a state and of some tangents, one after another."""
-        self.evaluations += 1
-        if self.evaluations > MAX_EVALUATIONS:
+    def linearised(_: float, z: np.ndarray) -> np.ndarray:
+        """Time derivative of a state and of a tangent, one after the other."""
+        if next(evaluations) > MAX_EVALUATIONS:
             raise _TooLongError
-        d = self.dimension
-        jacobian = self.dynamics.jacobian((z[:d] * self.width)[None])[0] * self.width / self.width[:, None]
-        return np.concatenate([self.drift(z[:d]), (jacobian @ z[d:].reshape(d, -1)).ravel()])
+        jacobian = dynamics.jacobian((z[:d] * width)[None])[0] * width / width[:, None]
+        return np.concatenate([drift(z[:d]), jacobian @ z[d:]])
 
-    def recurrence(self) -> Recurrence:
-        """From return to return, until there are enough of them."""
-        if not self.speed > RESTING_SPEED * self.rate:
-            return Recurrence("none")
-        # Any direction grows as the fastest does.
-        state, tangent = self.start, np.random.default_rng(0).standard_normal(self.dimension)
-        tangent /= np.linalg.norm(tangent)
-        growth, times, places = [], [], []
-        for _ in range(RETURNS):
-            step = self._next(state, tangent)
-            if step is None:
-                break
-            state, grown, time = step
-            size = float(np.linalg.norm(grown))
-            tangent = grown / size
-            growth.append(np.log(size))
-            times.append(time)
-            places.append(state)
-            if len(places) in SEARCHED_RETURNS:
-                # Backwards from the last place, where a trajectory is closest to the cycle on which it ends.
-                past = places[-2 : -2 - MAX_RETURNS_OF_PERIOD : -1]
-                away = np.array([np.linalg.norm(place - state) for place in past])
-                close = away <= max(CLOSE_RETURN_RATIO * away.min(), RETURN_TOLERANCE)
-                passed = np.cumsum(times)
-                period = float(passed[-1] - passed[-2 - int(np.flatnonzero(close)[0])])
-                if (cycle := self._stable_cycle(state, period)) is not None:
-                    return Recurrence("cycle", cycle=cycle)
-        if not places:
-            return Recurrence("none")
-        exponent = float(np.sum(growth) / np.sum(times))
-        # Regular motion tears two states apart in proportion to the time, forty returns by some forty times.
-        chaotic = np.sum(growth) > -np.log(RETURN_TOLERANCE)
-        return Recurrence("chaos" if chaotic else "aperiodic", exponent=exponent)
+    across = drift(start)
+    speed = float(np.linalg.norm(across))
 
-    def _next(self, state: np.ndarray, tangent: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
-        """State, tangent and time at the next return through the section; None where there is none."""
-        d = self.dimension
+    def returns(_: float, z: np.ndarray) -> float:
+        return float(across @ (z[:d] - start))
 
-        def returns(_: float, z: np.ndarray) -> float:
-            return float(self.across @ (z[:d] - self.start))
+    def escapes(_: float, z: np.ndarray) -> float:
+        return float(ESCAPE_DISTANCE - np.abs(z[:d] - middle).max())
 
-        def escapes(_: float, z: np.ndarray) -> float:
-            return float(ESCAPE_DISTANCE - np.abs(z[:d] - self.middle).max())
+    returns.terminal, returns.direction = True, 1.0  # type: ignore[attr-defined]
+    escapes.terminal = True  # type: ignore[attr-defined]
 
-        returns.terminal, returns.direction = True, 1.0  # type: ignore[attr-defined]
-        escapes.terminal = True  # type: ignore[attr-defined]
-        # Away from the section first, on which it begins: what is zero there would be taken for a return.
-        away = SECTION_DISTANCE / self.speed
-        begin = np.concatenate([state + away * self.drift(state), tangent])
-        way = solve_ivp(
-            lambda _, z: self.linearised(z), (0.0, LONGEST_RETURN / self.rate), begin, method="DOP853",
-            rtol=1e-8, atol=1e-10, events=[returns, escapes],
-        )  # fmt: skip
-        if not len(way.t_events[0]):
-            return None
-        end = way.y_events[0][0]
-        return end[:d], end[d:], float(way.t_events[0][0]) + away
-
-    def _stable_cycle(self, base: np.ndarray, period: float) -> Cycle | None:
+    def stable_cycle(base: np.ndarray, period: float) -> Cycle | None:
         """A stable cycle that passes close by, None where there is none."""
         around = solve_ivp(
-            lambda _, y: self.drift(y), (0.0, period), base, method="DOP853", rtol=1e-9, atol=1e-11,
+            lambda _, y: drift(y), (0.0, period), base, method="DOP853", rtol=1e-9, atol=1e-11,
             t_eval=np.linspace(0, period, PARTS, endpoint=False),
         )  # fmt: skip
         if not around.success:
             return None
         try:
-            cycle = closed_orbit(self.dynamics, around.y.T * self.width, period, scale=self.width)
+            cycle = closed_orbit(dynamics, around.y.T * width, period, scale=width)
         except NumericalFailure:
             return None
-        near = cycle.distances((base * self.width)[None], scale=self.width)[0] < CYCLE_DISTANCE
+        near = cycle.distances((base * width)[None], scale=width)[0] < CYCLE_DISTANCE
         return cycle if cycle.stable and near and cycle.period < 2 * period else None
+
+    if not speed > RESTING_SPEED * rate:
+        return Recurrence("none")
+    # Any direction grows as the fastest does.
+    state, tangent = start, np.random.default_rng(0).standard_normal(d)
+    tangent /= np.linalg.norm(tangent)
+    growth, times, places = [], [], []
+    for _ in range(RETURNS):
+        # Away from the section first, on which it begins: what is zero there would be taken for a return.
+        away = SECTION_DISTANCE / speed
+        way = solve_ivp(
+            linearised, (0.0, LONGEST_RETURN / rate), np.append(state + away * drift(state), tangent),
+            method="DOP853", rtol=1e-8, atol=1e-10, events=[returns, escapes],
+        )  # fmt: skip
+        if not len(way.t_events[0]):
+            break
+        state, tangent = np.split(way.y_events[0][0], 2)
+        size = float(np.linalg.norm(tangent))
+        tangent = tangent / size
+        growth.append(np.log(size))
+        times.append(float(way.t_events[0][0]) + away)
+        places.append(state)
+        if len(places) in SEARCHED_RETURNS:
+            # Backwards from the last place, where a trajectory is closest to the cycle on which it ends.
+            past = places[-2 : -2 - MAX_RETURNS_OF_PERIOD : -1]
+            distances = np.array([np.linalg.norm(place - state) for place in past])
+            close = distances <= max(CLOSE_RETURN_RATIO * distances.min(), RETURN_TOLERANCE)
+            passed = np.cumsum(times)
+            period = float(passed[-1] - passed[-2 - int(np.flatnonzero(close)[0])])
+            if (cycle := stable_cycle(state, period)) is not None:
+                return Recurrence("cycle", cycle=cycle)
+    if not places:
+        return Recurrence("none")
+    # Regular motion tears two states apart in proportion to the time, forty returns by some forty times.
+    chaotic = np.sum(growth) > -np.log(RETURN_TOLERANCE)
+    return Recurrence("chaos" if chaotic else "aperiodic", exponent=float(np.sum(growth) / np.sum(times)))

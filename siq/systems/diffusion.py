@@ -181,8 +181,8 @@ class Diffusion:
         """
         if order == 0:
             return np.asarray((momenta * self.push(x, momenta)).sum(axis=-1))
-        result = "nk" if order == 1 else "nkl"
-        factors = f"ni,nij{result[1:]},nj->{result}"
+        further = "k" if order == 1 else "kl"
+        factors = f"ni,nij{further},nj->n{further}"
         return np.asarray(np.einsum(factors, momenta, self.derivatives(x, order), momenta))
 
     def turn(self, x: np.ndarray, momenta: np.ndarray) -> np.ndarray:

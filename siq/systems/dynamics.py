@@ -148,11 +148,6 @@ class ParametricFunctions:
     """Dynamics as functions of arrays, with derivatives by states and by free parameters.
 
     States come as ``(d, n)``, for parameters' values ``(p,)``.
-
-    Parameters
-    ----------
-    dynamics
-        What is compiled.
     """
 
     def __init__(self, dynamics: Dynamics) -> None:
@@ -211,16 +206,14 @@ class ParametricFunctions:
         smooth, formulas = self._smooth, self._equations
         if what == "output_slopes":
             smooth, formulas = [_without_teeth(each) for each in self._measured], self._measured
+        # u(t - τ) depends on a parameter in τ through the slope of u, backwards.
+        delays = [(_delayed(k), _slope(k), each.args[1]) for k, each in enumerate(self._delays)]
         by_state = [each.diff(state) for each in smooth for state in self._states]
-        return by_state + [self._by_parameter(each, one) for each in formulas for one in self._free]
-
-    def _by_parameter(self, formula: sympy.Expr, parameter: sympy.Symbol) -> sympy.Expr:
-        """Derivative of an evaluable formula by a parameter, which may stand in a delay as well."""
-        result = formula.diff(parameter)
-        for k, each in enumerate(self._delays):
-            # u(t - τ) depends on τ through the slope of u, backwards.
-            result -= formula.diff(_delayed(k)) * _slope(k) * each.args[1].diff(parameter)
-        return result
+        return by_state + [
+            each.diff(one) - sum(each.diff(u) * slope * time.diff(one) for u, slope, time in delays)
+            for each in formulas
+            for one in self._free
+        ]
 
 
 def _without_teeth(formula: sympy.Expr) -> sympy.Expr:
@@ -369,8 +362,8 @@ class Dynamics:
             object.__setattr__(self, "units", ("1",) * d)
         if not self.outputs:
             object.__setattr__(self, "outputs", tuple((name, symbol(name)) for name in self.states))
-        for what, count in (("equations", len(self.equations)), ("units", len(self.units)),
-                            ("rows of D", self.diffusion.dimension)):  # fmt: skip
+        counts = {"equations": len(self.equations), "units": len(self.units)}
+        for what, count in (counts | {"rows of D": self.diffusion.dimension}).items():
             if count != d:
                 raise Fault(f"there are {count} {what} for {d} states", "give one for each")
         if self.diffusion.symbols not in ((), self.symbols):
@@ -388,20 +381,10 @@ class Dynamics:
         domain: Sequence[Sequence[float]] | np.ndarray | None = None,
         parameters: Mapping[sympy.Symbol, float] | None = None,
     ) -> Dynamics:
-        """Dynamics of formulas alone, with D = 1 unless another is given.
+        """Dynamics of formulas alone, in real symbols for d states; parameters come with their values.
 
-        Parameters
-        ----------
-        symbols
-            The d states, real symbols.
-        equations
-            The components of f.
-        diffusion
-            D, as `Diffusion`, as a matrix ``(d, d)``, or as rows of formulas.
-        domain
-            Two limits a state, where somebody says them.
-        parameters
-            Real symbols of f that may take other values, with the values that they have.
+        D is 1 unless it is given, as `Diffusion`, as a matrix ``(d, d)``, or as rows of formulas; the domain
+        has two limits a state.
         """
         if diffusion is None:
             diffusion = Diffusion.identity(len(symbols))
@@ -479,11 +462,8 @@ class Dynamics:
 
     def with_values(self, values: np.ndarray) -> Dynamics:
         """The dynamics with other values of its parameters, shape ``(p,)``."""
-        changed = (
-            replace(parameter, value=float(value))
-            for parameter, value in zip(self.parameters, values, strict=True)
-        )
-        result = replace(self, parameters=tuple(changed))
+        pairs = zip(self.parameters, values, strict=True)
+        result = replace(self, parameters=tuple(replace(each, value=float(value)) for each, value in pairs))
         # Formulas and names are the same, and compiling them takes longer than most uses.
         for name in COMPILED:
             if name in self.__dict__:
@@ -515,34 +495,30 @@ class Dynamics:
 
     def drift(self, x: np.ndarray) -> np.ndarray:
         """f at points: ``(n, d)`` to ``(n, d)``."""
-        return self.drift_of_components(_components(x)).T
+        return self.drift_of_components(np.ascontiguousarray(x.T)).T
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
         """∂f_i/∂x_j at points: ``(n, d)`` to ``(n, d, d)``, i before j."""
-        d = self.dimension
-        result = np.zeros((len(x), d, d))
-        places, compiled = self._first
-        if len(places):
-            result[:, places[:, 0], places[:, 1]] = compiled(_components(x)).T
+        result = np.zeros((*x.shape, self.dimension))
+        (i, j), compiled = self._first
+        if len(i):
+            result[:, i, j] = compiled(np.ascontiguousarray(x.T)).T
         return result
 
     def hessian(self, x: np.ndarray) -> np.ndarray:
         """∂²f_i/∂x_j∂x_k at points: ``(n, d)`` to ``(n, d, d, d)``, i first."""
-        d = self.dimension
-        result = np.zeros((len(x), d, d, d))
-        places, compiled = self._second
-        if len(places):
-            i, j, k = places.T
-            result[:, i, j, k] = result[:, i, k, j] = compiled(_components(x)).T
+        result = np.zeros((*x.shape, self.dimension, self.dimension))
+        (i, j, k), compiled = self._second
+        if len(i):
+            result[:, i, j, k] = result[:, i, k, j] = compiled(np.ascontiguousarray(x.T)).T
         return result
 
     def bend(self, x: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """``Σ_i w_i ∂²f_i`` at points and weights ``(n, d)``: to ``(n, d, d)``, without all of `hessian`."""
-        d = self.dimension
-        result = np.zeros((len(x), d, d))
+        result = np.zeros((*x.shape, self.dimension))
         places, compiled = self._second
-        if len(places):
-            for (i, j, k), values in zip(places, compiled(_components(x)), strict=True):
+        if places.size:
+            for (i, j, k), values in zip(places.T, compiled(np.ascontiguousarray(x.T)), strict=True):
                 result[:, j, k] += weights[:, i] * values
                 if j != k:
                     result[:, k, j] += weights[:, i] * values
@@ -572,20 +548,20 @@ class Dynamics:
 
     @cached_property
     def _first(self) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-        """Places (i, j) of the derivatives that do not vanish, shape ``(m, 2)``, and these as a function."""
-        places = np.array(list(self._derivatives), dtype=int).reshape(-1, 2)
+        """Places i, j of the derivatives that do not vanish, shape ``(2, m)``, and these as a function."""
+        places = np.array(list(self._derivatives), dtype=int).reshape(-1, 2).T
         return places, compile_formulas(list(self._derivatives.values()), self.symbols)
 
     @cached_property
     def _second(self) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-        """Places (i, j, k), k ≥ j, of second derivatives that do not vanish, and these as a function."""
+        """Places i, j, k, k ≥ j, of second derivatives that do not vanish, and these as a function."""
         found = {
             (i, j, k): second
             for (i, j), first in self._derivatives.items()
             for k, symbol in enumerate(self.symbols)
             if k >= j and symbol in first.free_symbols and (second := first.diff(symbol)) != 0
         }
-        places = np.array(list(found), dtype=int).reshape(-1, 3)
+        places = np.array(list(found), dtype=int).reshape(-1, 3).T
         return places, compile_formulas(list(found.values()), self.symbols)
 
     def _autonomous_formulas(self) -> tuple[sympy.Expr, ...]:
@@ -631,11 +607,5 @@ class Dynamics:
         if not self.delays:
             return ()
         places = {entry.name: place for place, entry in enumerate(self.inputs)}
-        times = self._lags(*values)
-        return tuple(
-            (places[str(each.args[0])], float(time)) for each, time in zip(self.delays, times, strict=True)
-        )
-
-
-def _components(x: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(x.T)
+        pairs = zip(self.delays, self._lags(*values), strict=True)
+        return tuple((places[str(each.args[0])], float(time)) for each, time in pairs)

@@ -9,15 +9,16 @@ on. About an equilibrium with Jacobian J this is Kalman's condition: the linear 
 everywhere by D = σσᵀ if ``(σ, Jσ, J²σ, …)`` has full rank, and then, and only then, W of ``J W + W Jᵀ =
 -2D`` is regular (`hessian_at`).
 
-References
-----------
-J. Zabczyk, SIAM J. Control Optim. 23 (1985) 278: exit problems where noise acts on some states only.
-
 Newton's method starts from a low-discrepancy sequence over the domain, more and more densely until nothing
 new is found; then again with the known roots deflated, which leads to roots with a small neighbourhood of
 their own. In one and two dimensions the topological degree of f on the boundary of the domain is the sum of
 the indices ``sign det J`` of all roots within: where this fails a root was missed, and that is said. No
 search in more dimensions proves that nothing was missed.
+
+References
+----------
+J. Zabczyk, SIAM J. Control Optim. 23 (1985) 278: exit problems where noise acts on some states only.
+P. E. Farrell, Á. Birkisson, S. W. Funke, SIAM J. Sci. Comput. 37 (2015) A2026: deflation.
 """
 
 from __future__ import annotations
@@ -86,27 +87,19 @@ def find_equilibria(
     margin: float = BOX_MARGIN,
     rate: float | None = None,
 ) -> list[Equilibrium]:
-    """All equilibria in the box of some points that Newton's method finds from these.
+    """All isolated equilibria that Newton's method finds from points ``(n, d)``, by their first state.
 
     Parameters
     ----------
-    dynamics
-        f.
-    points
-        Shape ``(n, d)``: recorded states, from all over the recorded region.
     box, margin
         Shape ``(d, 2)``: by default that of the points; and the share of it by which one may lie outside.
     rate
         At which f crosses the box, see `classify`; by default its median over the points.
-
-    Returns
-    -------
-    list of Equilibrium
-        By their position along the first state. Only roots of f that are isolated are found.
     """
     box = np.stack([points.min(axis=0), points.max(axis=0)], axis=1) if box is None else box
     found = distinct_roots(dynamics, points, box=box, margin=margin)
-    return _classified(dynamics, found, box, _rate_of(dynamics, points) if rate is None else rate)
+    rate = crossing_rate(dynamics, points, np.ptp(points, axis=0)) if rate is None else rate
+    return _classified(dynamics, found, box, rate)
 
 
 def distinct_roots(
@@ -117,25 +110,11 @@ def distinct_roots(
     margin: float,
     known: Sequence[np.ndarray] = (),
 ) -> list[np.ndarray]:
-    """Where f vanishes, as far as Newton's method comes there from some starts; each root once.
+    """Where f vanishes, as far as Newton's method comes there from starts ``(n, d)``; each root once.
 
-    Parameters
-    ----------
-    dynamics
-        f.
-    starts
-        Shape ``(n, d)``.
-    box
-        Shape ``(d, 2)``: the region of interest.
-    margin
-        Share of the box by which a root may lie outside.
-    known
-        Roots that are deflated: f is multiplied by ``Π (1 + 1/∣x - r∣²)``, so that Newton's method is kept
-        away from them and comes to others. They are not given again.
-
-    References
-    ----------
-    P. E. Farrell, Á. Birkisson, S. W. Funke, SIAM J. Sci. Comput. 37 (2015) A2026: deflation.
+    A root may lie outside the box ``(d, 2)`` by a share of it, the `margin`. Those that are `known` are
+    deflated, and not given again: f is multiplied by ``Π (1 + 1/∣x - r∣²)``, which keeps Newton's method away
+    from them.
     """
     low, high = box.T
     width = np.where(high > low, high - low, 1.0)
@@ -199,26 +178,17 @@ def _classified(
     return [classify(dynamics, position, rate=rate) for position in ordered]
 
 
-def _rate_of(dynamics: _VectorField, points: np.ndarray) -> float:
-    """At which f crosses the box of some points ``(n, d)``, per unit of time: the median over them."""
-    width = np.ptp(points, axis=0)
+def crossing_rate(dynamics: _VectorField, points: np.ndarray, width: np.ndarray) -> float:
+    """At which f crosses a box of a width, per unit of time: the median over points ``(n, d)``."""
     speed = np.linalg.norm(dynamics.drift(points) / np.where(width > 0, width, 1.0), axis=1)
     return float(np.median(speed))
 
 
 def classify(dynamics: _VectorField, position: np.ndarray, *, rate: float = 0.0) -> Equilibrium:
-    """The equilibrium at a position, by the eigenvalues of the Jacobian there.
+    """The equilibrium at a position ``(d,)``, by the eigenvalues of the Jacobian there.
 
-    Parameters
-    ----------
-    dynamics
-        f.
-    position
-        Where it vanishes, shape ``(d,)``.
-    rate
-        At which f crosses the region of interest, per unit of time. An eigenvalue counts as zero by it, or by
-        the largest eigenvalue if that is faster: a single eigenvalue can only be told from zero by another
-        rate.
+    An eigenvalue counts as zero by the rate at which f crosses the region of interest, per unit of time, or
+    by the largest eigenvalue if that is faster: one alone can only be told from zero by another rate.
     """
     eigenvalues = np.linalg.eigvals(dynamics.jacobian(position[None])[0])
     eigenvalues = eigenvalues[np.argsort(-eigenvalues.real)]
@@ -305,13 +275,6 @@ def measure_at(dynamics: Dynamics, attractor: np.ndarray) -> Diffusion:
     mean rate of relaxation times the spread of states per noise. For ``f = -D∇V`` with relaxation as fast in
     every direction it is D.
 
-    Parameters
-    ----------
-    dynamics
-        f and D.
-    attractor
-        Shape ``(d,)``.
-
     Raises
     ------
     NumericalFailure
@@ -349,20 +312,7 @@ def spread_evenly(box: np.ndarray, count: int, *, generator: np.random.Generator
 def all_equilibria(
     dynamics: Dynamics, *, generator: np.random.Generator
 ) -> tuple[tuple[Equilibrium, ...], list[Remark]]:
-    """Equilibria in the domain of a system.
-
-    Parameters
-    ----------
-    dynamics
-        f, with its domain.
-    generator
-        Scrambles the sequences of starts.
-
-    Returns
-    -------
-    tuple
-        The equilibria, by their position along the first state; and what speaks against their being all.
-    """
+    """Equilibria in the domain of a system, by their first state; and what speaks against their being all."""
     box, d = dynamics.box, dynamics.dimension
     width = np.ptp(box, axis=1)
     found: list[np.ndarray] = []
@@ -383,8 +333,7 @@ def all_equilibria(
         if not new:
             break
         found += new
-    rate = float(np.median(np.linalg.norm(dynamics.drift(starts) / width, axis=1)))
-    equilibria = tuple(_classified(dynamics, found, box, rate))
+    equilibria = tuple(_classified(dynamics, found, box, crossing_rate(dynamics, starts, width)))
     degree = _boundary_degree(dynamics, equilibria)
     indices = [np.sign(np.linalg.det(dynamics.jacobian(one.position[None])[0])) for one in equilibria]
     if degree is None or degree == int(sum(indices)):
@@ -399,11 +348,8 @@ def _boundary_degree(dynamics: Dynamics, equilibria: tuple[Equilibrium, ...]) ->
     """
     box, d = dynamics.box, dynamics.dimension
     width = np.ptp(box, axis=1)
-    places = [one.position for one in equilibria]
-    near = any(
-        (np.minimum(place - box[:, 0], box[:, 1] - place) / width < BOUNDARY_DISTANCE).any()
-        for place in places
-    )
+    places = np.array([one.position for one in equilibria]).reshape(-1, d)
+    near = (np.minimum(places - box[:, 0], box[:, 1] - places) / width < BOUNDARY_DISTANCE).any()
     if d > 2 or near or any(one.kind == "degenerate" for one in equilibria):
         return None
     if d == 1:
@@ -411,8 +357,7 @@ def _boundary_degree(dynamics: Dynamics, equilibria: tuple[Equilibrium, ...]) ->
         return round(float(high - low) / 2)
     share = np.linspace(0, 1, BOUNDARY_POINTS // 4, endpoint=False)
     zero, one = np.zeros_like(share), np.ones_like(share)
-    along = [(share, zero), (one, share), (1 - share, one), (zero, 1 - share)]
-    around = np.concatenate([np.stack(side, axis=1) for side in along])
+    around = np.concatenate([share, one, 1 - share, zero, zero, share, one, 1 - share]).reshape(2, -1).T
     flow = dynamics.drift(box[:, 0] + around * width) / width
     angle = np.arctan2(flow[:, 1], flow[:, 0])
     turn = np.diff(np.append(angle, angle[0]))

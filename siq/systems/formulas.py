@@ -86,21 +86,16 @@ class FormulaError(Fault):
 def parse_formula(
     text: str | float, names: Mapping[str, sympy.Expr], *, inputs: Collection[str] = ()
 ) -> sympy.Expr:
-    """Build a sympy expression from the text of a formula.
+    """Build a sympy expression from the text of a formula, such as ``"-2*(x**3 - x) - y"``, or a number.
+
+    Numbers with a decimal point become floating-point numbers.
 
     Parameters
     ----------
-    text
-        The formula, such as ``"-2*(x**3 - x) - y"``; a plain number is a formula as well.
     names
         What every name in the formula stands for: states as symbols, parameters as numbers.
     inputs
         Those of the names that may be delayed, ``delay(u, tau)``.
-
-    Returns
-    -------
-    sympy.Expr
-        The expression; numbers with a decimal point become floating-point numbers.
 
     Raises
     ------
@@ -112,11 +107,10 @@ def parse_formula(
     if len(text) > MAX_FORMULA_LENGTH:
         raise FormulaError(f"the formula has {len(text)} characters", f"keep it below {MAX_FORMULA_LENGTH}")
     try:
-        tree = ast.parse(text.strip(), mode="eval")
-        expression = _build(tree.body, names, inputs)
-    except (ArithmeticError, SyntaxError, TypeError, ValueError, MemoryError, RecursionError) as error:
-        if isinstance(error, FormulaError):
-            raise
+        expression = _build(ast.parse(text.strip(), mode="eval").body, names, inputs)
+    except FormulaError:
+        raise
+    except (ArithmeticError, SyntaxError, TypeError, ValueError, MemoryError, RecursionError):
         raise FormulaError(f"'{_short(text)}' is not a formula", "check brackets and operators") from None
     if expression.has(sympy.zoo, sympy.nan, sympy.oo, -sympy.oo, sympy.I):
         raise FormulaError(f"'{_short(text)}' is not a real number somewhere", "correct the formula")
@@ -197,23 +191,11 @@ def _call(name: str, arguments: Sequence[sympy.Expr]) -> sympy.Expr:
 def compile_formulas(
     expressions: Sequence[sympy.Expr], variables: Sequence[sympy.Symbol]
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Turn expressions into one vectorised numpy function.
+    """Turn m expressions in d variables into one vectorised numpy function.
 
-    Integer powers become products and common parts are worked out once, which makes polynomial vector
-    fields several times faster than numpy's power function.
-
-    Parameters
-    ----------
-    expressions
-        What to evaluate, ``m`` expressions in `variables`.
-    variables
-        The ``d`` symbols, in the order of the components of a point.
-
-    Returns
-    -------
-    callable
-        Maps components of shape ``(d, ...)`` to values of shape ``(m, ...)``: components first, so that
-        each is contiguous in memory.
+    It maps components of shape ``(d, ...)`` to values of shape ``(m, ...)``: components first, so that each
+    is contiguous in memory. Integer powers become products and common parts are worked out once, which makes
+    polynomial vector fields several times faster than numpy's power function.
     """
     function = compile_values(expressions, variables)
 
@@ -232,20 +214,9 @@ def compile_values(
     """Turn expressions into a function of as many arguments as there are variables.
 
     Compare `compile_formulas`, whose argument is one array: here some variables may be arrays and others,
-    such as parameters, numbers.
-
-    Parameters
-    ----------
-    expressions, variables
-        See `compile_formulas`.
-    common
-        Whether parts that several expressions share are worked out once. Finding them takes longer than it
-        saves for a few short ones.
-
-    Returns
-    -------
-    callable
-        Gives one value for each expression: an array, or a number where only numbers stand in it.
+    such as parameters, numbers. It gives one value for each expression: an array, or a number where only
+    numbers stand in it. To find the parts that are `common` to several takes longer than it saves for a few
+    short ones.
     """
     return _compiled(tuple(expressions), tuple(variables), common)
 
@@ -289,16 +260,13 @@ class _ProductPrinter(NumPyPrinter):
         return "0.0"
 
     # Conditions that are numbers and such that are arrays are joined one by one; numpy wants equal shapes.
-    def _print_And(self, expr: sympy.And) -> str:  # noqa: N802
-        return self._joined("logical_and", expr)
-
-    def _print_Or(self, expr: sympy.Or) -> str:  # noqa: N802
-        return self._joined("logical_or", expr)
-
-    def _joined(self, operation: str, expr: sympy.Basic) -> str:
+    def _print_And(self, expr: sympy.Basic, operation: str = "logical_and") -> str:  # noqa: N802
         parts = ", ".join(self._print(each) for each in expr.args)
         one_by_one = self._module_format("functools.reduce")
         return f"{one_by_one}({self._module_format(f'numpy.{operation}')}, [{parts}])"
+
+    def _print_Or(self, expr: sympy.Basic) -> str:  # noqa: N802
+        return self._print_And(expr, "logical_or")
 
 
 def _integer_power(base: np.ndarray, exponent: int) -> np.ndarray:
@@ -386,16 +354,7 @@ class Formula:
     ) -> Formula:
         """``Σ_k c_k Π_i ((x_i - center_i)/scale_i)^e_ki``, written in the units of the states.
 
-        Parameters
-        ----------
-        name, symbols, units, title
-            As of the class.
-        center, scale
-            Shape ``(d,)``.
-        exponents
-            Shape ``(m, d)``.
-        coefficients
-            Shape ``(m,)``.
+        Center and scale have the shape ``(d,)``, exponents ``(m, d)``, coefficients ``(m,)``.
         """
         plain = coefficients / np.prod(scale.astype(float) ** exponents, axis=1)
         terms = (
@@ -403,9 +362,7 @@ class Formula:
             for value, row in zip(plain, exponents, strict=True)
             if value != 0
         )
-        return cls(
-            name, sympy.Add(*terms), tuple(symbols), tuple(float(c) for c in center), tuple(units), title
-        )
+        return cls(name, sympy.Add(*terms), tuple(symbols), tuple(map(float, center)), tuple(units), title)
 
     @property
     def gradient(self) -> tuple[sympy.Expr, ...]:
@@ -431,10 +388,7 @@ class Formula:
     def to_latex(self, *, digits: int = DIGITS) -> str:
         r"""The function as LaTeX, in an ``aligned`` environment where offsets are defined as well.
 
-        Parameters
-        ----------
-        digits
-            Significant digits of its numbers, for a page that has no room for 17.
+        Its numbers have so many significant digits: a page has no room for 17.
         """
 
         def latex(expression: sympy.Expr) -> str:
@@ -552,18 +506,6 @@ class _Doubles:
         return repr(float(expr)) if abs(expr) >= LARGEST_INTEGER else str(int(expr))
 
 
-class _Text(_Doubles, StrPrinter):
-    pass
-
-
-class _NumPy(_Doubles, NumPyPrinter):
-    pass
-
-
-class _C(_Doubles, C99CodePrinter):
-    pass
-
-
 class _Julia(_Doubles, JuliaCodePrinter):
     def _print_Max(self, expr: sympy.Expr) -> str:  # noqa: N802
         return f"max({', '.join(map(self._print, expr.args))})"
@@ -573,5 +515,6 @@ class _Julia(_Doubles, JuliaCodePrinter):
 
 
 _PRINTERS: Mapping[str, type[CodePrinter | StrPrinter]] = {
-    "text": _Text, "numpy": _NumPy, "c": _C, "julia": _Julia
+    "text": type("_Text", (_Doubles, StrPrinter), {}), "numpy": type("_NumPy", (_Doubles, NumPyPrinter), {}),
+    "c": type("_C", (_Doubles, C99CodePrinter), {}), "julia": _Julia,
 }  # fmt: skip

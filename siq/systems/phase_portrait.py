@@ -30,7 +30,6 @@ from siq.systems.basins import (
     Descents,
     basin_of,
     edge_saddle,
-    ends_of,
     follow,
     settled_on,
     sides_of,
@@ -42,6 +41,7 @@ from siq.systems.equilibria import (
     Equilibrium,
     all_equilibria,
     classify,
+    crossing_rate,
     find_equilibria,
     hessian_at,
     spread_evenly,
@@ -199,10 +199,9 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
         # Of many independent states the mean is always about the same: some have all states high, or low.
         alike = np.linspace(0, 1, DIAGONAL_STARTS)[:, None] * width + box[:, 0]
         points = np.concatenate([points, alike])
-    flow = dynamics.drift(points)
-    if searched and not np.isfinite(flow).all():
+    if searched and not np.isfinite(dynamics.drift(points)).all():
         raise NumericalFailure("f has no value in a part of the domain: choose one in which it has")
-    rate = float(np.median(np.linalg.norm(flow / width, axis=1)))
+    rate = crossing_rate(dynamics, points, width)
 
     starts, remarks = points, list[Remark]()
     if recorded:
@@ -324,10 +323,9 @@ def _cycles_backwards(
     sources = [classify(backwards, one.position) for one in equilibria if one.kind == "repeller"]
     starts = spread_evenly(box, BACKWARD_STARTS, generator=generator)
     width = np.ptp(box, axis=1)
-    rate = float(np.median(np.linalg.norm(dynamics.drift(starts) / width, axis=1)))
     try:
         with np.errstate(all="ignore"):
-            ways = follow(backwards, starts, sources, box=box)
+            rate, ways = crossing_rate(dynamics, starts, width), follow(backwards, starts, sources, box=box)
             found, _ = _stable_cycles(backwards, ways, first=len(sources), box=box, rate=rate)
     except NumericalFailure:
         return ()
@@ -344,16 +342,11 @@ def _separatrix_cycles(
     generator: np.random.Generator,
 ) -> tuple[Cycle, ...]:
     """Cycles with one unstable direction on boundaries of basins, where a cycle is on one side of them."""
-
-    def ends(x: np.ndarray) -> np.ndarray:
-        return ends_of(dynamics, x, attractors, cycles, box=box)
-
-    width = np.ptp(box, axis=1)
-    places = [*(one.position for one in attractors), *(one.position for one in cycles)]
-    pairs = [pair for pair in itertools.combinations(range(len(places)), 2) if max(pair) >= len(attractors)]
+    pairs = itertools.combinations(range(len(attractors) + len(cycles)), 2)
+    with_cycle = [pair for pair in pairs if max(pair) >= len(attractors)]
     found: list[Cycle] = []
-    for one, two in pairs[:MAX_CYCLE_PAIRS]:
-        edge = tracked_edge(dynamics, places[one], places[two], one, ends, width=width, generator=generator)
+    for one, two in with_cycle[:MAX_CYCLE_PAIRS]:
+        edge = tracked_edge(dynamics, one, two, attractors, cycles, box=box, generator=generator)
         times, states = np.zeros(0), np.zeros((0, len(box)))
         for number, (passed, along, _) in enumerate(itertools.islice(edge, TRACKING_ROUNDS + 1)):
             times = np.append(times, times[-1:].sum() + passed)

@@ -129,29 +129,10 @@ def _sampling_stride(options: SimulationOptions) -> int:
 def noise_source(
     diffusion: Diffusion, *, intensity: float, step: float, generator: np.random.Generator
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Generator of the noise over one step of states: ``sqrt(ε) σ(x) ΔW``, in the sense of Itô.
+    """Generator of the noise over one step Δt of states: ``sqrt(ε) σ(x) ΔW``, in the sense of Itô.
 
-    Parameters
-    ----------
-    diffusion
-        D.
-    intensity
-        ε of ``dx = f dt + sqrt(ε) D^(1/2) dW``.
-    step
-        Time step Δt.
-    generator
-        Source of the noise.
-
-    Returns
-    -------
-    callable
-        Maps the components of states ``(d, n)`` to increments ``(d, n)``, new ones with every call. Every
-        root of D gives the same process in law.
-
-    Raises
-    ------
-    ValueError
-        When ε or Δt is negative.
+    It maps the components of states ``(d, n)`` to increments ``(d, n)``, new ones with every call. Every root
+    of D gives the same process in law. Raises ValueError when ε or Δt is negative.
     """
     if intensity < 0 or step < 0:
         raise ValueError(f"the noise intensity ({intensity}) and the step ({step}) must not be negative")
@@ -165,23 +146,11 @@ def noise_source(
 def simulate_snapshots(
     dynamics: Dynamics, *, options: SimulationOptions, generator: np.random.Generator
 ) -> Recordings:
-    """Simulate trajectories from random initial states and keep their snapshot pairs.
+    """Simulate trajectories from initial states, uniform over the domain Ω, and keep their snapshot pairs.
 
-    Parameters
-    ----------
-    dynamics
-        What is simulated; its domain Ω is where the initial states are drawn, uniformly.
-    options
-        Sampling (paper, Appendix B).
-    generator
-        Source of the initial states, and then of the noise; a run passes its own. The initial states are
-        the same with and without noise.
-
-    Returns
-    -------
-    Recordings
-        Every trajectory as one recording of 2·M samples at t_j and t_j + h. Consecutive samples no
-        further apart than h are the pairs (X0, Xh); see `siq.data.recordings.snapshot_pairs`.
+    Every trajectory is one recording of 2·M samples at t_j and t_j + h (paper, Appendix B). Consecutive
+    samples no further apart than h are the pairs (X0, Xh); see `siq.data.recordings.snapshot_pairs`. The
+    generator draws the initial states, and then the noise: they are the same with and without it.
 
     Raises
     ------
@@ -192,8 +161,7 @@ def simulate_snapshots(
     """
     step = options.pair_step / options.substeps
     stride = _sampling_stride(options)
-    lower, upper = dynamics.box.T
-    count = options.trajectories
+    count, (lower, upper) = options.trajectories, dynamics.box.T
     x = generator.uniform(lower[:, None], upper[:, None], size=(dynamics.dimension, count))
     samples = np.empty((count, 2 * options.pairs, dynamics.dimension))
     noise = noise_source(
@@ -245,7 +213,7 @@ def simulate_stationary(
     generator: np.random.Generator,
     rule: Callable[..., np.ndarray] = euler_maruyama_step,
 ) -> np.ndarray:
-    """Simulate walkers in noise for a long time, to compare with the invariant distribution.
+    """Samples of walkers in noise, shape ``(d, steps // thin, walkers)``, after a long time.
 
     The walkers share nothing but the equation ``dx = f dt + sqrt(ε) D^(1/2) dW``; the spread among them
     therefore tells the sampling error, whatever the correlation in time. Where ε is small a walker stays
@@ -253,29 +221,18 @@ def simulate_stationary(
 
     Parameters
     ----------
-    dynamics
-        f and D.
     intensity
         ε, in the unit of U.
     start
         Initial states, shape ``(d, walkers)``.
     step
         Step of the rule; by that of Euler and Maruyama the samples' distribution is biased by O(step).
-    burn_in
-        Number of steps before the first sample.
-    steps
-        Number of steps from then on.
+    burn_in, steps
+        Number of steps before the first sample, and from then on.
     thin
         Every how many steps a sample is kept.
-    generator
-        Source of the noise.
     rule
         The next state from f, the state, the step and the kicks of the noise (`siq.numerics.integration`).
-
-    Returns
-    -------
-    numpy.ndarray
-        Samples, shape ``(d, steps // thin, walkers)``, in the states' units.
 
     Raises
     ------
@@ -306,8 +263,7 @@ def _rates(dynamics: Dynamics) -> tuple[float, float]:
     Eigenvalues of the Jacobian, which no choice of the states' units can alter. Where there is no attractor
     the slow rates of the domain stand in for its relaxation.
     """
-    low, high = dynamics.box.T
-    x = np.random.default_rng(0).uniform(low, high, size=(STATES, dynamics.dimension))
+    x = np.random.default_rng(0).uniform(*dynamics.box.T, size=(STATES, dynamics.dimension))
     sizes = np.abs(np.linalg.eigvals(dynamics.jacobian(x))).max(axis=1)
     fastest = float(np.quantile(sizes, FASTEST)) or 1.0
     relaxing = [
@@ -323,9 +279,9 @@ def fault_over_domain(dynamics: Dynamics) -> tuple[str, str] | None:
     States at random and the corners tell what overflows; a divisor that changes its sign between them is zero
     somewhere, though no state of a sample meets it.
     """
-    low, high = dynamics.box.T
-    x = np.random.default_rng(0).uniform(low, high, size=(STATES, dynamics.dimension))
-    x = np.concatenate([x, low[None], high[None]])
+    corners = dynamics.box.T
+    x = np.random.default_rng(0).uniform(*corners, size=(STATES, dynamics.dimension))
+    x = np.concatenate([x, corners])
     with np.errstate(all="ignore"):
         flow, slopes = dynamics.drift(x), dynamics.jacobian(x)
         for index, (name, formula) in enumerate(zip(dynamics.states, dynamics.formulas, strict=True)):

@@ -82,6 +82,6 @@ def test_a_root_between_two_sites_leads_to_the_saddle_beside_it(centre: float) -
     system, _ = chain(24, coupling=2.0)
     low, _, high = np.sort(np.roots([1, 0, -1, 0.1]).real)
     droplet = high - 0.75 * (high - low) * np.exp(-(((np.arange(24) - centre) / 2.5) ** 2))
-    found = _saddle_near(system, droplet, system.box, np.ptp(system.box, axis=1))
+    found = _saddle_near(system, droplet, system.box)
     assert found is not None and found.kind == "saddle" and found.unstable == 1
     assert np.abs(system.drift(found.position[None])).max() < 1e-9

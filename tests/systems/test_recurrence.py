@@ -10,7 +10,7 @@ from known_systems import limit_cycle
 from siq.remarks import Remark, sentence
 from siq.systems.cycles import Recurrence, recurrence_of
 from siq.systems.dynamics import Dynamics
-from siq.systems.equilibria import _rate_of
+from siq.systems.equilibria import crossing_rate
 from siq.systems.phase_portrait import phase_portrait
 
 x, y, z = (sympy.Symbol(name, real=True) for name in "xyz")
@@ -24,7 +24,9 @@ ROOM = np.array([[-20.0, 20.0], [-25.0, 25.0], [0.0, 50.0]])
 
 def found_of(dynamics: Dynamics, start: np.ndarray, box: np.ndarray) -> Recurrence:
     points = np.random.default_rng(0).uniform(*box.T, (200, len(box)))
-    return recurrence_of(dynamics, start, box=box, rate=_rate_of(dynamics, points))
+    return recurrence_of(
+        dynamics, start, box=box, rate=crossing_rate(dynamics, points, np.ptp(points, axis=0))
+    )
 
 
 def settled(dynamics: Dynamics, start: list[float], time: float, step: float = 0.01) -> np.ndarray:
