@@ -49,6 +49,7 @@ from siq.data.stationarity import (
     same_stretch,
     usual_step,
 )
+from siq.numerics.randomness import positive
 
 Kind = Literal["none", "white", "sensor", "blur", "coloured", "either", "memory", "hidden", "unknown"]
 
@@ -139,7 +140,7 @@ class _Residuals(NamedTuple):
     def correlations(self, most: int) -> tuple[np.ndarray, np.ndarray]:
         """Correlations at lags 1 ... most and their standard errors, each of shape ``(most, d)``."""
         own = np.einsum("kii->ki", lagged_covariances(self.rest, self.number, most))
-        values = own[1:] / np.where(own[0] > 0, own[0], 1.0)
+        values = own[1:] / positive(own[0])
         # Bartlett: correlations at shorter lags make all others uncertain.
         spread = 1 + 2 * np.cumsum(np.vstack([np.zeros_like(values[:1]), values[:-1] ** 2]), axis=0)
         return values, np.sqrt(spread * self.kurtosis(most) / self.size)
@@ -151,7 +152,7 @@ class _Residuals(NamedTuple):
         if both.sum() < STEPS_PER_FUNCTION:
             return np.ones(squares.shape[1])
         product = (squares[: len(both)] * squares[lag:])[both].mean(axis=0)
-        return np.maximum(product / np.where(mean > 0, mean, 1.0), 1.0)
+        return np.maximum(product / positive(mean), 1.0)
 
 
 class _Increments(NamedTuple):
@@ -203,29 +204,18 @@ class _Increments(NamedTuple):
 
 
 def markov_lag(recordings: Recordings) -> MarkovLag:
-    """Find the lag from which on recordings are Markovian.
-
-    Parameters
-    ----------
-    recordings
-        Trajectories; evenly spaced stretches of them are looked at.
-    """
-    d = len(recordings.names)
-    stretches = even_stretches(recordings)
+    """Find the lag from which on recordings are Markovian; evenly spaced stretches of them are looked at."""
+    d, stretches = len(recordings.names), even_stretches(recordings)
+    step, sensor = stretches.step, np.zeros(d)
     problem = _increments(recordings, stretches)
     first = None if problem is None else problem.residuals(0)
     if problem is None or first is None:
         nothing, none = np.zeros((0, d)), np.zeros(0, dtype=int)
-        step = stretches.step
-        return MarkovLag("unknown", None, step, 0.0, float("nan"), none, nothing, nothing, np.zeros(d))
+        return MarkovLag("unknown", None, step, 0.0, float("nan"), none, nothing, nothing, sensor)
     relaxation = problem.relaxation
 
-    def told(
-        kind: Kind, lag: int | None, seen: _Residuals, most: int, memory: float = 0.0,
-        sensor: np.ndarray = np.zeros(d),  # noqa: B008 (of this call alone)
-    ) -> MarkovLag:  # fmt: skip
+    def told(kind: Kind, lag: int | None, seen: _Residuals, most: int, memory: float = 0.0) -> MarkovLag:
         lags = np.arange(1, most + 1)
-        step = stretches.step
         return MarkovLag(kind, lag, step, memory, relaxation, lags, *seen.correlations(most), sensor)
 
     left = np.diag(lagged_covariances(first.rest, first.number, 0)[0])
@@ -235,12 +225,10 @@ def markov_lag(recordings: Recordings) -> MarkovLag:
         return told("white", 0, first, FIRST_LAGS)
     lag = 1
     while (seen := problem.residuals(lag)) is not None:
-        if lag * stretches.step > LONGEST_LAG * relaxation:
-            break
-        if problem.forgotten(seen, lag):
+        if lag * step > LONGEST_LAG * relaxation or problem.forgotten(seen, lag):
             break
         lag = max(lag + 1, round(lag * LAG_GROWTH))
-    if seen is None or lag * stretches.step > LONGEST_LAG * relaxation:
+    if seen is None or lag * step > LONGEST_LAG * relaxation:
         return told("hidden", None, seen or first, 2 * lag)
     # The kind of each state that remembers; that of the longest memory stands for the record.
     most = max(2 * lag, FIRST_LAGS)
@@ -253,10 +241,8 @@ def markov_lag(recordings: Recordings) -> MarkovLag:
         return told("white", 0, seen, most)
     if longest.departure > max(SHAPE_DEPARTURE, 4 * float(seen.correlations(most)[1][0].max())):
         return told("memory", lag, seen, most)
-    sensor = np.zeros(d)
     sensor[marked] = np.sqrt([fit.sensor for fit in fits])
-    lag = 1 if longest.memory == 0 else lag
-    return told(longest.shape, lag, seen, most, longest.memory * stretches.step, sensor)
+    return told(longest.shape, 1 if longest.memory == 0 else lag, seen, most, longest.memory * step)
 
 
 def _increments(recordings: Recordings, stretches: Stretches) -> _Increments | None:
@@ -276,26 +262,21 @@ def _increments(recordings: Recordings, stretches: Stretches) -> _Increments | N
     exponents = [row for row in itertools.product(range(degree + 1), repeat=d) if sum(row) <= degree]
     if known.sum() < STEPS_PER_FUNCTION * len(exponents):
         return None
-    tower = [np.ones_like(scaled)]
-    for _ in range(degree):
-        tower.append(tower[-1] * scaled)
+    powers = np.polynomial.polynomial.polyvander(scaled, degree)
     functions = np.ones((len(scaled), len(exponents)))
-    for place, row in enumerate(exponents):
-        for state, exponent in enumerate(row):
-            if exponent:
-                functions[:, place] *= tower[exponent][:, state]
+    for state, row in enumerate(np.transpose(exponents)):
+        functions *= powers[:, state, row]
     eigenvalues, vectors = np.linalg.eigh(functions[known].T @ functions[known] / known.sum())
     kept = eigenvalues > 1e-10 * eigenvalues[-1]
     increments = np.where(known[:, None], np.diff(values, axis=0), 0.0)
     runs = runs_of(recordings)
     times = [relaxation_samples(column, runs) for column in recordings.values.T]
-    known_times = [time for time in times if time is not None]
     return _Increments(
         functions @ (vectors[:, kept] / np.sqrt(eigenvalues[kept])),
         increments,
         Stretches(number, stretches.step),
         np.sqrt((increments[known] ** 2).mean(axis=0)),
-        min(known_times) * usual_step(recordings) if known_times else float("nan"),
+        min((time for time in times if time is not None), default=float("nan")) * usual_step(recordings),
     )
 
 
@@ -324,18 +305,14 @@ class _Shape(NamedTuple):
         return self.misfit - MIN_CHI2_GAIN * self.freedom
 
 
-def _exposure_displacement(lags: np.ndarray, exposure: float) -> np.ndarray:
-    """M(k)/σ²h of means over an exposure of so many steps."""
+def _displacement(kind: Kind, lags: np.ndarray, u: float) -> np.ndarray:
+    """M(k)/σ²h of means over an exposure of u steps, or else of forces with a memory of u steps."""
     k = np.abs(np.asarray(lags, dtype=float))
-    if exposure <= 0:
+    if u <= 0:
         return k
-    return np.where(k >= exposure, k - exposure / 3, k**2 / exposure - k**3 / (3 * exposure**2))
-
-
-def _coloured_displacement(lags: np.ndarray, memory: float) -> np.ndarray:
-    """M(k)/σ²h of forces with a memory of so many steps."""
-    k = np.abs(np.asarray(lags, dtype=float))
-    return k if memory <= 0 else k + memory * np.expm1(-k / memory)
+    if kind == "blur":
+        return np.where(k >= u, k - u / 3, k**2 / u - k**3 / (3 * u**2))
+    return k + u * np.expm1(-k / u)
 
 
 def _increment_covariances(displacement: np.ndarray) -> np.ndarray:
@@ -367,8 +344,8 @@ def _fitted_shape(covariances: np.ndarray, count: float, *, seen: int) -> _Shape
     of_sensor = _increment_covariances(np.where(lags > 0, 2.0, 0.0))
 
     def fitted(kind: Kind, memory: float, sensor: bool) -> _Shape:
-        move = _exposure_displacement if kind == "blur" else _coloured_displacement
-        parts = np.stack([_increment_covariances(move(lags, memory)), of_sensor][: 1 + sensor])
+        own = _increment_covariances(_displacement(kind, lags, memory))
+        parts = np.stack([own, of_sensor][: 1 + sensor])
         design = (root @ parts[:, :, None])[:, :, 0].T
         scale = np.linalg.norm(design, axis=0)
         values, left = scipy.optimize.nnls(design / scale, goal)
@@ -423,13 +400,7 @@ class NoiseFloor:
 
 
 def noise_floors(recordings: Recordings) -> tuple[NoiseFloor, ...] | None:
-    """The noise of each state; None where too few neighbouring samples are evenly spaced.
-
-    Parameters
-    ----------
-    recordings
-        Trajectories; of long ones a part is looked at.
-    """
+    """The noise of each state; None where too few neighbouring samples are evenly spaced."""
     stretches = even_stretches(recordings)
     for width in WINDOWS:
         begins = stretches.within(width - 2)
@@ -499,18 +470,10 @@ VALUES_SAMPLED = 2000  # looked at before all are
 
 
 def resolution_step(values: np.ndarray) -> float | None:
-    """The step of which all values are multiples, None where there is none.
+    """The step of which all values ``(n,)`` are multiples, None where there is none.
 
-    Parameters
-    ----------
-    values
-        Shape ``(n,)``, finite.
-
-    Returns
-    -------
-    float or None
-        A power of ten where the values have so many decimals; else the least difference of two values, where
-        all differences are multiples of it.
+    A power of ten where the values have so many decimals; else the least difference of two values, where all
+    differences are multiples of it.
 
     Examples
     --------
@@ -538,10 +501,7 @@ def resolution_step(values: np.ndarray) -> float | None:
         return None
     gaps = np.diff(levels)
     # Levels that differ by less than numbers are written with are one level.
-    gaps = gaps[gaps > 1e-9 * np.ptp(levels)]
-    if len(gaps) == 0:
-        return None
-    counts = (levels - levels[0]) / float(gaps.min())
+    counts = (levels - levels[0]) / float(gaps[gaps > 1e-9 * np.ptp(levels)].min())
     if counts[-1] > 1e7 or np.abs(counts - np.round(counts)).max() > 0.05:
         return None
     return float(np.ptp(levels) / np.round(counts[-1]))

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import codecs
 import csv
+import difflib
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,7 +30,6 @@ import pyarrow.compute as pc
 from siq.data.layout import is_unit, read_heading
 from siq.data.recordings import TABLE
 from siq.errors import InputError
-from siq.numerics.files import missing_file
 from siq.remarks import Remark
 
 if TYPE_CHECKING:
@@ -41,6 +41,7 @@ SAMPLED_LINES = 200  # of a table, from which its separator and decimal mark are
 SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".xlsb", ".ods")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
+_NUMERIC = re.compile(f"{_NUMBER.pattern}|{_DECIMAL_COMMA.pattern}", re.IGNORECASE)
 _GROUPED = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d+")
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", "|": "vertical bars", " ": "spaces"}
 _COMMENTS = ("#", "%", "//")
@@ -89,14 +90,14 @@ def open_columns(path: str | Path | pd.DataFrame) -> ColumnFile:
     """
     if not isinstance(path, str | Path):
         return _open_frame(path)
-    file, suffix = str(path), Path(path).suffix.lower()
-    exists, reader = Path(path).exists(), READERS.get(suffix)
+    file, path = str(path), Path(path)
+    suffix, exists, begin = path.suffix.lower(), path.exists(), b""
+    reader = READERS.get(suffix)
     if not exists and (reader or not suffix):
-        raise missing_file(file, [Path(path)])
-    begin = b""
+        raise _missing_file(path)
     try:
         if exists:
-            with Path(path).open("rb") as stream:
+            with path.open("rb") as stream:
                 begin = stream.read(8)
     except OSError as error:
         reason = f"it cannot be read ({error.strerror})"
@@ -107,9 +108,22 @@ def open_columns(path: str | Path | pd.DataFrame) -> ColumnFile:
         remedy = "save the sheet as CSV (in Excel: Save As, CSV UTF-8)"
         raise InputError(file, "", "it is a spreadsheet", remedy)
     if reader is None:
-        fault = f"the suffix '{Path(path).suffix}' is unknown"
-        raise InputError(file, "", fault, f"use one of {', '.join(READERS)}")
+        remedy = f"use one of {', '.join(READERS)}"
+        raise InputError(file, "", f"the suffix '{path.suffix}' is unknown", remedy)
     return reader(file)
+
+
+def _missing_file(path: Path) -> InputError:
+    """What to say of a file as the user named it: where it was looked for, and what has nearly its name."""
+    folder, remedy = path.parent, "check the name and the folder"
+    if folder.is_dir():
+        names = {each.name.casefold(): each for each in folder.iterdir() if not each.name.startswith(".")}
+        near = difflib.get_close_matches(path.name.casefold(), names, n=1)
+        near = near or [name for name in names if Path(name).stem == path.stem.casefold()]
+        remedy = f"perhaps you meant '{names[near[0]]}'" if near else remedy
+    else:
+        remedy = f"there is no folder '{folder}' either"
+    return InputError(path, "", f"No such file; it was looked for at {path.absolute()}", remedy)
 
 
 def _open_frame(frame: pd.DataFrame) -> ColumnFile:
@@ -164,7 +178,7 @@ def _open_text(file: str) -> ColumnFile:
         raise InputError(file, "", "the table has no headings and no rows", "write the recordings again")
     separator = separator or _separator(lines)
     headings, rows = _split(lines[0], separator), [_split(line, separator) for line in lines[1:]]
-    if all(_is_number(cell) for cell in headings):
+    if all(map(_NUMERIC.fullmatch, headings)):
         above = _split(comments[-1], separator) if comments else []
         if len(above) != len(headings):
             example = ",".join(["t", *"xyzuvw"][: len(headings)])
@@ -246,17 +260,13 @@ def _split(line: str, separator: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
 
 
-def _is_number(cell: str) -> bool:
-    return bool(_NUMBER.fullmatch(cell) or _DECIMAL_COMMA.fullmatch(cell))
-
-
 def _line_of_units(cells: list[str], width: int) -> list[str | None] | None:
     """Units from the second line of headings, if that is what it is: no number, and a unit at least."""
     inner = [cell.strip("[]() ") for cell in cells]
     if any(cell and not is_unit(text) for cell, text in zip(cells, inner, strict=True)):
         return None
     units = [text if text not in ("", "-") else None for text in inner]
-    return units if len(cells) == width and any(units) and not any(map(_is_number, cells)) else None
+    return units if len(cells) == width and any(units) and not any(map(_NUMERIC.fullmatch, cells)) else None
 
 
 def _decimal_mark(file: str, rows: list[list[str]], width: int, separator: str) -> str:
@@ -334,12 +344,12 @@ def _open_parquet(file: str) -> ColumnFile:
 
     kept = [field.metadata or {} for field in schema]
     units, titles = (tuple(_text(each.get(key)) for each in kept) for key in (b"unit", b"heading"))
-    noted = json.loads((schema.metadata or {}).get(b"notes", b"[]"))
-    remarks = tuple(
+    noted = json.loads((schema.metadata or {}).get(b"notes", b"[]"))  # sentences, before remarks were kept
+    remarks = (
         Remark("data.text", {"text": each}) if isinstance(each, str) else Remark.from_data(each)
         for each in noted
-    )  # sentences were kept before remarks were
-    return ColumnFile(tuple(schema.names), units, load, titles, remarks)
+    )
+    return ColumnFile(tuple(schema.names), units, load, titles, tuple(remarks))
 
 
 def _open_hdf5(file: str) -> ColumnFile:
@@ -435,13 +445,14 @@ READERS: dict[str, Callable[[str], ColumnFile]] = {
 
 def _vectors(file: str, arrays: Mapping[str, np.ndarray]) -> list[Column]:
     """Arrays, by the names of their columns, as vectors of one length."""
-    columns = [_vector(file, name, values) for name, values in arrays.items()]
-    for name, column in zip(arrays, columns, strict=True):
-        if len(column) != len(columns[0]):
-            fault = f"it has {len(column)} rows while column {next(iter(arrays))} has {len(columns[0])}"
+    columns = {name: _vector(file, name, values) for name, values in arrays.items()}
+    (first, other), *_ = columns.items()
+    for name, column in columns.items():
+        if len(column) != len(other):
+            fault = f"it has {len(column)} rows while column {first} has {len(other)}"
             remedy = "give all columns one value per sample, or name the columns to read"
             raise InputError(file, f"column {name}", fault, remedy)
-    return columns
+    return list(columns.values())
 
 
 def _vector(file: str, name: str, values: np.ndarray) -> Column:

@@ -31,6 +31,7 @@ from siq.data.recordings import (
     Recordings,
 )
 from siq.data.two_states import RecordStates, Switching, switching
+from siq.numerics.randomness import positive
 from siq.remarks import Remark, sentence
 
 if TYPE_CHECKING:
@@ -264,11 +265,6 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
         A file, a folder of files, recordings, or a table with the columns ``t``, the measured ones and, of
         several recordings, ``recording``.
 
-    Returns
-    -------
-    Inspection
-        With `text()` and `plot()`.
-
     Raises
     ------
     InputError
@@ -291,18 +287,16 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
     gaps = np.diff(recordings.t)[np.diff(recordings.recording) == 0]
     steps = _span(gaps) if len(gaps) else None
     near = 0 if steps is None else int((gaps <= LONGEST_STEP * steps.usual * (1 + 1e-6)).sum())
-    floors = noise_floors(recordings)
     states = []
-    for place, values in enumerate(recordings.values.T):
-        different = len(np.unique(values[:: max(len(values) // VALUES_SAMPLED, 1)]))
-        label = different < FEWEST_VALUES <= len(values) / MIN_REPETITIONS
-        states.append(
-            StateFacts(
-                recordings.names[place], recordings.titles[place], recordings.units[place],
-                float(values.min()), float(values.max()), resolution_step(values),
-                None if floors is None else floors[place], different if label else None,
-            )
-        )  # fmt: skip
+    floors = noise_floors(recordings) or (None,) * len(recordings.names)
+    columns = zip(
+        recordings.names, recordings.titles, recordings.units, recordings.values.T, floors, strict=True
+    )
+    for name, title, unit, x, noise in columns:
+        different = len(np.unique(x[:: max(len(x) // VALUES_SAMPLED, 1)]))
+        label = different if different < FEWEST_VALUES <= len(x) / MIN_REPETITIONS else None
+        low, high = float(x.min()), float(x.max())
+        states.append(StateFacts(name, title, unit, low, high, resolution_step(x), noise, label))
     memory = markov_lag(recordings)
     return Inspection(
         file=str(source) if isinstance(source, str | Path) else named,
@@ -326,8 +320,6 @@ def _span(values: np.ndarray | Sequence[float]) -> Span:
 def _coverage(values: np.ndarray) -> float:
     """Share of the cells over the range of one state or two that were visited."""
     low, high = np.quantile(values, [OUTLIER_SHARE, 1 - OUTLIER_SHARE], axis=0)
-    place = np.floor((values - low) / np.where(high > low, high - low, 1.0) * CELLS).astype(int)
-    inside = ((place >= 0) & (place < CELLS)).all(axis=1)
-    shape = (CELLS,) * values.shape[1]
-    counts = np.bincount(np.ravel_multi_index(tuple(place[inside].T), shape), minlength=np.prod(shape))
+    place = np.floor((values - low) / positive(high - low) * CELLS).astype(int)
+    counts, _ = np.histogramdd(place, bins=[np.arange(CELLS + 1) - 0.5] * place.shape[1])
     return float((counts >= VISITED_SAMPLES).mean())

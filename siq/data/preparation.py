@@ -47,16 +47,9 @@ def read_pairs(
     pair_step: float | None,
     hidden_velocities: bool = False,
 ) -> tuple[Recordings, SnapshotPairs]:
-    """Read recordings that something is to be learned from, and their pairs.
+    """Read recordings that something is to be learned from, and their pairs, see `snapshot_pairs`.
 
-    Parameters
-    ----------
-    path, states, units
-        See `read_recordings`.
-    pair_step
-        See `snapshot_pairs`.
-    hidden_velocities
-        Whether they are positions: these are smooth, however strong the process noise on velocities is.
+    With hidden velocities they are positions: smooth, however strong the process noise on velocities is.
 
     Raises
     ------
@@ -133,15 +126,8 @@ def in_stretches(recordings: Recordings, *, hidden_velocities: bool = False) -> 
 
     Stretches are ten correlation times long, hops included, where this makes between ten and forty of them.
     Several recordings come back as they are, and so does one of too few pairs, or without
-    process noise: a system that settles once is not seen again in another stretch.
-
-    Parameters
-    ----------
-    recordings
-        Trajectories.
-    hidden_velocities
-        Whether they are positions: these are smooth, however strong the process noise on velocities is, and
-        whether there are any is found together with f.
+    process noise: a system that settles once is not seen again in another stretch. With hidden velocities
+    they are positions, which are smooth in any case; whether there is noise is found together with f.
     """
     count = len(recordings.t)
     if len(recordings.labels) > 1 or count < 2 * FEWEST_STRETCHES:
@@ -168,25 +154,18 @@ def joined(recordings: Recordings) -> Recordings:
     What takes long, such as a hop or a memory, is not seen in a stretch: how long a record remembers, and how
     it hops, is asked of the record as a whole. Rows stay as they are.
     """
-    numbers = [_STRETCH_LABEL.fullmatch(label) for label in recordings.labels]
-    follows = [False] + [
-        one is not None
-        and other is not None
-        and (one["label"], one["of"], int(one["number"]) + 1)
-        == (other["label"], other["of"], int(other["number"]))
-        for one, other in pairwise(numbers)
-    ]
-    if not any(follows):
+    matches = [_STRETCH_LABEL.fullmatch(label) for label in recordings.labels]
+    parts = [(one["label"], one["of"], int(one["number"])) if one else (None, None, 0) for one in matches]
+    begins = np.array([True] + [
+        other[0] is None or (*one[:2], one[2] + 1) != other for one, other in pairwise(parts)
+    ])  # fmt: skip
+    if begins.all():
         return recordings
-    labels = tuple(
-        label if number is None else number["label"]
-        for label, number, later in zip(recordings.labels, numbers, follows, strict=True)
-        if not later
-    )
-    if len(set(labels)) < len(labels):  # of recordings drawn again, some may follow, and others not
-        labels = tuple(label for label, later in zip(recordings.labels, follows, strict=True) if not later)
-    whole = np.cumsum(~np.array(follows)) - 1
-    return replace(recordings, labels=labels, recording=whole[recordings.recording])
+    labels = [recordings.labels[place] for place in np.flatnonzero(begins)]
+    wholes = [parts[place][0] or recordings.labels[place] for place in np.flatnonzero(begins)]
+    # Of recordings drawn again, some may follow, and others not.
+    labels = wholes if len(set(wholes)) == len(wholes) else labels
+    return replace(recordings, labels=tuple(labels), recording=(np.cumsum(begins) - 1)[recordings.recording])
 
 
 def without_slow_drift(recordings: Recordings) -> Recordings:

@@ -107,13 +107,10 @@ class Recordings:
         Parameters
         ----------
         frame
-            With the columns ``t`` and the measured ones; units may stand behind the names (``x [mm]``), in
-            the metadata ``frame.attrs["units"]``, or in the cells. A table without the column
-            ``recording`` is one recording. An index called ``recording`` or ``t`` counts as a column.
-        columns
-            The measured columns wanted, in the order of the state vector; default all others.
-        units
-            Of the columns, ``t`` included. What the table says itself must agree.
+            As `read_recordings` reads a file; units may stand in the metadata ``frame.attrs["units"]``, too.
+            An index called ``recording`` or ``t`` counts as a column.
+        columns, units
+            See `read_recordings`; the units are those of columns that say none.
 
         Raises
         ------
@@ -159,12 +156,8 @@ class Recordings:
         values
             States. Shape ``(n, d)`` for one recording, ``(r, n, d)`` for r of one length, or one array
             ``(n_k, d)`` for each.
-        names
-            Of the d states.
-        units
-            Of each state; default not known.
-        time_unit
-            Of `t`.
+        names, units, time_unit
+            Of the d states, and of `t`; units are not known by default.
 
         Raises
         ------
@@ -212,11 +205,8 @@ class Recordings:
     def select(self, indices: Sequence[int] | np.ndarray) -> Recordings:
         """Whole recordings, in the order given.
 
-        Parameters
-        ----------
-        indices
-            Indices into `labels`, not of rows. One that stands twice gives copies, told apart by their
-            labels: ``r07``, ``r07#2``.
+        The indices are those of `labels`, not of rows. One that stands twice gives copies, told apart by
+        their labels: ``r07``, ``r07#2``.
 
         Raises
         ------
@@ -343,19 +333,8 @@ def read_recordings(
 def write_recordings(path: str | Path, recordings: Recordings) -> None:
     """Write recordings as Parquet; `read_recordings` gives them back to the last bit.
 
-    The file appears complete or not at all, and the same recordings give the same bytes.
-
-    Parameters
-    ----------
-    path
-        A file named ``.parquet``; one that exists is replaced.
-    recordings
-        What to write.
-
-    Raises
-    ------
-    ValueError
-        When the path has another suffix.
+    The file appears complete or not at all, and the same recordings give the same bytes. One that exists is
+    replaced. Raises ValueError when its suffix is not ``.parquet``.
     """
     import pyarrow as pa
     from pyarrow import parquet
@@ -385,20 +364,10 @@ def write_recordings(path: str | Path, recordings: Recordings) -> None:
 
 
 def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) -> SnapshotPairs:
-    """Pair every sample with the next one of the same recording.
+    """Pair every sample with the next one of the same recording; raises ValueError when no pair results.
 
-    Parameters
-    ----------
-    recordings
-        The trajectories.
-    pair_step
-        The longest gap that still makes a pair, in the unit of `t`; by default `LONGEST_STEP` median steps.
-        This is a limit, not the step h of the pairs, of which each has its own.
-
-    Raises
-    ------
-    ValueError
-        When no pair results.
+    The pair step is the longest gap that still makes a pair, in the unit of `t`; by default `LONGEST_STEP`
+    median steps. It is a limit, not the step h of the pairs, of which each has its own.
     """
     if pair_step is not None and not pair_step > 0:
         raise ValueError(f"pair_step is {pair_step}, but it must be positive")
@@ -424,18 +393,7 @@ def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) ->
 
 @lru_cache(maxsize=16)
 def parent_recordings(labels: tuple[str, ...]) -> np.ndarray:
-    """Index of the recording that each is, or is a copy of: ``r07#2`` is a copy where there is an ``r07``.
-
-    Parameters
-    ----------
-    labels
-        The labels of all recordings, k of them.
-
-    Returns
-    -------
-    numpy.ndarray
-        Shape ``(k,)``, indices into `labels`.
-    """
+    """Index into labels of the recording that each is, or is a copy of: ``r07#2`` is one of ``r07``."""
     position = {label: index for index, label in enumerate(labels)}
     parents = []
     for label in labels:

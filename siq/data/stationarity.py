@@ -39,12 +39,7 @@ def usual_step(recordings: Recordings) -> float:
 def runs_of(recordings: Recordings, *, longest: float | None = None) -> list[slice]:
     """Rows of one recording without a gap between them, each a slice.
 
-    Parameters
-    ----------
-    recordings
-        Trajectories.
-    longest
-        Time between samples that is no gap yet; by default `LONGEST_STEP` median steps.
+    A time between samples is a gap beyond the longest, by default `LONGEST_STEP` median steps.
     """
     if longest is None:
         longest = LONGEST_STEP * usual_step(recordings)
@@ -64,15 +59,7 @@ def stretches_of(runs: list[slice], length: int, *, most: int | None = None) -> 
 
 
 def relaxation_samples(values: np.ndarray, runs: list[slice]) -> float | None:
-    """The local relaxation time in samples; None where no stretch is long enough to tell.
-
-    Parameters
-    ----------
-    values
-        Shape ``(n,)``.
-    runs
-        See `runs_of`.
-    """
+    """The local relaxation time in samples; None where no stretch is long enough to tell."""
     length, longest = SHORTEST_STRETCH, max((run.stop - run.start for run in runs), default=0)
     times = []
     while length <= longest:
@@ -145,29 +132,15 @@ def correlated_samples(values: np.ndarray, runs: list[slice]) -> float:
 def background_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, int]:
     """The slow drift of a series, common to all that it does: of a hopping record, less its levels.
 
-    Every recording has cosines of its own, ``cos(πkt/T)`` with k from 1 to the number of half periods.
-
-    Parameters
-    ----------
-    recordings
-        Whose times and divisions these are.
-    values
-        Shape ``(n,)``.
-
-    Returns
-    -------
-    drift
-        Shape ``(n,)``, less its mean over the record; zero where none is seen.
-    half_periods
-        How many the fastest cosine has in a recording; 0 where none is seen.
+    Every recording has cosines of its own, ``cos(πkt/T)`` with k from 1 to the number of half periods. Gives
+    the drift ``(n,)``, less its mean over the record, and how many half periods the fastest cosine has in a
+    recording; both are zero where none is seen.
     """
-    runs = runs_of(recordings)
-    nothing = (np.zeros(len(values)), 0)
-    best, found = 0.0, nothing
+    runs, counts = runs_of(recordings), np.bincount(recordings.recording)
+    best, found = 0.0, (np.zeros(len(values)), 0)
     spread = float(np.var(values))
     if spread <= 0:
-        return nothing
-    counts = np.bincount(recordings.recording)
+        return found
     for half_periods in range(1, MOST_HALF_PERIODS + 1):
         fitted = _slow(recordings, values, half_periods)
         rest = values - fitted
@@ -238,22 +211,10 @@ def even_stretches(recordings: Recordings) -> Stretches:
 
 
 def lagged_covariances(rest: np.ndarray, number: np.ndarray, most: int) -> np.ndarray:
-    """Covariances of what is left of steps with what is left of later ones.
+    """Covariances of what is left of steps, ``(n, d)`` with mean zero, with what is left of later ones.
 
-    Parameters
-    ----------
-    rest
-        Shape ``(n, d)``: what is left of each step, with mean zero.
-    number
-        Shape ``(n,)``: the stretch of each step, -1 for none. Steps of a stretch follow each other.
-    most
-        The longest lag.
-
-    Returns
-    -------
-    numpy.ndarray
-        Shape ``(most + 1, d, d)``: ``C[k, i, j]`` is the mean of ``rest[m, i] rest[m + k, j]``; zero where no
-        two steps are so far apart.
+    Steps of a stretch follow each other; `number` says of which each is, -1 for none. Shape ``(most + 1, d,
+    d)``: ``C[k, i, j]`` is the mean of ``rest[m, i] rest[m + k, j]``; zero where no two are so far apart.
     """
     d = rest.shape[1]
     covariances = np.zeros((most + 1, d, d))

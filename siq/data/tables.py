@@ -96,11 +96,10 @@ def _checked(
     faults: list[Fault] = []
     remarks = list(layout.remarks)
     for index, (name, place) in enumerate(zip(("t", *layout.names), used, strict=True)):
-        clock = _seconds_of_clock(file, called[0], cells[0]) if index == 0 else None
-        cell_unit: str | None = "s"
-        if clock is not None:
-            numbers[index] = clock[0]
-            remarks.append(Remark("data.seconds_of_clock", {"start": clock[1]}))
+        if index == 0 and (clock := _seconds_of_clock(file, called[0], cells[0])) is not None:
+            numbers[index], start = clock
+            cell_unit: str | None = "s"
+            remarks.append(Remark("data.seconds_of_clock", {"start": start}))
         else:
             shown = "t" if index == 0 else called[index]
             numbers[index], cell_unit, fault = _parse_numbers(file, shown, cells[index])
@@ -303,18 +302,14 @@ def _seconds_of_clock(file: str, name: str, cells: Column) -> tuple[np.ndarray, 
 
 def _trimmed(rows: _Rows, numbers: np.ndarray, remarks: list[Remark]) -> _Rows:
     """Without rows at the ends of recordings in which a number is missing, where two others are left."""
-    whole = ~np.isnan(numbers[:, rows.order]).any(axis=0)
-    place, count = np.arange(len(whole)), len(rows.labels)
-    first, last = np.full(count, len(whole)), np.full(count, -1)
-    np.minimum.at(first, rows.recording[whole], place[whole])
-    np.maximum.at(last, rows.recording[whole], place[whole])
-    inner = np.bincount(rows.recording[whole], minlength=count) >= 2
-    keep = (place >= first[rows.recording]) & (place <= last[rows.recording]) | ~inner[rows.recording]
-    dropped = int((~keep).sum())
-    if dropped == 0:
-        return rows
-    values = {"rows": dropped, "recordings": len(np.unique(rows.recording[~keep]))}
-    remarks.append(Remark("data.rows_at_ends", values))
+    whole = pd.Series(~np.isnan(numbers[:, rows.order]).any(axis=0))
+    after = whole.groupby(rows.recording).cummax()
+    before = whole[::-1].groupby(rows.recording[::-1]).cummax()
+    few = whole.groupby(rows.recording).transform("sum") < 2
+    keep = (after & before | few).to_numpy()
+    if not keep.all():
+        values = {"rows": int((~keep).sum()), "recordings": len(np.unique(rows.recording[~keep]))}
+        remarks.append(Remark("data.rows_at_ends", values))
     return _Rows(rows.order[keep], rows.recording[keep], rows.labels)
 
 
@@ -333,20 +328,17 @@ def _without_gaps(rows: _Rows, numbers: np.ndarray, remarks: list[Remark]) -> _R
 
 
 def _refuse_missing(file: str, numbers: np.ndarray, rows: _Rows, called: Sequence[str]) -> None:
-    wrong = np.flatnonzero(np.isnan(numbers[:, rows.order]).any(axis=0))
-    if not len(wrong):
-        return
-    row = int(rows.order[wrong].min())
-    column = called[int(np.argmax(np.isnan(numbers[:, row])))]
+    wrong = rows.order[np.isnan(numbers[:, rows.order]).any(axis=0)]
     if len(wrong) == len(rows.order) and len(wrong) > 2:
         remedy = "interpolate all columns to the same times, or name the states in the study"
         raise InputError(file, "", "no row has a value in every column", remedy)
-    others, remedy = "", "remove the row or write a finite number"
-    if len(wrong) > 1:
-        others = f", as in {len(wrong) - 1} more row{'s' if len(wrong) > 2 else ''}"
-        remedy = "remove these rows or write finite numbers"
-    fault = f"the value is missing (empty or NaN){others}"
-    raise InputError(file, f"row {row + 1}, column {column}", fault, remedy)
+    if len(wrong):
+        place = f"row {wrong.min() + 1}, column {called[int(np.argmax(np.isnan(numbers[:, wrong.min()])))]}"
+        fault, remedy = "the value is missing (empty or NaN)", "remove the row or write a finite number"
+        if len(wrong) > 1:
+            fault += f", as in {len(wrong) - 1} more row{'s' if len(wrong) > 2 else ''}"
+            remedy = "remove these rows or write finite numbers"
+        raise InputError(file, place, fault, remedy)
 
 
 def _in_order(rows: _Rows, numbers: np.ndarray, labelled: bool, remarks: list[Remark]) -> _Rows:
@@ -381,12 +373,8 @@ def _in_order(rows: _Rows, numbers: np.ndarray, labelled: bool, remarks: list[Re
             twice += len(piece) - len(once)
             parts.append(once)
             labels.append(label if len(pieces) == 1 else f"{label}/{number}" if label != "0" else str(number))
-    counted = (
-        Remark("data.rows_sorted", {"count": was_sorted}),
-        Remark("data.time_starts_over", {"count": begun}),
-        Remark("data.rows_twice", {"count": twice}),
-    )
-    remarks += [remark for remark in counted if remark.values["count"]]
+    counted = {"rows_sorted": was_sorted, "time_starts_over": begun, "rows_twice": twice}
+    remarks += [Remark(f"data.{code}", {"count": count}) for code, count in counted.items() if count]
     lengths = [len(part) for part in parts]
     return _Rows(np.concatenate(parts), np.repeat(np.arange(len(parts)), lengths), tuple(labels))
 
@@ -400,23 +388,10 @@ def _once(rows: np.ndarray, numbers: np.ndarray) -> np.ndarray:
 def check_times(
     file: str, t: np.ndarray, recording: np.ndarray, labels: tuple[str, ...], rows: np.ndarray
 ) -> None:
-    """Refuse times that do not increase within every recording.
+    """Refuse times that do not increase within every recording, and recordings of one row each.
 
-    Parameters
-    ----------
-    file
-        The file, for messages.
-    t, recording
-        Shape ``(n,)``: the time and the recording of each row; the rows of a recording stand together.
-    labels
-        The label of each recording.
-    rows
-        Shape ``(n,)``: where each row stands in the file, counted from 0.
-
-    Raises
-    ------
-    InputError
-        For the first row of the file whose time is repeated or earlier, or when no recording has two rows.
+    Time and recording have the shape ``(n,)``; the rows of a recording stand together. `rows` says where each
+    stands in the file, counted from 0: the first row at fault is named.
     """
     same = recording[1:] == recording[:-1]
     if not same.any():
@@ -449,17 +424,13 @@ def _joined(files: Sequence[Path], tables: Sequence[Recordings], folder: str) ->
             raise InputError(str(file), "", fault, remedy)
         stem = file.name if stems.count(file.stem) > 1 else file.stem
         labels += [stem] if len(table.labels) == 1 else [f"{stem}/{label}" for label in table.labels]
-    orders = [[table.names.index(name) for name in first.names] for table in tables]
-
-    def agreed(name: str, stated: Sequence[str | None]) -> str | None:
-        return _agreed_unit(folder, name, dict(zip(names, stated, strict=True)), None)
-
-    units = tuple(
-        agreed(name, [table.units[order[index]] for table, order in zip(tables, orders, strict=True)])
-        for index, name in enumerate(first.names)
+    stated = [dict(zip(table.names, table.units, strict=True)) | {"t": table.time_unit} for table in tables]
+    *units, time_unit = (
+        _agreed_unit(folder, name, {file: each[name] for file, each in zip(names, stated, strict=True)}, None)
+        for name in (*first.names, "t")
     )
-    time_unit = agreed("t", [table.time_unit for table in tables])
-    starts = np.cumsum([0, *(len(table.labels) for table in tables)])
+    starts = np.cumsum([0, *(len(table.labels) for table in tables[:-1])])
+    lengths = [len(table.t) for table in tables]
     remarks = [Remark("data.folder", {"files": len(files), "recordings": len(labels)})]
     for text, remark in {sentence(each): each for table in tables for each in table.remarks}.items():
         having = sum(remark in table.remarks for table in tables)
@@ -467,13 +438,11 @@ def _joined(files: Sequence[Path], tables: Sequence[Recordings], folder: str) ->
         remarks.append(remark if having == len(tables) else Remark("data.in_some_files", values))
     return Recordings(
         names=first.names,
-        units=units,
+        units=tuple(units),
         labels=tuple(labels),
-        recording=np.concatenate(
-            [table.recording + start for table, start in zip(tables, starts, strict=False)]
-        ),
+        recording=np.concatenate([table.recording for table in tables]) + np.repeat(starts, lengths),
         t=np.concatenate([table.t for table in tables]),
-        values=np.concatenate([table.values[:, order] for table, order in zip(tables, orders, strict=True)]),
+        values=np.concatenate([table.values[:, [*map(table.names.index, first.names)]] for table in tables]),
         time_unit=time_unit,
         headings=first.headings,
         remarks=tuple(remarks),

@@ -63,12 +63,10 @@ def _two_levels(
         means = flat[begins[:, None] + np.arange(width)].mean(axis=1)
         first = np.append(True, np.diff(begins) != width)
         centre, spread, weights = _two_normals(means, first)
-        order = np.argsort(centre)
-        levels = (float(centre[order[0]]), float(centre[order[1]]))
-        share = np.full(len(values), np.nan)
-        share[begins[:, None] + np.arange(width)] = weights[:, order[1]][:, None]
-        known = np.isfinite(share)
-        share = np.interp(np.arange(len(share)), np.flatnonzero(known), share[known])
+        low, high = np.argsort(centre)
+        levels = (float(centre[low]), float(centre[high]))
+        known = (begins[:, None] + np.arange(width)).ravel()
+        share = np.interp(np.arange(len(values)), known, np.repeat(weights[:, high], width))
         found, number = background_of(recordings, values - (1 - share) * levels[0] - share * levels[1])
         unchanged = number == half_periods and np.abs(found - background).max() <= 0.01 * spread.min()
         background, half_periods = found, number
@@ -203,22 +201,11 @@ class DwellCount:
 
 def _counted_visits(values: np.ndarray, runs: list[slice], levels: tuple[float, float]) -> np.ndarray:
     """0 from where the lower level is reached, 1 from where the upper one is, -1 before: shape ``(n,)``."""
-    core = np.full(len(values), -1)
-    core[values <= levels[0]] = 0
-    core[values >= levels[1]] = 1
-    return continued_visits(core, runs)
+    return continued_visits(np.select([values >= levels[1], values <= levels[0]], [1, 0], -1), runs)
 
 
 def continued_visits(core: np.ndarray, runs: list[slice]) -> np.ndarray:
-    """Which core was entered last, at every sample of a run; -1 before the first.
-
-    Parameters
-    ----------
-    core
-        Shape ``(n,)``: the core that a sample lies in, -1 between them.
-    runs
-        See `siq.data.stationarity.runs_of`.
-    """
+    """Which core was entered last, at every sample of a run; a core ``(n,)`` is -1 where there is none."""
     visits = np.full(len(core), -1)
     for run in runs:
         part = core[run]
@@ -247,15 +234,11 @@ def _pushed_apart(values: np.ndarray, runs: list[slice], relaxation: float) -> t
     lag = max(int(LAG_SHARE * relaxation), 1)
     longest = sum(run.stop - run.start for run in runs) / (lag * FEWEST_STRETCHES) - 2
     rows = int(min(np.ceil(STRETCH_TIMES * relaxation / lag), longest))
-    begins = (
-        stretches_of(runs, (rows + 2) * lag, most=MOST_STRETCHES)
-        if rows * lag >= SHORTEST_TIMES * relaxation
-        else np.zeros(0)
-    )
-    if len(begins) < FEWEST_STRETCHES - 2:  # gaps cost some
-        return None
     low, high = np.quantile(values, [0.001, 0.999])
-    if not high > low:
+    if rows * lag < SHORTEST_TIMES * relaxation or not high > low:
+        return None
+    begins = stretches_of(runs, (rows + 2) * lag, most=MOST_STRETCHES)
+    if len(begins) < FEWEST_STRETCHES - 2:  # gaps cost some
         return None
     scaled = 2 * (values - low) / (high - low) - 1
     at = begins[:, None] + lag * np.arange(rows)
@@ -402,11 +385,6 @@ def switching(recordings: Recordings) -> Switching | None:
 
     Every state is looked at by itself, and the one in which the record is pushed apart most clearly is taken.
     Whether two are supported at all is `Switching.supported`.
-
-    Parameters
-    ----------
-    recordings
-        Trajectories, of any number.
 
     Examples
     --------

@@ -6,8 +6,7 @@ built, a key that stands twice is refused, and whatever the schema refuses is to
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,17 +23,8 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     """A temporary path beside `path` that takes its place once the block has ended without an error.
 
     A killed process leaves the old file, or none, and perhaps the temporary one, which the next attempt
-    overwrites. The folder is made if need be.
-
-    Parameters
-    ----------
-    path
-        The file to be written.
-
-    Yields
-    ------
-    pathlib.Path
-        Where to write; it keeps the suffix of `path`, which some writers choose their format by.
+    overwrites. The folder is made if need be. The temporary path keeps the suffix, by which some writers
+    choose their format.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -78,12 +68,7 @@ class Document:
 
 
 def read_document(path: str | Path) -> Document:
-    """Read a YAML mapping and the lines of its entries.
-
-    Parameters
-    ----------
-    path
-        A UTF-8 YAML file whose top level is a mapping.
+    """Read a YAML mapping, in UTF-8, and the lines of its entries.
 
     Raises
     ------
@@ -94,18 +79,17 @@ def read_document(path: str | Path) -> Document:
     try:
         text = Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or type(error).__name__
         raise InputError(
-            file, "", f"it cannot be read ({_reason(error)})", "check the name and permissions"
+            file, "", f"it cannot be read ({reason})", "check the name and permissions"
         ) from None
     try:
         loader = _loader_of(text)
         for event in yaml.parse(text, Loader=loader):
             if isinstance(event, yaml.AliasEvent):  # may refer to itself, or multiply without bound
+                place = f"line {event.start_mark.line + 1}" if event.start_mark else ""
                 raise InputError(
-                    file,
-                    f"line {event.start_mark.line + 1}" if event.start_mark else "",
-                    f"the alias '*{event.anchor}' is not allowed",
-                    "write the value out",
+                    file, place, f"the alias '*{event.anchor}' is not allowed", "write the value out"
                 )
         root = yaml.compose(text, Loader=loader)
         data = yaml.load(text, Loader=loader)
@@ -114,14 +98,11 @@ def read_document(path: str | Path) -> Document:
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         place = f"line {mark.line + 1}" if mark is not None else ""
-        problem = getattr(error, "problem", None) or "an entry cannot be read"
-        raise InputError(
-            file, place, f"it is not valid YAML ({problem})", "correct the syntax or the indentation"
-        ) from None
+        fault = f"it is not valid YAML ({getattr(error, 'problem', None) or 'an entry cannot be read'})"
+        raise InputError(file, place, fault, "correct the syntax or the indentation") from None
     if not isinstance(data, dict) or root is None:
-        raise InputError(
-            file, "line 1", "the file is not a mapping of keys to values", "write it as 'key: value' lines"
-        )
+        fault = "the file is not a mapping of keys to values"
+        raise InputError(file, "line 1", fault, "write it as 'key: value' lines")
     lines: dict[Keys, int] = {}
     _collect_lines(file, root, (), lines)
     return Document(file=file, data=data, lines=lines)
@@ -155,33 +136,32 @@ def validate(document: Document, model: type[Model]) -> Model:
     # The loc of a union member ends in the member's name; the document has no such entry.
     while len(keys) > 1 and keys not in document.lines and first["type"] not in ("missing",):
         keys = keys[:-1]
-    fault, remedy = _explain(first, keys, model)
-    raise InputError(document.file, document.place(keys), fault, remedy)
-
-
-def _explain(error: Any, keys: Keys, model: type[BaseModel]) -> tuple[str, str]:
     name = keys[-1] if keys else ""
-    kind = error["type"]
-    if kind in UNKNOWN_KEY:
+    if first["type"] in UNKNOWN_KEY:
         known = _known_keys(model, keys[:-1])
         otherwise = f"remove it or use one of {', '.join(sorted(known))}"
-        return f"the key '{name}' is unknown", suggestion(str(name), known, otherwise=otherwise)
-    if kind in ("missing", "missing_argument"):
-        return f"the key '{name}' is missing", f"add '{name}: ...'"
-    cause = error.get("ctx", {}).get("error")
-    if isinstance(cause, Fault):  # a validator of ours
-        return cause.fault, cause.remedy
-    message = error["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")
-    message = message[:1].lower() + message[1:]
-    return f"the value {error['input']!r} cannot be used", message.rstrip(".")
+        fault = Fault(f"the key '{name}' is unknown", suggestion(str(name), known, otherwise=otherwise))
+    elif first["type"] in ("missing", "missing_argument"):
+        fault = Fault(f"the key '{name}' is missing", f"add '{name}: ...'")
+    else:
+        cause = first.get("ctx", {}).get("error")
+        message = first["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ").rstrip(".")
+        remedy = message[:1].lower() + message[1:]
+        ours = isinstance(cause, Fault)
+        fault = cause if ours else Fault(f"the value {first['input']!r} cannot be used", remedy)
+    raise fault.at(document.file, document.place(keys))
 
 
 def _known_keys(model: Any, keys: Keys) -> list[str]:
     schema = model.model_json_schema()
+
+    def options_of(node: dict[str, Any]) -> list[dict[str, Any]]:
+        options = [node, *node.get("anyOf", []), *node.get("allOf", [])]
+        return [_resolve(schema, option) for option in options]
+
     node = schema
     for key in keys:
-        options = [node, *node.get("anyOf", []), *node.get("allOf", [])]
-        options = [_resolve(schema, option) for option in options]
+        options = options_of(node)
         found = [option["properties"][key] for option in options if key in option.get("properties", {})]
         # Entries of a mapping of names, such as the states of a card, share one schema.
         found += [option["additionalProperties"] for option in options if option.get("additionalProperties")]
@@ -191,8 +171,7 @@ def _known_keys(model: Any, keys: Keys) -> list[str]:
         if not found:
             return []
         node = found[0]
-    options = [_resolve(schema, option) for option in [node, *node.get("anyOf", []), *node.get("allOf", [])]]
-    return [name for option in options for name in option.get("properties", {})]
+    return [name for option in options_of(node) for name in option.get("properties", {})]
 
 
 def _resolve(schema: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
@@ -205,24 +184,17 @@ def _collect_lines(file: str, node: yaml.Node, keys: Keys, lines: dict[Keys, int
     if isinstance(node, yaml.MappingNode):
         for key_node, value_node in node.value:
             path = (*keys, key_node.value)
+            line = key_node.start_mark.line + 1
             if path in lines:
-                raise InputError(
-                    file,
-                    f"line {key_node.start_mark.line + 1}",
-                    f"the key '{key_node.value}' stands twice (first on line {lines[path]})",
-                    "keep one of the two",
-                )
-            lines[path] = key_node.start_mark.line + 1
+                fault = f"the key '{key_node.value}' stands twice (first on line {lines[path]})"
+                raise InputError(file, f"line {line}", fault, "keep one of the two")
+            lines[path] = line
             _collect_lines(file, value_node, path, lines)
     elif isinstance(node, yaml.SequenceNode):
         for index, value_node in enumerate(node.value):
             path = (*keys, index)
             lines[path] = value_node.start_mark.line + 1
             _collect_lines(file, value_node, path, lines)
-
-
-def _reason(error: Exception) -> str:
-    return getattr(error, "strerror", None) or type(error).__name__
 
 
 SUFFIXES = (".parquet", ".csv", ".tsv", ".txt", ".dat", ".h5", ".hdf5", ".mat", ".npz", ".npy")
@@ -244,28 +216,6 @@ def case_folders(folder: Path) -> dict[str, Path]:
     }
 
 
-def missing_file(file: str, looked_at: Sequence[Path]) -> InputError:
-    """What to say of a file as the user named it: where it was looked for, and what has nearly its name."""
-    places = list(dict.fromkeys(str(path.absolute()) for path in looked_at))
-    fault = f"No such file; it was looked for at {' and at '.join(places)}"
-    for path in looked_at:
-        folder = path.parent
-        if not folder.is_dir():
-            continue
-        names = {
-            each.name.casefold(): each.name for each in folder.iterdir() if not each.name.startswith(".")
-        }
-        near = difflib.get_close_matches(path.name.casefold(), names, n=1)
-        near = near or [name for name in names if Path(name).stem == path.stem.casefold()]
-        if near:
-            return InputError(file, "", fault, f"perhaps you meant '{folder / names[near[0]]}'")
-    missing = next((path.parent for path in looked_at if not path.parent.is_dir()), None)
-    remedy = (
-        f"there is no folder '{missing}' either" if missing is not None else "check the name and the folder"
-    )
-    return InputError(file, "", fault, remedy)
-
-
 def files_of(folder: Path) -> list[Path]:
     """The files of recordings in a folder, in the order of their names, without hidden and unreadable ones.
 
@@ -281,8 +231,6 @@ def files_of(folder: Path) -> list[Path]:
         and path.stem.casefold() not in ("readme", "notes", "license")
     )  # fmt: skip
     if not found:
-        raise InputError(
-            str(folder), "", "the folder holds no recordings",
-            f"put one file per recording into it, with one of the suffixes {', '.join(SUFFIXES)}",
-        )  # fmt: skip
+        remedy = f"put one file per recording into it, with one of the suffixes {', '.join(SUFFIXES)}"
+        raise InputError(folder, "", "the folder holds no recordings", remedy)
     return found

@@ -30,28 +30,11 @@ ORDER = 8  # of the rule
 def dormand_prince_step(
     rates: Rates, state: np.ndarray, step: np.ndarray, *, first: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Advance every row by its own step with the rule of Dormand and Prince of order 8.
+    """Advance every row by its own step ``(n,)`` with the rule of Dormand and Prince of order 8.
 
-    Parameters
-    ----------
-    rates
-        Time derivative, row by row, not depending on time.
-    state
-        Shape ``(n, s)``.
-    step
-        Shape ``(n,)``, in time units.
-    first
-        The time derivative at `state`, where it is known.
-
-    Returns
-    -------
-    tuple
-        The new state, and the estimate of its local error by component, both of shape ``(n, s)``.
-
-    Notes
-    -----
-    The coefficients, and the estimate from embedded rules of order 5 and 3, are those of Hairer, Nørsett and
-    Wanner as `scipy.integrate.DOP853` holds them.
+    Gives the new state, and the estimate of its local error by component, both of shape ``(n, s)``. The
+    coefficients, and the estimate from embedded rules of order 5 and 3, are those of Hairer, Nørsett and
+    Wanner as `scipy.integrate.DOP853` holds them. `first` is the time derivative at the state, if known.
     """
     h = step[:, None]
     stages = np.empty((DOP853.n_stages + 1, state.size))
@@ -111,18 +94,10 @@ def runge_kutta_step(drift: Rates, x: np.ndarray, step: float | np.ndarray) -> n
 
 
 def euler_maruyama_step(drift: Rates, x: np.ndarray, step: float, increments: np.ndarray) -> np.ndarray:
-    """One step of the Euler–Maruyama rule, ``x + f(x) Δt + sqrt(ε) D^(1/2) ΔW``.
+    """One step of the Euler–Maruyama rule, ``x + f(x) Δt + sqrt(ε) D^(1/2) ΔW``, for states ``(d, n)``.
 
-    Parameters
-    ----------
-    drift, x
-        f of components ``(d, n)``, and states ``(d, n)``.
-    step
-        Time step Δt.
-    increments
-        ``sqrt(ε) D^(1/2) ΔW``, shape ``(d, n)``: the noise over the step, see `noise_source`. The rule is of
-        strong order 1 where the noise is additive, and of ½ where D depends on the state; its weak order is
-        1.
+    The increments ``sqrt(ε) D^(1/2) ΔW`` are the noise over the step, see `noise_source`. The rule is of
+    strong order 1 where the noise is additive, and of ½ where D depends on the state; its weak order is 1.
     """
     result = step * drift(x)
     result += x

@@ -35,19 +35,9 @@ class Purpose(StrEnum):
 
 
 def seed_sequence(seed: int, *keys: int | str) -> np.random.SeedSequence:
-    """The seed of one purpose within one run, independent of all others.
+    """The seed of one purpose within one run, of a study's seed and keys such as ``(3, Purpose.TRAINING)``.
 
-    Parameters
-    ----------
-    seed
-        The study's seed.
-    keys
-        The run's number and the purpose, such as ``(3, Purpose.TRAINING)``.
-
-    Returns
-    -------
-    numpy.random.SeedSequence
-        The same for the same arguments, whatever else a study draws and however many runs it has.
+    It is the same for the same arguments, whatever else a study draws and however many runs it has.
     """
     spawn_key = tuple(zlib.crc32(key.encode()) if isinstance(key, str) else key for key in keys)
     return np.random.SeedSequence(seed, spawn_key=spawn_key)
@@ -64,26 +54,10 @@ def normal_draws(
     """Draws from a normal distribution, of coordinates whose sizes differ by any factor.
 
     Coefficients of x and of x³ may differ by 10¹⁴ in the unit of a recording. The covariance is therefore
-    taken apart as standard deviations and correlations, of which eigenvalues can be told from rounding.
-
-    Parameters
-    ----------
-    mean
-        Shape ``(p,)``.
-    covariance
-        Shape ``(p, p)``; coordinates without variance stay at their mean.
-    count
-        So many draws.
-    generator
-        Where they come from.
-
-    Returns
-    -------
-    numpy.ndarray
-        Shape ``(count, p)``.
+    taken apart as standard deviations and correlations, of which eigenvalues can be told from rounding. Of
+    a mean ``(p,)`` the draws have the shape ``(count, p)``; coordinates without variance stay there.
     """
-    deviation = np.sqrt(np.diag(covariance))
-    scale = np.where(deviation > 0, deviation, 1.0)
+    scale = positive(np.sqrt(np.diag(covariance)))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     drawn = generator.standard_normal((count, len(mean)))
@@ -98,27 +72,12 @@ def positive(sizes: np.ndarray) -> np.ndarray:
 def representative_subset(
     points: np.ndarray, *, distance: float, generator: np.random.Generator
 ) -> np.ndarray:
-    """Indices of a random subset whose points are pairwise at least `distance` apart.
+    """Sorted indices of a random subset of points ``(n, d)`` that are pairwise at least `distance` apart.
 
-    Parameters
-    ----------
-    points
-        Shape ``(n, d)``, any dimension.
-    distance
-        r of the paper, Euclidean, in the units of the points.
-    generator
-        Decides the order in which points are visited.
-
-    Returns
-    -------
-    numpy.ndarray
-        Sorted indices of the points kept. Every point left out lies closer than `distance` to a kept one.
-
-    Notes
-    -----
-    Visiting all points one by one is slow where they crowd. Points are therefore first offered in
-    batches, of which only those that are the earliest in the random order among their neighbours are
-    kept; the result is exactly that of the sequential visit.
+    The distance is Euclidean, r of the paper. Every point left out lies closer to a kept one; the generator
+    decides the order in which points are visited. Visiting all of them one by one is slow where they crowd.
+    They are therefore first offered in batches, of which only those that are the earliest in the random order
+    among their neighbours are kept; the result is exactly that of the sequential visit.
     """
     if not distance > 0:
         raise ValueError(f"the thinning distance is {distance}; give a positive number")

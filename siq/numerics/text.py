@@ -28,17 +28,7 @@ MINUS = "−"
 def number_text(value: float, *, decimals: int = 3) -> str:
     """Write a number with so many decimals, or as ``m × 10ᵉ`` where those would hide or feign digits.
 
-    Parameters
-    ----------
-    value
-        The number.
-    decimals
-        Decimals of the plain number, or of the mantissa m.
-
-    Returns
-    -------
-    str
-        Such as ``"−2.001"``, ``"4.500 × 10⁻⁴"``; ``"—"`` for a missing value.
+    Such as ``"−2.001"``, ``"4.500 × 10⁻⁴"``; ``"—"`` for a missing value.
     """
     if math.isnan(value):
         return "—"
@@ -52,15 +42,7 @@ def number_text(value: float, *, decimals: int = 3) -> str:
 
 
 def mantissa_and_exponent(magnitude: float, decimals: int) -> tuple[str, int]:
-    """Write a positive number as m × 10ᵉ: m with so many decimals, and e, which is 0 for a plain number.
-
-    Parameters
-    ----------
-    magnitude
-        The number without its sign.
-    decimals
-        Decimals of m.
-    """
+    """Write a positive number as m × 10ᵉ: m with so many decimals, and e, which is 0 for a plain number."""
     # Two significant digits are the least that says anything about a coefficient.
     if magnitude == 0 or 10.0 ** (1 - decimals) <= magnitude < LARGEST_PLAIN_NUMBER:
         return f"{magnitude:.{decimals}f}", 0
@@ -73,13 +55,7 @@ SMALLEST_P = 1e-12  # below which the tail of a distribution tells nothing about
 
 
 def percent(share: float) -> str:
-    """Write a share in words that do not round it to all or nothing: ``99.97 %``, ``more than 99.9 %``.
-
-    Parameters
-    ----------
-    share
-        Between 0 and 1.
-    """
+    """Write a share in words that do not round it to all or nothing: ``99.97 %``, ``more than 99.9 %``."""
     if share <= 0:
         return "none"
     if share >= 1:
@@ -97,10 +73,7 @@ def p_text(p: float) -> str:
     """Write a p-value: ``0.034``, ``2.9 × 10⁻³``, ``less than 10⁻¹²``."""
     if p < SMALLEST_P:
         return "less than 10⁻¹²"
-    if p >= 0.01:
-        return f"{p:.2g}"
-    mantissa, power = f"{p:.1e}".split("e")
-    return f"{mantissa} × 10{str(int(power)).translate(SUPERSCRIPTS)}"
+    return f"{p:.2g}" if p >= 0.01 else number_text(p, decimals=1)
 
 
 def p_equation(p: float) -> str:
@@ -117,20 +90,9 @@ def value_text(
 ) -> str:
     """Write a value with its standard error, both to the digits that the error leaves.
 
-    Parameters
-    ----------
-    value, error
-        The value and its standard error; None or NaN where it is not known.
-    unit
-        As `unit_text` takes it.
-    digits
-        Significant digits of a value without an error.
-
-    Returns
-    -------
-    str
-        Such as ``"1.115 ± 0.031 µm"`` or ``"(1.047 ± 0.012) × 10⁻⁸"``. An error that does not reach the
-        fourth digit of the value is not written, and neither is one that is not known.
+    Such as ``"1.115 ± 0.031 µm"`` or ``"(1.047 ± 0.012) × 10⁻⁸"``. An error that does not reach the fourth
+    digit of the value is not written, and neither is one that is not known (None or NaN); the value then has
+    so many significant digits.
 
     Examples
     --------
@@ -215,10 +177,7 @@ def _two_digits(value: float) -> str:
 def unit_text(unit: str | None) -> str:
     """A unit as it is printed: ``um^2/s`` as µm²/s, ``s**(-1)`` as 1/s; nothing for ``1``.
 
-    Parameters
-    ----------
-    unit
-        As cards and headings have it. What is no product of powers is kept as it is.
+    What is no product of powers is kept as it is.
 
     Examples
     --------

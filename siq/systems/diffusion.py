@@ -20,6 +20,7 @@ import sympy
 from scipy.linalg import solve_triangular
 
 from siq.errors import Fault, NumericalFailure
+from siq.numerics.randomness import positive
 from siq.systems.formulas import compile_formulas, exact_number, parse_formula
 
 ROUNDING = 1e-12  # of numbers of size one, and some products of them
@@ -127,7 +128,7 @@ class Diffusion:
     @property
     def scale(self) -> np.ndarray:
         """√D_ii, shape ``(d,)``: the unit of each state in which its noise is one; 1 where there is none."""
-        return np.sqrt(np.where(np.diag(self.matrix) > 0, np.diag(self.matrix), 1.0))
+        return np.sqrt(positive(np.diag(self.matrix)))
 
     @cached_property
     def root(self) -> np.ndarray:
@@ -217,7 +218,7 @@ class Diffusion:
         if not np.isfinite(root).all():
             lowest = np.full(len(x), -np.inf)  # eigenvalues, in units in which the diagonal is one
             for k in np.flatnonzero(np.isfinite(matrices).all(axis=(1, 2))):
-                scale = np.sqrt(np.where(np.diag(matrices[k]) > 0, np.diag(matrices[k]), 1.0))
+                scale = np.sqrt(positive(np.diag(matrices[k])))
                 lowest[k] = np.linalg.eigvalsh(matrices[k] / np.outer(scale, scale))[0]
             raise _indefinite(x[np.argmin(lowest)])
         return root
@@ -282,7 +283,7 @@ class _Constant(Diffusion):
         matrix = np.asarray(matrix, dtype=float)
         if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
             raise Fault("the diffusion is not a square matrix", "give one row and one column a state")
-        scale = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
+        scale = np.sqrt(positive(np.diag(matrix)))
         scaled = matrix / np.outer(scale, scale)
         if not np.isfinite(scaled).all() or np.abs(scaled - scaled.T).max() > ROUNDING:
             raise Fault("the diffusion is not symmetric", "correct the matrix")

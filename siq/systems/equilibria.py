@@ -32,6 +32,7 @@ import scipy.linalg
 from scipy.stats import qmc
 
 from siq.errors import NumericalFailure
+from siq.numerics.randomness import positive
 from siq.remarks import Remark
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -117,7 +118,7 @@ def distinct_roots(
     from them.
     """
     low, high = box.T
-    width = np.where(high > low, high - low, 1.0)
+    width = positive(high - low)
     x = _newton(dynamics, starts, low, width, known)
     if known:
         x = _newton(dynamics, x, low, width, ())
@@ -173,14 +174,14 @@ def _classified(
     dynamics: _VectorField, positions: Sequence[np.ndarray], box: np.ndarray, rate: float
 ) -> list[Equilibrium]:
     """Equilibria at positions, by these along the first state."""
-    width = np.where(box[:, 1] > box[:, 0], box[:, 1] - box[:, 0], 1.0)
+    width = positive(np.ptp(box, axis=1))
     ordered = sorted(positions, key=lambda position: tuple(np.round(position / width, 6)))
     return [classify(dynamics, position, rate=rate) for position in ordered]
 
 
 def crossing_rate(dynamics: _VectorField, points: np.ndarray, width: np.ndarray) -> float:
     """At which f crosses a box of a width, per unit of time: the median over points ``(n, d)``."""
-    speed = np.linalg.norm(dynamics.drift(points) / np.where(width > 0, width, 1.0), axis=1)
+    speed = np.linalg.norm(dynamics.drift(points) / positive(width), axis=1)
     return float(np.median(speed))
 
 

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
-from siq.numerics.randomness import representative_subset
+from siq.numerics.randomness import positive, representative_subset
 from siq.remarks import Remark
 from siq.systems.basins import (
     Basin,
@@ -159,7 +159,7 @@ def evenly_spread(x: np.ndarray, *, generator: np.random.Generator) -> np.ndarra
     """
     width, dimension = np.ptp(x, axis=0), x.shape[1]
     rows = representative_subset(
-        x / np.where(width > 0, width, 1.0),
+        x / positive(width),
         distance=max(SPACING ** max(1.0, 2 / dimension), 0.5 * MOST_SPREAD ** (-1 / dimension)),
         generator=generator,
     )
@@ -194,7 +194,7 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
         box = dynamics.box
         count = min(DOMAIN_STARTS * 2 ** max(d - 2, 0), MAX_DOMAIN_STARTS)
         points = spread_evenly(box, count if searched else INDEPENDENT_STARTS, generator=generator)
-    width = np.where(np.ptp(box, axis=1) > 0, np.ptp(box, axis=1), 1.0)
+    width = positive(np.ptp(box, axis=1))
     if not recorded and not searched:
         # Of many independent states the mean is always about the same: some have all states high, or low.
         alike = np.linspace(0, 1, DIAGONAL_STARTS)[:, None] * width + box[:, 0]
@@ -446,7 +446,7 @@ class RecordedRegion:
     """
 
     def __init__(self, states: np.ndarray, elsewhere: np.ndarray | None, width: np.ndarray) -> None:
-        self._width = np.where(width > 0, width, 1.0)
+        self._width = positive(width)
         places = states / self._width
         self._tree = cKDTree(places)
         # Of the 2d-th neighbour: states on one descent lie closer to each other than descents do.

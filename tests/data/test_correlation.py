@@ -5,9 +5,9 @@ import pytest
 from remembering import STEP, double_wells, trap
 
 from siq.data.correlation import (
+    Kind,
     MarkovLag,
-    _coloured_displacement,
-    _exposure_displacement,
+    _displacement,
     _increment_covariances,
     markov_lag,
 )
@@ -129,14 +129,15 @@ def test_long_run_covariance_is_that_of_sums() -> None:
     assert long_run_covariance(covariances, 2)[0, 0] == pytest.approx(1.75**2, rel=0.02)
 
 
-@pytest.mark.parametrize("move", [_exposure_displacement, _coloured_displacement])
-def test_displacements_are_those_of_simulated_forces(move: object) -> None:
+@pytest.mark.parametrize("kind", ["blur", "coloured"])
+def test_displacements_are_those_of_simulated_forces(kind: Kind) -> None:
     """Over long times all of σ² is seen, and without a memory nothing is correlated."""
-    own = _increment_covariances(move(np.arange(400), 3.0))  # type: ignore[operator]
+    own = _increment_covariances(_displacement(kind, np.arange(400), 3.0))
     assert own[0] + 2 * own[1:].sum() == pytest.approx(1.0, abs=1e-9)
-    assert _increment_covariances(move(np.arange(5), 0.0)) == pytest.approx([1, 0, 0, 0])  # type: ignore[operator]
+    none = _increment_covariances(_displacement(kind, np.arange(5), 0.0))
+    assert none == pytest.approx([1, 0, 0, 0])
 
 
 def test_an_exposure_of_one_step_correlates_neighbours_by_a_quarter() -> None:
-    own = _increment_covariances(_exposure_displacement(np.arange(5), 1.0))
+    own = _increment_covariances(_displacement("blur", np.arange(5), 1.0))
     assert own == pytest.approx([2 / 3, 1 / 6, 0, 0])
