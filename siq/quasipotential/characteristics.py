@@ -45,25 +45,85 @@ Function = Callable[[np.ndarray], np.ndarray]
 norm = partial(np.linalg.norm, axis=1)
 
 
-class HamiltonianFlow:
+class ScaledSystem:
+    """f, D and Hamilton's equations of the states y, ``x = center + units y``, with actions in a `unit`.
+
+    Times are in units of ``1/rate``. A momentum q of y is ``p = unit units⁻ᵀ q`` of x, so that
+    ``ẏ = F + 2Dq`` and ``q̇ = -∂_y (q·F + q·Dq)`` with F and D, `noise`, in these units.
+    """
+
+    def __init__(
+        self, dynamics: Dynamics, center: np.ndarray, units: np.ndarray, *, unit: float, rate: float = 1.0
+    ) -> None:
+        self.dynamics, self.center, self.units, self.inverse = dynamics, center, units, np.linalg.inv(units)
+        self.unit, self.rate, self.dimension = unit, rate, dynamics.dimension
+        self.noise = dynamics.diffusion.in_units(center, units, unit / rate)
+
+    def points(self, y: np.ndarray) -> np.ndarray:
+        """x of y, ``(n, d)``."""
+        return self.center + y @ self.units.T
+
+    def scaled(self, x: np.ndarray) -> np.ndarray:
+        """y of x, ``(n, d)``."""
+        return np.asarray((x - self.center) @ self.inverse.T)
+
+    def momenta(self, q: np.ndarray) -> np.ndarray:
+        """p of q, ``(n, d)``."""
+        return np.asarray(self.unit * q @ self.inverse)
+
+    def slopes(self, p: np.ndarray) -> np.ndarray:
+        """q of p, ``(n, d)``."""
+        return np.asarray(p @ self.units / self.unit)
+
+    def curvatures(self, hessians: np.ndarray) -> np.ndarray:
+        """Second derivatives of V by y from those by x, ``(..., d, d)``."""
+        return np.asarray(self.units.T @ hessians @ self.units / self.unit)
+
+    def force(self, y: np.ndarray) -> np.ndarray:
+        """F at y, ``(n, d)``."""
+        return self.dynamics.drift(self.points(y)) @ self.inverse.T / self.rate
+
+    def jacobian(self, y: np.ndarray) -> np.ndarray:
+        """∂F/∂y, ``(n, d, d)``."""
+        return self.inverse @ self.dynamics.jacobian(self.points(y)) @ self.units / self.rate
+
+    def bend(self, y: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """``Σ_k q_k ∂²F_k + q·∂²D q``, the matrix before X in Ṗ: ``(n, d, d)``."""
+        second = self.dynamics.bend(self.points(y), q @ self.inverse / self.rate)
+        return np.asarray(self.units.T @ second @ self.units + self.noise.contract(y, q, 2))
+
+    def turned(self, y: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """``G_ik = ∂_k F_i + 2 ((∂_k D)q)_i``, ``(n, d, d)``."""
+        return self.jacobian(y) + 2 * self.noise.turn(y, q)
+
+    def pull(self, y: np.ndarray, q: np.ndarray, turned: np.ndarray | None = None) -> np.ndarray:
+        """q̇ at positions and momenta ``(n, d)``; `turned` where it is known."""
+        turned = self.turned(y, q) if turned is None else turned
+        # Of the slope of D the turn has twice as much.
+        return np.asarray(self.noise.contract(y, q, 1) - np.einsum("nij,ni->nj", turned, q))
+
+    def velocities(
+        self, y: np.ndarray, q: np.ndarray, turned: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """ẏ, q̇ and the rate of U at positions and momenta ``(n, d)``; `turned` where it is known."""
+        push = self.noise.push(y, q)
+        return self.force(y) + 2 * push, self.pull(y, q, turned), 2 * np.sum(q * push, axis=1)
+
+
+class HamiltonianFlow(ScaledSystem):
     """The equations in units in which M is the unit matrix and the level the unit sphere.
 
-    A row of a state is ``y, q, v, X, P``, of length ``2d + 1 + 2d²``, with ``x = A + units y``, ``units =
-    (2 level)^½ L⁻¹``, ``M = LᵀL``, ``p = (2 level)^½ Lᵀ q`` and ``V = level v`` (of V, not of U); X and P are
-    derivatives of y and q. Tolerances then mean the same for states of any size.
+    A row of a state is ``y, q, v, X, P``, of length ``2d + 1 + 2d²``, with ``units = (2 level)^½ L⁻¹``,
+    ``M = LᵀL`` and ``V = level v`` (of V, not of U); X and P are derivatives of y and q. Tolerances then mean
+    the same for states of any size.
     """
 
     def __init__(self, dynamics: Dynamics, center: np.ndarray, level: float) -> None:
-        self.dynamics, self.center, self.level = dynamics, center, level
-        self.dimension = dynamics.dimension
-        self.hessian = hessian_at(dynamics, center)
-        upper = np.linalg.cholesky(self.hessian).T
-        self.units = np.sqrt(2 * level) * np.linalg.inv(upper)
-        self.inverse = upper / np.sqrt(2 * level)
-        self.noise = dynamics.diffusion.in_units(center, self.units, 2 * level)
-        self.constant = dynamics.diffusion.constant
-        self.diffusion = self.noise.at(np.zeros((1, self.dimension)))
-        self.jacobian = self.inverse @ dynamics.jacobian(center[None])[0] @ self.units
+        self.level, self.hessian = level, hessian_at(dynamics, center)
+        units = np.sqrt(2 * level) * np.linalg.inv(np.linalg.cholesky(self.hessian).T)
+        super().__init__(dynamics, center, units, unit=2 * level)
+        rest = np.zeros((1, self.dimension))
+        self.relaxation, self.diffusion = self.jacobian(rest)[0], self.noise.at(rest)[0]
 
     def parts(self, state: np.ndarray) -> tuple[np.ndarray, ...]:
         """y, q, v, X, P of rows."""
@@ -74,66 +134,28 @@ class HamiltonianFlow:
     def rates(self, state: np.ndarray) -> np.ndarray:
         """Time derivative of rows."""
         y, q, _, x_tangents, p_tangents = self.parts(state)
-        x = self.points(y)
-        turned, diffusion, bend = self.linear(y, q, x)
+        turned = self.turned(y, q)
         new = np.empty_like(state)
         y_rate, q_rate, v_rate, x_rate, p_rate = self.parts(new)
-        y_rate[...], q_rate[...], v_rate[...] = self.velocities(y, q, turned, x)
-        x_rate[...] = turned @ x_tangents + 2 * diffusion @ p_tangents
-        p_rate[...] = -turned.transpose(0, 2, 1) @ p_tangents - bend @ x_tangents
+        y_rate[...], q_rate[...], v_rate[...] = self.velocities(y, q, turned)
+        x_rate[...] = turned @ x_tangents + 2 * self.noise.at(y) @ p_tangents
+        p_rate[...] = -turned.transpose(0, 2, 1) @ p_tangents - self.bend(y, q) @ x_tangents
         return new
-
-    def velocities(
-        self, y: np.ndarray, q: np.ndarray, turned: np.ndarray | None = None, x: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """ẏ, q̇ and v̇ at positions and momenta ``(n, d)``; `turned` as of `linear`, and x, where known."""
-        x = self.points(y) if x is None else x
-        force = self.dynamics.drift(x) @ self.inverse.T
-        push = (self.at(y) @ q[:, :, None])[:, :, 0]
-        if turned is None:
-            turned = self.inverse @ self.dynamics.jacobian(x) @ self.units
-            turned = turned if self.constant else turned + 2 * self.noise.turn(y, q)
-        pulled = -(turned.transpose(0, 2, 1) @ q[:, :, None])[:, :, 0]
-        if not self.constant:  # of which the turn has twice as much
-            pulled += self.noise.contract(y, q, 1)
-        return force + 2 * push, pulled, 2 * np.sum(q * push, axis=1)
-
-    def linear(
-        self, y: np.ndarray, q: np.ndarray, x: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """G, D and the matrix before X in Ṗ, at positions and momenta: ``(n, d, d)`` each; see `at`."""
-        x, p = self.points(y) if x is None else x, 2 * self.level * q @ self.inverse
-        turned = self.inverse @ self.dynamics.jacobian(x) @ self.units
-        bend = self.units.T @ self.dynamics.bend(x, p) @ self.units / (2 * self.level)
-        if self.constant:
-            return turned, self.at(y), bend
-        return turned + 2 * self.noise.turn(y, q), self.at(y), bend + self.noise.contract(y, q, 2)
-
-    def at(self, y: np.ndarray) -> np.ndarray:
-        """D at positions, ``(n, d, d)``; where it is the same everywhere, ``(1, d, d)``."""
-        if self.constant:
-            return self.diffusion
-        return self.noise.at(y)
-
-    def points(self, y: np.ndarray) -> np.ndarray:
-        """Points in the states' units."""
-        return self.center + y @ self.units.T
 
     def pack(self, x: np.ndarray, p: np.ndarray, values: np.ndarray, hessians: np.ndarray) -> np.ndarray:
         """States that start at points with given V and derivatives."""
         tangents = np.broadcast_to(np.eye(self.dimension), hessians.shape)
-        bends = self.units.T @ hessians @ self.units / (2 * self.level)
-        rows = [(x - self.center) @ self.inverse.T, p @ self.units / (2 * self.level)]
-        rows += [values[:, None] / self.level, tangents.reshape(len(x), -1), bends.reshape(len(x), -1)]
+        rows = [self.scaled(x), self.slopes(p), values[:, None] / self.level]
+        rows += [tangents.reshape(len(x), -1), self.curvatures(hessians).reshape(len(x), -1)]
         return self.orthonormal(np.concatenate(rows, axis=1))
 
     def unpack(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Points, momenta, V and its Hessians, in the units of the states."""
         y, q, v, x_tangents, p_tangents = self.parts(state)
         # A pseudoinverse, because at a caustic itself X is singular; that Hessian is not handed on.
-        bends = 2 * self.level * self.inverse.T @ (p_tangents @ np.linalg.pinv(x_tangents)) @ self.inverse
+        bends = self.unit * self.inverse.T @ (p_tangents @ np.linalg.pinv(x_tangents)) @ self.inverse
         bends = (bends + bends.transpose(0, 2, 1)) / 2
-        return self.points(y), 2 * self.level * q @ self.inverse, self.level * v, bends
+        return self.points(y), self.momenta(q), self.level * v, bends
 
     def orthonormal(self, state: np.ndarray) -> np.ndarray:
         """The same planes of tangents with orthonormal columns, which neither grow nor collapse."""
@@ -326,7 +348,7 @@ def characteristics(
     x = flow.center + np.sqrt(start) * directions @ flow.units.T
     initial = flow.pack(x, series.gradients(x), series.values(x), series.hessians(x))
     if time_limit is None:
-        time_limit = MAX_RELAXATION_TIMES / np.abs(np.linalg.eigvals(flow.jacobian).real).min()
+        time_limit = MAX_RELAXATION_TIMES / np.abs(np.linalg.eigvals(flow.relaxation).real).min()
     box = np.asarray(box, dtype=float)
 
     def relative(error: np.ndarray, state: np.ndarray) -> np.ndarray:
@@ -350,7 +372,7 @@ def characteristics(
     # Many curves at once, each with a step of its own, until each has ended.
     count = len(initial)
     states, times, ends = initial.copy(), np.zeros(count), np.full(count, End.STALLED, dtype=int)
-    steps = np.full(count, 0.1 / np.linalg.norm(flow.jacobian, 2))
+    steps = np.full(count, 0.1 / np.linalg.norm(flow.relaxation, 2))
     last_steps = np.zeros(count)
     running = np.arange(count)
     kept, kept_curves = [initial], [running]

@@ -32,17 +32,16 @@ W.-J. Beyn, IMA J. Numer. Anal. 9 (1990) 379: boundary conditions of orbits betw
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 import scipy.linalg
 from scipy.integrate import solve_bvp, solve_ivp
-from scipy.interpolate import Akima1DInterpolator, PchipInterpolator
+from scipy.interpolate import Akima1DInterpolator, PchipInterpolator, PPoly
 
 from siq.errors import NumericalFailure
 from siq.quasipotential.characteristics import HamiltonianFlow, crossed
-from siq.quasipotential.path_chains import MinimumActionPath
+from siq.quasipotential.path_chains import MinimumActionPath, unwound
 from siq.quasipotential.power_series import local_series
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import classify, hessian_at
@@ -72,15 +71,13 @@ ROUGH, SWITCHED, FINE = 1e-3, 1e-5, 1e-6  # residuals of collocation: on the way
 GAUSS = np.polynomial.legendre.leggauss(3)  # exact to the order of collocation
 
 
-@dataclass(frozen=True, eq=False)
-class _Solution:
-    """A solution over backward times, from -T to 0: positions and momenta, and its mesh."""
-
-    at: Callable[[np.ndarray], np.ndarray]
-    times: np.ndarray
+_States = tuple[np.ndarray, np.ndarray]
+"""Backward times, from -T to 0, and the positions and momenta there, ``(2d, n)``."""
+_Condition = tuple[np.ndarray, np.ndarray]
+"""A matrix before the last position and momentum, and what it gives."""
 
 
-class _HamiltonianProblem:
+class _HamiltonianProblem(HamiltonianFlow):
     """Hamilton's equations in units in which M is the unit matrix and the end is at the distance one."""
 
     def __init__(self, dynamics: Dynamics, attractor: np.ndarray, end: np.ndarray) -> None:
@@ -88,67 +85,60 @@ class _HamiltonianProblem:
         level = 0.5 * float(offset @ hessian_at(dynamics, attractor) @ offset)
         if not level > 0:
             raise ValueError(f"the path is to end where it starts, at {attractor.tolist()}")
-        self.flow = HamiltonianFlow(dynamics, attractor, level)
-        self.dimension = dynamics.dimension
-        self.end = self.flow.inverse @ offset
-        self.gradients, self.hessians = local_series(dynamics, attractor)
-        self.growth = self.flow.jacobian + 2 * self.flow.diffusion[0]  # of what leaves A: ẏ = (J + 2DM) y
+        super().__init__(dynamics, attractor, level)
+        self.end = self.inverse @ offset
+        self.series = local_series(dynamics, attractor)
+        self.growth = self.relaxation + 2 * self.diffusion  # of what leaves A: ẏ = (J + 2DM) y
         self.fastest = float(np.abs(np.linalg.eigvals(self.growth)).max())
         self.unstable: float | None = None
-        speed = np.abs(self.flow.inverse @ dynamics.drift(end[None])[0]).max()
-        kind = classify(dynamics, end)
-        if speed < REST * np.linalg.norm(self.flow.jacobian) and kind.kind == "saddle" and kind.unstable == 1:
-            self._about_saddle(end)
-
-    def _about_saddle(self, end: np.ndarray) -> None:
-        jacobian = self.flow.inverse @ self.flow.dynamics.jacobian(end[None])[0] @ self.flow.units
-        values, left, right = scipy.linalg.eig(jacobian, left=True)
+        kind, speed = classify(dynamics, end), np.abs(self.force(self.end[None])).max()
+        if speed >= REST * np.linalg.norm(self.relaxation) or kind.kind != "saddle" or kind.unstable != 1:
+            return
+        self.at_end = self.jacobian(self.end[None])[0]
+        values, left, right = scipy.linalg.eig(self.at_end, left=True)
         place = int(np.argmax(values.real))
         self.unstable, self.left = float(values[place].real), left[:, place].real
-        self.jacobian, self.right = jacobian, right[:, place].real / (self.left @ right[:, place].real)
-        self.noise = self.flow.at(self.end[None])[0]
-        self.push = float(self.left @ self.noise @ self.left)
+        self.right = right[:, place].real / (self.left @ right[:, place].real)
+        self.end_noise = self.noise.at(self.end[None])[0]
+        self.push = float(self.left @ self.end_noise @ self.left)
         if not self.push > 0:
             raise NumericalFailure(f"the noise does not move states across the saddle {end.tolist()}")
         # Where paths come from: ẏ = J (y - S) + 2Dq with q = -λ/(w·Dw) w e^(-λt). What other directions
         # gather meanwhile is ∫ e^((J + λ)t) dt of what q gives them: since ever, where that is finite, or
         # since the path was far from S, where they decay about as fast as q.
         d = self.dimension
-        given = -2 * self.unstable / self.push * self.noise @ self.left
+        given = -2 * self.unstable / self.push * self.end_noise @ self.left
         given -= self.right * (self.left @ given)
         block = np.zeros((d + 1, d + 1))
-        block[:d, :d], block[:d, d] = jacobian + self.unstable * np.eye(d), given
+        block[:d, :d], block[:d, d] = self.at_end + self.unstable * np.eye(d), given
         since_ever = self.right - np.linalg.lstsq(block[:d, :d], given, rcond=None)[0]
         lately = self.right + scipy.linalg.expm(-np.log(APPROACH) / self.unstable * block)[:d, d]
         self.arrivals = [since_ever, lately]
 
-    def rates(self, z: np.ndarray) -> np.ndarray:
+    def field(self, z: np.ndarray) -> np.ndarray:
         """Velocities of (y, q), ``(2d, n)`` to ``(2d, n)``."""
-        y, q, _ = self.flow.velocities(z[: self.dimension].T, z[self.dimension :].T)
-        return np.concatenate([y, q], axis=1).T
+        return np.concatenate(self.velocities(z[: self.dimension].T, z[self.dimension :].T)[:2], axis=1).T
 
     def matrices(self, z: np.ndarray) -> np.ndarray:
         """Their derivatives, ``(2d, n)`` to ``(2d, 2d, n)``."""
-        turned, noise, bend = self.flow.linear(z[: self.dimension].T, z[self.dimension :].T)
-        top = np.concatenate([turned, np.broadcast_to(2 * noise, turned.shape)], axis=2)
-        return np.concatenate(
-            [top, np.concatenate([-bend, -turned.transpose(0, 2, 1)], axis=2)], axis=1
-        ).transpose(1, 2, 0)
+        y, q = z[: self.dimension].T, z[self.dimension :].T
+        turned = self.turned(y, q)
+        rows = [[turned, 2 * self.noise.at(y)], [-self.bend(y, q), -turned.transpose(0, 2, 1)]]
+        return np.concatenate([np.concatenate(row, axis=2) for row in rows], axis=1).transpose(1, 2, 0)
 
     def slope(self, y: np.ndarray) -> np.ndarray:
         """Q of the power series at points, ``(n, d)``."""
-        return np.asarray(self.gradients(self.flow.points(y)) @ self.flow.units / (2 * self.flow.level))
+        return self.slopes(self.series[0](self.points(y)))
 
     def curvature(self, y: np.ndarray) -> np.ndarray:
         """∂q/∂y of the power series at points, ``(n, d, d)``."""
-        hessians = self.hessians(self.flow.points(y))
-        return np.asarray(self.flow.units.T @ hessians @ self.flow.units / (2 * self.flow.level))
+        return self.curvatures(self.series[1](self.points(y)))
 
-    def fixed(self, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def fixed(self, last: np.ndarray) -> _Condition:
         """The condition that y ends at a point, as a matrix before (y, q) and what it gives."""
         return np.eye(self.dimension, 2 * self.dimension), last
 
-    def at_saddle(self, solution: _Solution) -> tuple[np.ndarray, np.ndarray]:
+    def at_saddle(self, final: np.ndarray) -> _Condition:
         """The conditions at the saddle, as close to it as a solution ends: one more than unknowns."""
         d, rate = self.dimension, self.unstable
         assert rate is not None
@@ -157,29 +147,27 @@ class _HamiltonianProblem:
         matrix[1:, d:] = np.eye(d)
         matrix[1:, :d] = rate / self.push * np.outer(self.left, self.left)
         right = matrix[:, :d] @ self.end
-        right[0] = self.left @ solution.at(np.zeros(1))[:d, 0]
+        right[0] = self.left @ final[:d]
         return matrix, right
 
-    def solved(
-        self, guess: _Solution, last: tuple[np.ndarray, np.ndarray], tolerance: float
-    ) -> _Solution | None:
+    def solved(self, guess: _States, last: _Condition, tolerance: float) -> PPoly | None:
         """The solution with a condition at its end, None where Newton's method does not come to one.
 
         As H is conserved, a condition at the saddle is one too many. A further unknown k makes up for it,
         ``ż = F + k ∇H``, along which H would grow: it comes out as zero.
         """
-        d, (matrix, right) = self.dimension, last
+        d, (matrix, right), (times, states) = self.dimension, last, guess
         further = len(matrix) - d
 
         def rates(_: np.ndarray, z: np.ndarray, k: np.ndarray | None = None) -> np.ndarray:
-            own = self.rates(z)
+            own = self.field(z)
             return own if k is None else own + k[0] * np.concatenate([-own[d:], own[:d]])
 
         def derivatives(_: np.ndarray, z: np.ndarray, k: np.ndarray | None = None) -> object:
             own = self.matrices(z)
             if k is None:
                 return own
-            velocity = self.rates(z)
+            velocity = self.field(z)
             return own + k[0] * np.concatenate([-own[d:], own[:d]]), np.concatenate(
                 [-velocity[d:], velocity[:d]]
             )[:, None]
@@ -196,19 +184,17 @@ class _HamiltonianProblem:
         with np.errstate(all="ignore"):
             try:
                 found = solve_bvp(
-                    rates, ends, guess.times, guess.at(guess.times), p=np.zeros(1) if further else None,
+                    rates, ends, times, states, p=np.zeros(1) if further else None,
                     fun_jac=derivatives, bc_jac=slopes, tol=tolerance, bc_tol=min(tolerance, 1e-6),
-                    max_nodes=min(max(MESH_GROWTH * len(guess.times), ENOUGH_NODES), MOST_NODES),
+                    max_nodes=min(max(MESH_GROWTH * len(times), ENOUGH_NODES), MOST_NODES),
                 )  # fmt: skip
             except (ValueError, np.linalg.LinAlgError):  # not finite, where a trial has run away
                 return None
-        return _Solution(found.sol, found.x) if found.success else None
+        return found.sol if found.success else None
 
 
-def _interpolated(times: np.ndarray, states: np.ndarray) -> _Solution:
-    """States ``(n, 2d)`` at times, as a first guess."""
-    curve = Akima1DInterpolator(times, states)
-    return _Solution(lambda t: np.asarray(curve(t)).T, times)
+def _on_mesh(solution: PPoly) -> _States:
+    return solution.x, solution(solution.x)
 
 
 def hamiltonian_paths(
@@ -244,42 +230,39 @@ def hamiltonian_paths(
         )
     problem = _HamiltonianProblem(dynamics, attractor, end)
     found: list[MinimumActionPath] = []
-    known: list[_Solution] = []
+    known: list[PPoly] = []
 
-    def finished(solution: _Solution | None) -> None:
+    def finished(solution: PPoly | None) -> None:
         path = None if solution is None else _finished(problem, solution, tolerance)
         found.extend([] if path is None else [path])
 
-    def apart(one: _Solution, two: _Solution) -> bool:
+    def apart(one: PPoly, two: PPoly) -> bool:
         """Whether two solutions that end at one state come from different sides."""
-        times = np.linspace(max(one.times[0], two.times[0]), 0.0, COMPARED_TIMES)
-        difference = one.at(times)[: problem.dimension] - two.at(times)[: problem.dimension]
-        return bool(np.abs(difference).max() > SAME_PATH)
+        times = np.linspace(max(one.x[0], two.x[0]), 0.0, COMPARED_TIMES)
+        return bool(np.abs((one(times) - two(times))[: problem.dimension]).max() > SAME_PATH)
 
-    guess = _reversed_motion(problem, beside)
-    if guess is not None:
-        last = guess.at(np.zeros(1))[: problem.dimension, 0]
-        backwards = problem.solved(guess, problem.fixed(last), ROUGH)
-        known += [] if backwards is None else [backwards]
-        finished(backwards)
-    share = np.linspace(0, 1, 201)[:, None]
-    given = [(one - problem.flow.center) @ problem.flow.inverse.T for one in curves]
     # The end is moved to the end itself, or to states before the saddle on the side of A.
     lasts = [problem.end]
     if problem.unstable is not None:
         side = np.sign(problem.left @ -problem.end)
         if beside is not None:
-            down = (beside - problem.flow.center) @ problem.flow.inverse.T
+            down = problem.scaled(beside)
             far = np.flatnonzero(np.linalg.norm(down - problem.end, axis=1) >= APPROACH)
+            guess = _reversed_motion(problem, beside, far)
+            if guess is not None:
+                backwards = problem.solved(guess, problem.fixed(guess[1][: problem.dimension, -1]), ROUGH)
+                known += [] if backwards is None else [backwards]
+                finished(backwards)
             side = np.sign(problem.left @ (down[far[0]] - problem.end))
         lasts = [problem.end + side * APPROACH * one / np.linalg.norm(one) for one in problem.arrivals]
+    share = np.linspace(0, 1, 201)[:, None]
     for last in lasts:
         solutions = list(known)
         across = np.linalg.svd(last[None])[2][1 : BENDS // 2 + 1]
         bent = [
             share * last + BEND * side * np.sin(np.pi * share) * way for way in across for side in (1, -1)
         ]
-        for curve in (share * last, *bent, *given):
+        for curve in (share * last, *bent, *map(problem.scaled, curves)):
             solution = _followed(problem, curve)
             if solution is not None and all(apart(solution, one) for one in solutions):
                 solutions.append(solution)
@@ -296,7 +279,7 @@ def hamiltonian_paths(
     return sorted(found, key=lambda path: (not path.smooth, path.action))
 
 
-def _followed(problem: _HamiltonianProblem, curve: np.ndarray) -> _Solution | None:
+def _followed(problem: _HamiltonianProblem, curve: np.ndarray) -> PPoly | None:
     """The solution at the end of a curve, None where one of the steps fails."""
     outside = np.linalg.norm(curve, axis=1) >= FIRST_END
     curve = curve[int(np.flatnonzero(~outside).max(initial=0)) + 1 :]
@@ -305,25 +288,18 @@ def _followed(problem: _HamiltonianProblem, curve: np.ndarray) -> _Solution | No
     def at(place: float) -> np.ndarray:
         return np.array([np.interp(place, along, column) for column in curve.T])
 
-    def moved_on(guess: _Solution, before: _Solution, share: float) -> _Solution:
-        """Moved on by a share of what it has moved from the one before, as far as both go back."""
-
-        def states(times: np.ndarray) -> np.ndarray:
-            own, common = guess.at(times), times >= before.times[0]
-            own[:, common] += share * (own[:, common] - before.at(times[common]))
-            return own
-
-        return _Solution(states, guess.times)
-
     solution = problem.solved(_linear(problem, at(0.0)), problem.fixed(at(0.0)), ROUGH)
-    before: tuple[_Solution, float] | None = None
+    before: tuple[PPoly, float] | None = None
     place, step, failed = 0.0, LONGEST_STEP, False
     while solution is not None and place < along[-1]:
         ahead = min(place + step, along[-1])
-        guess = _longer(problem, solution)
+        times, states = _longer(problem, solution)
         if before is not None:
-            guess = moved_on(guess, before[0], (ahead - place) / (place - before[1]))
-        moved = problem.solved(guess, problem.fixed(at(ahead)), ROUGH)
+            # Moved on by a share of what it has moved from the one before, as far as both go back.
+            common = times >= before[0].x[0]
+            moved_by = states[:, common] - before[0](times[common])
+            states[:, common] += (ahead - place) / (place - before[1]) * moved_by
+        moved = problem.solved((times, states), problem.fixed(at(ahead)), ROUGH)
         if moved is None:
             step, failed = step / 2, True
             if step < SHORTEST_STEP:
@@ -335,39 +311,34 @@ def _followed(problem: _HamiltonianProblem, curve: np.ndarray) -> _Solution | No
     return solution
 
 
-def _linear(problem: _HamiltonianProblem, last: np.ndarray) -> _Solution:
+def _linear(problem: _HamiltonianProblem, last: np.ndarray) -> _States:
     """The way to a point close to A, were f linear: q = y there."""
-    back = scipy.linalg.expm(-SPIRAL_STEP / problem.fastest * problem.growth)
-    y = [last]
-    while np.linalg.norm(y[-1]) > START and len(y) < MOST_NODES:
-        y.append(back @ y[-1])
-    states = np.array(y[::-1])
-    times = SPIRAL_STEP / problem.fastest * np.arange(1 - len(y), 1)
-    return _interpolated(times, np.concatenate([states, states], axis=1))
+    metric = np.eye(problem.dimension)
+    states, times = unwound(problem.growth, metric, last, step=SPIRAL_STEP, level=START**2)
+    return times, np.concatenate([states, states], axis=1).T
 
 
-def _longer(problem: _HamiltonianProblem, solution: _Solution) -> _Solution:
+def _longer(problem: _HamiltonianProblem, solution: PPoly) -> _States:
     """A solution at evenly spaced times, begun so close to A as the power series asks for."""
-    first = solution.at(solution.times[:1])[: problem.dimension, 0]
+    times, states = _on_mesh(solution)
+    first = states[: problem.dimension, 0]
     if np.linalg.norm(first) > START:
-        before = _linear(problem, first)
-        times = np.r_[before.times[:-1] + solution.times[0], solution.times]
-        states = np.concatenate([before.at(before.times[:-1]), solution.at(solution.times)], axis=1)
-        solution = _interpolated(times, states.T)
-    count = int(-solution.times[0] * problem.fastest / SPIRAL_STEP) + 2
-    return _Solution(solution.at, np.linspace(solution.times[0], 0.0, count))
+        earlier, before = _linear(problem, first)
+        times = np.r_[earlier[:-1] + times[0], times]
+        solution = Akima1DInterpolator(times, np.concatenate([before[:, :-1], states], axis=1), axis=1)
+    even = np.linspace(times[0], 0.0, int(-times[0] * problem.fastest / SPIRAL_STEP) + 2)
+    return even, np.asarray(solution(even))
 
 
-def _onward(problem: _HamiltonianProblem, solution: _Solution, distance: float) -> _Solution:
+def _onward(problem: _HamiltonianProblem, solution: PPoly, distance: float) -> _States:
     """A solution continued by the linear equations to a distance from the saddle."""
     d, rate = problem.dimension, problem.unstable
     assert rate is not None
-    final = solution.at(np.zeros(1))[:, 0]
-    fastest = np.abs(np.linalg.eigvals(problem.jacobian)).max()
-    step = SPIRAL_STEP / fastest
-    whole = np.block([[problem.jacobian, 2 * problem.noise], [np.zeros((d, d)), -problem.jacobian.T]])
-    flow = scipy.linalg.expm(step * whole)
-    states = [np.concatenate([final[:d] - problem.end, final[d:]])]
+    times, before = _on_mesh(solution)
+    step = SPIRAL_STEP / np.abs(np.linalg.eigvals(problem.at_end)).max()
+    whole = np.block([[problem.at_end, 2 * problem.end_noise], [np.zeros((d, d)), -problem.at_end.T]])
+    flow, at_rest = scipy.linalg.expm(step * whole), np.r_[problem.end, np.zeros(d)]
+    states = [before[:, -1] - at_rest]
     height = float(problem.left @ states[0][:d])
     while np.linalg.norm(states[-1][:d]) > distance and len(states) < MOST_NODES:
         ahead = flow @ states[-1]
@@ -376,42 +347,34 @@ def _onward(problem: _HamiltonianProblem, solution: _Solution, distance: float) 
         ahead[:d] += problem.right * (height - problem.left @ ahead[:d])
         ahead[d:] = -rate * height / problem.push * problem.left
         states.append(ahead)
-    further = np.array(states[1:]).reshape(-1, 2 * d) + np.r_[problem.end, np.zeros(d)]
-    times = np.r_[solution.times, step * np.arange(1, len(states))]
-    rows = np.concatenate([solution.at(solution.times).T, further])
-    return _interpolated(times - times[-1], rows)
+    further = np.array(states[1:]).reshape(-1, 2 * d) + at_rest
+    times = np.r_[times, step * np.arange(1, len(states))]
+    return times - times[-1], np.concatenate([before, further.T], axis=1)
 
 
-def _reversed_motion(problem: _HamiltonianProblem, beside: np.ndarray | None) -> _Solution | None:
+def _reversed_motion(problem: _HamiltonianProblem, beside: np.ndarray, far: np.ndarray) -> _States | None:
     """A first guess of the path to a saddle, which ends before it: the way down with velocities reversed.
 
     None where states are not positions and their velocities, noise acts on others than velocities, or the way
-    down is not known.
+    down is not known: `far` are its states that are not close to the saddle.
     """
-    dynamics, flow = problem.flow.dynamics, problem.flow
-    if beside is None or problem.unstable is None:
-        return None
-    symbols, noise_formulas = list(dynamics.symbols), dynamics.diffusion.formulas
+    dynamics, symbols = problem.dynamics, list(problem.dynamics.symbols)
     defined = [(at, symbols.index(one)) for at, one in enumerate(dynamics.formulas) if one in symbols]
     positions, velocities = np.array(defined, dtype=int).reshape(-1, 2).T
     if not np.array_equal(np.sort(np.r_[positions, velocities]), np.arange(len(symbols))):
         return None
-    if any(noise_formulas[place][place] != 0 for place in positions):  # noise acts on velocities alone
-        return None
-    far = np.flatnonzero(
-        np.linalg.norm((beside - flow.center) @ flow.inverse.T - problem.end, axis=1) >= APPROACH
-    )
-    if not len(far):
+    # Noise has to act on velocities alone.
+    if not len(far) or any(dynamics.diffusion.formulas[place][place] != 0 for place in positions):
         return None
 
     def arrives(_: float, x: np.ndarray) -> float:
-        return float(np.linalg.norm(flow.inverse @ (x - flow.center))) - START
+        return float(np.linalg.norm(problem.scaled(x))) - START
 
     arrives.terminal = True  # type: ignore[attr-defined]
     step = SPIRAL_STEP / problem.fastest / REVERSED_PACE
     motion = solve_ivp(
         lambda _, x: dynamics.drift(x[None])[0], (0.0, step * MOST_NODES), beside[far[0]], method="DOP853",
-        rtol=REVERSED_ACCURACY, atol=REVERSED_ACCURACY * np.abs(beside - flow.center).max(axis=0),
+        rtol=REVERSED_ACCURACY, atol=REVERSED_ACCURACY * np.abs(beside - problem.center).max(axis=0),
         events=arrives, dense_output=True,
     )  # fmt: skip
     if motion.status != 1:  # it does not come to A
@@ -429,134 +392,114 @@ def _reversed_motion(problem: _HamiltonianProblem, beside: np.ndarray | None) ->
         return None
     momenta[:, velocities] = pushed
     turned = dynamics.jacobian(x)[:, velocities[:, None], velocities]
-    pulled = np.gradient(pushed, step, axis=0) + (turned.transpose(0, 2, 1) @ pushed[:, :, None])[:, :, 0]
-    momenta[:, positions] = -pulled
-    y = (x - flow.center) @ flow.inverse.T
-    q = momenta @ flow.units / (2 * flow.level)
+    momenta[:, positions] = -np.gradient(pushed, step, axis=0) - np.einsum("nij,ni->nj", turned, pushed)
+    states = np.concatenate([problem.scaled(x), problem.slopes(momenta)], axis=1).T
     times = step * np.arange(1 - len(x), 1)
-    guess = _interpolated(times, np.concatenate([y, q], axis=1))
-    return _Solution(guess.at, times[::-REVERSED_PACE][::-1])
+    return times[::-REVERSED_PACE][::-1], states[:, ::-REVERSED_PACE][:, ::-1]
 
 
-def _finished(
-    problem: _HamiltonianProblem, solution: _Solution, tolerance: float
-) -> MinimumActionPath | None:
+def _finished(problem: _HamiltonianProblem, solution: PPoly, tolerance: float) -> MinimumActionPath | None:
     """The path of a solution that ends close to the end: on to it, and solved as finely as is asked."""
-    if problem.unstable is None:
-        ended: _Solution | None = solution
-        last = problem.fixed(problem.end)
-    else:
+    ended: PPoly | None = solution
+    last = problem.fixed(problem.end)
+    if problem.unstable is not None:
         # What winds has to be known better than on the way, or H is not zero where the condition changes.
-        known = problem.solved(
-            solution, problem.fixed(solution.at(np.zeros(1))[: problem.dimension, 0]), SWITCHED
-        )
-        if known is None:
-            return None
-        ended = _as_at_saddle(problem, known)
+        last = problem.fixed(solution(0.0)[: problem.dimension])
+        ended = problem.solved(_on_mesh(solution), last, SWITCHED)
+        ended = None if ended is None else _as_at_saddle(problem, ended)
         distance = APPROACH
         while ended is not None and distance > LAST_APPROACH:
             distance /= APPROACH_FACTOR
-            ended = _onward(problem, ended, distance)
-            ended = problem.solved(ended, problem.at_saddle(ended), ROUGH)
+            guess = _onward(problem, ended, distance)
+            ended = problem.solved(guess, problem.at_saddle(guess[1][:, -1]), ROUGH)
         if ended is None:
             return None
-        last = problem.at_saddle(ended)
-    rough = None if ended is None else problem.solved(_longer(problem, ended), last, ROUGH / 10)
+        last = problem.at_saddle(ended(0.0))
+    rough = problem.solved(_longer(problem, ended), last, ROUGH / 10)
     if rough is None:
         return None
-    fine: _Solution | None = None
-    value = _values(problem, rough)[-1]
+    value = _values(problem, rough, rough.x)[-1]
     for fineness in (FINE, FINE / 10, FINE / 100):
-        fine = problem.solved(rough, last, fineness)
-        if fine is None:
+        rough = problem.solved(_on_mesh(rough), last, fineness)
+        if rough is None:
             return None
-        before, value, rough = value, _values(problem, fine)[-1], fine
+        before, value = value, _values(problem, rough, rough.x)[-1]
         if abs(value - before) <= tolerance * value:
             break
     return _path(problem, rough, abs(value - before), tolerance)
 
 
-def _as_at_saddle(problem: _HamiltonianProblem, solution: _Solution) -> _Solution | None:
+def _as_at_saddle(problem: _HamiltonianProblem, solution: PPoly) -> PPoly | None:
     """A solution that ends somewhere before the saddle, moved to where those end that come to it.
 
     In steps as long as Newton's method follows: of what other directions have gathered on the way the ends
     that are tried know little, least where they decay about as fast as the path comes to the saddle.
     """
-    matrix, right = problem.at_saddle(solution)
-    own = matrix @ solution.at(np.zeros(1))[:, 0]
-    share, step, moved = 0.0, 1.0, solution
+    matrix, right = problem.at_saddle(solution(0.0))
+    own = matrix @ solution(0.0)
+    share, step = 0.0, 1.0
     while share < 1:
         ahead = min(share + step, 1.0)
-        new = problem.solved(moved, (matrix, own + ahead * (right - own)), SWITCHED)
+        new = problem.solved(_on_mesh(solution), (matrix, own + ahead * (right - own)), SWITCHED)
         if new is None:
             step /= 2
             if step < LEAST_SHARE:
                 return None
             continue
-        moved, share = new, ahead
-    return moved
+        solution, share = new, ahead
+    return solution
 
 
-def _values(problem: _HamiltonianProblem, solution: _Solution) -> np.ndarray:
-    """V at the nodes of the mesh, and at the end: the last one twice if that is where the mesh ends."""
-    length = np.diff(solution.times)
-    total = np.zeros(len(length))
+def _values(problem: _HamiltonianProblem, solution: PPoly, times: np.ndarray) -> np.ndarray:
+    """V at times of a solution, and at the end: the last one twice if that is where they end."""
+    d, length = problem.dimension, np.diff(times)
+    total, begin = np.zeros(len(length)), 0.0
+    first, final = (solution(times[place])[:d] for place in (0, -1))
     for place, weight in zip(*GAUSS, strict=True):
-        z = solution.at(solution.times[:-1] + (1 + place) / 2 * length).T
-        y, q = z[:, : problem.dimension], z[:, problem.dimension :]
-        total += weight / 2 * length * problem.flow.velocities(y, q)[2]
-    first, final = (solution.at(solution.times[[place]])[: problem.dimension].T for place in (0, -1))
-    begin = 0.0  # of the power series, v = 2 ∫ q·dy from A on
-    for place, weight in zip(*GAUSS, strict=True):
-        share = (1 + place) / 2
-        begin += weight * float(problem.slope(share * first)[0] @ first[0])
+        z = solution(times[:-1] + (1 + place) / 2 * length).T
+        total += weight / 2 * length * problem.velocities(z[:, :d], z[:, d:])[2]
+        # Of the power series, v = 2 ∫ q·dy from A on.
+        begin += weight * float(problem.slope((1 + place) / 2 * first[None])[0] @ first)
     values = begin + np.r_[0.0, np.cumsum(total)]
     rest = 0.0
     if problem.unstable is not None:
-        rest = problem.unstable * float(problem.left @ (final[0] - problem.end)) ** 2 / problem.push
+        rest = problem.unstable * float(problem.left @ (final - problem.end)) ** 2 / problem.push
     return np.append(values, values[-1] + rest)
 
 
-def _path(
-    problem: _HamiltonianProblem, solution: _Solution, error: float, tolerance: float
-) -> MinimumActionPath:
-    d, flow = problem.dimension, problem.flow
-    z = solution.at(solution.times).T
-    velocity = np.linalg.norm(problem.rates(z.T)[:d].T, axis=1)
+def _path(problem: _HamiltonianProblem, solution: PPoly, error: float, tolerance: float) -> MinimumActionPath:
+    d, (nodes, z) = problem.dimension, _on_mesh(solution)
     # About A the path may wind: points lie as close as their distance from it, and from the end, asks for.
-    pace = velocity / (np.linalg.norm(z[:, :d], axis=1) + CENTRAL_SPACING)
-    measure = np.r_[0.0, np.cumsum((pace[1:] + pace[:-1]) / 2 * np.diff(solution.times))]
+    pace = np.linalg.norm(problem.field(z)[:d], axis=0) / (np.linalg.norm(z[:d], axis=0) + CENTRAL_SPACING)
+    measure = np.r_[0.0, np.cumsum((pace[1:] + pace[:-1]) / 2 * np.diff(nodes))]
     count = int(np.clip(measure[-1] / SPACING, FEWEST_POINTS, MOST_POINTS))
-    times = PchipInterpolator(measure, solution.times)(np.linspace(0.0, measure[-1], count))
-    times[0], times[-1] = solution.times[0], 0.0
-    z = solution.at(times).T
-    places = np.union1d(times, solution.times)
-    whole = _values(problem, _Solution(solution.at, places))
-    values = np.append(whole[np.searchsorted(places, times)], whole[-1])
+    times = PchipInterpolator(measure, nodes)(np.linspace(0.0, measure[-1], count))
+    times[0], times[-1] = nodes[0], 0.0
+    places = np.union1d(times, nodes)
+    values = _values(problem, solution, places)
+    values = np.r_[0.0, values[np.searchsorted(places, times)], values[-1]]
+    z = solution(times).T
     y, q = z[:, :d], z[:, d:]
-    force = flow.dynamics.drift(flow.points(y)) @ flow.inverse.T
-    drift, push = np.sum(q * force, axis=1), problem.flow.velocities(y, q)[2] / 2
+    drift, push = np.sum(q * problem.force(y), axis=1), problem.noise.contract(y, q)
     residual = float(np.abs(drift + push).max() / (np.abs(drift) + push).max())
-    times = np.r_[-np.inf, times]
+    z, times = np.vstack([np.zeros(2 * d), z]), np.r_[-np.inf, times]
     if problem.unstable is not None:
-        y, q, times = np.vstack([y, problem.end]), np.vstack([q, np.zeros(d)]), np.append(times, np.inf)
-    else:
-        values = values[:-1]
-    y, q, values = np.vstack([np.zeros(d), y]), np.vstack([np.zeros(d), q]), np.r_[0.0, values]
-    values, error, smooth = 2 * flow.level * values, 2 * flow.level * error, _smooth(problem, solution)
+        z, times = np.vstack([z, np.r_[problem.end, np.zeros(d)]]), np.append(times, np.inf)
+    values, error = problem.unit * values[: len(z)], problem.unit * error
+    smooth = _smooth(problem, solution)
     return MinimumActionPath(
-        points=flow.points(y), momenta=2 * flow.level * q @ flow.inverse, values=values,
+        points=problem.points(z[:, :d]), momenta=problem.momenta(z[:, d:]), values=values,
         action=float(values[-1]), error=error, residual=residual,
         converged=smooth and bool(error <= tolerance * values[-1]), times=times, smooth=smooth,
     )  # fmt: skip
 
 
-def _smooth(problem: _HamiltonianProblem, solution: _Solution) -> bool:
+def _smooth(problem: _HamiltonianProblem, solution: PPoly) -> bool:
     """Whether no neighbour crosses the path, by the tangents of those that leave A beside it."""
-    d, times = problem.dimension, solution.times
+    d, times = problem.dimension, solution.x
     middles = (times[1:] + times[:-1]) / 2
-    at_nodes, between = (problem.matrices(solution.at(t)).transpose(2, 0, 1) for t in (times, middles))
-    first = solution.at(times[:1])[:d].T
+    at_nodes, between = (problem.matrices(solution(t)).transpose(2, 0, 1) for t in (times, middles))
+    first = solution(times[0])[None, :d]
     frame = np.linalg.qr(np.concatenate([np.eye(d), problem.curvature(first)[0]]))[0]
     for index, step in enumerate(np.diff(times)):
         k1 = at_nodes[index] @ frame

@@ -33,6 +33,7 @@ from scipy.interpolate import Akima1DInterpolator, CubicSpline
 from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
+from siq.quasipotential.characteristics import ScaledSystem
 from siq.systems.cycles import Cycle, hessians_along
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -109,7 +110,7 @@ class MinimumActionPath:
     downhill: np.ndarray | None = None
 
 
-class _Tube:
+class Tube:
     """The quadratic cost ``ρ·Hρ`` about a cycle, in the units of a problem."""
 
     def __init__(self, points: np.ndarray, hessians: np.ndarray, period: float) -> None:
@@ -162,48 +163,39 @@ class _Tube:
         return np.asarray(2 * self.costs(self.place(y[None])[0]))
 
 
-@dataclass(frozen=True)
 class _Bowl:
     """The quadratic cost about a point attractor at the origin, ``y·My``, with the methods of a tube."""
 
-    hessian: np.ndarray
+    def __init__(self, hessian: np.ndarray) -> None:
+        self.hessian = hessian
 
     def closest(self, y: np.ndarray) -> np.ndarray:
-        """The attractor, for each of some points."""
         return np.zeros_like(y)
 
     def level(self, y: np.ndarray) -> np.ndarray:
-        """The cost: ``(n, d)`` to ``(n,)``."""
         return np.einsum("ni,ij,nj->n", y, self.hessian, y)
 
     def slope(self, y: np.ndarray) -> np.ndarray:
-        """Of the cost at one point, shape ``(d,)``."""
         return np.asarray(2 * self.hessian @ y)
 
-    def curvature(self, y: np.ndarray) -> np.ndarray:
-        """Second derivatives of the cost, shape ``(d, d)``."""
+    def curvature(self, _: np.ndarray) -> np.ndarray:
         return 2 * self.hessian
 
 
-@dataclass(frozen=True)
 class Segments:
-    """f of the middles, the differences and the sizes of both: ``(n - 1, d)`` and ``(n - 1,)``.
+    """f of the middles of a chain, the differences Δ, and the sizes of both in the metric D⁻¹."""
 
-    `whitening` is that of the middles, ``(n - 1, d, d)``, and `turn` is the difference of both directions.
-    """
-
-    middles: np.ndarray
-    force: np.ndarray
-    forward: np.ndarray
-    whitening: np.ndarray
-    speed: np.ndarray
-    length: np.ndarray
-    turn: np.ndarray
-
-    @property
-    def actions(self) -> np.ndarray:
-        """``|f||Δ| - f·Δ``, written so that nothing cancels where f and Δ are parallel."""
-        return 0.5 * self.speed * self.length * np.sum(self.turn**2, axis=1)
+    def __init__(self, problem: PathProblem, y: np.ndarray) -> None:
+        self.middles, self.forward = (y[1:] + y[:-1]) / 2, np.diff(y, axis=0)
+        self.force = problem.force(self.middles)
+        self.whitening = problem.noise.whitening_at(self.middles)
+        force, forward = (products(self.whitening, part) for part in (self.force, self.forward))
+        self.speed, self.length = (
+            np.linalg.norm(part, axis=1) + np.finfo(float).tiny for part in (force, forward)
+        )
+        # ``|f||Δ| - f·Δ``, written so that nothing cancels where f and Δ are parallel.
+        turn = forward / self.length[:, None] - force / self.speed[:, None]
+        self.actions = 0.5 * self.speed * self.length * np.sum(turn**2, axis=1)
 
     @property
     def metric(self) -> np.ndarray:
@@ -216,12 +208,11 @@ class Segments:
         return float(np.sum(self.speed * self.length))
 
 
-class PathProblem:
+class PathProblem(ScaledSystem):
     """Chains between two states, in units in which D at the start, their distance and ∂f/∂x are of size one.
 
-    ``x = start + units y``. M is the Hessian of V at the start, None where that is no attractor; then the
-    first point of a chain is as fixed as the last. Where D has no inverse a `measure` stands in for it, and
-    there is no action of chains.
+    M is the Hessian of V at the start, None where that is no attractor; then the first point of a chain is as
+    fixed as the last. Where D has no inverse a `measure` stands in for it, and there is no action of chains.
 
     The start may be a stable cycle, and the end an unstable one: a chain begins and ends on thin tubes then.
     """
@@ -234,7 +225,6 @@ class PathProblem:
         *,
         measure: Diffusion | None = None,
     ) -> None:
-        around, onto = (each if isinstance(each, Cycle) else None for each in (start, end))
         # Of cycles, the states that are closest to the other end.
         one, two = (each.points if isinstance(each, Cycle) else each[None] for each in (start, end))
         away = np.linalg.norm(one[:, None] - two, axis=2)
@@ -244,78 +234,41 @@ class PathProblem:
         distance = float(np.linalg.norm(noise.whitening @ (last - first)))
         if not distance > 0:
             raise ValueError(f"the path is to end where it starts, at {first.tolist()}")
-        self.dynamics, self.start, self.units = dynamics, first, distance * noise.root
-        self.inverse = noise.whitening / distance
-        self.constant = dynamics.diffusion.constant
-        self.noise = dynamics.diffusion.in_units(first, self.units, distance**2)
-        jacobians = self.inverse @ dynamics.jacobian(np.stack([first, last])) @ self.units
-        self.rate = float(np.linalg.norm(jacobians, axis=(1, 2)).max())
-        self.unit = distance**2 * self.rate  # of the action
+        units = distance * noise.root
+        jacobians = np.linalg.inv(units) @ dynamics.jacobian(np.stack([first, last])) @ units
+        rate = float(np.linalg.norm(jacobians, axis=(1, 2)).max())
+        super().__init__(dynamics, first, units, unit=distance**2 * rate, rate=rate)
         self.end = self.inverse @ (last - first)
         self.hessian: np.ndarray | None = None
-        self.begin: _Bowl | _Tube | None = None
-        self.finish: _Tube | None = None
+        self.begin: _Bowl | Tube | None = None
+        self.finish: Tube | None = None
 
-        def tube(cycle: Cycle, hessians: np.ndarray) -> _Tube:
-            points = (cycle.points - self.start) @ self.inverse.T
-            return _Tube(points, self.units.T @ hessians @ self.units / self.unit, cycle.period * self.rate)
+        def tube(cycle: Cycle, hessians: np.ndarray) -> Tube:
+            return Tube(self.scaled(cycle.points), self.curvatures(hessians), cycle.period * rate)
 
-        if onto is not None:
-            self.finish = tube(onto, hessians_along(dynamics, onto, reaching=True))
-        if around is not None:
-            self.begin = tube(around, hessians_along(dynamics, around))
+        if isinstance(end, Cycle):
+            self.finish = tube(end, hessians_along(dynamics, end, reaching=True))
+        if isinstance(start, Cycle):
+            self.begin = tube(start, hessians_along(dynamics, start))
         elif self.rests(np.zeros(len(first))) and classify(dynamics, first).kind == "attractor":
-            self.hessian = self.units.T @ hessian_at(dynamics, first) @ self.units / self.unit
+            self.hessian = self.curvatures(hessian_at(dynamics, first))
             self.begin = _Bowl(self.hessian)
         # By how much of the upper bound S may fail to curve upwards at a minimum: about cycles any phase may
         # be as good as any other.
-        self.flat = CYCLE_SHIFT if isinstance(self.begin, _Tube) or self.finish is not None else 0.0
+        self.flat = CYCLE_SHIFT if isinstance(self.begin, Tube) or self.finish is not None else 0.0
 
     def rests(self, y: np.ndarray) -> bool:
         """Whether f vanishes at a state, to rounding."""
         return bool(np.linalg.norm(self.force(y[None])) < REST)
 
-    def scaled(self, x: np.ndarray) -> np.ndarray:
-        """Points in the units of the problem, from its start to its end."""
-        y = (x - self.start) @ self.inverse.T
-        if not isinstance(self.begin, _Tube):
+    def chain(self, x: np.ndarray) -> np.ndarray:
+        """A curve ``(n, d)`` in the units of the problem, from its start to its end."""
+        y = self.scaled(x)
+        if not isinstance(self.begin, Tube):
             y[0] = 0.0
         if self.finish is None:
             y[-1] = self.end
-        return np.asarray(y)
-
-    def unscaled(self, y: np.ndarray) -> np.ndarray:
-        """Points in the states' units."""
-        return self.start + y @ self.units.T
-
-    def force(self, y: np.ndarray) -> np.ndarray:
-        """f at points, ``(n, d)``."""
-        return self.dynamics.drift(self.unscaled(y)) @ self.inverse.T / self.rate
-
-    def jacobian(self, y: np.ndarray) -> np.ndarray:
-        """∂f/∂y, ``(n, d, d)``."""
-        return self.inverse @ self.dynamics.jacobian(self.unscaled(y)) @ self.units / self.rate
-
-    def bend(self, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """``Σ_k weights_k ∂²f_k``, ``(n, d, d)``."""
-        second = self.dynamics.bend(self.unscaled(y), weights @ self.inverse / self.rate)
-        return np.asarray(self.units.T @ second @ self.units)
-
-    def segments(self, y: np.ndarray) -> Segments:
-        """What the action of a chain is made of."""
-        middles, forward = (y[1:] + y[:-1]) / 2, np.diff(y, axis=0)
-        force = self.force(middles)
-        own_force, own_forward = force, forward
-        if self.constant:
-            whitening = np.broadcast_to(np.eye(y.shape[1]), (len(middles), y.shape[1], y.shape[1]))
-        else:
-            whitening = self.noise.whitening_at(middles)
-            own_force, own_forward = products(whitening, force), products(whitening, forward)
-        speed, length = (
-            np.linalg.norm(part, axis=1) + np.finfo(float).tiny for part in (own_force, own_forward)
-        )
-        turn = own_forward / length[:, None] - own_force / speed[:, None]
-        return Segments(middles, force, forward, whitening, speed, length, turn)
+        return y
 
     def level(self, y: np.ndarray) -> np.ndarray:
         """The action from the start to points close to it, ``y·My``; zero without M."""
@@ -329,10 +282,10 @@ class PathProblem:
         """S of a chain; infinite where it leads through states at which D is not positive."""
         with np.errstate(all="ignore"):  # a trial may run away
             try:
-                inner = float(self.segments(y).actions.sum())
-                return float(self.level(y[:1])[0]) + inner + self.remaining(y[-1])
+                inner = float(Segments(self, y).actions.sum())
             except NumericalFailure:
                 return np.inf
+            return float(self.level(y[:1])[0]) + inner + self.remaining(y[-1])
 
     def spaced(self, y: np.ndarray, count: int, level: float) -> np.ndarray:
         """A chain along another one, which begins where the level is as given and is spaced for accuracy.
@@ -341,8 +294,8 @@ class PathProblem:
         the path may wind.
         """
         if self.hessian is not None and self.level(y[:1])[0] > level > 0:
-            y = np.vstack([_spiral(self, y[0], level / self.level(y[:1])[0]), y])
-        if level > 0 and isinstance(self.begin, _Tube):
+            y = np.vstack([_spiral(self, y[0], level), y[1:]])
+        if level > 0 and isinstance(self.begin, Tube):
             y = np.vstack([_winding(self, self.begin, y[0], level, -1.0)[::-1], y])
         if level > 0 and self.finish is not None:
             y = np.vstack([y, _winding(self, self.finish, y[-1], level, 1.0)])
@@ -427,11 +380,15 @@ class PathProblem:
         chains += [line + BEND * side * np.sin(np.pi * share) * way for way in across for side in (1, -1)]
         if self.hessian is None:
             return chains, 0.0
-        linear = np.vstack([_spiral(self, self.end, START_LEVEL), self.end])
-        forward = np.diff(linear @ np.linalg.cholesky(self.hessian), axis=0)
-        forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-        turns = np.arccos(np.clip(np.sum(forward[1:] * forward[:-1], axis=1), -1, 1))
-        return [linear, *chains], float(turns.sum())
+        linear = _spiral(self, self.end, START_LEVEL * self.level(self.end[None])[0])
+        return [linear, *chains], total_turn(linear @ np.linalg.cholesky(self.hessian))
+
+
+def total_turn(y: np.ndarray) -> float:
+    """By how many radian a chain ``(n, d)`` turns."""
+    forward = np.diff(y, axis=0)
+    forward /= np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), np.finfo(float).tiny)
+    return float(np.arccos(np.clip(np.sum(forward[1:] * forward[:-1], axis=1), -1, 1)).sum())
 
 
 def products(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
@@ -448,28 +405,36 @@ def _relative_lengths(problem: PathProblem, y: np.ndarray) -> np.ndarray:
     return np.sqrt(problem.level(forward)) / near
 
 
-def _spiral(problem: PathProblem, last: np.ndarray, share: float) -> np.ndarray:
-    """The way that linear dynamics takes to a point from where its level is a share of the one there."""
+def _spiral(problem: PathProblem, last: np.ndarray, level: float) -> np.ndarray:
+    """The way that linear dynamics takes to a point from where the action is as given."""
     assert problem.hessian is not None
     flow = problem.jacobian(np.zeros((1, len(last))))[0] + 2 * problem.hessian
-    back = scipy.linalg.expm(-SPIRAL_STEP * flow / np.abs(np.linalg.eigvals(flow)).max())
-    lowest = share * problem.level(last[None])[0]
-    y = [back @ last]
-    while y[-1] @ problem.hessian @ y[-1] > lowest and len(y) < MOST_NODES:
+    return unwound(flow, problem.hessian, last, step=SPIRAL_STEP, level=level)[0]
+
+
+def unwound(
+    flow: np.ndarray, hessian: np.ndarray, last: np.ndarray, *, step: float, level: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """States of ``ẏ = flow y`` up to a point from where ``y·My`` is below a level, and their times.
+
+    These end at zero; `step` is in units of the shortest time of the flow.
+    """
+    step = step / np.abs(np.linalg.eigvals(flow)).max()
+    back = scipy.linalg.expm(-step * flow)
+    y = [last]
+    while y[-1] @ hessian @ y[-1] > level and len(y) < MOST_NODES:
         y.append(back @ y[-1])
-    return np.array(y[::-1])
+    return np.array(y[::-1]), step * np.arange(1 - len(y), 1)
 
 
-def _winding(problem: PathProblem, tube: _Tube, last: np.ndarray, level: float, sense: float) -> np.ndarray:
+def _winding(problem: PathProblem, tube: Tube, last: np.ndarray, level: float, sense: float) -> np.ndarray:
     """The way by linear dynamics from a point onwards to a tube, or back to where it left one.
 
     ``ẏ = F + 2Dp`` with ``p`` as the quadratic cost has it, with or against time.
     """
 
     def rates(_: float, y: np.ndarray) -> np.ndarray:
-        slope, force = tube.slope(y), problem.force(y[None])[0]
-        push = slope if problem.constant else problem.noise.at(y[None])[0] @ slope
-        return np.asarray(sense * force - push)
+        return sense * problem.force(y[None])[0] - problem.noise.push(y[None], tube.slope(y)[None])[0]
 
     def arrives(_: float, y: np.ndarray) -> float:
         return float(tube.level(y[None])[0] - level)
@@ -501,26 +466,21 @@ class _Across:
     """
 
     def __init__(self, problem: PathProblem, y: np.ndarray) -> None:
-        parts, dimension = problem.segments(y), y.shape[1]
+        parts, noise, dimension = Segments(problem, y), problem.noise, y.shape[1]
         self.y, self.effort = y, parts.effort
         self.range = slice(1 if problem.begin is None else 0, -1 if problem.finish is None else None)
         times = (parts.length / parts.speed)[:, None, None]
         metric, middles, jacobian = parts.metric, parts.middles, problem.jacobian(parts.middles)
         force, forward = (products(metric, part) for part in (parts.force, parts.forward))
         twice = forward / times[:, 0] - force
-        turned, by_middle = jacobian, np.einsum("nij,ni->nj", jacobian, twice)
-        bent = problem.bend(middles, -times[:, 0] * twice)
+        turned = jacobian + noise.turn(middles, twice)
+        by_middle = -2 * problem.pull(middles, twice / 2, turned)
+        bent = -2 * times * problem.bend(middles, twice / 2)
         # The times change, too: by so much, up to a factor, with the middles and the differences.
-        slower = 2 * times[:, 0] * np.einsum("nij,ni->nj", jacobian, force)
-        if not problem.constant:
-            noise = problem.noise
-            turned = jacobian + noise.turn(middles, twice)
-            by_middle = by_middle + noise.contract(middles, twice, 1) / 2
-            bent = bent - times / 2 * noise.contract(middles, twice, 2)
-            slower -= (
-                times[:, 0] * noise.contract(middles, force, 1)
-                - noise.contract(middles, forward, 1) / times[:, 0]
-            )
+        slower = (
+            times[:, 0] * (2 * np.einsum("nij,ni->nj", jacobian, force) - noise.contract(middles, force, 1))
+            + noise.contract(middles, forward, 1) / times[:, 0]
+        )
         by_middle *= -times[:, 0]
         slope = np.zeros_like(y)
         slope[1:] += by_middle / 2 + twice
@@ -544,7 +504,7 @@ class _Across:
         self.problem = problem
         # Orthonormal directions across the chain at its points, shape (n, d, d - 1).
         normal = np.linalg.svd(np.gradient(y, axis=0)[:, None, :])[2][:, 1:].transpose(0, 2, 1)
-        if isinstance(problem.begin, _Tube):  # along the tube, on which the chain begins, and ends
+        if isinstance(problem.begin, Tube):  # along the tube, on which the chain begins, and ends
             normal[0] = np.linalg.svd(problem.begin.slope(y[0])[None])[2][1:].T
         if problem.finish is not None:
             normal[-1] = np.linalg.svd(problem.finish.slope(y[-1])[None])[2][1:].T
@@ -567,7 +527,7 @@ class _Across:
         """The chain after a step."""
         y = self.y.copy()
         y[self.range] += np.einsum("nij,nj->ni", self.normal, step.reshape(len(self.normal), -1))
-        if isinstance(begin := self.problem.begin, _Tube):
+        if isinstance(begin := self.problem.begin, Tube):
             y[0] = begin.onto(y[0], float(begin.level(self.y[:1])[0]))
         if (finish := self.problem.finish) is not None:
             y[-1] = finish.onto(y[-1], float(finish.level(self.y[-1:])[0]))

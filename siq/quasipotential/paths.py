@@ -13,8 +13,9 @@ tube, or of a small ellipsoid, with the momentum ``p = Hρ``, H being the curvat
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -28,11 +29,14 @@ from siq.quasipotential.path_chains import (
     NO_ACTION,
     MinimumActionPath,
     PathProblem,
+    Segments,
+    Tube,
     evenly,
     products,
+    total_turn,
 )
 from siq.systems.basins import ends_of
-from siq.systems.cycles import Cycle, hessians_along, unstable_direction
+from siq.systems.cycles import Cycle, unstable_direction
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import measure_at
 from siq.systems.phase_portrait import PhasePortrait
@@ -128,12 +132,12 @@ def minimum_action_path(
             rivals=tuple(one.action for one in found[1:] if one.smooth),
         )
     problem = PathProblem(dynamics, start, end)
-    if problem.flat == 0:
-        own, turning = problem.first_chains()
+    if problem.flat > 0:
+        own = _first_guesses(problem, start, end)
+        turning = max((total_turn(evenly(chain, DESCENT_POINTS)) for chain in own), default=0.0)
     else:
-        own = [problem.scaled(one) for one in _first_guesses(problem, start, end)]
-        turning = max((_turning(chain) for chain in own), default=0.0)
-    guesses = own if initial is None else [problem.scaled(np.asarray(one, dtype=float)) for one in initial]
+        own, turning = problem.first_chains()
+    guesses = own if initial is None else [problem.chain(np.asarray(one, dtype=float)) for one in initial]
     count = min(max(nodes, int(turning / TURN)), MOST_NODES // 4)
     chains: list[tuple[np.ndarray, float, bool]] = []
     for guess in guesses:
@@ -142,7 +146,7 @@ def minimum_action_path(
             chains.append(problem.descended(guess, count, action, first=True))
     chains = sorted((one for one in chains if np.isfinite(one[1])), key=lambda one: one[1])
     if not chains:
-        last = problem.unscaled(problem.end[None])[0]
+        last = problem.points(problem.end[None])[0]
         raise NumericalFailure(
             f"no path from {problem.start.tolist()} to {last.tolist()} was found that has a finite action"
         )
@@ -151,15 +155,15 @@ def minimum_action_path(
         coarse, before = fine, action
         fine, action, minimum = problem.descended(coarse, 2 * len(coarse) - 1, before, first=not minimum)
         error = abs(action - before) / 3
-        known = error <= max(tolerance * action, NO_ACTION * problem.segments(fine).effort)
+        known = error <= max(tolerance * action, NO_ACTION * Segments(problem, fine).effort)
     line = _extrapolated(problem, (coarse, before), (fine, action))
     # Rivals have the error of short chains, which they share with the first one.
     lowest = max(chains[0][1], np.finfo(float).tiny)
     shares = [one / lowest for one in _other_minima(chains, fine)]
     points, momenta = np.split(line[:, :-1], 2, axis=1)
     return MinimumActionPath(
-        points=problem.unscaled(points),
-        momenta=problem.unit * momenta @ problem.inverse,
+        points=problem.points(points),
+        momenta=problem.momenta(momenta),
         values=problem.unit * line[:, -1],
         action=problem.unit * float(line[-1, -1]),
         error=problem.unit * error,
@@ -171,15 +175,11 @@ def minimum_action_path(
 
 def _path_nodes(problem: PathProblem, y: np.ndarray) -> np.ndarray:
     """Points, momenta, and actions up to there, shape ``(n, 2d + 1)``."""
-    parts = problem.segments(y)
-    # Momenta of the middles, carried over half a segment with ṗ = -Jᵀp - p·(∂D)p; both sides agree at a
-    # minimum.
+    parts = Segments(problem, y)
+    # Momenta of the middles, carried over half a segment; both sides agree at a minimum.
     times = (parts.length / parts.speed)[:, None]
     middle = products(parts.metric, (parts.forward / times - parts.force) / 2)
-    change = np.einsum("nij,ni->nj", problem.jacobian(parts.middles), middle)
-    if not problem.constant:
-        change += problem.noise.contract(parts.middles, middle, 1)
-    turn = times / 2 * change
+    turn = -times / 2 * problem.pull(parts.middles, middle)
     p = np.empty_like(y)
     p[1:-1] = (middle[1:] + turn[1:] + middle[:-1] - turn[:-1]) / 2
     p[0] = middle[0] + turn[0] if problem.begin is None else problem.begin.slope(y[0]) / 2
@@ -193,7 +193,7 @@ def _hamiltonian_residual(problem: PathProblem, nodes: np.ndarray) -> float:
     y, p = np.split(nodes[:, :-1], 2, axis=1)
     force = problem.force(y)
     drift = np.sum(p * force, axis=1)
-    push = np.sum((p if problem.constant else products(problem.noise.at(y), p)) * p, axis=1)
+    push = problem.noise.contract(y, p)
     scale = max((np.abs(drift) + push).max(), NO_ACTION * np.sum(force**2, axis=1).max())
     return float(np.abs(drift + push).max() / scale)
 
@@ -291,9 +291,6 @@ def descent(dynamics: Dynamics, saddle: np.ndarray, target: np.ndarray, nodes: i
         raise NumericalFailure(f"{saddle.tolist()} is no saddle with one unstable direction")
     upwards = vectors[:, np.argmax(values.real)].real
 
-    def rates(_: float, y: np.ndarray) -> np.ndarray:
-        return problem.force(y[None])[0]
-
     def arrives(_: float, y: np.ndarray) -> float:
         return float(np.linalg.norm(y - problem.end) - ARRIVAL)
 
@@ -303,20 +300,29 @@ def descent(dynamics: Dynamics, saddle: np.ndarray, target: np.ndarray, nodes: i
     def rests(_: float, y: np.ndarray) -> float:
         return float(np.linalg.norm(problem.force(y[None])) - REST_SPEED)
 
-    for event in (arrives, leaves, rests):
-        event.terminal, event.direction = True, -1  # type: ignore[attr-defined]
-    for side in (1, -1):
-        begin = side * UNSTABLE_START * upwards / np.linalg.norm(upwards)
-        way = solve_ivp(
-            rates, [0, LONGEST_DESCENT], begin, method="DOP853", rtol=STEP_PRECISION, atol=1e-12,
-            dense_output=True, events=[arrives, leaves, rests],
-        )  # fmt: skip
-        if len(way.t_events[0]):
-            times = np.interp(np.linspace(0, len(way.t) - 1, 20 * len(way.t)), np.arange(len(way.t)), way.t)
-            return problem.unscaled(
-                evenly(np.vstack([np.zeros_like(begin), way.sol(times).T, problem.end]), nodes)
-            )
-    raise NumericalFailure(f"f does not lead from the saddle {saddle.tolist()} to {target.tolist()}")
+    begin = UNSTABLE_START * upwards / np.linalg.norm(upwards)
+    way = _arriving(
+        lambda _, y: problem.force(y[None])[0], [begin, -begin], LONGEST_DESCENT, [arrives, leaves, rests],
+        method="DOP853", rtol=STEP_PRECISION, atol=1e-12, dense_output=True,
+    )  # fmt: skip
+    if way is None:
+        raise NumericalFailure(f"f does not lead from the saddle {saddle.tolist()} to {target.tolist()}")
+    times = np.interp(np.linspace(0, len(way.t) - 1, 20 * len(way.t)), np.arange(len(way.t)), way.t)
+    return problem.points(evenly(np.vstack([np.zeros_like(begin), way.sol(times).T, problem.end]), nodes))
+
+
+def _arriving(
+    rates: Callable[[float, np.ndarray], np.ndarray],
+    starts: Iterable[np.ndarray],
+    longest: float,
+    events: Sequence[Any],
+    **options: Any,
+) -> Any:
+    """The first solution from some starts that ends with the first of the events, or None."""
+    for event in events:
+        event.terminal, event.direction = True, -1
+    ways = (solve_ivp(rates, (0.0, longest), start, events=events, **options) for start in starts)
+    return next((way for way in ways if len(way.t_events[0])), None)
 
 
 def both_sides(dynamics: Dynamics, cycle: Cycle, portrait: PhasePortrait) -> np.ndarray:
@@ -349,73 +355,59 @@ def _downhill(
     place = 0
     if isinstance(over, Cycle):
         place = int(np.argmin(np.linalg.norm((over.points - begin) / width, axis=1)))
-    cycle = target if isinstance(target, Cycle) else over
-    if not isinstance(cycle, Cycle):
-        raise ValueError("neither end is a cycle")
-    period = cycle.period
-
-    def rates(_: float, y: np.ndarray) -> np.ndarray:
-        return np.asarray(dynamics.drift((y * width)[None])[0] / width)
+    period = next(one.period for one in (target, over) if isinstance(one, Cycle))
 
     def arrives(_: float, y: np.ndarray) -> float:
         if isinstance(target, Cycle):
             return float(target.distances((y * width)[None], scale=width)[0] - CYCLE_ARRIVAL)
         return float(np.linalg.norm(y - target / width) - CYCLE_ARRIVAL)
 
-    arrives.terminal = True  # type: ignore[attr-defined]
-    for start in _states_beside(dynamics, over, place, box):
-        way = solve_ivp(
-            rates, (0.0, LONGEST_PERIODS * period), start / width, rtol=1e-6, atol=1e-8, max_step=period / 40,
-            events=arrives,
-        )  # fmt: skip
-        if len(way.t_events[0]):
-            return evenly(np.vstack([begin[None], way.y.T * width]), CYCLE_DESCENT_POINTS)
-    raise NumericalFailure("f does not lead on to the attractor behind what parts the basins")
-
-
-def _turning(chain: np.ndarray) -> float:
-    """By how many radian a chain turns."""
-    forward = np.diff(evenly(chain, DESCENT_POINTS), axis=0)
-    forward /= np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), np.finfo(float).tiny)
-    return float(np.arccos(np.clip(np.sum(forward[1:] * forward[:-1], axis=1), -1, 1)).sum())
+    way = _arriving(
+        lambda _, y: dynamics.drift((y * width)[None])[0] / width,
+        _states_beside(dynamics, over, place, box) / width, LONGEST_PERIODS * period, [arrives],
+        rtol=1e-6, atol=1e-8, max_step=period / 40,
+    )  # fmt: skip
+    if way is None:
+        raise NumericalFailure("f does not lead on to the attractor behind what parts the basins")
+    return evenly(np.vstack([begin[None], way.y.T * width]), CYCLE_DESCENT_POINTS)
 
 
 def _first_guesses(
     problem: PathProblem, start: np.ndarray | Cycle, end: np.ndarray | Cycle
 ) -> list[np.ndarray]:
     """Curves from beside a start to an end, one of them a cycle, by rising action."""
-    d, unit, draw = len(problem.units), problem.units, np.random.default_rng(0)
-    inverse = np.linalg.inv(unit)
+    d, draw = problem.dimension, np.random.default_rng(0)
     # States on all sides of the start, and the momenta there.
     if isinstance(start, Cycle):
+        assert isinstance(problem.begin, Tube)
         rows = np.linspace(0, len(start.points), PHASES, endpoint=False).astype(int)
-        hessians = hessians_along(problem.dynamics, start)[rows]
+        hessians = problem.begin.costs(rows)
         # The axes of the curvature, of which the first one is along the flow, and directions between them.
-        across = np.linalg.eigh(unit.T @ hessians @ unit)[1].transpose(0, 2, 1)[:, 1:]
+        across = np.linalg.eigh(hessians)[1].transpose(0, 2, 1)[:, 1:]
         between = draw.standard_normal((SIDES * (d - 2), d - 1))
         sides = np.concatenate([np.eye(d - 1), -np.eye(d - 1), between])
         sides /= np.linalg.norm(sides, axis=1, keepdims=True)
-        offset = GUESS_START * np.einsum("sa,nai->nsi", sides, across) @ unit.T
+        offset = GUESS_START * np.einsum("sa,nai->nsi", sides, across)
         momenta = np.einsum("nij,nsj->nsi", hessians, offset).reshape(-1, d)
-        states = (start.points[rows][:, None] + offset).reshape(-1, d)
+        states = (problem.begin.curve(rows)[:, None] + offset).reshape(-1, d)
     elif problem.hessian is not None:
         directions = draw.standard_normal((GUESSES_PER_STATE * (d - 1), d))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        offset = GUESS_START * directions @ unit.T
-        states = start + offset
-        momenta = offset @ (problem.inverse.T @ problem.hessian @ problem.inverse * problem.unit)
+        states = GUESS_START * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        momenta = states @ problem.hessian
     else:
         raise NumericalFailure("a path to a cycle has to begin at an attractor")
-    ways, actions = _hamiltonian_trajectories(problem.dynamics, states, momenta, inverse)
-    target = cKDTree((end.points if isinstance(end, Cycle) else end[None]) @ inverse.T)
+    ways = _hamiltonian_trajectories(problem, states, momenta)
+    target = cKDTree(problem.scaled(end.points if isinstance(end, Cycle) else end[None]))
     found = []
-    for way, action in zip(ways, actions, strict=True):
-        away = target.query(way @ inverse.T)[0]
+    for way, action in zip(ways[:, :, :d], ways[:, :, -1], strict=True):
+        away = target.query(way)[0]
         close = max(GUESS_ARRIVAL, float(away.min()))
         arrived = int(np.argmax(away <= close))
         left = np.flatnonzero(away[arrived:] > 2 * close)
         nearest = int(arrived + np.argmin(away[arrived : arrived + (left[0] if len(left) else len(away))]))
-        curve = way[: nearest + 1] if isinstance(end, Cycle) else np.vstack([way[: nearest + 1], end])
+        curve = way[: nearest + 1] if isinstance(end, Cycle) else np.vstack([way[: nearest + 1], problem.end])
+        if not isinstance(start, Cycle):
+            curve[0] = 0.0
         if nearest > 0:
             found.append((float(away[nearest]), float(action[nearest]), curve))
     found.sort(key=lambda one: one[1])
@@ -434,39 +426,28 @@ def _first_guesses(
     return [curve for _, _, curve in chosen]
 
 
-def _hamiltonian_trajectories(
-    dynamics: Dynamics, states: np.ndarray, momenta: np.ndarray, inverse: np.ndarray
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Trajectories of Hamilton's equations, and the action along each."""
+def _hamiltonian_trajectories(problem: PathProblem, states: np.ndarray, momenta: np.ndarray) -> np.ndarray:
+    """States, momenta and actions along trajectories of Hamilton's equations: ``(n, steps, 2d + 1)``."""
     n, d = states.shape
 
     def rates(z: np.ndarray) -> np.ndarray:
-        x, p = z[:, :d], z[:, d : 2 * d]
-        push = dynamics.diffusion.push(x, p)
-        falls = -np.einsum("nij,ni->nj", dynamics.jacobian(x), p) - dynamics.diffusion.contract(x, p, 1)
-        return np.column_stack([dynamics.drift(x) + 2 * push, falls, 2 * np.sum(p * push, axis=1)])
+        return np.column_stack(problem.velocities(z[:, :d], z[:, d : 2 * d]))
 
-    z = np.column_stack([states, momenta, np.zeros(n)])
-    first = states @ inverse.T
+    z, alive = np.column_stack([states, momenta, np.zeros(n)]), np.arange(n)
     kept: list[np.ndarray] = [z.copy()]
-    alive = np.arange(n)
-    rate = np.linalg.norm(rates(z)[:, :d] @ inverse.T, axis=1).max()
-    longest = LONGEST_GUESS_STEP * max(1.0, float(np.linalg.norm(np.ptp(first, axis=0))))
-    steps = np.full(n, longest / rate)
+    longest = LONGEST_GUESS_STEP * max(1.0, float(np.linalg.norm(np.ptp(states, axis=0))))
+    steps = np.full(n, longest / np.linalg.norm(rates(z)[:, :d], axis=1).max())
     for _ in range(MOST_GUESS_STEPS):
         with np.errstate(all="ignore"):
             at = rates(z[alive])
-            speed = np.linalg.norm(at[:, :d] @ inverse.T, axis=1)
-            step = np.minimum(steps[alive], longest / np.maximum(speed, 1e-300))
+            step = np.minimum(steps[alive], longest / np.maximum(np.linalg.norm(at[:, :d], axis=1), 1e-300))
             moved, error = dormand_prince_step(rates, z[alive], step, first=at)
-            relative = np.abs(error[:, :d] @ inverse.T).max(axis=1) / GUESS_ACCURACY
+            relative = np.abs(error[:, :d]).max(axis=1) / GUESS_ACCURACY
         steps[alive] = next_step(step, relative)
         taken = np.isfinite(moved).all(axis=1) & (relative <= 1)
         z[alive[taken]] = moved[taken]
         kept.append(z.copy())
-        away = np.linalg.norm(z[alive][:, :d] @ inverse.T - first[alive], axis=1)
-        alive = alive[away < GUESS_REACH]
+        alive = alive[np.linalg.norm(z[alive, :d] - states[alive], axis=1) < GUESS_REACH]
         if not len(alive):
             break
-    ways = np.stack(kept, axis=1)
-    return list(ways[:, :, :d]), list(ways[:, :, -1])
+    return np.stack(kept, axis=1)

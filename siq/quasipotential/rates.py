@@ -379,41 +379,27 @@ class _Frame:
         self.resonant = bool(sums.min(initial=np.inf) < RESONANCE * self.unstable)
         self.stable = float(-rates[1:].real.max(initial=-np.inf))
         self.problem = problem
-        self.white = problem.constant and dynamics.diffusion.regular  # then D is the unit matrix
         self.gradients, self.hessians = local_series(dynamics, start)
         self.at_attractor = problem.hessian
-        self.at_saddle = None
-        if not self.resonant:
-            self.at_saddle = problem.units.T @ hessian_at(dynamics, end) @ problem.units / problem.unit
-        points = (path.points - start) @ problem.inverse.T
-        momenta = path.momenta @ problem.units / problem.unit
+        self.at_saddle = None if self.resonant else problem.curvatures(hessian_at(dynamics, end))
+        points, momenta = problem.scaled(path.points), problem.slopes(path.momenta)
         level = np.einsum("ni,ij,nj->n", points, self.at_attractor, points)
+        degree = 3 if dynamics.dimension > MOST_STATES_OF_DEGREE_4 else 4
         used = np.linalg.norm(points - problem.end, axis=1) > SADDLE_RADIUS
-        used[
-            : int(
-                np.sum(
-                    level
-                    < SERIES_RADIUS[3 if dynamics.dimension > MOST_STATES_OF_DEGREE_4 else 4] ** 2 * level[-1]
-                )
-            )
-        ] = False
-        self._lay_grid(points[used], momenta[used])
-
-    def _lay_grid(self, points: np.ndarray, momenta: np.ndarray) -> None:
-        """A grid along the path, with the time per unit of it; a step in time is two of its intervals."""
-        count, dimension = points.shape
-        curve = CubicSpline(np.arange(count), np.column_stack([points, momenta]))
+        used[: int(np.sum(level < SERIES_RADIUS[degree] ** 2 * level[-1]))] = False
+        # A grid along the path, with the time per unit of it; a step in time is two of its intervals.
+        count = int(used.sum())
+        curve = CubicSpline(np.arange(count), np.column_stack([points[used], momenta[used]]))
 
         def along(share: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
             y, p = np.split(curve(share), 2, axis=1)
-            push = p if self.white else np.einsum("nij,nj->ni", self.diffusion(y), p)
-            v = self.problem.force(y) + 2 * push
-            speed = np.linalg.norm(v, axis=1)
-            return y, p, v, np.linalg.norm(curve(share, 1)[:, :dimension], axis=1) / speed
+            v = problem.force(y) + 2 * problem.noise.push(y, p)
+            moved = curve(share, 1)[:, : dynamics.dimension]
+            return y, p, v, np.linalg.norm(moved, axis=1) / np.linalg.norm(v, axis=1)
 
         y, _, _, pace = along(np.arange(count))
-        largest = np.linalg.norm(self.problem.jacobian(y), axis=(1, 2)) + 2 * np.linalg.norm(
-            self.diffusion(y) @ self.at_attractor, axis=(1, 2)
+        largest = np.linalg.norm(problem.jacobian(y), axis=(1, 2)) + 2 * np.linalg.norm(
+            problem.noise.at(y) @ self.at_attractor, axis=(1, 2)
         )
         # As many steps from one point of the path to the next as its two ends call for.
         parts = np.ceil(np.maximum(pace[1:], pace[:-1]) * largest.max() / RICCATI_STEP)
@@ -425,20 +411,13 @@ class _Frame:
 
     def curvature(self, hessian: Callable[[np.ndarray], np.ndarray], y: np.ndarray) -> np.ndarray:
         """∇²V of a formula at points, in these units."""
-        problem = self.problem
-        return problem.units.T @ hessian(problem.unscaled(y)) @ problem.units / problem.unit
-
-    def diffusion(self, y: np.ndarray) -> np.ndarray:
-        """D, ``(n, d, d)``."""
-        if self.white:
-            return np.broadcast_to(np.eye(y.shape[1]), (len(y), y.shape[1], y.shape[1]))
-        return self.problem.noise.at(y)
+        return self.problem.curvatures(hessian(self.problem.points(y)))
 
     def rise(self, y: np.ndarray, p: np.ndarray, curvatures: np.ndarray) -> np.ndarray:
         """c, by which the logarithm of the density's prefactor falls along the path: shape ``(n,)``."""
-        rise = np.trace(self.problem.jacobian(y) + self.diffusion(y) @ curvatures, axis1=1, axis2=2)
-        constant = self.problem.constant
-        return rise if constant else rise + 2 * (self.problem.noise.divergence(y) * p).sum(axis=1)
+        noise = self.problem.noise
+        rise = np.trace(self.problem.jacobian(y) + noise.at(y) @ curvatures, axis1=1, axis2=2)
+        return np.asarray(rise + 2 * (noise.divergence(y) * p).sum(axis=1))
 
     def skew(self) -> float:
         """``|p - M_S (x - S)|`` at the end of the path to its parts, zero if V has this Hessian at S.
@@ -467,10 +446,10 @@ class _Frame:
         """∫ c dt over the whole path; near S the integrand per length is continued as a straight line."""
         problem = self.problem
         # From A to the first point y: with ẏ = By and c = b·y it is b·B⁻¹y.
-        here = np.zeros((1, len(problem.end)))
-        flow = problem.jacobian(here)[0] + 2 * self.diffusion(here)[0] @ self.at_attractor
+        here = np.zeros((1, problem.dimension))
+        flow = problem.jacobian(here)[0] + 2 * problem.noise.at(here)[0] @ self.at_attractor
         y = np.linalg.solve(flow, self.points[0]) * np.array([[1.0], [-1.0]])
-        p = self.gradients(problem.unscaled(y)) @ problem.units / problem.unit
+        p = problem.slopes(self.gradients(problem.points(y)))
         odd = self.rise(y, p, self.curvature(self.hessians, y))
         rise = self.rise(self.points[::2], self.momenta[::2], curvatures)
         density = rise / np.linalg.norm(self.velocities[::2], axis=1)
@@ -488,17 +467,13 @@ class _Frame:
             Where it diverges.
         """
         problem = self.problem
-        jacobians, bends = problem.jacobian(self.points), problem.bend(self.points, self.momenta)
-        forces = -np.einsum("nji,nj->ni", jacobians, self.momenta)
-        noise = self.diffusion(self.points)
-        if not problem.constant:
-            bends = bends + problem.noise.contract(self.points, self.momenta, 2)
-            forces -= problem.noise.contract(self.points, self.momenta, 1)
-            jacobians = jacobians + 2 * problem.noise.turn(self.points, self.momenta)
+        turned, bends = (part(self.points, self.momenta) for part in (problem.turned, problem.bend))
+        forces = problem.pull(self.points, self.momenta, turned)
+        noise = problem.noise.at(self.points)
         largest = CAUSTIC_GROWTH * np.abs(self.at_attractor).max()
 
         def rate(m: np.ndarray, index: int) -> np.ndarray:
-            product = m @ jacobians[index]
+            product = m @ turned[index]
             return -self.pace[index] * (product + product.T + 2 * m @ noise[index] @ m + bends[index])
 
         m = _imposed(self.curvature(self.hessians, self.points[:1])[0], self.velocities[0], forces[0])
@@ -511,7 +486,7 @@ class _Frame:
                 k3 = rate(m + h / 2 * k2, index + 1)
                 m = m + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(m + h * k3, index + 2))
             if not np.abs(m).max() < largest:
-                place = problem.unscaled(self.points[index])
+                place = problem.points(self.points[[index]])[0]
                 raise NumericalFailure(
                     f"the path meets a caustic near {place.tolist()}: V is not smooth there"
                 )

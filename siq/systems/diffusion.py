@@ -182,12 +182,16 @@ class Diffusion:
         """
         if order == 0:
             return np.asarray((momenta * self.push(x, momenta)).sum(axis=-1))
+        if self.constant:
+            return np.zeros((len(x), *(self.dimension,) * order))
         further = "k" if order == 1 else "kl"
         factors = f"ni,nij{further},nj->n{further}"
         return np.asarray(np.einsum(factors, momenta, self.derivatives(x, order), momenta))
 
     def turn(self, x: np.ndarray, momenta: np.ndarray) -> np.ndarray:
         """``((∂_k D)p)_i`` at points and momenta ``(n, d)``: shape ``(n, d, d)``, i before k."""
+        if self.constant:
+            return np.zeros((len(x), self.dimension, self.dimension))
         return np.asarray(np.einsum("nijk,nj->nik", self.derivatives(x), momenta))
 
     def divergence(self, x: np.ndarray) -> np.ndarray:
@@ -400,8 +404,11 @@ class _InUnits(Diffusion):
         self.noise, self.center, self.units, self.factor = noise, center, units, factor
         self.dimension, self.constant, self.regular = noise.dimension, noise.constant, noise.regular
         self._inverse = np.linalg.inv(units)
+        self._constant = factor * self._inverse @ noise.matrix @ self._inverse.T if noise.constant else None
 
     def derivatives(self, y: np.ndarray, order: int = 1) -> np.ndarray:
+        if self._constant is not None and order == 0:
+            return np.broadcast_to(self._constant, (len(y), *self._constant.shape))
         inner = self.noise.derivatives(self.center + y @ self.units.T, order)
         if order == 0:
             return np.asarray(self.factor * self._inverse @ inner @ self._inverse.T)
