@@ -169,40 +169,37 @@ class Inspection:
         return plot_inspection(self)
 
     def _contents(self) -> list[Remark]:
-        recordings, time_unit = self.recordings, self.recordings.time_unit
-        values: dict[str, Any]
-        held = {"recordings": len(recordings.labels), "samples": self.samples, "durations": self.durations}
-        found = [Remark("data.recordings", held | {"unit": time_unit})]
+        time_unit = self.recordings.time_unit
+        values: dict[str, Any] = {
+            "recordings": len(self.recordings.labels), "samples": self.samples, "durations": self.durations,
+            "steps": self.steps, "pairs": self.pairs, "gaps": self.gaps, "unit": time_unit,
+        }  # fmt: skip
+        found = [Remark("data.recordings", values)]
         if self.steps is not None:
-            values = {"steps": self.steps, "unit": time_unit, "pairs": self.pairs, "gaps": self.gaps}
             found.append(Remark("data.steps", values))
         # Where increments are correlated the two noises of a first look are neither.
         told = not self.memory.remembers and self.memory.kind != "hidden"
         for state in self.states:
-            step, floor = state.quantum, state.noise if told else None
-            error = 0.0 if step is None else rounding_error(step)
-            rounded = step is not None and error > NEGLIGIBLE_ROUNDING * (state.highest - state.lowest)
+            noise = (state.noise if told else None) or NoiseFloor(0.0, 0.0, 0.0, 0.0)
+            error = rounding_error(state.quantum or 0.0)
+            step = state.quantum if error > NEGLIGIBLE_ROUNDING * (state.highest - state.lowest) else None
             values = {
-                "name": state.name, "title": state.title, "unit": state.unit, "time_unit": time_unit,
-                "lowest": state.lowest, "highest": state.highest, "values": state.values,
-                "rounding_step": step if rounded else None, "rounding_error": error,
-                "decimals": decimals_of(step) if rounded and step is not None else None,
+                **vars(state), **vars(noise), "time_unit": time_unit, "rounding_step": step,
+                "rounding_error": error, "decimals": None if step is None else decimals_of(step),
             }  # fmt: skip
-            noise = vars(floor or NoiseFloor(0.0, 0.0, 0.0, 0.0))
-            found.append(Remark("data.state", values | noise))
+            found.append(Remark("data.state", values))
         return found
 
     def _findings(self) -> list[Remark]:
         memory, titles, unit = self.memory, self.recordings.titles, self.recordings.time_unit
         values: dict[str, Any]
-        strongest, state = 0.0, ""
-        if len(memory.correlations):
-            row, place = np.unravel_index(np.argmax(np.abs(memory.correlations)), memory.correlations.shape)
-            strongest, state = float(memory.correlations[row, place]), titles[int(place)]
         values = {
             "kind": memory.kind, "lag": memory.lag, "time": memory.time, "memory": memory.memory,
-            "correlation": strongest, "state": state, "unit": unit,
+            "correlation": 0.0, "state": "", "unit": unit,
         }  # fmt: skip
+        if len(memory.correlations):
+            row, place = np.unravel_index(np.argmax(np.abs(memory.correlations)), memory.correlations.shape)
+            values |= {"correlation": float(memory.correlations[row, place]), "state": titles[int(place)]}
         found = [Remark("data.memory", values)]
         if np.isfinite(memory.relaxation) and memory.kind not in ("unknown", "hidden"):
             values = {"time": memory.relaxation, "steps": memory.relaxation / memory.step, "unit": unit}
@@ -215,9 +212,9 @@ class Inspection:
                 "visits": [count.visits for count in hops.counts],
             }  # fmt: skip
             found.append(Remark("data.two_states", values) if hops.supported else Remark("data.one_state"))
-            fewest = min(count.visits for count in hops.counts)
-            if hops.supported and fewest:
-                values = {"transitions": fewest, "relative_error": float(1 / np.sqrt(fewest))}
+            fewest = min(hops.counts, key=lambda count: count.visits)
+            if hops.supported and fewest.visits:
+                values = {"transitions": fewest.visits, "relative_error": fewest.relative_error}
                 found.append(Remark("data.few_transitions", values))
             values = {"state": titles[hops.state], "range": float(np.ptp(hops.background))}
             drifts = bool(hops.background.any())

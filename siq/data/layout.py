@@ -151,16 +151,7 @@ class _Layout(NamedTuple):
 
 
 def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _Layout:
-    """Find the time, the labels and the measured columns.
-
-    Parameters
-    ----------
-    file
-        The file, for messages.
-    source
-        Its columns.
-    columns
-        The names of the measured columns wanted, in the order of the state vector; None for all.
+    """Find the time, the labels and the measured columns: those wanted, in their order, or all.
 
     Raises
     ------
@@ -176,9 +167,8 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
     titles = [title or name for title, name in zip(source.titles or (None,) * len(parts), plain, strict=True)]
     for name in plain:
         if name and plain.count(name) > 1:
-            raise InputError(
-                file, f"column {name}", "the column stands twice", "rename or remove one of them"
-            )
+            remedy = "rename or remove one of them"
+            raise InputError(file, f"column {name}", "the column stands twice", remedy)
     remarks = list(source.remarks)
     free = [place for place in range(len(parts)) if columns is None or plain[place] not in columns]
     dropped = set()
@@ -223,9 +213,8 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
         names = list(columns)
     if not states:
         raise InputError(file, "", "there is no measured column", "add one beside 'recording' and 't'")
-    units = tuple(
-        {"name": part.unit, "metadata": unit} for part, unit in zip(parts, source.units, strict=True)
-    )
+    pairs = zip(parts, source.units, strict=True)
+    units = tuple({"name": part.unit, "metadata": unit} for part, unit in pairs)
     shown = tuple(titles[place] for place in states)
     return _Layout(recording, time, tuple(states), tuple(names), shown, units, tuple(remarks))
 
@@ -257,9 +246,9 @@ def _is_second_time(source: ColumnFile, parts: list[_Heading], place: int) -> bo
 def _time_column(
     file: str, headings: Sequence[str], parts: list[_Heading], free: list[int], remarks: list[Remark]
 ) -> int:
-    for place in free:
-        if parts[place].title == "t":
-            return place
+    found = [place for place in free if parts[place].title == "t"]
+    if found:
+        return found[0]
     found = [place for place in free if _may_be_time(parts[place])]
     if len(found) > 1:
         # "T" is a temperature rather than a time.
@@ -270,8 +259,7 @@ def _time_column(
     if found:
         names = " and ".join(f"'{headings[place].strip()}'" for place in found)
         raise InputError(file, "", f"the columns {names} all look like the time", "call the right one 't'")
-    remedy = "add the time of every sample as a column 't'"
-    raise InputError(file, "", "the column 't' is missing", remedy)
+    raise InputError(file, "", "the column 't' is missing", "add the time of every sample as a column 't'")
 
 
 def _label_column(

@@ -229,14 +229,12 @@ class Recordings:
             copies[index] = copy
             labels.append(label if copy == 1 else f"{label}#{copy}")
             taken.add(labels[-1])
-        bounds = np.searchsorted(self.recording, np.arange(count + 1))
-        lengths = np.diff(bounds)[chosen]
-        begins = np.cumsum(lengths) - lengths
-        rows = np.arange(lengths.sum()) + np.repeat(bounds[chosen] - begins, lengths)
+        own = np.split(np.arange(len(self.t)), np.searchsorted(self.recording, np.arange(1, count)))
+        parts = [own[index] for index in chosen]
+        rows, recording = np.concatenate(parts), np.repeat(np.arange(len(parts)), [*map(len, parts)])
         return replace(
-            self, labels=tuple(labels), recording=np.repeat(np.arange(len(chosen)), lengths),
-            t=self.t[rows], values=self.values[rows],
-        )  # fmt: skip
+            self, labels=tuple(labels), recording=recording, t=self.t[rows], values=self.values[rows]
+        )
 
     def resampled(self, *, generator: np.random.Generator) -> Recordings:
         """As many recordings, drawn with replacement: one bootstrap sample.

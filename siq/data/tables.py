@@ -121,10 +121,7 @@ def _checked(
         remarks.append(Remark("data.empty_rows", {"rows": dropped}))
     if faults:
         raise min(faults, key=lambda each: each[0])[1]
-    rows = _trimmed(rows, numbers, remarks)
-    if gaps:
-        rows = _without_gaps(rows, numbers, remarks)
-    _refuse_missing(file, numbers, rows, ["t", *layout.titles])
+    rows = _complete(file, rows, numbers, ["t", *layout.titles], gaps, remarks)
     rows = _in_order(rows, numbers, layout.recording is not None, remarks)
     check_times(file, numbers[0][rows.order], rows.recording, rows.labels, rows.order)
     return Recordings(
@@ -300,8 +297,15 @@ def _seconds_of_clock(file: str, name: str, cells: Column) -> tuple[np.ndarray, 
     return ((values - start) / pd.Timedelta(seconds=1)).to_numpy(dtype=float), first or str(start)
 
 
-def _trimmed(rows: _Rows, numbers: np.ndarray, remarks: list[Remark]) -> _Rows:
-    """Without rows at the ends of recordings in which a number is missing, where two others are left."""
+def _complete(
+    file: str, rows: _Rows, numbers: np.ndarray, called: Sequence[str], gaps: bool, remarks: list[Remark]
+) -> _Rows:
+    """Rows in which no number is missing.
+
+    Rows at the ends of recordings are left out, where two others remain, and with `gaps` those in which a
+    measured value is missing, where they are the few. Where most are, the columns were hardly meant to be one
+    state, and they are refused, as is whatever else is missing.
+    """
     whole = pd.Series(~np.isnan(numbers[:, rows.order]).any(axis=0))
     after = whole.groupby(rows.recording).cummax()
     before = whole[::-1].groupby(rows.recording[::-1]).cummax()
@@ -310,24 +314,12 @@ def _trimmed(rows: _Rows, numbers: np.ndarray, remarks: list[Remark]) -> _Rows:
     if not keep.all():
         values = {"rows": int((~keep).sum()), "recordings": len(np.unique(rows.recording[~keep]))}
         remarks.append(Remark("data.rows_at_ends", values))
-    return _Rows(rows.order[keep], rows.recording[keep], rows.labels)
-
-
-def _without_gaps(rows: _Rows, numbers: np.ndarray, remarks: list[Remark]) -> _Rows:
-    """Without rows in which a measured value is missing, where they are the few.
-
-    Where most are missing, the columns were hardly meant to be one state, and they are refused.
-    """
+    rows = _Rows(rows.order[keep], rows.recording[keep], rows.labels)
     missing = np.isnan(numbers[1:, rows.order]).any(axis=0) & ~np.isnan(numbers[0, rows.order])
-    count = int(missing.sum())
-    if not count or 2 * count > len(missing):
-        return rows
-    remarks.append(Remark("data.rows_with_gaps", {"rows": count}))
-    present, recording = np.unique(rows.recording[~missing], return_inverse=True)
-    return _Rows(rows.order[~missing], recording, tuple(rows.labels[place] for place in present))
-
-
-def _refuse_missing(file: str, numbers: np.ndarray, rows: _Rows, called: Sequence[str]) -> None:
+    if gaps and 0 < 2 * missing.sum() <= len(missing):
+        remarks.append(Remark("data.rows_with_gaps", {"rows": int(missing.sum())}))
+        present, recording = np.unique(rows.recording[~missing], return_inverse=True)
+        rows = _Rows(rows.order[~missing], recording, tuple(rows.labels[place] for place in present))
     wrong = rows.order[np.isnan(numbers[:, rows.order]).any(axis=0)]
     if len(wrong) == len(rows.order) and len(wrong) > 2:
         remedy = "interpolate all columns to the same times, or name the states in the study"
@@ -339,6 +331,7 @@ def _refuse_missing(file: str, numbers: np.ndarray, rows: _Rows, called: Sequenc
             fault += f", as in {len(wrong) - 1} more row{'s' if len(wrong) > 2 else ''}"
             remedy = "remove these rows or write finite numbers"
         raise InputError(file, place, fault, remedy)
+    return rows
 
 
 def _in_order(rows: _Rows, numbers: np.ndarray, labelled: bool, remarks: list[Remark]) -> _Rows:
@@ -350,10 +343,9 @@ def _in_order(rows: _Rows, numbers: np.ndarray, labelled: bool, remarks: list[Re
     inside = rows.recording[1:] == rows.recording[:-1]
     if not (inside & (np.diff(t[rows.order]) <= 0)).any():
         return rows
-    bounds = np.searchsorted(rows.recording, np.arange(len(rows.labels) + 1))
+    bounds = np.searchsorted(rows.recording, np.arange(1, len(rows.labels)))
     parts, labels, was_sorted, twice, begun = [], [], 0, 0, 0
-    for index, label in enumerate(rows.labels):
-        own = rows.order[bounds[index] : bounds[index + 1]]
+    for label, own in zip(rows.labels, np.split(rows.order, bounds), strict=True):
         pieces = [own]
         back = np.flatnonzero(np.diff(t[own]) < 0) + 1
         if len(back) >= 3 and len(back) > SHUFFLED_SHARE * (len(own) - 1):
