@@ -37,7 +37,7 @@ from siq.quasipotential.landscape_comparison import (
     compare_estimate,
     compare_landscape,
     compare_mesh,
-    compare_with_mesh,
+    compare_overall,
     differences,
     reference_landscape,
 )
@@ -150,8 +150,8 @@ def run_landscape_errors(
         tables.append(_rows(NONE_OF_OURS, "published mesh", compared))
         if formulas_of_others:  # the paper's own comparison, in its Appendix E
             level = reference.level if below is None else below
-            values = formulas_of_others[0](reference.points)
-            both = [compare_with_mesh(values, published_mesh(reference.points), below=level)]
+            values, mesh = formulas_of_others[0](reference.points), published_mesh(reference.points)
+            both = [compare_overall(mesh - np.nanmin(mesh), values, level, shifted=True)]
             tables.append(_rows(NONE_OF_OURS, "published formula, against the published mesh", both))
     return concatenate(TABLE, tables)
 

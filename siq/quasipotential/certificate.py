@@ -15,7 +15,7 @@ the level at which the first characteristic leaves these.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -119,34 +119,15 @@ def uncertified(reason: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Everything that formulas of V are tested with.
+    """Everything that formulas of V are tested with."""
 
-    Attributes
-    ----------
-    found, portrait
-        f and D, identified without V or given, and the phase portrait that follows from them.
-    points
-        Evenly spread states that no fit saw, shape ``(n, d)``.
-    pairs
-        Consecutive samples of held-out recordings; None where f is given, and no motion was recorded.
-    references
-        V by characteristics about every attractor.
-    options
-        The limits.
-    prediction
-        The verdict on f; None where f is given.
-    seed
-        Draws of f, and the points on which the error is estimated.
-    """
-
-    found: AnyField
-    portrait: PhasePortrait
-    points: np.ndarray
-    pairs: SnapshotPairs | None = None
-    references: Sequence[Reference] = ()
-    options: CertificateOptions = field(default_factory=CertificateOptions)
-    prediction: Verdict | None = None
-    seed: int = 0
+    found: AnyField  # f and D, identified without V or given
+    portrait: PhasePortrait  # which follows from them
+    points: np.ndarray  # evenly spread states that no fit saw, shape (n, d)
+    pairs: SnapshotPairs | None = None  # of held-out recordings; None where no motion was recorded
+    references: Sequence[Reference] = ()  # V by characteristics about every attractor
+    options: CertificateOptions = field(default_factory=CertificateOptions)  # the limits
+    seed: int = 0  # draws f, and the points on which the error is estimated
 
 
 def certify(
@@ -243,8 +224,8 @@ def certify(
             tests["agreement"] = Verdict.worst(agreement)
         elif compared:
             tests["agreement"] = Verdict.refused(ALONE)
-        if evidence.prediction is not None:
-            tests["prediction"] = evidence.prediction
+        if found.prediction is not None:
+            tests["prediction"] = found.prediction
     if (fault := portrait.fault()) is not None:
         tests["branch"] = Verdict.refused(
             sentence(fault), tests["branch"].limit if "branch" in tests else 0.0
@@ -258,30 +239,19 @@ def _candidate_of_region(
     formulas: SymbolicDecomposition, evidence: Evidence, relative_error: float
 ) -> Candidate:
     symbols, d = formulas.symbols, len(formulas.symbols)
-    second = [slope.diff(symbol) for slope in formulas.gradient for symbol in symbols]
-    hessian = compile_formulas(second, symbols)
-    together, gradient = formulas.evaluate, formulas.evaluate_gradient
+    second = compile_formulas([one.diff(symbol) for one in formulas.gradient for symbol in symbols], symbols)
     return Candidate(
-        values=formulas.values,
-        gradients=lambda x: gradient(np.ascontiguousarray(x.T)).T,
-        hessians=lambda x: hessian(np.ascontiguousarray(x.T)).T.reshape(-1, d, d),
-        circulatory=lambda x: together(np.ascontiguousarray(x.T))[1 : d + 1].T,
-        points=evidence.points,
-        attractors=evidence.portrait.attractors,
-        relative_error=relative_error,
-        pairs=evidence.pairs,
-        references=evidence.references,
+        formulas.values,
+        lambda x: formulas.evaluate_gradient(np.ascontiguousarray(x.T)).T,
+        lambda x: second(np.ascontiguousarray(x.T)).T.reshape(-1, d, d),
+        lambda x: formulas.evaluate(np.ascontiguousarray(x.T))[1 : d + 1].T,
+        evidence.points, evidence.portrait.attractors, relative_error, evidence.pairs, evidence.references,
         tested_on=f"{len(evidence.points)} held-out states",
-    )
+    )  # fmt: skip
 
 
 def _candidate_in_well(well: Well, evidence: Evidence) -> Candidate:
-    """V about an attractor, to be tested on what lies in its well below `LEVEL_SHARE` of its level.
-
-    It makes no claim where its own residual is large, as at a caustic. Where few held-out states lie in the
-    well, points of characteristics are added. Pairs count by their first sample: to ask where the second one
-    lies would be to choose the noise.
-    """
+    """V about an attractor, to be tested on what lies in its well below `LEVEL_SHARE` of its level."""
     portrait, pairs = evidence.portrait, evidence.pairs
     index = [np.array_equal(one.position, well.attractor) for one in portrait.attractors].index(True)
     region = RecordedRegion.of_basin(portrait, index)
@@ -292,19 +262,18 @@ def _candidate_in_well(well: Well, evidence: Evidence) -> Candidate:
         mask[mask] = ~region.across(x[mask])
         return np.asarray(mask)
 
+    # Where few held-out states lie in the well, points of characteristics are added.
     points, further = evidence.points[inside(evidence.points)], ", all held out"
     if len(points) < MIN_POINTS and references:
         further = (
             f", {len(points)} of them held out and, as these are few, the others reached by characteristics"
         )
         points = np.concatenate([points, references[0].below(well.level)[0]])
-    believed = well.believed(points)
-    if pairs is not None:
+    believed = well.believed(points)  # no claim is made where its own residual is large, as at a caustic
+    if pairs is not None:  # by their first sample: to ask where the second one lies would choose the noise
         rows = inside(pairs.x0)
         rows[rows] = well.believed(pairs.x0[rows])
-        pairs = replace(
-            pairs, x0=pairs.x0[rows], xh=pairs.xh[rows], h=pairs.h[rows], recording=pairs.recording[rows]
-        )
+        pairs = pairs.take(rows)
     return Candidate(
         well.values, well.gradients, well.hessians, None, points[believed], [portrait.attractors[index]],
         pairs=pairs, references=references, level=well.level,
@@ -338,12 +307,10 @@ def caustics_below(
     Only sought where the stated error leaves room for one. A kink of V is no fault of the method, but no
     polynomial follows it, and the error that is stated comes from there.
     """
-    if not error > MIN_EXPLAINED_ERROR:
-        return ()
     remarks = []
     width = portrait.box[:, 1] - portrait.box[:, 0]
     box = np.stack([portrait.box[:, 0] - width / 4, portrait.box[:, 1] + width / 4], axis=1)
-    for well in wells:
+    for well in wells if error > MIN_EXPLAINED_ERROR else ():
         fan = adapted_fan(
             dynamics, well.attractor, level=0.98 * well.level, box=box,
             generator=np.random.default_rng(seed), **CAUSTIC_FAN,
@@ -379,18 +346,15 @@ def references_about(
     seed draws directions where there are more than two states, and thins the points.
     """
     known = [np.inf] * len(portrait.attractors) if depths is None else depths
-    return tuple(
-        _follow_well(dynamics, portrait, index, depth=depth, seed=seed) for index, depth in enumerate(known)
-    )
+    return tuple(_follow_well(dynamics, portrait, *each, seed=seed) for each in enumerate(known))
 
 
 def _follow_well(
-    dynamics: Dynamics, portrait: PhasePortrait, index: int, *, depth: float = np.inf, seed: int = 0
+    dynamics: Dynamics, portrait: PhasePortrait, index: int, depth: float = np.inf, *, seed: int = 0
 ) -> Reference:
     """V by characteristics about one attractor, as far as they may be believed, or a fault."""
     attractor = portrait.attractors[index].position
-    name = _position_text(attractor)
-    region = RecordedRegion.of_basin(portrait, index)
+    name, region = _position_text(attractor), RecordedRegion.of_basin(portrait, index)
 
     def without(fault: str) -> Reference:
         return Reference(attractor, np.zeros((0, len(attractor))), np.zeros(0), np.nan, np.inf, fault)
@@ -428,11 +392,7 @@ def _follow_well(
 def _level(
     dynamics: Dynamics, portrait: PhasePortrait, index: int, region: RecordedRegion, seed: int
 ) -> float:
-    """V at which the first characteristic comes to another basin, or to rest at a saddle.
-
-    Where there is neither, 1.1 times as much as most recorded starts have of V in the quadratic
-    approximation, so that `LEVEL_SHARE` of it is about that.
-    """
+    """V at which the first characteristic comes to another basin, or to rest at a saddle."""
     attractor = portrait.attractors[index].position
     hessian = hessian_at(dynamics, attractor)
 
@@ -464,7 +424,7 @@ def _level(
             continue
         if known is not None:
             return known
-        if not len(tops):
+        if not len(tops):  # then V, to second order, of most recorded starts
             return level / LEVEL_SHARE
         if not (fan.ends == End.LEVEL).any():
             return float(ends.max())

@@ -97,27 +97,16 @@ class CertificateOptions(PredictionLimits):
 class Reference:
     """V about one attractor at points that characteristics reach.
 
-    Attributes
-    ----------
-    attractor
-        Shape ``(d,)``; V is zero there.
-    points, values
-        Shape ``(n, d)`` and ``(n,)``.
-    level
-        V up to which they were followed, NaN where they could not be.
-    error
-        Relative error of the values: steps of a curve times their tolerance, and the margin of the sheets
-        where there was more than one.
-    fault
-        Why there is nothing to compare with, and what would help; empty where there is.
+    The relative error of the values is the steps of a curve times their tolerance, and the margin of the
+    sheets where there was more than one.
     """
 
-    attractor: np.ndarray
-    points: np.ndarray
-    values: np.ndarray
-    level: float
+    attractor: np.ndarray  # shape (d,); V is zero there
+    points: np.ndarray  # shape (n, d)
+    values: np.ndarray  # shape (n,)
+    level: float  # V up to which they were followed, NaN where they could not be
     error: float
-    fault: str = ""
+    fault: str = ""  # why there is nothing to compare with, and what would help; empty where there is
 
     def below(self, level: float) -> tuple[np.ndarray, np.ndarray]:
         """Points and values up to `LEVEL_SHARE` of a level that a formula claims, if it is the lower one."""
@@ -127,39 +116,20 @@ class Reference:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A V to be tested, with g, on the points for which it claims to hold.
+    """A V to be tested, with g, on the points for which it claims to hold."""
 
-    Attributes
-    ----------
-    values, gradients, hessians
-        V, ∇V and ∇²V: points ``(n, d)`` to ``(n,)``, ``(n, d)`` and ``(n, d, d)``.
-    circulatory
-        g, points to ``(n, d)``; None where g is f + D∇V by definition, and identity is no test.
-    points, pairs
-        Held-out states where it claims to hold, shape ``(n, d)``, and consecutive samples of which the first
-        does; None where no motion was recorded.
-    attractors, references
-        Those within, and V by characteristics about them.
-    relative_error
-        Relative standard error of V on the points, from the uncertainty of f.
-    level, claimed
-        V up to which it claims to hold, and at which share of the states of its region it does.
-    tested_on
-        The points, in words.
-    """
-
-    values: Function
-    gradients: Function
-    hessians: Function
-    circulatory: Function | None
-    points: np.ndarray
-    attractors: Sequence[Equilibrium]
-    relative_error: float = 0.0
-    pairs: SnapshotPairs | None = None
-    references: Sequence[Reference] = ()
-    level: float = np.inf
-    claimed: float = 1.0
-    tested_on: str = ""
+    values: Function  # V: points (n, d) to (n,)
+    gradients: Function  # to (n, d)
+    hessians: Function  # to (n, d, d)
+    circulatory: Function | None  # g, to (n, d); None where it is f + D∇V by definition
+    points: np.ndarray  # held-out states where it claims to hold, shape (n, d)
+    attractors: Sequence[Equilibrium]  # those within
+    relative_error: float = 0.0  # standard error of V on the points, from the uncertainty of f
+    pairs: SnapshotPairs | None = None  # of which the first state is such; None where no motion was recorded
+    references: Sequence[Reference] = ()  # V by characteristics about the attractors
+    level: float = np.inf  # V up to which it claims to hold
+    claimed: float = 1.0  # at which share of the states of its region it does
+    tested_on: str = ""  # the points, in words
 
     def stated_error(self, found: AnyField, *, seed: int = 0) -> float:
         """Relative L2 error of V on its points that its own residual and the uncertainty of f leave open.
@@ -263,7 +233,7 @@ def _check_branch(
     """Whether V has the right curvature at every attractor: the test that exposes exact false solutions."""
     if not candidate.attractors:
         return Verdict.refused("there is no stable equilibrium at which V could be tested", options.branch)
-    worst, allowed, place = 0.0, options.branch, candidate.attractors[0]
+    verdicts = []
     for one in candidate.attractors:
         expected = hessian_at(dynamics_of(found), one.position)
         root = np.linalg.inv(np.linalg.cholesky(expected))
@@ -288,23 +258,15 @@ def _check_branch(
                     )
                 spread.append(deviation(hessian_at(dynamics, position), expected, root))
             bound += STANDARD_ERRORS * float(np.sqrt(np.mean(np.square(spread))))
-        if value / bound >= worst / allowed:
-            worst, allowed, place = value, bound, one
-    return Verdict.of(
-        worst,
-        allowed,
-        f"the curvature of V at the stable state {place_text(place.position)} is not what f asks for",
-    )
+        reason = f"the curvature of V at the stable state {place_text(one.position)} is not what f asks for"
+        verdicts.append(Verdict.of(value, bound, reason))
+    return Verdict.worst(verdicts)
 
 
 def _residual_integral(
     gradient: Function, dynamics: Dynamics, x: np.ndarray, *, box: np.ndarray, slowest: float, fastest: float
 ) -> np.ndarray:
-    """∫∣∇V·(f + D∇V)∣ dt along the ascending paths that end at points ``(n, d)``: shape ``(n,)``.
-
-    It is infinite where a path runs away, far outside the box ``(d, 2)``, instead of coming from the
-    attractor.
-    """
+    """∫∣∇V·(f + D∇V)∣ dt along the ascending paths to points ``(n, d)``, infinite where one runs away."""
     total, _, lost = ascending_integrals(
         gradient, dynamics, x,
         lambda _, slope, flow, push: np.abs((slope * (flow + push)).sum(axis=1))[:, None],
@@ -315,29 +277,24 @@ def _residual_integral(
 
 
 def check_agreement(first: Function, wells: Sequence[Well], *, limit: float) -> Verdict:
-    """Whether V by another route is that of every well, up to a constant.
-
-    The figure is the largest relative L2 difference in any of them, its limit what the errors of both
-    explain.
-    """
-    worst, where = 0.0, ""
+    """Whether V by another route is that of every well, up to a constant, by relative L2 differences."""
+    verdicts = []
     for well in wells:
         x = well.inside(LEVEL_SHARE)
         one, two = first(x) - first(well.attractor[None]), well.values(x)
         value = float(np.linalg.norm(one - two) / np.linalg.norm(two))
-        if value >= worst:
-            worst, where = value, place_text(x[int(np.argmax(np.abs(one - two)))])
-    return Verdict.of(worst, limit, f"the two routes disagree most at {where}")
+        where = place_text(x[int(np.argmax(np.abs(one - two)))])
+        verdicts.append(Verdict.of(value, limit, f"the two routes disagree most at {where}"))
+    return Verdict.worst(verdicts)
 
 
 def _check_characteristics(
     candidate: Candidate, found: AnyField, options: CertificateOptions, *, error: float, seed: int = 0
 ) -> tuple[Verdict, float]:
-    """Whether V is the one that characteristics carry, within the error that its own residual leaves open.
+    """Whether V is the one that characteristics carry, and the error to be stated.
 
-    The verdict has the largest relative L2 difference about any attractor, and what the errors of both
-    explain. Also returned is the error to be stated: where V differs by more than that of its region, at
-    least that which its residual leaves open about this attractor.
+    The figure is the largest relative L2 difference about any attractor. Where it is more than the error of
+    the region, at least that is stated which the residual leaves open about this attractor.
     """
     if not candidate.references or len(candidate.references) < len(candidate.attractors):
         reason = "characteristics were not followed from every attractor, or there is none"
@@ -345,11 +302,9 @@ def _check_characteristics(
     verdicts = []
     for one in candidate.references:
         x, expected = one.below(candidate.level)
-        fault = one.fault
-        if not fault and len(x) < MIN_POINTS:
-            fault = f"only {len(x)} points of characteristics lie below the level of V: the level is too low"
-        if fault:
-            verdicts.append(Verdict.refused(fault))
+        few = f"only {len(x)} points of characteristics lie below the level of V: the level is too low"
+        if one.fault or len(x) < MIN_POINTS:
+            verdicts.append(Verdict.refused(one.fault or few))
             continue
         difference = candidate.values(x) - candidate.values(one.attractor[None]) - expected
         value = float(np.linalg.norm(difference) / np.linalg.norm(expected))
@@ -357,14 +312,12 @@ def _check_characteristics(
             error = max(error, replace(candidate, points=x).stated_error(found, seed=seed))
         # An error that cannot be stated explains nothing: a false solution, whose ascending paths run away.
         from_field = STATED_SIGMAS * candidate.relative_error  # of a formula that was fitted together with f
-        own = error - from_field
-        limit = (
-            (own if own <= options.error else 0.0) + (from_field if np.isfinite(error) else 0.0) + one.error
+        own = error - from_field if error - from_field <= options.error else 0.0
+        limit = own + (from_field if np.isfinite(error) else 0.0) + one.error
+        reason = (
+            f"V is not what characteristics give, most of all at {place_text(x[np.abs(difference).argmax()])}"
         )
-        place = place_text(x[int(np.argmax(np.abs(difference)))])
-        verdicts.append(
-            Verdict.of(value, limit, f"V is not what characteristics give, most of all at {place}")
-        )
+        verdicts.append(Verdict.of(value, limit, reason))
     return Verdict.worst(verdicts), error
 
 
@@ -384,17 +337,17 @@ def _check_descent(
 
     Without noise a pair rises where ``V(x_h) - V(x_0)`` is more than the residuals of f over such a pair, and
     rounding, explain; a share of them may. With noise the mean of ``∇V(X)·ΔX/h`` at the left point (Itô) is
-    ``-∇V·D∇V``, as g is orthogonal to ∇V; the standard error of its mean over a bin in V is known, as
-    increments are independent given the state from which they start. The figure is the largest of the bins'
-    deviations, in standard errors, and its limit one that all of them keep by chance except with probability
-    `false_alarms`. Two things are allowed for: of a V with the relative error e the term ``∇V·D∇V`` is off by
-    2e; and over a pair of length h the drift differs from f by ``(h/2) Lf`` with ``Lf = Jf + ½ Σ:∇²f``, Σ
-    being the noise per unit of time.
+    ``-∇V·D∇V``, as g is orthogonal to ∇V. The figure is the largest deviation of its mean over a bin in V, in
+    standard errors; all bins keep the limit by chance except with probability `false_alarms`. Allowed for
+    are 2e of ``∇V·D∇V``, e being the relative error of V; and over a pair of length h the drift's difference
+    from f, ``(h/2) Lf`` with ``Lf = Jf + ½ Σ:∇²f``, Σ being the noise per unit of time.
     """
     pairs = candidate.pairs
     assert pairs is not None
-    rows = np.unique(np.linspace(0, max(len(pairs.h) - 1, 0), MAX_PAIRS).astype(int))[: len(pairs.h)]
-    x0, xh, h = pairs.x0[rows], pairs.xh[rows], pairs.h[rows]
+    pairs = pairs.take(
+        np.unique(np.linspace(0, max(len(pairs.h) - 1, 0), MAX_PAIRS).astype(int))[: len(pairs.h)]
+    )
+    x0, xh, h = pairs.x0, pairs.xh, pairs.h
     if len(h) < MIN_POINTS:
         reason = f"only {len(h)} pairs of held-out samples start where V claims to hold: record more there"
         return Verdict(1.0, 0.0, False, reason)
@@ -435,9 +388,8 @@ def _check_descent(
         worst = max(worst, beyond / spread if spread > 0 else np.inf)
     if not claimed.max() > 0:
         return Verdict.refused(FLAT, limit)
-    return Verdict.of(
-        float(worst), limit, "in the mean over its noise V does not fall along the recordings as it has to"
-    )
+    reason = "in the mean over its noise V does not fall along the recordings as it has to"
+    return Verdict.of(float(worst), limit, reason)
 
 
 EXISTENCE_DRAWS = 200  # of f: a share of one in twenty is then known to ±0.015
@@ -454,8 +406,8 @@ def _lost_shares(
 ) -> np.ndarray:
     """Share of the f that the data allow in which each equilibrium does not exist: shape ``(k,)``.
 
-    Every equilibrium is followed from the identified f to drawn ones by Newton's method, in small steps. It
-    is lost where it vanishes together with another one, where its stability changes, and where it has jumped.
+    It is lost where it vanishes together with another one, where its stability changes, and where it has
+    jumped.
     """
     if found.noise_free or not equilibria:
         return np.zeros(len(equilibria))
@@ -465,11 +417,9 @@ def _lost_shares(
     changes[:, found.support[:, 1], found.support[:, 0]] = own
     changes += found.drawn_alternatives(EXISTENCE_DRAWS, generator=generator)
     followed = [_followed(found, one, changes, width) for one in equilibria]
-    places = np.array([place for place, _ in followed])
-    lost = np.array([gone for _, gone in followed])
-    far = np.array(
-        [np.abs((at - one.position) / width).max(axis=1) for at, one in zip(places, equilibria, strict=True)]
-    )
+    places, lost = (np.array(each) for each in zip(*followed, strict=True))
+    starts = np.array([one.position for one in equilibria])
+    far = np.abs((places - starts[:, None]) / width).max(axis=2)
     met = np.zeros_like(lost)
     for one, two in itertools.combinations(range(len(equilibria)), 2):
         same = np.abs((places[one] - places[two]) / width).max(axis=1) < EQUILIBRIUM_MERGE_TOLERANCE
@@ -483,7 +433,7 @@ def _lost_shares(
 def _followed(
     found: FieldEstimate, one: Equilibrium, changes: np.ndarray, width: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where changes of f lead an equilibrium, shape ``(n, d)``, and a mask of those that lose it."""
+    """Where changes of f lead an equilibrium by Newton's method, ``(n, d)``; a mask of those that lose it."""
     library, d = found.library, found.library.dimension
     first = [term.diff(symbol) for term in library.terms for symbol in library.symbols]
     derivative = compile_formulas(first, library.symbols)

@@ -21,10 +21,7 @@ import scipy.special
 
 from siq.inference.field_estimate import FieldEstimate
 from siq.inference.library import CandidateLibrary
-from siq.quasipotential.hamilton_jacobi import (
-    HamiltonJacobi,
-    LibraryBasis,
-)
+from siq.quasipotential.hamilton_jacobi import HamiltonJacobi, LibraryBasis
 
 MIN_PROBABILITY = 1e-4  # a probability below which no orthogonal fit is believed
 FIT_POINTS = 400  # where ∇V·g is asked to vanish in a joint fit
@@ -36,34 +33,18 @@ RANK_TOLERANCE = 1e-7  # singular values below this share of the largest are no 
 class GlobalFormula:
     """V over the library of f, q functions, and g where it was sought.
 
-    Attributes
-    ----------
-    potential
-        Coefficients of V, shape ``(q,)``.
-    covariance
-        Shape ``(q, q)``, zero for terms that are not there.
-    residual
-        Relative Hamilton–Jacobi residual on the points of the fit.
-    sensitivity
-        Shape ``(q, p)``: how the coefficients follow the p of f.
-    circulatory, circulatory_errors
-        Coefficients of g with their standard errors, shape ``(q, d)``.
-    joint
-        Whether V and g were fitted together at the Cramér–Rao bound, with ∇V·g = 0 identically.
-    freedom, chi_square
-        Of such a fit the number of constraints on the coefficients of f, and the squared distance of the
-        constrained f from the identified one, in its own covariance.
+    A joint fit of V and g is one at the Cramér–Rao bound, with ∇V·g = 0 identically.
     """
 
-    potential: np.ndarray
-    covariance: np.ndarray
-    residual: float = np.nan
-    sensitivity: np.ndarray | None = None
-    circulatory: np.ndarray | None = None
-    circulatory_errors: np.ndarray | None = None
+    potential: np.ndarray  # coefficients of V, shape (q,)
+    covariance: np.ndarray  # shape (q, q), zero for terms that are not there
+    residual: float = np.nan  # relative, of the Hamilton–Jacobi equation on the points of the fit
+    sensitivity: np.ndarray | None = None  # shape (q, p): how the coefficients follow the p of f
+    circulatory: np.ndarray | None = None  # coefficients of g, shape (q, d)
+    circulatory_errors: np.ndarray | None = None  # their standard errors
     joint: bool = False
-    freedom: int = 0
-    chi_square: float = 0.0
+    freedom: int = 0  # of a joint fit: constraints on the coefficients of f
+    chi_square: float = 0.0  # squared distance of its f from the identified one, in the covariance of that
 
     @property
     def probability(self) -> float:

@@ -12,7 +12,7 @@ what it found must be tested by what does not know of this equation (`siq.quasip
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -35,23 +35,20 @@ SINGULAR_RATIO = 1e-10  # of the largest singular value: combinations of functio
 
 
 class Basis(Protocol):
-    """m functions of d states."""
+    """m functions of d states: values ``(n, m)`` and derivatives at points; a sum of them as a formula."""
 
-    @property
-    def size(self) -> int:
-        """Number of functions, m."""
+    def values(self, x: np.ndarray) -> np.ndarray: ...  # noqa: D102
 
-    def values(self, x: np.ndarray) -> np.ndarray:
-        """Points ``(n, d)`` to values ``(n, m)``."""
+    def gradients(self, x: np.ndarray) -> np.ndarray: ...  # noqa: D102
 
-    def gradients(self, x: np.ndarray) -> np.ndarray:
-        """Points ``(n, d)`` to gradients ``(n, d, m)``."""
+    def hessians(self, x: np.ndarray) -> np.ndarray: ...  # noqa: D102
 
-    def hessians(self, x: np.ndarray) -> np.ndarray:
-        """Points ``(n, d)`` to Hessians ``(n, d, d, m)``."""
+    def expression(self, coefficients: np.ndarray) -> sympy.Expr: ...  # noqa: D102
 
-    def expression(self, coefficients: np.ndarray) -> sympy.Expr:
-        """The sum as a formula of the states."""
+
+def _weighted_sum(coefficients: np.ndarray, terms: Iterable[sympy.Expr]) -> sympy.Expr:
+    pairs = zip(coefficients, terms, strict=True)
+    return sympy.Add(*(sympy.Float(float(one), 17) * term for one, term in pairs if one != 0))
 
 
 @dataclass(frozen=True)
@@ -100,13 +97,7 @@ class LibraryBasis:
 
     def expression(self, coefficients: np.ndarray) -> sympy.Expr:
         """The sum as a formula of the states."""
-        return sympy.Add(
-            *(
-                sympy.Float(float(c), 17) * self.library.terms[k]
-                for c, k in zip(coefficients, self.chosen, strict=True)
-                if c != 0
-            )
-        )
+        return _weighted_sum(coefficients, (self.library.terms[k] for k in self.chosen))
 
 
 @dataclass(frozen=True)
@@ -128,7 +119,7 @@ class PowerBasis:
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...]) -> PowerBasis:
-        """The powers that `Expansion.powers` wrote."""
+        """The powers that `Well.powers` wrote."""
         return cls(symbols, *(np.array(data[name]) for name in ("center", "scale", "exponents")))
 
     @property
@@ -161,14 +152,8 @@ class PowerBasis:
             symbol if (c, s) == (0, 1) else (symbol - sympy.Float(float(c), 17)) / sympy.Float(float(s), 17)
             for symbol, c, s in zip(self.symbols, self.center, self.scale, strict=True)
         ]
-        return sympy.Add(
-            *(
-                sympy.Float(float(c), 17)
-                * sympy.Mul(*(base ** int(e) for base, e in zip(scaled, row, strict=True)))
-                for c, row in zip(coefficients, self.exponents, strict=True)
-                if c != 0
-            )
-        )
+        powers = ([base ** int(e) for base, e in zip(scaled, row, strict=True)] for row in self.exponents)
+        return _weighted_sum(coefficients, (sympy.Mul(*factors) for factors in powers))
 
     def _powers(self, x: np.ndarray) -> np.ndarray:
         """Powers of every scaled state, shape ``(highest + 1, d, n)``."""
@@ -194,19 +179,8 @@ class PowerBasis:
 class Expansion:
     """V = Σ c_k φ_k: the functions φ of a basis, with coefficients of the shape ``(m,)``."""
 
-    basis: PowerBasis
+    basis: Basis
     coefficients: np.ndarray
-
-    @property
-    def powers(self) -> dict[str, Any]:
-        """Center, scale, exponents and coefficients as plain data."""
-        parts = {name: getattr(self.basis, name).tolist() for name in ("center", "scale", "exponents")}
-        return parts | {"coefficients": self.coefficients.tolist()}
-
-    @property
-    def degree(self) -> int:
-        """Highest power."""
-        return int(self.basis.exponents.sum(axis=1).max())
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """V at points ``(n, d)``, shape ``(n,)``."""
@@ -219,11 +193,6 @@ class Expansion:
     def hessians(self, x: np.ndarray) -> np.ndarray:
         """∇²V at points, shape ``(n, d, d)``."""
         return self.basis.hessians(x) @ self.coefficients
-
-    @property
-    def expression(self) -> sympy.Expr:
-        """V as a formula of the states, in powers of ``(x - center)/scale``."""
-        return self.basis.expression(self.coefficients)
 
 
 def affordable_degree(dimension: int, degree: int) -> int:
@@ -294,16 +263,6 @@ class HamiltonJacobi:
         """``∣∇V·(f + D∇V)∣ / (∣∇V∣ ∣f∣)`` at the points, shape ``(n,)``."""
         size = np.sqrt(self.measure.contract(self.points, self.slopes(coefficients)))
         return np.asarray(np.abs(self.residual(coefficients)) / np.where(size > 0, size, np.inf))
-
-    def size(self, coefficients: np.ndarray) -> float:
-        """Rms of ∇V over the points, in the metric of the noise."""
-        gradient = self.slopes(coefficients)
-        return float(np.sqrt(self.measure.contract(self.points, gradient).mean()))
-
-    def size_jacobian(self, coefficients: np.ndarray) -> np.ndarray:
-        """Derivative of the size, which must not be zero, by the coefficients, shape ``(m,)``."""
-        along = self.measure.push(self.points, self.slopes(coefficients))
-        return np.einsum("nd,ndm->m", along, self.gradients) / (len(along) * self.size(coefficients))
 
     def sizes(self) -> np.ndarray:
         """Rms of each function's gradient over the points, in the metric of the noise: shape ``(m,)``."""
@@ -379,16 +338,18 @@ class HamiltonJacobi:
         scale = np.where(scale > 0, scale, 1.0)
 
         def relative(current: np.ndarray) -> tuple[np.ndarray, float]:
-            """The residual over rms of ∇V, shape ``(n,)``, and that rms."""
-            size = self.size(current)
+            """The residual over rms of ∇V in the metric of the noise, shape ``(n,)``, and that rms."""
+            size = float(np.sqrt(self.measure.contract(self.points, self.slopes(current)).mean()))
             return self.residual(current) / max(size, 1e-300), size
 
         residual, size = relative(coefficients)
         for _ in range(steps if free.any() else 0):
             if size == 0:
                 break
-            slant = self.size_jacobian(coefficients)[free]
-            jacobian = self.jacobian(coefficients)[:, free] - np.outer(residual, slant)
+            # Of that rms the derivative by the coefficients.
+            along = self.measure.push(self.points, self.slopes(coefficients))
+            slant = np.einsum("nd,ndm->m", along, self.gradients) / (len(along) * size)
+            jacobian = self.jacobian(coefficients)[:, free] - np.outer(residual, slant[free])
             matrix = jacobian / (size * scale[free])
             step = None
             try:  # the normal equations, ten times as fast, where they do: the next step corrects this one

@@ -354,23 +354,17 @@ class Landscape:
     def quasipotential_errors(self, points: np.ndarray) -> np.ndarray:
         """Standard errors of U at points ``(n, d)``, above the attractor of the well that each lies in.
 
-        Returns
-        -------
-        numpy.ndarray
-            Shape ``(n,)``, from the uncertainty of f; zero where recordings carry no noise, NaN where U is
-            not known, or f was not identified.
+        They come from the uncertainty of f, shape ``(n,)``: zero where recordings carry no noise, NaN where U
+        is not known, or f was not identified.
         """
         x = np.asarray(points, dtype=float)
-        errors = np.full(len(x), np.nan)
-        if self.field_estimate is None or self.global_quasipotential is None:
+        errors, whole = np.full(len(x), np.nan), self.global_quasipotential
+        if self.field_estimate is None or whole is None:
             return errors
-        whole = self.global_quasipotential(x)
-        for well, height in zip(self.wells, self.heights, strict=True):
-            if well is None:
-                continue
-            mine = np.isfinite(whole) & (
-                2 * well.known_values(x) + height <= whole + LEVEL_TOLERANCE * well.level
-            )
+        by_well = whole.by_well(x)
+        least = least_over_wells(by_well)
+        for well, values in zip(whole.wells, by_well, strict=True):
+            mine = values <= least + LEVEL_TOLERANCE * well.level  # false of NaN
             if mine.any():
                 found = self.field_estimate
                 errors[mine] = 2 * potential_errors(found, well.gradients, well.attractor, x[mine])
@@ -399,14 +393,9 @@ class Landscape:
             missing where the way leads out of the recorded region; ΔU in the unit of ε with its standard
             error from the uncertainty of f, NaN where it is not known.
         """
-        return pd.DataFrame(
-            {
-                "start": np.array([way.start for way in self.transitions], dtype=int),
-                "end": pd.array([way.end for way in self.transitions], dtype="Int64"),
-                "barrier": np.array([way.barrier for way in self.transitions], dtype=float),
-                "standard_error": np.array([way.standard_error for way in self.transitions], dtype=float),
-            }
-        )
+        types = {"start": int, "end": "Int64", "barrier": float, "standard_error": float}
+        rows = [[getattr(way, name) for name in types] for way in self.transitions]
+        return pd.DataFrame(rows, columns=list(types)).astype(types)
 
     def dwell_times(self, *, noise: float | None = None) -> pd.DataFrame:
         """Mean residence times, one row for every attractor.
@@ -431,11 +420,11 @@ class Landscape:
         strength = self.noise if noise is None else NoiseStrength(noise)
         if strength is None:
             raise Fault("no noise is known, and how long a well lasts follows from it", "give 'noise'")
-        rows = []
-        for index in range(len(self.attractors)):
-            found = mean_residence_time(self.exits(index), strength)
-            said = (np.nan,) * 3 if found is None else (found.value, found.data_error, found.law_error)
-            rows.append((index, *said))
+        times = [mean_residence_time(self.exits(index), strength) for index in range(len(self.attractors))]
+        rows = [
+            (index, *((np.nan,) * 3 if one is None else (one.value, one.data_error, one.law_error)))
+            for index, one in enumerate(times)
+        ]
         return pd.DataFrame(rows, columns=["attractor", "mean_time", "data_error", "law_error"])
 
     def exits(self, well: int) -> list[EscapeRate]:

@@ -58,34 +58,18 @@ Potential = Callable[[np.ndarray], np.ndarray]
 class ReferenceLandscape:
     """U at points, and barriers, by independent methods.
 
-    Attributes
-    ----------
-    attractors
-        Shape ``(k, d)``.
-    points
-        Shape ``(n, d)``.
-    characteristics, mesh
-        U about each attractor, zero there, shape ``(k, n)``; NaN where the method does not tell. The mesh is
-        NaN throughout where there are not two states, or somewhere in the box f is not finite or D not
-        positive definite.
-    barriers
-        Lowest barrier of U out of each well, by minimum action, shape ``(k,)``; infinite without a saddle.
-    mesh_barriers
-        The same on the mesh.
-    heights
-        U at the attractors, shape ``(k,)``.
-    reason
-        Why there is no reference, in words; then k and n are zero. Empty where there is one.
+    U about each attractor is NaN where the method does not tell. The mesh is NaN throughout where there are
+    not two states, or somewhere in the box f is not finite or D not positive definite.
     """
 
-    attractors: np.ndarray
-    points: np.ndarray
-    characteristics: np.ndarray
-    mesh: np.ndarray
-    barriers: np.ndarray
-    mesh_barriers: np.ndarray
-    heights: np.ndarray
-    reason: str = ""
+    attractors: np.ndarray  # shape (k, d)
+    points: np.ndarray  # shape (n, d)
+    characteristics: np.ndarray  # U about each attractor, zero there, shape (k, n)
+    mesh: np.ndarray  # the same on a mesh
+    barriers: np.ndarray  # lowest of U out of each well, by minimum action, (k,); infinite without a saddle
+    mesh_barriers: np.ndarray  # the same on the mesh
+    heights: np.ndarray  # U at the attractors, shape (k,)
+    reason: str = ""  # why there is no reference, in words; then k and n are zero
 
     def below(self, index: int, share: float) -> np.ndarray:
         """Mask of the points of one well below a share of its barrier."""
@@ -162,15 +146,13 @@ def reference_landscape(
     if not len(attractors):
         raise NumericalFailure("f has no attractor, so that there is no landscape to compare with")
     # Least action from each attractor to each saddle next to it, (k, s), infinite elsewhere.
-    saddles = list({tuple(one.position): one for row in portrait.saddles for one in row}.values())
+    saddles = list(dict.fromkeys(tuple(one.position) for row in portrait.saddles for one in row))
     count = len(attractors)
     actions = np.full((count, max(len(saddles), 1)), np.inf)
     for index, attractor in enumerate(attractors):
-        around = {tuple(saddle.position) for saddle in portrait.saddles[index]}
-        for column, saddle in enumerate(saddles):
-            if tuple(saddle.position) in around:
-                path = minimum_action_path(dynamics, attractor, saddle.position)
-                actions[index, column] = path.action
+        for top in portrait.saddles[index]:
+            path = minimum_action_path(dynamics, attractor, top.position)
+            actions[index, saddles.index(tuple(top.position))] = path.action
     barriers = actions.min(axis=1)
     lowest = np.where(np.isfinite(barriers), barriers, np.nan)
     if np.isnan(lowest).all():
@@ -191,11 +173,9 @@ def reference_landscape(
     else:
         known = np.concatenate([fan.points[sheet] for fan, sheet in zip(fans, sheets, strict=True)])
         points = known[generator.permutation(len(known))[:SCATTERED_POINTS]]
+    pairs = zip(fans, sheets, strict=True)
     values = np.stack(
-        [
-            2 * fan.value_near(points, sheet=sheet, distance=CURVE_DISTANCE)
-            for fan, sheet in zip(fans, sheets, strict=True)
-        ]
+        [2 * fan.value_near(points, sheet=sheet, distance=CURVE_DISTANCE) for fan, sheet in pairs]
     )
     on_mesh, mesh_barriers = np.full(values.shape, np.nan), np.full(count, np.nan)
     for index, one in enumerate(attractors if dynamics.dimension == 2 else ()):
@@ -206,12 +186,9 @@ def reference_landscape(
         tops = np.array([saddle.position for saddle in portrait.saddles[index]]).reshape(-1, 2)
         if len(tops):
             mesh_barriers[index] = np.nanmin(2 * potential(tops), initial=np.inf)
-    between = np.full((count, count), np.inf)
-    for i in range(count):
-        for j in range(count):
-            shared = np.isfinite(actions[i]) & np.isfinite(actions[j])
-            if i != j and shared.any():
-                between[i, j] = actions[i][shared].min()
+    # From i to j over the lowest saddle that is next to both.
+    between = np.where(np.isfinite(actions), actions[:, None], np.inf).min(axis=2)
+    np.fill_diagonal(between, np.inf)
     try:
         heights = heights_of_attractors(between)
     except NumericalFailure:
@@ -241,7 +218,7 @@ def compare_estimate(
         at = float(potential(attractor[None])[0])
         exact = reference.characteristics[index][inside]
         rows.append(_compared(_well_region(index), values[inside] - at, exact))
-    rows.append(_compare_overall(reference.values, values, below or reference.level, shifted=True))
+    rows.append(compare_overall(reference.values, values, below or reference.level, shifted=True))
     return rows
 
 
@@ -268,7 +245,7 @@ def compare_landscape(
             everywhere = _relative_l2(2 * well.values(x), exact)
         rows.append(_compared(_well_region(index), values, exact, everywhere))
     if (whole := landscape.global_quasipotential) is not None:
-        rows.append(_compare_overall(reference.values, whole(reference.points), below or reference.level))
+        rows.append(compare_overall(reference.values, whole(reference.points), below or reference.level))
     for index, place in pairs.items():
         barriers = [way.barrier for way in landscape.transitions if way.start == place]
         lowest = min((one for one in barriers if np.isfinite(one) and one), default=np.nan)
@@ -280,19 +257,14 @@ def compare_landscape(
 def compare_mesh(reference: ReferenceLandscape, *, below: float | None) -> list[dict[str, object]]:
     """The reference's own mesh against its characteristics, and its barriers against the least action."""
     errors = np.abs(reference.mesh_barriers / reference.barriers - 1)
-    overall = _compare_overall(reference.values, reference.mesh_values, below or reference.level)
+    overall = compare_overall(reference.values, reference.mesh_values, below or reference.level)
     return [overall, *(_compared_barrier(index, float(one)) for index, one in enumerate(errors))]
 
 
-def compare_with_mesh(values: np.ndarray, mesh: np.ndarray, *, below: float) -> dict[str, object]:
-    """An estimate of U against a mesh that is known up to a constant, below a level above its minimum."""
-    return _compare_overall(mesh - np.nanmin(mesh), values, below, shifted=True)
-
-
-def _compare_overall(
+def compare_overall(
     exact: np.ndarray, values: np.ndarray, level: float, *, shifted: bool = False
 ) -> dict[str, object]:
-    """Values of U over all wells below a level."""
+    """Values of U over all wells below a level; `shifted` where they are known up to a constant."""
     inside = np.nan_to_num(exact, nan=np.inf) < level
     own = values[inside]
     if shifted:

@@ -32,7 +32,17 @@ from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium
 
 DIGITS = 8  # of points of a fit and of a path, which tell where a formula holds and where to draw
-PATH_FIGURES = ("error", "residual", "converged", "smooth")  # of a path, as they are stored
+# Keys of the file, and the fields that they are: of a transition, of its law, of a cycle's loss, of its path.
+NUMBERS = {
+    "barrier": "barrier", "formula_share": "formula_share", "standard_error": "standard_error",
+    "by_rivals": "by_rivals", "noise_leverage": "leverage",
+}  # fmt: skip
+NUMBERS_OF_LAW = {
+    "prefactor": "prefactor", "prefactor_error": "prefactor_error", "prefactor_covariance": "covariance",
+    "exponent": "exponent",
+}  # fmt: skip
+TURN = {"own": "loss", "beyond": "loss_beyond", "exact": "particle"}
+PATH_FIGURES = ("error", "residual", "converged", "smooth")
 
 
 def landscape_data(landscape: Landscape) -> dict[str, Any]:
@@ -86,38 +96,28 @@ def landscape_data(landscape: Landscape) -> dict[str, Any]:
 
 
 def _transition_data(one: Transition) -> dict[str, Any]:
-    rate, path = one.rate, one.path
-    return {
+    rate, path = one.rate or EscapeRate(np.nan, np.nan, np.nan), one.path
+    data = {
         "start": one.start,
         "end": one.end,
         "saddle": one.place.tolist(),
-        "barrier": _number(one.barrier),
-        "formula_share": _number(one.formula_share),
-        "standard_error": _number(one.standard_error),
-        "error": _number(one.error),
-        "by_rivals": _number(one.by_rivals),
-        "minimum_action": None if path is None else path.action,
-        "prefactor": None if rate is None else rate.prefactor,
+        **{key: _number(getattr(one, name)) for key, name in (NUMBERS | {"error": "error"}).items()},
+        **{key: _number(getattr(rate, name)) for key, name in NUMBERS_OF_LAW.items()},
         "turn": None
-        if rate is None or rate.loss is None
-        else {"own": rate.loss, "beyond": rate.loss_beyond, "exact": rate.particle},
-        "prefactor_error": None if rate is None else rate.prefactor_error,
-        "prefactor_covariance": 0.0 if rate is None else rate.covariance,
-        "noise_leverage": one.leverage,
-        "exponent": None if rate is None else rate.exponent,
-        "uphill": None if path is None else path.points.tolist(),
-        "downhill": None if path is None or path.downhill is None else path.downhill.tolist(),
-        "path": None
-        if path is None
-        else {
-            "momenta": _rounded(path.momenta),
-            "values": _rounded(path.values[None])[0],
-            "rivals": list(path.rivals),
-            **{name: getattr(path, name) for name in PATH_FIGURES},
-        },
+        if rate.loss is None
+        else {key: getattr(rate, name) for key, name in TURN.items()},
+        "minimum_action": None, "uphill": None, "downhill": None, "path": None,
         "remarks": [remark.as_data() for remark in one.remarks],
-        "law_remarks": [] if rate is None else [remark.as_data() for remark in rate.remarks],
-    } | ({"over_cycle": one.saddle.period} if isinstance(one.saddle, Cycle) else {})
+        "law_remarks": [remark.as_data() for remark in rate.remarks],
+    }  # fmt: skip
+    if path is not None:
+        data |= {"minimum_action": path.action, "uphill": path.points.tolist()}
+        data["downhill"] = None if path.downhill is None else path.downhill.tolist()
+        data["path"] = {name: getattr(path, name) for name in PATH_FIGURES} | {
+            "momenta": _rounded(path.momenta), "values": _rounded(path.values[None])[0],
+            "rivals": list(path.rivals),
+        }  # fmt: skip
+    return data | ({"over_cycle": one.saddle.period} if isinstance(one.saddle, Cycle) else {})
 
 
 def _cycle_data(one: Cycle) -> dict[str, Any]:
@@ -145,8 +145,8 @@ def _pairs(values: np.ndarray) -> list[list[float]]:
     return [[value.real, value.imag] for value in values.astype(complex).tolist()]
 
 
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+def _number(value: float | None) -> float | None:
+    return None if value is None or not np.isfinite(value) else float(value)
 
 
 def _known(value: float | None) -> float:
@@ -229,17 +229,15 @@ def _transition_from_data(
             **{name: kept[name] for name in PATH_FIGURES},
         )  # fmt: skip
     if one["prefactor"] is not None:
-        turn = one["turn"] or {"own": None, "beyond": None, "exact": False}
         rate = EscapeRate(
-            one["minimum_action"], one["prefactor"], one["exponent"],
-            tuple(map(Remark.from_data, one["law_remarks"])),
-            turn["own"], turn["beyond"], turn["exact"],
-            prefactor_error=one["prefactor_error"], covariance=one["prefactor_covariance"],
+            one["minimum_action"], remarks=tuple(map(Remark.from_data, one["law_remarks"])),
+            **{name: one[key] for key, name in NUMBERS_OF_LAW.items()},
+            **{name: one["turn"][key] for key, name in TURN.items() if one["turn"]},
         )  # fmt: skip
     return Transition(
-        one["start"], one["end"], saddle, path, _known(one["barrier"]), _known(one["formula_share"]),
-        _known(one["standard_error"]), rate, tuple(map(Remark.from_data, one["remarks"])),
-        one["noise_leverage"], _known(one["by_rivals"]), from_cycle,
+        one["start"], one["end"], saddle, path, rate=rate, from_cycle=from_cycle,
+        remarks=tuple(map(Remark.from_data, one["remarks"])),
+        **{name: _known(one[key]) for key, name in NUMBERS.items()},
     )  # fmt: skip
 
 

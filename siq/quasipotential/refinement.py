@@ -126,26 +126,13 @@ class RefinementOptions:
 
 @dataclass(frozen=True)
 class Refined:
-    """The V of both routes.
+    """The V of both routes."""
 
-    Attributes
-    ----------
-    found
-        The identified f, over the functions of a formula for the region: those of f and of V together.
-    wells, network_wells
-        By the local route, one for each attractor; and by the network route, where it found no formula for
-        the region.
-    remarks
-        What could not be done.
-    formula
-        V and g where one formula holds over the whole region.
-    """
-
-    found: FieldEstimate
-    wells: tuple[Well, ...]
-    network_wells: tuple[Well, ...] = ()
-    remarks: tuple[Remark, ...] = ()
-    formula: GlobalFormula | None = None
+    found: FieldEstimate  # over the functions of a formula for the region: those of f and of V together
+    wells: tuple[Well, ...]  # by the local route, one for each attractor
+    network_wells: tuple[Well, ...] = ()  # by the network route, where it found no formula for the region
+    remarks: tuple[Remark, ...] = ()  # what could not be done
+    formula: GlobalFormula | None = None  # V and g where one formula holds over the whole region
 
 
 def _formula_library(found: FieldEstimate, options: RefinementOptions) -> CandidateLibrary:
@@ -237,7 +224,8 @@ def refine(
                         )
                     )  # fmt: skip
                 except NumericalFailure as error:
-                    remarks.append(_failed("network", error))
+                    failure = {"route": "network", "reason": str(error)}
+                    remarks.append(Remark("quasipotential.route_failed", failure))
     elif wells:
         network_wells = wells
     if not found.diffusion.constant:  # g = f + D∇V would need functions that no library has
@@ -296,12 +284,9 @@ def local_wells(
         try:
             wells.append(local_well(found.dynamics, portrait, index, options=options, seed=seed))
         except NumericalFailure as error:
-            remarks.append(_failed("local", error))
+            values = {"route": "local", "reason": str(error)}
+            remarks.append(Remark("quasipotential.route_failed", values))
     return tuple(wells), remarks
-
-
-def _failed(route: Route, error: NumericalFailure) -> Remark:
-    return Remark("quasipotential.route_failed", {"route": route, "reason": str(error)})
 
 
 def _refined_decomposition(refined: Refined, points: np.ndarray) -> SymbolicDecomposition:
@@ -388,12 +373,10 @@ class RefinementContext:
     @cached_property
     def evidence(self) -> Evidence:
         """Everything that formulas of the run are tested with."""
-        assert self.found.prediction is not None
         references = references_about(self.found.dynamics, self.portrait, seed=self.number)
         return Evidence(
-            self.found, self.portrait, self.held_out, self.pairs, references, self.limits,
-            self.found.prediction, self.number,
-        )  # fmt: skip
+            self.found, self.portrait, self.held_out, self.pairs, references, self.limits, self.number
+        )
 
     def record_test(self) -> OccupancyCheck:
         """Hops and histogram of the record, compared with those that f predicts."""
@@ -519,41 +502,30 @@ def _refined_by_routes(
 
 @dataclass(frozen=True)
 class Refinement:
-    """Refined formulas of a run.
+    """Refined formulas of a run."""
 
-    Attributes
-    ----------
-    formulas, certificate
-        V, g and f, and whether to believe them.
-    record
-        The test of f against hops and histogram of the recordings.
-    remarks
-        What could not be done, and caustics.
-    """
-
-    formulas: SymbolicDecomposition
-    certificate: Certificate
-    record: OccupancyCheck
-    remarks: tuple[Remark, ...] = ()
+    formulas: SymbolicDecomposition  # V, g and f
+    certificate: Certificate  # whether to believe them
+    record: OccupancyCheck  # f against hops and histogram of the recordings
+    remarks: tuple[Remark, ...] = ()  # what could not be done, and caustics
 
 
 def _difference(
     one: SymbolicDecomposition, two: SymbolicDecomposition, references: Sequence[Reference]
 ) -> float:
     """Largest relative L2 difference of two V about any attractor; infinite where one has none there."""
-
-    def about(formulas: SymbolicDecomposition, attractor: np.ndarray) -> Function | None:
-        if formulas.potential is not None:
-            return formulas.values
-        return next((one.values for one in formulas.wells if np.array_equal(one.attractor, attractor)), None)
-
     worst = 0.0 if references else np.inf
     for reference in references:
-        x, attractor = reference.points, reference.attractor
-        first, second = (about(formulas, attractor) for formulas in (one, two))
-        if first is None or second is None or not len(x):
+        x, at = reference.points, reference.attractor
+        potentials = [
+            potential.values(x) - potential.values(at[None])
+            for formulas in (one, two)
+            for potential in (formulas.wells if formulas.potential is None else [formulas])
+            if not isinstance(potential, Well) or np.array_equal(potential.attractor, at)
+        ]
+        if len(potentials) < 2 or not len(x):
             return np.inf
-        mine, theirs = (values(x) - values(attractor[None]) for values in (first, second))
+        mine, theirs = potentials
         worst = max(worst, float(np.linalg.norm(mine - theirs) / np.linalg.norm(theirs)))
     return worst
 

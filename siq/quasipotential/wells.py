@@ -54,23 +54,12 @@ NEGLIGIBLE_COEFFICIENT = 1e-14  # of the largest coefficient, or of the size of 
 
 @dataclass(frozen=True)
 class DegreeTrial:
-    """One degree that was tried about an attractor.
+    """One degree that was tried about an attractor, on points that took no part in the fit."""
 
-    Attributes
-    ----------
-    degree, terms
-        Highest power, and number of coefficients.
-    residual
-        Median relative Hamilton–Jacobi residual on points that took no part in the fit.
-    covered
-        Those of them at which the formula is believed, as a share of those that the degree which reaches most
-        of them has.
-    """
-
-    degree: int
-    terms: int
-    residual: float
-    covered: float
+    degree: int  # highest power
+    terms: int  # number of coefficients
+    residual: float  # median relative Hamilton–Jacobi residual
+    covered: float  # where the formula is believed, as a share of what the widest degree reaches
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +88,7 @@ class Well(Expansion):
         The degrees that were tried.
     """
 
+    basis: PowerBasis
     dynamics: Dynamics
     attractor: np.ndarray
     level: float
@@ -113,6 +103,17 @@ class Well(Expansion):
     def __post_init__(self) -> None:
         if not self.reach:
             object.__setattr__(self, "reach", self.level)
+
+    @property
+    def powers(self) -> dict[str, Any]:
+        """Center, scale, exponents and coefficients as plain data."""
+        parts = {name: getattr(self.basis, name).tolist() for name in ("center", "scale", "exponents")}
+        return parts | {"coefficients": self.coefficients.tolist()}
+
+    @property
+    def degree(self) -> int:
+        """Highest power."""
+        return int(self.basis.exponents.sum(axis=1).max())
 
     def inside(self, share: float = 1.0) -> np.ndarray:
         """The points of the fit below a share of the level, shape ``(m, d)``."""
@@ -293,9 +294,8 @@ def local_well(
         try:
             if depth is None or not wells:
                 well = _grow_well(
-                    dynamics, attractor, basin, saddles, degree=degree, generator=generator,
-                    depth=depth,
-                )  # fmt: skip
+                    dynamics, attractor, basin, saddles, degree=degree, generator=generator, depth=depth
+                )
             else:  # the same formula in powers up to a higher degree; the lower ones come first
                 lower = wells[-1]
                 basis = PowerBasis.up_to(degree, lower.basis.symbols, lower.basis.center, lower.basis.scale)
@@ -303,13 +303,10 @@ def local_well(
                 coefficients = np.concatenate([lower.coefficients, padding])
                 well = replace(lower, basis=basis, coefficients=coefficients)
             if depth is not None:
-                start, goal = well, options.reach * depth
-                told = {"goal": goal, "rows": kept, "path": path, "generator": generator}
-                well = _extend_well(start, basin, **told)
-                if (
-                    wells and not well.residual < RUNAWAY_RATIO * wells[-1].residual
-                ):  # by the path it began far off
-                    again = _extend_well(start, basin, by_path=False, **told)
+                told = {"goal": options.reach * depth, "rows": kept, "path": path, "generator": generator}
+                start, well = well, _extend_well(well, basin, **told)
+                if wells and not well.residual < RUNAWAY_RATIO * wells[-1].residual:
+                    again = _extend_well(start, basin, by_path=False, **told)  # by the path it began far off
                     well = min(well, again, key=lambda one: one.residual)
         except NumericalFailure as error:  # of one degree: another may do
             failure = error
@@ -337,9 +334,9 @@ def local_well(
     trials = []
     for well, mask in zip(wells, reached, strict=True):
         residual = well.residual_at(x[mask])
-        believed = int((residual <= well.tolerance).sum())
+        covered = int((residual <= well.tolerance).sum()) / max(most, 1)
         median = float(np.median(residual)) if len(residual) else np.inf
-        trials.append(DegreeTrial(well.degree, well.basis.size, median, believed / max(most, 1)))
+        trials.append(DegreeTrial(well.degree, well.basis.size, median, covered))
     return replace(wells[best_trial(trials)], trials=tuple(trials))
 
 
@@ -410,14 +407,12 @@ def _grown(
     attractor = basis.center
     place = f"the attractor near {attractor.round(4)}"
     flat = basin.states.reshape(-1, len(attractor))
-    functions = basis.values(flat)
+    functions, width = basis.values(flat), np.ptp(flat, axis=0)
+    tops = np.array([one.position for one in saddles]).reshape(-1, len(attractor))
+    at_tops = basis.values(tops)
 
     def along(current: np.ndarray) -> np.ndarray:
         return (functions @ current).reshape(basin.states.shape[:2])
-
-    tops = np.array([one.position for one in saddles]).reshape(-1, len(attractor))
-    at_tops = basis.values(tops)
-    width = np.ptp(flat, axis=0)
 
     def close(points: np.ndarray) -> np.ndarray:
         """Mask of the saddles that points of a fit have reached."""
@@ -447,9 +442,9 @@ def _grown(
                 f" needs {2 * basis.size}"
             )
         equation = HamiltonJacobi.at(basis, points, dynamics, attractor=attractor)
-        steps, tolerance = (40, 1e-13) if last else (8, COARSE_TOLERANCE)
+        pace: dict[str, Any] = {} if last else {"tolerance": COARSE_TOLERANCE}
         coefficients, residual = equation.gauss_newton(
-            coefficients, free=free, steps=steps, tolerance=tolerance
+            coefficients, free=free, steps=40 if last else 8, **pace
         )
         values = along(coefficients)
         recorded = _recorded(basin.starts(values), len(attractor))
@@ -458,11 +453,8 @@ def _grown(
         heights = at_tops @ coefficients
         believed = (heights > (1 - SADDLE_TOLERANCE) * level) | close(points)
         limit = depth or min(float(heights[believed & (heights > 0)].min(initial=np.inf)), recorded)
-        if (
-            last
-            and abs(limit - level) < LEVEL_TOLERANCE * level
-            and len(fitted) <= (1 + LEVEL_TOLERANCE) * before
-        ):
+        settled = last and abs(limit - level) < LEVEL_TOLERANCE * level
+        if settled and len(fitted) <= (1 + LEVEL_TOLERANCE) * before:
             break
         if any(abs(limit - one) < REPEAT_TOLERANCE * level for one in ends):  # from here on in circles
             break
@@ -479,9 +471,8 @@ def _grown(
         if abs(heights[nearest] - level) < (4 if close(points)[nearest] else 1) * SADDLE_TOLERANCE * level:
             saddle, level = tops[nearest], float(heights[nearest])
     # A V that vanishes is a solution too, and the end of what starts far from any other.
-    if not (np.isfinite(residual) and level > 0) or (
-        saddle is None and level < (1 - LEVEL_TOLERANCE) * recorded
-    ):
+    short = saddle is None and level < (1 - LEVEL_TOLERANCE) * recorded
+    if short or not (np.isfinite(residual) and level > 0):
         degree = int(basis.exponents.sum(axis=1).max())
         raise NumericalFailure(f"powers of degree {degree} do not follow V from {place} up to a saddle")
     return Well(basis, coefficients, dynamics, attractor, level, saddle, residual, points)
@@ -506,12 +497,10 @@ def fit_well(
 ) -> Well:
     """V about an attractor by the network route: from values V_θ, up to a constant, refined without M.
 
-    It starts on the states where the network says that V is low, since networks are worst far out, and which
-    are low is all that it has of them in the end: from there V grows by itself, as in the local route, but
-    with all powers free. Were it fitted on what the network takes for the well, it would have to be compared
-    with the local route at states beyond, where it says nothing. The other arguments are those of the local
-    route; `steps` are the most of Gauss–Newton at the start. Fails with `NumericalFailure` when the networks
-    leave too few states for a start, or no start grows to a well.
+    It starts on the states where the network says that V is low, since networks are worst far out. From there
+    V grows by itself, as in the local route, but with all powers free. The other arguments are those of the
+    local route; `steps` are the most of Gauss–Newton at the start. Fails with `NumericalFailure` when the
+    networks leave too few states for a start, or no start grows to a well.
     """
     lowest = float(potential(attractor.position[None])[0])
     flat = basin.states.reshape(-1, basin.states.shape[2])
@@ -595,9 +584,8 @@ def _extend_well(
         fitted = basin.below(lower, level)
         # Where the well narrows towards its saddle, V in lower powers may be far off, and few states below.
         distance, nearest = cKDTree(path.points @ metric).query(places)
-        beside = np.where(
-            distance < PATH_DISTANCE * np.sqrt(path.values[-1]), path.values[nearest] / 2, np.inf
-        )
+        near = distance < PATH_DISTANCE * np.sqrt(path.values[-1])
+        beside = np.where(near, path.values[nearest] / 2, np.inf)
         if by_path:
             coefficients = _towards_path(well, basin.points(fitted), path, free)
     while True:

@@ -106,8 +106,9 @@ def evidence_of(
     """States from all over the domain, where each comes to in a hundredth of a time unit, characteristics."""
     x0 = uniform_points(known, held_out, seed=5, share=share)
     return Evidence(
-        found or exact_field(known, degree_of(known)), portrait_of(known, count, share=share), x0,
-        pairs_from(known, x0, 0.01), references_of(known, share=share, count=count), prediction=prediction,
+        replace(found or exact_field(known, degree_of(known)), prediction=prediction),
+        portrait_of(known, count, share=share), x0, pairs_from(known, x0, 0.01),
+        references_of(known, share=share, count=count),
     )  # fmt: skip
 
 

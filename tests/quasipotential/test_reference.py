@@ -14,9 +14,9 @@ from scipy.interpolate import RegularGridInterpolator
 from siq.errors import InputError, NumericalFailure
 from siq.quasipotential.landscape_comparison import (
     ReferenceLandscape,
-    _compare_overall,
     _relative_l2,
     compare_landscape,
+    compare_overall,
     reference_landscape,
 )
 from siq.systems.cards import load_system
@@ -86,9 +86,9 @@ def test_a_well_without_a_formula_counts_as_not_covered(smooth) -> None:
 
 
 def test_the_reference_has_no_difference_from_itself(smooth) -> None:
-    row = _compare_overall(smooth.values, smooth.values, 0.4)
+    row = compare_overall(smooth.values, smooth.values, 0.4)
     assert row["points"] > 500 and row["covered"] == 1 and row["error"] == 0
-    shifted = _compare_overall(smooth.values, smooth.values + 3.0, 0.4, shifted=True)
+    shifted = compare_overall(smooth.values, smooth.values + 3.0, 0.4, shifted=True)
     assert shifted["error"] < 1e-12
 
 
@@ -117,7 +117,7 @@ def test_three_methods_agree_on_the_resonator(resonator) -> None:
         inside = resonator.below(index, 0.9)
         on_mesh, exact = resonator.mesh[index][inside], resonator.characteristics[index][inside]
         assert _relative_l2(on_mesh, exact) < 2e-3
-    assert _compare_overall(resonator.values, resonator.mesh_values, 1.2e-8)["error"] < 2e-3
+    assert compare_overall(resonator.values, resonator.mesh_values, 1.2e-8)["error"] < 2e-3
 
 
 @pytest.mark.slow
@@ -129,7 +129,7 @@ def test_the_published_mesh_is_as_far_off_as_was_found(resonator) -> None:
     at = RegularGridInterpolator(axes, 2 * values, bounds_error=False)
     published = at(resonator.points)
     published = published - at(resonator.attractors[:1])
-    row = _compare_overall(resonator.values, published, 1.2e-8)
+    row = compare_overall(resonator.values, published, 1.2e-8)
     print(row)
     assert row["covered"] > 0.95
     assert 0.02 < row["error"] < 0.06

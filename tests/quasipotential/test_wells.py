@@ -327,9 +327,9 @@ def test_the_formula_of_a_well_has_its_values() -> None:
     known = maier_stein(3)
     well = grown(known, portrait_of(known), 0, degree=6)
     x = well.points[:50]
-    formula = compile_formulas([well.expression], known.dynamics.symbols)
+    formula = compile_formulas([well.basis.expression(well.coefficients)], known.dynamics.symbols)
     np.testing.assert_allclose(formula(np.ascontiguousarray(x.T))[0], well.values(x), atol=1e-12)
-    assert isinstance(well.expression, sympy.Expr)
+    assert isinstance(well.to_sympy(), sympy.Expr)
 
 
 def test_refinement_keeps_the_best_degree_of_a_well() -> None:
