@@ -22,12 +22,20 @@ from siq.errors import Fault, InputError, NumericalFailure
 from siq.inference.library import CandidateLibrary, linear_combination
 from siq.numerics.files import whole_file
 from siq.quasipotential.hamilton_jacobi import LibraryBasis, PowerBasis
-from siq.quasipotential.wells import RESIDUAL_TOLERANCE, DegreeTrial, Well
+from siq.quasipotential.wells import DegreeTrial, Well
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import FormulaError, compile_formulas, parse_formula
 
 MOST_STARTS = 8  # of descents to the minimum of V
+WELL = (
+    "attractor",
+    "level",
+    "saddle",
+    "reach",
+    "tolerance",
+    "residual",
+)  # what the file has of a well as it is
 
 
 @dataclass(frozen=True)
@@ -96,14 +104,10 @@ class SymbolicDecomposition:
 def exact_decomposition(dynamics: Dynamics, quasipotential: sympy.Expr) -> SymbolicDecomposition:
     """The decomposition of known dynamics with a known U = 2V; g = f + D∇V. For scoring only."""
     potential = sympy.expand(quasipotential / 2)
-    gradient = [potential.diff(symbol) for symbol in dynamics.symbols]
-    downhill = downhill_formulas(dynamics.diffusion, gradient)
-    return SymbolicDecomposition(
-        symbols=dynamics.symbols,
-        potential=potential,
-        circulatory=tuple(sympy.expand(f + v) for f, v in zip(dynamics.formulas, downhill, strict=True)),
-        vector_field=tuple(sympy.expand(formula) for formula in dynamics.formulas),
-    )
+    downhill = downhill_formulas(dynamics.diffusion, [potential.diff(one) for one in dynamics.symbols])
+    circulatory = tuple(sympy.expand(f + v) for f, v in zip(dynamics.formulas, downhill, strict=True))
+    flow = tuple(map(sympy.expand, dynamics.formulas))
+    return SymbolicDecomposition(dynamics.symbols, potential, circulatory, flow)
 
 
 def downhill_formulas(diffusion: Diffusion, gradient: Sequence[sympy.Expr]) -> tuple[sympy.Expr, ...]:
@@ -128,14 +132,11 @@ def decomposition_from_coefficients(
     box of the points ``(n, d)``, from the lowest of them; a V that is nowhere finite there is a
     `NumericalFailure`.
     """
-    basis = LibraryBasis(library, np.arange(library.size))
-    value = basis.expression(potential)
-    lowest = _minimum(value, library.symbols, points)
+    formula = LibraryBasis(library, np.arange(library.size)).expression
+    value = formula(potential)
+    value -= sympy.Float(_minimum(value, library.symbols, points), 17)
     return SymbolicDecomposition(
-        symbols=library.symbols,
-        potential=value - sympy.Float(lowest, 17),
-        circulatory=tuple(basis.expression(column) for column in circulatory.T),
-        vector_field=tuple(basis.expression(column) for column in vector_field.T),
+        library.symbols, value, tuple(map(formula, circulatory.T)), tuple(map(formula, vector_field.T))
     )
 
 
@@ -182,20 +183,15 @@ def term_coefficients(expression: sympy.Expr) -> dict[str, float]:
 def _expression_to_data(expression: sympy.Expr, symbols: Sequence[sympy.Symbol]) -> dict[str, Any]:
     """A formula as plain data: a polynomial by its coefficients, anything else by its text."""
     # "is polynomial" must not simplify: 1/x*x**2 is what the library said it is.
-    if expression.is_polynomial(*symbols):
-        polynomial = sympy.Poly(expression, *symbols)
-        pairs = [(list(map(int, e)), float(c)) for e, c in polynomial.terms() if c != 0]
-        return {
-            "center": [0.0] * len(symbols),
-            "scale": [1.0] * len(symbols),
-            "exponents": [exponents for exponents, _ in pairs],
-            "coefficients": [coefficient for _, coefficient in pairs],
-        }
-    return {"formula": str(expression)}
+    if not expression.is_polynomial(*symbols):
+        return {"formula": str(expression)}
+    pairs = [(list(map(int, e)), float(c)) for e, c in sympy.Poly(expression, *symbols).terms() if c != 0]
+    data = {"center": [0.0] * len(symbols), "scale": [1.0] * len(symbols)}
+    return data | {"exponents": [e for e, _ in pairs], "coefficients": [c for _, c in pairs]}
 
 
 def _expression_from_data(data: Mapping[str, Any], symbols: Sequence[sympy.Symbol]) -> sympy.Expr:
-    """The formula that `expression_to_data` wrote; text goes through the whitelist of formulas."""
+    """The formula that `_expression_to_data` wrote; text goes through the whitelist of formulas."""
     if "formula" in data:
         return parse_formula(data["formula"], {symbol.name: symbol for symbol in symbols})
     return PowerBasis.from_data(data, tuple(symbols)).expression(data["coefficients"])
@@ -212,15 +208,10 @@ def decomposition_data(one: SymbolicDecomposition) -> dict[str, Any]:
     if one.wells:
         data["wells"] = [
             {
-                "attractor": well.attractor.tolist(),
-                "level": well.level,
-                "saddle": None if well.saddle is None else well.saddle.tolist(),
-                "reach": well.reach,
-                "tolerance": well.tolerance,
-                "residual": well.residual,
-                "V": well.powers,
-                "degrees": [asdict(trial) for trial in well.trials],
+                name: None if (part := getattr(well, name)) is None else np.asarray(part).tolist()
+                for name in WELL
             }
+            | {"V": well.powers, "degrees": [asdict(trial) for trial in well.trials]}
             for well in one.wells
         ]
         data["D"] = one.wells[0].dynamics.diffusion.rows
@@ -230,20 +221,15 @@ def decomposition_data(one: SymbolicDecomposition) -> dict[str, Any]:
 
 
 def _wells_from_data(method: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...]) -> tuple[Well, ...]:
-    if not method.get("wells"):
+    if "wells" not in method:
         return ()
-    d = len(symbols)
     equations = [_expression_from_data(part, symbols) for part in method["f"]]
-    diffusion = Diffusion.of_rows(symbols, method.get("D", np.eye(d).tolist()))
-    dynamics = Dynamics.of(symbols, equations, diffusion=diffusion)
+    dynamics = Dynamics.of(symbols, equations, diffusion=Diffusion.of_rows(symbols, method["D"]))
     return tuple(
         Well(
-            PowerBasis.from_data(one["V"], symbols), np.array(one["V"]["coefficients"], dtype=float),
-            dynamics, np.array(one["attractor"]), float(one["level"]),
-            None if one.get("saddle") is None else np.array(one["saddle"]),
-            float(one.get("residual", np.nan)), np.zeros((0, d)), float(one.get("reach", one["level"])),
-            float(one.get("tolerance", RESIDUAL_TOLERANCE)), None,
-            tuple(DegreeTrial(**trial) for trial in one.get("degrees", ())),
+            PowerBasis.from_data(one["V"], symbols), np.array(one["V"]["coefficients"]), dynamics,
+            points=np.zeros((0, len(symbols))), trials=tuple(DegreeTrial(**each) for each in one["degrees"]),
+            **{name: np.array(one[name]) if isinstance(one[name], list) else one[name] for name in WELL},
         )
         for one in method["wells"]
     )  # fmt: skip
@@ -258,13 +244,12 @@ def write_model(
 
     Certificates of what is no method, such as a randomised network, stand beside them.
     """
-    model: dict[str, Any] = {"states": [], "methods": {}, "certificate": {}}
-    if decompositions:
-        model = {
-            "states": [symbol.name for symbol in next(iter(decompositions.values())).symbols],
-            "methods": {method: decomposition_data(one) for method, one in decompositions.items()},
-            "certificate": {method: dict(one) for method, one in certificates.items()},
-        }
+    symbols = next((one.symbols for one in decompositions.values()), ())
+    model = {
+        "states": [symbol.name for symbol in symbols],
+        "methods": {method: decomposition_data(one) for method, one in decompositions.items()},
+        "certificate": {method: dict(one) for method, one in certificates.items() if decompositions},
+    }
     with whole_file(path) as partial:
         partial.write_text(json.dumps(model, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 

@@ -21,6 +21,7 @@ import scipy.special
 
 from siq.inference.field_estimate import FieldEstimate
 from siq.inference.library import CandidateLibrary
+from siq.numerics.randomness import positive
 from siq.quasipotential.hamilton_jacobi import HamiltonJacobi, LibraryBasis
 
 MIN_PROBABILITY = 1e-4  # a probability below which no orthogonal fit is believed
@@ -73,8 +74,7 @@ def fit_values(
     weight = np.repeat([1 / np.sqrt(max(count, 1)) for count in counts], counts)
     constants = np.repeat(np.eye(len(points)), counts, axis=0)
     functions = np.column_stack([basis.values(np.concatenate(points)), constants])
-    scale = np.sqrt((functions**2).mean(axis=0))
-    scale = np.where(scale > 0, scale, 1.0)
+    scale = positive(np.sqrt((functions**2).mean(axis=0)))
     matrix = weight[:, None] * functions / scale
     solution = np.linalg.lstsq(matrix, weight * np.concatenate(values), rcond=1e-10)[0] / scale
     coefficients = np.zeros(library.size)
@@ -133,8 +133,7 @@ def refine_globally(
 
 def _left_inverse(jacobian: np.ndarray) -> np.ndarray:
     """The inverse of least squares, shape ``(m, n)``, of columns that may be of very different sizes."""
-    scale = np.linalg.norm(jacobian, axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
+    scale = positive(np.linalg.norm(jacobian, axis=0))
     return np.asarray(np.linalg.pinv(jacobian / scale, rcond=1e-11) / scale[:, None])
 
 
@@ -166,8 +165,7 @@ def _eliminate(
     active = np.arange(m)
     while len(active):
         columns = triangle[:, active]
-        scale = np.linalg.norm(columns, axis=0)
-        scale = np.where(scale > 0, scale, 1.0)
+        scale = positive(np.linalg.norm(columns, axis=0))
         # The inverse of least squares; by QR where columns are independent, which is ten times faster.
         orthogonal, upper = np.linalg.qr(columns / scale)
         diagonal = np.abs(np.diag(upper))
@@ -272,8 +270,7 @@ def _fit_orthogonal(
     for column, (i, k) in enumerate(places):
         circulation[:, i, column] = values[:, k]
     slopes = np.sqrt(noise.contract(points, gradients.transpose(0, 2, 1)))
-    scale = np.concatenate([np.sqrt((slopes**2).mean(axis=0)) / usual, sizes[of_circulatory]])
-    scale = np.where(scale > 0, scale, 1.0)
+    scale = positive(np.concatenate([np.sqrt((slopes**2).mean(axis=0)) / usual, sizes[of_circulatory]]))
     weight = 1 / np.maximum(speed, 1e-3 * speed.max()) / usual / np.sqrt(len(points))
 
     def constraints(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -22,6 +22,7 @@ import scipy.linalg
 import sympy
 
 from siq.inference.library import CandidateLibrary, monomial_exponents
+from siq.numerics.randomness import positive
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import measure_at
@@ -204,28 +205,14 @@ def affordable_degree(dimension: int, degree: int) -> int:
 
 @dataclass(frozen=True)
 class HamiltonJacobi:
-    """The equation at some points.
+    """The equation at some points, weighted so that fast regions do not rule."""
 
-    Attributes
-    ----------
-    points, flow
-        x and f there, shape ``(n, d)``.
-    gradients
-        ∂θ_j/∂x_i at the points, shape ``(n, d, m)``.
-    diffusion
-        D.
-    weight
-        Shape ``(n,)``: one over ∣f∣ in the metric of the noise, so that fast regions do not rule.
-    measure
-        That metric: D, or what stands in for a D without inverse (`siq.systems.equilibria.measure_at`).
-    """
-
-    points: np.ndarray
-    gradients: np.ndarray
-    flow: np.ndarray
-    diffusion: Diffusion
-    weight: np.ndarray
-    measure: Diffusion
+    points: np.ndarray  # shape (n, d)
+    gradients: np.ndarray  # ∂θ_j/∂x_i there, shape (n, d, m)
+    flow: np.ndarray  # f there, shape (n, d)
+    diffusion: Diffusion  # D
+    weight: np.ndarray  # one over ∣f∣ in the metric of the noise, shape (n,)
+    measure: Diffusion  # that metric: D, or what stands in for a D without inverse (`measure_at`)
 
     @classmethod
     def at(
@@ -334,8 +321,7 @@ class HamiltonJacobi:
         """
         coefficients = start.copy()
         free = np.ones(len(start), dtype=bool) if free is None else free
-        scale = self.sizes()
-        scale = np.where(scale > 0, scale, 1.0)
+        scale = positive(self.sizes())
 
         def relative(current: np.ndarray) -> tuple[np.ndarray, float]:
             """The residual over rms of ∇V in the metric of the noise, shape ``(n,)``, and that rms."""
@@ -368,16 +354,19 @@ class HamiltonJacobi:
                 trial = coefficients.copy()
                 trial[free] += length * step
                 attempt, size = relative(trial)
-                if np.linalg.norm(attempt) < np.linalg.norm(residual) or length < 1e-3:
+                improved = np.linalg.norm(attempt) < np.linalg.norm(residual)
+                if improved or length < 1e-3:
                     break
                 length /= 2
-            improved = np.linalg.norm(attempt) < np.linalg.norm(residual)
-            change = np.linalg.norm(length * step * scale[free])
-            reached = np.linalg.norm(coefficients * scale)
-            if improved:
-                gain = 1 - float(np.linalg.norm(attempt)) / max(float(np.linalg.norm(residual)), 1e-300)
-                coefficients, residual = trial, attempt
-            if not improved or change <= tolerance * reached or gain < 1e-7:
+            if not improved:
+                break
+            gain = 1 - float(np.linalg.norm(attempt)) / max(float(np.linalg.norm(residual)), 1e-300)
+            change, reached = (
+                np.linalg.norm(length * step * scale[free]),
+                np.linalg.norm(coefficients * scale),
+            )
+            coefficients, residual = trial, attempt
+            if change <= tolerance * reached or gain < 1e-7:
                 break
         squared = self.measure.contract(self.points, self.slopes(coefficients))
         if not np.sqrt((self.weight**2 * squared).mean()) > MIN_SLOPE:
@@ -393,8 +382,7 @@ def _orthonormalised(equation: HamiltonJacobi, free: np.ndarray) -> tuple[Hamilt
     """
     roots = equation.measure.root_at(equation.points)
     stacked = np.einsum("nij,nim->njm", roots, equation.gradients[:, :, free], optimize=True)
-    scale = np.sqrt((stacked**2).sum(axis=(0, 1)))
-    scale = np.where(scale > 0, scale, 1.0)
+    scale = positive(np.sqrt((stacked**2).sum(axis=(0, 1))))
     upper = np.linalg.qr((stacked / scale).reshape(-1, stacked.shape[2]), mode="r")
     _, sizes, right = np.linalg.svd(upper)
     determined = sizes > SINGULAR_RATIO * sizes[0]

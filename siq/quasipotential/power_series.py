@@ -22,7 +22,6 @@ unknowns. Eigenvectors would do, too, but those of a long chain that turns are a
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -38,7 +37,6 @@ from siq.systems.equilibria import classify, hessian_at
 from siq.systems.formulas import compile_formulas
 
 MOST_STATES_OF_DEGREE_4 = 8  # beyond, the local series is of degree 3
-
 
 Function = Callable[[np.ndarray], np.ndarray]
 
@@ -83,33 +81,22 @@ def _cubic_series(dynamics: Dynamics, attractor: np.ndarray) -> tuple[np.ndarray
 
 
 def quasipotential_series(dynamics: Dynamics, attractor: np.ndarray, *, degree: int) -> Expansion:
-    """Taylor polynomial of V at an attractor, V being zero there.
+    """Taylor polynomial of V (not U = 2V) at an attractor ``(d,)``, with all terms of degree 2 to `degree`.
 
-    Parameters
-    ----------
-    dynamics
-        f, differentiable ``degree - 1`` times at the attractor.
-    attractor
-        A, shape ``(d,)``: a stable equilibrium of f to rounding.
-    degree
-        Highest total degree, at least 2; degree 2 is ``½ (x - A)ᵀ M (x - A)``.
-
-    Returns
-    -------
-    Expansion
-        All terms of degree 2 to `degree`. This is V, not U = 2V; and it is the Taylor polynomial, which is
-        exact at A and useless beyond its radius of convergence, not the best polynomial over a region.
+    V is zero there. The polynomial is useless beyond its radius of convergence, and not the best one over a
+    region.
 
     Raises
     ------
     ValueError
-        When A is no stable equilibrium, or f has no finite derivatives there.
+        When A is no stable equilibrium to rounding, or f has no finite derivatives of the order
+        ``degree - 1`` there.
     """
     if degree < 2:
         raise Fault(f"a series of degree {degree} was asked for", "V begins with degree 2")
     center = np.asarray(attractor, dtype=float)
     basis = _Homogeneous(dynamics.dimension, degree)
-    force = _expanded("f", dynamics.formulas, dynamics.symbols, center, basis, degree - 1)
+    force = basis.expanded("f", dynamics.formulas, dynamics.symbols, center, degree - 1)
     jacobian = dynamics.jacobian(center[None])[0]
     if classify(dynamics, center).kind != "attractor":
         raise ValueError(
@@ -122,15 +109,16 @@ def quasipotential_series(dynamics: Dynamics, attractor: np.ndarray, *, degree: 
     if not np.all((step <= 1e-6 * np.abs(center).max()) | (step <= 1e-9 * scale)):
         raise ValueError(f"{center.tolist()} is no equilibrium: f is {force[0][:, 0].tolist()} there")
     force = [part * basis.scales(k, scale) / scale[:, None] for k, part in enumerate(force)]
-    diffusion, d = dynamics.diffusion, dynamics.dimension
-    noise = [diffusion.matrix[:, :, None]] if diffusion.constant else []
-    if not diffusion.constant:
+    diffusion, d, both = dynamics.diffusion, dynamics.dimension, np.outer(scale, scale)
+    if diffusion.constant:
+        noise = [diffusion.matrix]
+    else:
         entries = [entry for row in diffusion.formulas for entry in row]
-        parts_of_noise = _expanded("D", entries, dynamics.symbols, center, basis, degree - 2)
-        noise = [part.reshape(d, d, -1) for part in parts_of_noise]
-    own = np.outer(scale, scale)[:, :, None]
-    noise = [part * basis.scales(k, scale) / own for k, part in enumerate(noise)]
-    hessian = hessian * np.outer(scale, scale)
+        noise = basis.expanded("D", entries, dynamics.symbols, center, degree - 2)
+    noise = [
+        part.reshape(d, d, -1) * basis.scales(k, scale) / both[:, :, None] for k, part in enumerate(noise)
+    ]
+    hessian = hessian * both
     flow = jacobian * scale / scale[:, None] + 2 * noise[0][:, :, 0] @ hessian
 
     parts = {2: basis.quadratic(hessian)}
@@ -196,12 +184,9 @@ class _Homogeneous:
     def dot(self, left: np.ndarray, left_degree: int, right: np.ndarray, right_degree: int) -> np.ndarray:
         """Σ_i left_i right_i of polynomials, ``(d, n)`` and ``(d, m)``."""
         degree = left_degree + right_degree
-        sums = self.exponents[left_degree][:, None] + self.exponents[right_degree][None]
-        return np.bincount(
-            self.place(sums, degree).ravel(),
-            weights=(left.T @ right).ravel(),
-            minlength=len(self.exponents[degree]),
-        )
+        places = self.place(self.exponents[left_degree][:, None] + self.exponents[right_degree], degree)
+        count = len(self.exponents[degree])
+        return np.bincount(places.ravel(), weights=(left.T @ right).ravel(), minlength=count)
 
     def advection(self, flow: np.ndarray, degree: int) -> np.ndarray:
         """Matrix of ``P ↦ (flow y)·∇P`` on polynomials P of a degree."""
@@ -214,42 +199,41 @@ class _Homogeneous:
                 matrix[rows, columns] += exponents[columns, i] * flow[i, j]
         return matrix
 
-
-def _expanded(
-    name: str,
-    formulas: Sequence[sympy.Expr],
-    symbols: Sequence[sympy.Symbol],
-    center: np.ndarray,
-    basis: _Homogeneous,
-    degree: int,
-) -> list[np.ndarray]:
-    """Taylor coefficients of formulas at the center: for each degree of each formula, ``(m, n)``."""
-    parts = [np.zeros((len(formulas), len(basis.exponents[k]))) for k in range(degree + 1)]
-    if all(formula.is_polynomial(*symbols) for formula in formulas):
-        # x^β = Σ_α binomial(β, α) center^(β - α) y^α: nothing is differentiated, nothing truncated.
-        for component, formula in enumerate(formulas):
-            terms = sympy.Poly(formula, *symbols).terms()
-            powers = np.array([monomial for monomial, _ in terms])
-            coefficients = np.array([float(coefficient) for _, coefficient in terms])
-            for k, part in enumerate(parts):
-                for place, lower in enumerate(basis.exponents[k]):
-                    choices = np.prod(scipy.special.comb(powers, lower), axis=1)
-                    rest = np.prod(center ** np.maximum(powers - lower, 0), axis=1)
-                    part[component, place] = np.sum(coefficients * choices * rest)
+    def expanded(
+        self,
+        name: str,
+        formulas: Sequence[sympy.Expr],
+        symbols: Sequence[sympy.Symbol],
+        center: np.ndarray,
+        degree: int,
+    ) -> list[np.ndarray]:
+        """Taylor coefficients of formulas at the center: for each degree of each formula, ``(m, n)``."""
+        parts = [np.zeros((len(formulas), len(self.exponents[k]))) for k in range(degree + 1)]
+        if all(formula.is_polynomial(*symbols) for formula in formulas):
+            # x^β = Σ_α binomial(β, α) center^(β - α) y^α: nothing is differentiated, nothing truncated.
+            for component, formula in enumerate(formulas):
+                terms = sympy.Poly(formula, *symbols).terms()
+                powers = np.array([monomial for monomial, _ in terms])
+                coefficients = np.array([float(coefficient) for _, coefficient in terms])
+                for k, part in enumerate(parts):
+                    for place, lower in enumerate(self.exponents[k]):
+                        choices = np.prod(scipy.special.comb(powers, lower), axis=1)
+                        rest = np.prod(center ** np.maximum(powers - lower, 0), axis=1)
+                        part[component, place] = np.sum(coefficients * choices * rest)
+            return parts
+        derivatives = {(0,) * len(symbols): list(formulas)}
+        for block in self.exponents[1 : degree + 1]:
+            for row in block:
+                state = int(np.flatnonzero(row)[-1])
+                lower = tuple(int(power) - (index == state) for index, power in enumerate(row))
+                derivatives[tuple(map(int, row))] = [d.diff(symbols[state]) for d in derivatives[lower]]
+        every = [expression for row in derivatives.values() for expression in row]
+        with np.errstate(all="ignore"):
+            values = compile_formulas(every, tuple(symbols))(center[:, None])[:, 0]
+        table = values.reshape(len(derivatives), len(formulas)).T
+        factorials = scipy.special.factorial(list(derivatives)).prod(axis=1)
+        blocks = np.cumsum([len(block) for block in self.exponents[:degree]])
+        parts = np.split(table / factorials, blocks, axis=1)
+        if not all(np.isfinite(part).all() for part in parts):
+            raise ValueError(f"{name} has no finite derivatives up to order {degree} at {center.tolist()}")
         return parts
-    derivatives = {(0,) * len(symbols): list(formulas)}
-    for block in basis.exponents[1 : degree + 1]:
-        for row in block:
-            state = int(np.flatnonzero(row)[-1])
-            lower = tuple(int(power) - (index == state) for index, power in enumerate(row))
-            derivatives[tuple(map(int, row))] = [d.diff(symbols[state]) for d in derivatives[lower]]
-    every = [expression for row in derivatives.values() for expression in row]
-    with np.errstate(all="ignore"):
-        values = compile_formulas(every, tuple(symbols))(center[:, None])[:, 0]
-    table = values.reshape(len(derivatives), len(formulas)).T
-    factorials = np.array([math.prod(math.factorial(power) for power in row) for row in derivatives])
-    blocks = np.cumsum([len(block) for block in basis.exponents[:degree]])
-    parts = np.split(table / factorials, blocks, axis=1)
-    if not all(np.isfinite(part).all() for part in parts):
-        raise ValueError(f"{name} has no finite derivatives up to order {degree} at {center.tolist()}")
-    return parts

@@ -27,6 +27,7 @@ import sympy
 from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
+from siq.numerics.randomness import positive
 from siq.quasipotential.hamilton_jacobi import (
     SINGULAR_RATIO,
     Expansion,
@@ -514,8 +515,7 @@ def fit_well(
         if len(rows) > MAX_POINTS:
             rows = np.sort(generator.choice(rows, MAX_POINTS, replace=False))
         points = basin.points(rows)
-        scale = np.abs(points - attractor.position).max(axis=0, initial=0.0)
-        scale = np.where(scale > 0, scale, 1.0)
+        scale = positive(np.abs(points - attractor.position).max(axis=0, initial=0.0))
         basis = PowerBasis.up_to(degree, dynamics.symbols, attractor.position, scale)
         if len(points) < 2 * basis.size:
             failure = failure or NumericalFailure(
@@ -645,8 +645,7 @@ def _towards_path(well: Well, x: np.ndarray, path: MinimumActionPath, free: np.n
     wanted = np.einsum("n,nij,ni->nj", weight, roots[0], rest).ravel()
     matrix = np.concatenate([one.reshape(-1, one.shape[2]) for one in rows])
     right = np.concatenate([wanted, np.zeros(len(matrix) - len(wanted))])
-    scale = np.linalg.norm(matrix, axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
+    scale = positive(np.linalg.norm(matrix, axis=0))
     coefficients = well.coefficients.copy()
     coefficients[free] += np.linalg.lstsq(matrix / scale, right, rcond=SINGULAR_RATIO)[0] / scale
     return coefficients
