@@ -89,9 +89,7 @@ class NoLandscape(NumericalFailure):
         self, reason: str, states: RecordStates | None = None, dynamics: Dynamics | None = None
     ) -> None:
         super().__init__(" ".join(sentences_without_landscape(reason, states)))
-        self.reason = reason
-        self.states = states
-        self.dynamics = dynamics
+        self.reason, self.states, self.dynamics = reason, states, dynamics
 
 
 def sentences_without_landscape(reason: str, states: RecordStates | None) -> list[str]:
@@ -103,18 +101,10 @@ def sentences_without_landscape(reason: str, states: RecordStates | None) -> lis
 
 @dataclass(frozen=True)
 class GlobalQuasipotential:
-    """U over all wells, where it is known.
+    """U over all wells, where it is known."""
 
-    Attributes
-    ----------
-    wells
-        V about the attractors.
-    heights
-        U at the attractors, shape ``(k,)``; the lowest is zero.
-    """
-
-    wells: tuple[Well, ...]
-    heights: np.ndarray
+    wells: tuple[Well, ...]  # V about the attractors
+    heights: np.ndarray  # U at the attractors, shape (k,); the lowest is zero
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """U at points ``(n, d)``: shape ``(n,)``, NaN where it is not known."""
@@ -373,10 +363,7 @@ class Landscape:
     def potential(self, well: int = 0) -> Well:
         """V about an attractor, zero there, as a formula with where it holds; U is 2V.
 
-        Raises
-        ------
-        NumericalFailure
-            Where no formula was found.
+        Where no formula was found, it is a `NumericalFailure` that says why.
         """
         found = self.wells[well]
         if found is None:
@@ -384,38 +371,23 @@ class Landscape:
         return found
 
     def barriers(self) -> pd.DataFrame:
-        """ΔU on every way out of every well, one row each.
+        """ΔU on every way out of every well, one row each: columns ``start end barrier standard_error``.
 
-        Returns
-        -------
-        pandas.DataFrame
-            Columns ``start end barrier standard_error``: attractors by their place in `attractors`, the end
-            missing where the way leads out of the recorded region; ΔU in the unit of ε with its standard
-            error from the uncertainty of f, NaN where it is not known.
+        Attractors are given by their place in `attractors`, the end missing where the way leads out of the
+        recorded region; ΔU is in the unit of ε, with its standard error from the uncertainty of f, NaN where
+        it is not known.
         """
         types = {"start": int, "end": "Int64", "barrier": float, "standard_error": float}
         rows = [[getattr(way, name) for name in types] for way in self.transitions]
         return pd.DataFrame(rows, columns=list(types)).astype(types)
 
     def dwell_times(self, *, noise: float | None = None) -> pd.DataFrame:
-        """Mean residence times, one row for every attractor.
+        """Mean residence times, one row for every attractor: ``attractor mean_time data_error law_error``.
 
-        Parameters
-        ----------
-        noise
-            ε, in the unit of U; by default as the recordings show it.
-
-        Returns
-        -------
-        pandas.DataFrame
-            Columns ``attractor mean_time data_error law_error``: the time, NaN where it is not known, its
-            relative standard error from the uncertainty of f and of the noise, and the relative error of the
-            law itself (`siq.quasipotential.rates`).
-
-        Raises
-        ------
-        ValueError
-            When no noise is known.
+        The noise ε is in the unit of U, by default as the recordings show it; where none is known, it is a
+        `ValueError`. The time is NaN where it is not known. It has a relative standard error from the
+        uncertainty of f and of the noise, and a relative error of the law itself
+        (`siq.quasipotential.rates`).
         """
         strength = self.noise if noise is None else NoiseStrength(noise)
         if strength is None:
@@ -434,16 +406,9 @@ class Landscape:
     def escape_times(self, *, noise: float) -> pd.DataFrame:
         """Mean times until noise has led from each attractor to the next, one row for every way out.
 
-        Parameters
-        ----------
-        noise
-            ε of ``dx = f dt + √ε σ dW``, in the unit of U.
-
-        Returns
-        -------
-        pandas.DataFrame
-            Columns ``start end mean_time note``: the mean time by the law of Eyring and Kramers with its
-            prefactor (`siq.quasipotential.rates`), NaN with a note that says why where the law does not hold.
+        The noise is ε of ``dx = f dt + √ε σ dW``, in the unit of U. Columns are ``start end mean_time note``:
+        the mean time by the law of Eyring and Kramers with its prefactor (`siq.quasipotential.rates`), NaN
+        with a note that says why where the law does not hold.
 
         Raises
         ------
@@ -456,11 +421,10 @@ class Landscape:
         rows = []
         for way in self.transitions:
             time, note = np.nan, "; ".join(way.notes)
-            if way.rate is not None:
-                try:
-                    time = way.rate.mean_time(noise)
-                except NumericalFailure as error:
-                    note = str(error)
+            try:
+                time = np.nan if way.rate is None else way.rate.mean_time(noise)
+            except NumericalFailure as error:
+                note = str(error)
             rows.append((way.start, way.end, time, note))
         table = pd.DataFrame(rows, columns=["start", "end", "mean_time", "note"])
         return table.astype({"start": int, "end": "Int64", "mean_time": float})
@@ -471,8 +435,8 @@ class Landscape:
         Parameters
         ----------
         equations
-            From `from_equations`, of the same states. U is in the unit of D, which has to be the same, but
-            for the errors of one that was estimated: tell the recordings that of the equations
+            From `from_equations`. States and D have to be the same, or it is a `ValueError`: U is in the unit
+            of D. An estimated D may differ by its errors: tell the recordings that of the equations
             (`siq.workflow.study.StateSpace`), or read ΔU/ε of both.
         noise
             ε for which mean times are compared; left out, none are.
@@ -482,11 +446,6 @@ class Landscape:
         pandas.DataFrame
             One row for each number, with the columns ``item quantity noise equations trajectories
             standard_error relative_difference in_errors note`` (`siq.quasipotential.landscape_comparison`).
-
-        Raises
-        ------
-        ValueError
-            When the states are not the same, or D is not.
         """
         from siq.quasipotential.landscape_comparison import compare_with
 
@@ -502,10 +461,8 @@ class Landscape:
 
     def __repr__(self) -> str:
         """One line: a landscape holds thousands of numbers, which `report` makes readable."""
-        named = ", ".join(self.dynamics.states)
-        return (
-            f"<Landscape of ({named}): {len(self.attractors)} attractors, {len(self.transitions)} ways out>"
-        )
+        named, ways = ", ".join(self.dynamics.states), len(self.transitions)
+        return f"<Landscape of ({named}): {len(self.attractors)} attractors, {ways} ways out>"
 
     def _repr_html_(self) -> str:
         from siq.report.landscape import landscape_html
@@ -513,13 +470,7 @@ class Landscape:
         return landscape_html(self)
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw U with its wells, passes and paths; see `siq.plot_quasipotential`, which this calls.
-
-        Parameters
-        ----------
-        ax
-            Where; by default new axes.
-        """
+        """Draw U with its wells, passes and paths, by default on new axes; see `siq.plot_quasipotential`."""
         from siq.report.plots.quasipotential import plot_quasipotential
 
         return plot_quasipotential(self, ax=ax)

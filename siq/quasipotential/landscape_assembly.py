@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import ConfigDict
@@ -27,13 +28,8 @@ from siq.quasipotential.certificate import (
     references_about,
 )
 from siq.quasipotential.certificate_tests import CertificateOptions
-from siq.quasipotential.landscape import (
-    Landscape,
-    LandscapeOptions,
-    NoLandscape,
-    heights_of_attractors,
-)
-from siq.quasipotential.path_chains import MinimumActionPath, evenly
+from siq.quasipotential.landscape import Landscape, LandscapeOptions, NoLandscape, heights_of_attractors
+from siq.quasipotential.path_chains import evenly
 from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.refinement import RefinementOptions
 from siq.quasipotential.transitions import Transition, position_standard_errors, transitions, ways_out
@@ -44,11 +40,7 @@ from siq.systems.cards import load_system
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, hessian_at, spread_evenly, unreached_states
-from siq.systems.phase_portrait import (
-    MOST_SEARCHED,
-    PhasePortrait,
-    phase_portrait,
-)
+from siq.systems.phase_portrait import MOST_SEARCHED, PhasePortrait, phase_portrait
 from siq.systems.simulation import fault_over_domain
 
 ATTRACTOR_MATCH_TOLERANCE = 1e-6  # of the recorded box: one attractor, from different starts
@@ -108,15 +100,12 @@ def find_landscape(
     width = portrait.box[:, 1] - portrait.box[:, 0]
     for index, one in enumerate(portrait.attractors):
         if wells is None:
-            kept.append(_local_well(found.dynamics, portrait, index, options, seed, remarks))
+            kept.append(_local_well(found.dynamics, portrait, index, remarks, options=options, seed=seed))
             continue
-        given = [
-            well
-            for well in wells
-            if np.abs((well.attractor - one.position) / width).max() < ATTRACTOR_MATCH_TOLERANCE
-        ]
-        kept.append(given[0].surveyed(found.dynamics, portrait, index) if given else None)
-        if not given:
+        away = [np.abs((well.attractor - one.position) / width).max() for well in wells]
+        same = [well for well, far in zip(wells, away, strict=True) if far < ATTRACTOR_MATCH_TOLERANCE]
+        kept.append(same[0].surveyed(found.dynamics, portrait, index) if same else None)
+        if not same:
             remarks.append(Remark("quasipotential.no_refined_formula", {"place": _place(one.position)}))
     ways = transitions(found, ways_out(found.dynamics, portrait), kept)
     return _assembled(found, portrait, kept, ways, remarks, certificate=certificate, noise=noise)
@@ -164,7 +153,7 @@ def landscape_from_equations(
         portrait = _with_states_along_paths(system, portrait, lowest, draw)
         wells = [
             _local_well(
-                system, portrait, index, settings.refinement, seed, remarks,
+                system, portrait, index, remarks, options=settings.refinement, seed=seed,
                 saddle=None if way is None else way.saddle, path=None if way is None else way.path,
             )
             for index, way in enumerate(lowest)
@@ -188,13 +177,7 @@ def landscape_from_equations(
 
 
 def usable_system(system: str | Path | Dynamics) -> Dynamics:
-    """A system whose landscape can be worked out, read from its card where a path is given.
-
-    Raises
-    ------
-    InputError
-        In one sentence, for a card that cannot be read and a system that has no landscape.
-    """
+    """A system whose landscape can be worked out, read from its card; an `InputError` where there is none."""
     given = system if isinstance(system, Dynamics) else load_system(system)
     if (fault := fault_for_landscape(given, directly=False)) is not None:
         keys, what, remedy = fault
@@ -206,12 +189,8 @@ def usable_system(system: str | Path | Dynamics) -> Dynamics:
 def fault_for_landscape(system: Dynamics, *, directly: bool) -> tuple[tuple[str, ...], str, str] | None:
     """Why no landscape of a system can be worked out: the place in its card, the fault and the remedy.
 
-    Parameters
-    ----------
-    system
-        As its card says.
-    directly
-        Whether noise has to act on every state, as trajectories ask for, or may reach it by way of others.
+    `directly` is whether noise has to act on every state, as trajectories ask for, or may reach it by way of
+    others.
     """
     if not system.autonomous:
         key, what = ("inputs", "inputs") if system.inputs else ("equations", "time")
@@ -229,11 +208,8 @@ def fault_for_landscape(system: Dynamics, *, directly: bool) -> tuple[tuple[str,
         return ("diffusion",), what, remedy
     if still := unreached_states(system):
         what = f"the noise does not reach {' and '.join(still)}, neither directly nor by way of other states"
-        return (
-            ("diffusion",),
-            what,
-            f"let it act on {still[0]} or on a state in its equation, or leave it out",
-        )
+        remedy = f"let it act on {still[0]} or on a state in its equation, or leave it out"
+        return ("diffusion",), what, remedy
     if (found := fault_over_domain(system)) is not None:
         remedy = "choose a domain in which it has a value"
         return ("equations", found[0]), f"the equation {found[1]}", remedy
@@ -253,47 +229,31 @@ def _assembled(
     """The landscape of what was found, with the heights of its attractors."""
     ends = portrait.descents.ends
     settled: tuple[Equilibrium | Cycle, ...] = (*portrait.attractors, *portrait.cycles)
-    barriers, heights = np.full((len(settled), len(settled)), np.inf), np.zeros(0)
+    barriers = np.full((len(settled), len(settled)), np.inf)
     for way in ways:
         if way.end is not None and np.isfinite(way.barrier):
             barriers[way.start, way.end] = min(barriers[way.start, way.end], way.barrier)
     try:
-        heights = heights_of_attractors(barriers) if settled else heights
+        heights = heights_of_attractors(barriers) if settled else np.zeros(0)
     except NumericalFailure as error:
         remarks.append(Remark("quasipotential.reason", {"reason": str(error)}))
         heights = np.full(len(settled), np.nan)
     return Landscape(
-        dynamics_of(found),
-        portrait.equilibria,
-        settled,
+        dynamics_of(found), portrait.equilibria, settled,
         np.array([float((ends == index).mean()) for index in range(len(settled))]),
-        tuple(wells),
-        tuple(ways),
-        heights,
-        tuple(remarks),
-        certificate,
+        tuple(wells), tuple(ways), heights, tuple(remarks), certificate,
         np.array([position_standard_errors(found, one.position) for one in settled]),
-        noise,
-        None if isinstance(found, Dynamics) else found,
-        given=isinstance(found, Dynamics),
-        parting=portrait.parting,
-    )
+        noise, None if isinstance(found, Dynamics) else found,
+        given=isinstance(found, Dynamics), parting=portrait.parting,
+    )  # fmt: skip
 
 
 def _local_well(
-    dynamics: Dynamics,
-    portrait: PhasePortrait,
-    index: int,
-    options: RefinementOptions,
-    seed: int,
-    remarks: list[Remark],
-    *,
-    saddle: Equilibrium | Cycle | None = None,
-    path: MinimumActionPath | None = None,
+    dynamics: Dynamics, portrait: PhasePortrait, index: int, remarks: list[Remark], **how: Any
 ) -> Well | None:
-    """V about one attractor; a remark where none was found."""
+    """V about one attractor by the local route; a remark where it found none."""
     try:
-        return local_well(dynamics, portrait, index, options=options, seed=seed, saddle=saddle, path=path)
+        return local_well(dynamics, portrait, index, **how)
     except NumericalFailure as error:
         values = {"place": _place(portrait.attractors[index].position), "reason": str(error)}
         remarks.append(Remark("quasipotential.no_formula", values))
@@ -317,6 +277,5 @@ def _with_states_along_paths(
         along = evenly(way.path.points, STATES_ALONG_PATH)
         starts = [along + share * draw.standard_normal(along.shape) @ extent for share in PATH_NEIGHBOURHOOD]
         ways = follow(system, np.concatenate(starts), portrait.attractors, box=portrait.box)
-        center = portrait.attractors[index].position
-        basins[index] = basins[index].enlarged(ways.paths[ways.ends == index], center, generator=draw)
+        basins[index] = basins[index].enlarged(ways.paths[ways.ends == index], one.position, generator=draw)
     return replace(portrait, basins=tuple(basins))

@@ -123,7 +123,7 @@ def reference_landscape(
     generator: np.random.Generator,
     mesh: Callable[[np.ndarray, float], Potential | None] | None = None,
 ) -> ReferenceLandscape:
-    """Compute the references.
+    """Compute the references; a `NumericalFailure` without an attractor, or without any saddle.
 
     Parameters
     ----------
@@ -136,11 +136,6 @@ def reference_landscape(
     mesh
         Of two states, V (not U) about an attractor up to a level by a method that shares no code with the
         others (`siq.validation.mesh.mesh_potential`).
-
-    Raises
-    ------
-    NumericalFailure
-        When there is no attractor, or an attractor has no saddle to compare a barrier at.
     """
     attractors = np.array([one.position for one in portrait.attractors])
     if not len(attractors):
@@ -204,12 +199,9 @@ def compare_estimate(
     A constant means nothing to U. In a well the estimate is zero at the attractor; over all wells it is
     shifted by the median of its difference, so that no single point decides.
 
-    Returns
-    -------
-    list of dict
-        Rows with the columns ``region points covered error error_everywhere``: the region in words and its
-        number of points; the share of them at which the estimate says something, and its relative L2 error
-        there; and that of the formula at every point, whether it is to be believed or not, NaN of others.
+    The rows have the columns ``region points covered error error_everywhere``: the region in words and its
+    number of points; the share of them at which the estimate says something, and its relative L2 error there;
+    and that of the formula at every point, whether it is to be believed or not, NaN of others.
     """
     rows = []
     values = potential(reference.points)
@@ -250,7 +242,7 @@ def compare_landscape(
         barriers = [way.barrier for way in landscape.transitions if way.start == place]
         lowest = min((one for one in barriers if np.isfinite(one) and one), default=np.nan)
         error = float(abs(lowest / reference.barriers[index] - 1))
-        rows.append(_compared_barrier(index, error, covered=float(np.isfinite(error))))
+        rows.append(_row(f"barrier from A{index + 1}", 1, float(np.isfinite(error)), error))
     return rows
 
 
@@ -258,7 +250,8 @@ def compare_mesh(reference: ReferenceLandscape, *, below: float | None) -> list[
     """The reference's own mesh against its characteristics, and its barriers against the least action."""
     errors = np.abs(reference.mesh_barriers / reference.barriers - 1)
     overall = compare_overall(reference.values, reference.mesh_values, below or reference.level)
-    return [overall, *(_compared_barrier(index, float(one)) for index, one in enumerate(errors))]
+    barriers = [_row(f"barrier from A{index + 1}", 1, 1.0, float(one)) for index, one in enumerate(errors)]
+    return [overall, *barriers]
 
 
 def compare_overall(
@@ -282,17 +275,18 @@ def _well_region(index: int) -> str:
     return f"A{index + 1}, below {WELL_SHARE:g} of its barrier"
 
 
-def _compared_barrier(index: int, error: float, *, covered: float = 1.0) -> dict[str, object]:
-    row = {"region": f"barrier from A{index + 1}", "points": 1, "covered": covered}
-    return row | {"error": error, "error_everywhere": np.nan}
-
-
 def _compared(
     region: str, values: np.ndarray, exact: np.ndarray, everywhere: float = np.nan
 ) -> dict[str, object]:
     known = np.isfinite(values)
     covered, error = float(known.mean()) if len(values) else 0.0, _relative_l2(values[known], exact[known])
-    row = {"region": region, "points": len(exact), "covered": covered}
+    return _row(region, len(exact), covered, error, everywhere)
+
+
+def _row(
+    region: str, points: int, covered: float, error: float, everywhere: float = np.nan
+) -> dict[str, object]:
+    row = {"region": region, "points": points, "covered": covered}
     return row | {"error": error, "error_everywhere": everywhere}
 
 
@@ -305,9 +299,8 @@ COLUMNS = (
 
 def compare_with(equations: Landscape, learned: Landscape, *, noise: float | None = None) -> pd.DataFrame:
     """The table of `siq.Landscape.compare_with`."""
-    table = pd.DataFrame(
-        differences(equations, learned, noises=() if noise is None else (noise,)), columns=list(COLUMNS)
-    )
+    rows = differences(equations, learned, noises=() if noise is None else (noise,))
+    table = pd.DataFrame(rows, columns=list(COLUMNS))
     places = np.array([one.position for one in (*equations.attractors, *equations.equilibria)])
     _check_same_noise(equations.dynamics, learned.dynamics, places, found=learned.field_estimate)
     return table.fillna({"note": ""})
@@ -347,8 +340,8 @@ def differences(
         nearest = min(same, key=lambda one: float(np.linalg.norm(one.place - way.place)))
         left = [one for one in left if one is not nearest]
         rows.append(_difference(item, "barrier", way.barrier, nearest.barrier, nearest.error))
-        law, learned = (np.nan if one.rate is None else _known(one.rate.prefactor) for one in (way, nearest))
-        error = np.nan if nearest.rate is None else learned * _known(nearest.rate.prefactor_error)  # of ln K
+        law, learned, error = way.exit.prefactor, nearest.exit.prefactor, nearest.exit.prefactor_error
+        error = np.nan if error is None else learned * error  # it is that of ln K
         note = "; ".join(way.notes) if np.isnan(law) else ""
         rows.append(_difference(item, "prefactor", law, learned, error, note=note))
     for way in left:
@@ -357,21 +350,14 @@ def differences(
         rows.append(_difference(item, "barrier", np.nan, way.barrier, note=sentence(further)))
     for index, one in enumerate(equations.attractors):
         for noise in noises:
-            # The law is the same for both, so that its error is not counted.
-            exact = mean_residence_time(equations.exits(index), NoiseStrength(noise))
-            own = pairs.get(index)
-            found = (
-                None if own is None else mean_residence_time(trajectories.exits(own), NoiseStrength(noise))
+            exact, found = (
+                None if place is None else mean_residence_time(of.exits(place), NoiseStrength(noise))
+                for of, place in ((equations, index), (trajectories, pairs.get(index)))
             )
-            rows.append(
-                _difference(
-                    f"A{index + 1}", "mean time",
-                    np.nan if exact is None else exact.value,
-                    np.nan if found is None else found.value,
-                    np.nan if found is None else found.value * found.data_error,
-                    noise=noise,
-                )
-            )  # fmt: skip
+            numbers = [np.nan if exact is None else exact.value]
+            # The law is the same for both, so that its error is not counted.
+            numbers += [] if found is None else [found.value, found.value * found.data_error]
+            rows.append(_difference(f"A{index + 1}", "mean time", *numbers, noise=noise))
         if isinstance(one, Cycle) or index not in pairs:
             not_compared = Remark("quasipotential.limit_cycle_not_compared")
             remark = not_compared if isinstance(one, Cycle) else NOT_SHOWN
@@ -390,18 +376,10 @@ def _difference(
     note: str = "",
 ) -> dict[str, object]:
     """One number by the equations and by the trajectories; the standard error is that of the latter."""
-    known = standard_error > 0
-    return {
-        "item": item,
-        "quantity": quantity,
-        "noise": noise,
-        "equations": equations,
-        "trajectories": trajectories,
-        "standard_error": standard_error,
-        "relative_difference": trajectories / equations - 1 if equations else np.nan,
-        "in_errors": (trajectories - equations) / standard_error if known else np.nan,
-        "note": note,
-    }
+    relative = trajectories / equations - 1 if equations else np.nan
+    in_errors = (trajectories - equations) / standard_error if standard_error > 0 else np.nan
+    row = (item, quantity, noise, equations, trajectories, standard_error, relative, in_errors, note)
+    return dict(zip(COLUMNS, row, strict=True))
 
 
 def _matched_attractors(equations: Landscape, trajectories: Landscape) -> dict[int, int]:
@@ -419,10 +397,6 @@ def _matched_attractors(equations: Landscape, trajectories: Landscape) -> dict[i
         if index < len(points):
             nearest[index] = min(nearest.get(index, (np.inf, -1)), (float(distance[index]), place))
     return {index: place for index, (_, place) in nearest.items()}
-
-
-def _known(value: float | None) -> float:
-    return np.nan if value is None else float(value)
 
 
 def _check_same_noise(

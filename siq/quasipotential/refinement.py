@@ -16,7 +16,7 @@ passes was thereby selected for agreement: that of a certificate is a test of co
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, Any, Literal
@@ -165,90 +165,71 @@ def refine(
     over the recorded states `points`, shape ``(n, d)``. The seed decides which points are used where there
     are too many.
     """
-    remarks: list[Remark] = []
     routes = options.with_routes(networks=network is not None).routes or ()
     library = _formula_library(found, options)
     found = _over_library(found, library)
-    wells: tuple[Well, ...] = ()
-    if "local" in routes:
-        wells, remarks = local_wells(found, portrait, options=options, seed=seed)
+    wells, remarks = (
+        local_wells(found, portrait, options=options, seed=seed) if "local" in routes else ((), [])
+    )
+    network_wells: list[Well] = []
     # The errors of f make some of the residual with which one formula is believed to hold.
     errors = np.abs(np.sqrt(np.diag(found.covariance)) / found.values)
     noise = 0.0 if found.noise_free else 3 * float(np.sqrt((errors**2).mean()))
-    limit = options.single_formula + noise
-    best: GlobalFormula | None = None
 
-    def good() -> bool:
-        return best is not None and bool(best.potential.any()) and best.residual < limit
+    def starts() -> Iterator[np.ndarray]:
+        """Where one formula may begin; none is asked for once a formula is good enough."""
+        group: Sequence[Well] = wells
+        if "network" in routes:
+            group = network_wells
+            if formula is not None:
+                yield formula
+            if network is not None:
+                values = network(points)
+                yield fit_values(library, [points], [values])
+                # Networks are worst where recordings are few, far out, and Gauss–Newton may follow them to a
+                # false solution; further starts are refined on lower and lower parts of V first.
+                for part in (values <= np.quantile(values, share) for share in LOWER_PARTS):
+                    if part.sum() > 2 * library.size:
+                        start = fit_values(library, [points[part]], [values[part]])
+                        yield refine_globally(start, found, points[part], sparse=False).potential
+                # In powers no higher than the local route took.
+                degree = max((well.degree for well in wells), default=NETWORK_DEGREE)
+                degree = affordable_degree(library.dimension, min(degree, NETWORK_DEGREE))
+                made, failures = _about_attractors(
+                    "network", portrait,
+                    lambda at: fit_well(found.dynamics, portrait, at, network, degree=degree, seed=seed),
+                )  # fmt: skip
+                network_wells.extend(made)
+                remarks.extend(failures)
+        if found.diffusion.constant and found.diffusion.regular:
+            # Refined one by one, the wells may turn out to share one formula. All of them together make the
+            # start: one alone does not tell an odd power from an even one, and goes on wrongly in the others.
+            for some in (group, *([well] for well in group if len(group) > 1)) if group else ():
+                inside = [well.inside() for well in some]
+                values = [well.values(x) for well, x in zip(some, inside, strict=True)]
+                yield fit_values(library, inside, values)
 
-    def seek(starts: Iterable[np.ndarray]) -> None:
-        """Refine starts until one is good enough, or else keep that of the smallest residual."""
-        nonlocal best
-        for start in starts:
-            trial = refine_globally(
-                start, found, points,
-                false_terms=options.false_terms, precision=options.precision,
-            )  # fmt: skip
-            if best is None or trial.residual < best.residual:
-                best = trial
-            if good():
-                break
-
-    def of_wells(group: Sequence[Well]) -> np.ndarray:
-        inside = [well.inside() for well in group]
-        return fit_values(library, inside, [well.values(x) for well, x in zip(group, inside, strict=True)])
-
-    network_wells: Sequence[Well] = ()
-    if "network" in routes:
-        seek([] if formula is None else [formula])
-        if network is not None and not good():
-            values = network(points)
-            seek([fit_values(library, [points], [values])])
-            # Networks are worst where recordings are few, far out, and Gauss–Newton may follow them to a
-            # false solution; further starts are refined on lower and lower parts of V first.
-            for part in (values <= np.quantile(values, share) for share in LOWER_PARTS):
-                if part.sum() > 2 * library.size and not good():
-                    start = fit_values(library, [points[part]], [values[part]])
-                    seek([refine_globally(start, found, points[part], sparse=False).potential])
-        if network is not None and not good():
-            # In powers no higher than the local route took.
-            degree = max((well.degree for well in wells), default=NETWORK_DEGREE)
-            degree = affordable_degree(library.dimension, min(degree, NETWORK_DEGREE))
-            network_wells = []
-            for index, attractor in enumerate(portrait.attractors):
-                try:
-                    network_wells.append(
-                        fit_well(
-                            found.dynamics, attractor, portrait.basins[index], portrait.saddles[index],
-                            network, degree=degree, generator=np.random.default_rng(seed),
-                        )
-                    )  # fmt: skip
-                except NumericalFailure as error:
-                    failure = {"route": "network", "reason": str(error)}
-                    remarks.append(Remark("quasipotential.route_failed", failure))
-    elif wells:
-        network_wells = wells
+    accepted: dict[str, float] = {"false_terms": options.false_terms, "precision": options.precision}
+    best, good = None, False
+    for start in starts():
+        trial = refine_globally(start, found, points, **accepted)
+        if best is None or trial.residual < best.residual:
+            best = trial
+        if good := bool(best.potential.any()) and best.residual < options.single_formula + noise:
+            break
     if not found.diffusion.constant:  # g = f + D∇V would need functions that no library has
         remarks.append(Remark("quasipotential.no_single_formula_for_noise_of_the_state"))
     elif not found.diffusion.regular:  # the equation of Hamilton and Jacobi is weighed by its inverse
         remarks.append(Remark("quasipotential.noise_on_some_states_only"))
     else:
-        if network_wells and not good():
-            # Refined one by one, the wells may turn out to share one formula. All of them together make the
-            # start: one alone does not tell an odd power from an even one, and goes on wrongly in the others.
-            groups = [network_wells, *([well] for well in network_wells if len(network_wells) > 1)]
-            seek(map(of_wells, groups))
-        if best is not None and good():
-            whole = with_circulation(
-                best, found, points, false_terms=options.false_terms, precision=options.precision,
-                single_formula=options.single_formula,
-            )  # fmt: skip
+        if best is not None and good:
+            whole = with_circulation(best, found, points, single_formula=options.single_formula, **accepted)
             if whole is not None:
                 if not (whole.joint or found.noise_free):
                     remarks.append(Remark("quasipotential.not_orthogonal"))
                 return Refined(found, wells, (), tuple(remarks), whole)
         remarks.append(Remark("quasipotential.no_single_formula"))
-    return Refined(found, wells, tuple(network_wells) if "network" in routes else (), tuple(remarks))
+    return Refined(found, wells, tuple(network_wells), tuple(remarks))
 
 
 def _over_library(found: FieldEstimate, library: CandidateLibrary) -> FieldEstimate:
@@ -256,35 +237,38 @@ def _over_library(found: FieldEstimate, library: CandidateLibrary) -> FieldEstim
     if found.library is library:
         return found
     position = {term: k for k, term in enumerate(library.terms)}
-    coefficients = np.zeros((library.size, library.dimension))
-    support = np.empty_like(found.support)
-    for row, (component, term) in enumerate(found.support):
-        place = position[found.library.terms[term]]
-        support[row] = component, place
-        coefficients[place, component] = found.coefficients[term, component]
-    average = found.alternatives
-    if average is not None:
-        places = [position[term] for term in found.library.terms]
-        bias, spread = np.zeros_like(coefficients), np.zeros((len(average[1]), *coefficients.shape))
-        bias[places], spread[:, places] = average
-        average = bias, spread
+    places = np.array([position[term] for term in found.library.terms])
+
+    def moved(values: np.ndarray) -> np.ndarray:
+        """Numbers by function, the last axis but one, in their new places."""
+        new = np.zeros((*values.shape[:-2], library.size, library.dimension))
+        new[..., places, :] = values
+        return new
+
+    support = np.column_stack([found.support[:, 0], places[found.support[:, 1]]])
+    average = None if found.alternatives is None else tuple(map(moved, found.alternatives))
+    coefficients = moved(found.coefficients)
     return replace(found, library=library, coefficients=coefficients, support=support, alternatives=average)
 
 
 def local_wells(
-    found: FieldEstimate,
-    portrait: PhasePortrait,
-    *,
-    options: RefinementOptions,
-    seed: int = 0,
+    found: FieldEstimate, portrait: PhasePortrait, *, options: RefinementOptions, seed: int = 0
 ) -> tuple[tuple[Well, ...], list[Remark]]:
     """The local route: V about each attractor, and where that was not possible."""
+    return _about_attractors(
+        "local", portrait, lambda at: local_well(found.dynamics, portrait, at, options=options, seed=seed)
+    )
+
+
+def _about_attractors(
+    route: Route, portrait: PhasePortrait, solve: Callable[[int], Well]
+) -> tuple[tuple[Well, ...], list[Remark]]:
     wells, remarks = [], []
     for index in range(len(portrait.attractors)):
         try:
-            wells.append(local_well(found.dynamics, portrait, index, options=options, seed=seed))
+            wells.append(solve(index))
         except NumericalFailure as error:
-            values = {"route": "local", "reason": str(error)}
+            values = {"route": route, "reason": str(error)}
             remarks.append(Remark("quasipotential.route_failed", values))
     return tuple(wells), remarks
 
@@ -378,18 +362,6 @@ class RefinementContext:
             self.found, self.portrait, self.held_out, self.pairs, references, self.limits, self.number
         )
 
-    def record_test(self) -> OccupancyCheck:
-        """Hops and histogram of the record, compared with those that f predicts."""
-        strength, variance = self.found.noise_strength, self.found.sensor_variance
-        noise = None if strength is None else NoiseStrength(*strength, source="estimated")
-        try:
-            return check_occupancy(
-                self.found, self.portrait, noise, self.recordings, self.unseen,
-                sensor=None if variance is None else np.sqrt(variance), seed=self.number,
-            )  # fmt: skip
-        except (NumericalFailure, np.linalg.LinAlgError) as error:
-            return OccupancyCheck(missing=str(error))
-
     def refine_and_certify(self, regressed: SymbolicDecomposition | None) -> Refinement:
         """Refined formulas of the run with their certificate, from those of a regression, if any."""
         formula = None
@@ -398,17 +370,23 @@ class RefinementContext:
             library = _formula_library(self.found, self.options)
             formula = np.array([named.get(name, 0.0) for name in library.names])
         network = None if self.networks is None else self.networks.potential_at
-        refined, formulas, certificate = _refined_by_routes(self, self.options, network, formula)
-        caustics = caustics_below(
-            self.found.dynamics, refined.wells or refined.network_wells, self.portrait, certificate.error,
-            seed=self.number,
-        )  # fmt: skip
-        record = self.record_test()
+        refined, formulas, certificate = self._by_routes(self.options, network, formula)
+        wells, found = refined.wells or refined.network_wells, self.found
+        caustics = caustics_below(found.dynamics, wells, self.portrait, certificate.error, seed=self.number)
+        # Hops and histogram of the record, compared with those that f predicts.
+        strength, variance = found.noise_strength, found.sensor_variance
+        try:
+            record = check_occupancy(
+                found, self.portrait,
+                None if strength is None else NoiseStrength(*strength, source="estimated"),
+                self.recordings, self.unseen,
+                sensor=None if variance is None else np.sqrt(variance), seed=self.number,
+            )  # fmt: skip
+        except (NumericalFailure, np.linalg.LinAlgError) as error:
+            record = OccupancyCheck(missing=str(error))
         verdict = record.verdict(false_alarms=self.limits.false_alarms)
         if verdict is not None:
-            reason = certificate.reason
-            if not verdict.passed:
-                reason = "; ".join(one for one in (reason, verdict.reason) if one)
+            reason = "; ".join(one for one in (certificate.reason, verdict.reason) if one)
             certificate = replace(certificate, tests={**certificate.tests, "record": verdict}, reason=reason)
         return Refinement(formulas, certificate, record, (*refined.remarks, *caustics))
 
@@ -431,7 +409,7 @@ class RefinementContext:
         randomised = shuffled(self.networks, generator=draw).potential_at
         options = replace(self.options, routes=("network",))
         try:
-            _, formulas, made = _refined_by_routes(self, options, randomised, None)
+            _, formulas, made = self._by_routes(options, randomised, None)
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             nothing = Verdict.refused(
                 f"refinement from random weights led to no V: {error}", self.limits.hamilton_jacobi
@@ -451,6 +429,36 @@ class RefinementContext:
         data["tests"]["same_as_refined"] = verdict.as_data()
         return data
 
+    def _by_routes(
+        self, options: RefinementOptions, network: Function | None, formula: np.ndarray | None
+    ) -> tuple[Refined, SymbolicDecomposition, Certificate]:
+        """V as the routes make it of their starts, with its certificate."""
+        refined = refine(
+            self.found, self.portrait, formula=formula, network=network, points=self.points,
+            options=options, seed=self.number,
+        )  # fmt: skip
+        formulas, whole = _refined_decomposition(refined, self.points), refined.formula
+        wells = refined.wells or refined.network_wells
+        compared = len(options.routes or ()) == 2
+        others = refined.network_wells if refined.wells else ()
+        error = 0.0
+        if formulas.potential is None:
+            return refined, formulas, certify(wells, self.evidence, others=others, compared=compared)
+        if whole is not None and not self.found.noise_free:
+            error = whole.relative_error(refined.found.library.evaluate(self.points))
+        certificate = certify(
+            formulas, self.evidence, others=refined.wells, compared=compared, relative_error=error
+        )
+        if certificate.certified or not refined.wells:
+            return refined, formulas, certificate
+        # One formula for all wells is an extra. What refuses it is no word against the wells.
+        refused = Remark("quasipotential.single_formula_refused", {"reason": certificate.reason})
+        alone = replace(refined, formula=None, remarks=(*refined.remarks, refused))
+        of_wells = certify(wells, self.evidence, others=others, compared=compared)
+        if not of_wells.certified:
+            return refined, formulas, certificate
+        return alone, _refined_decomposition(alone, self.points), of_wells
+
 
 def _every_well_held_out(portrait: PhasePortrait, pairs: SnapshotPairs, mask: np.ndarray) -> np.ndarray:
     """Held-out recordings as a mask, more of them where those that there are never come into some well.
@@ -465,39 +473,6 @@ def _every_well_held_out(portrait: PhasePortrait, pairs: SnapshotPairs, mask: np
         while counts[mask].sum() < MIN_POINTS and counts[~mask].any():
             mask[int(np.argmax(np.where(mask, -1, counts)))] = True
     return mask
-
-
-def _refined_by_routes(
-    context: RefinementContext,
-    options: RefinementOptions,
-    network: Function | None,
-    formula: np.ndarray | None,
-) -> tuple[Refined, SymbolicDecomposition, Certificate]:
-    """V as the routes make it of their starts, with its certificate."""
-    compared = options.routes is not None and len(options.routes) == 2
-    refined = refine(
-        context.found, context.portrait, formula=formula, network=network, points=context.points,
-        options=options, seed=context.number,
-    )  # fmt: skip
-    formulas = _refined_decomposition(refined, context.points)
-    both = refined.wells and refined.network_wells
-    wells, others = refined.wells or refined.network_wells, refined.network_wells if both else ()
-    if formulas.potential is None:
-        return refined, formulas, certify(wells, context.evidence, others=others, compared=compared)
-    certificate = certify(
-        formulas, context.evidence, others=refined.wells, compared=compared,
-        relative_error=0.0 if refined.formula is None or context.found.noise_free
-        else refined.formula.relative_error(refined.found.library.evaluate(context.points)),
-    )  # fmt: skip
-    if certificate.certified or not refined.wells:
-        return refined, formulas, certificate
-    # One formula for all wells is an extra. What refuses it is no word against the wells.
-    refused = Remark("quasipotential.single_formula_refused", {"reason": certificate.reason})
-    alone = replace(refined, formula=None, remarks=(*refined.remarks, refused))
-    of_wells = certify(wells, context.evidence, others=others, compared=compared)
-    if not of_wells.certified:
-        return refined, formulas, certificate
-    return alone, _refined_decomposition(alone, context.points), of_wells
 
 
 @dataclass(frozen=True)
@@ -574,11 +549,11 @@ class TrainingCheck:
         return result.residual < self.options.residual / 10 and worst < self.options.difference
 
     def _by_wells(self, potential: Function) -> bool:
-        for index, (one, local) in enumerate(zip(self.portrait.attractors, self.wells, strict=True)):
+        for index, local in enumerate(self.wells):
             try:
                 well = fit_well(
-                    self.found.dynamics, one, self.portrait.basins[index], self.portrait.saddles[index],
-                    potential, degree=local.degree, generator=np.random.default_rng(0), steps=CHECK_STEPS,
+                    self.found.dynamics, self.portrait, index, potential, degree=local.degree,
+                    steps=CHECK_STEPS,
                 )  # fmt: skip
             except NumericalFailure:
                 return False

@@ -487,13 +487,12 @@ def _recorded(starts: np.ndarray, dimension: int) -> float:
 
 def fit_well(
     dynamics: Dynamics,
-    attractor: Equilibrium,
-    basin: Basin,
-    saddles: Sequence[Equilibrium],
+    portrait: PhasePortrait,
+    index: int,
     potential: Callable[[np.ndarray], np.ndarray],
     *,
     degree: int,
-    generator: np.random.Generator,
+    seed: int = 0,
     steps: int = 60,
 ) -> Well:
     """V about an attractor by the network route: from values V_θ, up to a constant, refined without M.
@@ -503,6 +502,8 @@ def fit_well(
     local route; `steps` are the most of Gauss–Newton at the start. Fails with `NumericalFailure` when the
     networks leave too few states for a start, or no start grows to a well.
     """
+    attractor, basin = portrait.attractors[index], portrait.basins[index]
+    saddles, generator = portrait.saddles[index], np.random.default_rng(seed)
     lowest = float(potential(attractor.position[None])[0])
     flat = basin.states.reshape(-1, basin.states.shape[2])
     along = (potential(flat) - lowest).reshape(basin.states.shape[:2])

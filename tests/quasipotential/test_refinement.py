@@ -16,7 +16,13 @@ from siq.networks.decomposition import CheckOptions
 from siq.quasipotential import refinement
 from siq.quasipotential.certificate import Certificate
 from siq.quasipotential.global_formula import GlobalFormula
-from siq.quasipotential.refinement import Refined, RefinementOptions, TrainingCheck, _every_well_held_out
+from siq.quasipotential.refinement import (
+    Refined,
+    RefinementContext,
+    RefinementOptions,
+    TrainingCheck,
+    _every_well_held_out,
+)
 from siq.remarks import has_code
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import phase_portrait
@@ -91,7 +97,7 @@ def test_the_wells_carry_the_certificate_where_one_formula_is_refused(
 
     monkeypatch.setattr(refinement, "certify", certified)
     context: Any = SimpleNamespace(found=found.found, portrait=None, points=None, number=0, evidence=None)
-    refined, formulas, made = refinement._refined_by_routes(context, RefinementOptions(), None, None)
+    refined, formulas, made = RefinementContext._by_routes(context, RefinementOptions(), None, None)
     assert made.scope == scope
     assert (formulas.potential is not None) == whole
     assert made.certified == (PASSED in (formula, wells))

@@ -231,10 +231,7 @@ def test_the_network_route_refines_values_that_are_off_by_a_tenth(known: KnownSy
         return 3 + potential_values(known, x) * 1.05 + 0.01 * waves
 
     for index in range(2):
-        well = fit_well(
-            known.dynamics, found.attractors[index], found.basins[index], found.saddles[index], rough,
-            degree=4, generator=np.random.default_rng(0),
-        )  # fmt: skip
+        well = fit_well(known.dynamics, found, index, rough, degree=4)
         assert_exact(known, replace(well, level=0.9 * well.level), 1e-9)
 
 
@@ -246,10 +243,7 @@ def test_the_network_route_needs_recorded_states_below_the_saddle() -> None:
         return -potential_values(known, x)
 
     with pytest.raises(NumericalFailure, match="the networks leave only"):
-        fit_well(
-            known.dynamics, found.attractors[0], found.basins[0], found.saddles[0], inverted,
-            degree=4, generator=np.random.default_rng(0),
-        )  # fmt: skip
+        fit_well(known.dynamics, found, 0, inverted, degree=4)
 
 
 def test_a_start_with_just_enough_states_is_not_halved() -> None:
@@ -263,10 +257,7 @@ def test_a_start_with_just_enough_states_is_not_halved() -> None:
         away = ((x - top) ** 2).sum(axis=1)
         return potential_values(known, x) - lowest - 0.4996 * np.exp(-20 * away)
 
-    well = fit_well(
-        known.dynamics, found.attractors[0], found.basins[0], found.saddles[0], dipped,
-        degree=8, generator=np.random.default_rng(0),
-    )  # fmt: skip
+    well = fit_well(known.dynamics, found, 0, dipped, degree=8)
     assert well.level == pytest.approx(0.5, rel=1e-9)
     assert_exact(known, replace(well, level=0.9 * well.level), 1e-9)
 
@@ -284,10 +275,7 @@ def test_the_network_route_does_not_follow_networks_in_how_far_a_well_reaches() 
 
     x = local.points[local.values(local.points) < 0.9 * local.level]
     assert np.linalg.norm(distorted(x) - local.values(x)) > 0.4 * np.linalg.norm(local.values(x))
-    well = fit_well(
-        known.dynamics, found.attractors[0], found.basins[0], found.saddles[0], distorted,
-        degree=10, generator=np.random.default_rng(0),
-    )  # fmt: skip
+    well = fit_well(known.dynamics, found, 0, distorted, degree=10)
     assert well.level == pytest.approx(local.level, rel=0.02)
     assert np.linalg.norm(well.values(x) - local.values(x)) < 5e-3 * np.linalg.norm(local.values(x))
 
@@ -300,10 +288,7 @@ def test_the_network_route_is_not_drawn_to_a_v_that_vanishes(factor: float) -> N
     def off(x: np.ndarray) -> np.ndarray:
         return factor * potential_values(known, x)
 
-    well = fit_well(
-        known.dynamics, found.attractors[0], found.basins[0], found.saddles[0], off,
-        degree=4, generator=np.random.default_rng(0),
-    )  # fmt: skip
+    well = fit_well(known.dynamics, found, 0, off, degree=4)
     at = found.attractors[0].position[None]
     true = potential_values(known, well.points) - potential_values(known, at)
     np.testing.assert_allclose(well.values(well.points), true, atol=1e-6 * true.max())
@@ -317,10 +302,7 @@ def test_the_network_route_refuses_a_v_without_a_minimum() -> None:
         return (x[:, 0] + 1) ** 2 - x[:, 1] ** 2  # low on either side of the attractor
 
     with pytest.raises(NumericalFailure, match="none with a minimum"):
-        fit_well(
-            known.dynamics, found.attractors[0], found.basins[0], found.saddles[0], saddle,
-            degree=4, generator=np.random.default_rng(0),
-        )  # fmt: skip
+        fit_well(known.dynamics, found, 0, saddle, degree=4)
 
 
 def test_the_formula_of_a_well_has_its_values() -> None:
