@@ -21,7 +21,7 @@ import pandas as pd
 from matplotlib import pyplot
 
 import siq
-from siq.data.two_states import Switching
+from siq.data.two_states import RecordStates
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "images" / "real-records"
@@ -51,7 +51,9 @@ ICE = Drawn(
 CHIP = Drawn("neuromorphic-chip/activity.csv", "rate", "rate (Hz)", "time (s)", (0, 20), ("quiet", "active"))
 
 
-def drawn(one: Drawn, means: tuple[list[Mean], list[Mean]], said: Switching, record: siq.Recordings) -> None:
+def drawn(
+    one: Drawn, means: tuple[list[Mean], list[Mean]], said: RecordStates, record: siq.Recordings
+) -> None:
     """One picture: the record with its visits, and mean visits by everybody who says something of them."""
     figure, (course, times) = pyplot.subplots(
         2, 1, figsize=(9.5, 5.0), layout="constrained", height_ratios=(1.3, 1)
@@ -80,7 +82,7 @@ def drawn(one: Drawn, means: tuple[list[Mean], list[Mean]], said: Switching, rec
     figure.savefig(FOLDER / f"{Path(one.file).parts[0]}.png", dpi=110)
 
 
-def counted(said: Switching) -> tuple[Mean, Mean]:
+def counted(said: RecordStates) -> tuple[Mean, Mean]:
     """From level to level, with the intervals of 95 %."""
     low, high = (("counted, level to level", one.mean, *one.limits) for one in said.counts)
     return low, high

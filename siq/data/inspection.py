@@ -30,7 +30,7 @@ from siq.data.recordings import (
     SINGLE_RECORDING_REMEDY,
     Recordings,
 )
-from siq.data.two_states import RecordStates, Switching, switching
+from siq.data.two_states import RecordStates, switching
 from siq.numerics.randomness import positive
 from siq.remarks import Remark, sentence
 
@@ -137,12 +137,12 @@ class Inspection:
     gaps: int
     memory: MarkovLag
     coverage: float
-    switching: Switching | None
+    switching: RecordStates | None
 
     @property
     def seen(self) -> RecordStates | None:
         """The two states that the recordings show by themselves; None where nothing is known of them."""
-        return None if self.switching is None else self.switching.summary(self.recordings)
+        return self.switching
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -206,7 +206,7 @@ class Inspection:
             found.append(Remark("data.relaxation", values))
         if (hops := self.switching) is not None:
             values = {
-                "state": titles[hops.state], "unit": unit, "levels": hops.levels, "hops": hops.hops,
+                "state": hops.state, "unit": unit, "levels": hops.levels, "hops": hops.transitions,
                 "means": [count.mean for count in hops.counts],
                 "limits": [count.limits for count in hops.counts],
                 "visits": [count.visits for count in hops.counts],
@@ -216,7 +216,7 @@ class Inspection:
             if hops.supported and fewest.visits:
                 values = {"transitions": fewest.visits, "relative_error": fewest.relative_error}
                 found.append(Remark("data.few_transitions", values))
-            values = {"state": titles[hops.state], "range": float(np.ptp(hops.background))}
+            values = {"state": hops.state, "range": float(np.ptp(hops.background))}
             drifts = bool(hops.background.any())
             found.append(Remark("data.drift", values) if drifts else Remark("data.stationary"))
         sparse = self.coverage < SPARSE_COVERAGE and len(titles) > 1

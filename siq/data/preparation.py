@@ -182,7 +182,7 @@ def without_slow_drift(recordings: Recordings) -> Recordings:
     flat, remarks = recordings.values.copy(), list(recordings.remarks)
     for state, values in enumerate(recordings.values.T):
         background, _ = background_of(recordings, values)
-        if found is not None and found.supported and state == found.state:
+        if found is not None and found.supported and recordings.titles[state] == found.state:
             background = found.background
         if not background.any():
             continue

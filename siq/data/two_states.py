@@ -25,7 +25,7 @@ the first one is beyond doubt. Two states are supported if one of the tests says
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -330,105 +330,9 @@ DECISIVE_P = 1e-5  # probability for the first test from which on the second one
 PULLED_TOGETHER = -3.0  # standard errors: where f falls so clearly between all places, one state attracts
 
 
-@dataclass(frozen=True)
-class Switching:
-    """Two states of a record, and its hops between them.
-
-    Attributes
-    ----------
-    state
-        Index of the state (column) that shows them best.
-    levels
-        The two levels, the lower first, in the unit of the state; of the record less its background.
-    counts
-        How long each lasts.
-    visits
-        Shape ``(n,)``: 0 or 1 at each sample, -1 before the record has reached a level.
-    background
-        What drifts slowly below both levels, shape ``(n,)``; zero where nothing does.
-    probability
-        Of so much with a single state over a slowly drifting background, both tests and all states counted.
-    """
-
-    state: int
-    levels: tuple[float, float]
-    counts: tuple[DwellCount, DwellCount]
-    visits: np.ndarray
-    background: np.ndarray
-    probability: float
-
-    def summary(self, recordings: Recordings) -> RecordStates:
-        """What the recordings show by themselves.
-
-        Where a background drifts slowly it is taken off the histogram, as it is off the levels.
-        """
-        values = recordings.values[:, self.state] - self.background
-        density, edges = np.histogram(values, bins=BINS, density=True)
-        return RecordStates(
-            recordings.titles[self.state], recordings.units[self.state], recordings.time_unit,
-            self.supported, self.probability, self.levels, self.counts, edges, density,
-        )  # fmt: skip
-
-    @property
-    def hops(self) -> int:
-        """How many transitions were seen, both ways."""
-        return self.counts[0].visits + self.counts[1].visits
-
-    @property
-    def supported(self) -> bool:
-        """Whether the record supports two states: it is pushed apart, and was seen to hop at least once."""
-        return self.probability < SIGNIFICANCE and self.hops > 0
-
-
-def switching(recordings: Recordings) -> Switching | None:
-    """The two states that the recordings show best; None where they are too short to tell anything.
-
-    Every state is looked at by itself, and the one in which the record is pushed apart most clearly is taken.
-    Whether two are supported at all is `Switching.supported`.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from siq.data.correlation import markov_lag
-    >>> from siq.data.recordings import Recordings
-    >>> generator = np.random.default_rng(1)
-    >>> x = np.empty((20_000, 1))
-    >>> x[0] = 1.0
-    >>> for before in range(len(x) - 1):
-    ...     kick = np.sqrt(0.25 * 0.05) * generator.standard_normal()
-    ...     x[before + 1] = x[before] + 0.05 * (x[before] - x[before] ** 3) + kick
-    >>> found = switching(Recordings.from_arrays(0.05 * np.arange(len(x)), x, names=["x"]))
-    >>> found.supported, [round(level, 1) for level in found.levels]
-    (True, [-0.9, 0.8])
-    """
-    runs, generator = runs_of(recordings), np.random.default_rng(0)  # always the same surrogates
-    tests: dict[int, tuple[float, float, float]] = {}  # probability, less the depth, relaxation
-    for place, column in enumerate(recordings.values.T):
-        relaxation = relaxation_samples(column, runs)
-        if relaxation is None:  # too short, or a column that runs on like a clock
-            continue
-        pushed, chance = _pushed_apart(column, runs, relaxation) or (float("nan"), 1.0)
-        clear = pushed < PULLED_TOGETHER or chance < DECISIVE_P
-        depth, rarity = _valley_between(
-            column, runs, relaxation, generator=None if clear else generator,
-            surrogates=SURROGATES * recordings.values.shape[1],
-        )  # fmt: skip
-        tests[place] = (min(chance, rarity), -depth, relaxation)
-    if not tests:
-        return None
-    state = min(tests, key=lambda place: tests[place][:2])
-    probability, _, relaxation = tests[state]
-    values = recordings.values[:, state]
-    background, levels = _two_levels(recordings, values, runs, relaxation)
-    visits = _counted_visits(values - background, runs, levels)
-    lower, upper = DwellCount.of_visits(recordings.t, visits, runs)
-    chance = min(2 * probability * len(tests), 1.0)
-    return Switching(state, levels, (lower, upper), visits, background, chance)
-
-
 @dataclass(frozen=True, eq=False)
 class RecordStates:
-    """The two states that recordings show by themselves.
+    """Two states that recordings show by themselves, and the hops between them.
 
     Attributes
     ----------
@@ -437,15 +341,19 @@ class RecordStates:
     unit, time_unit
         None where the file does not say.
     supported
-        Whether the record supports two states at all.
+        Whether the record supports two states at all: it is pushed apart, and was seen to hop at least once.
     probability
-        Of as much with a single state over a slowly drifting background.
+        Of so much with a single state over a slowly drifting background, both tests and all states counted.
     levels
-        The two, the lower first, in the unit of the state.
+        The two, the lower first, in the unit of the state; of the record less its background.
     counts
         How long each lasts, the lower first.
     edges, density
         Histogram of the state: edges ``(b + 1,)`` and, per unit of the state, ``(b,)``.
+    visits
+        Shape ``(n,)``: 0 or 1 at each sample, -1 before the record has reached a level. Not stored.
+    background
+        What drifts slowly below both levels, shape ``(n,)``; zero where nothing does. Not stored.
     """
 
     state: str
@@ -457,12 +365,13 @@ class RecordStates:
     counts: tuple[DwellCount, DwellCount]
     edges: np.ndarray
     density: np.ndarray
+    visits: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
+    background: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def of(cls, recordings: Recordings) -> RecordStates | None:
         """What recordings show; None where they are too short to tell anything, or have no noise."""
-        found = switching(recordings) if markov_lag(recordings).may_hop else None
-        return None if found is None else found.summary(recordings)
+        return switching(recordings) if markov_lag(recordings).may_hop else None
 
     @property
     def transitions(self) -> int:
@@ -499,9 +408,10 @@ class RecordStates:
 
     def as_data(self) -> dict[str, Any]:
         """As plain data, which `from_data` reads back."""
+        kept = {name: value for name, value in vars(self).items() if name not in ("visits", "background")}
         counts = [vars(one) for one in self.counts]
         arrays = {"edges": self.edges.tolist(), "density": self.density.tolist()}
-        return {**vars(self), "levels": list(self.levels), "counts": counts, **arrays}
+        return {**kept, "levels": list(self.levels), "counts": counts, **arrays}
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any]) -> RecordStates:
@@ -509,3 +419,55 @@ class RecordStates:
         first, second = (DwellCount(**one) for one in data["counts"])
         arrays = {name: np.array(data[name], dtype=float) for name in ("edges", "density")}
         return cls(**{**data, "levels": tuple(data["levels"]), "counts": (first, second), **arrays})
+
+
+def switching(recordings: Recordings) -> RecordStates | None:
+    """The two states that the recordings show best; None where they are too short to tell anything.
+
+    Every state is looked at by itself, and the one in which the record is pushed apart most clearly is taken.
+    Where a background drifts slowly it is taken off the histogram, as it is off the levels.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from siq.data.correlation import markov_lag
+    >>> from siq.data.recordings import Recordings
+    >>> generator = np.random.default_rng(1)
+    >>> x = np.empty((20_000, 1))
+    >>> x[0] = 1.0
+    >>> for before in range(len(x) - 1):
+    ...     kick = np.sqrt(0.25 * 0.05) * generator.standard_normal()
+    ...     x[before + 1] = x[before] + 0.05 * (x[before] - x[before] ** 3) + kick
+    >>> found = switching(Recordings.from_arrays(0.05 * np.arange(len(x)), x, names=["x"]))
+    >>> found.supported, [round(level, 1) for level in found.levels]
+    (True, [-0.9, 0.8])
+    """
+    runs, generator = runs_of(recordings), np.random.default_rng(0)  # always the same surrogates
+    tests: dict[int, tuple[float, float, float]] = {}  # probability, less the depth, relaxation
+    for place, column in enumerate(recordings.values.T):
+        relaxation = relaxation_samples(column, runs)
+        if relaxation is None:  # too short, or a column that runs on like a clock
+            continue
+        pushed, chance = _pushed_apart(column, runs, relaxation) or (float("nan"), 1.0)
+        clear = pushed < PULLED_TOGETHER or chance < DECISIVE_P
+        depth, rarity = _valley_between(
+            column, runs, relaxation, generator=None if clear else generator,
+            surrogates=SURROGATES * recordings.values.shape[1],
+        )  # fmt: skip
+        tests[place] = (min(chance, rarity), -depth, relaxation)
+    if not tests:
+        return None
+    state = min(tests, key=lambda place: tests[place][:2])
+    probability, _, relaxation = tests[state]
+    values = recordings.values[:, state]
+    background, levels = _two_levels(recordings, values, runs, relaxation)
+    flat = values - background
+    visits = _counted_visits(flat, runs, levels)
+    counts = DwellCount.of_visits(recordings.t, visits, runs)
+    chance = min(2 * probability * len(tests), 1.0)
+    density, edges = np.histogram(flat, bins=BINS, density=True)
+    return RecordStates(
+        recordings.titles[state], recordings.units[state], recordings.time_unit,
+        chance < SIGNIFICANCE and any(one.visits for one in counts), chance, levels,
+        (counts[0], counts[1]), edges, density, visits, background,
+    )  # fmt: skip

@@ -48,7 +48,7 @@ from siq.data.two_states import (
     BINS,
     SIGNIFICANCE,
     DwellCount,
-    Switching,
+    RecordStates,
     continued_visits,
     switching,
 )
@@ -433,7 +433,7 @@ class OccupancyCheck:
     visits: tuple[VisitTest, ...] = ()
     densities: tuple[DensityTest, ...] = ()
     missing: str | None = None
-    unseen: Switching | None = None
+    unseen: RecordStates | None = None
 
     def verdict(self, *, false_alarms: float) -> Verdict | None:
         """The verdict for the certificate, refused by chance with a probability `false_alarms`; None without.
@@ -498,8 +498,8 @@ def check_occupancy(
             return OccupancyCheck(missing="there is one stable state, so that nothing hops")
         low, high = seen.levels
         return OccupancyCheck(
-            missing=f"the record hops between two states, at {low:.3g} and {high:.3g}, with {seen.hops}"
-            " transitions seen, and what was identified has one stable state",
+            missing=f"the record hops between two states, at {low:.3g} and {high:.3g}, with"
+            f" {seen.transitions} transitions seen, and what was identified has one stable state",
             unseen=seen,
         )
     cores = _cores_about(found.dynamics, portrait, noise.intensity)

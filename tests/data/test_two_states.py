@@ -56,12 +56,12 @@ def test_one_state_on_a_slow_background_is_not_two(background: str) -> None:
 def test_two_wells_are_two(background: str, sensor: float) -> None:
     noise = sensor * np.random.default_rng(9).standard_normal(COUNT)
     found = switching(recorded(two_states(3, 0.25) + noise + BACKGROUNDS[background] / 20))
-    assert found is not None and found.supported and 10 < found.hops < 60
+    assert found is not None and found.supported and 10 < found.transitions < 60
 
 
 def test_two_wells_of_which_each_recording_shows_one_are_not_seen_to_hop() -> None:
     found = switching(recorded(two_states(0, 0.04), -two_states(1, 0.04)))
-    assert found is not None and found.hops == 0 and not found.supported
+    assert found is not None and found.transitions == 0 and not found.supported
 
 
 def test_visits_go_from_level_to_level() -> None:

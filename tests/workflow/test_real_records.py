@@ -51,5 +51,5 @@ def test_the_states_of_the_chip_last_as_its_authors_say() -> None:
     for count, authors in zip(seen.counts, (1.51, 0.313), strict=True):
         low, high = count.limits
         assert low < authors < high
-    assert seen.hops == pytest.approx(108, abs=20)
+    assert seen.transitions == pytest.approx(108, abs=20)
     assert refused(analyse(record))

@@ -112,7 +112,7 @@ def _draw_record(axes: Axes, found: Inspection, state: int) -> None:
         low, high = np.minimum.reduceat(x, edges), np.maximum.reduceat(x, edges)
         axes.fill_between(t[edges], low, high, color=BLUE, linewidth=0.3, rasterized=True)
     hops = found.switching
-    if hops is not None and hops.supported and hops.state == state:
+    if hops is not None and hops.supported and hops.state == recordings.titles[state]:
         for level in hops.levels:
             axes.axhline(level, color=BLACK, linestyle="--", linewidth=0.8)
     time_unit = recordings.time_unit
