@@ -57,8 +57,10 @@ from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.inference.library import field_dynamics
 from siq.numerics.randomness import normal_draws
 from siq.numerics.text import place_text
+from siq.quasipotential.characteristics import ScaledSystem
 from siq.quasipotential.rates import NoiseStrength, mean_residence_time
 from siq.quasipotential.transitions import transitions, ways_out
+from siq.remarks import Remark, sentence
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
 from siq.systems.phase_portrait import PhasePortrait
@@ -86,89 +88,100 @@ COMPARED_PLACES = 200  # at which distribution functions are compared
 MEAN_DISTANCE = 0.8687  # of Kolmogorov's statistic: √(π/2) ln 2
 
 
+_Cores = list[tuple[np.ndarray, np.ndarray, float]]
+"""A, M and a level for each well: its core is where ``(x - A)ᵀ M (x - A)``, about U, is below the level."""
+
+
 class _CellProcess:
     """The Markov jump process between the cells of a box, of one or two states, that nothing leaves.
 
-    `points` are the centres of the n cells, ``(n, d)``; `rates` is the sparse generator, row i holding the
-    rates out of cell i; `density` are the invariant probabilities, ``(n,)``.
+    `points` are the centres of the n cells, ``(n, d)``, and `density` are the invariant probabilities,
+    ``(n,)``. For each core, `last` are the probabilities that it was the last of all that was visited, of
+    each cell, ``(n,)``; and `means` are the mean times from entering it until another one is entered.
     """
 
     def __init__(
-        self, dynamics: Dynamics, intensity: float, box: np.ndarray, *, cells: int | None = None
+        self,
+        dynamics: Dynamics,
+        intensity: float,
+        box: np.ndarray,
+        cores: _Cores,
+        *,
+        cells: int | None = None,
     ) -> None:
         dimension = dynamics.dimension
         if dimension not in CELLS:
             raise NumericalFailure("the Fokker–Planck operator is solved for one and two states only")
-        count = CELLS[dimension] if cells is None else cells
+        count = cells or CELLS[dimension]
         # A unit lower triangular change of states after which D has no mixed terms in the middle.
         # With mixed terms it is the parallelogram's hull that is covered. A D(x) that was learned may be
         # no covariance far from recordings: cells where that is so are left out.
         shear, matrix = np.eye(dimension), dynamics.diffusion.at(box.mean(axis=1)[None])[0]
         if dimension == 2 and abs(matrix[0, 1]) > 1e-12 * np.sqrt(matrix[0, 0] * matrix[1, 1]):
             shear[1, 0] = matrix[0, 1] / matrix[0, 0]
-        corners = np.array(list(product(*box))) @ np.linalg.inv(shear).T
-        plain = np.array_equal(shear, np.eye(dimension))
-        sides = box if plain else np.stack([corners.min(axis=0), corners.max(axis=0)], axis=1)
+        system = ScaledSystem(dynamics, np.zeros(dimension), shear, unit=1.0)
+        corners = system.scaled(np.array(list(product(*box))))
+        sides = np.stack([corners.min(axis=0), corners.max(axis=0)], axis=1)
         axes = [low + (high - low) * (np.arange(count) + 0.5) / count for low, high in sides]
         steps = (sides[:, 1] - sides[:, 0]) / count
         y = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dimension)
-        inverse = np.linalg.inv(shear)
-
-        def tensors(points: np.ndarray) -> np.ndarray:
-            return np.asarray(inverse @ dynamics.diffusion.at(points @ shear.T) @ inverse.T)
-
-        floor = LEAST_NOISE * float(np.linalg.eigvalsh(tensors(y)).max())
+        strengths = np.linalg.eigvalsh(system.noise.at(y))
+        floor = LEAST_NOISE * float(strengths.max())
 
         def noise(points: np.ndarray) -> np.ndarray:
-            matrices = tensors(points)
+            matrices = system.noise.at(points)
             levels, vectors = np.linalg.eigh(matrices)
             if not (levels >= floor).all():  # nothing is weaker than the floor
                 matrices = np.einsum("nik,nk,njk->nij", vectors, np.maximum(levels, floor), vectors)
             return 0.5 * intensity * matrices
 
-        def flow(points: np.ndarray) -> np.ndarray:
-            return np.asarray(dynamics.drift(points @ shear.T) @ inverse.T)
-
-        usable = np.linalg.eigvalsh(tensors(y))[:, 0] > floor
-        if not usable.any():
+        places = np.flatnonzero(strengths[:, 0] > floor)
+        if not len(places):
             raise NumericalFailure(
                 "the noise does not reach every state: no Fokker–Planck operator is solved"
             )
         # The generator of the largest set of usable cells that are connected.
-        places = np.flatnonzero(usable)
-        inner = _rates(flow, noise, y, steps, count)[places][:, places]
+        inner = _rates(system.force, noise, y, steps, count)[places][:, places]
         _, piece = sparse.csgraph.connected_components(inner, directed=True, connection="strong")
         largest = piece == np.argmax(np.bincount(piece))
         places, inner = places[largest], inner[largest][:, largest]
         rates = (inner - sparse.diags(np.asarray(inner.sum(axis=1)).ravel())).tocsr()
-        y, density = y[places], _invariant_density(rates)
-        tensor, drift = np.diagonal(noise(y), axis1=1, axis2=2), flow(y)
-        if float((density[:, None] * np.abs(drift) * steps / tensor).sum(axis=0).max()) > COARSE:
+        y, self.density = y[places], _invariant_density(rates)
+        tensor, drift = np.diagonal(noise(y), axis1=1, axis2=2), system.force(y)
+        if float((self.density[:, None] * np.abs(drift) * steps / tensor).sum(axis=0).max()) > COARSE:
             raise NumericalFailure("the noise is too weak for a grid: the wells are narrower than its cells")
-        self.points, self.rates, self.density = y @ shear.T, rates, density
+        self.points = system.points(y)
+        core, wells = _core_of(cores, self.points), range(len(cores))
+        if len(np.unique(core[core >= 0])) < len(wells):
+            raise NumericalFailure("the core of a well is smaller than a cell of the grid")
+        self.last = [self._last_visited(rates, core, well) for well in wells]
+        self.means = np.full(len(cores), np.inf)
+        for well, last in enumerate(self.last):
+            own = self.density * last
+            flow = float(own @ (rates @ ((core >= 0) & (core != well)).astype(float)))
+            if flow > 0:
+                self.means[well] = own.sum() / flow
 
-    def last_visited(self, cores: np.ndarray, which: int) -> np.ndarray:
-        """Probability that core `which` was the last of all that was visited: shape ``(n,)``.
-
-        `cores`, shape ``(n,)``, has the core that each cell belongs to, -1 between them.
-        """
-        found = (cores == which).astype(float)
-        free = np.flatnonzero(cores < 0)
-        weight = np.maximum(self.density, np.finfo(float).tiny)
+    def _last_visited(self, rates: sparse.csr_matrix, core: np.ndarray, which: int) -> np.ndarray:
+        found = (core == which).astype(float)
+        free = np.flatnonzero(core < 0)
         # Of the reversed process only ratios count: π_j L_ji, row by row.
-        flows = (sparse.diags(weight) @ self.rates).T.tocsr()
+        flows = (sparse.diags(np.maximum(self.density, np.finfo(float).tiny)) @ rates).T.tocsr()
         inner = flows[free][:, free]
         scale = 1 / np.maximum(-inner.diagonal(), np.finfo(float).tiny)
         into = -(flows[free] @ found)
         found[free] = splu((sparse.diags(scale) @ inner).tocsc()).solve(scale * into)
         return np.clip(found, 0.0, 1.0)
 
-    def mean_visit(self, cores: np.ndarray, which: int) -> float:
-        """Mean time from entering core `which` until another one is entered, counted as on a record."""
-        own = self.density * self.last_visited(cores, which)
-        others = ((cores >= 0) & (cores != which)).astype(float)
-        flow = float(own @ (self.rates @ others))
-        return float(own.sum() / flow) if flow > 0 else float("inf")
+    def distribution(self, well: int, state: int, places: np.ndarray, blur: float = 0.0) -> np.ndarray:
+        """Distribution function of a state during visits to a well, blurred by measurement noise."""
+        at, group = np.unique(np.round(self.points[:, state], 12), return_inverse=True)
+        mass = np.bincount(group, weights=self.density * self.last[well])
+        if len(at) > MOST_PLACES:
+            mass, edges = np.histogram(at, bins=MOST_PLACES, weights=mass)
+            at = (edges[1:] + edges[:-1]) / 2
+        spread = np.hypot(blur, float(np.median(np.diff(at))) / np.sqrt(12))  # a cell is no point
+        return np.asarray(stats.norm.cdf((places[:, None] - at) / spread) @ (mass / mass.sum()))
 
 
 def _rates(
@@ -239,10 +252,6 @@ def _invariant_density(rates: sparse.csr_matrix) -> np.ndarray:
     return np.asarray(found / found.sum())
 
 
-_Cores = list[tuple[np.ndarray, np.ndarray, float]]
-"""A, M and a level for each well: its core is where ``(x - A)ᵀ M (x - A)``, about U, is below the level."""
-
-
 def _as_sampled(cores: _Cores, dynamics: Dynamics, intensity: float, step: float) -> _Cores:
     """Cores that a state meets all the time as often as it is seen in these at samples a step apart."""
     # A random walk meets a boundary as Brownian motion meets one that lies OVERSHOOT standard deviations
@@ -281,42 +290,41 @@ def _cores_about(dynamics: Dynamics, portrait: PhasePortrait, intensity: float) 
 
 def _predicted_visits(
     found: FieldEstimate, portrait: PhasePortrait, noise: NoiseStrength, cores: _Cores, *, seed: int = 0
-) -> tuple[list[tuple[int, float, float]], list[_CellVisits], list[str]]:
+) -> tuple[list[tuple[int, float, float]], list[_CellProcess], Remark]:
     """Well, mean time of visits and its relative error by f, D and ε, core to core, where that is known.
 
     It is by the operator of f and of draws of it, which is returned too, or else by the law; and what is not
-    known, in words.
+    known.
     """
-    notes: list[str] = []
+    reasons: list[str] = []
     dynamics, width = found.dynamics, portrait.box[:, 1] - portrait.box[:, 0]
     for margin in MARGINS if dynamics.dimension in CELLS else ():
         cells = CELLS[dynamics.dimension]
         box = portrait.box + margin * np.stack([-width, width], axis=1)
         try:
-            processes = [_CellVisits(dynamics, noise.intensity, box, cores, cells)]
+            processes = [_CellProcess(dynamics, noise.intensity, box, cores, cells=cells)]
             generator = np.random.default_rng(seed)
             for _ in range(DRAWS[dynamics.dimension]):
                 drawn = _drawn_system(found, generator=generator)
-                strength = np.exp(noise.standard_error / noise.intensity * generator.standard_normal())
+                strength = float(np.exp(noise.standard_error / noise.intensity * generator.standard_normal()))
                 coarse = round(COARSER * cells)
-                processes.append(_CellVisits(drawn, noise.intensity * float(strength), box, cores, coarse))
+                processes.append(_CellProcess(drawn, noise.intensity * strength, box, cores, cells=coarse))
         except (NumericalFailure, np.linalg.LinAlgError, RuntimeError, ValueError) as error:
-            notes.append(str(error))
+            reasons.append(str(error))
             continue
         means, errors = processes[0].means, np.log([one.means for one in processes[1:]]).std(axis=0, ddof=1)
         known = np.flatnonzero(np.isfinite(means) & np.isfinite(errors))
-        return [(int(well), float(means[well]), float(errors[well])) for well in known], processes, []
+        times = [(int(well), float(means[well]), float(errors[well])) for well in known]
+        return times, processes, Remark("quasipotential.no_dwell_time", {"reasons": [], "places": []})
     ways = transitions(found, ways_out(dynamics, portrait), [None] * len(cores))
-    times, missing = [], []
+    times, places = [], []
     for well, one in enumerate(portrait.attractors):
         mean_time = mean_residence_time([way.exit for way in ways if way.start == well], noise)
         if mean_time is None or not mean_time.complete:
-            missing.append(place_text(one.position))
+            places.append(place_text(one.position))
         else:
             times.append((well, mean_time.value, mean_time.error))
-    if missing:
-        notes.append(f"no law says how long {' and '.join(missing)} lasts")
-    return times, [], notes
+    return times, [], Remark("quasipotential.no_dwell_time", {"reasons": reasons, "places": places})
 
 
 def _drawn_system(found: FieldEstimate, *, generator: np.random.Generator) -> Dynamics:
@@ -333,30 +341,6 @@ def _drawn_system(found: FieldEstimate, *, generator: np.random.Generator) -> Dy
         diffusion = replace(terms, values=entries).diffusion(found.intensity)
     values = coefficients[support[:, 1], support[:, 0]]
     return field_dynamics(found.library, support, values, diffusion=diffusion)
-
-
-class _CellVisits:
-    """The operator of one f, with the probability of each cell to belong to a visit of each well."""
-
-    def __init__(
-        self, dynamics: Dynamics, intensity: float, box: np.ndarray, cores: _Cores, cells: int
-    ) -> None:
-        self.process = _CellProcess(dynamics, intensity, box, cells=cells)
-        core, wells = _core_of(cores, self.process.points), range(len(cores))
-        if len(np.unique(core[core >= 0])) < len(wells):
-            raise NumericalFailure("the core of a well is smaller than a cell of the grid")
-        self.last = [self.process.last_visited(core, well) for well in wells]
-        self.means = np.array([self.process.mean_visit(core, well) for well in wells])
-
-    def distribution(self, well: int, state: int, places: np.ndarray, blur: float = 0.0) -> np.ndarray:
-        """Distribution function of a state during visits to a well, blurred by measurement noise."""
-        at, group = np.unique(np.round(self.process.points[:, state], 12), return_inverse=True)
-        mass = np.bincount(group, weights=self.process.density * self.last[well])
-        if len(at) > MOST_PLACES:
-            mass, edges = np.histogram(at, bins=MOST_PLACES, weights=mass)
-            at = (edges[1:] + edges[:-1]) / 2
-        spread = np.hypot(blur, float(np.median(np.diff(at))) / np.sqrt(12))  # a cell is no point
-        return np.asarray(stats.norm.cdf((places[:, None] - at) / spread) @ (mass / mass.sum()))
 
 
 @dataclass(frozen=True)
@@ -425,14 +409,14 @@ class OccupancyCheck:
     visits, densities
         As counted, and as predicted.
     missing
-        Why neither is compared, in words; None where they are.
+        Why neither is compared; None where they are.
     unseen
         Two states between which the record hops, where a single one was identified; None elsewhere.
     """
 
     visits: tuple[VisitTest, ...] = ()
     densities: tuple[DensityTest, ...] = ()
-    missing: str | None = None
+    missing: Remark | None = None
     unseen: RecordStates | None = None
 
     def verdict(self, *, false_alarms: float) -> Verdict | None:
@@ -443,7 +427,7 @@ class OccupancyCheck:
         """
         if self.unseen is not None:
             rarity, limit = -float(np.log10(self.unseen.probability)), -float(np.log10(SIGNIFICANCE))
-            return Verdict(rarity, limit, False, self.missing or "")
+            return Verdict(rarity, limit, False, "" if self.missing is None else sentence(self.missing))
         found = [one.probability for one in self.visits] + [one.probability for one in self.densities]
         if self.missing is not None or not found:
             return None
@@ -488,19 +472,21 @@ def check_occupancy(
     seed
         Decides the draws of f.
     """
+
+    def none(code: str, **values: float) -> OccupancyCheck:
+        return OccupancyCheck(missing=Remark(code, values))
+
     if found.noise_free:
-        return OccupancyCheck(missing="the recordings show no process noise, so that nothing hops")
+        return none("quasipotential.record_without_noise")
     if noise is None:
-        return OccupancyCheck(missing="the strength of the process noise is not known")
+        return none("quasipotential.record_of_unknown_noise")
     if len(portrait.attractors) < 2:
         seen = switching(joined(recordings)) if found.dynamics.dimension == 1 else None
         if seen is None or not seen.supported:
-            return OccupancyCheck(missing="there is one stable state, so that nothing hops")
+            return none("quasipotential.record_of_one_state")
         low, high = seen.levels
-        return OccupancyCheck(
-            missing=f"the record hops between two states, at {low:.3g} and {high:.3g}, with"
-            f" {seen.transitions} transitions seen, and what was identified has one stable state",
-            unseen=seen,
+        return replace(
+            none("quasipotential.hops_unseen", low=low, high=high, hops=seen.transitions), unseen=seen
         )
     cores = _cores_about(found.dynamics, portrait, noise.intensity)
     runs = runs_of(recordings)
@@ -510,9 +496,9 @@ def check_occupancy(
     whole = DwellCount.of_visits(recordings.t, visits, runs_of(joined(recordings)), states=states)
     held = DwellCount.of_visits(recordings.t, visits, apart, states=states)
     if found.dynamics.dimension not in CELLS and not any(one.visits for one in whole):
-        return OccupancyCheck(missing="the recordings do not hop")
+        return none("quasipotential.record_without_hops")
     sampled = _as_sampled(cores, found.dynamics, noise.intensity, usual_step(recordings))
-    times, processes, notes = _predicted_visits(found, portrait, noise, sampled, seed=seed)
+    times, processes, unknown = _predicted_visits(found, portrait, noise, sampled, seed=seed)
     method = "operator" if processes else "law"
     tested = tuple(
         VisitTest(
@@ -521,10 +507,10 @@ def check_occupancy(
         for well, mean, error in times
     )
     if not tested:
-        return OccupancyCheck(missing=f"no dwell time is predicted: {'; '.join(notes)}")
+        return OccupancyCheck(missing=unknown)
     chance = min(_probability_of(one.whole, one.predicted, one.error) for one in tested)
     if not any(one.visits for one in whole) and chance > NO_HOP_PROBABILITY:
-        return OccupancyCheck(missing="the recordings do not hop, nor should they have in their time")
+        return none("quasipotential.record_too_short_to_hop")
     # Each state's distribution during the visits to each well, on the held-out runs.
     used, densities = np.zeros(len(visits), dtype=bool), []
     for run in apart:

@@ -383,7 +383,7 @@ class RefinementContext:
                 sensor=None if variance is None else np.sqrt(variance), seed=self.number,
             )  # fmt: skip
         except (NumericalFailure, np.linalg.LinAlgError) as error:
-            record = OccupancyCheck(missing=str(error))
+            record = OccupancyCheck(missing=Remark("quasipotential.reason", {"reason": str(error)}))
         verdict = record.verdict(false_alarms=self.limits.false_alarms)
         if verdict is not None:
             reason = "; ".join(one for one in (certificate.reason, verdict.reason) if one)

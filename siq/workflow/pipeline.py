@@ -244,7 +244,7 @@ def refine_run(
             formulas[Method.REFINED] = refinement.formulas
             certificates[Method.REFINED] = certificate.as_data() | {
                 "notes": [*lost, *map(sentence, refinement.remarks)],
-                "no_record_test": refinement.record.missing or "",
+                "no_record_test": "" if (none := refinement.record.missing) is None else sentence(none),
             }  # fmt: skip
             status = Status.OK if certificate.certified else Status.WARNING
             reason = [] if certificate.certified else [*lost, certificate.reason]

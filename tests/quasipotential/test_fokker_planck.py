@@ -24,8 +24,7 @@ BOX = np.array([[-2.0, 2.0]])
 HALF = 0.1  # width of a core
 
 
-def cores(points: np.ndarray) -> np.ndarray:
-    return _core_of([(well, np.eye(1), HALF**2) for well in WELLS[:, None]], points)
+CORES = [(well, np.eye(1), HALF**2) for well in WELLS[:, None]]
 
 
 @pytest.mark.parametrize("intensity", [0.05, 0.15, 0.4])
@@ -33,7 +32,7 @@ def cores(points: np.ndarray) -> np.ndarray:
 def test_one_state_by_quadrature(intensity: float, graded: bool) -> None:
     graded_noise = Diffusion.of_formulas((x,), (((1 + x**2 / 2) ** 2,),))
     system = TILTED.with_diffusion(graded_noise) if graded else TILTED
-    process = _CellProcess(system, intensity, BOX)
+    process = _CellProcess(system, intensity, BOX, CORES)
     grid = np.linspace(*BOX[0], 200_001)
     spread = (1 + grid**2 / 2) ** 2 if graded else np.ones_like(grid)
     force = 2 * (grid - grid**3 + 0.1) / (intensity * spread)
@@ -44,31 +43,30 @@ def test_one_state_by_quadrature(intensity: float, graded: bool) -> None:
     expected = np.interp(process.points[:, 0], grid, density / below[-1])
     assert np.abs(process.density / width - expected).max() < 1e-4 * expected.max()
     between = (grid >= WELLS[0] + HALF) & (grid <= WELLS[1] - HALF)
-    core = cores(process.points)
     for well, mass in enumerate((below, below[-1] - below)):
         exact = 2 / intensity * np.trapezoid((mass / scale)[between], grid[between])
-        assert process.mean_visit(core, well) == pytest.approx(exact, rel=3e-3)
+        assert process.means[well] == pytest.approx(exact, rel=3e-3)
 
 
 def test_cells_where_a_formula_of_the_noise_is_none_are_left_out() -> None:
     """D = 1 - x² on a wider box: Jacobi's process, with the density (1 - x²)^(1/ε - 1)."""
     system = Dynamics(("x",), (-x,), Diffusion.of_formulas((x,), ((1 - x**2,),)))
     intensity = 0.4
-    process = _CellProcess(system, intensity, BOX)
+    process = _CellProcess(system, intensity, BOX, [])
     place = process.points[:, 0]
     assert np.abs(place).max() < 1 and np.abs(place).max() > 0.99
     expected = (1 - place**2) ** (1 / intensity - 1)
     assert process.density == pytest.approx(expected / expected.sum(), rel=1e-3, abs=1e-6)
     beyond = system.with_diffusion(Diffusion.of_formulas((x,), ((x**2 - 9,),)))
     with pytest.raises(NumericalFailure, match="does not reach every state"):
-        _CellProcess(beyond, intensity, BOX)
+        _CellProcess(beyond, intensity, BOX, [])
 
 
 @pytest.mark.parametrize("mixed", [0.0, 0.5])
 def test_two_states_with_mixed_noise_have_the_density_of_a_linear_system(mixed: float) -> None:
     matrix = np.array([[1.0, mixed], [mixed, 1.0]])
     system = Dynamics(("x", "y"), (-x, -y), Diffusion(matrix))
-    process = _CellProcess(system, 0.5, np.array([[-2.5, 2.5], [-2.5, 2.5]]), cells=80)
+    process = _CellProcess(system, 0.5, np.array([[-2.5, 2.5], [-2.5, 2.5]]), [], cells=80)
     covariance = np.cov(process.points.T, aweights=process.density)
     assert np.abs(covariance - 0.25 * matrix).max() < 0.005
 
@@ -87,19 +85,18 @@ def test_two_states_against_a_simulation() -> None:
     recordings = Recordings.from_arrays(step * np.arange(steps), seen.transpose(1, 0, 2), names=["x", "y"])
     visits = continued_visits(_core_of(about, recordings.values), runs_of(recordings))
     counts = DwellCount.of_visits(recordings.t, visits, runs_of(recordings))
-    process = _CellProcess(system, intensity, np.array([[-2.4, 2.4], [-2.2, 2.2]]), cells=100)
-    core = _core_of(about, process.points)
+    process = _CellProcess(system, intensity, np.array([[-2.4, 2.4], [-2.2, 2.2]]), about, cells=100)
     for well, count in enumerate(counts):
         error = np.hypot(count.relative_error, 0.03)  # of the simulation's own step, and of the cells
-        assert process.mean_visit(core, well) == pytest.approx(count.mean, rel=3 * error)
+        assert process.means[well] == pytest.approx(count.mean, rel=3 * error)
 
 
 def test_noise_that_is_too_weak_is_refused() -> None:
     with pytest.raises(NumericalFailure, match="too weak"):
-        _CellProcess(TILTED, 1e-9, BOX)
+        _CellProcess(TILTED, 1e-9, BOX, [])
 
 
 def test_noise_that_does_not_reach_a_state_is_refused() -> None:
     system = Dynamics(("x", "y"), (y, x - x**3 - y), Diffusion(np.diag([0.0, 1.0])))
     with pytest.raises(NumericalFailure, match="does not reach"):
-        _CellProcess(system, 0.1, np.array([[-2.0, 2.0], [-2.0, 2.0]]))
+        _CellProcess(system, 0.1, np.array([[-2.0, 2.0], [-2.0, 2.0]]), [])

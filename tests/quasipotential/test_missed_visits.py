@@ -12,6 +12,7 @@ from siq.inference.field_estimate import FieldEstimate, FlowMap
 from siq.inference.library import IdentificationOptions, field_library
 from siq.quasipotential.occupancy import _as_sampled, _CellProcess, _core_of, _cores_about, check_occupancy
 from siq.quasipotential.rates import NoiseStrength
+from siq.remarks import sentence
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import phase_portrait
@@ -59,9 +60,8 @@ def test_visits_are_foreseen_as_samples_show_them(intensity: float, step: float)
     visits = continued_visits(_core_of(cores, values.reshape(-1, 1)), runs)
     counts = DwellCount.of_visits(np.tile(step * np.arange(800), 400), visits, runs)
     counted = sum(one.time for one in counts) / sum(one.visits for one in counts)
-    process = _CellProcess(dynamics, intensity, np.array([[-3.5, 3.5]]))
     always, sampled = (
-        process.mean_visit(_core_of(one, process.points), 0)
+        _CellProcess(dynamics, intensity, np.array([[-3.5, 3.5]]), one).means[0]
         for one in (cores, _as_sampled(cores, dynamics, intensity, step))
     )
     assert sampled == pytest.approx(counted, rel=0.04)
@@ -78,7 +78,11 @@ def test_a_state_that_the_record_shows_and_f_does_not_is_noticed() -> None:
     found = check_occupancy(alone, portrait, NoiseStrength(0.3), recordings, held)
     verdict = found.verdict(false_alarms=1e-4)
     assert verdict is not None and not verdict.passed and verdict.value > -np.log10(SIGNIFICANCE)
-    assert "hops between two states" in verdict.reason and found.missing == verdict.reason
+    assert (
+        "hops between two states" in verdict.reason
+        and found.missing is not None
+        and sentence(found.missing) == verdict.reason
+    )
     both = field({"x": 1.0, "x**3": -1.0}, 0.3)
     portrait = phase_portrait(both.dynamics, values[::20], seed=0)
     agreed = check_occupancy(both, portrait, NoiseStrength(0.3, 0.003), recordings, held)

@@ -19,6 +19,7 @@ from siq.quasipotential.occupancy import (
     check_occupancy,
 )
 from siq.quasipotential.rates import NoiseStrength
+from siq.remarks import Remark, sentence
 from siq.systems.phase_portrait import PhasePortrait, phase_portrait
 from siq.workflow import pipeline
 from siq.workflow.pipeline import PipelineSettings
@@ -81,7 +82,9 @@ def test_a_wrong_depth_is_refused(recorded: RECORDED) -> None:
 def test_without_noise_there_is_no_test(recorded: RECORDED) -> None:
     recordings, record, portrait, held_out = recorded
     found = check_occupancy(record, portrait, None, recordings, held_out)
-    assert found.verdict(false_alarms=1e-4) is None and "strength of the process noise" in str(found.missing)
+    assert found.verdict(false_alarms=1e-4) is None
+    assert found.missing == Remark("quasipotential.record_of_unknown_noise")
+    assert "strength of the process noise" in sentence(found.missing)
 
 
 def test_a_record_too_short_to_hop_is_no_test(recorded: RECORDED) -> None:
@@ -92,7 +95,7 @@ def test_a_record_too_short_to_hop_is_no_test(recorded: RECORDED) -> None:
         values=recordings.values[rows],
     )  # fmt: skip
     found = check_occupancy(record, portrait, NoiseStrength(INTENSITY), short, np.array([True]))
-    assert found.missing is not None and "nor should they" in found.missing
+    assert found.missing == Remark("quasipotential.record_too_short_to_hop")
 
 
 def test_cores_keep_clear_of_the_saddle(recorded: RECORDED) -> None:
