@@ -472,22 +472,17 @@ def check_occupancy(
     seed
         Decides the draws of f.
     """
-
-    def none(code: str, **values: float) -> OccupancyCheck:
-        return OccupancyCheck(missing=Remark(code, values))
-
     if found.noise_free:
-        return none("quasipotential.record_without_noise")
+        return OccupancyCheck(missing=Remark("quasipotential.record_without_noise"))
     if noise is None:
-        return none("quasipotential.record_of_unknown_noise")
+        return OccupancyCheck(missing=Remark("quasipotential.record_of_unknown_noise"))
     if len(portrait.attractors) < 2:
         seen = switching(joined(recordings)) if found.dynamics.dimension == 1 else None
         if seen is None or not seen.supported:
-            return none("quasipotential.record_of_one_state")
+            return OccupancyCheck(missing=Remark("quasipotential.record_of_one_state"))
         low, high = seen.levels
-        return replace(
-            none("quasipotential.hops_unseen", low=low, high=high, hops=seen.transitions), unseen=seen
-        )
+        values = {"low": low, "high": high, "hops": seen.transitions}
+        return OccupancyCheck(missing=Remark("quasipotential.hops_unseen", values), unseen=seen)
     cores = _cores_about(found.dynamics, portrait, noise.intensity)
     runs = runs_of(recordings)
     visits = continued_visits(_core_of(cores, recordings.values), runs_of(joined(recordings)))
@@ -496,7 +491,7 @@ def check_occupancy(
     whole = DwellCount.of_visits(recordings.t, visits, runs_of(joined(recordings)), states=states)
     held = DwellCount.of_visits(recordings.t, visits, apart, states=states)
     if found.dynamics.dimension not in CELLS and not any(one.visits for one in whole):
-        return none("quasipotential.record_without_hops")
+        return OccupancyCheck(missing=Remark("quasipotential.record_without_hops"))
     sampled = _as_sampled(cores, found.dynamics, noise.intensity, usual_step(recordings))
     times, processes, unknown = _predicted_visits(found, portrait, noise, sampled, seed=seed)
     method = "operator" if processes else "law"
@@ -510,7 +505,7 @@ def check_occupancy(
         return OccupancyCheck(missing=unknown)
     chance = min(_probability_of(one.whole, one.predicted, one.error) for one in tested)
     if not any(one.visits for one in whole) and chance > NO_HOP_PROBABILITY:
-        return none("quasipotential.record_too_short_to_hop")
+        return OccupancyCheck(missing=Remark("quasipotential.record_too_short_to_hop"))
     # Each state's distribution during the visits to each well, on the held-out runs.
     used, densities = np.zeros(len(visits), dtype=bool), []
     for run in apart:
