@@ -8,7 +8,7 @@ is claimed; the vector field, which tells where a formula solves the Hamilton–
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -32,17 +32,82 @@ from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium
 
 DIGITS = 8  # of points of a fit and of a path, which tell where a formula holds and where to draw
-# Keys of the file, and the fields that they are: of a transition, of its law, of a cycle's loss, of its path.
-NUMBERS = {
-    "barrier": "barrier", "formula_share": "formula_share", "standard_error": "standard_error",
-    "by_rivals": "by_rivals", "noise_leverage": "leverage",
-}  # fmt: skip
-NUMBERS_OF_LAW = {
-    "prefactor": "prefactor", "prefactor_error": "prefactor_error", "prefactor_covariance": "covariance",
-    "exponent": "exponent",
-}  # fmt: skip
-TURN = {"own": "loss", "beyond": "loss_beyond", "exact": "particle"}
-PATH_FIGURES = ("error", "residual", "converged", "smooth")
+
+Codec = tuple[Callable[[Any], Any], Callable[[Any], Any]]
+"""How a value is written as plain data, and read."""
+
+
+def _fields(codec: Codec, *same: str, **renamed: str) -> dict[str, tuple[str, Codec]]:
+    """Keys of the file with the fields that they are."""
+    return {key: (name, codec) for key, name in ({each: each for each in same} | renamed).items()}
+
+
+def _written(one: Any, fields: Mapping[str, tuple[str, Codec]]) -> dict[str, Any]:
+    return {key: write(getattr(one, name)) for key, (name, (write, _)) in fields.items()}
+
+
+def _read(data: Mapping[str, Any], fields: Mapping[str, tuple[str, Codec]]) -> dict[str, Any]:
+    return {name: read(data[key]) for key, (name, (_, read)) in fields.items()}
+
+
+def _maybe(read: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """The same, None of None."""
+    return lambda value: None if value is None else read(value)
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None or not np.isfinite(value) else float(value)
+
+
+def _rounded(values: np.ndarray) -> list[Any]:
+    return [float(f"{one:.{DIGITS}g}") if np.ndim(one) == 0 else _rounded(one) for one in values]
+
+
+def _pairs(values: np.ndarray) -> list[list[float]]:
+    """Complex numbers as real and imaginary parts."""
+    return [[value.real, value.imag] for value in values.astype(complex).tolist()]
+
+
+def _complex(pairs: Sequence[Sequence[float]]) -> np.ndarray:
+    values = np.array([complex(*one) for one in pairs])
+    return values if values.imag.any() else values.real
+
+
+PLAIN: Codec = (lambda value: value, lambda value: value)
+NUMBER: Codec = (_number, lambda value: np.nan if value is None else float(value))
+KNOWN: Codec = (_number, lambda value: value)
+ARRAY: Codec = (_maybe(np.ndarray.tolist), _maybe(np.array))
+ROUNDED: Codec = (_rounded, np.array)
+COMPLEX: Codec = (_pairs, _complex)
+REMARKS: Codec = (
+    lambda remarks: [one.as_data() for one in remarks], lambda data: tuple(map(Remark.from_data, data))
+)  # fmt: skip
+
+EQUILIBRIUM = _fields(ARRAY, "position") | _fields(PLAIN, "kind") | _fields(COMPLEX, "eigenvalues")
+CYCLE = _fields(PLAIN, "period") | _fields(COMPLEX, "multipliers") | _fields(ROUNDED, "points")
+WELL = (
+    _fields(PLAIN, "tolerance", "residual", level="reach", depth="level")
+    | _fields(ARRAY, "saddle")
+    | _fields(ROUNDED, "points")
+)
+TRANSITION = (
+    _fields(PLAIN, "start", "end")
+    | _fields(NUMBER, "barrier", "formula_share", "standard_error", "by_rivals", noise_leverage="leverage")
+    | _fields(REMARKS, "remarks")
+)
+LAW = _fields(KNOWN, "prefactor", "prefactor_error", "exponent", prefactor_covariance="covariance") | _fields(
+    REMARKS, law_remarks="remarks"
+)
+TURN = _fields(PLAIN, own="loss", beyond="loss_beyond", exact="particle")
+WAY = _fields(PLAIN, minimum_action="action") | _fields(ARRAY, "downhill", uphill="points")
+PATH = (
+    _fields(PLAIN, "error", "residual", "converged", "smooth")
+    | _fields((list, tuple), "rivals")
+    | _fields(ROUNDED, "momenta", "values")
+)
+VISIT = _fields(PLAIN, "well", "predicted", "method", "probability") | _fields(
+    (asdict, lambda count: DwellCount(**count)), "held_out"
+)
 
 
 def landscape_data(landscape: Landscape) -> dict[str, Any]:
@@ -53,10 +118,7 @@ def landscape_data(landscape: Landscape) -> dict[str, Any]:
         "units": list(landscape.dynamics.units),
         "time_unit": landscape.dynamics.time_unit,
         "noise": None if noise is None else asdict(noise),
-        "equilibria": [
-            {"position": one.position.tolist(), "kind": one.kind, "eigenvalues": _pairs(one.eigenvalues)}
-            for one in landscape.equilibria
-        ],
+        "equilibria": [_written(one, EQUILIBRIUM) for one in landscape.equilibria],
         "wells": [
             {
                 "attractor": attractor.position.tolist(),
@@ -65,92 +127,41 @@ def landscape_data(landscape: Landscape) -> dict[str, Any]:
                 "height": _number(height),
                 "V": None if well is None else _well_data(well),
             }
-            | ({"cycle": _cycle_data(attractor)} if isinstance(attractor, Cycle) else {})
+            | ({"cycle": _written(attractor, CYCLE)} if isinstance(attractor, Cycle) else {})
             for index, (attractor, basin, height, well) in enumerate(
                 zip(landscape.attractors, landscape.basins, landscape.heights, landscape.wells, strict=True)
             )
         ],
         "transitions": [_transition_data(one) for one in landscape.transitions],
         "visits": [
-            {
-                "well": one.well,
-                "visits": one.whole.visits,
-                "time": one.whole.time,
-                "counted": _number(one.whole.mean),
-                "lowest": one.whole.limits[0],
-                "highest": _number(one.whole.limits[1]),
-                "predicted": one.predicted,
-                "error": one.predicted * one.error,
-                "method": one.method,
-                "held_out": asdict(one.held_out),
-                "probability": one.probability,
-            }
+            _written(one, VISIT)
+            | {"visits": one.whole.visits, "time": one.whole.time, "counted": _number(one.whole.mean)}
+            | {"lowest": one.whole.limits[0], "highest": _number(one.whole.limits[1])}
+            | {"error": one.predicted * one.error}
             for one in landscape.visits
         ],
-        "remarks": [one.as_data() for one in landscape.remarks],
+        "remarks": REMARKS[0](landscape.remarks),
     }
     if landscape.given:  # no other file could hold its certificate
         data |= {"given": True, "certificate": None if certificate is None else certificate.as_data()}
-        data |= {"parting": list(map(_cycle_data, landscape.parting))} if landscape.parting else {}
+        parting = [_written(one, CYCLE) for one in landscape.parting]
+        data |= {"parting": parting} if parting else {}
     return data
+
+
+def _well_data(well: Well) -> dict[str, Any]:
+    elsewhere = [] if well.elsewhere is None else _rounded(well.elsewhere)
+    return well.powers | _written(well, WELL) | {"elsewhere": elsewhere}
 
 
 def _transition_data(one: Transition) -> dict[str, Any]:
     rate, path = one.rate or EscapeRate(np.nan, np.nan, np.nan), one.path
-    data = {
-        "start": one.start,
-        "end": one.end,
-        "saddle": one.place.tolist(),
-        **{key: _number(getattr(one, name)) for key, name in (NUMBERS | {"error": "error"}).items()},
-        **{key: _number(getattr(rate, name)) for key, name in NUMBERS_OF_LAW.items()},
-        "turn": None
-        if rate.loss is None
-        else {key: getattr(rate, name) for key, name in TURN.items()},
-        "minimum_action": None, "uphill": None, "downhill": None, "path": None,
-        "remarks": [remark.as_data() for remark in one.remarks],
-        "law_remarks": [remark.as_data() for remark in rate.remarks],
-    }  # fmt: skip
-    if path is not None:
-        data |= {"minimum_action": path.action, "uphill": path.points.tolist()}
-        data["downhill"] = None if path.downhill is None else path.downhill.tolist()
-        data["path"] = {name: getattr(path, name) for name in PATH_FIGURES} | {
-            "momenta": _rounded(path.momenta), "values": _rounded(path.values[None])[0],
-            "rivals": list(path.rivals),
-        }  # fmt: skip
+    data = _written(one, TRANSITION) | _written(rate, LAW)
+    data |= {"saddle": one.place.tolist(), "error": _number(one.error)}
+    data |= {"turn": None if rate.loss is None else _written(rate, TURN)}
+    data |= dict.fromkeys((*WAY, "path")) if path is None else _written(path, WAY)
+    data |= {} if path is None else {"path": _written(path, PATH)}
     return data | ({"over_cycle": one.saddle.period} if isinstance(one.saddle, Cycle) else {})
-
-
-def _cycle_data(one: Cycle) -> dict[str, Any]:
-    return {"period": one.period, "multipliers": _pairs(one.multipliers), "points": _rounded(one.points)}
-
-
-def _well_data(well: Well) -> dict[str, Any]:
-    return well.powers | {
-        "level": well.reach,
-        "depth": well.level,
-        "saddle": None if well.saddle is None else well.saddle.tolist(),
-        "tolerance": well.tolerance,
-        "residual": well.residual,
-        "points": _rounded(well.points),
-        "elsewhere": [] if well.elsewhere is None else _rounded(well.elsewhere),
-    }
-
-
-def _rounded(points: np.ndarray) -> list[list[float]]:
-    return [[float(f"{value:.{DIGITS}g}") for value in row] for row in points]
-
-
-def _pairs(values: np.ndarray) -> list[list[float]]:
-    """Complex numbers as real and imaginary parts."""
-    return [[value.real, value.imag] for value in values.astype(complex).tolist()]
-
-
-def _number(value: float | None) -> float | None:
-    return None if value is None or not np.isfinite(value) else float(value)
-
-
-def _known(value: float | None) -> float:
-    return np.nan if value is None else float(value)
 
 
 def landscape_from_data(data: Mapping[str, Any], dynamics: Dynamics) -> Landscape:
@@ -161,102 +172,72 @@ def landscape_from_data(data: Mapping[str, Any], dynamics: Dynamics) -> Landscap
     """
     if list(data["states"]) != [symbol.name for symbol in dynamics.symbols]:
         raise ValueError("the landscapes are of different states")
-    units = tuple(data.get("units") or ("1",) * dynamics.dimension)
-    dynamics = replace(dynamics, units=units, time_unit=data.get("time_unit") or "1")
-    equilibria = tuple(
-        Equilibrium(np.array(one["position"]), _complex(one["eigenvalues"]), one["kind"])
-        for one in data["equilibria"]
-    )
-
-    def cycle(one: Mapping[str, Any], first: Sequence[float] | None = None) -> Cycle:
-        points = np.array(one["points"])
-        points[0] = points[0] if first is None else first
-        return Cycle(points, one["period"], _complex(one["multipliers"]))
+    dynamics = replace(dynamics, units=tuple(data["units"]), time_unit=data["time_unit"])
+    equilibria = tuple(Equilibrium(**_read(one, EQUILIBRIUM)) for one in data["equilibria"])
+    parting = tuple(Cycle(**_read(one, CYCLE)) for one in data.get("parting", ()))
+    wells = data["wells"]
 
     def equilibrium(place: Sequence[float]) -> Equilibrium:
         same = (one for one in equilibria if np.array_equal(one.position, place))
         return next(same, Equilibrium(np.array(place), np.full(len(place), np.nan), "degenerate"))
 
-    parting = tuple(map(cycle, data.get("parting", ())))
-    transitions = []
+    def attractor(one: Mapping[str, Any]) -> Equilibrium | Cycle:
+        if "cycle" not in one:
+            return equilibrium(one["attractor"])
+        cycle = Cycle(**_read(one["cycle"], CYCLE))
+        cycle.points[0] = one["attractor"]  # the others are rounded
+        return cycle
+
+    attractors, transitions = tuple(map(attractor, wells)), []
     for one in data["transitions"]:
         saddle: Equilibrium | Cycle = equilibrium(one["saddle"])
         if "over_cycle" in one:
             saddle = min(parting, key=lambda each: abs(each.period - one["over_cycle"]))
-        transitions.append(_transition_from_data(one, saddle, "cycle" in data["wells"][one["start"]]))
-    wells = data["wells"]
+        path = rate = None
+        if one["path"] is not None:
+            path = MinimumActionPath(**_read(one, WAY), **_read(one["path"], PATH))
+        if one["prefactor"] is not None:
+            turn = {} if one["turn"] is None else _read(one["turn"], TURN)
+            rate = EscapeRate(one["minimum_action"], **_read(one, LAW), **turn)
+        from_cycle = isinstance(attractors[one["start"]], Cycle)
+        way = Transition(saddle=saddle, path=path, rate=rate, from_cycle=from_cycle, **_read(one, TRANSITION))
+        transitions.append(way)
     errors = [one["standard_errors"] for one in wells]
     return Landscape(
         dynamics,
         equilibria,
-        tuple(
-            cycle(one["cycle"], one["attractor"]) if "cycle" in one else equilibrium(one["attractor"])
-            for one in wells
-        ),
+        attractors,
         np.array([one["basin"] for one in wells]),
         tuple(_well_from_data(one, dynamics) for one in wells),
         tuple(transitions),
-        np.array([_known(one["height"]) for one in wells]),
-        tuple(map(Remark.from_data, data["remarks"])),
+        np.array([NUMBER[1](one["height"]) for one in wells]),
+        REMARKS[1](data["remarks"]),
         None if data.get("certificate") is None else Certificate.from_data(data["certificate"]),
         np.array(errors, dtype=float) if errors and None not in errors else None,
-        None if data.get("noise") is None else NoiseStrength(**data["noise"]),
+        None if data["noise"] is None else NoiseStrength(**data["noise"]),
         visits=tuple(
             VisitTest(
-                one["well"],
-                DwellCount(**one["held_out"]),
-                DwellCount(one["visits"], one["time"]),
-                one["predicted"],
-                one["error"] / one["predicted"],
-                one["method"],
-                one["probability"],
+                whole=DwellCount(one["visits"], one["time"]), error=one["error"] / one["predicted"],
+                **_read(one, VISIT),
             )
-            for one in data.get("visits") or ()
+            for one in data.get("visits", ())
         ),
         given=bool(data.get("given")),
         parting=parting,
-    )
-
-
-def _transition_from_data(
-    one: Mapping[str, Any], saddle: Equilibrium | Cycle, from_cycle: bool
-) -> Transition:
-    path, rate, kept = None, None, one["path"]
-    if kept is not None:
-        path = MinimumActionPath(
-            np.array(one["uphill"]), np.array(kept["momenta"]), np.array(kept["values"]),
-            one["minimum_action"], rivals=tuple(kept["rivals"]), downhill=np.array(one["downhill"]),
-            **{name: kept[name] for name in PATH_FIGURES},
-        )  # fmt: skip
-    if one["prefactor"] is not None:
-        rate = EscapeRate(
-            one["minimum_action"], remarks=tuple(map(Remark.from_data, one["law_remarks"])),
-            **{name: one[key] for key, name in NUMBERS_OF_LAW.items()},
-            **{name: one["turn"][key] for key, name in TURN.items() if one["turn"]},
-        )  # fmt: skip
-    return Transition(
-        one["start"], one["end"], saddle, path, rate=rate, from_cycle=from_cycle,
-        remarks=tuple(map(Remark.from_data, one["remarks"])),
-        **{name: _known(one[key]) for key, name in NUMBERS.items()},
     )  # fmt: skip
 
 
 def _well_from_data(data: Mapping[str, Any], dynamics: Dynamics) -> Well | None:
-    powers, d = data["V"], dynamics.dimension
-    if powers is None:
+    if (powers := data["V"]) is None:
         return None
-    return Well(
-        PowerBasis.from_data(powers, dynamics.symbols), np.array(powers["coefficients"]),
-        dynamics, np.array(data["attractor"]), powers["depth"],
-        None if powers["saddle"] is None else np.array(powers["saddle"]), powers["residual"],
-        np.array(powers["points"]).reshape(-1, d), powers["level"], powers["tolerance"],
-        np.array(powers["elsewhere"]).reshape(-1, d),
+    well = Well(
+        PowerBasis.from_data(powers, dynamics.symbols), np.array(powers["coefficients"]), dynamics,
+        np.array(data["attractor"]), **_read(powers, WELL),
     )  # fmt: skip
-
-
-def _complex(pairs: Sequence[Sequence[float]]) -> np.ndarray:
-    values = np.array([complex(*one) for one in pairs])
-    return values if values.imag.any() else values.real
+    points, elsewhere = (
+        np.array(each).reshape(-1, dynamics.dimension) for each in (well.points, powers["elsewhere"])
+    )
+    return replace(well, points=points, elsewhere=elsewhere)
 
 
 def write_landscape(path: str | Path, landscape: Landscape) -> None:
