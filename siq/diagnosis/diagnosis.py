@@ -19,12 +19,12 @@ import pandas as pd
 
 from siq.diagnosis.evidence import NUMERICAL_ERRORS
 from siq.diagnosis.investigation import HeldOutRuns, held_out_runs, investigate
+from siq.diagnosis.mechanisms import MECHANISM
 from siq.diagnosis.naming import Investigation
 from siq.diagnosis.residual_structure import Remainder
 from siq.diagnosis.search import Search
 from siq.diagnosis.statement import Location, StatedTerm, Statement
 from siq.diagnosis.study import Comparison, MismatchStudy, MismatchVerdict, comparison_of
-from siq.diagnosis.terms import MECHANISM
 from siq.diagnosis.unnamed_models import fit_unnamed_models
 from siq.diagnosis.verdict import statement_of
 from siq.errors import InputError, NumericalFailure
@@ -53,7 +53,8 @@ def _withdrawn(found: Investigation) -> Investigation:
     options, budget = context.study.search, context.budget
     models = fit_unnamed_models(found.search, context)
     certain = any(
-        each.log_evidence >= options.least_log_odds and all(part.kind != MECHANISM for part in each.parts)
+        each.log_evidence >= options.least_log_odds
+        and all(part.candidate.kind != MECHANISM for part in each.parts)
         for each in models
     )
     if not (
@@ -368,9 +369,9 @@ def _candidate_rows(search: Search) -> list[tuple[str | float, ...]]:
                 rows.append((name, label, "", trial.delta_chi2, 1.0, stage, beside))
     beside = ", ".join(search.screened_with)
     stage = "further" if list(search.screened_with) == labels else "instead"
-    for probe, result in search.screened:
-        name, label = probe.candidate.name, probe.candidate.label
+    for each in search.screened:
+        name, label = each.term.candidate.name, each.term.candidate.label
         if (label, beside) not in fitted:  # of what was fitted, what had been promised is of no interest
-            shapes = ", ".join(f"{shape}={value:.4g}" for shape, value in probe.shapes)
-            rows.append((name, label, shapes, result.gain, result.level, stage, beside))
+            shapes = ", ".join(f"{shape}={value:.4g}" for shape, value in each.term.shapes)
+            rows.append((name, label, shapes, each.gain, each.level, stage, beside))
     return rows

@@ -40,18 +40,16 @@ NUMERICAL_ERRORS = (ArithmeticError, ValueError, np.linalg.LinAlgError)
 
 @dataclass(frozen=True)
 class FittedCandidate:
-    """A candidate, fitted.
+    """A candidate with its fit, and how that compares with the simulation without it.
 
     Attributes
     ----------
-    candidate
-        The mechanism.
-    fit
-        Of the simulation with it.
+    candidate, fit
+        What was added, and the fit of the simulation with it.
     delta_chi2
-        Twice the increase of the log-likelihood over the simulation without it.
+        Twice the increase of the log-likelihood.
     delta_bic
-        Change of the Bayesian information criterion; negative where the mechanism is worth its parameters.
+        Change of the Bayesian information criterion; negative where it is worth its parameters.
     p_white, p_cluster
         Probabilities of as much by chance.
     """
@@ -122,17 +120,12 @@ def _correlation_time(series: np.ndarray) -> float:
 
 
 def correlation_time_of(left: np.ndarray, recording: np.ndarray, *, outputs: int) -> float:
-    """Integral correlation time of all residuals in samples, at least 1; of white ones it is 1.
+    """Integral correlation time of all residuals in samples, at least 1.
 
-    Autocorrelations are means over recordings and outputs. The sum ends at the first that white errors would
-    have by chance, so that noise does not lengthen it. Of n residuals, n over it count as independent.
-
-    Parameters
-    ----------
-    left, recording
-        Residuals, the outputs of a sample one behind the other, and the recording of each; shape ``(n·m,)``.
-    outputs
-        Their number m.
+    Of n residuals, n over it count as independent. Autocorrelations are means over recordings and outputs.
+    The sum ends at the first that white errors would have by chance, so that noise does not lengthen it. The
+    residuals have the outputs of a sample one behind the other, and come with the recording of each; shape
+    ``(n·m,)``.
     """
     series = left.reshape(-1, outputs)
     owner = recording.reshape(-1, outputs)[:, 0]
@@ -151,7 +144,7 @@ def correlation_time_of(left: np.ndarray, recording: np.ndarray, *, outputs: int
 
 
 def _blocks_of(recording: np.ndarray, left: np.ndarray, *, least: int) -> np.ndarray:
-    """The block of each residual, numbered from 0, where recordings are cut into at least so many."""
+    """The block of each residual, numbered from 0; recordings are cut into at least so many."""
     recordings = np.unique(recording)
     block = np.empty(len(recording), dtype=int)
     begun = 0
@@ -171,17 +164,9 @@ def probability_by_chance(
 ) -> float:
     """Probability of a mechanism by chance, where errors of a recording are autocorrelated.
 
-    Among many recordings each counts as one (`_clustered_probability`). Of a few, blocks are too few to know
-    a covariance from them; how long errors are correlated is known all the same (`_correlated_probability`).
-
-    Parameters
-    ----------
-    fit, before
-        With the mechanism and without it; None where there is no such fit.
-    data, candidate
-        The recordings, and the mechanism.
-    blocks
-        Where there are fewer recordings than half of it, they are few.
+    Among many recordings, at least half of `blocks`, each counts as one (`_clustered_probability`). Of a few,
+    blocks are too few to know a covariance from them; how long errors are correlated is known all the same
+    (`_correlated_probability`), if there is a fit without the mechanism.
     """
     many = len(data.labels) >= blocks // 2
     if before is None or many or fit.has_process_noise or before.has_process_noise:
@@ -195,8 +180,7 @@ def _correlated_probability(
 ) -> float:
     """Probability by chance of a gain in twice the log-likelihood, where errors are autocorrelated.
 
-    Of n errors with an integral correlation time τ, n/τ are independent: so much less does the gain weigh.
-    Places at which a shape was looked for are chances, too.
+    It weighs less by their correlation time. Places at which a shape was looked for are chances, too.
     """
     white, _, left = residuals(fit, data)
     weights = np.bincount(white.recording)
@@ -280,7 +264,7 @@ def averaged_evidence(
 def evidences_by_size(
     gram: np.ndarray, overlap: np.ndarray, total: float, *, freedom: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Log-likelihood of columns with independent normal coefficients, for every size of these.
+    """Log-likelihood of columns with independent normal coefficients, over that of none, by their size.
 
     Parameters
     ----------
@@ -292,8 +276,8 @@ def evidences_by_size(
     Returns
     -------
     gained, variance, rest
-        Shape ``(s,)`` each: over that of nothing; of the coefficients, in units of the noise as it is with
-        the columns; and the sum of squares then. All zero where no column does anything.
+        Shape ``(s,)`` each: the log-likelihood; the variance of the coefficients, in units of the noise as it
+        is with the columns; and the sum of squares then. All zero where no column does anything.
     """
     # In the eigenvectors of what the recordings tell, the evidence is a sum for every size.
     told, vectors = np.linalg.eigh(gram)
@@ -312,18 +296,9 @@ def evidences_by_size(
 def evidence_of_function(
     columns: np.ndarray, target: np.ndarray, knots: np.ndarray, *, freedom: float
 ) -> float:
-    """Log-likelihood of a smooth function, averaged over its values, size and smoothness, to that of nothing.
+    """Log-likelihood of a smooth function, averaged over its values, size and smoothness, to that of none.
 
-    Parameters
-    ----------
-    columns
-        What its value at each knot does to the innovations, in units of noise, shape ``(n, k)``.
-    target
-        The innovations, shape ``(n,)``.
-    knots
-        Shape ``(k,)``.
-    freedom
-        Degrees of freedom of the target.
+    The columns ``(n, k)`` are what its value at each knot does to the target, innovations in units of noise.
     """
     total = float(target @ target)
     values = []
@@ -334,22 +309,14 @@ def evidence_of_function(
 
 
 def _log_evidence_of(fit: Fit, data: Measurements, *, correlated: float = 1.0) -> float:
-    """Log-likelihood of a whole explanation, less what its parameters would gain by chance.
+    """Log-likelihood of an explanation, less what its parameters gain by chance: log L/τ - ½ k log(n/τ).
 
-    Schwarz's approximation of the marginal likelihood, -½ k log n, with process noise counted as
-    parameters, so that explanations with and without them can be compared. What the recordings do not tell
-    of the parameters does not count. Of parameters of which something is expected together, such as the
-    heights of a smooth function, the likelihood is averaged over that (Laplace's approximation,
-    -½ log det(1 + K G)), so that they count as few as the data tell. Where a recording begins is a parameter
-    for each state, told or not, so that one more hidden state has to be worth its beginnings.
-
-    Parameters
-    ----------
-    fit, data
-        The explanation, and the recordings.
-    correlated
-        Correlation time τ of the errors in samples, the same for all explanations that are compared
-        (`log_evidences`): log L/τ - ½ k log(n/τ).
+    Schwarz's approximation of the marginal likelihood, with process noise counted as parameters and those
+    left out of which the recordings tell nothing. Of parameters of which something is expected together, such
+    as the heights of a smooth function, the likelihood is averaged over that (Laplace's approximation, -½ log
+    det(1 + K G)), so that they count as few as the data tell. Where a recording begins is a parameter for
+    each state, told or not, so that one more hidden state has to be worth its beginnings. Errors have the
+    correlation time τ in samples.
     """
     white = whiten(fit.linearisation, data, fit.noise)
     names = [fit.model.parameters[place].name for place in fit.model.free]
@@ -373,8 +340,8 @@ def _log_evidence_of(fit: Fit, data: Measurements, *, correlated: float = 1.0) -
 def log_evidences(fits: Sequence[Fit], data: Measurements) -> list[float]:
     """The evidence of whole explanations that are compared (`_log_evidence_of`).
 
-    For all of them errors are as correlated as the likeliest leaves them: what the others leave is rather the
-    effect that they lack.
+    Errors are as correlated as the likeliest leaves them: what the others leave is rather the effect that
+    they lack.
     """
     known, correlated = [each for each in fits if np.isfinite(each.log_likelihood)], 1.0
     if known:

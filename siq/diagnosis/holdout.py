@@ -42,14 +42,7 @@ MIN_STRETCH_SAMPLES = 16  # of a stretch that an initial state and an error can 
 def simulated(fit: Fit, data: Measurements, *, noise: Noise, substeps: int) -> np.ndarray:
     """A fit's free run of recordings, told how they begin and where it usually is.
 
-    Parameters
-    ----------
-    fit, data
-        Of the simulation, and the recordings.
-    noise
-        See `siq.inference.trajectories.free_run`.
-    substeps
-        Runge–Kutta steps between samples at least; a fit that needed more is run with its own.
+    The noise is that of `siq.inference.trajectories.free_run`; a fit that needed more substeps has its own.
     """
     finer = max(substeps, fit.substeps)
     return free_run(fit.model, data, noise=noise, substeps=finer, usual=fit.x)
@@ -88,15 +81,9 @@ class HeldOutErrors:
         *,
         noise_floor: float | None = None,
     ) -> HeldOutErrors:
-        """From squared errors of each simulation.
+        """From normalised squared errors of the same values, shape ``(values,)``, by the names above.
 
-        Parameters
-        ----------
-        runs
-            By their names above: normalised squared errors of the same values, sample by sample, shape
-            ``(values,)``; None where the simulation ran away (`siq.inference.trajectories.squared_errors`).
-        noise_floor
-            See above.
+        They are None where the simulation ran away (`siq.inference.trajectories.squared_errors`).
         """
         known = {name: each for name, each in runs.items() if each is not None}
         errors = {name: float(np.sqrt(each.mean())) for name, each in known.items()}
@@ -125,13 +112,7 @@ class HeldOutErrors:
         return known
 
     def change(self, first: Run, second: Run) -> Change:
-        """Whether one simulation is better than another, by more than appears by chance.
-
-        Parameters
-        ----------
-        first, second
-            Without and with what is judged.
-        """
+        """Whether the second of two simulations is better, by more than appears by chance."""
         names = [self.better_without if each == "without" else each for each in (first, second)]
         if any(self.error(name) is None for name in names):
             runs = [self.error(name) is not None for name in names]
@@ -153,10 +134,7 @@ class HeldOutErrors:
 def change_between(first: tuple[float, ...] | None, second: tuple[float, ...] | None) -> Change:
     """Whether the second of two simulations is better, by mean squared errors of the same blocks of samples.
 
-    Parameters
-    ----------
-    first, second
-        Without and with what is judged; None where the simulation ran away.
+    They are None where the simulation ran away.
     """
     if first is None or second is None:
         return "unknown" if first is second else "better" if first is None else "worse"
@@ -231,25 +209,16 @@ def _cross_validation_folds(
 def errors_left_out(
     fit: Fit, learned: Measurements, *, noise: Noise, candidates: Iterable[MechanismCandidate] = ()
 ) -> np.ndarray | None:
-    """Normalised squared errors of free runs of the parts left out.
+    """Normalised squared errors of free runs of the parts left out, one behind the other, ``(values,)``.
 
-    Parameters
-    ----------
-    fit
-        Of a simulation to all of the recordings. It is made again without each part, from where it is.
-    learned
-        These recordings.
-    noise
-        See `siq.inference.trajectories.free_run`.
-    candidates
-        The mechanisms in it, of which some amplitudes cannot be negative. What the rest would have of a sign
-        that cannot be is not there: the part left out may be the only one that tells of it.
+    The fit to all of the recordings is made again without each part, from where it is. Amplitudes of
+    candidates that cannot be negative, and would be, are zero: the part left out may be the only one that
+    tells of them.
 
     Returns
     -------
     numpy.ndarray or None
-        One part behind the other, shape ``(values,)``; None where a fit has no result, or a simulation runs
-        away.
+        None where a fit has no result, or a simulation runs away.
     """
     positive = {name for each in candidates for name in each.positive.intersection(each.amplitudes)}
     squares = []

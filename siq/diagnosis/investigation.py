@@ -39,15 +39,10 @@ from siq.systems.dynamics import Dynamics
 
 
 def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigation:
-    """Say whether, where and in which way a simulation differs from recordings.
+    """Say whether, where and in which way a simulation differs from the recordings of a case to learn from.
 
-    Parameters
-    ----------
-    case
-        The simulation, the recordings to learn from, and what may be named and counts as found. Recordings
-        held out stay out.
-    budget
-        Charged for the work; what it does not reach is left undone, and the answer is that of the rest.
+    The budget is charged for the work; what it does not reach is left undone, and the answer is that of the
+    rest.
 
     Raises
     ------
@@ -159,10 +154,8 @@ class HeldOutRuns:
         Of the three.
     independent
         Whether the recordings are others than those that were learned from, rather than a later part.
-    described
-        The model of what has no name that was run; None where nothing was described.
-    described_fit
-        Its estimates that were run.
+    described, described_fit
+        The model of what has no name that was run, and its estimates; None where nothing was described.
     adopted
         Whether that model is part of the new card, since it makes predictions better.
     """
@@ -184,14 +177,7 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     Of several models of what has no name one may be adopted (`siq.diagnosis.holdout`): it makes the
     prediction better than that of the mechanisms with a name, where there are any, or else of the simulation.
     Where all recordings are tests of somebody else, parts of those to learn from are left out in turn, and
-    decide.
-
-    Parameters
-    ----------
-    investigation
-        What was found. The recordings that it was found in decide which estimates run freely best.
-    data
-        The recordings held out.
+    decide. The recordings that something was found in decide which estimates run freely best.
     """
     search, learned, study = investigation.search, investigation.context.data, investigation.context.study
     noise, substeps = search.recalibrated.noise, max(search.fit.substeps, search.recalibrated.substeps)
@@ -248,7 +234,7 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         errors = [
             errors_left_out(
                 fit, learned, noise=noise,
-                candidates=[*names, *(part.trial.candidate for part in model.parts)],
+                candidates=[*names, *(part.candidate for part in model.parts)],
             )
             for model, fit in choices
         ]  # fmt: skip

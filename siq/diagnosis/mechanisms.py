@@ -21,6 +21,7 @@ import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 import sympy
@@ -42,9 +43,17 @@ from siq.inference.measurements import Measurements
 from siq.systems.dynamics import TIME, Dynamics, Parameter, Signals, symbol
 from siq.systems.formulas import FormulaError, compile_values, parse_formula
 
-LATTICE_TOLERANCE = (
-    1e-3  # of a step: numbers that were written with a few digits lie on their lattice within this
-)
+if TYPE_CHECKING:
+    from siq.diagnosis.smooth_functions import SmoothFunction
+    from siq.diagnosis.terms import Place
+
+Kind = Literal["formula", "curve", "surface", "mechanism"]
+FORMULA: Final = "formula"
+CURVE: Final = "curve"
+SURFACE: Final = "surface"
+MECHANISM: Final = "mechanism"
+# Of a step: numbers that were written with a few digits lie on their lattice within this.
+LATTICE_TOLERANCE = 1e-3
 
 
 def places_of(search: Shape, data: Measurements, model: Dynamics, x: np.ndarray) -> np.ndarray:
@@ -89,13 +98,7 @@ def _sized(search: Shape, factors: np.ndarray, course: np.ndarray) -> np.ndarray
 
 
 def lattice_step(values: np.ndarray) -> float | None:
-    """The step of the lattice through zero on which all values lie; None where there is none.
-
-    Parameters
-    ----------
-    values
-        What a sensor recorded, shape ``(n,)``; NaN where nothing was measured.
-    """
+    """The step of the lattice through zero on which all recorded values lie; None where there is none."""
     values = values[np.isfinite(values)]
     levels = np.unique(values)
     if not 2 < len(levels) < len(values) / 2:  # of values that hardly repeat a lattice tells nothing
@@ -137,35 +140,35 @@ def fresh_names(stem: str, count: int, used: Collection[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class MechanismCandidate:
-    """One way in which a mechanism may be at work in a system.
+    """One way in which a mechanism may be at work in a system, or a function without a name.
 
     Attributes
     ----------
-    name
-        Of the mechanism.
-    label
-        The same, told apart from its other forms and places: what is added where.
+    name, label, variant
+        Of the mechanism; the same, told apart from its other forms and places; and of its form.
     model
-        The simulation with the mechanism built in; amplitudes are zero, shapes not yet set.
-    amplitudes, shapes
-        Names of the new parameters, those that the mechanism depends on linearly and the others.
+        The simulation with it built in; amplitudes are zero, shapes not yet set.
+    amplitudes, shapes, searches
+        Names of the new parameters, those that it depends on linearly and the others, with how
+        these are looked for.
     positive
         Those that must not be negative.
-    searches
-        For each shape how it is looked for.
     scales, begins
         For each further state a formula of its size, and one of where it begins.
-    equations
-        States in whose equations something changes.
-    coordinate
-        Along which coordinate it acts, in words of the system.
+    equations, coordinate
+        States in whose equations something changes; and along which coordinate, in words of the system.
     changes
         What is added to equations, by state; where something is replaced, the new equation or output; and
         the equations of further states.
     generalises
         Mechanisms that are special cases of it.
-    variant
-        What tells its form from others, in words.
+    kind
+        ``mechanism``, one of the dictionary; ``formula``, ``curve`` or ``surface``.
+    log_cost
+        Logarithm of the number of places, or mechanisms, that it was chosen among.
+    place, smooth
+        Where a function stands, and what a curve or a surface is made of: the amplitudes are the heights of
+        its bumps.
     """
 
     name: str
@@ -182,6 +185,10 @@ class MechanismCandidate:
     begins: tuple[sympy.Expr, ...] = ()
     generalises: tuple[str, ...] = ()
     variant: str = ""
+    kind: Kind = MECHANISM
+    log_cost: float = 0.0
+    place: Place | None = None
+    smooth: SmoothFunction | None = None
 
     @property
     def new(self) -> tuple[str, ...]:
@@ -237,12 +244,8 @@ class MechanismCandidate:
     def columns(self, model: Dynamics) -> list[tuple[int, int, sympy.Expr]]:
         """What a unit of each amplitude, none being there yet, does to the equations and outputs of a model.
 
-        Of a mechanism without an amplitude it is the whole change.
-
-        Returns
-        -------
-        list of (int, int, Expr)
-            The row, equations before outputs; the amplitude; and the formula, where it is not zero.
+        Of a mechanism without an amplitude it is the whole change. Returned are the row, equations before
+        outputs; the amplitude; and the formula, where it is not zero.
         """
         after = [*self.model.equations[: model.dimension], *dict(self.model.outputs).values()]
         before = [*model.equations, *dict(model.outputs).values()]
@@ -640,16 +643,8 @@ def generic_candidates(
 ) -> list[MechanismCandidate]:
     """Monomials of the states up to a degree in every equation that says more than a definition.
 
-    Those that the simulation's own parameters can do are left out, and so are those that have a name.
-
-    Parameters
-    ----------
-    model, roles
-        The simulation.
-    degree
-        Highest degree.
-    named
-        Candidates of the dictionary.
+    Those that the simulation's own parameters can do are left out, and so are those of candidates with a
+    name.
     """
     states = [symbol(name) for name in model.states]
     found = []

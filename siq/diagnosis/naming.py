@@ -41,10 +41,10 @@ from siq.diagnosis.evidence import (
 from siq.diagnosis.holdout import change_between, errors_left_out, in_blocks
 from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.diagnosis.residual_structure import Remainder
-from siq.diagnosis.screening import PROBE_SUBSTEPS, Probe, ProbeColumns, probe_response, slices_of
+from siq.diagnosis.screening import Probe, linearised_with, portions
 from siq.diagnosis.search import FitContext, Search
 from siq.diagnosis.study import MismatchVerdict
-from siq.diagnosis.terms import linearised_with_places, places_in, products_in
+from siq.diagnosis.terms import places_in, products_in
 from siq.diagnosis.unnamed_models import (
     AugmentedModel,
     exact_fit,
@@ -55,7 +55,7 @@ from siq.diagnosis.unnamed_models import (
 )
 from siq.errors import NumericalFailure
 from siq.inference.budget import UNLIMITED, Account
-from siq.inference.kalman_filter import Grid, Noise, Whitened, solve, whiten
+from siq.inference.kalman_filter import Noise, Whitened, solve, whiten
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.remarks import Remark
@@ -66,16 +66,9 @@ EFFECTS_DRAWN = 300  # effects without a name, which tell a probability of 5 % t
 
 
 class _MissingEffect:
-    """What is missing, as a linear problem: innovations without the mechanism, and what could explain them.
+    """What is missing, as a linear problem: innovations without some mechanisms, and what could explain them.
 
-    Parameters
-    ----------
-    white
-        Innovations of the fit with the mechanism, with columns of its parameters.
-    fit
-        The fit.
-    candidates
-        The mechanisms whose effect counts as missing.
+    The innovations are those of the fit with the mechanisms, with columns of its parameters.
     """
 
     def __init__(self, white: Whitened, fit: Fit, candidates: Sequence[MechanismCandidate]) -> None:
@@ -125,14 +118,15 @@ def _log_odds_of_a_name(fit: Fit, candidates: Sequence[MechanismCandidate], cont
     single = places_in(model, context.roles, data, fit.x)
     there = {name for each in candidates for name in each.equations}
     products = products_in([each for each in single if there & set(each.targets)], model, data, fit.x)
-    for response, groups in linearised_with_places(fit, data, (*single, *products)):
+    for some in portions(fit, data, (*single, *products)):
+        response, groups = linearised_with(fit, data, some)
         white = whiten(response, data, fit.noise)
         problem = _MissingEffect(white, fit, candidates)
         ours = problem.log_evidence_of_mechanisms()
         further = white.columns[:, len(fit.model.free) :]
         theirs += [
             problem.log_evidence_of_function(further[:, group], place.knots)
-            for place, group in groups
+            for place, group in zip(some, groups, strict=True)
             if np.isfinite(further[:, group]).all()
         ]
     if not theirs:
@@ -157,15 +151,14 @@ def _false_match_rate(
     ]
     noise = Noise(whole.fit.noise.measurement, np.zeros(model.dimension))
     effects = _drawn_effects(recalibrated, data, context.roles, noise, generator=generator)
-    grid = Grid(data, min(recalibrated.substeps, PROBE_SUBSTEPS))
-    columns = ProbeColumns(model, grid, probes, recalibrated.x)
-    white = whiten(probe_response(recalibrated, grid, columns), data, noise)
+    response, slices = linearised_with(recalibrated, data, probes)
+    white = whiten(response, data, noise)
     own = orthonormal(white.columns[:, :count])
     effects = effects - own @ (own.T @ effects)
     effects = effects[:, (effects**2).sum(axis=0) > 0]
     if not effects.shape[1]:
         raise NumericalFailure("no effect can be seen in the recordings")
-    groups = [white.columns[:, count:][:, each] for each in slices_of(probes)]
+    groups = [white.columns[:, count:][:, each] for each in slices]
     groups = [orthonormal(each - own @ (own.T @ each)) for each in groups if np.isfinite(each).all()]
     best = _best_shares(effects, groups, mechanisms)
     return float((np.sum(best >= share) + 1) / (len(best) + 1))
@@ -180,9 +173,10 @@ def _drawn_effects(
         return np.zeros((data.outputs.size, 0))
     counts = iter(generator.multinomial(EFFECTS_DRAWN, np.full(len(places), 1 / len(places))))
     drawn = []
-    for response, groups in linearised_with_places(fit, data, places):
+    for some in portions(fit, data, places):
+        response, groups = linearised_with(fit, data, some)
         further = whiten(response, data, noise).columns[:, len(fit.model.free) :]
-        for place, group in groups:
+        for place, group in zip(some, groups, strict=True):
             count, columns = next(counts), further[:, group]
             if np.isfinite(columns).all():
                 for _ in range(count):
@@ -286,8 +280,8 @@ class Investigation:
     search
         Recalibration, mechanisms that are named, or that describe what has no name, and the final fit.
     remainder
-        What the recalibrated simulation does not explain, what the final fit leaves, and the share of the
-        excess that mechanisms explain.
+        What the recalibrated simulation and the final fit leave, and the share of the excess that is
+        explained.
     verdict
         One of four.
     least_squares
@@ -298,7 +292,7 @@ class Investigation:
         For each mechanism, that it is this rather than a function without a name, as a logarithm.
     p_alike
         Probability that as many mechanisms explain as much of an effect that has no name; None where nothing
-        is left, so that nobody asked.
+        is left.
     convincing
         Whether the mechanisms explain enough; the odds have to be for them as well before they are named.
     remarks
@@ -306,8 +300,7 @@ class Investigation:
     models
         Of what has no name, be it all that is missing or what names leave, the likeliest first.
     exact
-        The final fit whose trajectories follow the equations, where a remainder that is no noise was admitted
-        as process noise.
+        The final fit whose trajectories follow the equations, where process noise stands in for a remainder.
     account
         The work that it took, and whether something was left undone.
     withdrawn
@@ -409,16 +402,8 @@ def decide_naming(
 ) -> Investigation:
     """Decide about the names of a search that found something, and fit models of the rest.
 
-    Parameters
-    ----------
-    whole
-        The search.
-    left
-        What is left with the first mechanism, the first two, and so on.
-    context
-        What models are made from, and what could be named.
-    generator
-        Draws effects without a name.
+    It is given what is left with the first mechanism, the first two, and so on, and draws effects without a
+    name.
     """
     least = context.study.search.least_log_odds
     decision = _judge_mechanisms(whole, left, context, generator=generator)

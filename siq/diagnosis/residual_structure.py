@@ -26,8 +26,8 @@ import scipy.stats
 
 from siq.diagnosis.dictionary import Roles, roles_of
 from siq.diagnosis.mechanisms import lattice_step
-from siq.diagnosis.screening import projected
-from siq.diagnosis.terms import Place, linearised_with_places, places_in
+from siq.diagnosis.screening import Projection, linearised_with, portions
+from siq.diagnosis.terms import Place, places_in
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget
 from siq.inference.kalman_filter import Grid, Noise, profile_likelihood, solve, whiten
@@ -48,10 +48,8 @@ class Curve:
         Where.
     values, standard_errors
         At the knots, less what the parameters can do, in the unit of the equation; shape ``(k,)``.
-    gain
-        Decrease of the sum of squared innovations.
-    p_value
-        Probability of as much by chance.
+    gain, p_value
+        Decrease of the sum of squared innovations, and the probability of as much by chance.
     """
 
     place: Place
@@ -69,10 +67,9 @@ class Structure:
     ----------
     curves
         One for every direction, the one that explains most first.
-    p_curves
-        Probability that the best of them is chance, for as many as were tried.
-    p_autocorrelation
-        Probability that innovations are as correlated in time by chance.
+    p_curves, p_autocorrelation
+        Probabilities that the best of them is chance, for as many as were tried, and that innovations are as
+        correlated in time by chance.
     total, freedom
         Sum of squared innovations and its degrees of freedom, at the measurement noise of the fit.
     """
@@ -95,15 +92,15 @@ def _structure_of(data: Measurements, fit: Fit, roles: Roles, *, noise: Noise | 
     noise = fit.noise if noise is None else noise
     parameters = len(fit.model.free)
     white = whiten(fit.linearisation, data, noise)
-    left, _ = projected(white, parameters)
-    freedom = white.degrees_of_freedom - parameters
-    total = float(left @ left)
+    problem = Projection.of(white, parameters)
+    left, freedom, total = problem.left, problem.freedom, problem.total
     # Below its measurement noise a fit has no scale of its own; above it errors are as large as they are.
     scale = 1.0 if noise.process.any() or not fit.has_process_noise else max(total / freedom, 1.0)
     curves = []
-    for response, groups in linearised_with_places(fit, data, places):
-        left, columns = projected(whiten(response, data, noise), parameters)
-        for place, group in groups:
+    for some in portions(fit, data, places):
+        response, groups = linearised_with(fit, data, some)
+        columns = Projection.of(whiten(response, data, noise), parameters).columns
+        for place, group in zip(some, groups, strict=True):
             own = columns[:, group]
             values, covariance = solve(own, left)
             gain = total - float(((left - own @ values) ** 2).sum())
@@ -150,14 +147,9 @@ RANDOM_RESIDUALS = 0.01  # probability that residuals are random, above which no
 
 @dataclass(frozen=True)
 class Remainder:
-    """What a simulation leaves.
+    """Structure of what the recalibrated simulation, and the one with mechanisms, does not explain.
 
-    Attributes
-    ----------
-    before, after
-        Structure of what the recalibrated simulation, and the one with mechanisms, does not explain.
-    share
-        Of the excess that the mechanisms explain.
+    The share is that of the excess over noise that the mechanisms explain.
     """
 
     before: Structure
@@ -176,17 +168,7 @@ class Remainder:
 
     @classmethod
     def of(cls, data: Measurements, recalibrated: Fit, final: Fit, roles: Roles) -> Remainder:
-        """Structure before and after mechanisms were added, and the share of the excess that they explain.
-
-        Parameters
-        ----------
-        data
-            The recordings.
-        recalibrated, final
-            The fit of the simulation, and that with mechanisms.
-        roles
-            Of the simulation's states.
-        """
+        """Of the fits of the simulation alone and with mechanisms, and the roles of its states."""
         after = _structure_of(data, final, roles)
         # Process noise that stands for missing physics takes measurement noise with it: take the final one.
         still = Noise(final.noise.measurement, np.zeros(recalibrated.model.dimension))
@@ -231,23 +213,16 @@ def explained_by_quantisation(
 
     Parameters
     ----------
-    data
-        The recordings.
     strict
         The fit of the simulation without process noise.
-    roles
-        Of the simulation's states.
     least
         Probability of structure by chance, below which it is no noise.
-    budget
-        Charged for every evaluation.
 
     Returns
     -------
     (Fit, Remainder, tuple of str) or None
-        Its parameters and states are those that the values which were rounded are fitted by; its errors are
-        those of the fit to the readings, which rounding makes wider. What is left of the values, which is
-        noise; and the names of the outputs that are rounded.
+        Parameters and states that fit the values before rounding, with errors of the fit to the readings,
+        which rounding makes wider; what is left of the values; and the names of the outputs that are rounded.
     """
     steps = _quantisation_steps(data)
     # What rounding does under noise half as wide as a step is white (Widrow and Kollár 2008), and fitted.
@@ -311,21 +286,10 @@ NOISE_RATIOS = (1 / 8, 1 / 4, 1 / 2, 1 / 1.4, 1.0, 1.4, 2.0, 4.0, 8.0)  # of pro
 
 
 def noise_nonstationarity(fit: Fit, data: Measurements) -> float:
-    """How much better process noise fits that follows the motion than stationary noise does.
+    """How much better process noise fits that follows the motion than stationary noise does, in χ².
 
-    Parameters
-    ----------
-    fit
-        With process noise.
-    data
-        The measurements it was made for.
-
-    Returns
-    -------
-    float
-        Twice the difference of the log-likelihoods, each with the intensities at their best and, for forces
-        that follow the motion, at least half of them in proportion to the square of its size. Negative
-        where steady forces fit better.
+    Both have their intensities at their best; of forces that follow the motion at least half are in
+    proportion to the square of its size.
     """
     spread = fit.x.std(axis=0)
     moved = (fit.x - fit.x.mean(axis=0)) / np.where(spread > 0, spread, 1.0)

@@ -1,57 +1,84 @@
-"""Screening: how much a little of each mechanism would improve the fit.
+"""Screening: how much likelier a fit would be with a little of each of many terms.
 
-A mechanism that is absent from a simulation enters, to first order, by the derivative of f by its amplitudes.
-Along the trajectories of one fit everything is linear, so that the likelihood with a probe, its amplitude and
+A term that a simulation lacks enters, to first order, by the derivative of f by its coefficients.
+Along the trajectories of a fit everything is linear: the likelihood with a term, its coefficients and
 all parameters at their best, is a matter of least squares. It is worked out for several levels of process
-noise: where physics is missing the fit had to admit such noise, and the right probe makes it needless.
+noise: where physics is missing the fit had to admit such noise, and the right term makes it needless.
+
+`rank` compares terms of any kind, mechanisms (`Probe`) or functions (`siq.diagnosis.terms.Place`); what is
+compared is up to a `Judge`: the likelihood at the best amplitudes, or that averaged over all functions.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from siq.diagnosis.evidence import (
-    BUDGET_SPENT,
-    NUMERICAL_ERRORS,
-    NotFitted,
-    orthonormal,
-)
+from siq.diagnosis.evidence import BUDGET_SPENT, NUMERICAL_ERRORS, NotFitted, orthonormal
 from siq.diagnosis.mechanisms import MechanismCandidate, along, places_of
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent, evaluation
-from siq.inference.kalman_filter import (
-    Columns,
-    Grid,
-    Linearisation,
-    Whitened,
-    linearise,
-    profile_likelihood,
-    whiten,
-)
+from siq.inference.kalman_filter import Grid, Linearisation, Whitened, linearise, profile_likelihood, whiten
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.trajectories import EDGE_SUBSTEPS, run_along, spread_edges
 from siq.systems.dynamics import Dynamics, Tape
 from siq.systems.formulas import compile_values
 
+Entry = tuple[int, int | slice, np.ndarray]
+"""A row of f or h, the columns of a term that act there, and their values."""
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """States ``(n, d)`` of a simulation along recordings, at the samples and between them."""
+
+    model: Dynamics
+    grid: Grid
+    x: np.ndarray
+    compiled: dict[int, Any] = field(default_factory=dict)
+
+    @cached_property
+    def node_states(self) -> list[np.ndarray]:
+        """States at all nodes: between samples cubics that have the slopes of f.
+
+        Straight lines would be early or late by half a sample, as much as what a sensor's lag does.
+        """
+        grid, model = self.grid, self.model
+        rows, substeps = grid.rows, grid.substeps
+        begin, end = self.x[rows].T, self.x[rows + 1].T
+        delays, whole = model.lags(model.values), grid.step * substeps
+        first, last = (
+            whole * model.functions.rates(x, grid.signals(node, delays), model.values)
+            for x, node in ((begin, 0), (end, 3 * substeps - 1))
+        )
+        turn = first + last - 2 * (end - begin)
+        bend = 3 * (end - begin) - 2 * first - last
+        shares = [(node // 3 + (node % 3) / 2) / substeps for node in range(3 * substeps)]
+        return [begin + share * (first + share * (bend + share * turn)) for share in shares]
+
+
+class Term(Protocol):
+    """An unknown part of an equation, or of what is measured, that is linear in its coefficients."""
+
+    @property
+    def width(self) -> int:
+        """The number of coefficients."""
+
+    def columns(
+        self, trajectories: Trajectories
+    ) -> Callable[[np.ndarray, np.ndarray, int | None], Iterator[Entry]]:
+        """What a unit of each does, from states ``(d, n)``, parameters and a node; without a node to h."""
+
 
 @dataclass(frozen=True)
 class Probe:
-    """A candidate with its shapes set; its amplitudes are what the data are asked for.
-
-    Attributes
-    ----------
-    candidate
-        The mechanism and the model that has it.
-    shapes
-        Values of the shapes, by name.
-    """
+    """A mechanism with its shapes set, by name; its amplitudes are what the data are asked for: a `Term`."""
 
     candidate: MechanismCandidate
     shapes: tuple[tuple[str, float], ...]
@@ -60,15 +87,7 @@ class Probe:
     def all_of(
         cls, candidate: MechanismCandidate, data: Measurements, model: Dynamics, x: np.ndarray
     ) -> list[Probe]:
-        """A candidate with its shapes at all places where they are looked for.
-
-        Parameters
-        ----------
-        candidate
-            The mechanism.
-        data, model, x
-            The recordings, and the simulation along them: sizes of motion are taken from there.
-        """
+        """A candidate with its shapes at all places where they are looked for along a simulation."""
         choices: list[tuple[tuple[str, float], ...]] = [()]
         for name, search in zip(candidate.shapes, candidate.searches, strict=True):
             found = places_of(search, data, model, x)
@@ -90,6 +109,11 @@ class Probe:
         return max(len(self.candidate.amplitudes), 1)
 
     @property
+    def positive(self) -> np.ndarray:
+        """Which of its columns have amplitudes that must not be negative."""
+        return np.array([each in self.candidate.positive for each in self.candidate.amplitudes] or [True])
+
+    @property
     def delays(self) -> tuple[tuple[int, float], ...]:
         """Of inputs in the candidate's formulas."""
         shapes = dict(self.shapes)
@@ -103,121 +127,55 @@ class Probe:
         # As numpy has them: a division by zero is then infinite, and no error.
         return (*values, *(np.float64(shapes.get(each.name, 0.0)) for each in new))
 
+    def columns(
+        self, trajectories: Trajectories
+    ) -> Callable[[np.ndarray, np.ndarray, int | None], Iterator[Entry]]:
+        """See `Term`."""
+        model, grid, candidate = trajectories.model, trajectories.grid, self.candidate
+        if id(candidate) not in trajectories.compiled:  # once for all probes of a candidate
+            # Of rates and of outputs: the entries that are not zero, and their functions.
+            columns, d = candidate.columns(model), model.dimension
+            compiled = []
+            for measured in (False, True):
+                some = [one for one in columns if (one[0] >= d) is measured]
+                entries = [(row - d * measured, column) for row, column, _ in some]
+                formulas = [one for _, _, one in some]
+                compiled.append((entries, compile_values(formulas, candidate.model.arguments, common=False)))
+            trajectories.compiled[id(candidate)] = compiled
+        of_rates, of_outputs = trajectories.compiled[id(candidate)]
+        nodes = self._carried(trajectories) if candidate.scales else []
+
+        def evaluated(x: np.ndarray, values: np.ndarray, node: int | None) -> Iterator[Entry]:
+            entries, functions = of_outputs if node is None else of_rates
+            if entries:
+                further = x[:0]
+                if nodes:
+                    further = nodes[node] if node is not None else _at_samples(nodes, grid).T
+                delays = self.delays
+                signals = grid.at_samples(delays) if node is None else grid.signals(node, delays)
+                at = (*x, *further, *signals.inputs, *signals.delayed, *signals.slopes, signals.t)
+                found = functions(*at, *self.parameters(values))
+                yield from ((row, column, value) for (row, column), value in zip(entries, found, strict=True))
+
+        return evaluated
+
     def states_along(self, fit: Fit, data: Measurements, x: np.ndarray) -> np.ndarray:
         """States ``(n, d)`` along recordings, with those that it brings to a fit, shape ``(n, d + k)``."""
         if not self.candidate.scales:
             return x
-        columns = ProbeColumns(fit.model, Grid(data, fit.substeps), [self], x)
-        return np.concatenate([x, columns.further_states(0)], axis=1)
+        grid = Grid(data, fit.substeps)
+        further = _at_samples(self._carried(Trajectories(fit.model, grid, x)), grid)
+        return np.concatenate([x, further], axis=1)
 
+    def _carried(self, trajectories: Trajectories) -> list[np.ndarray]:
+        """Its further states at all nodes, carried along each recording from its begin.
 
-class Basis(Protocol):
-    """A function with linear parameters, such as values at knots."""
-
-    @property
-    def width(self) -> int:
-        """The number of its parameters."""
-
-    def values(self, courses: np.ndarray) -> np.ndarray:
-        """What a unit of each does along courses ``(c, n)`` of the coordinates, shape ``(width, n)``."""
-
-
-class ProbeColumns:
-    """The columns of many probes, as `siq.inference.kalman_filter.linearise` wants them.
-
-    Parameters
-    ----------
-    model
-        The simulation that the candidates extend.
-    grid
-        Measurements and substeps.
-    probes
-        The columns stand in their order.
-    x
-        States along which further states of candidates are carried, shape ``(n, d)``.
-    """
-
-    def __init__(self, model: Dynamics, grid: Grid, probes: Sequence[Probe], x: np.ndarray) -> None:
-        self._model, self._grid, self._probes, self._x = model, grid, probes, x
-        self.width = sum(probe.width for probe in probes)
-        # Of each candidate, of rates and of outputs: the entries that are not zero, and their functions.
-        self._compiled = {}
-        self._memories: dict[int, list[np.ndarray]] = {}
-        for key, each in {id(probe.candidate): probe.candidate for probe in probes}.items():
-            columns, d = each.columns(model), model.dimension
-            for measured in (False, True):
-                some = [one for one in columns if (one[0] >= d) is measured]
-                entries = [(row - d * measured, column) for row, column, _ in some]
-                functions = compile_values([one for _, _, one in some], each.model.arguments, common=False)
-                self._compiled[key, measured] = entries, functions
-
-    def rates(self, x: np.ndarray, values: np.ndarray, node: int) -> np.ndarray:
-        """See `siq.inference.kalman_filter.Columns`."""
-        return self._filled(x, values, node)
-
-    def outputs(self, x: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """See `siq.inference.kalman_filter.Columns`."""
-        return self._filled(x, values, None)
-
-    def _filled(self, x: np.ndarray, values: np.ndarray, node: int | None) -> np.ndarray:
-        """Columns of the rates at a node, or of the outputs at all samples."""
-        count = len(self._model.outputs) if node is None else self._model.dimension
-        result = np.zeros((count, self.width, x.shape[1]))
-        place = 0
-        for index, probe in enumerate(self._probes):
-            entries, functions = self._compiled[id(probe.candidate), node is None]
-            if entries:
-                further, delays = x[:0], probe.delays
-                if probe.candidate.scales:
-                    further = self.further_states(index).T if node is None else self._memory(index)[node]
-                signals = self._grid.at_samples(delays) if node is None else self._grid.signals(node, delays)
-                at = (*x, *further, *signals.inputs, *signals.delayed, *signals.slopes, signals.t)
-                found = functions(*at, *probe.parameters(values))
-                for (row, column), value in zip(entries, found, strict=True):
-                    result[row, place + column] = value
-            place += probe.width
-        return result
-
-    @cached_property
-    def _node_states(self) -> list[np.ndarray]:
-        """States of the simulation at all nodes: between samples cubics that have the slopes of f.
-
-        Straight lines would be early or late by half a sample, as much as what a sensor's lag does.
+        Sample after sample along each recording, then within all intervals side by side.
         """
-        grid, model = self._grid, self._model
-        rows, substeps = grid.rows, grid.substeps
-        begin, end = self._x[rows].T, self._x[rows + 1].T
-        delays, whole = model.lags(model.values), grid.step * substeps
-        first, last = (
-            whole * model.functions.rates(x, grid.signals(node, delays), model.values)
-            for x, node in ((begin, 0), (end, 3 * substeps - 1))
-        )
-        turn = first + last - 2 * (end - begin)
-        bend = 3 * (end - begin) - 2 * first - last
-        shares = [(node // 3 + (node % 3) / 2) / substeps for node in range(3 * substeps)]
-        return [begin + share * (first + share * (bend + share * turn)) for share in shares]
-
-    def further_states(self, index: int) -> np.ndarray:
-        """The states that a probe brings, at all samples, shape ``(n, k)``."""
-        nodes = self._memory(index)
-        rows = self._grid.rows
-        states = np.zeros((len(self._x), len(nodes[0])))
-        states[rows + 1] = nodes[-1].T
-        states[rows] = nodes[0].T
-        return states
-
-    def _memory(self, index: int) -> list[np.ndarray]:
-        """The further states of a probe at all nodes, carried along each recording from its begin."""
-        if index not in self._memories:
-            self._memories[index] = self._carry(self._probes[index])
-        return self._memories[index]
-
-    def _carry(self, probe: Probe) -> list[np.ndarray]:
-        """Sample after sample along each recording, then within all intervals side by side."""
-        grid, model, augmented = self._grid, self._model, probe.candidate.model
+        grid, model, augmented = trajectories.grid, trajectories.model, self.candidate.model
         step = grid.step
-        numbers = probe.parameters(model.values)
-        begins = along(probe.candidate.begins, model, grid.data, self._x)
+        numbers = self.parameters(model.values)
+        begins = along(self.candidate.begins, model, grid.data, trajectories.x)
         begin = np.ascontiguousarray(begins[:, grid.data.first[:-1]].T, dtype=float)
         # Further states, which come first, are carried; all else is known along the recordings.
         formulas = [augmented.evaluable(each) for each in augmented.equations[model.dimension :]]
@@ -229,10 +187,8 @@ class ProbeColumns:
             raise NumericalFailure(f"a state of its own has a formula that cannot be followed: {names}")
         signals = [
             np.concatenate([x, s.inputs, s.delayed, s.slopes, s.t[None]])
-            for x, s in (
-                (self._node_states[node], grid.signals(node, probe.delays))
-                for node in range(3 * grid.substeps)
-            )
+            for node, x in enumerate(trajectories.node_states)
+            for s in (grid.signals(node, self.delays),)
         ]
 
         def rate(z: np.ndarray, node: int) -> np.ndarray:
@@ -253,132 +209,261 @@ class ProbeColumns:
         return nodes
 
 
+def _at_samples(nodes: Sequence[np.ndarray], grid: Grid) -> np.ndarray:
+    """What is known at all nodes, at the samples, shape ``(n, k)``."""
+    states = np.zeros((len(grid.data.t), len(nodes[0])))
+    states[grid.rows + 1] = nodes[-1].T
+    states[grid.rows] = nodes[0].T
+    return states
+
+
+class TermColumns:
+    """The columns of terms, one behind the other: `siq.inference.kalman_filter.Columns`."""
+
+    def __init__(self, terms: Sequence[Term], trajectories: Trajectories) -> None:
+        self._model, self.slices = trajectories.model, slices_of(terms)
+        self._parts = [
+            (each.columns(trajectories), part) for each, part in zip(terms, self.slices, strict=True)
+        ]
+
+    def rates(self, x: np.ndarray, values: np.ndarray, node: int | None) -> np.ndarray:
+        """See `siq.inference.kalman_filter.Columns`; without a node, of the outputs at all samples."""
+        count = len(self._model.outputs) if node is None else self._model.dimension
+        result = np.zeros((count, self.slices[-1].stop if self.slices else 0, x.shape[1]))
+        for evaluated, part in self._parts:
+            for row, column, value in evaluated(x, values, node):
+                result[row, part][column] = value
+        return result
+
+    def outputs(self, x: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """See `siq.inference.kalman_filter.Columns`."""
+        return self.rates(x, values, None)
+
+
+def slices_of(terms: Sequence[Term]) -> list[slice]:
+    """Which columns are those of which term, where they stand one behind the other."""
+    ends = itertools.accumulate(each.width for each in terms)
+    return [slice(end - each.width, end) for each, end in zip(terms, ends, strict=True)]
+
+
 NOISE_LEVELS = (1.0, 0.1, 1e-2, 1e-3, 1e-4, 0.0)
 """Process noise, relative to that of the fit."""
 LARGEST_PORTION = 20_000_000  # numbers that are worked out at once; with copies about a gigabyte
 LEAST_PORTION = 10  # columns
 NEGATIVE_ERRORS = 2.0  # standard errors below zero, from which on an amplitude is taken for negative
 COLLINEAR = 0.02  # share of a column left by the parameters, below which its amplitude knows no bounds
+PROBE_SUBSTEPS = 2  # what a little of a mechanism does need not be known to many digits
+OVERFLOWS = "its effect along the recorded motion is beyond all numbers"
+AnyTerm = TypeVar("AnyTerm", bound=Term)
+
+
+def portions(fit: Fit, data: Measurements, terms: Sequence[AnyTerm]) -> list[list[AnyTerm]]:
+    """Terms divided so that the response to a portion fits into the memory."""
+    most = LARGEST_PORTION // (len(data.t) * (fit.model.dimension + len(fit.model.outputs)))
+    found: list[list[AnyTerm]] = []
+    for term in terms:
+        if not found or sum(each.width for each in found[-1]) + term.width > max(most, LEAST_PORTION):
+            found.append([])
+        found[-1].append(term)
+    return found
+
+
+def linearised_with(
+    fit: Fit, data: Measurements, terms: Sequence[Term], *, substeps: int = PROBE_SUBSTEPS
+) -> tuple[Linearisation, list[slice]]:
+    """The linearisation of a fit with the columns of terms behind its parameters, and which is whose.
+
+    These are worked out with so many substeps between samples at most.
+    """
+    grid = Grid(data, min(fit.substeps, substeps))
+    with np.errstate(all="ignore"):  # what overflows is left out of the screening
+        columns = TermColumns(terms, Trajectories(fit.model, grid, fit.x))
+        coarse = linearise(fit.model, grid, fit.model.values, fit.linearised_at, columns=columns)
+    known, parameters = fit.linearisation, len(fit.model.free)
+    further, measured = coarse.response[:, :, parameters:], coarse.measured_response[:, :, parameters:]
+    return replace(
+        known,
+        response=np.concatenate([known.response, further], axis=2),
+        measured_response=np.concatenate([known.measured_response, measured], axis=2),
+    ), columns.slices
 
 
 @dataclass(frozen=True)
-class Screened:
-    """What one group of columns would do.
+class Projection:
+    """Innovations and columns of terms, in units of noise, the effects of all parameters projected out.
 
-    Attributes
-    ----------
-    gain
-        Twice the increase of the log-likelihood, each side at its best level of process noise.
-    level
-        The level at which it is best.
-    amplitudes, standard_errors
-        There; shape ``(k,)``.
-    finite
-        Whether what the columns do to what is measured is a number at any level.
+    A column of which little is left is zero, since the parameters can do what it does, and so is one that is
+    not finite.
     """
 
-    gain: float
-    level: float
-    amplitudes: np.ndarray
-    standard_errors: np.ndarray
-    finite: bool = True
+    left: np.ndarray
+    columns: np.ndarray
+    finite: np.ndarray
+    freedom: int
+    white: Whitened
+
+    @classmethod
+    def of(cls, white: Whitened, parameters: int) -> Projection:
+        """Of whitened innovations, whose first columns are those of parameters.
+
+        Raises
+        ------
+        NumericalFailure
+            When a parameter's column is not finite.
+        """
+        own, further = white.columns[:, :parameters], white.columns[:, parameters:]
+        if not np.isfinite(own).all():
+            raise NumericalFailure("the effect of a parameter on what is measured is beyond all numbers")
+        finite = np.isfinite(further).all(axis=0)
+        further = np.where(finite, further, 0.0)
+        basis = orthonormal(own)
+        left = white.innovations - basis @ (basis.T @ white.innovations)
+        size = np.sqrt((further**2).sum(axis=0))
+        further = further - basis @ (basis.T @ further)
+        further[:, np.sqrt((further**2).sum(axis=0)) <= COLLINEAR * size] = 0.0
+        return cls(left, further, finite, white.degrees_of_freedom - parameters, white)
+
+    @cached_property
+    def total(self) -> float:
+        """Sum of squares."""
+        return float(self.left @ self.left)
+
+    @cached_property
+    def overlap(self) -> np.ndarray:
+        """Of the columns with the innovations."""
+        return self.columns.T @ self.left
+
+    @property
+    def unexplained(self) -> np.ndarray:
+        """What all columns together leave."""
+        basis = orthonormal(self.columns)
+        return self.left - basis @ (basis.T @ self.left)
+
+    def likelihood(self, total: float) -> float:
+        """Log-likelihood with so large a sum of squares left, the scale of the noise at its best."""
+        return profile_likelihood(total, self.freedom, self.white.log_determinant)
 
 
-def levels_of(fit: Fit) -> tuple[float, ...]:
-    """The levels of process noise at which something is judged on top of a fit; one where it has none."""
-    return NOISE_LEVELS if fit.has_process_noise else (1.0,)
+def at_noise_levels(
+    response: Linearisation,
+    fit: Fit,
+    data: Measurements,
+    prepare: Callable[[Whitened], tuple[Whitened, int]] | None = None,
+) -> Iterator[tuple[float, Projection]]:
+    """The problem at each level of process noise at which it can be worked out; one where a fit has none.
 
-
-def slices_of(bases: Sequence[Probe | Basis]) -> list[slice]:
-    """Which columns are those of which basis, where they stand one behind the other."""
-    ends = itertools.accumulate(each.width for each in bases)
-    return [slice(end - each.width, end) for each, end in zip(bases, ends, strict=True)]
-
-
-def probe_response(fit: Fit, grid: Grid, columns: Columns) -> Linearisation:
-    """The linearisation of a fit, with further columns, on a grid that may be coarser, behind its own."""
-    with np.errstate(all="ignore"):  # what overflows is left out of the screening
-        coarse = linearise(fit.model, grid, fit.model.values, fit.linearised_at, columns=columns)
-    known, parameters = fit.linearisation, len(fit.model.free)
-    return replace(
-        known,
-        response=np.concatenate([known.response, coarse.response[:, :, parameters:]], axis=2),
-        measured_response=np.concatenate(
-            [known.measured_response, coarse.measured_response[:, :, parameters:]], axis=2
-        ),
-    )
-
-
-def projected(white: Whitened, parameters: int) -> tuple[np.ndarray, np.ndarray]:
-    """Innovations and further columns with the parameters' columns projected out.
-
-    A column of which little is left is set to zero, since the parameters can do what it does, and so is one
-    that is not finite.
+    Innovations may be prepared, and are then returned with the number of parameters that are left.
 
     Raises
     ------
-    NumericalFailure
-        When a parameter's column is not finite.
+    NumericalFailure, numpy.linalg.LinAlgError
+        When it cannot be worked out at any.
     """
-    own, further = white.columns[:, :parameters], white.columns[:, parameters:]
-    if not np.isfinite(own).all():
-        raise NumericalFailure("the effect of a parameter on what is measured is beyond all numbers")
-    further = np.where(np.isfinite(further).all(axis=0), further, 0.0)
-    basis = orthonormal(own)
-    left = white.innovations - basis @ (basis.T @ white.innovations)
-    size = np.sqrt((further**2).sum(axis=0))
-    further = further - basis @ (basis.T @ further)
-    further[:, np.sqrt((further**2).sum(axis=0)) <= COLLINEAR * size] = 0.0
-    return left, further
-
-
-def _screen(
-    linearisation: Linearisation,
-    data: Measurements,
-    fit: Fit,
-    groups: Sequence[slice],
-    *,
-    positive: Sequence[np.ndarray],
-) -> list[Screened]:
-    """Screen groups of columns."""
-    parameters = len(fit.model.free)
-    base = -np.inf
-    best = [Screened(-np.inf, 1.0, np.zeros(0), np.zeros(0), finite=False)] * len(groups)
-    failure: NumericalFailure | None = None
-    for level in levels_of(fit):
+    failure, worked = None, False
+    for level in NOISE_LEVELS if fit.has_process_noise else (1.0,):
         try:
-            white = whiten(linearisation, data, fit.noise.scaled(level))
-        except NumericalFailure as error:  # without process noise an unstable simulation does not follow
+            white, parameters = whiten(response, data, fit.noise.scaled(level)), len(fit.model.free)
+            if prepare is not None:
+                white, parameters = prepare(white)
+            problem = Projection.of(white, parameters)
+        except NUMERICAL_ERRORS as error:  # without process noise an unstable simulation does not follow
             failure = error
             continue
-        finite = np.isfinite(white.columns[:, parameters:]).all(axis=0)
-        freedom = white.degrees_of_freedom - parameters
-        left, columns = projected(white, parameters)
-        total = float(left @ left)
-        base = max(base, profile_likelihood(total, freedom, white.log_determinant))
-        overlap = columns.T @ left
-        for place, group in enumerate(groups):
-            if not finite[group].all():
-                continue
-            best[place] = replace(best[place], finite=True)
-            gram = columns[:, group].T @ columns[:, group]
-            amplitudes, errors, after = _admissible(gram, overlap[group], total, freedom, positive[place])
-            value = profile_likelihood(after, freedom, white.log_determinant)
-            if amplitudes.any() and value > best[place].gain:
-                best[place] = Screened(value, level, amplitudes, errors)
-    if failure is not None and base == -np.inf:
+        worked = True
+        yield level, problem
+    if failure is not None and not worked:
         raise failure
-    return [replace(each, gain=2 * (each.gain - base)) for each in best]
 
 
-def _admissible(
-    gram: np.ndarray, overlap: np.ndarray, total: float, freedom: int, positive: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Amplitudes that their signs allow, their standard errors, and the squares that are left.
+@dataclass(frozen=True)
+class Ranked(Generic[AnyTerm]):
+    """What a term would do.
+
+    Attributes
+    ----------
+    term
+        The term.
+    gain
+        Increase of what the judge tells, over that of no term, each at its best level of process noise.
+    level
+        The level at which it is best.
+    amplitudes, standard_errors
+        There; shape ``(k,)``, none where they are averaged over.
+    finite
+        Whether what it does to what is measured is a number at any level.
+    """
+
+    term: AnyTerm
+    gain: float = -np.inf
+    level: float = 1.0
+    amplitudes: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    standard_errors: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    finite: bool = False
+
+
+Judge = Callable[[AnyTerm, Projection, slice], tuple[float, np.ndarray, np.ndarray] | None]
+"""Log-likelihood with a term, which has these columns, its amplitudes and their errors; None where there is
+nothing to judge."""
+
+
+def _rank_along(
+    response: Linearisation,
+    groups: Sequence[slice],
+    fit: Fit,
+    data: Measurements,
+    terms: Sequence[AnyTerm],
+    judge: Judge[AnyTerm],
+) -> list[Ranked[AnyTerm]]:
+    """Terms along a linearisation that has their columns, in their order."""
+    base, best = -np.inf, [Ranked(each) for each in terms]
+    for level, problem in at_noise_levels(response, fit, data):
+        base = max(base, problem.likelihood(problem.total))
+        for place, (term, group) in enumerate(zip(terms, groups, strict=True)):
+            if (found := judge(term, problem, group)) is not None:
+                best[place] = replace(best[place], finite=True)
+                if found[0] > best[place].gain:
+                    best[place] = Ranked(term, found[0], level, *found[1:], finite=True)
+    return [replace(each, gain=each.gain - base) for each in best]
+
+
+def rank(
+    fit: Fit,
+    data: Measurements,
+    terms: Sequence[AnyTerm],
+    *,
+    judge: Judge[AnyTerm],
+    budget: Budget | None = None,
+) -> tuple[list[Ranked[AnyTerm]], list[tuple[AnyTerm, Exception]]]:
+    """Judge terms on top of a fit, and say why the others could not be worked out.
+
+    The budget is charged for the work; terms that it does not reach are in neither list.
+    """
+    budget, ranked, failed = budget or Budget(), list[Ranked[AnyTerm]](), list[tuple[AnyTerm, Exception]]()
+    for some in portions(fit, data, terms):
+        try:
+            work = evaluation(fit.model, data, columns=sum(each.width for each in some))
+            budget.charge(min(fit.substeps, PROBE_SUBSTEPS) * work)
+            response, groups = linearised_with(fit, data, some)
+            ranked += _rank_along(response, groups, fit, data, some, judge)
+        except BudgetSpent:
+            break
+        except NUMERICAL_ERRORS as error:
+            failed += [(each, error) for each in some]
+    return ranked, failed
+
+
+def by_likelihood(
+    probe: Probe, problem: Projection, group: slice
+) -> tuple[float, np.ndarray, np.ndarray] | None:
+    """A `Judge`: the likelihood, amplitudes at their best values with signs that they may have.
 
     Those that would clearly be negative, and must not, are zero, the clearest first: what is left of a
     mechanism then is a special case of it.
     """
+    if not problem.finite[group].all():
+        return None
+    columns, overlap, positive = problem.columns[:, group], problem.overlap[group], probe.positive
+    gram, total = columns.T @ columns, problem.total
     kept = np.ones(len(overlap), dtype=bool)
     amplitudes, errors, after = np.zeros(len(overlap)), np.zeros(len(overlap)), total
     while kept.any():
@@ -390,7 +475,7 @@ def _admissible(
         covariance = (vectors[:, told] / values[told]) @ vectors[:, told].T / np.outer(scale, scale)
         solved = covariance @ overlap[kept]
         after = max(total - float(solved @ overlap[kept]), 1e-12 * total)
-        spread = np.sqrt(np.diag(covariance) * after / max(freedom - len(solved), 1))
+        spread = np.sqrt(np.diag(covariance) * after / max(problem.freedom - len(solved), 1))
         amplitudes[kept], errors[kept] = solved, spread
         below = np.where(positive & kept, -amplitudes / np.maximum(errors, np.finfo(float).tiny), 0.0)
         worst = int(np.argmax(below))
@@ -398,11 +483,8 @@ def _admissible(
             break
         kept[worst] = False
         amplitudes[worst] = errors[worst] = 0.0
-    return amplitudes, errors, after if kept.any() else total
-
-
-PROBE_SUBSTEPS = 2  # what a little of a mechanism does need not be known to many digits
-OVERFLOWS = "its effect along the recorded motion is beyond all numbers"
+    value = problem.likelihood(after if kept.any() else total)
+    return value if amplitudes.any() else -np.inf, amplitudes, errors
 
 
 def screen_all(
@@ -412,73 +494,37 @@ def screen_all(
     *,
     fruitless: Collection[str] = (),
     budget: Budget | None = None,
-) -> tuple[list[tuple[Probe, Screened]], list[NotFitted]]:
-    """Screen every candidate, with its shapes at all places where they are looked for.
+) -> tuple[list[Ranked[Probe]], list[NotFitted]]:
+    """Screen every candidate on top of a fit, with its shapes at all places where they are looked for.
 
     One whose shape the recordings themselves show promises as much as the best, unless it was fitted before
-    and gained nothing: see `Probe.recorded`.
-
-    Parameters
-    ----------
-    data, current
-        The recordings, and the fit that is to be improved.
-    candidates
-        What may be missing.
-    fruitless
-        Labels of those that gained nothing when they were fitted.
-    budget
-        Charged for the work; what it does not reach is not screened.
+    and gained nothing (`fruitless`, by label): see `Probe.recorded`. What the budget does not reach is not
+    screened.
 
     Returns
     -------
-    list of (Probe, Screened), list of NotFitted
-        What each probe would gain; and candidates of which no probe could be screened, with the reason.
+    list of Ranked, list of NotFitted
+        What each probe would gain, in χ²; and candidates of which none could be screened, with the reason.
     """
-    budget, model, substeps = budget or Budget(), current.model, current.substeps
-    untried: dict[str, NotFitted] = {}
-    probes = []
+    budget, untried = budget or Budget(), dict[str, NotFitted]()
+    probes: list[Probe] = []
+    budget.says(f"screening {len(candidates)} candidates")
     for candidate in candidates:
         try:
-            sharp = max(substeps, EDGE_SUBSTEPS)
+            sharp = max(current.substeps, EDGE_SUBSTEPS)
             spread = replace(candidate, model=spread_edges(candidate.model, data, current.x, substeps=sharp))
-            probes += Probe.all_of(spread, data, model, current.x)
+            probes += Probe.all_of(spread, data, current.model, current.x)
         except NUMERICAL_ERRORS as error:
             untried[candidate.label] = NotFitted.of(candidate, error)
-    grid = Grid(data, min(substeps, PROBE_SUBSTEPS))
-    screened: list[tuple[Probe, Screened]] = []
-    # Divided so that the response to a portion fits into the memory.
-    most = max(LARGEST_PORTION // (len(data.t) * (model.dimension + len(model.outputs))), LEAST_PORTION)
-    portions: list[list[Probe]] = []
-    for probe in probes:
-        if not portions or sum(each.width for each in portions[-1]) + probe.width > most:
-            portions.append([])
-        portions[-1].append(probe)
-    for some in portions:
-        try:
-            budget.says(f"screening {len(candidates)} candidates")
-            budget.charge(grid.substeps * evaluation(model, data, columns=sum(probe.width for probe in some)))
-            response = probe_response(current, grid, ProbeColumns(model, grid, some, current.x))
-            groups = slices_of(some)
-            positive = [
-                np.array([name in each.candidate.positive for name in each.candidate.amplitudes] or [True])
-                for each in some
-            ]
-            results = _screen(response, data, current, groups, positive=positive)
-            screened += zip(some, results, strict=True)
-        except BudgetSpent:
-            break
-        except NUMERICAL_ERRORS as error:
-            for probe in some:
-                untried[probe.candidate.label] = NotFitted.of(probe.candidate, error)
-    promised = max((result.gain for _, result in screened), default=0.0)
-    screened = [
-        (probe, replace(result, gain=max(promised, result.gain)))
-        if probe.recorded and result.finite and probe.candidate.label not in fruitless
-        else (probe, result)
-        for probe, result in screened
-    ]
-    finite = {probe.candidate.label for probe, result in screened if result.finite}
-    seen = {probe.candidate.label for probe, _ in screened}
+    ranked, failed = rank(current, data, probes, judge=by_likelihood, budget=budget)
+    untried |= {each.candidate.label: NotFitted.of(each.candidate, error) for each, error in failed}
+    promised = max((2 * each.gain for each in ranked), default=0.0)
+    screened = []
+    for each in ranked:
+        shown = each.term.recorded and each.finite and each.term.candidate.label not in fruitless
+        screened.append(replace(each, gain=promised if shown else 2 * each.gain))
+    finite = {each.term.candidate.label for each in ranked if each.finite}
+    seen = {each.term.candidate.label for each in ranked}
     for candidate in (probe.candidate for probe in probes):  # some have no place where they could be
         if candidate.label not in finite:
             why = OVERFLOWS if candidate.label in seen else BUDGET_SPENT

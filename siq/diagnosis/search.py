@@ -25,7 +25,7 @@ from siq.diagnosis.evidence import (
 )
 from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.diagnosis.residual_structure import has_structure
-from siq.diagnosis.screening import Probe, Screened, screen_all
+from siq.diagnosis.screening import Probe, Ranked, screen_all
 from siq.diagnosis.study import MismatchStudy, SearchOptions
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent
@@ -48,12 +48,8 @@ class FitContext:
 
     Attributes
     ----------
-    model
-        The simulation as its author believes it.
-    data
-        The recordings.
-    roles
-        Of the simulation's states.
+    model, data, roles
+        The simulation as its author believes it, the recordings, and the roles of its states.
     candidates
         The mechanisms that may be named.
     study
@@ -72,16 +68,10 @@ class FitContext:
 
 @dataclass(frozen=True)
 class AcceptedMechanism:
-    """A mechanism that stood the tests, and what else was fitted in its place.
+    """A mechanism that stood the tests, and what else was fitted in its place, by how it compares.
 
-    Attributes
-    ----------
-    best
-        The mechanism.
-    others
-        What else was fitted, by how it compares with the mechanism: ``same``, it explains the recordings as
-        well; ``needless``, it explains as much, but with further parameters that do not earn their place;
-        ``less``, it explains less.
+    It explains the recordings as well (``same``); as much, but with further parameters that do not earn their
+    place (``needless``); or less (``less``).
     """
 
     best: FittedCandidate
@@ -96,15 +86,11 @@ class Search:
     ----------
     recalibrated
         The simulation with its own parameters fitted, and nothing else.
-    found
-        Mechanisms, in the order of their discovery; each was judged with those before it in place.
-    fit
-        Of the simulation with all of them.
-    screened
-        The last screening: every candidate with what it would gain.
-    screened_with
-        Labels of the mechanisms that were in place for it. Where nothing was left to be explained, nothing
-        was screened on top of the last mechanism.
+    found, fit
+        Mechanisms, each judged with those before it in place; and the fit of the simulation with all of them.
+    screened, screened_with
+        The last screening: every probe with what it would gain; and labels of the mechanisms that were in
+        place for it, not the last one where nothing was left to be explained.
     untried
         Candidates whose fit gave nothing that could be judged, with the reason.
     fruitless
@@ -114,7 +100,7 @@ class Search:
     recalibrated: Fit
     found: tuple[AcceptedMechanism, ...]
     fit: Fit
-    screened: tuple[tuple[Probe, Screened], ...]
+    screened: tuple[Ranked[Probe], ...]
     untried: tuple[NotFitted, ...] = ()
     screened_with: tuple[str, ...] = ()
     fruitless: frozenset[str] = frozenset()
@@ -178,24 +164,24 @@ def _better_without(trial: FittedCandidate, current: Fit, context: FitContext) -
 
 
 def _fit_most_promising(
-    context: FitContext, current: Fit, screened: Sequence[tuple[Probe, Screened]]
+    context: FitContext, current: Fit, screened: Sequence[Ranked[Probe]]
 ) -> tuple[list[FittedCandidate], list[NotFitted]]:
     """Fit the candidates that promise most, each from its best probe."""
     data, budget, options = context.data, context.budget, context.study.search
     most, least_gain, blocks = options.fitted, options.same, options.blocks
     best = best_probes(screened)
-    ranked = sorted(best.values(), key=lambda each: -each[1].gain)
+    ranked = sorted(best.values(), key=lambda each: -each.gain)
     trials: dict[str, FittedCandidate] = {}
     failed: dict[str, NotFitted] = {}
-    begun: list[tuple[Probe, Screened]] = []
+    begun: list[Ranked[Probe]] = []
 
-    def attempt(probe: Probe, result: Screened, begin: Fit) -> None:
+    def attempt(promised: Ranked[Probe], begin: Fit) -> None:
         """Fit and judge a candidate; one that leads away, or has a sign that it cannot have, has failed."""
-        candidate = probe.candidate
+        candidate = promised.term.candidate
         try:
-            x = probe.states_along(current, data, begin.x[:, : current.model.dimension])
+            x = promised.term.states_along(current, data, begin.x[:, : current.model.dimension])
             fit = fit_with_process_noise_as_needed(
-                _with_start(probe, result, begin.model), data, begin, level=result.level, x=x, budget=budget
+                _with_start(promised, begin.model), data, begin, level=promised.level, x=x, budget=budget
             )
             if not fit.converged:
                 raise NumericalFailure(fit.fault or "its fit does not settle")
@@ -217,24 +203,24 @@ def _fit_most_promising(
             trials[candidate.label] = trial
 
     # What the recordings themselves show is fitted as well as the others, and in the place of none of them.
-    most_promised = ranked[0][1].gain if ranked else 0.0
-    shown = sum(probe.recorded and result.gain >= most_promised for probe, result in ranked)
-    for place, (probe, result) in enumerate(ranked[: shown + 2 * most], start=-shown):
+    most_promised = ranked[0].gain if ranked else 0.0
+    shown = sum(each.term.recorded and each.gain >= most_promised for each in ranked)
+    for place, promised in enumerate(ranked[: shown + 2 * most], start=-shown):
         # Against what screening predicted of those that did gain it: some promise much and gain nothing, and
         # of others the first order shows little.
-        gained = max((min(each.delta_chi2, best[name][1].gain) for name, each in trials.items()), default=0.0)
-        if result.gain < max(least_gain, PROMISING_GAIN * gained):
+        gained = max((min(each.delta_chi2, best[name].gain) for name, each in trials.items()), default=0.0)
+        if promised.gain < max(least_gain, PROMISING_GAIN * gained):
             break
-        if place >= most and result.gain < gained - least_gain:
+        if place >= most and promised.gain < gained - least_gain:
             break  # no alternative to the best, which the class of indistinguishables must have
-        begun.append((probe, result))
+        begun.append(promised)
         budget.says(
             f"candidate {place + shown + 1} of at most {min(shown + 2 * most, len(ranked))}:"
-            f" {probe.candidate.label}"
+            f" {promised.term.candidate.label}"
         )
-        attempt(probe, result, current)
-    for probe, result in begun:  # once more, what led nowhere, or to less than a special case of it
-        candidate = probe.candidate
+        attempt(promised, current)
+    for promised in begun:  # once more, what led nowhere, or to less than a special case of it
+        candidate = promised.term.candidate
         own = trials.get(candidate.label)
         better_ones = [
             each
@@ -249,9 +235,10 @@ def _fit_most_promising(
                 on_top = replace(candidate.rebased(current.model, better.fit.model), positive=frozenset())
                 again, _ = screen_all(data, better.fit, [on_top], budget=budget)
                 if again:
-                    values = [value for _, value in max(again, key=lambda each: each[1].gain)[0].shapes]
-                    probe = replace(probe, shapes=tuple(zip(candidate.shapes, values, strict=True)))
-            attempt(probe, result, better.fit)
+                    values = [value for _, value in max(again, key=lambda each: each.gain).term.shapes]
+                    shapes = tuple(zip(candidate.shapes, values, strict=True))
+                    promised = replace(promised, term=Probe(candidate, shapes))
+            attempt(promised, better.fit)
     most_gained = max((each.delta_chi2 for each in trials.values()), default=0.0)
     for label, trial in trials.items():
         if trial.fit.model.edges and trial.delta_chi2 >= SHARPENED_GAIN * most_gained:
@@ -268,39 +255,34 @@ def _special_case(one: MechanismCandidate, of: MechanismCandidate) -> bool:
     return one.name in of.generalises and one.equations == of.equations
 
 
-def best_probes(
-    screened: Sequence[tuple[Probe, Screened]],
-) -> dict[str, tuple[Probe, Screened]]:
+def best_probes(screened: Sequence[Ranked[Probe]]) -> dict[str, Ranked[Probe]]:
     """Of each candidate the probe that promises most, by label; none that promises nothing."""
-    best: dict[str, tuple[Probe, Screened]] = {}
-    for probe, result in screened:
-        label = probe.candidate.label
-        if result.gain > 0 and (label not in best or result.gain > best[label][1].gain):
-            best[label] = (probe, result)
+    best: dict[str, Ranked[Probe]] = {}
+    for each in screened:
+        label = each.term.candidate.label
+        if each.gain > 0 and (label not in best or each.gain > best[label].gain):
+            best[label] = each
     return best
 
 
-def _with_start(probe: Probe, result: Screened, base: Dynamics) -> Dynamics:
+def _with_start(promised: Ranked[Probe], base: Dynamics) -> Dynamics:
     """The candidate's model with parameters to begin with: those of the base, and no effect yet.
 
-    What screening found of the amplitudes is a start only where shapes need one: linearised amplitudes can be
-    far off, and a fit that begins there may diverge.
+    Linearised amplitudes can be far off, and a fit that begins there may diverge: they are a start only where
+    shapes need one.
     """
-    candidate = probe.candidate
+    candidate = promised.term.candidate
     known = {parameter.name: parameter.value for parameter in base.parameters}
-    known |= dict.fromkeys(candidate.amplitudes, 0.0) | dict(probe.shapes)
+    known |= dict.fromkeys(candidate.amplitudes, 0.0) | dict(promised.term.shapes)
     if candidate.amplitudes and candidate.shapes:
-        known |= dict(zip(candidate.amplitudes, map(float, result.amplitudes), strict=True))
+        known |= dict(zip(candidate.amplitudes, map(float, promised.amplitudes), strict=True))
     return candidate.model.with_values(np.array([known[each.name] for each in candidate.model.parameters]))
 
 
 def _stands_together(
     progress: Search, before: Search, context: FitContext, *, chance: float
 ) -> Search | None:
-    """A search in which a mechanism was taken on trial, if it stands the clustered test in the final fit.
-
-    It has the probabilities of the final fit; None where nothing came on top of it, or it does not stand.
-    """
+    """A search in which a mechanism was taken on trial, if it stands the clustered test in the final fit."""
     place, data, blocks = len(before.found), context.data, context.study.search.blocks
     if len(progress.found) < place + 2:
         return None

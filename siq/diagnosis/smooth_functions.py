@@ -19,7 +19,6 @@ else, and one that is too smooth explains too little (MacKay, Neural Computation
 from __future__ import annotations
 
 import itertools
-import logging
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -27,31 +26,18 @@ import numpy as np
 import scipy.linalg
 import sympy
 
-from siq.diagnosis.evidence import (
-    NUMERICAL_ERRORS,
-    FittedCandidate,
-    correlation_time_of,
-    evidences_by_size,
-    orthonormal,
-)
-from siq.diagnosis.mechanisms import MechanismCandidate, along, fresh_names
-from siq.diagnosis.screening import PROBE_SUBSTEPS, levels_of, probe_response, projected
-from siq.diagnosis.terms import (
-    CURVE,
-    LARGEST_LINEARISATION,
-    SURFACE,
-    Kind,
-    Place,
-    PlaceColumns,
-)
+from siq.diagnosis.evidence import FittedCandidate, correlation_time_of, evidences_by_size
+from siq.diagnosis.mechanisms import CURVE, SURFACE, MechanismCandidate, along, fresh_names
+from siq.diagnosis.screening import PROBE_SUBSTEPS, Projection, at_noise_levels, linearised_with
+from siq.diagnosis.terms import Place
 from siq.errors import NumericalFailure
-from siq.inference.kalman_filter import Grid, Whitened, profile_likelihood, whiten
+from siq.inference.kalman_filter import Whitened
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.systems.dynamics import Dynamics, JointExpectation, symbol
 
-LOGGER = logging.getLogger(__name__)
 LENGTH_SCALES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # of the range; beyond, a function is a parabola
+LARGEST_LINEARISATION = 40_000_000  # numbers held at a time, which is a third of a gigabyte
 MOST_BUMPS = 100  # a guard on the time of a fit
 # Lengths between neighbours: a sum of bumps then has the variance of the process to 2e-5, that of two
 # coordinates to 4 % (of points that are spread evenly).
@@ -63,18 +49,14 @@ PRODUCT_TOLERANCE = 1e-4  # of what is left, by which an iteration has to be bet
 
 @dataclass(frozen=True)
 class Bumps:
-    """A smooth function as a sum of bumps, and what is expected of it: a `siq.diagnosis.screening.Basis`.
+    """A smooth function as a sum of bumps, and what is expected of it: a `siq.diagnosis.terms.Basis`.
 
     Attributes
     ----------
-    coordinates
-        What it is a function of.
-    limits
-        Where the recordings have been: lower and upper, shape ``(2, c)``.
-    centres
-        Of the bumps, shape ``(b, c)``.
-    lengths
-        Over which it changes, and how wide the bumps are, shape ``(c,)``.
+    coordinates, limits
+        What it is a function of, and where the recordings have been: lower and upper, shape ``(2, c)``.
+    centres, lengths
+        Of the bumps, shape ``(b, c)``; and over which it changes, how wide they are, shape ``(c,)``.
     deviation
         s, the size that is expected of it.
     weight
@@ -101,16 +83,8 @@ class Bumps:
     ) -> Bumps:
         """A smooth function with its bumps where the recordings have been.
 
-        Parameters
-        ----------
-        coordinates, courses
-            What it is a function of, and their values along the recordings, shape ``(c, n)``.
-        shares
-            Its lengths, as shares of the coordinates' ranges.
-        deviation, weight
-            See above.
-        most
-            So many bumps at most; those left out are nearest to others.
+        Its lengths are shares of the ranges of the courses ``(c, n)``. Of more bumps than so many, those
+        nearest to others are left out.
         """
         lengths = np.array(shares) * np.ptp(courses, axis=1)
         limits = np.stack([courses.min(axis=1), courses.max(axis=1)])
@@ -187,25 +161,13 @@ def _squares(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 class SmoothFunction:
     """A smooth function in a place, or a product of two, of one coordinate each.
 
-    Attributes
-    ----------
-    place
-        Where it stands, and of what it is a function.
-    factors
-        The function, or the two.
-    begin
-        Heights to begin with, of all bumps, shape ``(b,)``: of a product none, since where both factors are
-        zero nothing points anywhere.
+    It begins with heights ``(b,)`` of all bumps: of a product none, since where both factors are zero nothing
+    points anywhere.
     """
 
     place: Place
     factors: tuple[Bumps, ...]
     begin: np.ndarray
-
-    @property
-    def kind(self) -> Kind:
-        """What it looks like."""
-        return CURVE if len(self.place.coordinates) == 1 else SURFACE
 
     @property
     def width(self) -> int:
@@ -245,7 +207,8 @@ class SmoothFunction:
         known = dict(zip(names, self.begin, strict=True))
         values = [known.get(each.name, each.value) for each in candidate.model.parameters]
         begun = replace(candidate.model, expected_together=together).with_values(np.array(values))
-        return replace(candidate, model=begun)
+        kind = CURVE if len(self.place.coordinates) == 1 else SURFACE
+        return replace(candidate, model=begun, kind=kind, smooth=self)
 
 
 def _product_of(
@@ -312,31 +275,6 @@ def _given(basis: np.ndarray, gram: np.ndarray, overlap: np.ndarray) -> tuple[np
 
 
 @dataclass(frozen=True)
-class Term:
-    """A part of a description.
-
-    Attributes
-    ----------
-    trial
-        What was added, fitted and judged.
-    kind
-        ``formula``, ``curve``, ``surface``, or ``mechanism``.
-    cost
-        Logarithm of the number of places, or mechanisms, that it was chosen among.
-    place
-        Where a function stands; None for a mechanism or a memory.
-    smooth
-        What a curve or a surface is made of: the amplitudes are the heights of its bumps.
-    """
-
-    trial: FittedCandidate
-    kind: Kind
-    cost: float
-    place: Place | None = None
-    smooth: SmoothFunction | None = None
-
-
-@dataclass(frozen=True)
 class Smoothness:
     """How smooth a function is, as recordings tell it at the likeliest level of process noise.
 
@@ -344,23 +282,17 @@ class Smoothness:
     ----------
     place, courses
         Where it stands, and its coordinates along the recordings, shape ``(c, n)``.
-    shares
-        Its lengths, as shares of the ranges of its coordinates.
-    deviation
-        Its size.
-    noise
-        Variance of the innovations with it, in units of what the fit takes for it.
-    level
-        Of process noise, relative to that of the fit.
+    shares, deviation
+        Its lengths, as shares of the ranges of its coordinates, and its size.
+    noise, level
+        Variance of the innovations with it, and process noise, in units of what the fit takes for them.
     correlated
         Correlation time τ of the innovations in samples, with such a function: n of them count as n/τ.
     considered
         How many lengths and sizes were compared.
-    fine
-        The function, with bumps as narrow as any.
-    gram, overlap
-        Of what a unit of each of these does to the innovations, with each other and with the innovations,
-        over τ; shapes ``(b, b)`` and ``(b,)``.
+    fine, gram, overlap
+        The function with bumps as narrow as any; and of what a unit of each does to the innovations, with
+        each other and with the innovations, over τ; shapes ``(b, b)`` and ``(b,)``.
     log_evidence
         Logarithm of the odds for such a function, over none, each at its best level; averaged over all
         lengths and sizes.
@@ -381,16 +313,20 @@ class Smoothness:
 
     @classmethod
     def of(
-        cls, fit: Fit, data: Measurements, place: Place, *, known: Term | None = None, alike: bool = False
+        cls,
+        fit: Fit,
+        data: Measurements,
+        place: Place,
+        *,
+        known: FittedCandidate | None = None,
+        alike: bool = False,
     ) -> Smoothness | None:
         """The likeliest smoothness of a function on top of a fit; None where it cannot be worked out.
 
         Parameters
         ----------
-        fit, data
-            The fit along whose trajectories everything is linear, and what it was made for.
-        place
-            Where the function stands.
+        fit, data, place
+            The fit along whose trajectories everything is linear, its data, and where the function stands.
         known
             A part of the fit that is a first description of this function, in whose stead it comes.
         alike
@@ -416,32 +352,25 @@ class Smoothness:
         shapes = [fine.heights_of(_triangle_of(fine.centres, np.array(each) * ranges)) for each in choices]
         # What is told at each level of process noise at which it can be worked out. Errors are as correlated
         # as the likeliest level leaves them with such a function, at all levels.
-        grid = Grid(data, fit.substeps if known else min(fit.substeps, PROBE_SUBSTEPS))
-        response = probe_response(fit, grid, PlaceColumns(fit.model, grid, [place], [fine]))
-        levels: list[tuple[float, np.ndarray, np.ndarray, float, float, float]] = []
+        response, _ = linearised_with(
+            fit, data, [replace(place, basis=fine)], substeps=fit.substeps if known else PROBE_SUBSTEPS
+        )
+        levels: list[tuple[float, Projection]] = []
         highest, correlated = -np.inf, 1.0
-        for level in levels_of(fit):
-            try:
-                white = whiten(response, data, fit.noise.scaled(level))
-                white, parameters = _without(white, fit, known)
-                left, columns = projected(white, parameters)
-            except NUMERICAL_ERRORS as error:
-                LOGGER.info("no function of %s can be screened: %s", " and ".join(place.words[:count]), error)
-                continue
-            total, freedom = float(left @ left), white.degrees_of_freedom - parameters
-            likelihood = profile_likelihood(total, freedom, white.log_determinant)
-            levels.append((level, columns.T @ columns, columns.T @ left, total, freedom, likelihood))
-            basis = orthonormal(columns)
-            rest = left - basis @ (basis.T @ left)
-            likelihood = profile_likelihood(float(rest @ rest), freedom, white.log_determinant)
+        for level, problem in at_noise_levels(response, fit, data, lambda white: _without(white, fit, known)):
+            levels.append((level, problem))
+            rest = problem.unexplained
+            likelihood = problem.likelihood(float(rest @ rest))
             if likelihood > highest:
                 highest = likelihood
-                correlated = correlation_time_of(rest, white.recording, outputs=len(fit.model.outputs))
+                recording, outputs = problem.white.recording, len(fit.model.outputs)
+                correlated = correlation_time_of(rest, recording, outputs=outputs)
         alone, values = -np.inf, list[np.ndarray]()
         highest, best = -np.inf, None
-        for level, gram, overlap, total, degrees, likelihood in levels:
-            gram, overlap, total = gram / correlated, overlap / correlated, total / correlated
-            degrees, likelihood = degrees / correlated, likelihood / correlated
+        for level, problem in levels:
+            gram = problem.columns.T @ problem.columns / correlated
+            overlap, total = problem.overlap / correlated, problem.total / correlated
+            degrees, likelihood = problem.freedom / correlated, problem.likelihood(problem.total) / correlated
             alone = max(alone, likelihood)
             for shares, shape in zip(choices, shapes, strict=True):
                 gained, scale, rest = evidences_by_size(
@@ -485,12 +414,13 @@ class Smoothness:
         )
 
 
-def _without(white: Whitened, fit: Fit, known: Term | None) -> tuple[Whitened, int]:
+def _without(white: Whitened, fit: Fit, known: FittedCandidate | None) -> tuple[Whitened, int]:
     """Innovations as if a part were not there, its columns left out, and the number of parameters left."""
     names = [fit.model.parameters[place].name for place in fit.model.free]
-    amplitudes = () if known is None else known.trial.candidate.amplitudes
+    amplitudes = () if known is None else known.candidate.amplitudes
     mine = [names.index(name) for name in amplitudes]
-    linear = mine if known is None or known.smooth is None else mine[: known.smooth.linear]
+    smooth = None if known is None else known.candidate.smooth
+    linear = mine if smooth is None else mine[: smooth.linear]
     values = fit.model.values[[fit.model.free[place] for place in linear]]
     others = np.delete(white.columns, mine, axis=1)
     innovations = white.innovations + white.columns[:, linear] @ values

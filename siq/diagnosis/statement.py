@@ -16,10 +16,9 @@ from pydantic_core import to_jsonable_python
 
 from siq.diagnosis.evidence import BUDGET_SPENT, FittedCandidate, NotFitted
 from siq.diagnosis.holdout import HeldOutErrors
-from siq.diagnosis.mechanisms import GENERIC, PROCESS_NOISE
+from siq.diagnosis.mechanisms import GENERIC, MECHANISM, PROCESS_NOISE, Kind
 from siq.diagnosis.search import Standing
 from siq.diagnosis.study import MismatchVerdict
-from siq.diagnosis.terms import MECHANISM, Kind
 from siq.inference.budget import UNLIMITED, Account
 from siq.remarks import Remark
 

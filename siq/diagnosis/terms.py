@@ -10,68 +10,60 @@ powers becomes part of the simulation.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final, Literal
+from typing import Protocol
 
 import numpy as np
 import scipy.interpolate
 import sympy
 
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
-from siq.diagnosis.evidence import correlation_time_of, evidence_of_function, orthonormal
-from siq.diagnosis.mechanisms import MechanismCandidate, along, fresh_names, with_added
-from siq.diagnosis.screening import (
-    PROBE_SUBSTEPS,
-    Basis,
-    Probe,
-    ProbeColumns,
-    levels_of,
-    probe_response,
-    projected,
-    slices_of,
-)
-from siq.errors import NumericalFailure
-from siq.inference.kalman_filter import Grid, Linearisation, profile_likelihood, whiten
+from siq.diagnosis.evidence import correlation_time_of, evidence_of_function
+from siq.diagnosis.mechanisms import FORMULA, MechanismCandidate, along, fresh_names, with_added
+from siq.diagnosis.screening import Entry, Probe, Projection, Ranked, Trajectories, linearised_with, rank
+from siq.inference.kalman_filter import whiten
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
-from siq.systems.dynamics import Dynamics, Parameter, Signals, symbol
+from siq.systems.dynamics import Dynamics, Parameter, symbol
 from siq.systems.formulas import compile_values, exact_number
 
-Kind = Literal["formula", "curve", "surface", "mechanism"]
-FORMULA: Final = "formula"
-CURVE: Final = "curve"
-SURFACE: Final = "surface"
-MECHANISM: Final = "mechanism"
 FUNCTIONS_FITTED = 3  # places in which functions are fitted, the most likely ones: a choice
 SPLINE_KNOTS = 17  # enough for the shortest length of `siq.diagnosis.evidence.SMOOTH_LENGTHS`, two for each
 HAT_KNOTS = 9  # of piecewise linear functions: a choice
 TINY_AMPLITUDE = sympy.Float(1e-300)  # so that a system at rest has a direction, which is none
-LARGEST_LINEARISATION = 40_000_000  # numbers held at a time, which is a third of a gigabyte
 ONE = sympy.Integer(1)
 Power = tuple[sympy.Expr, int, int]
 """A term of a formula, and how often the first and the second coordinate are factors of it."""
 
 
+class Basis(Protocol):
+    """A function with linear coefficients, such as values at knots."""
+
+    @property
+    def width(self) -> int:
+        """The number of its coefficients."""
+
+    def values(self, courses: np.ndarray) -> np.ndarray:
+        """What a unit of each does along courses ``(c, n)`` of the coordinates, shape ``(width, n)``."""
+
+
 @dataclass(frozen=True)
 class Place:
-    """Where a function may stand, and of what; of one coordinate it is a basis of splines.
+    """Where a function may stand, and of what: a `siq.diagnosis.screening.Term`.
 
     Attributes
     ----------
     equations, outputs
         What the function is multiplied by, in each equation, or each output, in which it stands.
-    coordinates
-        What it is a function of: one formula, or two.
-    words
-        The coordinates in words of the system. One more than there are coordinates is that of a factor.
-    knots
-        Of the spline: quantiles of the coordinate, shape ``(k,)``.
-    linear
-        Whether the spline is piecewise linear, rather than a natural cubic one.
-    log_evidence, level
-        Logarithm of the evidence of a smooth function here over that of none, each at its best level of
-        process noise; and that level (`rank_places`).
+    coordinates, words
+        What it is a function of: one formula, or two; and these in words of the system. One word more is that
+        of a factor.
+    knots, linear
+        Of the spline: quantiles of the coordinate, shape ``(k,)``; and whether it is piecewise linear, rather
+        than a natural cubic one.
+    basis
+        Of the function, in the place of the spline.
     """
 
     equations: tuple[tuple[str, sympy.Expr], ...]
@@ -80,24 +72,46 @@ class Place:
     words: tuple[str, ...]
     knots: np.ndarray = field(default_factory=lambda: np.empty(0))
     linear: bool = False
-    log_evidence: float = float("nan")
-    level: float = 1.0
+    basis: Basis | None = None
 
     @property
     def width(self) -> int:
         """The number of its values."""
-        return len(self.knots)
+        return len(self.knots) if self.basis is None else self.basis.width
 
     def values(self, courses: np.ndarray) -> np.ndarray:
         """Splines that are one at one knot and zero at the others, shape ``(k, n)``.
 
         What lies beyond the knots has the value at the last one.
         """
+        if self.basis is not None:
+            return self.basis.values(courses)
         unit = np.eye(len(self.knots))
         if self.linear:
             return np.stack([np.interp(courses[0], self.knots, each) for each in unit])
         course = np.clip(courses[0], self.knots[0], self.knots[-1])
         return scipy.interpolate.make_interp_spline(self.knots, unit, bc_type="natural")(course).T
+
+    def columns(
+        self, trajectories: Trajectories
+    ) -> Callable[[np.ndarray, np.ndarray, int | None], Iterator[Entry]]:
+        """See `siq.diagnosis.screening.Term`."""
+        model, grid = trajectories.model, trajectories.grid
+        targets = (*self.equations, *self.outputs)  # it has either
+        formulas = [*self.coordinates, *(factor for _, factor in targets)]
+        compiled = compile_values(formulas, list(map(symbol, coordinates_of(model))), common=False)
+
+        def evaluated(x: np.ndarray, values: np.ndarray, node: int | None) -> Iterator[Entry]:
+            if bool(self.outputs) is (node is None):
+                signals = grid.at_samples(()) if node is None else grid.signals(node, ())
+                known = compiled(*x, *signals.inputs, signals.t)
+                count, names = len(self.coordinates), model.output_names if node is None else model.states
+                courses = [np.broadcast_to(each, x.shape[1]) for each in known[:count]]
+                basis = self.values(np.stack(courses))
+                for (name, _), factor in zip(targets, known[count:], strict=True):
+                    yield names.index(name), slice(None), basis * factor
+
+        return evaluated
 
     @property
     def targets(self) -> tuple[str, ...]:
@@ -141,6 +155,8 @@ class Place:
             equations=tuple(name for name, _ in self.equations),
             coordinate="measurement" if self.outputs else ", ".join(self.words),
             changes=tuple({**added, **read}.items()),
+            kind=FORMULA,
+            place=self,
         )
 
     def unit(self, model: Dynamics, first: int, second: int) -> str:
@@ -165,67 +181,14 @@ def _amplitude(first: str, second: str) -> sympy.Expr:
     return sympy.sqrt(symbol(first) ** 2 + symbol(second) ** 2)
 
 
-class PlaceColumns:
-    """Functions in many places, as `siq.inference.kalman_filter.linearise` wants them; splines by default."""
-
-    def __init__(
-        self, model: Dynamics, grid: Grid, places: Sequence[Place], bases: Sequence[Basis] | None = None
-    ) -> None:
-        self._model, self._grid, self._places = model, grid, places
-        self._bases: Sequence[Basis] = places if bases is None else bases
-        self.width = sum(each.width for each in self._bases)
-        names = (*model.states, *(entry.name for entry in model.inputs), "t")
-        arguments = [symbol(name) for name in names]
-        self._compiled = [
-            compile_values(
-                [*each.coordinates, *(factor for _, factor in (*each.equations, *each.outputs))],
-                arguments,
-                common=False,
-            )
-            for each in places
-        ]
-
-    def rates(self, x: np.ndarray, values: np.ndarray, node: int) -> np.ndarray:
-        """See `siq.inference.kalman_filter.Columns`."""
-        return self._filled(x, self._grid.signals(node, ()), measured=False)
-
-    def outputs(self, x: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """See `siq.inference.kalman_filter.Columns`."""
-        return self._filled(x, self._grid.at_samples(()), measured=True)
-
-    def _filled(self, x: np.ndarray, signals: Signals, *, measured: bool) -> np.ndarray:
-        names = list(self._model.output_names if measured else self._model.states)
-        result = np.zeros((len(names), self.width, x.shape[1]))
-        begin = 0
-        for place, basis, compiled in zip(self._places, self._bases, self._compiled, strict=True):
-            end = begin + basis.width
-            targets = place.outputs if measured else place.equations
-            if targets:
-                known = compiled(*x, *signals.inputs, signals.t)
-                courses = [np.broadcast_to(each, x.shape[1]) for each in known[: len(place.coordinates)]]
-                values = basis.values(np.stack(courses))
-                for (name, _), factor in zip(targets, known[len(place.coordinates) :], strict=True):
-                    result[names.index(name), begin:end] = values * factor
-            begin = end
-        return result
-
-
 def places_in(
     model: Dynamics, roles: Roles, data: Measurements, x: np.ndarray, *, linear: bool = False
 ) -> tuple[Place, ...]:
     """Functions of one coordinate, in every equation that says more than a definition, and in every output.
 
-    In a rotating frame they are also those of amplitude and time, along the state and across it.
-
-    Parameters
-    ----------
-    model, roles
-        The simulation, and the roles of its states.
-    data, x
-        The recordings and the states along them, shape ``(n, d)``: knots are quantiles of these.
-    linear
-        Whether they are piecewise linear, of few knots, and forces: in equations only, and in a rotating
-        frame of the amplitude only, of which they have the direction and not the size.
+    In a rotating frame they are also those of amplitude and time, along the state and across it. Knots are
+    quantiles along the states ``(n, d)``. Piecewise linear ones have few knots and are forces: in equations
+    only, and in a rotating frame of the amplitude only, of which they have the direction and not the size.
     """
     found: list[Place] = []
     coordinates = coordinates_of(model)
@@ -300,99 +263,59 @@ def _with_knots(
             yield replace(each, knots=known[each.coordinates])
 
 
-def linearised_with_places(
-    fit: Fit, data: Measurements, places: Sequence[Place]
-) -> Iterator[tuple[Linearisation, list[tuple[Place, slice]]]]:
-    """The linearisation of a fit with the columns of places behind those of its parameters, in portions.
-
-    Parameters
-    ----------
-    fit, data
-        The fit along whose trajectories everything is linear, and what it was made for.
-    places
-        The functions.
-
-    Yields
-    ------
-    Linearisation, list of (Place, slice)
-        Which of the further columns are those of which place.
-    """
-    model = fit.model
-    room = LARGEST_LINEARISATION // (len(data.t) * (model.dimension + len(model.outputs))) - len(model.free)
-    at_once = max(room // SPLINE_KNOTS, 1)
-    grid = Grid(data, min(fit.substeps, PROBE_SUBSTEPS))
-    for begin in range(0, len(places), at_once):
-        some = places[begin : begin + at_once]
-        groups = list(zip(some, slices_of(some), strict=True))
-        yield probe_response(fit, grid, PlaceColumns(model, grid, some)), groups
-
-
-def rank_places(fit: Fit, data: Measurements, roles: Roles) -> list[Place]:
-    """All places with their evidence, the one in which a smooth function is likeliest first.
+def rank_places(fit: Fit, data: Measurements, roles: Roles) -> list[Ranked[Place]]:
+    """All places, by the evidence of a smooth function there, the likeliest first.
 
     Functions of one coordinate are tried everywhere, and as coefficients of other coordinates in the
     equations in which they do best.
     """
     single = places_in(fit.model, roles, data, fit.x)
-    ranked = _compared(fit, data, single)
-    if not ranked:
-        return []
-    equations = {each.targets for each in ranked[:FUNCTIONS_FITTED] if each.equations}
+    ranked = _ranked(fit, data, single)
+    equations = {each.term.targets for each in ranked[:FUNCTIONS_FITTED] if each.term.equations}
     products = products_in([each for each in single if each.targets in equations], fit.model, data, fit.x)
-    return sorted((*ranked, *_compared(fit, data, products)), key=lambda each: -each.log_evidence)
+    return sorted((*ranked, *_ranked(fit, data, products)), key=lambda each: -each.gain)
 
 
-def _compared(fit: Fit, data: Measurements, places: Sequence[Place]) -> list[Place]:
-    parameters = len(fit.model.free)
-    found: dict[int, Place] = {}
-    alone = -np.inf
-    for response, groups in linearised_with_places(fit, data, places):
-        for level in levels_of(fit):
-            try:
-                white = whiten(response, data, fit.noise.scaled(level))
-                left, columns = projected(white, parameters)
-            except NumericalFailure:  # without process noise an unstable simulation does not follow
-                continue
-            freedom = white.degrees_of_freedom - parameters
-            base = profile_likelihood(float(left @ left), freedom, white.log_determinant)
-            alone = max(alone, base)
-            for place, group in groups:
-                own = columns[:, group]
-                value = base + evidence_of_function(own, left, place.knots, freedom=freedom)
-                known = found.get(id(place))
-                if own.any() and (known is None or value > known.log_evidence):
-                    found[id(place)] = replace(place, log_evidence=value, level=level)
-    ranked = sorted(found.values(), key=lambda each: -each.log_evidence)
-    return [replace(each, log_evidence=each.log_evidence - alone) for each in ranked]
+def _ranked(fit: Fit, data: Measurements, places: Sequence[Place]) -> list[Ranked[Place]]:
+    ranked = rank(fit, data, places, judge=by_evidence)[0]
+    return sorted((each for each in ranked if each.finite), key=lambda each: -each.gain)
+
+
+def by_evidence(
+    place: Place, problem: Projection, group: slice
+) -> tuple[float, np.ndarray, np.ndarray] | None:
+    """A `siq.diagnosis.screening.Judge`: the likelihood averaged over all smooth functions in a place."""
+    own = problem.columns[:, group]
+    if not own.any():
+        return None
+    gained = evidence_of_function(own, problem.left, place.knots, freedom=problem.freedom)
+    return problem.likelihood(problem.total) + gained, np.zeros(0), np.zeros(0)
 
 
 def formula_in(
-    place: Place, fit: Fit, data: Measurements, *, degree: int
-) -> tuple[Place, MechanismCandidate] | None:
+    place: Place, fit: Fit, data: Measurements, *, level: float, degree: int
+) -> MechanismCandidate | None:
     """The simulation of a fit with a formula in a place, of the powers that it needs; None if it needs none.
 
-    The place is that of a function of the second coordinate, where the first is in none of them.
+    Its place is that of a function of the second coordinate, where the first is in none of them.
     """
-    if not (terms := _few_powers(place, fit, data, degree=degree)):
-        return None
-    place, terms = _simplest(place, terms)
-    return place, _with_formula(fit.model, place, terms)
+    terms = _few_powers(place, fit, data, level=level, degree=degree)
+    return _with_formula(fit.model, *_simplest(place, terms)) if terms else None
 
 
-def _few_powers(place: Place, fit: Fit, data: Measurements, *, degree: int) -> tuple[Power, ...]:
+def _few_powers(
+    place: Place, fit: Fit, data: Measurements, *, level: float, degree: int
+) -> tuple[Power, ...]:
     """Powers of which each earns its place, one after the other (Schwarz).
 
     Errors count as correlated as all of the powers leave them (`siq.diagnosis.evidence`).
     """
     terms = _powers(place, degree=degree)
-    probe = Probe(_with_formula(fit.model, place, terms), ())
-    grid = Grid(data, min(fit.substeps, PROBE_SUBSTEPS))
-    response = probe_response(fit, grid, ProbeColumns(fit.model, grid, [probe], fit.x))
-    white = whiten(response, data, fit.noise.scaled(place.level))
-    left, own = projected(white, len(fit.model.free))
-    basis = orthonormal(own)
-    rest = left - basis @ (basis.T @ left)
-    correlated = correlation_time_of(rest, white.recording, outputs=len(fit.model.outputs))
+    response, _ = linearised_with(fit, data, [Probe(_with_formula(fit.model, place, terms), ())])
+    white = whiten(response, data, fit.noise.scaled(level))
+    problem = Projection.of(white, len(fit.model.free))
+    left, own = problem.left, problem.columns
+    correlated = correlation_time_of(problem.unexplained, white.recording, outputs=len(fit.model.outputs))
     count = max(float(white.known.sum()) / correlated, 2.0)  # errors that count as independent
     chosen: list[int] = []
     total = float(left @ left)
@@ -418,7 +341,7 @@ def _with_formula(model: Dynamics, place: Place, terms: Sequence[Power]) -> Mech
     names = fresh_names("c", len(terms), model.names)
     formula = sympy.Add(*(symbol(name) * term for name, (term, _, _) in zip(names, terms, strict=True)))
     units = [place.unit(model, first, second) for _, first, second in terms]
-    return place.without_factor.added_to(model, formula, names, units)
+    return replace(place.without_factor.added_to(model, formula, names, units), place=place)
 
 
 def _simplest(place: Place, terms: Sequence[Power]) -> tuple[Place, tuple[Power, ...]]:

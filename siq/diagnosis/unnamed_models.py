@@ -25,26 +25,13 @@ import numpy as np
 import sympy
 
 from siq.diagnosis.dictionary import Form, FurtherState, Mechanism, MechanismParameter, Role, Roles, Shape
-from siq.diagnosis.evidence import (
-    NUMERICAL_ERRORS,
-    FittedCandidate,
-    log_evidences,
-)
-from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
+from siq.diagnosis.evidence import NUMERICAL_ERRORS, FittedCandidate, log_evidences
+from siq.diagnosis.mechanisms import FORMULA, MECHANISM, MechanismCandidate, candidates_of
 from siq.diagnosis.residual_structure import has_structure
-from siq.diagnosis.screening import screen_all
+from siq.diagnosis.screening import Ranked, screen_all
 from siq.diagnosis.search import FitContext, Search, best_probes
-from siq.diagnosis.smooth_functions import SmoothFunction, Smoothness, Term
-from siq.diagnosis.terms import (
-    FORMULA,
-    FUNCTIONS_FITTED,
-    MECHANISM,
-    ONE,
-    Place,
-    coordinates_of,
-    formula_in,
-    rank_places,
-)
+from siq.diagnosis.smooth_functions import Smoothness
+from siq.diagnosis.terms import FUNCTIONS_FITTED, ONE, Place, coordinates_of, formula_in, rank_places
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent
 from siq.inference.kalman_filter import substeps_needed
@@ -77,17 +64,15 @@ class AugmentedModel:
 
     Attributes
     ----------
-    parts
-        What was added, in the order in which it was found.
-    fit
-        Of the simulation with all of it.
+    parts, fit
+        What was added, in the order in which it was found; and the fit of the simulation with all of it.
     log_evidence
         Of the whole over that of the simulation without its parts, less the costs of these; see `_weighed`.
     exact
         The fit whose trajectories follow the equations, if process noise is part of `fit`.
     """
 
-    parts: tuple[Term, ...]
+    parts: tuple[FittedCandidate, ...]
     fit: Fit
     log_evidence: float = float("nan")
     exact: Fit | None = None
@@ -95,12 +80,13 @@ class AugmentedModel:
     @property
     def coordinates(self) -> int:
         """On how many coordinates the parts depend, each by itself."""
-        return sum(1 if part.place is None else len(part.place.words) for part in self.parts)
+        places = [part.candidate.place for part in self.parts]
+        return sum(1 if place is None else len(place.words) for place in places)
 
     @property
     def cost(self) -> float:
         """Logarithm of how many combinations of parts this one was chosen among."""
-        return sum(part.cost for part in self.parts)
+        return sum(part.candidate.log_cost for part in self.parts)
 
 
 def _weighed(models: Sequence[AugmentedModel], alone: Fit, data: Measurements) -> list[AugmentedModel]:
@@ -133,18 +119,13 @@ def runs_freely(fit: Fit, alone: Fit, data: Measurements) -> bool:
 def _fitted_term(
     candidate: MechanismCandidate,
     level: float,
-    place: Place | None,
     fit: Fit,
-    cost: float,
     context: FitContext,
     *,
-    smooth: SmoothFunction | None = None,
     begin: Fit | None = None,
-) -> list[Term]:
+) -> list[FittedCandidate]:
     """A function as part of a model, or nothing where it cannot be fitted."""
-    kind = FORMULA if smooth is None else smooth.kind
-    data, budget = context.data, context.budget
-
+    kind, data, budget = candidate.kind, context.data, context.budget
     try:
         budget.says(f"a {kind}: {candidate.label}")
         with budget.part(LARGEST_PART):
@@ -179,15 +160,14 @@ def _fitted_term(
                 trial = preferred_fit(trial, damped)
             if not trial.converged:
                 raise NumericalFailure(trial.fault or "its fit does not settle")
-            fitted = FittedCandidate.of(trial, fit, data, candidate, blocks=context.study.search.blocks)
+            return [FittedCandidate.of(trial, fit, data, candidate, blocks=context.study.search.blocks)]
     except (*NUMERICAL_ERRORS, BudgetSpent) as error:
         LOGGER.info("%s as a %s cannot be fitted: %s", candidate.label, kind, error)
         return []
-    return [Term(fitted, kind, cost, place, smooth)]
 
 
 def _asked(
-    fit: Fit, data: Measurements, place: Place, *, known: Term | None, alike: bool = False
+    fit: Fit, data: Measurements, place: Place, *, known: FittedCandidate | None, alike: bool = False
 ) -> Smoothness | None:
     """See `Smoothness.of`; what is beyond all numbers ends a function, not a case."""
     try:
@@ -198,7 +178,7 @@ def _asked(
 
 
 def _with_smooth_term(
-    before: tuple[Term, ...],
+    before: tuple[FittedCandidate, ...],
     fit: Fit,
     place: Place,
     cost: float,
@@ -216,7 +196,7 @@ def _with_smooth_term(
         if asked is None:
             break
         price = cost + float(np.log(asked.considered))
-        parts: list[Term] = []
+        parts: list[FittedCandidate] = []
         # What promises to be rough and to need hardly any process noise may be what no fit can follow.
         for times, level in ((1.0, asked.level), (2.0, 1.0)):
             if parts:
@@ -226,11 +206,11 @@ def _with_smooth_term(
             except NUMERICAL_ERRORS as error:
                 LOGGER.info("no function of %s can be worked out: %s", " and ".join(place.words), error)
                 break
-            candidate = function.added_to(fit.model)
-            parts = _fitted_term(candidate, level, place, fit, price, context, smooth=function, begin=current)
+            candidate = replace(function.added_to(fit.model), log_cost=price)
+            parts = _fitted_term(candidate, level, fit, context, begin=current)
         if not parts:
             break
-        found = AugmentedModel((*before, parts[0]), parts[0].trial.fit)
+        found = AugmentedModel((*before, parts[0]), parts[0].fit)
         LOGGER.info(
             "%s, %d bumps: log-likelihood %.1f",
             candidate.label, function.width, found.fit.log_likelihood,
@@ -253,10 +233,10 @@ def _with_surfaces(fit: Fit, models: Sequence[AugmentedModel], context: FitConte
     single = [each for each in models if len(each.parts) == 1]
     begins: list[tuple[Place, AugmentedModel | None]] = []
     for each in single[:FUNCTIONS_FITTED]:
-        if (place := each.parts[0].place) is not None:
+        if (place := each.parts[0].candidate.place) is not None:
             begins.append((place, each))
     if not single:  # one of two may tell so little of either coordinate alone
-        begins = [(place, None) for place in _ranked_places(fit, context)[:FUNCTIONS_FITTED]]
+        begins = [(each.term, None) for each in rank_places(fit, data, context.roles)[:FUNCTIONS_FITTED]]
     names = [name for name in coordinates_of(fit.model) if name != "t"]
     asked: list[tuple[float, Place, AugmentedModel | None]] = []
     done = set()
@@ -278,7 +258,7 @@ def _with_surfaces(fit: Fit, models: Sequence[AugmentedModel], context: FitConte
                 asked.append((both.log_evidence - alone, pair, like))
     cost = float(np.log(max(len(asked), 1)))
     ranked = sorted((each for each in asked if each[0] > cost), key=lambda each: -each[0])
-    price = max((part.cost for model in models for part in model.parts), default=0.0) + cost
+    price = max((part.candidate.log_cost for model in models for part in model.parts), default=0.0) + cost
     found: list[AugmentedModel] = []
     for _, pair, like in ranked[:FUNCTIONS_FITTED]:
         for product in (True, False):
@@ -289,65 +269,53 @@ def _with_surfaces(fit: Fit, models: Sequence[AugmentedModel], context: FitConte
     return found
 
 
-def _ranked_places(fit: Fit, context: FitContext) -> list[Place]:
-    """See `rank_places`; none where nothing can be screened."""
-    try:
-        return rank_places(fit, context.data, context.roles)
-    except NUMERICAL_ERRORS as error:
-        LOGGER.info("no function can be screened: %s", error)
-        return []
+def with_function(before: tuple[FittedCandidate, ...], fit: Fit, context: FitContext) -> list[AugmentedModel]:
+    """Models with one function more on top of a fit, that earns it, the likeliest first.
 
-
-def with_function(before: tuple[Term, ...], fit: Fit, context: FitContext) -> list[AugmentedModel]:
-    """Models with one function more, in the likeliest places, that earn it.
-
-    Parameters
-    ----------
-    before, fit
-        What was added already, and the fit with it.
-    context
-        What models are made from.
-
-    Returns
-    -------
-    list of AugmentedModel
-        The likeliest first, with the evidence over that of `fit`.
+    The evidence is that over the fit with what was added before.
     """
     data = context.data
     context.budget.says("comparing functions without a name")
-    ranked = _ranked_places(fit, context)
+    ranked = rank_places(fit, data, context.roles)
     cost = float(np.log(max(len(ranked), 1)))  # a function is chosen among so many places
-    ranked = [each for each in ranked if each.log_evidence > cost]
+    ranked = [each for each in ranked if each.gain > cost]
     if not ranked:
         return []
     models = _formulas(before, fit, ranked, cost, context)
-    alone = (each for each in ranked if len(each.words) == 1)
+    alone = (each for each in ranked if len(each.term.words) == 1)
     chosen = {id(each): each for each in (*ranked[:FUNCTIONS_FITTED], *itertools.islice(alone, 1))}
-    for place in chosen.values():
-        models += _with_smooth_term(before, fit, place, cost, context)
-    given = sum(part.cost for part in before)
+    for one in chosen.values():
+        models += _with_smooth_term(before, fit, one.term, cost, context)
+    given = sum(part.candidate.log_cost for part in before)
     found = [replace(each, log_evidence=each.log_evidence + given) for each in _weighed(models, fit, data)]
     for each in found:
         last = each.parts[-1]
         LOGGER.info(
             "%s as a %s: log-evidence better by %.1f",
-            last.trial.candidate.label, last.kind, each.log_evidence,
+            last.candidate.label, last.candidate.kind, each.log_evidence,
         )  # fmt: skip
     return [each for each in found if each.log_evidence > 0]
 
 
 def _formulas(
-    before: tuple[Term, ...], fit: Fit, ranked: Sequence[Place], cost: float, context: FitContext
+    before: tuple[FittedCandidate, ...],
+    fit: Fit,
+    ranked: Sequence[Ranked[Place]],
+    cost: float,
+    context: FitContext,
 ) -> list[AugmentedModel]:
     """Formulas in the likeliest places, each once."""
-    knots = {(each.targets, each.words): each.knots for each in ranked}
+    knots = {(each.term.targets, each.term.words): each.term.knots for each in ranked}
     done: set[frozenset[tuple[str, sympy.Expr]]] = set()
     models: list[AugmentedModel] = []
     for likely in ranked[:FUNCTIONS_FITTED]:
-        if (found := formula_in(likely, fit, context.data, degree=context.study.degree)) is None:
+        candidate = formula_in(
+            likely.term, fit, context.data, level=likely.level, degree=context.study.degree
+        )
+        if candidate is None or (place := candidate.place) is None:
             continue
-        place, candidate = found
-        place = replace(place, knots=knots.get((place.targets, place.words), likely.knots))
+        place = replace(place, knots=knots.get((place.targets, place.words), likely.term.knots))
+        candidate = replace(candidate, place=place, log_cost=cost)
         # A sum of x²v and xv² is the same function, whichever coordinate comes first.
         monomials = frozenset(
             (name, formula.diff(symbol(amplitude)))
@@ -355,8 +323,8 @@ def _formulas(
             for amplitude in candidate.amplitudes
         )
         if monomials not in done:
-            parts = _fitted_term(candidate, likely.level, place, fit, cost, context)
-            models += [AugmentedModel((*before, each), each.trial.fit) for each in parts]
+            parts = _fitted_term(candidate, likely.level, fit, context)
+            models += [AugmentedModel((*before, each), each.fit) for each in parts]
         done.add(monomials)
     return models
 
@@ -370,14 +338,14 @@ def _memory_suspected(models: Sequence[AugmentedModel], data: Measurements) -> b
     if not models:
         return True
     best = models[0]
-    place = best.parts[0].place
+    place = best.parts[0].candidate.place
     told = len(best.parts) == 1 and place is not None and len(place.words) == 1 and place.words[0] != "t"
     return not told or has_structure(best.fit, data)
 
 
 def _with_memories(fit: Fit, models: Sequence[AugmentedModel], context: FitContext) -> list[AugmentedModel]:
     """Models with a hidden state that follows a coordinate late, or that it makes ring."""
-    likely = {name for each in models for part in each.parts for name in part.trial.candidate.equations}
+    likely = {name for each in models for part in each.parts for name in part.candidate.equations}
     candidates = sorted(
         _memories_of(fit.model, context.roles), key=lambda each: not likely & set(each.equations)
     )
@@ -393,25 +361,24 @@ def _with_memories(fit: Fit, models: Sequence[AugmentedModel], context: FitConte
     with context.budget.part(LARGEST_PART):
         screened, _ = screen_all(context.data, fit, begun, budget=context.budget)
     found: list[AugmentedModel] = []
-    ranked = sorted(best_probes(screened).values(), key=lambda each: -each[1].gain)
-    for probe, result in ranked[:MEMORIES_FITTED]:
-        if result.gain < 2 * cost:
+    ranked = sorted(best_probes(screened).values(), key=lambda each: -each.gain)
+    for each in ranked[:MEMORIES_FITTED]:
+        if each.gain < 2 * cost:
             break
         # Fitted from no effect on, with the τ that promises most.
-        candidate, model = probe.candidate, probe.candidate.model
-        known = dict(probe.shapes)
-        values = [known.get(each.name, each.value) for each in model.parameters]
-        candidate = replace(candidate, model=model.with_values(np.array(values)))
+        candidate, known = each.term.candidate, dict(each.term.shapes)
+        values = [known.get(one.name, one.value) for one in candidate.model.parameters]
+        begun_model = candidate.model.with_values(np.array(values))
+        candidate = replace(candidate, model=begun_model, log_cost=cost)
         try:
-            x = probe.states_along(fit, context.data, fit.x)
+            x = each.term.states_along(fit, context.data, fit.x)
         except NUMERICAL_ERRORS as error:
             LOGGER.info("%s cannot be fitted: %s", candidate.label, error)
             continue
-        begin = replace(fit, x=x)
-        for part in _fitted_term(candidate, result.level, None, fit, cost, context, begin=begin):
-            LOGGER.info("%s: chi2 better by %.1f", candidate.label, part.trial.delta_chi2)
-            if candidate.admits(part.trial.fit):
-                found.append(AugmentedModel((part,), part.trial.fit))
+        for part in _fitted_term(candidate, each.level, fit, context, begin=replace(fit, x=x)):
+            LOGGER.info("%s: chi2 better by %.1f", candidate.label, part.delta_chi2)
+            if candidate.admits(part.fit):
+                found.append(AugmentedModel((part,), part.fit))
     return found
 
 
@@ -423,7 +390,7 @@ def _memories_of(model: Dynamics, roles: Roles) -> list[MechanismCandidate]:
         name = f"a memory of {each.coordinate}"
         variant = f", {each.variant}" if each.variant else ""
         label = f"{name} in {', '.join(each.equations)}{variant}"
-        found.append(replace(each, name=name, label=label))
+        found.append(replace(each, name=name, label=label, kind=FORMULA))
     return found
 
 
@@ -478,14 +445,7 @@ def fit_unnamed_models(
 ) -> tuple[AugmentedModel, ...]:
     """Models of what is missing, the likeliest first; none where none is likelier than the simulation alone.
 
-    Parameters
-    ----------
-    search
-        What was found; mechanisms among it are one of the models.
-    context
-        What models are made from.
-    functions
-        Those without mechanisms, where they are fitted already.
+    Mechanisms that a search found are one of the models. Functions may be fitted already.
     """
     base, data = search.recalibrated, context.data
     models = list(with_function((), base, context) if functions is None else functions)
@@ -501,7 +461,7 @@ def fit_unnamed_models(
         best is not None
         and best.fit.model.dimension == base.model.dimension
         and len(best.parts) < DESCRIBED_MOST
-        and (functions is None or best.parts[0].kind == MECHANISM)
+        and (functions is None or best.parts[0].candidate.kind == MECHANISM)
         and has_structure(best.fit, data)
     ):
         models += with_function(best.parts, best.fit, context)
@@ -514,20 +474,11 @@ def fit_models_of_remainder(
     """Models of what mechanisms with a name leave, the likeliest first; none where none is likelier.
 
     They are what was found on top of the names, not certain enough for one itself, and functions on top of
-    all that was found.
-
-    Parameters
-    ----------
-    named, whole
-        The search with what is named, and with all that was found.
-    context
-        What models are made from.
-    functions
-        Those on top of the names alone, where they are fitted already.
+    all that was found. Functions on top of the names alone may be fitted already.
     """
     base, data = named.fit, context.data
 
-    def on_top(parts: tuple[Term, ...], fit: Fit) -> list[AugmentedModel]:
+    def on_top(parts: tuple[FittedCandidate, ...], fit: Fit) -> list[AugmentedModel]:
         if fit.model.dimension > named.recalibrated.model.dimension or not has_structure(fit, data):
             return []
         return with_function(parts, fit, context)
@@ -549,10 +500,12 @@ def fit_models_of_remainder(
     return _likeliest(allowed, base, data)
 
 
-def _terms_of(search: Search, context: FitContext) -> tuple[Term, ...]:
+def _terms_of(search: Search, context: FitContext) -> tuple[FittedCandidate, ...]:
     """The mechanisms of a search as parts of a model, each chosen among all that were considered."""
     cost = float(np.log(max(len(context.candidates), 1)))
-    return tuple(Term(each.best, MECHANISM, cost) for each in search.found)
+    return tuple(
+        replace(each.best, candidate=replace(each.best.candidate, log_cost=cost)) for each in search.found
+    )
 
 
 def exact_fit(fit: Fit, data: Measurements, budget: Budget | None = None) -> Fit | None:

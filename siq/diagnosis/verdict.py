@@ -15,10 +15,9 @@ import sympy
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
 from siq.diagnosis.evidence import BUDGET_SPENT, FittedCandidate, log_evidences, residuals
 from siq.diagnosis.investigation import HeldOutRuns
-from siq.diagnosis.mechanisms import PROCESS_NOISE
+from siq.diagnosis.mechanisms import PROCESS_NOISE, SURFACE
 from siq.diagnosis.naming import Investigation
 from siq.diagnosis.residual_structure import Structure
-from siq.diagnosis.smooth_functions import Term
 from siq.diagnosis.statement import (
     Alternative,
     DescribedCurve,
@@ -33,7 +32,6 @@ from siq.diagnosis.statement import (
     UpperBound,
 )
 from siq.diagnosis.study import MismatchVerdict
-from siq.diagnosis.terms import SURFACE
 from siq.diagnosis.unnamed_models import AugmentedModel
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
@@ -52,33 +50,19 @@ AFFECTED_SHARE = 0.5  # of its fair share of the excess, from which on a recordi
 
 
 def statement_of_failure(reason: str) -> Statement:
-    """The statement about a simulation that cannot be fitted to the recordings at all.
-
-    Parameters
-    ----------
-    reason
-        What happened, in lower case and without a full stop.
-    """
+    """What is stated of a simulation that cannot be fitted to the recordings at all, for a reason."""
     return Statement(MismatchVerdict.UNEXPLAINED, remarks=(Remark("diagnosis.no_fit", {"reason": reason}),))
 
 
 def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
-    """What follows from an investigation.
-
-    Parameters
-    ----------
-    investigation
-        What was found.
-    shown
-        The fit on those held out.
-    """
+    """What follows from an investigation, and from the runs of recordings held out."""
     search, verdict = investigation.search, investigation.verdict
     described = shown.described if shown.adopted else None
     described_fit = shown.described_fit if shown.adopted else None
     found = _found_mechanisms(investigation, described_fit if verdict.names else None)
     names = tuple(each.best.candidate.label for each in search.found) if verdict.names else ()
     parts = () if described is None else described.parts
-    labels = [each.trial.candidate.label for each in parts]
+    labels = [each.candidate.label for each in parts]
     final = investigation.final if described_fit is None else described_fit
     errors = _standard_errors(final)
     remarks = list(investigation.remarks)
@@ -137,7 +121,7 @@ def _explanations(investigation: Investigation, names: tuple[str, ...]) -> dict[
     if search.found:
         fits.append((" and ".join(each.best.candidate.label for each in search.found), search.fit))
     fits += [
-        (" and ".join((*names, *(part.trial.candidate.label for part in model.parts))), model.fit)
+        (" and ".join((*names, *(part.candidate.label for part in model.parts))), model.fit)
         for model in investigation.models
     ]
     known = [each for each in fits if np.isfinite(each[1].log_likelihood)]
@@ -153,11 +137,11 @@ def _explanations(investigation: Investigation, names: tuple[str, ...]) -> dict[
 def _excluded(investigation: Investigation) -> dict[str, UpperBound]:
     """Upper bounds (95 %) of the amplitudes of mechanisms that were not found."""
     bounds: dict[str, UpperBound] = {}
-    for probe, result in investigation.search.screened:
-        candidate = probe.candidate
-        units = {each.name: each.unit for each in candidate.model.parameters}
+    for each in investigation.search.screened:
+        candidate = each.term.candidate
+        units = {one.name: one.unit for one in candidate.model.parameters}
         for name, estimate, error in zip(
-            candidate.amplitudes, result.amplitudes, result.standard_errors, strict=False
+            candidate.amplitudes, each.amplitudes, each.standard_errors, strict=False
         ):
             bound = abs(float(estimate)) + BOUND_ERRORS * float(error)
             known = bounds.get(candidate.label)
@@ -239,9 +223,10 @@ def _stated(trial: FittedCandidate, fit: Fit, *, log_odds: float | None = None, 
     )
 
 
-def _stated_function(part: Term, fit: Fit, beside: tuple[str, ...]) -> StatedTerm:
+def _stated_function(part: FittedCandidate, fit: Fit, beside: tuple[str, ...]) -> StatedTerm:
     """A part of the model of what has no name, with its curve or surface and their standard errors."""
-    candidate, place, smooth = part.trial.candidate, part.place, part.smooth
+    candidate = part.candidate
+    place, smooth = candidate.place, candidate.smooth
     known = {entry.name: entry.value for entry in fit.model.parameters}
     amplitudes = np.array([known[name] for name in candidate.amplitudes])
     curve = surface = None
@@ -266,7 +251,7 @@ def _stated_function(part: Term, fit: Fit, beside: tuple[str, ...]) -> StatedTer
         variances = np.einsum("kc,cd,kd->k", weights, fit.covariance[np.ix_(rows, rows)], weights)
         shape, deviations = [len(each) for each in at], np.sqrt(np.maximum(variances, 0.0))
         shaped = [each.reshape(shape).tolist() for each in (values, deviations)]
-        if part.kind == SURFACE:
+        if candidate.kind == SURFACE:
             grid = (tuple(at[0].tolist()), tuple(at[1].tolist()))
             surface = DescribedSurface(
                 (place.words[0], place.words[1]), grid, *(tuple(map(tuple, each)) for each in shaped)
@@ -275,9 +260,9 @@ def _stated_function(part: Term, fit: Fit, beside: tuple[str, ...]) -> StatedTer
             curve = DescribedCurve(place.words[0], tuple(at[0].tolist()), *map(tuple, shaped))
     measured = [name for name, _ in candidate.changes if name in fit.model.output_names]
     return _stated(
-        part.trial,
+        part,
         fit,
-        kind=part.kind,
+        kind=candidate.kind,
         outputs=() if candidate.equations else tuple(measured),
         coordinates=tuple(candidate.coordinate.split(", ")) if place is None else place.words,
         curve=curve,
@@ -308,7 +293,7 @@ def _locate(investigation: Investigation, described: AugmentedModel | None = Non
     if investigation.verdict.names and search.found:
         candidate = search.found[0].best.candidate
     elif not investigation.verdict.names and (model := described or next(iter(investigation.models), None)):
-        candidate = model.parts[0].trial.candidate
+        candidate = model.parts[0].candidate
     if candidate is not None:
         equations, coordinate = candidate.equations, candidate.coordinate
         if not equations:  # it changes nothing but what sensors read

@@ -20,11 +20,9 @@ from siq.diagnosis.evidence import FittedCandidate
 from siq.diagnosis.investigation import held_out_runs
 from siq.diagnosis.naming import Investigation
 from siq.diagnosis.residual_structure import Remainder
-from siq.diagnosis.screening import Probe
+from siq.diagnosis.screening import Probe, Ranked
 from siq.diagnosis.search import FitContext, Search
-from siq.diagnosis.smooth_functions import Term
 from siq.diagnosis.study import MismatchVerdict, read_case
-from siq.diagnosis.terms import MECHANISM
 from siq.diagnosis.unnamed_models import AugmentedModel
 from siq.errors import InputError, NumericalFailure
 from siq.remarks import has_code
@@ -218,8 +216,8 @@ def test_random_forces_are_no_noise_where_a_function_beside_them_is_likelier(
     def models(search: Search, _: FitContext) -> tuple[AugmentedModel, ...]:
         # A function of a sensor that leaves process noise, and is likelier than noise alone.
         assert search.recalibrated.has_process_noise
-        candidate = next(each.candidate for each, _ in search.screened if not each.candidate.equations)
-        part = Term(FittedCandidate(candidate, search.recalibrated, 50.0, 40.0, 0.0, 0.0), MECHANISM, 0.0)
+        candidate = next(each.term.candidate for each in search.screened if not each.term.candidate.equations)
+        part = FittedCandidate(candidate, search.recalibrated, 50.0, 40.0, 0.0, 0.0)
         return (AugmentedModel((part,), search.recalibrated, 5.0),)
 
     monkeypatch.setattr(investigation, "fit_unnamed_models", models)
@@ -412,10 +410,10 @@ def test_a_candidate_whose_fit_fails_unforeseen_is_recorded_with_the_reason(
 ) -> None:
     right = search._with_start
 
-    def failing(probe: Probe, *further: Any) -> Dynamics:
-        if probe.candidate.name == "cubic stiffness":
+    def failing(promised: Ranked[Probe], *further: Any) -> Dynamics:
+        if promised.term.candidate.name == "cubic stiffness":
             raise error
-        return right(probe, *further)
+        return right(promised, *further)
 
     monkeypatch.setattr(search, "_with_start", failing)
     kept = {"cubic stiffness", "quintic stiffness"}

@@ -273,8 +273,8 @@ def test_each_mechanism_is_among_those_that_are_fitted(name: str) -> None:
     data = recorded(resident)
     best: dict[str, float] = {}
     screened, _ = screen_all(data, recalibrate(model, data)[0], candidates(model))
-    for probe, result in screened:
-        label = probe.candidate.label
-        best[label] = max(best.get(label, 0.0), result.gain)
+    for each in screened:
+        label = each.term.candidate.label
+        best[label] = max(best.get(label, 0.0), each.gain)
     ranked = sorted(best, key=lambda label: -best[label])[: SearchOptions().fitted]
     assert truth.label in ranked and best[truth.label] > SearchOptions().same

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from siq.diagnosis import screening
 from siq.diagnosis.diagnosis import Diagnosis, solve_case, tables_of
 from siq.diagnosis.study import Allowance
 from siq.errors import NumericalFailure
@@ -135,12 +136,11 @@ def test_a_candidate_that_overflows_ends_itself_and_not_the_case(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Screening that has no numbers leaves what can be said without it."""
-    from siq.diagnosis import screening as promises
 
     def overflow(*_: object, **__: object) -> None:
         raise NumericalFailure("it runs away")
 
-    monkeypatch.setattr(promises, "_screen", overflow)
+    monkeypatch.setattr(screening, "by_likelihood", overflow)
     found = answered(falling_ball(0.3), tmp_path)
     assert {each.reason for each in found.statement.not_fitted} == {"it runs away"}
     assert not found.statement.partial and np.isfinite(found.statement.errors.recalibrated or 0.0)

@@ -116,7 +116,7 @@ def test_a_name_stands_beside_a_rest_where_no_function_does_as_well_in_its_place
     known = {id(own): None if foreseen is None else squares(draw, foreseen)}
     without = squares(draw, 1.0)
     monkeypatch.setattr(naming, "errors_left_out", lambda fit, *_, **__: known.get(id(fit), without))
-    part = SimpleNamespace(cost=1.0)
+    part = SimpleNamespace(candidate=SimpleNamespace(log_cost=1.0))
 
     def functions(parts: tuple, fit: SimpleNamespace, _: object) -> list[AugmentedModel]:
         if fit is own:

@@ -17,7 +17,7 @@ from siq.diagnosis.evidence import FittedCandidate, _blocks_of, _correlated_prob
 from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.diagnosis.naming import Investigation, _judge_mechanisms
 from siq.diagnosis.residual_structure import Curve, Remainder, Structure
-from siq.diagnosis.screening import _screen
+from siq.diagnosis.screening import _rank_along, by_likelihood
 from siq.diagnosis.search import AcceptedMechanism, FitContext, Search, _accepted, _better_without
 from siq.diagnosis.study import MismatchStudy, SearchOptions
 from siq.diagnosis.terms import ONE, Place
@@ -111,10 +111,9 @@ def test_an_amplitude_that_may_not_be_negative_is_zero_and_leaves_the_special_ca
         measured_response=np.concatenate([known.measured_response, shapes[:, None, :]], axis=2),
         response=np.concatenate([known.response, np.zeros((*known.response.shape[:2], 2))], axis=2),
     )
-    either, first, both = _screen(
-        with_shapes, data, fit, [slice(0, 2), slice(0, 1), slice(0, 2)],
-        positive=[np.array([True, True]), np.array([True]), np.array([False, False])],
-    )  # fmt: skip
+    groups = [slice(0, 2), slice(0, 1), slice(0, 2)]
+    terms = [SimpleNamespace(positive=np.array(each)) for each in ([True, True], [True], [False, False])]
+    either, first, both = _rank_along(with_shapes, groups, fit, data, terms, by_likelihood)
     assert either.amplitudes[1] == 0
     assert either.amplitudes[0] == pytest.approx(first.amplitudes[0])
     assert either.gain == pytest.approx(first.gain)

@@ -64,7 +64,7 @@ def context(data: Measurements) -> FitContext:
 def test_what_x_was_is_likelier_than_any_function(fading: Measurements, alone: Fit) -> None:
     models = fit_unnamed_models(Search(alone, (), alone, ()), context(fading))
     (part,) = models[0].parts
-    assert part.trial.candidate.name == "a memory of x"
+    assert part.candidate.name == "a memory of x"
     found = {each.name: each.value for each in models[0].fit.model.parameters}
     # A decay with a memory is a sum of two; of k, c and τ their rates tell two combinations.
     k, c, tau = found["k"], found["c_1"], found["tau_1"]
@@ -84,7 +84,7 @@ def test_a_memory_whose_fit_leads_away_begins_again(
 
     monkeypatch.setattr(unnamed_models, "fit_with_process_noise_as_needed", leading_away)
     found = _with_memories(still, [], context(fading))
-    kept = {each.parts[0].trial.candidate.label: each.fit.log_likelihood for each in found}
+    kept = {each.parts[0].candidate.label: each.fit.log_likelihood for each in found}
     assert kept["a memory of x in x"] > 2000 and kept["a memory of x in x, as a rate"] > -1e3
     # Nothing rings here: how much it is damped no recording tells, and such a fit may lead away once more.
     assert min(kept.values()) >= -1e3
@@ -125,7 +125,7 @@ def test_the_time_is_suspected_of_standing_in_for_what_was(
 ) -> None:
     monkeypatch.setattr("siq.diagnosis.unnamed_models.has_structure", lambda *_: False)
     place = Place((("x", sympy.Integer(1)),), (), (X,), words)
-    model = SimpleNamespace(parts=(SimpleNamespace(place=place),), fit=None)
+    model = SimpleNamespace(parts=(SimpleNamespace(candidate=SimpleNamespace(place=place)),), fit=None)
     assert _memory_suspected([model], fading) is suspected
     assert _memory_suspected([], fading)
 
@@ -152,8 +152,8 @@ def test_a_function_whose_fit_leads_away_begins_again(monkeypatch: pytest.Monkey
     context = FitContext(DECAY, data, SimpleNamespace())
 
     def fitted() -> Fit:
-        (part,) = _fitted_term(candidate, 1.0, place, alone, 0.0, context)
-        return part.trial.fit
+        (part,) = _fitted_term(candidate, 1.0, alone, context)
+        return part.fit
 
     right = fitted()
     away = replace(right, log_likelihood=alone.log_likelihood - 50, model=right.model.with_values(np.ones(2)))
