@@ -77,38 +77,22 @@ EIGENVALUE_FLOOR = 1e-9  # of the largest, so that a covariance can be inverted
 class MarkovLag:
     """How long a record remembers, and why.
 
-    Attributes
-    ----------
-    kind
-        ``none``: no noise. ``white``: white process noise. ``sensor``: measurement noise, new
-        in each sample. ``blur``: each sample is a mean over an exposure. ``coloured``: the process noise
-        have a memory, or the sensor is slow. ``either`` of these two. ``memory``: it remembers in another
-        way, such as by an oscillation of its own. ``hidden``: it remembers longer than
-        it takes to relax, as where a state is not recorded. ``unknown``: too few samples, or uneven ones.
-    lag
-        From so many steps on it is Markovian: 0 of white noise, None where no such lag was found.
-    step
-        The usual time between samples.
-    memory
-        Exposure, or memory of the forces, in the unit of time; 0 where there is none.
-    relaxation
-        The shortest time in which the state relaxes, in the unit of time; NaN where nothing is known of it.
-    lags, correlations, errors
-        Shapes ``(K,)``, ``(K, d)`` and ``(K, d)``: correlation of residuals so many steps apart, for each
-        state, and its standard error were there none.
-    sensor
-        Shape ``(d,)``: standard deviation of the sensor's error, where it follows; else 0.
+    Its kind is ``none``: no noise. ``white``: white process noise. ``sensor``: measurement noise, new in each
+    sample. ``blur``: each sample is a mean over an exposure. ``coloured``: the process noise has a memory, or
+    the sensor is slow. ``either`` of these two. ``memory``: it remembers in another way, such as by an
+    oscillation of its own. ``hidden``: it remembers longer than it takes to relax, as where a state is not
+    recorded. ``unknown``: too few samples, or uneven ones.
     """
 
     kind: Kind
-    lag: int | None
-    step: float
-    memory: float
-    relaxation: float
-    lags: np.ndarray
-    correlations: np.ndarray
-    errors: np.ndarray
-    sensor: np.ndarray
+    lag: int | None  #: from so many steps on it is Markovian: 0 of white noise, None where none was found
+    step: float  #: the usual time between samples
+    memory: float  #: exposure, or memory of the forces, in the unit of time; 0 where there is none
+    relaxation: float  #: the shortest time in which the state relaxes; NaN where nothing is known of it
+    lags: np.ndarray  #: (K,), in steps
+    correlations: np.ndarray  #: (K, d): of residuals so many steps apart, for each state
+    errors: np.ndarray  #: (K, d): standard errors of these, were there no correlation
+    sensor: np.ndarray  #: (d,): standard deviation of the sensor's error, where it follows; else 0
 
     @property
     def remembers(self) -> bool:
@@ -381,22 +365,12 @@ VISIBLE_NOISE = 1e-3  # of the rms step of a state: noise below that share is no
 
 @dataclass(frozen=True)
 class NoiseFloor:
-    """The noise of one state.
+    """The noise of one state; zero where none is seen."""
 
-    Attributes
-    ----------
-    sensor
-        Standard deviation of the sensor's error, in the state's unit; 0 where none is seen.
-    process
-        Variance that process noise adds per unit of time; 0 where none is seen.
-    sensor_error, process_error
-        Their standard errors.
-    """
-
-    sensor: float
-    process: float
-    sensor_error: float
-    process_error: float
+    sensor: float  #: standard deviation of the sensor's error, in the state's unit
+    process: float  #: variance that process noise adds per unit of time
+    sensor_error: float  #: standard error of the first
+    process_error: float  #: standard error of the second
 
 
 def noise_floors(recordings: Recordings) -> tuple[NoiseFloor, ...] | None:

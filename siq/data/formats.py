@@ -51,26 +51,15 @@ _COMMENTS = ("#", "%", "//")
 class ColumnFile:
     """The columns of a file, of which only the names have been read.
 
-    Attributes
-    ----------
-    headings
-        What stands above the columns, in the order of the file, a unit included where there is one.
-    units
-        The unit of each column that stands neither in its heading nor in its cells (Parquet field metadata,
-        HDF5 attribute, a second line of headings), None where there is none.
-    load
-        Reads the columns of the given positions in `headings`; all have the same length.
-    titles
-        What people call each column, where the file keeps that beside a name (Parquet that we wrote).
-    remarks
-        What was recognised or assumed.
+    The units are those that stand neither in headings nor in cells: Parquet field metadata, an HDF5
+    attribute, a second line of headings.
     """
 
-    headings: tuple[str, ...]
-    units: tuple[str | None, ...]
-    load: Callable[[Sequence[int]], list[Column]]
-    titles: tuple[str | None, ...] = ()
-    remarks: tuple[Remark, ...] = ()
+    headings: tuple[str, ...]  #: what stands above the columns, in their order, a unit included
+    units: tuple[str | None, ...]  #: of each column, None where there is none
+    load: Callable[[Sequence[int]], list[Column]]  #: columns of positions in `headings`, of one length
+    titles: tuple[str | None, ...] = ()  #: what people call each, where a file that we wrote keeps that
+    remarks: tuple[Remark, ...] = ()  #: what was recognised or assumed
 
 
 def open_columns(path: str | Path | pd.DataFrame) -> ColumnFile:

@@ -59,32 +59,16 @@ class Span(NamedTuple):
 
 @dataclass(frozen=True)
 class StateFacts:
-    """What is known of one measured column.
+    """What is known of one measured column."""
 
-    Attributes
-    ----------
-    name, title
-        Its name in formulas, and what the file calls it.
-    unit
-        None where the file does not say.
-    lowest, highest
-        The interval of its values.
-    quantum
-        The step to which it was rounded when it was written, None where none is recognised.
-    noise
-        A first look at its noise; None where neighbouring samples are too few or uneven.
-    values
-        How many different values it has, where these are so few that it is rather a label than a state.
-    """
-
-    name: str
-    title: str
-    unit: str | None
-    lowest: float
-    highest: float
-    quantum: float | None
-    noise: NoiseFloor | None
-    values: int | None = None
+    name: str  #: in formulas
+    title: str  #: what the file calls it
+    unit: str | None  #: None where the file does not say
+    lowest: float  #: of its values
+    highest: float  #: of its values
+    quantum: float | None  #: the step to which it was rounded when it was written; None for none
+    noise: NoiseFloor | None  #: a first look; None where neighbouring samples are too few or uneven
+    values: int | None = None  #: how many differ, where so few that it is rather a label than a state
 
     def sensor_dominates(self, step: float) -> bool:
         """Whether measurement noise, other than rounding, is more than an identification takes."""
@@ -97,51 +81,23 @@ class StateFacts:
 
 @dataclass(frozen=True)
 class Inspection:
-    """A file of recordings at a glance.
+    """A file of recordings at a glance."""
 
-    Attributes
-    ----------
-    file
-        As it was named.
-    recordings
-        What was read.
-    states
-        The measured columns.
-    samples
-        Of a recording: the fewest, the usual number, the most.
-    durations
-        Of a recording, in the unit of time.
-    steps
-        Between neighbouring samples, in the unit of time; None where no recording has two.
-    pairs
-        Number of neighbouring samples that are close enough to learn from.
-    gaps
-        Number of neighbouring samples that are further apart than that.
-    memory
-        From which lag on the recordings are Markovian, and what makes them remember until then.
-    coverage
-        Share of the range of the first two states (of one, where there is one) that was visited: of the cells
-        of a grid over it.
-    switching
-        Two states with the hops between them and the background; None where nothing is known of them, as of
-        recordings without noise.
-    """
-
-    file: str
-    recordings: Recordings
-    states: tuple[StateFacts, ...]
-    samples: Span
-    durations: Span
-    steps: Span | None
-    pairs: int
-    gaps: int
-    memory: MarkovLag
-    coverage: float
-    switching: RecordStates | None
+    file: str  #: as it was named
+    recordings: Recordings  #: what was read
+    states: tuple[StateFacts, ...]  #: the measured columns
+    samples: Span  #: of a recording: the fewest, the usual number, the most
+    durations: Span  #: of a recording, in the unit of time
+    steps: Span | None  #: between neighbouring samples, in the unit of time; None where no recording has two
+    pairs: int  #: number of neighbouring samples that are close enough to learn from
+    gaps: int  #: number of neighbouring samples that are further apart than that
+    memory: MarkovLag  #: from which lag on they are Markovian, and what makes them remember until then
+    coverage: float  #: share of the cells of a grid over the range of the first two states that was visited
+    switching: RecordStates | None  #: two states with the hops between them; None of recordings without noise
 
     @property
     def seen(self) -> RecordStates | None:
-        """The two states that the recordings show by themselves; None where nothing is known of them."""
+        """Another name of `switching`."""
         return self.switching
 
     @property

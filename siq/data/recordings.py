@@ -269,21 +269,13 @@ class Recordings:
 class SnapshotPairs:
     """States a short time apart, each pair with its own step. See `snapshot_pairs`.
 
-    Attributes
-    ----------
-    x0, xh
-        Shape ``(n, d)``: the earlier and the later state.
-    h
-        Shape ``(n,)``: the time between the two.
-    recording
-        Shape ``(n,)``: the index of the recording that the pair is from. Copies of a resampled recording
-        share one, so that none is held out while another trains.
+    Copies of a resampled recording share one index, so that none is held out while another trains.
     """
 
-    x0: np.ndarray
-    xh: np.ndarray
-    h: np.ndarray
-    recording: np.ndarray
+    x0: np.ndarray  #: (n, d): the earlier state
+    xh: np.ndarray  #: (n, d): the later state
+    h: np.ndarray  #: (n,): the time between the two
+    recording: np.ndarray  #: (n,): the index of the recording that the pair is from
 
     def take(self, rows: np.ndarray) -> SnapshotPairs:
         """Some of the pairs, by their indices or by a mask."""

@@ -173,19 +173,10 @@ def _slow(recordings: Recordings, values: np.ndarray, half_periods: int) -> np.n
 
 
 class Stretches(NamedTuple):
-    """Steps between neighbouring samples, numbered by the stretch of even steps that they belong to.
+    """Steps between neighbouring samples, numbered by the stretch of even steps that they belong to."""
 
-    Attributes
-    ----------
-    number
-        Shape ``(n - 1,)`` for n samples: the stretch of the step from sample k to sample k + 1, -1 where it
-        belongs to none.
-    step
-        The usual time between neighbouring samples, in the unit of time; 0 where there are none.
-    """
-
-    number: np.ndarray
-    step: float
+    number: np.ndarray  #: (n - 1,) for n samples: of the step from each to the next, -1 where it is in none
+    step: float  #: the usual time between neighbouring samples; 0 where there are none
 
     def within(self, lag: int) -> np.ndarray:
         """The first of `lag` + 1 steps that belong to one stretch, as indices of steps."""

@@ -146,18 +146,10 @@ CONFIDENCE = 0.95  # of the intervals of mean dwell times
 
 @dataclass(frozen=True)
 class DwellCount:
-    """How long a state lasts, as counted.
+    """How long a state lasts, as counted."""
 
-    Attributes
-    ----------
-    visits
-        How many were seen to end, each by a hop.
-    time
-        Spent in the state by all visits, in the unit of time.
-    """
-
-    visits: int
-    time: float
+    visits: int  #: seen to end, each by a hop
+    time: float  #: spent in the state by all visits, in the unit of time
 
     @classmethod
     def of_visits(
@@ -334,38 +326,22 @@ PULLED_TOGETHER = -3.0  # standard errors: where f falls so clearly between all 
 class RecordStates:
     """Two states that recordings show by themselves, and the hops between them.
 
-    Attributes
-    ----------
-    state
-        The measured quantity that shows them best, as its file calls it.
-    unit, time_unit
-        None where the file does not say.
-    supported
-        Whether the record supports two states at all: it is pushed apart, and was seen to hop at least once.
-    probability
-        Of so much with a single state over a slowly drifting background, both tests and all states counted.
-    levels
-        The two, the lower first, in the unit of the state; of the record less its background.
-    counts
-        How long each lasts, the lower first.
-    edges, density
-        Histogram of the state: edges ``(b + 1,)`` and, per unit of the state, ``(b,)``.
-    visits
-        Shape ``(n,)``: 0 or 1 at each sample, -1 before the record has reached a level. Not stored.
-    background
-        What drifts slowly below both levels, shape ``(n,)``; zero where nothing does. Not stored.
+    Two are supported if the record is pushed apart, and was seen to hop at least once. Levels and counts have
+    the lower one first. `as_data` leaves out what is of each sample.
     """
 
-    state: str
-    unit: str | None
+    state: str  #: the measured quantity that shows them best, as its file calls it
+    unit: str | None  #: None where the file does not say
     time_unit: str | None
-    supported: bool
-    probability: float
-    levels: tuple[float, float]
-    counts: tuple[DwellCount, DwellCount]
-    edges: np.ndarray
-    density: np.ndarray
+    supported: bool  #: whether the record supports two states at all
+    probability: float  #: of so much with a single state over a drifting background, all tests counted
+    levels: tuple[float, float]  #: in the unit of the state, of the record less its background
+    counts: tuple[DwellCount, DwellCount]  #: how long each lasts
+    edges: np.ndarray  #: (b + 1,): of the histogram of the state
+    density: np.ndarray  #: (b,): per unit of the state
+    #: (n,): 0 or 1 at each sample, -1 before the record has reached a level
     visits: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
+    #: (n,): what drifts slowly below both levels; zero where nothing does
     background: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod

@@ -43,21 +43,11 @@ Model = TypeVar("Model", bound=BaseModel)
 
 @dataclass(frozen=True)
 class Document:
-    """A YAML mapping with the line on which every entry stands.
+    """A YAML mapping with the line on which every entry stands."""
 
-    Attributes
-    ----------
-    file
-        The file as the user named it.
-    data
-        The mapping, of plain types only.
-    lines
-        Line number (from 1) of every entry, by its path of keys: ``("equations", "x")``.
-    """
-
-    file: str
-    data: dict[str, Any]
-    lines: dict[Keys, int]
+    file: str  #: as the user named it
+    data: dict[str, Any]  #: of plain types only
+    lines: dict[Keys, int]  #: number, from 1, of every entry by its path of keys: ``("equations", "x")``
 
     def place(self, keys: Keys) -> str:
         """Say where an entry stands, in words; the nearest parent's line where it has none."""

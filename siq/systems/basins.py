@@ -41,21 +41,11 @@ ATTRACTOR_DISTANCE = 1e-4  # of the recorded box: trajectories so close to an at
 
 @dataclass(frozen=True)
 class Descents:
-    """Trajectories of f from recorded points to where they end.
+    """Trajectories of f from recorded points to where they end."""
 
-    Attributes
-    ----------
-    paths
-        Shape ``(n, k, d)``: k states along each of the n trajectories, the first being the start.
-    ends
-        Shape ``(n,)``: index of the attractor at which each ends, -1 where it ends at none.
-    escaped
-        Shape ``(n,)``: whether it left the recorded box for good.
-    """
-
-    paths: np.ndarray
-    ends: np.ndarray
-    escaped: np.ndarray
+    paths: np.ndarray  #: (n, k, d): k states along each of the n trajectories, the first being the start
+    ends: np.ndarray  #: (n,): index of the attractor at which each ends, -1 where it ends at none
+    escaped: np.ndarray  #: (n,): whether it left the recorded box for good
 
 
 def follow(
@@ -310,20 +300,12 @@ BASIN_POINTS = 6000  # chosen in a basin, about: as many as a fit of V takes
 class Basin:
     """Points along descents to one attractor; what follows each point on its way is known.
 
-    Attributes
-    ----------
-    states
-        Shape ``(n, k, d)``: descents that end at the attractor.
-    chosen
-        Shape ``(s, 2)``: descent and place of evenly spread points among them.
-    spread
-        How many of the descents, the first ones, start evenly over the region; None for all. The others
-        start close to the attractor.
+    The first descents start evenly over the region, others close to the attractor.
     """
 
-    states: np.ndarray
-    chosen: np.ndarray
-    spread: int | None = None
+    states: np.ndarray  #: (n, k, d): descents that end at the attractor
+    chosen: np.ndarray  #: (s, 2): descent and place of evenly spread points among them
+    spread: int | None = None  #: how many start evenly over the region; None for all
 
     def starts(self, values: np.ndarray) -> np.ndarray:
         """Of values along descents, ``(n, k)``, those at the starts that are evenly spread."""

@@ -359,54 +359,29 @@ def _one_way(
 
 @dataclass(frozen=True, eq=False)
 class Bifurcation:
-    """A point of a branch at which the number of equilibria or their stability changes.
+    """A point of a branch at which the number of equilibria or their stability changes."""
 
-    Attributes
-    ----------
-    kind
-        ``fold``, ``Hopf`` or ``branch point``.
-    value
-        Of the parameter.
-    state
-        Shape ``(d,)``.
-    branch
-        Index of the branch on which it was found.
-    frequency
-        ω at a Hopf point, in radian per unit of time; 0 elsewhere.
-    residual
-        Largest component of f there, in shares of the domain per unit of time.
-    """
-
-    kind: str
-    value: float
-    state: np.ndarray
-    branch: int
-    frequency: float = 0.0
-    residual: float = 0.0
+    kind: str  #: ``fold``, ``Hopf`` or ``branch point``
+    value: float  #: of the parameter
+    state: np.ndarray  #: (d,)
+    branch: int  #: on which it was found
+    frequency: float = 0.0  #: ω at a Hopf point, in radian per unit of time; 0 elsewhere
+    residual: float = 0.0  #: largest component of f there, in shares of the domain per unit of time
 
 
 class Branch:
-    """Equilibria against a parameter; or folds, or Hopf points, along a curve in the plane of two.
-
-    Attributes
-    ----------
-    kind
-        ``equilibrium``, ``fold`` or ``Hopf``.
-    states
-        Shape ``(n, d)``.
-    values
-        Of the parameter, shape ``(n,)``, or of both, ``(n, 2)``.
-    tangents
-        In shares of the domain and of the range, the parameter last: shape ``(n, d + 1)``. Those of curves go
-        on with their further unknowns.
-    """
+    """Equilibria against a parameter; or folds, or Hopf points, along a curve in the plane of two."""
 
     def __init__(self, equations: _Equilibria, points: np.ndarray, tangents: np.ndarray) -> None:
-        self.kind, self.tangents = equations.kind, tangents
         self._equations, self._points = equations, points
+        self.kind = equations.kind  #: ``equilibrium``, ``fold`` or ``Hopf``
+        #: In shares of the domain and of the range, the parameter last: shape ``(n, d + 1)``. Those of curves
+        #: go on with their further unknowns.
+        self.tangents = tangents
         both = equations.family.natural(points[:, : equations.count])
-        self.states, values = np.split(both, [equations.d], axis=1)
-        self.values = values[:, 0] if values.shape[1] == 1 else values
+        states, values = np.split(both, [equations.d], axis=1)
+        self.states = states  #: (n, d)
+        self.values = values[:, 0] if values.shape[1] == 1 else values  #: of one, (n,), or of both, (n, 2)
 
     @cached_property
     def eigenvalues(self) -> np.ndarray:

@@ -58,20 +58,13 @@ POWER_ITERATION_TOLERANCE = 1e-9  # numerical: its accuracy, of integrals to 1e-
 class Cycle:
     """A periodic orbit of f.
 
-    Attributes
-    ----------
-    points
-        Shape ``(n, d)``: states at equal distances in time, the first one not repeated.
-    period
-        In units of time.
-    multipliers
-        Shape ``(d - 1,)``, by falling size: by what a small displacement across the orbit has been
-        multiplied after one period. The multiplier 1 of a displacement along it is left out.
+    Its multipliers are by what a small displacement across the orbit has been multiplied after one period.
+    The multiplier 1 of a displacement along it is left out.
     """
 
-    points: np.ndarray
-    period: float
-    multipliers: np.ndarray
+    points: np.ndarray  #: (n, d): states at equal distances in time, the first one not repeated
+    period: float  #: in units of time
+    multipliers: np.ndarray  #: (d - 1,), by falling size
 
     def __repr__(self) -> str:
         """One line: its points are some hundred numbers."""
@@ -282,21 +275,14 @@ Kind = Literal["cycle", "chaos", "aperiodic", "none"]
 class Recurrence:
     """The long-term behaviour of a trajectory that comes to rest nowhere.
 
-    Attributes
-    ----------
-    kind
-        ``cycle``: it ends on a limit cycle. ``chaos``: it returns, never to the same place, and small
-        differences grow. ``aperiodic``: it returns, and neither can be said. ``none``: it does not return.
-    exponent
-        Mean rate at which small differences grow, per unit of time: the largest Lyapunov exponent. NaN where
-        it was not asked for.
-    cycle
-        The cycle; None of anything else.
+    ``cycle``: it ends on a limit cycle. ``chaos``: it returns, never to the same place, and small differences
+    grow, at a mean rate that is the largest Lyapunov exponent. ``aperiodic``: it returns, and neither can be
+    said. ``none``: it does not return.
     """
 
     kind: Kind
-    exponent: float = float("nan")
-    cycle: Cycle | None = field(default=None, compare=False)
+    exponent: float = float("nan")  #: per unit of time; NaN where it was not asked for
+    cycle: Cycle | None = field(default=None, compare=False)  #: None of anything else
 
 
 def recurrence_of(dynamics: Dynamics, starts: np.ndarray, *, box: np.ndarray, rate: float) -> Recurrence:

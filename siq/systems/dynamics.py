@@ -36,22 +36,12 @@ def symbol(name: str) -> sympy.Symbol:
 
 @dataclass(frozen=True)
 class Signals:
-    """Inputs and times at n instants.
+    """Inputs and times at n instants."""
 
-    Attributes
-    ----------
-    inputs
-        Shape ``(i, n)``, in the order of the model's inputs.
-    delayed, slopes
-        The delayed inputs of the compiled model and their time derivatives, shape ``(j, n)`` each.
-    t
-        Shape ``(n,)``.
-    """
-
-    inputs: np.ndarray
-    delayed: np.ndarray
-    slopes: np.ndarray
-    t: np.ndarray
+    inputs: np.ndarray  #: (i, n), in the order of the model's inputs
+    delayed: np.ndarray  #: (j, n): the delayed inputs of the compiled model
+    slopes: np.ndarray  #: (j, n): their time derivatives
+    t: np.ndarray  #: (n,)
 
 
 # Operations of a tape, by the numbers that `siq.inference.trajectories` knows.
@@ -67,23 +57,14 @@ _FUNCTIONS = {
 class Tape:
     """Formulas as operations on registers.
 
-    Attributes
-    ----------
-    operations
-        Shape ``(k, 3)``: an operation, and the registers of its arguments; the second is the exponent
-        itself of a whole power. The result goes to the register ``base + k``.
-    registers
-        To begin with, shape ``(base + k,)``: arguments, which are to be filled in, then constants.
-    base
-        How many arguments and constants there are.
-    results
-        Registers that hold the values of the formulas in the end.
+    An operation has the registers of its arguments; the second is the exponent itself of a whole power. The
+    result goes to the register ``base + k``.
     """
 
-    operations: np.ndarray
-    registers: np.ndarray
-    base: int
-    results: np.ndarray
+    operations: np.ndarray  #: (k, 3)
+    registers: np.ndarray  #: (base + k,), to begin with: arguments, which are to be filled in, then constants
+    base: int  #: how many arguments and constants there are
+    results: np.ndarray  #: registers that hold the values of the formulas in the end
 
     @classmethod
     def of(cls, formulas: Sequence[sympy.Expr], arguments: Sequence[sympy.Symbol]) -> Tape | None:
@@ -264,19 +245,12 @@ class Parameter:
 class JointExpectation:
     """A joint prior of several parameters: ``roots @ values`` are standard normal.
 
-    Attributes
-    ----------
-    names
-        Of the parameters.
-    roots
-        Shape ``(r, k)``; the inverse of their covariance is ``roots.T @ roots``.
-    weight
-        How often it counts against the data: of errors that are correlated over τ samples, n count as n/τ,
-        and a fit that takes them for independent has to count what it expects τ times.
+    The weight is how often it counts against the data: of errors that are correlated over τ samples, n count
+    as n/τ, and a fit that takes them for independent has to count what it expects τ times.
     """
 
     names: tuple[str, ...]
-    roots: np.ndarray
+    roots: np.ndarray  #: (r, k); the inverse of their covariance is ``roots.T @ roots``
     weight: float = 1.0
 
 
@@ -308,12 +282,9 @@ class Dynamics:
         them, where nobody said.
     inputs
         The signals that drive it.
-
-    Parameters
-    ----------
-        θ, in the order of the parameter vector.
-    covariance
-        Of the free parameters' estimates, shape ``(p, p)``; None where they are not estimates.
+    parameters, covariance
+        θ, in the order of the parameter vector; and of the free ones' estimates, shape ``(p, p)``: None where
+        they are not estimates.
     outputs
         What a recording measures, by the name of its column; by default the states.
     edges

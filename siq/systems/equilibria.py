@@ -50,20 +50,13 @@ UNREACHED = 1e-12  # numerical, of the largest eigenvalue of W in units of its d
 class Equilibrium:
     """A state at which f vanishes.
 
-    Attributes
-    ----------
-    position
-        Shape ``(d,)``.
-    eigenvalues
-        Of the Jacobian, by falling real part.
-    kind
-        ``attractor``: all real parts are negative. ``saddle``: some of each, or of one state the positive
-        one: the top between two wells is the pass between them. ``repeller``: all positive, of several
-        states. ``degenerate``: a real part is zero to rounding, and the linearisation decides nothing.
+    ``attractor``: all real parts of eigenvalues are negative. ``saddle``: some of each, or of one state the
+    positive one: the top between two wells is the pass between them. ``repeller``: all positive, of several
+    states. ``degenerate``: a real part is zero to rounding, and the linearisation decides nothing.
     """
 
-    position: np.ndarray
-    eigenvalues: np.ndarray
+    position: np.ndarray  #: (d,)
+    eigenvalues: np.ndarray  #: of the Jacobian, by falling real part
     kind: EquilibriumKind
 
     @property

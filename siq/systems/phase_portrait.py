@@ -82,49 +82,20 @@ MERGE_TOLERANCE = 1e-6  # of the domain
 
 @dataclass(frozen=True)
 class PhasePortrait:
-    """Attractors, saddles, cycles and basins of f in a region.
+    """Attractors, saddles, cycles and basins of f in a region."""
 
-    Attributes
-    ----------
-    points
-        Evenly spread recorded states, shape ``(n, d)``.
-    box
-        Shape ``(d, 2)``: their limits.
-    equilibria
-        All that were found.
-    attractors
-        Those that are stable and that recorded points lead to.
-    saddles
-        For each attractor, and each of the cycles after these, the saddles next to it.
-    basins
-        For each attractor, what leads to it.
-    descents
-        From recorded points, to whatever end.
-    recurrence
-        Where those lead that come to rest nowhere; None where they are few.
-    harmless
-        Degenerate equilibria that take no part in the landscape.
-    remarks
-        What is not known.
-    cycles
-        Stable cycles that states of the domain lead to. In `descents` their numbers follow on those of the
-        attractors.
-    parting
-        Unstable cycles, which part basins.
-    """
-
-    points: np.ndarray
-    box: np.ndarray
-    equilibria: tuple[Equilibrium, ...]
-    attractors: tuple[Equilibrium, ...]
-    saddles: tuple[tuple[Equilibrium, ...], ...]
-    basins: tuple[Basin, ...]
-    descents: Descents
-    recurrence: Recurrence | None = None
-    harmless: tuple[Equilibrium, ...] = ()
-    remarks: tuple[Remark, ...] = ()
-    cycles: tuple[Cycle, ...] = ()
-    parting: tuple[Cycle, ...] = ()
+    points: np.ndarray  #: (n, d): evenly spread recorded states
+    box: np.ndarray  #: (d, 2): their limits
+    equilibria: tuple[Equilibrium, ...]  #: all that were found
+    attractors: tuple[Equilibrium, ...]  #: those that are stable and that recorded points lead to
+    saddles: tuple[tuple[Equilibrium, ...], ...]  #: next to each attractor, and each cycle after these
+    basins: tuple[Basin, ...]  #: for each attractor, what leads to it
+    descents: Descents  #: from recorded points, to whatever end; cycles are numbered after attractors
+    recurrence: Recurrence | None = None  #: where those lead that come to rest nowhere; None where few
+    harmless: tuple[Equilibrium, ...] = ()  #: degenerate equilibria that take no part in the landscape
+    remarks: tuple[Remark, ...] = ()  #: what is not known
+    cycles: tuple[Cycle, ...] = ()  #: stable cycles that states of the domain lead to
+    parting: tuple[Cycle, ...] = ()  #: unstable cycles, which part basins
 
     @property
     def unsettled(self) -> float:
@@ -433,16 +404,9 @@ def _harmless(
 
 
 class RecordedRegion:
-    """The neighbourhood of recorded states that lead to one attractor.
+    """The neighbourhood of recorded states ``(n, d)`` that lead to one attractor.
 
-    Parameters
-    ----------
-    states
-        From which f leads to the attractor, shape ``(n, d)``.
-    elsewhere
-        Those from which it leads elsewhere or nowhere, shape ``(m, d)``; None for none.
-    width
-        Shape ``(d,)``: distances are shares of it.
+    f leads elsewhere or nowhere from others, ``(m, d)``; distances are shares of a width ``(d,)``.
     """
 
     def __init__(self, states: np.ndarray, elsewhere: np.ndarray | None, width: np.ndarray) -> None:
