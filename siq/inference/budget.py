@@ -29,16 +29,9 @@ class BudgetSpent(Exception):
 
 @dataclass(frozen=True)
 class Account:
-    """The work and the time that a case took.
+    """The work that a case was allowed and spent, and the seconds by the clock.
 
-    Attributes
-    ----------
-    allowed, spent
-        Work, in the unit of this module.
-    seconds
-        By the clock.
-    stopped_by
-        What ran out before all was done; None where nothing was left undone.
+    It was stopped by what ran out before all was done; by nothing where nothing was left undone.
     """
 
     allowed: float
@@ -62,18 +55,14 @@ class Budget:
 
     Attributes
     ----------
-    work
-        Allowed, in the unit of this module; infinite by default.
-    seconds
-        Allowed by the clock.
+    work, seconds
+        Allowed: in the unit of this module, and by the clock.
     tell
         Called with what is being done, in words, whenever something new begins.
     clock
         Seconds of any clock that does not go back.
-    spent
-        Work done so far.
-    stopped_by
-        What ran out before all was done; None as long as nothing had to be left.
+    spent, stopped_by
+        Work done so far; and what ran out before all was done, None as long as nothing had to be left.
     """
 
     work: float = float("inf")
@@ -152,12 +141,7 @@ class Budget:
 def evaluation(model: Dynamics, data: Measurements, *, columns: int = 0) -> float:
     """The work of one evaluation of the likelihood: samples, times states, times columns of derivatives.
 
-    Parameters
-    ----------
-    model, data
-        Which model, and for which recordings.
-    columns
-        Further columns beside those of states and free parameters, such as those of candidates.
+    There may be further columns than those of states and free parameters, such as those of candidates.
     """
     width = 1 + model.dimension + len(model.free) + columns
     return (len(data.t) + OVERHEAD) * model.dimension * width

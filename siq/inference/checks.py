@@ -76,11 +76,6 @@ class PredictionLimits:
     held_out_ratio: Annotated[float, Field(gt=1)] = 1.1
     false_alarms: Annotated[float, Field(gt=0, lt=0.5)] = 1e-4
 
-    @property
-    def of_f(self) -> PredictionLimits:
-        """These alone."""
-        return PredictionLimits(self.prediction, self.held_out_ratio, self.false_alarms)
-
 
 def residual_noise(
     found: FieldEstimate, recordings: Recordings, *, pair_step: float | None
@@ -186,28 +181,20 @@ def bias_of_rounding(
 ) -> float | None:
     """The largest bias of a coefficient of f where measured noise is that of rounding; None where not.
 
-    The noise is in standard deviations ``(d,)``, and the correlation that of neighbouring residuals.
+    The noise is in standard deviations ``(d,)``, and the correlation that of neighbouring residuals: of
+    rounding alone it is -1/2 at most.
     """
-    rounding = _rounding_errors(recordings)
-    if not _is_rounding(measured, rounding, correlation=correlation):
-        return None
-    return _rounding_bias(found, pairs, rounding)
+    rounding, (low, high) = _rounding_errors(recordings), ROUNDING_RANGE
+    own = rounding > 0
+    known = (measured <= high * rounding) & ((measured >= low * rounding) | (rounding < rounding.max()))
+    small = known[own].all() and (measured[~own] <= rounding.max()).all()
+    return _rounding_bias(found, pairs, rounding) if own.any() and small and correlation < -0.3 else None
 
 
 def _rounding_errors(recordings: Recordings) -> np.ndarray:
     """Standard deviation of what rounding did to each state, 0 where none is recognised: shape ``(d,)``."""
     steps = [resolution_step(values) for values in recordings.values.T]
     return np.array([0.0 if step is None else rounding_error(step) for step in steps])
-
-
-def _is_rounding(measured: np.ndarray, rounding: np.ndarray, *, correlation: float) -> bool:
-    """Whether measured noise is that of rounding alone; neighbours then have the correlation -1/2 at most."""
-    low, high = ROUNDING_RANGE
-    own = rounding > 0
-    known = (measured <= high * rounding) & ((measured >= low * rounding) | (rounding < rounding.max()))
-    return bool(
-        own.any() and known[own].all() and (measured[~own] <= rounding.max()).all() and correlation < -0.3
-    )
 
 
 def _rounding_bias(found: FieldEstimate, pairs: SnapshotPairs, rounding: np.ndarray) -> float:
@@ -262,17 +249,9 @@ def unexplained_probability(
 ) -> float:
     """Probability of residuals having no part left that columns explain: tiny where f misses a term.
 
-    An F test of the regression of the residuals on the columns, or a χ² test where their variance is known.
-
-    Parameters
-    ----------
-    columns, rest
-        Shapes ``(n, q)`` and ``(n, r)``, of white residuals; the smallest probability of the r counts,
-        corrected for their number.
-    freedom
-        Degrees of freedom of the residuals, n by default.
-    variance
-        Of each of the r residuals, shape ``(r,)``, where it is known.
+    An F test of the regression of white residuals ``(n, r)`` on columns ``(n, q)``, or a χ² test where their
+    variances ``(r,)`` are known. The smallest probability of the r counts, corrected for their number. The
+    residuals have n degrees of freedom, unless these are given.
     """
     basis = np.linalg.qr(columns / positive(np.linalg.norm(columns, axis=0)))[0]
     explained = ((basis.T @ rest) ** 2).sum(axis=0)
@@ -287,15 +266,10 @@ def unexplained_probability(
 
 
 def mean_residual_probability(found: FieldEstimate, pairs: SnapshotPairs, *, seen: int = 0) -> float:
-    """Probability of held-out residuals having no mean left that f's library could express.
+    """Probability of the residuals of held-out pairs having no mean left that f's library could express.
 
-    Parameters
-    ----------
-    found, pairs
-        f, without the held-out pairs, and these.
-    seen
-        Number of pairs that f was fitted to, for `LaggedPairs`: its own error adds the share
-        ``len(pairs.h)/seen`` to their residuals at most.
+    Of `LaggedPairs` the number of pairs `seen` that f was fitted to counts: its own error adds the share
+    ``len(pairs.h)/seen`` to their residuals at most.
     """
     library = found.library
     if isinstance(pairs, LaggedPairs):
@@ -367,31 +341,17 @@ def prediction_errors(dynamics: Dynamics, recordings: Recordings) -> np.ndarray:
 def check_prediction(
     *,
     noise_fault: str | None,
-    errors: np.ndarray | None,
-    mean_probability: float | None,
-    held_out_ratio: float,
     limits: PredictionLimits,
+    errors: np.ndarray | None = None,
+    mean_probability: float | None = None,
+    held_out_ratio: float = 1.0,
 ) -> Verdict:
     """Whether f, which every V here is made from, holds for recordings that it was not fitted to.
 
-    Parameters
-    ----------
-    noise_fault
-        What speaks against the noise, see `NoiseDiagnosis.fault`.
-    errors
-        Errors of long-term prediction of held-out recordings, where these carry no noise.
-    mean_probability
-        Probability of the mean of the held-out residuals, where they carry noise.
-    held_out_ratio
-        Mean square of the held-out residuals over that of the others.
-    limits
-        Of the three.
-
-    Returns
-    -------
-    Verdict
-        Its figure is the median error; or how much larger the mean square is, as a share; or, where the mean
-        of the residuals refuses, how many powers of ten its probability lies below 1.
+    Without noise by the median of the errors of long-term prediction. Under noise by the mean square of the
+    held-out residuals over that of the others, whose excess is the figure; and by the probability of their
+    mean: where that refuses, the figure is how many powers of ten it lies below 1. A fault of the noise
+    (`NoiseDiagnosis.fault`) refuses before all.
     """
     if noise_fault is not None:
         return Verdict.refused(noise_fault, limits.prediction)

@@ -34,7 +34,7 @@ import sympy
 from siq.data.recordings import SnapshotPairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import STANDARD_ERRORS, FieldEstimate, NoiseFormula
-from siq.inference.kalman_filter import Noise, solve, whiten
+from siq.inference.kalman_filter import Noise, whiten
 from siq.inference.library import monomial_exponents
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
@@ -70,7 +70,8 @@ class _DiffusionLikelihood:
 
     A coefficient is a row ``(i, j, k)`` of places: of the entry ``i ≤ j`` of εD, and of the function φ_k. The
     `functions` act over each step, those `at_states` at recorded states, shape ``(n, q)``; `start` is εD
-    where it is the same everywhere; `sensor` are the sensors' variances, of which some are free.
+    where it is the same everywhere; `sensor` are the sensors' variances, of which some are free. Of at most
+    `most_correlated` states the correlations may depend on the state.
     """
 
     functions: np.ndarray
@@ -78,6 +79,8 @@ class _DiffusionLikelihood:
     start: np.ndarray
     sensor: np.ndarray
     free: np.ndarray
+
+    most_correlated = MAX_STATES
 
     def __init__(self, symbols: Sequence[sympy.Symbol]) -> None:
         self.symbols = tuple(symbols)
@@ -96,8 +99,9 @@ class _DiffusionLikelihood:
         """
         raise NotImplementedError
 
-    def least_squares(self, places: np.ndarray) -> np.ndarray | None:
-        """Coefficients to begin with where no constant part makes D positive; None where none are known."""
+    def least_squares(self, places: np.ndarray) -> np.ndarray:
+        """Coefficients to begin with where no constant part makes D positive; zero where none are known."""
+        return np.zeros(len(places))
 
     def relative_change(self, change: np.ndarray) -> np.ndarray:
         """Changes of εD ``(n, d, d)`` in units of its start."""
@@ -153,12 +157,10 @@ class _DiffusionLikelihood:
         covariance[inside] = inverse @ squares[inside] @ inverse
         return values, sensor, covariance
 
-    def formula(
+    def _formula(
         self, places: np.ndarray, values: np.ndarray, covariance: np.ndarray, p: float
     ) -> NoiseFormula:
-        """εD with these coefficients, of which a constant D shows as much with the probability p."""
-        count = len(values)
-        terms = tuple(self.terms[k] for k in places[:, 2])
+        count, terms = len(values), tuple(self.terms[k] for k in places[:, 2])
         return NoiseFormula(self.symbols, places[:, :2], terms, values, covariance[:count, :count], p)
 
     @cached_property
@@ -166,17 +168,14 @@ class _DiffusionLikelihood:
         """εD that is the same everywhere, and the sensors with it."""
         places = _all_places(len(self.symbols), 1)
         values, sensor, covariance = self.scored(places, np.array([self.start[i, j] for i, j, _ in places]))
-        return self.formula(places, values, covariance, 1.0), sensor
+        return self._formula(places, values, covariance, 1.0), sensor
 
     def constant_probability(self) -> float:
         """Probability that recordings with a constant D speak as much for one that depends on the state.
 
         1 where the change that they speak for is harmless.
         """
-        return self.probability_of_constant(_all_places(len(self.symbols), len(self.terms)))
-
-    def probability_of_constant(self, places: np.ndarray) -> float:
-        """The same for some of the coefficients, by their places."""
+        places = _all_places(len(self.symbols), len(self.terms), self.most_correlated)
         constant = places[:, 2] == 0
         formula, sensor = self.constant
         values = np.zeros(len(places))
@@ -206,17 +205,9 @@ class _DiffusionLikelihood:
     ) -> tuple[NoiseFormula, np.ndarray, np.ndarray]:
         """εD(x) of the largest likelihood, of the terms that differ from zero, together with the sensors.
 
-        Parameters
-        ----------
-        false_terms
-            Probability that chance brings any term into D.
-        probability
-            See `NoiseFormula`.
-
-        Returns
-        -------
-        formula, sensor, covariance
-            The covariance is that of the coefficients and of the logarithms of the sensors' variances.
+        Chance brings any term into D with the probability `false_terms`; the other one is that of a
+        `NoiseFormula`. The covariance is that of the coefficients and of the logarithms of the sensors'
+        variances.
 
         Raises
         ------
@@ -229,22 +220,22 @@ class _DiffusionLikelihood:
         critical = float(-scipy.special.ndtri(false_terms / (2 * len(places))))
         while True:
             values, sensor, covariance = self.scored(places, values)
-            kept, values = _eliminated(places, values, covariance[: len(values), : len(values)], critical)
-            if len(kept) == len(places):
+            count = len(values)
+            kept, values = _eliminated(places, values, covariance[:count, :count], critical)
+            if len(kept) == count:
                 break
             places = places[kept]
             # What is left may not be positive: then the others begin where they are sure to be, if they can.
             if not self.positive(places, values):
                 values = np.array([start[i, j] * (i == j) if k == 0 else 0.0 for i, j, k in places])
             if not self.positive(places, values):
-                begin = self.least_squares(places)
-                if begin is None or not self.positive(places, begin):
-                    raise NumericalFailure(
-                        "the noise depends on the state, and no formula of low degree for it is positive at"
-                        " all recorded states; give D as 'recordings.diffusion', in numbers or formulas"
-                    )
-                values = begin
-        formula = self.formula(places, values, covariance, probability)
+                values = self.least_squares(places)
+            if not self.positive(places, values):
+                raise NumericalFailure(
+                    "the noise depends on the state, and no formula of low degree for it is positive at"
+                    " all recorded states; give D as 'recordings.diffusion', in numbers or formulas"
+                )
+        formula = self._formula(places, values, covariance, probability)
         if len(sensor):  # they were left where the search for the terms began
             _, sensor, covariance = self.scored(places, values)
         return formula, sensor, covariance
@@ -285,13 +276,9 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
 
 
 class ResidualLikelihood(_DiffusionLikelihood):
-    """The likelihood of residuals of pairs; no sensor is noisy.
+    """The likelihood of residuals ``(n, d)`` of pairs about f; no sensor is noisy.
 
-    Parameters
-    ----------
-    found, pairs, rest
-        f, the pairs and their residuals ``(n, d)`` (`siq.inference.regression.residuals`), which are evenly
-        thinned where there are more than memory has room for.
+    They are evenly thinned where there are more than memory has room for.
     """
 
     def __init__(self, found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray) -> None:
@@ -312,14 +299,13 @@ class ResidualLikelihood(_DiffusionLikelihood):
         moved += 0.5 * np.einsum("kan,a->kn", bends, found.noise_rate.ravel())
         self.functions, self.at_states = (values + share * pairs.h * moved).T, values.T
         self.start = np.asarray(self.rest.T @ self.rest / len(self.rest))
-        self.sensor, self.free = np.zeros(0), np.zeros(0, dtype=bool)
+        self.sensor, self.free, self.most_correlated = np.zeros(0), np.zeros(0, dtype=bool), d
 
     def constant_probability(self) -> float:
         """See `_DiffusionLikelihood.constant_probability`; 1 where the residuals are too few to tell."""
-        (n, d), m = self.rest.shape, len(self.terms)
-        if n < MIN_RESIDUALS * d * (d + 1) // 2 * m:
-            return 1.0
-        return self.probability_of_constant(_all_places(d, m, most=d))
+        n, d = self.rest.shape
+        few = n < MIN_RESIDUALS * d * (d + 1) // 2 * len(self.terms)
+        return 1.0 if few else super().constant_probability()
 
     def relative_change(self, change: np.ndarray) -> np.ndarray:
         """Changes of εD ``(n, d, d)`` where its start is the unit matrix."""
@@ -433,8 +419,8 @@ class InnovationLikelihood(_DiffusionLikelihood):
 
     def __init__(self, symbols: tuple[sympy.Symbol, ...], fit: Fit, data: Measurements) -> None:
         super().__init__(symbols)
-        white = whiten(fit.linearisation, data, fit.noise)
-        still = fit.linearisation.with_parameters_changed(solve(white.columns, white.innovations)[0])
+        change, _ = whiten(fit.linearisation, data, fit.noise).solve()
+        still = fit.linearisation.with_parameters_changed(change)
         d, rows, x = len(symbols), data.begins, fit.linearised_at
         middle = x[:, :d].copy()
         middle[rows] += (x[rows + 1, :d] + still.gap[rows, :d] - x[rows, :d]) / 2
@@ -442,12 +428,10 @@ class InnovationLikelihood(_DiffusionLikelihood):
         spread = np.zeros_like(intensity) if fit.spread is None else fit.spread[:, :d, :d]
         wide = spread + intensity * data.step[:, None, None] / 2
         second = [term.diff(one, other) for term in self.terms for one in symbols for other in symbols]
-        components = np.ascontiguousarray(middle.T)
+        components, plain = np.ascontiguousarray(middle.T), compile_formulas(self.terms, symbols)
         bends = compile_formulas(second, symbols)(components).reshape(len(self.terms), d, d, -1)
-        plain = compile_formulas(self.terms, symbols)
-        self.all_functions = np.ascontiguousarray(
-            (plain(components) + np.einsum("kijn,nij->kn", bends, wide) / 2).T
-        )
+        functions = plain(components) + np.einsum("kijn,nij->kn", bends, wide) / 2
+        self.all_functions = np.ascontiguousarray(functions.T)
         self.functions = self.all_functions[rows]
         self.at_states = plain(np.ascontiguousarray(x[:, :d].T)).T
         self._still, self._data = still, data
@@ -460,35 +444,37 @@ class InnovationLikelihood(_DiffusionLikelihood):
         self, places: np.ndarray, values: np.ndarray, sensor: np.ndarray
     ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
         """By the derivatives of the filter, see `siq.inference.filter_kernels.filter_recursion`."""
-        d, data, whole = len(self.symbols), self._data, len(self._begin)
-        intensity = np.zeros((len(self.all_functions), whole, whole))
-        intensity[:, :d, :d] = self.matrices(places, values, self.all_functions)
         found = self._still.filtered(
-            data.first, data.step, sensor, intensity, begin_covariance=self._begin,
-            functions=self.all_functions, places=places,
+            self._data.first, self._data.step, sensor, self._intensity(places, values),
+            begin_covariance=self._begin, functions=self.all_functions, places=places,
         )  # fmt: skip
-        innovations, logarithm = found[0], found[3]
-        return -0.5 * (float((innovations**2).sum()) + logarithm), *found[4:7]
+        return -0.5 * (float((found[0] ** 2).sum()) + found[3]), *found[4:7]
 
     def parameter_covariance(
         self, formula: NoiseFormula, sensor: np.ndarray, covariance: np.ndarray, fit: Fit
     ) -> np.ndarray:
         """Covariance of the coefficients of f by the errors of a formula and its sensors."""
-        d, whole, count = len(self.symbols), len(self._begin), len(formula.values)
+        count, driven = len(formula.values), np.ones(len(self._begin))
         places = np.column_stack([formula.places, [self.terms.index(term) for term in formula.terms]])
+
+        def estimate(change: np.ndarray) -> np.ndarray:
+            shape = self._intensity(places, formula.values + change[:count])
+            noise = Noise(sensor * np.exp(change[count:]), driven, shape)
+            return whiten(fit.linearisation, self._data, noise).solve()[0]
+
         levels, axes = np.linalg.eigh(covariance)
         total = np.zeros_like(fit.covariance)
         for axis in (axes * np.sqrt(np.maximum(levels, 0.0))).T:
-            ends = []
-            for change in (axis, -axis):
-                shape = np.zeros((len(self.all_functions), whole, whole))
-                values = formula.values + change[:count]
-                shape[:, :d, :d] = self.matrices(places, values, self.all_functions)
-                noise = Noise(sensor * np.exp(change[count:]), np.ones(whole), shape)
-                white = whiten(fit.linearisation, self._data, noise)
-                ends.append(solve(white.columns, white.innovations)[0])
-            total += np.outer(ends[0] - ends[1], ends[0] - ends[1]) / 4
+            change = estimate(axis) - estimate(-axis)
+            total += np.outer(change, change) / 4
         return total
+
+    def _intensity(self, places: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Of the process noise at every sample; beyond the states of D nothing is driven."""
+        d, whole = len(self.symbols), len(self._begin)
+        intensity = np.zeros((len(self.all_functions), whole, whole))
+        intensity[:, :d, :d] = self.matrices(places, values, self.all_functions)
+        return intensity
 
 
 def constant_noise(symbols: Sequence[sympy.Symbol], rate: np.ndarray, *, samples: float) -> NoiseFormula:
@@ -496,13 +482,11 @@ def constant_noise(symbols: Sequence[sympy.Symbol], rate: np.ndarray, *, samples
 
     The entries of a covariance of n normal residuals have the covariance ``(R_ik R_jl + R_il R_jk)/n``.
     """
-    d = len(symbols)
-    places = np.array([(i, j) for i in range(d) for j in range(i, d)])
+    places = _all_places(len(symbols), 1)[:, :2]
     i, j = places.T
     straight, crossed = rate[np.ix_(i, i)] * rate[np.ix_(j, j)], rate[np.ix_(i, j)] * rate[np.ix_(j, i)]
-    values, one = rate[i, j], sympy.Integer(1)
-    covariance = (straight + crossed) / samples
-    return NoiseFormula(tuple(symbols), places, (one,) * len(places), values, covariance, 1.0)
+    terms = (sympy.Integer(1),) * len(places)
+    return NoiseFormula(tuple(symbols), places, terms, rate[i, j], (straight + crossed) / samples, 1.0)
 
 
 def estimated_diffusion(found: FieldEstimate, *, pairs: int) -> Diffusion | None:
@@ -528,13 +512,10 @@ def estimated_diffusion(found: FieldEstimate, *, pairs: int) -> Diffusion | None
     correlated = np.abs(rate) > STANDARD_ERRORS / np.sqrt(pairs) * np.outer(size, size)
     rate = np.where(correlated | np.eye(len(rate), dtype=bool), rate, 0.0)
     try:
-        whole = Diffusion(rate)
+        regular = Diffusion(rate).regular
     except ValueError:
         return None
-    if not whole.regular:
-        return None
-    logarithm = float(np.linalg.slogdet(rate)[1])
-    return Diffusion(rate / np.exp(logarithm / len(rate)))
+    return Diffusion(rate / np.exp(float(np.linalg.slogdet(rate)[1]) / len(rate))) if regular else None
 
 
 def check_units(states: Sequence[str], units: Sequence[str | None]) -> None:

@@ -48,15 +48,10 @@ HARMLESS_BIAS = 0.5  # of a standard error: with such a bias an error bar holds 
 
 @dataclass(frozen=True)
 class FlowMap:
-    """The map of a state over the step of a pair.
+    """The map of a state over the step of a pair, by so many steps of an integrator.
 
-    Attributes
-    ----------
-    steps
-        Steps of the integrator within every pair.
-    euler
-        Euler's rule, for pairs that an Euler–Maruyama simulation made with as many steps; otherwise the
-        classical Runge–Kutta rule, for everything that is continuous in time.
+    By Euler's rule for pairs that an Euler–Maruyama simulation made with as many steps; otherwise by the
+    classical Runge–Kutta rule, for everything that is continuous in time.
     """
 
     steps: int = 1
@@ -113,10 +108,8 @@ class NoiseFormula:
     ----------
     symbols
         The d states.
-    places
-        Shape ``(p, 2)``: the entry (i, j), i ≤ j, of each coefficient.
-    terms
-        The function of each coefficient.
+    places, terms
+        The entry (i, j), i ≤ j, of each coefficient, shape ``(p, 2)``; and its function of the states.
     values, covariance
         Shapes ``(p,)`` and ``(p, p)``, in the states' units squared per time.
     probability
@@ -207,9 +200,7 @@ class Verdict:
     def as_data(self) -> dict[str, Any]:
         """As it is stored; a figure that is not finite becomes null."""
         value = float(self.value) if np.isfinite(self.value) else None
-        return {
-            "value": value, "limit": float(self.limit), "passed": bool(self.passed), "reason": self.reason
-        }  # fmt: skip
+        return vars(self) | {"value": value, "limit": float(self.limit), "passed": bool(self.passed)}
 
     @classmethod
     def of(cls, value: float, limit: float, reason: str) -> Verdict:
@@ -245,9 +236,8 @@ class DiffusionSource(StrEnum):
     @property
     def note(self) -> str | None:
         """A remark for the reader of U; none where D was given."""
-        if self == DiffusionSource.GIVEN:
-            return None
-        return sentence(Remark("inference.diffusion_source", {"source": str(self)}))
+        remark = Remark("inference.diffusion_source", {"source": str(self)})
+        return None if self == DiffusionSource.GIVEN else sentence(remark)
 
 
 @dataclass(frozen=True)
@@ -287,8 +277,6 @@ class NoiseDiagnosis:
     rounding, rounding_bias, decimals
         How the values were written, in words, None where that is not seen; the largest bias that it brings
         into a coefficient of f, in its standard errors; and how many decimals would leave no trace.
-    remarks
-        What a reader has to know.
     """
 
     kind: NoiseKind
@@ -343,20 +331,25 @@ class NoiseDiagnosis:
         return sentence(Remark("inference.noise_fault", values))
 
     def as_data(self) -> dict[str, Any]:
-        """As it is stored in `vector_field.json`."""
-        data = {each.name: getattr(self, each.name) for each in fields(self)}
-        arrays = {name: value.tolist() for name, value in data.items() if isinstance(value, np.ndarray)}
+        """As it is stored in `vector_field.json`; an error that is not finite becomes null."""
+        arrays = {name: value.tolist() for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+        if self.measurement_error is not None:
+            errors = self.measurement_error.tolist()
+            arrays["measurement_error"] = [one if np.isfinite(one) else None for one in errors]
         remarks = [each.as_data() for each in self.remarks]
-        return data | arrays | {"diffusion": str(self.diffusion), "remarks": remarks}
+        return vars(self) | arrays | {"diffusion": str(self.diffusion), "remarks": remarks}
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any]) -> NoiseDiagnosis:
         """A diagnosis as `as_data` stored it; older files have fewer entries."""
-        known = {each.name: data[each.name] for each in fields(cls) if data.get(each.name) is not None}
         blank = {"covariance": [], "measurement": [], "correlation": 0.0, "correlation_score": 0.0}
-        known = {**blank, **known}
+        known = blank | {
+            each.name: data[each.name] for each in fields(cls) if data.get(each.name) is not None
+        }
         for name in {"covariance", "measurement", "measurement_error"} & known.keys():
             known[name] = np.array(known[name], dtype=float)
+        if "measurement_error" in known:
+            known["measurement_error"][np.isnan(known["measurement_error"])] = np.inf
         known["diffusion"] = DiffusionSource(known.get("diffusion", DiffusionSource.GIVEN))
         known["remarks"] = tuple(map(Remark.from_data, known.get("remarks", ())))
         return cls(**known)
@@ -387,20 +380,18 @@ class FieldEstimate:
         D, which recordings do not tell apart from ε: of these only the product, `noise_rate`, is identified.
     alternatives
         What other terms that fit nearly as well make of f: bias ``(q, d)`` and spread ``(r, q, d)``, see
-        `siq.inference.selection.model_average`. None where nobody asked.
+        `siq.inference.selection.model_average`. This and what follows is None where nobody asked.
     stability
         Shape ``(p,)``: the share of resampled recordings in which each term would be chosen
-        (`siq.inference.selection`). None where nobody asked.
-    noise
+        (`siq.inference.selection`).
+    noise, constant_noise
         εD as a formula of the states, where the recordings show that it depends on them; `noise_rate` is its
-        mean over the recorded states then.
-    constant_noise
-        εD with its errors, where D was estimated and is the same everywhere; None elsewhere.
+        mean over the recorded states then. Or with its errors, where D was estimated and is the same
+        everywhere.
     diagnosis
-        The noise that the recordings show, and how samples were taken to show the states. None of an f that
-        was not asked for it.
+        The noise that the recordings show, and how samples were taken to show the states.
     prediction
-        Whether f holds for recordings that it was not fitted to; None where nobody asked.
+        Whether f holds for recordings that it was not fitted to.
     """
 
     library: CandidateLibrary
@@ -454,9 +445,8 @@ class FieldEstimate:
     @property
     def memory(self) -> tuple[int, float] | None:
         """The lag from which on the recordings are Markovian, and the time lost; None of those that are."""
-        if self.diagnosis is None or self.diagnosis.lag is None:
-            return None
-        return self.diagnosis.lag, self.diagnosis.lost_time
+        noise = self.diagnosis
+        return None if noise is None or noise.lag is None else (noise.lag, noise.lost_time)
 
     @property
     def sensor_variance(self) -> np.ndarray | None:
@@ -492,13 +482,7 @@ class FieldEstimate:
         return noise.intensity, noise.intensity * (2 / samples) ** 0.5 if samples else 0.0
 
     def bias(self, slopes: np.ndarray) -> np.ndarray:
-        """By how much the mean over alternative terms moves what follows from f to first order.
-
-        Parameters
-        ----------
-        slopes
-            Derivatives by all coefficients, shape ``(..., q, d)``.
-        """
+        """By how much alternative terms move what follows from f, by its derivatives ``(..., q, d)``."""
         if self.alternatives is None:
             return np.zeros(slopes.shape[:-2])
         return np.asarray(np.einsum("...qd,qd->...", slopes, self.alternatives[0]))
@@ -508,9 +492,8 @@ class FieldEstimate:
         if self.alternatives is None:
             return np.zeros((count, *self.coefficients.shape))
         bias, spread = self.alternatives
-        return np.asarray(
-            bias + np.tensordot(generator.standard_normal((count, len(spread))), spread, axes=1)
-        )
+        numbers = generator.standard_normal((count, len(spread)))
+        return np.asarray(bias + np.tensordot(numbers, spread, axes=1))
 
     def variance(self, slopes: np.ndarray, *, of_mean: bool = False) -> np.ndarray:
         """Variance of what follows from f to first order, by its coefficients and by which terms there are.

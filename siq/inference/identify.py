@@ -14,19 +14,15 @@ constant one cannot be held; else the unit matrix. Last, f is tested on held-out
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from siq.data.correlation import MarkovLag, markov_lag
 from siq.data.preparation import joined
-from siq.data.recordings import (
-    Recordings,
-    SnapshotPairs,
-    snapshot_pairs,
-)
+from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.checks import (
     PredictionLimits,
@@ -52,7 +48,6 @@ from siq.inference.field_estimate import (
     DiffusionSource,
     FieldEstimate,
     NoiseDiagnosis,
-    Verdict,
 )
 from siq.inference.kalman_filter import Noise
 from siq.inference.kalman_identification import (
@@ -101,25 +96,20 @@ def identify(
 
     Parameters
     ----------
-    recordings
-        Whole trajectories.
-    library
-        The candidate functions of f; by default those of the options.
+    recordings, library, options
+        Whole trajectories; the candidate functions of f, by default those of the options; and what makes a
+        term significant.
     observation
         How samples show the states. By default as measurement noise and correlations in the recordings say;
         with hidden velocities where the options ask for them.
-    options
-        In which functions f is sought, and what makes a term significant.
     draw
         Gives the generator for a purpose: for held-out recordings, and for resampling.
-    diffusion
-        D, where it is given.
-    units
-        Of the states, None of one that nobody knows; by default those of the recordings.
-    pair_step
-        Longest time between samples that still belong together.
-    integrator_step
-        Step of the Euler–Maruyama simulation that made the recordings, None for everything else.
+    diffusion, units
+        D, where it is given; and the states' units, None of one that nobody knows, by default those of the
+        recordings.
+    pair_step, integrator_step
+        Longest time between samples that still belong together; step of the Euler–Maruyama simulation that
+        made the recordings, None for everything else.
     limits
         Of the test of f.
 
@@ -163,27 +153,24 @@ def identify(
         raise NumericalFailure(reason if advice is None else f"{reason}; {advice}") from error
 
 
+@dataclass
 class _Case:
     """An identification of recordings; the arguments are those of `identify`."""
 
-    def __init__(
-        self,
-        recordings: Recordings,
-        library: CandidateLibrary,
-        options: IdentificationOptions,
-        draw: Callable[[Purpose], np.random.Generator],
-        given: Diffusion | None,
-        units: Sequence[str | None],
-        pair_step: float | None,
-        integrator_step: float | None,
-        limits: PredictionLimits,
-    ) -> None:
-        self.recordings, self.library, self.options, self.draw = recordings, library, options, draw
-        self.given, self.units, self.limits = given, units, limits
-        self.pair_step, self.integrator_step = pair_step, integrator_step
-        held = recordings.held_out(generator=draw(Purpose.HOLD_OUT))
-        self.training = recordings.select(np.flatnonzero(~held))
-        self.held_out = recordings.select(np.flatnonzero(held))
+    recordings: Recordings
+    library: CandidateLibrary
+    options: IdentificationOptions
+    draw: Callable[[Purpose], np.random.Generator]
+    given: Diffusion | None
+    units: Sequence[str | None]
+    pair_step: float | None
+    integrator_step: float | None
+    limits: PredictionLimits
+
+    def __post_init__(self) -> None:
+        held = self.recordings.held_out(generator=self.draw(Purpose.HOLD_OUT))
+        self.training = self.recordings.select(np.flatnonzero(~held))
+        self.held_out = self.recordings.select(np.flatnonzero(held))
 
     def identified(self) -> FieldEstimate:
         """By the method that noise and correlations of the recordings ask for."""
@@ -214,17 +201,16 @@ class _Case:
         correlation, score = neighbour_correlations(found, pairs)
         if not (score < SUSPECT_SCORE).any():
             return None
-        rate = np.diag(found.noise_rate)
+        rate, least = np.diag(found.noise_rate), float(correlation.min())
         variance = rate * float(np.median(pairs.h))
         measured = np.sqrt(np.maximum(-correlation, 0.0) * variance)
-        least = float(correlation.min())
         bias = bias_of_rounding(found, pairs, self.recordings, measured, correlation=least)
         if bias is not None and bias <= HARMLESS_BIAS:
             return None
         share = np.clip(-correlation, MIN_SHARE, MAX_SHARE)
+        noise = Noise(share * variance, rate * (1 - 2 * share))
         try:
-            observation = ObservationModel(self.library, found.diffusion)
-            again = self._by_likelihood(observation, Noise(share * variance, rate * (1 - 2 * share)))
+            again = self._by_likelihood(ObservationModel(self.library, found.diffusion), noise)
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             if ((score < -SIGNIFICANT_SCORE) & (correlation < -HARMLESS_CORRELATION)).any():
                 raise NumericalFailure(f"the sensor is noisy, and f with it is not found: {error}") from None
@@ -281,10 +267,9 @@ class _Case:
             remarks = [Remark("inference.hidden_velocities", {"sensors": sensors, "process_noise": forced})]
             source = DiffusionSource.OF_VELOCITIES if forced else DiffusionSource.UNIT_OF_VELOCITIES
         else:
-            first = found
+            first, error = found, noise.intensity_error
             found, source = self._with_diffusion(found, pairs)
             strength = found.intensity if found.noise is not None else self._strength(first, found.diffusion)
-            error = noise.intensity_error
             if error is not None and noise.intensity > 0:
                 error *= strength / noise.intensity
             covariance = found.noise_rate / strength if forced else noise.covariance
@@ -297,10 +282,8 @@ class _Case:
                 remarks.append(Remark("inference.noise_depends_on_state"))
         noise = replace(noise, diffusion=source, pairs=pairs, remarks=tuple(remarks))
         found = replace(found, diagnosis=noise)
-        probability, ratio = held_out_innovations(
-            found, self.training, self.held_out, pair_step=self.pair_step
-        )
-        return self._tested(found, mean_probability=probability, held_out_ratio=ratio)
+        held_out = held_out_innovations(found, self.training, self.held_out, pair_step=self.pair_step)
+        return self._tested(found, mean_probability=held_out[0], held_out_ratio=held_out[1])
 
     def _strength(self, found: FieldEstimate, diffusion: Diffusion) -> float:
         """ε of another D than was found: the mean of ``tr D⁻¹(x) εD(x) / d`` over the states."""
@@ -391,8 +374,7 @@ class _Case:
                 found = replace(found, diagnosis=replace(noise, remarks=remarks))
         if found.noise_free:
             chosen = np.arange(min(len(self.held_out.labels), PREDICTED_RECORDINGS))
-            errors = prediction_errors(found.dynamics, self.held_out.select(chosen))
-            return self._tested(found, errors=errors)
+            return self._tested(found, errors=prediction_errors(found.dynamics, self.held_out.select(chosen)))
         if found.diffusion.constant:
             generator = self.draw(Purpose.STABILITY)
             found = with_stability(found, everything, options=self.options, generator=generator)
@@ -402,32 +384,23 @@ class _Case:
         self, found: FieldEstimate, training: SnapshotPairs, unseen: SnapshotPairs
     ) -> FieldEstimate:
         """With the test on the residuals of pairs that its terms, fitted to the others, leave."""
-        fitted, squares = refit(found, training), []
-        for pairs in (unseen, training):
-            rest = residuals(fitted, pairs)
-            if fitted.diffusion.constant:
-                squares.append(float((rest**2 / pairs.h[:, None]).mean()))
-            else:
-                speeds = rest / np.sqrt(pairs.h)[:, None]
-                squares.append(float(fitted.diffusion.squared_speed(pairs.x0, speeds).mean()))
-        probability = mean_residual_probability(fitted, unseen, seen=len(training.h))
-        return self._tested(found, held_out_ratio=squares[0] / squares[1], mean_probability=probability)
+        fitted = refit(found, training)
 
-    def _tested(
-        self,
-        found: FieldEstimate,
-        *,
-        errors: np.ndarray | None = None,
-        mean_probability: float | None = None,
-        held_out_ratio: float = 1.0,
-    ) -> FieldEstimate:
-        """The estimate with the verdict of `check_prediction` on it."""
+        def mean_square(pairs: SnapshotPairs) -> float:
+            rest, h = residuals(fitted, pairs), pairs.h[:, None]
+            if fitted.diffusion.constant:
+                return float((rest**2 / h).mean())
+            return float(fitted.diffusion.squared_speed(pairs.x0, rest / np.sqrt(h)).mean())
+
+        probability = mean_residual_probability(fitted, unseen, seen=len(training.h))
+        ratio = mean_square(unseen) / mean_square(training)
+        return self._tested(found, held_out_ratio=ratio, mean_probability=probability)
+
+    def _tested(self, found: FieldEstimate, **figures: Any) -> FieldEstimate:
+        """The estimate with the verdict of `check_prediction` on its figures."""
         assert found.diagnosis is not None
-        verdict: Verdict = check_prediction(
-            noise_fault=found.diagnosis.fault(self.recordings.names), errors=errors,
-            mean_probability=mean_probability, held_out_ratio=held_out_ratio, limits=self.limits,
-        )  # fmt: skip
-        return replace(found, prediction=verdict)
+        fault = found.diagnosis.fault(self.recordings.names)
+        return replace(found, prediction=check_prediction(noise_fault=fault, limits=self.limits, **figures))
 
     def advice(self, *, hidden: bool) -> str | None:
         """Advice where a recorded position has inertia, or hidden velocities are not needed."""
@@ -440,14 +413,14 @@ class _Case:
         if test.needs_velocity == hidden:
             return None
         said = test.sentence(self.recordings.time_unit or "")
-        if not hidden:
-            return (
-                f"{said}: set 'identification.hidden_velocities: true', in Python hidden_velocities=True, and"
-                " the velocity is a state that was not recorded"
-            )
-        if test.undecided:
+        if hidden and not (test.seen or test.overdamped):
             return said
-        return f"{said}: leave 'identification.hidden_velocities' out, the position alone is the state"
+        if hidden:
+            return f"{said}: leave 'identification.hidden_velocities' out, the position alone is the state"
+        return (
+            f"{said}: set 'identification.hidden_velocities: true', in Python hidden_velocities=True, and the"
+            " velocity is a state that was not recorded"
+        )
 
 
 def _possible_exposures(found: MarkovLag) -> list[float]:

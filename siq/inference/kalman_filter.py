@@ -36,15 +36,7 @@ RANK = 1e-9  # numerical: singular values below this share of the largest are ro
 
 
 class ClosedFunctions:
-    """f with the effect of a spread of the state, and its derivatives.
-
-    The methods are those of `siq.systems.dynamics.ParametricFunctions`, for f between samples.
-
-    Parameters
-    ----------
-    model
-        The dynamics without the closure.
-    """
+    """f of a model with the effect of a spread of the state; methods as of `ParametricFunctions`."""
 
     def __init__(self, model: Dynamics) -> None:
         d = model.dimension
@@ -65,11 +57,15 @@ class ClosedFunctions:
 
     def at(self, spread: np.ndarray) -> ClosedFunctions:
         """The functions for one covariance at each interval, shape ``(n, d, d)``."""
-        return self._with(np.stack([spread[:, j, k] for j, k in self._pairs]))
+        found = copy(self)
+        found._spread = np.stack([spread[:, j, k] for j, k in self._pairs])
+        return found
 
     def at_intervals(self, chosen: np.ndarray) -> ClosedFunctions:
         """Those of some of the intervals, by their places."""
-        return self._with(self._spread[:, chosen])
+        found = copy(self)
+        found._spread = self._spread[:, chosen]
+        return found
 
     def rates(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
         """Mean of f at mean states ``(d, n)``: shape ``(d, n)``."""
@@ -78,11 +74,6 @@ class ClosedFunctions:
     def slopes(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Its derivatives by states and by free parameters: ``(d, d, n)`` and ``(d, p, n)``."""
         return self._closed.functions.slopes(x, self._joined(signals), values)
-
-    def _with(self, spread: np.ndarray) -> ClosedFunctions:
-        found = copy(self)
-        found._spread = spread
-        return found
 
     def _joined(self, signals: Signals) -> Signals:
         return replace(signals, inputs=np.concatenate([signals.inputs, self._spread]))
@@ -100,16 +91,9 @@ class Columns(Protocol):
 
 @dataclass(frozen=True)
 class Grid:
-    """The instants at which intervals between samples are worked on.
+    """The instants at which intervals between samples are worked on, by so many Runge–Kutta steps each.
 
-    Attributes
-    ----------
-    data
-        The measurements.
-    substeps
-        Runge–Kutta steps in every interval.
-    whole, chosen
-        For a part of a grid: the grid, and the places of the intervals; the signals are taken from there.
+    A part of a grid has the whole one, from which the signals are taken, and the places of its intervals.
     """
 
     data: Measurements
@@ -132,8 +116,7 @@ class Grid:
     def signals(self, node: int, delays: tuple[tuple[int, float], ...]) -> Signals:
         """Inputs at a node, all intervals: nodes 0, 1, 2 are begin, middle and end of the first substep."""
         if self.whole is not None:
-            known = self.whole.signals(node, delays)
-            at = self.chosen
+            known, at = self.whole.signals(node, delays), self.chosen
             return Signals(known.inputs[:, at], known.delayed[:, at], known.slopes[:, at], known.t[at])
         if (node, delays) not in self._known:
             part, place = divmod(node, 3)
@@ -198,16 +181,14 @@ class Linearisation:
         By default recordings begin at zero without a covariance; with functions and places of the process
         noise the likelihood is derived by it.
         """
-        dimension = self.gap.shape[1]
-        begin = np.zeros((len(first) - 1, dimension)) if begin is None else begin
-        if begin_covariance is None:
-            begin_covariance = np.zeros((dimension, dimension))
-        scored = places is not None
+        d = self.gap.shape[1]
         return filter_recursion(
             first, self.transition, self.response, self.gap, self.measured, self.measured_response,
-            self.residual, variance, step, intensity, begin, begin_covariance,
+            self.residual, variance, step, intensity,
+            np.zeros((len(first) - 1, d)) if begin is None else begin,
+            np.zeros((d, d)) if begin_covariance is None else begin_covariance,
             np.zeros((0, 0)) if functions is None else functions,
-            np.zeros((0, 3), dtype=np.int64) if places is None else places, scored, kept,
+            np.zeros((0, 3), dtype=np.int64) if places is None else places, places is not None, kept,
         )  # fmt: skip
 
     def smoothed(
@@ -266,18 +247,10 @@ def linearise(
     columns: Columns | None = None,
     drift: ClosedFunctions | None = None,
 ) -> Linearisation:
-    """Integrate every interval from the state in hand, with the derivatives.
+    """Integrate every interval from the states in hand ``(n, d)``, with the derivatives.
 
-    Parameters
-    ----------
-    model, grid
-        Its free parameters are the first columns of the response; measurements and substeps.
-    values, x
-        All parameters, shape ``(p,)``, and the states in hand, shape ``(n, d)``.
-    columns
-        Further right-hand sides whose response is wanted behind those of the parameters.
-    drift
-        The mean of f over a spread of states, where that takes the place of f.
+    Free parameters, and behind them further right-hand sides, are the columns of the response; `values` are
+    those of all parameters. The mean of f over a spread of states may take the place of f as `drift`.
     """
     data, compiled, delays = grid.data, model.functions, model.lags(values)
     dimension, rows, count = x.shape[1], grid.rows, len(grid.rows)
@@ -364,11 +337,10 @@ def substeps_needed(
     The tolerance is the root mean square change of the increments from states ``(n, d)`` that is allowed,
     relative to the spread of the states.
     """
-    steps = 1
-    scale = x.std(axis=0) + 1e-300
-    coarse = integrate_intervals(model, Grid(data, 1), values, x[data.begins].T)
+    steps, begins, scale = 1, x[data.begins].T, x.std(axis=0) + 1e-300
+    coarse = integrate_intervals(model, Grid(data, 1), values, begins)
     while steps < MAX_SUBSTEPS:
-        fine = integrate_intervals(model, Grid(data, 2 * steps), values, x[data.begins].T)
+        fine = integrate_intervals(model, Grid(data, 2 * steps), values, begins)
         with np.errstate(all="ignore"):
             squares = (fine - coarse) ** 2
             known = np.maximum((~np.isnan(squares)).sum(axis=1), 1)
@@ -415,10 +387,8 @@ class Noise:
 
     Attributes
     ----------
-    measurement
-        R, per sample, shape ``(m,)``.
-    process
-        Q, per time, shape ``(d,)``; zero where nothing drives the state.
+    measurement, process
+        R per sample, shape ``(m,)``; and Q per time, shape ``(d,)``, zero where nothing drives the state.
     shape
         Of the process noise, where its components are not independent and of constant strength:
         ``(1, d, d)``, or ``(n, d, d)`` for one at each sample. The intensity is then ``√Q_i shape_ij √Q_j``.
@@ -514,18 +484,12 @@ class Whitened:
 
     Attributes
     ----------
-    innovations
-        Shape ``(n·m,)``.
-    columns
-        What a unit of each parameter explains of them, shape ``(n·m, p)``.
-    recording
-        The recording of each, shape ``(n·m,)``.
-    known
-        Which of them were measured, shape ``(n·m,)``.
-    degrees_of_freedom
-        Measured values less initial states.
-    log_determinant
-        Of the innovations' covariance.
+    innovations, columns
+        Shape ``(n·m,)``; and what a unit of each parameter explains of them, shape ``(n·m, p)``.
+    recording, known
+        The recording of each, and which of them were measured, shape ``(n·m,)``.
+    degrees_of_freedom, log_determinant
+        Measured values less initial states; and of the innovations' covariance.
     """
 
     innovations: np.ndarray
@@ -534,6 +498,15 @@ class Whitened:
     known: np.ndarray
     degrees_of_freedom: int
     log_determinant: float
+
+    def solve(
+        self, expected: tuple[np.ndarray, np.ndarray] | None = None, *, least: float = RANK
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Parameters and their covariance, with one row more for each expectation; see `solve`."""
+        columns, goal = self.columns, self.innovations
+        if expected is not None and len(expected[0]):
+            columns, goal = np.concatenate([columns, expected[0]]), np.concatenate([goal, expected[1]])
+        return solve(columns, goal, least=least)
 
     def log_likelihood(self, sum_of_squares: float) -> float:
         """Log-likelihood where the innovations have the given sum of squares."""
@@ -552,11 +525,9 @@ def whiten(linearisation: Linearisation, data: Measurements, noise: Noise) -> Wh
     innovations, columns, initial, log_determinant = linearisation.filtered(
         data.first, data.step, noise.measurement, noise.intensity
     )[:4]
-    outputs = innovations.shape[1]
-    known = ~np.isnan(linearisation.residual).ravel()
+    outputs, known = innovations.shape[1], ~np.isnan(linearisation.residual).ravel()
     innovations = innovations.ravel()
-    columns = columns.reshape(len(innovations), -1)
-    initial = initial.reshape(len(innovations), -1)
+    columns, initial = (each.reshape(len(innovations), -1) for each in (columns, initial))
     if not (np.isfinite(innovations).all() and np.isfinite(initial).all() and np.isfinite(log_determinant)):
         raise NumericalFailure("small deviations from the recorded motion grow beyond all numbers")
     used = 0
@@ -571,30 +542,15 @@ def whiten(linearisation: Linearisation, data: Measurements, noise: Noise) -> Wh
         innovations[begin:end] -= basis @ (basis.T @ innovations[begin:end])
         columns[begin:end] -= basis @ (basis.T @ columns[begin:end])
         used += basis.shape[1]
-    return Whitened(
-        innovations=innovations,
-        columns=columns,
-        recording=np.repeat(data.recording, outputs),
-        known=known,
-        degrees_of_freedom=int(known.sum()) - used,
-        log_determinant=log_determinant,
-    )
+    recording, freedom = np.repeat(data.recording, outputs), int(known.sum()) - used
+    return Whitened(innovations, columns, recording, known, freedom, log_determinant)
 
 
 def solve(columns: np.ndarray, target: np.ndarray, *, least: float = RANK) -> tuple[np.ndarray, np.ndarray]:
-    """Least squares with columns of any scale; what the data do not tell is left alone.
+    """Least squares with columns ``(n, p)`` of any scale; what the data do not tell is left alone.
 
-    Parameters
-    ----------
-    columns, target
-        Shapes ``(n, p)`` and ``(n,)``.
-    least
-        Singular values below this share of the largest tell nothing.
-
-    Returns
-    -------
-    estimate, covariance
-        Shapes ``(p,)`` and ``(p, p)``, for errors of unit variance.
+    Singular values below the share `least` of the largest tell nothing. Returned are the estimate, and its
+    covariance for errors of unit variance.
 
     Raises
     ------

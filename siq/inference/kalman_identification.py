@@ -25,7 +25,7 @@ from siq.errors import NumericalFailure
 from siq.inference.checks import correlations_between, unexplained_probability
 from siq.inference.diffusion_model import InnovationLikelihood
 from siq.inference.field_estimate import FieldEstimate, FlowMap, NoiseDiagnosis
-from siq.inference.kalman_filter import Grid, Noise, Whitened, linearise, solve, whiten
+from siq.inference.kalman_filter import Grid, Noise, Whitened, linearise, whiten
 from siq.inference.maximum_likelihood import Fit, fit_by_filter, noise_uncertainty
 from siq.inference.measurements import Measurements
 from siq.inference.observation import ObservationModel, moved_by, smoothed_motion
@@ -61,29 +61,23 @@ def identify_by_likelihood(
     generator: np.random.Generator,
     pair_step: float | None = None,
 ) -> FieldEstimate:
-    """f, the process noise and measurement noise together.
+    """f, the process noise and measurement noise together, with the diagnosis.
+
+    D is that of the observation, unless it depends on the state, or acts on hidden velocities: there it is
+    the unit matrix if no process noise is seen.
 
     Parameters
     ----------
-    observation
-        The candidate functions, and how samples show the states; its D does not matter for f.
-    recordings
-        Whole trajectories of the measured states.
+    observation, recordings
+        The candidate functions, and how samples show the states; and whole trajectories of these.
     noise
         To begin with; not needed with hidden velocities.
     false_terms
         Probability that a constant D is given up by chance; and that chance brings any false term into f, or
         into D.
-    generator
-        Draws recordings again, see `siq.inference.selection`.
-    pair_step
-        Longest time between samples that still belong together.
-
-    Returns
-    -------
-    FieldEstimate
-        With its diagnosis. D is that of the observation, unless it depends on the state, or acts on hidden
-        velocities: there it is the unit matrix if no process noise is seen.
+    generator, pair_step
+        Draws recordings again, see `siq.inference.selection`; longest time between samples that still belong
+        together.
 
     Raises
     ------
@@ -118,7 +112,7 @@ def identify_by_likelihood(
     share = min(KNOWN_EQUATIONS * false_terms, 0.5) if hidden else false_terms
     critical = np.tile(critical_values(library, false_terms=share), len(everything) // library.size)
     white = whiten(whole.linearisation, data, whole.noise)
-    last = solve(white.columns, white.innovations)[0] if whole.converged else 0.0
+    last = white.solve()[0] if whole.converged else 0.0
     goal = white.innovations + white.columns @ (whole.model.values - last)
     # Whitened values stand one behind the other, all outputs of a sample together.
     blocks = np.repeat(blocks_of(parent_recordings(data.labels)[data.recording]), data.outputs.shape[1])
@@ -258,26 +252,18 @@ def _strongest_correlation(white: Whitened, data: Measurements) -> tuple[float, 
     """Strongest correlation of near innovations over outputs and lags, and in standard errors."""
     measured = white.known.reshape(len(data.t), -1).any(axis=1)
     innovations, recording = white.innovations.reshape(len(data.t), -1)[measured], data.recording[measured]
-    found: list[tuple[float, float, float]] = []
+    found: list[tuple[float, float]] = []
     for lag in LAGS:
         rows = np.flatnonzero(recording[lag:] == recording[:-lag])
-        correlations, scores = correlations_between(innovations[rows], innovations[rows + lag])
-        found += zip(np.abs(scores), correlations, scores, strict=True)
-    _, correlation, score = max(found)
+        found += zip(*correlations_between(innovations[rows], innovations[rows + lag]), strict=True)
+    correlation, score = max(found, key=lambda one: abs(one[1]))
     return float(correlation), float(score)
 
 
 def _follow(
-    observation: ObservationModel,
-    data: Measurements,
-    *,
-    noise: Noise,
-    support: np.ndarray,
-    values: np.ndarray,
-    substeps: int,
+    observation: ObservationModel, data: Measurements, model: Dynamics, *, noise: Noise, substeps: int
 ) -> Fit:
     """The filter along recordings, with f and both noises as they are."""
-    model = observation.model(support, values)
     still = replace(model, parameters=tuple(replace(each, fixed=True) for each in model.parameters))
     return fit_by_filter(
         still, data, x=observation.states(data), noise=noise, estimate_process=False, estimate_sensor=False,
@@ -296,15 +282,10 @@ def held_out_innovations(
     """
     observation = ObservationModel.of(found)
     support, values = observation.unknown(found)
-    own = observation.measured(training, pair_step)
-    fit = observation.fitted(
-        support, values, own, noise=observation.noise_of(found), x=observation.states(own)
-    )
-    other = observation.measured(unseen, pair_step)
-    follow = _follow(
-        observation, other, noise=fit.noise, support=support, values=fit.model.values,
-        substeps=fit.substeps,
-    )  # fmt: skip
+    own, other = (observation.measured(each, pair_step) for each in (training, unseen))
+    begin = observation.states(own)
+    fit = observation.fitted(support, values, own, noise=observation.noise_of(found), x=begin)
+    follow = _follow(observation, other, fit.model, noise=fit.noise, substeps=fit.substeps)
     everything = observation.everything
     values = np.zeros(len(everything))
     values[[everything.tolist().index(one) for one in support.tolist()]] = fit.model.values
@@ -314,21 +295,17 @@ def held_out_innovations(
     white = whiten(replace(along, gap=follow.linearisation.gap), other, follow.noise)
     if white.degrees_of_freedom <= white.columns.shape[1]:
         return 1.0, 1.0
-    probability = unexplained_probability(
-        white.columns, white.innovations[:, None], freedom=white.degrees_of_freedom
-    )
-    total = float(white.innovations @ white.innovations)
-    usual = fit.sum_of_squares / fit.degrees_of_freedom
-    return probability, total / white.degrees_of_freedom / usual
+    rest, freedom = white.innovations, white.degrees_of_freedom
+    probability = unexplained_probability(white.columns, rest[:, None], freedom=freedom)
+    return probability, float(rest @ rest) / freedom / (fit.sum_of_squares / fit.degrees_of_freedom)
 
 
 def of_all_states(
     recordings: Recordings, found: FieldEstimate, *, pair_step: float | None = None
 ) -> Recordings:
     """The recordings, with the velocities of an estimate that were not recorded among their states."""
-    if not found.hidden_velocities:
-        return recordings
-    return filtered_recordings(found, recordings, pair_step=pair_step)
+    hidden = found.hidden_velocities
+    return filtered_recordings(found, recordings, pair_step=pair_step) if hidden else recordings
 
 
 def filtered_recordings(
@@ -342,19 +319,16 @@ def filtered_recordings(
     observation = ObservationModel.of(found)
     data = observation.measured(recordings, pair_step)
     count = observation.library.dimension - observation.hidden_states
-    support, values = observation.unknown(found)
-    follow = _follow(
-        observation, data, noise=observation.noise_of(found), support=support, values=values,
-        substeps=found.flow.steps,
-    )  # fmt: skip
+    model, noise = observation.model(*observation.unknown(found)), observation.noise_of(found)
+    follow = _follow(observation, data, model, noise=noise, substeps=found.flow.steps)
     runs, every = runs_of(recordings, longest=pair_step), observation.every(recordings)
     rows = np.concatenate([np.arange(run.start, run.stop, every) for run in runs])
-    measured = ~np.isnan(data.outputs).all(axis=1)
+    states = follow.linearised_at[~np.isnan(data.outputs).all(axis=1)]
     seen = replace(
         recordings,
         recording=recordings.recording[rows],
         t=recordings.t[rows],
-        values=follow.linearised_at[measured, :count].copy(),
+        values=states[:, :count].copy(),
     )
     if not observation.hidden:
         return seen
@@ -364,10 +338,6 @@ def filtered_recordings(
 
     time = bracketed(seen.time_unit or "1")
     per_time = [None if unit is None else f"{bracketed(unit)}/{time}" for unit in seen.units]
-    return replace(
-        seen,
-        names=found.library.states,
-        units=(*seen.units, *per_time),
-        headings=(*seen.titles, *found.library.states[count:]) if seen.headings else (),
-        values=follow.linearised_at.copy(),
-    )
+    headings = (*seen.titles, *found.library.states[count:]) if seen.headings else ()
+    units = (*seen.units, *per_time)
+    return replace(seen, names=found.library.states, units=units, headings=headings, values=states)

@@ -34,12 +34,8 @@ class CandidateLibrary:
 
     Attributes
     ----------
-    states
-        Names of the d states.
-    symbols
-        The states as sympy symbols.
-    terms
-        The q functions θ_k.
+    states, symbols, terms
+        Names of the d states; the same as symbols; and the q functions θ_k.
     in_potential, in_circulatory
         Shape ``(q,)``: which functions V, and g, may use. f may use all of them.
     derivatives
@@ -157,14 +153,12 @@ def candidate_library(
     circulatory_degree: int | None = None,
     further: Sequence[str] = (),
 ) -> CandidateLibrary:
-    """Monomials up to a degree, and whatever further functions a study lists.
+    """Monomials up to a total degree, and whatever further functions a study lists.
 
     Parameters
     ----------
-    states
-        Names of the states.
-    degree
-        Highest total degree of the monomials, for f.
+    states, degree
+        Names of the states; highest total degree of the monomials, for f.
     potential_degree, circulatory_degree
         Limits for V and g, where they are lower.
     further
@@ -176,15 +170,16 @@ def candidate_library(
     siq.systems.formulas.FormulaError
         When a further function is not a formula of the states, or is there already.
     """
-    return _candidate_library(tuple(states), degree, potential_degree, circulatory_degree, tuple(further))
+    limits = (degree if limit is None else limit for limit in (potential_degree, circulatory_degree))
+    return _candidate_library(tuple(states), degree, *limits, tuple(further))
 
 
 @lru_cache(maxsize=64)
 def _candidate_library(
     states: tuple[str, ...],
     degree: int,
-    potential_degree: int | None,
-    circulatory_degree: int | None,
+    potential_degree: int,
+    circulatory_degree: int,
     further: tuple[str, ...],
 ) -> CandidateLibrary:
     """`candidate_library`, once for the same functions: every step of a run asks for them, and every run."""
@@ -192,10 +187,8 @@ def _candidate_library(
     exponents = monomial_exponents(len(states), degree)
     terms = [sympy.Mul(*(s**e for s, e in zip(symbols, row, strict=True))) for row in exponents]
     degrees = [sum(row) for row in exponents]
-    in_potential = [total <= (degree if potential_degree is None else potential_degree) for total in degrees]
-    in_circulatory = [
-        total <= (degree if circulatory_degree is None else circulatory_degree) for total in degrees
-    ]
+    in_potential = [total <= potential_degree for total in degrees]
+    in_circulatory = [total <= circulatory_degree for total in degrees]
     names: Mapping[str, sympy.Expr] = dict(zip(states, symbols, strict=True))
     for text in further:
         function = parse_formula(text, names)
@@ -285,13 +278,8 @@ def field_dynamics(
     equations = [sympy.S.Zero] * library.dimension
     for (component, term), name in zip(support, names, strict=True):
         equations[component] += symbol(name) * library.terms[term]
-    return Dynamics(
-        states=library.states,
-        equations=tuple(equations),
-        diffusion=diffusion,
-        parameters=tuple(Parameter(name, float(value)) for name, value in zip(names, values, strict=True)),
-        covariance=covariance,
-    )
+    parameters = tuple(Parameter(name, float(value)) for name, value in zip(names, values, strict=True))
+    return Dynamics(library.states, tuple(equations), diffusion, parameters=parameters, covariance=covariance)
 
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))

@@ -15,8 +15,11 @@ restricted likelihood, which allows for these and for the parameters.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import scipy.optimize
@@ -28,7 +31,6 @@ from siq.inference.kalman_filter import (
     Grid,
     Linearisation,
     Noise,
-    Whitened,
     linearise,
     solve,
     substeps_needed,
@@ -41,9 +43,7 @@ PIECE = 500  # samples in one stretch, so that its unknown first state hardly ma
 MIN_ROUGHNESS_SHARE = 1e-4  # least measurement noise, as a share of what third differences show
 COARSE_SAMPLES = 8000  # whose noise is known to 2 %: enough to begin with
 LOGARITHM_STEP = 0.05  # numerical: of the logarithm of a variance, for differences of the likelihood
-MAX_ERROR = (
-    1.0  # standard error of a logarithm beyond which the likelihood is no parabola: a bound is far off
-)
+MAX_ERROR = 1.0  # standard error of a logarithm beyond which the likelihood is no parabola
 MIN_CURVATURE = 1.0  # along a logarithm, from which on its standard error is below one
 MAX_CORRECTION = 0.5  # of a logarithm, within which the likelihood is a parabola
 NO_PROCESS_NOISE = np.exp(-23.0)  # relative to where the search began; below it there is none
@@ -76,13 +76,6 @@ def first_noise(model: Dynamics, data: Measurements, x: np.ndarray) -> Noise:
     return Noise(data.with_known_noise(data.roughness), np.where(model.kinematic, 0.0, process))
 
 
-def _stacked(white: Whitened, expected: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Columns ``(n, p)`` and innovations ``(n,)`` with one row more for each expectation."""
-    if not len(expected[0]):
-        return white.columns, white.innovations
-    return np.concatenate([white.columns, expected[0]]), np.concatenate([white.innovations, expected[1]])
-
-
 def _estimate_noise(
     linearisation: Linearisation,
     data: Measurements,
@@ -96,9 +89,7 @@ def _estimate_noise(
     # The parameters are those that are best for the noise that the search begins with: they depend little on
     # it, and a fit returns here once they have settled.
     known, driven, outputs = data.known_sensors, start.driven, len(start.measurement)
-    white = whiten(linearisation, data, start)
-    columns, innovations = _stacked(white, expected)
-    whole = linearisation.with_parameters_changed(solve(columns, innovations)[0])
+    whole = linearisation.with_parameters_changed(whiten(linearisation, data, start).solve(expected)[0])
     count = len(data.t)
     # Pieces spread over all recordings, where there are many more samples than are needed.
     rows, first = np.arange(count), data.first
@@ -126,13 +117,11 @@ def _estimate_noise(
 
         return cost
 
-    cost = cost_along(rows, first)
-    begins = [np.zeros(start.coordinates)]
+    cost, of_process = cost_along(rows, first), np.zeros(start.coordinates)
+    of_process[outputs : outputs + len(driven)] = 1.0
     # Upwards, too: a candidate that promised to need hardly any process noise may not have kept that.
-    for factor in (1e-2, 1e-4, 1e-6, 1e2, 1e4) if len(driven) else ():
-        begins.append(np.zeros(start.coordinates))
-        begins[-1][outputs : outputs + len(driven)] = np.log(factor)
-    best = min(begins, key=cost)
+    factors = (1.0, 1e-2, 1e-4, 1e-6, 1e2, 1e4) if len(driven) else (1.0,)
+    best = min((np.log(factor) * of_process for factor in factors), key=cost)
     # States that process noise drives could follow every sample; the noise of a sensor never vanishes.
     least = np.log(MIN_ROUGHNESS_SHARE * data.roughness / start.measurement)
     bounds = [(0.0, 0.0) if known[k] else (min(least[k], 0.0), best[k] + 12.0) for k in range(outputs)]
@@ -195,18 +184,13 @@ def _corrected(
 def noise_uncertainty(fit: Fit, data: Measurements) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Errors of the noise of a fit, by the curvature of the likelihood along its trajectories.
 
-    Returns
-    -------
-    measurement, process
-        Standard errors of the logarithms of the sensors' variances ``(m,)``, and of the intensities of the
-        process noise ``(d,)``: infinite where one is only bounded from above, zero where it was given.
-    covariance
-        Of the free parameters, with what the noise leaves open in them, shape ``(p, p)``.
+    Standard errors of the logarithms of the sensors' variances ``(m,)``, and of the intensities of the
+    process noise ``(d,)``: infinite where one is only bounded from above, zero where it was given. And the
+    covariance of the free parameters ``(p, p)``, with what the noise leaves open in them.
     """
     known, line, driven = data.known_sensors, fit.linearisation, fit.noise.driven
     outputs, size = len(known), fit.noise.coordinates
-    white = whiten(line, data, fit.noise)
-    still = line.with_parameters_changed(solve(white.columns, white.innovations)[0])
+    still = line.with_parameters_changed(whiten(line, data, fit.noise).solve()[0])
     places = [k for k in range(size) if k >= outputs or not known[k]]
 
     def moved(*changes: tuple[int, float]) -> Noise:
@@ -234,14 +218,8 @@ def noise_uncertainty(fit: Fit, data: Measurements) -> tuple[np.ndarray, np.ndar
     if inside:
         of_noise = np.linalg.pinv(curvature[np.ix_(told, told)], hermitian=True)
         errors[inside] = np.sqrt(np.maximum(np.diag(of_noise), 0.0))
-        changes = []
-        for place in inside:
-            ends = []
-            for sign in (1, -1):
-                white = whiten(line, data, moved((place, sign * h)))
-                ends.append(solve(white.columns, white.innovations)[0])
-            changes.append((ends[0] - ends[1]) / (2 * h))
-        slope = np.stack(changes, axis=1)
+        ends = [[whiten(line, data, moved((one, step))).solve()[0] for step in (h, -h)] for one in inside]
+        slope = np.stack([(up - down) / (2 * h) for up, down in ends], axis=1)
         covariance = covariance + slope @ of_noise @ slope.T
     process = np.zeros_like(fit.noise.process)
     process[driven] = errors[outputs : outputs + len(driven)]
@@ -255,17 +233,16 @@ def _noise_along(
     estimate_process: bool,
     *,
     expected: tuple[np.ndarray, np.ndarray],
-    charge: Callable[[float], None] | None = None,
-    coarse: bool = False,
+    **search: Any,
 ) -> Noise:
     """The noise along the trajectories in hand, the process noise only where it is to be estimated, too."""
     driven = bool((noise.process > 0).any())
     if estimate_process and driven:
-        return _estimate_noise(linearisation, data, noise, expected=expected, charge=charge, coarse=coarse)
+        return _estimate_noise(linearisation, data, noise, expected=expected, **search)
     if driven and data.sensor_noise is not None:
         return noise
     white = whiten(linearisation, data, noise)
-    change, covariance = solve(*_stacked(white, expected))
+    change, covariance = white.solve(expected)
     determined = len(change) - float(np.einsum("rp,pq,rq->", expected[0], covariance, expected[0]))
     left = (white.innovations - white.columns @ change).reshape(len(data.t), -1)
     known = white.known.reshape(left.shape)
@@ -284,35 +261,27 @@ class Fit:
 
     Attributes
     ----------
-    model
-        With the estimates as its parameters' values.
-    covariance
-        Of the free parameters, shape ``(p, p)``, from white innovations.
+    model, covariance
+        With the estimates as its parameters' values; and of the free ones, shape ``(p, p)``.
     x
         Smoothed states at all samples, shape ``(n, d)``.
-    linearised_at
-        Where f was taken for `linearisation`, shape ``(n, d)``: `x` without process noise, otherwise what the
-        filter knows at each sample.
+    linearised_at, linearisation
+        Where f was taken, shape ``(n, d)``: `x` without process noise, otherwise what the filter knows at
+        each sample; and the linearisation there, at the estimates.
     spread
         Covariance of what the filter knows at each sample, shape ``(n, d, d)``; None without process noise.
     noise
         Estimates, or what was given.
-    linearisation
-        At `linearised_at` and the estimates.
     log_likelihood
         Not the restricted one, which depends on the units in which a model has its states.
-    sum_of_squares
-        Of the whitened innovations, and of what is expected of parameters: about `degrees_of_freedom` where
-        the model is right.
-    degrees_of_freedom
-        Measured values, and what is expected of several parameters together, less initial states and free
-        parameters.
+    sum_of_squares, degrees_of_freedom
+        Of the whitened innovations, and of what is expected of parameters; about as many where the model is
+        right: measured values, and what is expected of several parameters together, less initial states and
+        free parameters.
     substeps
         Runge–Kutta steps between samples.
-    converged
-        Whether the iteration settled.
-    fault
-        Why there is no result; empty where there is one, settled or not.
+    converged, fault
+        Whether the iteration settled; and why there is no result, empty where there is one, settled or not.
     """
 
     model: Dynamics
@@ -354,18 +323,9 @@ class _Iterate:
 def fit_of_states(
     model: Dynamics, data: Measurements, *, x: np.ndarray, noise: Noise, substeps: int, converged: bool
 ) -> Fit:
-    """A fit that was made otherwise: without process noise, its states follow the equations.
+    """A fit that was made otherwise, with states ``(n, d)`` that follow the equations of the fitted model.
 
-    Parameters
-    ----------
-    model
-        With the estimates.
-    data, substeps, converged
-        Of the fit.
-    x
-        The fitted states, shape ``(n, d)``.
-    noise
-        To begin with; the measurement noise is estimated.
+    The measurement noise is estimated, beginning with that of the noise.
     """
     at = _Iterate(model.values, x, linearise(model, Grid(data, substeps), model.values, x), x)
 
@@ -389,9 +349,9 @@ def _fit_at(
     """The fit whose iteration ended at parameters, states and noise."""
     white = whiten(at.along, data, noise)
     expected = expectations(model, at.values)
-    columns, innovations = _stacked(white, expected)
-    change, covariance = solve(columns, innovations, least=resolution)
+    change, covariance = white.solve(expected, least=resolution)
     # The last change is below the errors. The likelihood is that of the states in hand, not of a forecast.
+    innovations = np.append(white.innovations, expected[1])
     total = float(innovations @ innovations)
     together = sum(len(each.roots) for each in model.expected_together)
     return Fit(
@@ -468,13 +428,11 @@ class _Shooting:
         """The step suggested, shortened until it does about what was foreseen, and the share taken."""
         data = self.grid.data
         still = now.along.with_parameters_changed(change)
-        innovations, _, initial = still.filtered(data.first, data.step, noise.measurement, noise.intensity)[
-            :3
-        ]
+        filtered = still.filtered(data.first, data.step, noise.measurement, noise.intensity)
         begin = np.empty((len(data.labels), still.gap.shape[1]))
-        for place, (start, end) in enumerate(zip(data.first[:-1], data.first[1:], strict=True)):
-            columns = initial[start:end].reshape(-1, begin.shape[1])
-            begin[place] = solve(columns, innovations[start:end].ravel(), least=INEXACT)[0]
+        for place, (start, end) in enumerate(itertools.pairwise(data.first)):
+            columns = filtered[2][start:end].reshape(-1, begin.shape[1])
+            begin[place] = solve(columns, filtered[0][start:end].ravel(), least=INEXACT)[0]
         smoothed, known, covariance = still.smoothed(data.first, data.step, noise, begin)
         deviation = known if self.filtered else smoothed
         spread = covariance if noise.process.any() else None
@@ -503,10 +461,8 @@ class _Shooting:
     ) -> Fit:
         """The fit that begins at the model's values and states ``(n, d)``, in at most so many steps."""
         begin = _Iterate(self.model.values, x, along, x)
-        return _or_fault(
-            self.model, begin, noise, self.grid.substeps,
-            lambda: self.descended(begin, noise, estimate_process=estimate_process, most=most),
-        )  # fmt: skip
+        descended = partial(self.descended, begin, noise, estimate_process=estimate_process, most=most)
+        return _or_fault(self.model, begin, noise, self.grid.substeps, descended)
 
     def descended(self, now: _Iterate, noise: Noise, *, estimate_process: bool, most: int) -> Fit:
         """Gauss–Newton steps from a begin, at most so many."""
@@ -527,8 +483,7 @@ class _Shooting:
                 )  # fmt: skip
             self.charge()
             white = whiten(now.along, data, noise)
-            columns, innovations = _stacked(white, expected)
-            change, _ = solve(columns, innovations, least=self.resolution)
+            change, _ = white.solve(expected, least=self.resolution)
             explained = white.columns @ change
             left = white.innovations - explained
             settled = SETTLED * len(left) * max(1.0, (left**2).sum() / len(left))
@@ -575,26 +530,20 @@ def fit_by_multiple_shooting(
 ) -> Fit:
     """Fit free parameters, states and noise, by Gauss–Newton steps along linearised trajectories.
 
+    Where the simulation runs away the fit is not converged, with a log-likelihood of -∞ and its `fault`.
+
     Parameters
     ----------
     model, data
         Its parameters' values are where the fit begins.
-    x
-        States to begin with, shape ``(n, d)``.
-    noise
-        To begin with. Without process noise the fitted states follow their equations exactly.
+    x, noise
+        States ``(n, d)`` and noise to begin with. Without process noise the fitted states follow their
+        equations exactly.
     estimate_process
         Whether the process noise is estimated, too; the measurement noise always is.
-    substeps
-        Runge–Kutta steps between samples; by default as many as the accuracy needs.
-    iterations, budget
-        Most steps; charged for every evaluation.
-
-    Returns
-    -------
-    Fit
-        Not converged, with a log-likelihood of -∞ and the reason as its `fault`, where the simulation runs
-        away.
+    substeps, iterations, budget
+        Runge–Kutta steps between samples, by default as many as the accuracy needs; most steps of the fit;
+        charged for every evaluation.
 
     Raises
     ------

@@ -32,16 +32,12 @@ class Measurements:
 
     Attributes
     ----------
-    labels
-        One per recording.
-    first
-        Row at which each recording begins, and the number of rows; shape ``(recordings + 1,)``.
-    t
-        Times, shape ``(n,)``.
-    outputs
-        What was measured, shape ``(n, m)``, in the order of the model's outputs.
+    labels, first
+        One per recording; and the row at which each begins, then the number of rows: ``(recordings + 1,)``.
+    t, outputs
+        Times, shape ``(n,)``; and what was measured, shape ``(n, m)``, in the order of the model's outputs.
     courses
-        For each recording the courses of its inputs in time, see `course_of_input`.
+        For each recording the courses of its inputs in time.
     sensor_noise
         Variance of each output's noise where it is known, NaN where it is to be estimated; shape ``(m,)``.
         None where none is known.
@@ -81,20 +77,14 @@ class Measurements:
 
         What the motion itself adds is in it: a noise is hardly larger, and can be much smaller.
         """
-        result = np.empty(self.outputs.shape[1])
-        for place in range(len(result)):
-            differences = np.concatenate(
-                [
-                    np.diff(self.outputs[begin:end, place], n=3)
-                    for begin, end in zip(self.first[:-1], self.first[1:], strict=True)
-                ]
-            )
+        result = []
+        for column in self.outputs.T:
+            differences = np.concatenate([np.diff(part, n=3) for part in np.split(column, self.first[1:-1])])
             differences = differences[np.isfinite(differences)]
-            spread = np.nanvar(self.outputs[:, place])
             # The variance of the third difference of white noise is 20 times its own.
             rough = np.mean(differences**2) / 20 if len(differences) else 0.0
-            result[place] = max(rough, 1e-12 * spread) or 1.0
-        return result
+            result.append(max(rough, 1e-12 * np.nanvar(column)) or 1.0)
+        return np.array(result)
 
     def with_known_noise(self, measurement: np.ndarray) -> np.ndarray:
         """Variances of the outputs' noise, shape ``(m,)``, with those that are known in their places."""
@@ -115,20 +105,12 @@ class Measurements:
         delays: Sequence[tuple[int, float]],
         width: np.ndarray | float = 0.0,
     ) -> Signals:
-        """Inputs at instants, each in its recording.
+        """Inputs at instants ``(n,)``, each in its recording, whose places never decrease.
 
-        Parameters
-        ----------
-        t
-            Instants, shape ``(n,)``.
-        recording
-            The place of the recording of each; it never decreases.
-        delays
-            Delayed inputs wanted: the place of the input, and by how much time it lags. What was before a
-            recording is taken to be as it began.
-        width
-            Of time about each instant, over which a delayed input that is held between samples is averaged:
-            a jump within a step of an integration then acts as it should, and the lag has a derivative.
+        Delayed inputs are wanted by the place of the input, and by how much time it lags. What was before a
+        recording is taken to be as it began. Where they are held between samples they are averaged over a
+        width of time about each instant: a jump within a step of an integration then acts as it should, and
+        the lag has a derivative.
         """
         wide = np.broadcast_to(width, t.shape)
         count = len(self.courses[0]) if self.courses else 0
@@ -204,12 +186,7 @@ def _course_of_input(t: np.ndarray, u: np.ndarray, interpolation: str) -> scipy.
 def measurements(recordings: Recordings, model: Dynamics) -> Measurements:
     """Lay recordings out as the model needs them: its outputs, and the courses of its inputs.
 
-    Parameters
-    ----------
-    recordings
-        Read with the columns of `columns_of`, in this order.
-    model
-        Says what was measured and what drove the system.
+    Their columns are outputs, then inputs, see `columns_of`.
 
     Raises
     ------
@@ -293,20 +270,10 @@ def _filled(column: np.ndarray) -> np.ndarray:
 
 
 def expectations(model: Dynamics, values: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Priors of changes of the free parameters: combinations of them are normal, of unit width.
+    """Priors of changes of the free parameters: combinations of them ``(r, p)`` are normal, of unit width.
 
-    Parameters
-    ----------
-    model
-        Says what is expected of parameters, of each by itself and of several together.
-    values
-        Of all parameters; by default the model's own.
-
-    Returns
-    -------
-    tuple of numpy.ndarray
-        The combinations, shape ``(r, p)``, and how far the values fall short of what is expected of each,
-        shape ``(r,)``.
+    With how far the values of all parameters, by default the model's own, fall short of what is expected of
+    each combination, shape ``(r,)``.
     """
     now = (model.values if values is None else values)[list(model.free)]
     free = {model.parameters[place].name: column for column, place in enumerate(model.free)}

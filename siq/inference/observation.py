@@ -85,14 +85,10 @@ def velocity_names(positions: Sequence[str]) -> tuple[str, ...]:
 def seen_positions(plain: Dynamics) -> Dynamics:
     """Dynamics of forces alone, with ``dx/dt = v`` and with positions for their outputs."""
     half = plain.dimension // 2
-    names, symbols = plain.states[:half], [symbol(name) for name in plain.states]
-    return Dynamics(
-        states=plain.states,
-        equations=(*symbols[half:], *plain.equations[half:]),
-        diffusion=plain.diffusion,
-        parameters=plain.parameters,
-        outputs=tuple(zip(names, symbols[:half], strict=True)),
-    )
+    symbols = plain.symbols
+    outputs = tuple(zip(plain.states[:half], symbols[:half], strict=True))
+    equations = (*symbols[half:], *plain.equations[half:])
+    return Dynamics(plain.states, equations, plain.diffusion, parameters=plain.parameters, outputs=outputs)
 
 
 def smoothed_motion(data: Measurements, names: Sequence[str]) -> tuple[np.ndarray, Noise]:
@@ -132,14 +128,8 @@ def smoothed_motion(data: Measurements, names: Sequence[str]) -> tuple[np.ndarra
 class ObservationModel:
     """The relation of samples to the states of f.
 
-    Attributes
-    ----------
-    library, diffusion
-        Of f.
-    exposure
-        The time over which a sample is a mean, None where it is none.
-    hidden
-        Whether the second half of the states are velocities, of which samples show nothing.
+    A sample may be a mean over an exposure. Where velocities are hidden they are the second half of the
+    states, and samples show nothing of them.
     """
 
     library: CandidateLibrary
@@ -317,7 +307,8 @@ class InertiaTest:
     relaxation
         How fast x relaxes in the stiffest well if there is no inertia, ``-F'(x)``; 0 where there is no well.
     frequency, frequency_error
-        ω of that well with inertia, ``√(-γ F'(x))``, and its standard error.
+        ω of that well with inertia, ``√(-γ F'(x))``, and its standard error; not a number where γ is not
+        shown.
     step
         Time between samples.
     """
@@ -346,11 +337,6 @@ class InertiaTest:
         """Whether inertia is slight enough to be left out: it is not seen, and would have been."""
         return not self.seen and self.relaxation <= SLIGHT * self.friction
 
-    @property
-    def undecided(self) -> bool:
-        """Whether the record cannot tell."""
-        return not (self.seen or self.overdamped)
-
     def sentence(self, unit: str = "") -> str:
         """The answer in words, with its figures."""
         needed = 1 / max(self.relaxation / SLIGHT, 1e-300)
@@ -361,18 +347,9 @@ class InertiaTest:
 def inertia_test(
     recordings: Recordings, *, degree: int = 5, pair_step: float | None = None, limit: bool = True
 ) -> InertiaTest:
-    """Ask recordings of one position whether it has inertia.
+    """Ask recordings of one position whether it has inertia, with powers of x up to a degree in F.
 
-    Parameters
-    ----------
-    recordings
-        Of one position.
-    degree
-        Highest power of x in F.
-    pair_step
-        Longest time between samples that still belong together.
-    limit
-        Whether a limit of γ is searched for where no inertia is seen; if not, γ means nothing there.
+    Where no inertia is seen a limit of γ may be searched for; if not, γ means nothing there.
 
     Raises
     ------
@@ -380,18 +357,29 @@ def inertia_test(
         Where one of the models cannot be fitted, or there is more than one position.
     """
     models = _InertialModels(recordings, degree, pair_step)
-    test = models.test()
-    if test is not None and (test.seen or not limit):
-        return test
-    if test is None and not limit:
+    # With γF in terms of its own, and γ behind their coefficients.
+    model = models.with_velocity(lambda force, v, friction: force - friction * v, fixed=False)
+    best = fit_by_filter(model, models.data, x=models.x, noise=models.noise, closure=False)
+    friction, fastest = float(best.model.values[-1]), MAX_FRICTION / models.step
+    shown = best.converged and not best.fault and 0 < friction < fastest
+    if not (shown or limit):
         return InertiaTest(0.0, np.inf, 0.0, None, 0.0, np.nan, np.nan, models.step)
-    if test is None:  # the samples show no γ
-        fastest = MAX_FRICTION / models.step
-        fit = models.with_friction(fastest)
-        least = models.least_friction(fit.log_likelihood, fastest)
-        return InertiaTest(*models.compared(fit), least, None, models.relaxation, np.nan, np.nan, models.step)
-    best = models.without.log_likelihood + test.gain + models.price
-    return replace(test, friction=models.least_friction(best, test.friction), friction_error=None)
+    frequency, error = np.nan, np.nan
+    if shown:
+        stiffness, error = models.stiffness(best.model.values[:-1], best.covariance[:-1, :-1])
+        frequency = float(np.sqrt(stiffness))
+        error = error / (2 * frequency) if frequency > 0 else np.nan
+    else:
+        friction, best = fastest, models.with_friction(fastest)
+    relaxation = models.stiffness(models.without.model.values, models.without.covariance)[0]
+    test = InertiaTest(
+        *models.compared(best), friction, float(best.standard_errors[-1]), relaxation, frequency, error,
+        models.step,
+    )  # fmt: skip
+    if shown and (test.seen or not limit):
+        return test
+    least = models.least_friction(best.log_likelihood, friction)
+    return replace(test, friction=least, friction_error=None)
 
 
 class _InertialModels:
@@ -424,17 +412,12 @@ class _InertialModels:
             raise NumericalFailure(f"the model without inertia cannot be fitted: {fit.fault}")
         return fit
 
-    @property
-    def relaxation(self) -> float:
-        """In the stiffest well of the model without inertia."""
-        return self._stiffness(self.without.model.values, self.without.covariance)[0]
-
     def compared(self, fit: Fit) -> tuple[float, float]:
         """Log-likelihood over that without inertia, at its price, and its error from blocks of the record."""
         gain, data = fit.log_likelihood - self.without.log_likelihood - self.price, self.data
         length = max(len(data.t) // BLOCKS, 2)
         differences = []
-        for begin, end in zip(data.first[:-1], data.first[1:], strict=True):
+        for begin, end in itertools.pairwise(data.first):
             bounds = np.linspace(begin, end, max(round((end - begin) / length), 1) + 1).astype(int)
             for low, high in itertools.pairwise(bounds):
                 rows, values = slice(low, high), []
@@ -450,32 +433,16 @@ class _InertialModels:
             return gain, np.inf
         return gain, float(np.std(differences, ddof=1) * np.sqrt(len(differences)))
 
-    def test(self) -> InertiaTest | None:
-        """The test with the γ that fits best; None where that is none that samples could show."""
-        # With γF in terms of its own, and γ behind their coefficients.
-        model = self._model(lambda force, v, friction: force - friction * v, fixed=False)
-        best = fit_by_filter(model, self.data, x=self.x, noise=self.noise, closure=False)
-        friction = best.model.values[-1]
-        if not best.converged or best.fault or not 0 < friction < MAX_FRICTION / self.step:
-            return None
-        stiffness, error = self._stiffness(best.model.values[:-1], best.covariance[:-1, :-1])
-        frequency = float(np.sqrt(stiffness))
-        return InertiaTest(
-            *self.compared(best), float(friction), float(best.standard_errors[-1]), self.relaxation,
-            frequency, error / (2 * frequency) if frequency > 0 else np.nan, self.step,
-        )  # fmt: skip
-
     @cached_property
     def _with_speed(self) -> Dynamics:
         """With γ as it is given: F is that of the model without inertia."""
-        return self._model(lambda force, v, friction: friction * (force - v), fixed=True)
+        return self.with_velocity(lambda force, v, friction: friction * (force - v), fixed=True)
 
     def with_friction(self, friction: float) -> Fit:
         """With γ given, beginning with F and the noise of the model without inertia."""
         model = self._with_speed.with_values(np.append(self.without.model.values, friction))
-        noise = self.without.noise
-        rate = np.diag(np.append(0.0, friction**2 * noise.process))
-        noise = Noise.of_rate(noise.measurement, rate)
+        rate = np.diag(np.append(0.0, friction**2 * self.without.noise.process))
+        noise = Noise.of_rate(self.without.noise.measurement, rate)
         return fit_by_filter(model, self.data, x=self.x, noise=noise, closure=False)
 
     def least_friction(self, best: float, highest: float) -> float:
@@ -487,15 +454,14 @@ class _InertialModels:
                 return 0.0
         for _ in range(HALVINGS):
             middle = float(np.sqrt(low * high))
-            if best - self.with_friction(middle).log_likelihood < DROP:
-                high = middle
-            else:
-                low = middle
+            within = best - self.with_friction(middle).log_likelihood < DROP
+            low, high = (low, middle) if within else (middle, high)
         return high
 
-    def _model(
+    def with_velocity(
         self, rate: Callable[[sympy.Expr, sympy.Symbol, sympy.Symbol], sympy.Expr], *, fixed: bool
     ) -> Dynamics:
+        """With dv/dt as a rate of F, v and γ, of which γ may be fixed."""
         states = (*self.library.states, *velocity_names(self.library.states))
         friction = "friction" + "_" * max(map(len, states))  # no state is called so
         parameters = (*self._parameters, Parameter(friction, 0.0, fixed=fixed))
@@ -504,7 +470,7 @@ class _InertialModels:
             Dynamics(states, (sympy.S.Zero, equation), Diffusion.identity(2), parameters=parameters)
         )
 
-    def _stiffness(self, values: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
+    def stiffness(self, values: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
         """``-F'`` where F falls through zero most steeply, and its standard error; zeros where nowhere."""
         low, high = np.quantile(self.data.outputs, (0.01, 0.99))
         places, library = np.linspace(low, high, WELL_GRID)[:, None], self.library

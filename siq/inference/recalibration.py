@@ -10,13 +10,14 @@ likelihood, and so is how the parameters would change.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import scipy.stats
 
 from siq.errors import NumericalFailure
 from siq.inference.budget import COMPILATION, Budget, evaluation
-from siq.inference.kalman_filter import Grid, Noise, profile_likelihood, solve, whiten
+from siq.inference.kalman_filter import Grid, Noise, profile_likelihood, whiten
 from siq.inference.maximum_likelihood import Fit, first_noise, fit_by_multiple_shooting
 from siq.inference.measurements import Measurements, first_states
 from siq.inference.trajectories import EDGE_SUBSTEPS, fit_trajectories, jumps_of, run, sharpened, spread_edges
@@ -78,7 +79,7 @@ def _average(
             white = whiten(
                 fit.linearisation, data, Noise(fit.noise.measurement, process * size**2, fit.noise.shape)
             )
-            change, covariance = solve(white.columns, white.innovations)
+            change, covariance = white.solve()
         except (NumericalFailure, np.linalg.LinAlgError):
             return None
         left = white.innovations - white.columns @ change
@@ -146,18 +147,8 @@ def fit_with_and_without_process_noise(
 ) -> tuple[Fit | None, Fit]:
     """Fit with process noise estimated, where that was begun with, and without.
 
-    Parameters
-    ----------
-    model, data
-        With the parameters' values to begin with.
-    begin
-        A fit whose states and noise are begun with.
-    level
-        Factor on its process noise.
-    x
-        States, where the model has more of them.
-    settled
-        Whether `begin` is itself the fit of the model with process noise, and need not be made again.
+    Both begin with the states and noise of a fit, its process noise times the `level`; or with states `x`,
+    where the model has more of them. Where the fit is `settled` it is itself the one with process noise.
 
     Raises
     ------
@@ -166,46 +157,48 @@ def fit_with_and_without_process_noise(
     """
     if budget is not None:
         budget.charge(COMPILATION)
-    states = begin.x if x is None else x
-    substeps = begin.substeps
-    if jumps_of(model):
+    states, substeps, jumps = begin.x if x is None else x, begin.substeps, jumps_of(model)
+    if jumps:
         substeps = max(substeps, EDGE_SUBSTEPS)
         model = spread_edges(model, data, states, substeps=substeps)
     noise = begin.noise.of_states(model.dimension)
+    same: dict[str, Any] = {"substeps": substeps, "budget": budget}
     loose: Fit | None = None
-    if settled and not jumps_of(model):
+    if settled and not jumps:
         loose = begin
     elif noise.process.any():
-        loose = fit_by_multiple_shooting(
-            model, data, x=states, noise=noise.scaled(max(level, 1e-6)), estimate_process=True,
-            substeps=substeps, budget=budget,
-        )  # fmt: skip
-    start = loose if loose is not None and loose.converged else None
-    begun = model if start is None else start.model
-    x, still = (states, noise) if start is None else (start.x, start.noise)
+        driven = noise.scaled(max(level, 1e-6))
+        loose = fit_by_multiple_shooting(model, data, x=states, noise=driven, estimate_process=True, **same)
 
     def at_all_samples() -> Fit:
+        of = loose if loose is not None and loose.converged else None
+        at, still = (states, noise) if of is None else (of.x, of.noise)
         return fit_by_multiple_shooting(
-            begun, data, x=x, noise=still.without_process(), estimate_process=False, substeps=substeps,
-            budget=budget,
+            model if of is None else of.model, data, x=at, noise=still.without_process(),
+            estimate_process=False, **same,
         )  # fmt: skip
 
     def as_trajectories() -> Fit:
         # Where process noise led to nothing better, it led away.
-        better = start is not None or (loose is not None and loose.log_likelihood > begin.log_likelihood)
-        of = loose if loose is not None and better else None
+        better = loose is not None and (loose.converged or loose.log_likelihood > begin.log_likelihood)
+        of = loose if better else None
+        at, still = (states, noise) if of is None else (of.x, of.noise)
         return fit_trajectories(
-            model if of is None else of.model, data, begin=(states if of is None else of.x)[data.first[:-1]],
-            noise=noise if of is None else of.noise, substeps=substeps, budget=budget,
-        )  # fmt: skip
+            model if of is None else of.model, data, begin=at[data.first[:-1]], noise=still, **same
+        )
 
     # Where f jumps, steps of all samples at once go to and fro.
-    ways = (as_trajectories, at_all_samples) if jumps_of(model) else (at_all_samples, as_trajectories)
+    ways = (as_trajectories, at_all_samples) if jumps else (at_all_samples, as_trajectories)
     strict = ways[0]()
     if not strict.converged:
         strict = preferred_fit(strict, ways[1]())
-    vanished = None if start is None else drop_insignificant_process_noise(start, data)
-    return loose, strict if vanished is None else preferred_fit(vanished, strict)
+    return loose, _with_insignificant_dropped(loose, strict, data)
+
+
+def _with_insignificant_dropped(loose: Fit | None, strict: Fit, data: Measurements) -> Fit:
+    """Of a fit without process noise, and one whose process noise does nothing in it, the better one."""
+    idle = drop_insignificant_process_noise(loose, data) if loose is not None and loose.converged else None
+    return strict if idle is None else preferred_fit(idle, strict)
 
 
 def drop_insignificant_process_noise(fit: Fit, data: Measurements) -> Fit | None:
@@ -288,9 +281,7 @@ def recalibrate(model: Dynamics, data: Measurements, *, budget: Budget | None = 
         strict.model, data, x=strict.x, noise=small, estimate_process=True, substeps=strict.substeps,
         budget=budget,
     )  # fmt: skip
-    if again.converged:
-        idle = drop_insignificant_process_noise(again, data)
-        strict = strict if idle is None else preferred_fit(idle, strict)
+    strict = _with_insignificant_dropped(again, strict, data)
     loosened = [each for each in (known, again) if each is not None and each.converged]
     best = max(loosened, key=lambda each: each.log_likelihood, default=None)
     return _simpler_fit(best, strict), strict

@@ -63,16 +63,9 @@ FLOW_SAMPLE = 500  # pairs by which the accuracy of the flow is judged
 
 @dataclass(frozen=True)
 class LaggedPairs(SnapshotPairs):
-    """Neighbouring samples, each pair with the sample some steps earlier.
+    """Neighbouring samples, each pair with the state L steps earlier, ``(n, d)``, L being the lag.
 
-    Attributes
-    ----------
-    earlier
-        Shape ``(n, d)``: the states L steps before the pairs begin.
-    number
-        Shape ``(n,)``: the stretch that a pair is from; pairs of a stretch follow each other.
-    lag
-        L.
+    The `number` is that of the stretch that a pair is from, ``(n,)``; pairs of a stretch follow each other.
     """
 
     earlier: np.ndarray
@@ -128,13 +121,9 @@ def lagged_pairs(recordings: Recordings, lag: int) -> LaggedPairs:
 def coarse_pairs(recordings: Recordings, lag: int, *, lost: float) -> SnapshotPairs:
     """Pairs so far apart that each begins where the last one ends, and none knows of the noise of the other.
 
-    Parameters
-    ----------
-    recordings, lag
-        Trajectories that are Markovian from so many steps on.
-    lost
-        See `lost_time`. By so much less than the pairs are apart is their `h`: given where a pair begins, its
-        mean and its variance are those of white noise in that shorter time, but for what circulates.
+    The recordings are Markovian from so many steps on. By the lost time (`lost_time`) less than the pairs are
+    apart is their `h`: given where a pair begins, its mean and its variance are those of white noise in that
+    shorter time, but for what circulates.
     """
     stretches = even_stretches(recordings)
     at = stretches.within(lag - 1)
@@ -246,13 +235,8 @@ class _PairRegression:
         Columns ``(m, active)`` explain goals ``(m, d)``; `spread` is the covariance of a row of residuals.
         """
         whiten = scipy.linalg.solve_triangular(np.linalg.cholesky(spread), np.eye(len(spread)), lower=True)
-        design = np.stack(
-            [
-                np.outer(whiten[:, i], columns[:, k]).ravel()
-                for i, k in zip(self.support[:, 0], self.position, strict=True)
-            ],
-            axis=1,
-        )
+        places = zip(self.support[:, 0], self.position, strict=True)
+        design = np.stack([np.outer(whiten[:, i], columns[:, k]).ravel() for i, k in places], axis=1)
         # Scaled columns, for functions may differ by many orders of magnitude.
         scale = positive(np.linalg.norm(design, axis=0))
         inverse = np.linalg.pinv(design / scale) / scale[:, None]
@@ -309,10 +293,7 @@ def carries_noise(
     options: IdentificationOptions,
     integrator_step: float | None = None,
 ) -> bool:
-    """Whether pairs are more than an integrator's error away from any f in the library.
-
-    The arguments are those of `identify_vector_field`.
-    """
+    """Whether pairs are more than an integrator's error away from any f in the library."""
     if len(pairs.h) < 2 * library.size:
         raise NumericalFailure(
             f"only {len(pairs.h)} pairs for {library.size} candidate functions of f;"
@@ -330,16 +311,12 @@ def identify_vector_field(
     diffusion: Diffusion | None = None,
     integrator_step: float | None = None,
 ) -> FieldEstimate:
-    """f of pairs.
+    """f of pairs; by instruments of `LaggedPairs`, the library's functions of the earlier states.
 
     Parameters
     ----------
-    library
-        The candidate functions; those of the earlier states are the instruments of `LaggedPairs`.
-    pairs
-        X0, Xh and h.
-    options
-        What makes a term significant.
+    library, pairs, options
+        The candidate functions; X0, Xh and h; and what makes a term significant.
     diffusion
         D, by default the unit matrix; f does not depend on it.
     integrator_step
@@ -363,14 +340,12 @@ def identify_vector_field(
         return _identify_by_instruments(library, pairs, options, noise)
     if not carries_noise(library, pairs, options=options, integrator_step=integrator_step):
         pairs = pairs.take(_evenly(len(pairs.h), options.pairs))
-    n = len(pairs.h)
-    triangle, rate, ratio, flow = _fit_everything(
-        _PairRegression(library, pairs), integrator_step=integrator_step
-    )
+    regression = _PairRegression(library, pairs)
+    triangle, rate, ratio, flow = _fit_everything(regression, integrator_step=integrator_step)
     noise_free = ratio < NOISE_FREE
     critical = critical_values(library, false_terms=options.false_terms)
-    repeated = 1.0 if noise_free else copies(pairs)
-    problems = LinearProblem.of_components(triangle, samples=n / repeated, critical=critical)
+    samples = len(pairs.h) / (1.0 if noise_free else copies(pairs))
+    problems = LinearProblem.of_components(triangle, samples=samples, critical=critical)
     choose = partial(strong_terms, precision=options.precision) if noise_free else best_support
     chosen = chosen_terms(problems, library, choose)
     found = FieldEstimate.on_support(
@@ -480,18 +455,9 @@ def with_noise_formula(
 ) -> FieldEstimate | None:
     """f and D for a noise that depends on the state; None where a constant one can be held.
 
-    Parameters
-    ----------
-    found, pairs
-        f as it was found with one weight for all, and the pairs that it was fitted to.
-    false_terms
-        Probability that a constant D is given up by chance; and that chance brings any false term into f, or
-        into D.
-
-    Returns
-    -------
-    FieldEstimate or None
-        f with its D, of which the geometric mean of the determinant over the recorded states is one, and εD.
+    From f as it was found with one weight for all of its pairs. With the probability `false_terms` a constant
+    D is given up by chance; or chance brings any false term into f, or into D. Over the recorded states the
+    determinant of D has the geometric mean one.
 
     Raises
     ------
@@ -505,14 +471,12 @@ def with_noise_formula(
     probability = likelihood.constant_probability()
     if probability >= false_terms:
         return None
-    for done in range(WEIGHT_ROUNDS + 1):
-        if done:
-            likelihood = ResidualLikelihood(found, pairs, residuals(found, pairs))
+    for _ in range(WEIGHT_ROUNDS):
         formula = likelihood.selected(false_terms=false_terms, probability=probability)[0]
-        found = found.with_formula(formula, pairs.x0)
-        if done < WEIGHT_ROUNDS:
-            found = _identify_weighted(found, pairs, false_terms=false_terms)
-    return refit(found, pairs)
+        found = _identify_weighted(found.with_formula(formula, pairs.x0), pairs, false_terms=false_terms)
+        likelihood = ResidualLikelihood(found, pairs, residuals(found, pairs))
+    formula = likelihood.selected(false_terms=false_terms, probability=probability)[0]
+    return refit(found.with_formula(formula, pairs.x0), pairs)
 
 
 def with_given_noise(
@@ -527,16 +491,13 @@ def with_given_noise(
 
 def _identify_weighted(found: FieldEstimate, pairs: SnapshotPairs, *, false_terms: float) -> FieldEstimate:
     """The significant terms of f, sought anew among all of its library with the weights of its D."""
-    library = found.library
-    everything = all_coefficients(range(library.dimension), library.size)
-    triangle, intensity = weighted_triangle(found, pairs, None)
+    library, (triangle, intensity) = found.library, weighted_triangle(found, pairs, None)
     critical = np.tile(critical_values(library, false_terms=false_terms), library.dimension)
-    problem = LinearProblem(
-        triangle[:, :-1], triangle[:, -1], intensity * copies(pairs), critical, everything
-    )
+    everything = all_coefficients(range(library.dimension), library.size)
+    variance = intensity * copies(pairs)
+    problem = LinearProblem(triangle[:, :-1], triangle[:, -1], variance, critical, everything)
     support = chosen_terms([problem], library)
-    kept = problem.places(support)
-    start = np.linalg.lstsq(triangle[:, kept], triangle[:, -1], rcond=None)[0]
+    start = np.linalg.lstsq(triangle[:, problem.places(support)], triangle[:, -1], rcond=None)[0]
     found = refit(found.with_values(support, start, covariance=np.eye(len(support))), pairs)
     return replace(found, alternatives=model_average([problem], support, library))
 
@@ -546,21 +507,15 @@ def weighted_triangle(
 ) -> tuple[np.ndarray, float]:
     """R of the design with the weights of D and its goal as the last column; and ε.
 
-    Parameters
-    ----------
-    found, pairs
-        f says how the flow differs from a straight step, and D says the weights.
-    places
-        Component and function of each column, shape ``(p, 2)``; None for all of them.
-    of_rest
-        Whether the goal is what f leaves of the velocities, rather than these.
+    The columns are those of some components and functions ``(p, 2)``, or of all. The goal are the velocities,
+    less what f adds to a straight step; or what f leaves of them.
     """
-    regression = _PairRegression(found.library, pairs, found.support)
+    regression, d = _PairRegression(found.library, pairs, found.support), found.library.dimension
     velocity = regression.corrected(found.values, found.flow, found.noise_rate)
     left = velocity - regression.predicted(found.values)
-    if places is None:
-        places = all_coefficients(range(found.library.dimension), found.library.size)
-    p, d = len(places), found.library.dimension
+    goal = left if of_rest else velocity
+    places = all_coefficients(range(d), found.library.size) if places is None else places
+    p = len(places)
     triangle, squares = np.zeros((0, p + 1)), 0.0
     for begin in range(0, len(pairs.h), WEIGHTED_CHUNK):
         part = slice(begin, begin + WEIGHTED_CHUNK)
@@ -569,7 +524,6 @@ def weighted_triangle(
         terms = found.library.evaluate(x)[:, places[:, 1]]
         block = np.empty((len(x), d, p + 1))
         block[:, :, :-1] = whitening[:, :, places[:, 0]] * terms[:, None, :]
-        goal = left if of_rest else velocity
         block[:, :, -1] = (whitening @ goal[part][:, :, None])[:, :, 0]
         squares += float(((whitening @ left[part][:, :, None]) ** 2).sum())
         stacked = np.concatenate([triangle, block.reshape(-1, p + 1)])

@@ -66,12 +66,8 @@ def critical_values(library: CandidateLibrary, *, false_terms: float) -> np.ndar
 
     Then noise alone brings any false term into f with the probability `false_terms`.
     """
-    degrees = np.array(
-        [
-            library.total_degree(place) if term.is_polynomial(*library.symbols) else FURTHER_DEGREE
-            for place, term in enumerate(library.terms)
-        ]
-    )
+    powers = [term.is_polynomial(*library.symbols) for term in library.terms]
+    degrees = np.array([library.total_degree(k) if one else FURTHER_DEGREE for k, one in enumerate(powers)])
     present, counts = np.unique(degrees, return_counts=True)
     shares = 1 / scipy.special.factorial(present)
     budget = false_terms * shares / shares.sum() / (counts * library.dimension)
@@ -85,16 +81,11 @@ class LinearProblem:
 
     Attributes
     ----------
-    columns
-        Of the q coefficients, shape ``(m, q)``.
-    goal
-        What they explain, shape ``(m,)``.
-    variance
-        Of a residual.
-    critical
-        Standard errors that each coefficient has to be from zero, shape ``(q,)``.
-    labels
-        Component of f and function of each column, shape ``(q, 2)``.
+    columns, goal, variance
+        Of the q coefficients, shape ``(m, q)``; what they explain, shape ``(m,)``; and that of a residual.
+    critical, labels
+        Standard errors that each coefficient has to be from zero, shape ``(q,)``; and its component of f and
+        function, shape ``(q, 2)``.
     """
 
     columns: np.ndarray
@@ -120,8 +111,7 @@ class LinearProblem:
 
     def solve(self, support: Sequence[int]) -> np.ndarray:
         """Coefficients on a support, shape ``(q,)``."""
-        coefficients = np.zeros(self.columns.shape[1])
-        places = list(support)
+        coefficients, places = np.zeros(self.columns.shape[1]), list(support)
         if places:
             chosen = self.columns[:, places]
             scale = positive(np.linalg.norm(chosen, axis=0))
@@ -287,42 +277,22 @@ def _improved_support(problem: LinearProblem, start: Sequence[int]) -> tuple[int
 def fit_significant(
     fit: Callable[[np.ndarray], tuple[Result, np.ndarray]], support: np.ndarray
 ) -> tuple[Result, np.ndarray]:
-    """Fit a support, and again without its weakest term, until all terms are significant.
+    """Fit a support ``(p, 2)``, and again without its weakest term, until all terms are significant.
 
-    The last term of an equation stays.
-
-    Parameters
-    ----------
-    fit
-        From a support to what was fitted, and the strength of each coefficient: below one it is not
-        significant.
-    support
-        Component and term of each coefficient, shape ``(p, 2)``; what remains of it is given back with the
-        fit.
+    A fit leads to what was fitted, and the strength of each coefficient: below one it is not significant. The
+    last term of an equation stays. What remains of the support is given back with the fit.
     """
     while True:
         fitted, strength = fit(support)
-        weak = next(
-            (
-                place
-                for place in np.argsort(strength)
-                if strength[place] < 1 and np.sum(support[:, 0] == support[place, 0]) > 1
-            ),
-            None,
-        )
-        if weak is None:
+        several = (support[:, :1] == support[:, 0]).sum(axis=0) > 1
+        weak = [place for place in np.argsort(strength) if strength[place] < 1 and several[place]]
+        if not weak:
             return fitted, support
-        support = np.delete(support, weak, axis=0)
+        support = np.delete(support, weak[0], axis=0)
 
 
 def blocks_of(recording: np.ndarray) -> np.ndarray:
-    """The block of each row, shape ``(n,)``: whole recordings, or parts where there are few.
-
-    Parameters
-    ----------
-    recording
-        The place of the recording of each row, shape ``(n,)``; it never decreases.
-    """
+    """The block of each row ``(n,)``: whole recordings, whose places never decrease; parts of a few."""
     _, place = np.unique(recording, return_inverse=True)
     if place.max(initial=0) + 1 < MIN_RECORDINGS:
         return np.arange(len(place)) * PARTS // max(len(place), 1)
@@ -341,18 +311,10 @@ def stability(
     *,
     generator: np.random.Generator,
 ) -> np.ndarray:
-    """Share of resampled recordings in which each chosen term is chosen again, shape ``(p,)``.
+    """Share of resampled recordings in which each term of a support ``(p, 2)`` is chosen again: ``(p,)``.
 
-    Parameters
-    ----------
-    parts
-        Triangles of the blocks, see `triangles`.
-    problems_of
-        The problems of a triangle of all of them.
-    support
-        Component and term of each chosen coefficient, shape ``(p, 2)``, from which each search begins.
-    generator
-        Draws the blocks, with replacement.
+    Blocks, of which the triangles are known (`triangles`), are drawn with replacement; the search in the
+    problems of the triangle of all of them begins from the support.
     """
     counts = np.zeros(len(support))
     for _ in range(DRAWS):
@@ -367,22 +329,10 @@ def stability(
 def model_average(
     problems: Sequence[LinearProblem], support: np.ndarray, library: CandidateLibrary
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bias and spread that the mean over supports adds to the f of the chosen one.
+    """Bias and spread that the mean over supports of independent problems adds to the f of the chosen one.
 
-    Parameters
-    ----------
-    problems
-        Independent of each other.
-    support
-        The chosen one.
-    library
-        The functions.
-
-    Returns
-    -------
-    tuple of numpy.ndarray
-        By how much f changes in the mean, shape ``(q, d)``; and changes whose outer products add up to the
-        covariance about that mean, less that of the coefficients of the chosen support: ``(r, q, d)``.
+    By how much f changes in the mean, shape ``(q, d)``; and changes whose outer products add up to the
+    covariance about that mean, less that of the coefficients of the chosen support: ``(r, q, d)``.
     """
     bias, spread = np.zeros((library.size, library.dimension)), []
     for problem in problems:

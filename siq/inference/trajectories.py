@@ -12,7 +12,10 @@ of its argument when it is evaluated, so that an integrator can follow it.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import sympy
@@ -198,27 +201,12 @@ def fit_trajectories(
     substeps: int,
     budget: Budget | None = None,
 ) -> Fit:
-    """Fit free parameters and initial states, without process noise, by damped steps.
+    """Fit free parameters and initial states ``(recordings, d)``, without process noise, by damped steps.
 
     Slower by far than `siq.inference.maximum_likelihood.fit_by_multiple_shooting`, for it simulates
     sample after sample, and lost where the motion is chaotic; to be used where that one does not settle.
-
-    Parameters
-    ----------
-    model, data
-        Its parameters' values are where the fit begins.
-    begin
-        Initial states to begin with, shape ``(recordings, d)``.
-    noise
-        Of which only the measurement noise is used, for the weights of the outputs.
-    substeps, budget
-        Runge–Kutta steps between samples; charged for every evaluation.
-
-    Returns
-    -------
-    Fit
-        Not converged where the simulation runs away at the begin, or where more simulations would be needed
-        than are allowed.
+    The measurement noise weighs the outputs. The fit is not converged where the simulation runs away at the
+    begin, or where more simulations would be needed than are allowed.
 
     Raises
     ------
@@ -289,12 +277,10 @@ class _NormalEquations:
         innovations, by_parameters, by_initial = along.filtered(data.first, data.step, variance, still)[:3]
         dimension, parameters, recordings = by_initial.shape[2], by_parameters.shape[2], len(data.labels)
         self.shared, self.shared_target = np.zeros((parameters, parameters)), np.zeros(parameters)
-        self.own, self.own_target = (
-            np.zeros((recordings, dimension, dimension)),
-            np.zeros((recordings, dimension)),
-        )
+        self.own = np.zeros((recordings, dimension, dimension))
+        self.own_target = np.zeros((recordings, dimension))
         self.between = np.zeros((recordings, parameters, dimension))
-        for place, (first, end) in enumerate(zip(data.first[:-1], data.first[1:], strict=True)):
+        for place, (first, end) in enumerate(itertools.pairwise(data.first)):
             # As of a root at zero: where a derivative is no number, no direction is known.
             columns, states = (
                 np.nan_to_num(np.concatenate(each[first:end]), posinf=0.0, neginf=0.0)
@@ -317,9 +303,8 @@ class _NormalEquations:
         scale = _sizes(np.diag(self.shared))
         own_scale = _sizes(np.einsum("rii->ri", self.own))
         shared = self.shared / np.outer(scale, scale) + damping * np.eye(len(scale))
-        own = self.own / (own_scale[:, :, None] * own_scale[:, None, :]) + damping * np.eye(
-            own_scale.shape[1]
-        )
+        own = self.own / (own_scale[:, :, None] * own_scale[:, None, :])
+        own += damping * np.eye(own_scale.shape[1])
         between = self.between / (scale[None, :, None] * own_scale[:, None, :])
         target, own_target = self.shared_target / scale, self.own_target / own_scale
         inverse = np.linalg.pinv(own, rcond=SINGULAR, hermitian=True)
@@ -389,12 +374,10 @@ def free_run(
 
     Parameters
     ----------
-    model, data
-        Nothing but initial states is fitted.
+    model, data, substeps
+        Nothing but initial states is fitted; Runge–Kutta steps between samples.
     noise
         The measurement noise weighs the outputs; the process noise lets the states follow the prefix first.
-    substeps
-        Runge–Kutta steps between samples.
     told
         Samples of each prefix; by default a fifth of the recording, and `SHORTEST_PREFIX` at least.
     usual
@@ -433,29 +416,20 @@ def _initial_states(
         still = replace(still, outputs=(*still.outputs, *further))
         data = replace(data, outputs=np.hstack([data.outputs, expected]), sensor_noise=variances)
         noise = replace(noise, measurement=variances)
-    follow = fit_by_multiple_shooting(
-        still, data, x=start, noise=Noise(noise.measurement, process), estimate_process=False,
-        substeps=substeps,
-    )  # fmt: skip
-    x = follow.x if np.isfinite(follow.sum_of_squares) else start
-    strict = fit_by_multiple_shooting(
-        still, data, x=x, noise=Noise(noise.measurement, 0 * process), estimate_process=False,
-        substeps=substeps,
-    )  # fmt: skip
+    fitted = partial(fit_by_multiple_shooting, still, data, estimate_process=False, substeps=substeps)
+    follow = fitted(x=start, noise=Noise(noise.measurement, process))
+    x, first = follow.x if np.isfinite(follow.sum_of_squares) else start, data.first[:-1]
+    strict = fitted(x=x, noise=Noise(noise.measurement, 0 * process))
     if strict.converged:
-        return strict.x[data.first[:-1]]
+        return strict.x[first]
     # Where f jumps or a reading is cut off, steps of all samples at once may go to and fro. Damped steps of
     # whole trajectories never make it worse. A fit that did not end may have left the states anywhere.
     begins = [x] if follow.converged else [x, start]
     damped = max(
-        (
-            fit_trajectories(still, data, begin=each[data.first[:-1]], noise=noise, substeps=substeps)
-            for each in begins
-        ),
+        (fit_trajectories(still, data, begin=each[first], noise=noise, substeps=substeps) for each in begins),
         key=lambda fit: fit.log_likelihood if np.isfinite(fit.sum_of_squares) else -np.inf,
     )
-    best = damped.x if np.isfinite(damped.sum_of_squares) else x
-    return best[data.first[:-1]]
+    return (damped.x if np.isfinite(damped.sum_of_squares) else x)[first]
 
 
 EDGE_SUBSTEPS = 12  # between samples, for models whose f jumps
@@ -474,14 +448,7 @@ def jumps_of(model: Dynamics) -> list[sympy.Expr]:
 def spread_edges(model: Dynamics, data: Measurements, x: np.ndarray, *, substeps: int) -> Dynamics:
     """The model with its jumps spread over about what their arguments pass in a substep.
 
-    Parameters
-    ----------
-    model, data
-        The model and what it is compared with.
-    x
-        States along which it is used, shape ``(n, d)``.
-    substeps
-        Runge–Kutta steps between samples.
+    It is used along states ``(n, d)``, which are those of all samples of the data.
     """
     arguments = jumps_of(model)
     if not arguments:
@@ -494,11 +461,9 @@ def spread_edges(model: Dynamics, data: Measurements, x: np.ndarray, *, substeps
         *x.T, *further, *signals.inputs, *signals.delayed, *signals.slopes, signals.t, *model.values
     )
     rows = data.begins
-    widths = []
-    for course in along:
-        course = np.broadcast_to(course, data.t.shape)
-        passed = np.sqrt(np.mean((course[rows + 1] - course[rows]) ** 2))
-        widths.append(EDGE * float(passed) / substeps + 1e-300)
+    courses = (np.broadcast_to(course, data.t.shape) for course in along)
+    passed = [float(np.sqrt(np.mean((course[rows + 1] - course[rows]) ** 2))) for course in courses]
+    widths = (EDGE * each / substeps + 1e-300 for each in passed)
     return replace(model, edges=tuple(zip(arguments, widths, strict=True)))
 
 
@@ -510,17 +475,11 @@ def sharpened(rough: Fit, data: Measurements, *, budget: Budget | None = None) -
     while (
         rough.converged and rough.model.edges and not rough.has_process_noise and 2 * rough.substeps <= FINEST
     ):
-        substeps = 2 * rough.substeps
-        model = spread_edges(rough.model, data, rough.x, substeps=substeps)
-        begin = rough.x[data.first[:-1]]
-        finer = fit_trajectories(
-            model, data, begin=begin, noise=rough.noise, substeps=substeps, budget=budget
-        )
+        same: dict[str, Any] = {"noise": rough.noise, "substeps": 2 * rough.substeps, "budget": budget}
+        model = spread_edges(rough.model, data, rough.x, substeps=2 * rough.substeps)
+        finer = fit_trajectories(model, data, begin=rough.x[data.first[:-1]], **same)
         if not finer.converged:
-            finer = fit_by_multiple_shooting(
-                model, data, x=rough.x, noise=rough.noise, estimate_process=False, substeps=substeps,
-                budget=budget,
-            )  # fmt: skip
+            finer = fit_by_multiple_shooting(model, data, x=rough.x, estimate_process=False, **same)
         if not finer.converged:
             break
         gained, rough = finer.log_likelihood - rough.log_likelihood, finer

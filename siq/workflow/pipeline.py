@@ -88,7 +88,7 @@ def identify_run(
     named = zip(recordings.names, recordings.units, strict=True)
     try:
         found = identify(
-            recordings, options=settings.identification, limits=settings.certificate.of_f,
+            recordings, options=settings.identification, limits=settings.certificate,
             draw=partial(generator, settings.seed, number), diffusion=settings.space.noise(recordings.names),
             units=[unit or settings.space.unit(name) or None for name, unit in named],
             pair_step=settings.sampling.pair_step, integrator_step=settings.sampling.integrator_step,

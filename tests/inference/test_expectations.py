@@ -10,7 +10,6 @@ import sympy
 from siq.diagnosis.study import comparison_of
 from siq.inference.budget import Budget, BudgetSpent
 from siq.inference.kalman_filter import Noise, Whitened
-from siq.inference.maximum_likelihood import _stacked
 from siq.inference.measurements import Measurements, expectations, with_expectations
 from siq.inference.recalibration import recalibrate
 from siq.inference.trajectories import (
@@ -82,8 +81,8 @@ def test_nothing_is_expected_of_fixed_parameters_and_of_zeros() -> None:
     np.testing.assert_array_equal(rows, [[1.0, 0.0, 0.0], [0.0, 0.0, 0.5]])
     np.testing.assert_array_equal(deviations, [1.0, -1.0])
     white = Whitened(np.ones(5), np.ones((5, 3)), np.zeros(5, int), np.ones(5, bool), 5, 0.0)
-    columns, innovations = _stacked(white, expectations(model()))
-    assert columns is white.columns and innovations is white.innovations
+    for one, other in zip(white.solve(expectations(model())), white.solve(), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_expectations_do_not_depend_on_units() -> None:

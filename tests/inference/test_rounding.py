@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from siq.data.recordings import Recordings, snapshot_pairs
-from siq.inference.checks import _is_rounding, _rounding_bias, _rounding_errors, residual_noise
+from siq.inference.checks import _rounding_bias, _rounding_errors, bias_of_rounding, residual_noise
 from siq.inference.field_estimate import HARMLESS_BIAS
 from siq.inference.library import IdentificationOptions, candidate_library
 from siq.inference.regression import identify_vector_field
@@ -56,8 +56,13 @@ def test_noise_of_a_sensor_is_not_taken_for_rounding() -> None:
     noisy = settling(4, sensor=1e-3)
     noise = residual_noise(identified(noisy), noisy, pair_step=None)
     assert noise.kind == "measurement" and "measurement noise" in str(noise.fault(("x", "y")))
-    assert not _is_rounding(np.array([3e-4, 0.1]), np.array([3e-4, 0.0]), correlation=-0.5)
-    assert _is_rounding(np.array([3e-4, 1e-5]), np.array([3e-4, 0.0]), correlation=-0.5)
+    half = replace(
+        noisy, values=np.column_stack([np.round(noisy.values[:, 0], 3), settling(None).values[:, 1]])
+    )
+    found, pairs = identified(half), snapshot_pairs(half)
+    for measured, correlation, rounded in ((0.1, -0.5, False), (1e-5, -0.5, True), (1e-5, -0.2, False)):
+        bias = bias_of_rounding(found, pairs, half, np.array([3e-4, measured]), correlation=correlation)
+        assert (bias is not None) == rounded
 
 
 def test_the_bias_of_rounding_is_the_one_that_is_foreseen() -> None:

@@ -41,8 +41,8 @@ def record() -> FieldEstimate:
         (draw.normal(size=coefficients.shape), draw.normal(size=(3, *coefficients.shape))),
         draw.uniform(size=4), formula,
         diagnosis=NoiseDiagnosis(
-            "measurement", 0.1, np.eye(2), 1 / 3, -7.0, np.array([0.1, 0.0]), np.array([0.01, 0.0]), pairs=7,
-            diffusion=DiffusionSource.UNIT, lag=3, lost_time=0.1,
+            "measurement", 0.1, np.eye(2), 1 / 3, -7.0, np.array([0.1, 0.0]), np.array([0.01, np.inf]),
+            pairs=7, diffusion=DiffusionSource.UNIT, lag=3, lost_time=0.1,
             remarks=(Remark("inference.rounding", {"written": "so"}),),
         ),
         prediction=Verdict(np.inf, 0.01, False, "measurement noise"),
@@ -69,6 +69,7 @@ def test_a_field_comes_back_to_the_last_bit(written: Path) -> None:
     assert copy.prediction == original.prediction
     assert copy.diagnosis is not None and original.diagnosis is not None
     assert copy.diagnosis.as_data() == original.diagnosis.as_data()
+    np.testing.assert_array_equal(copy.diagnosis.measurement_error, original.diagnosis.measurement_error)
     assert copy.noise is not None and original.noise is not None and copy.alternatives is not None
     assert original.alternatives is not None
     assert copy.noise.as_data() == original.noise.as_data()
