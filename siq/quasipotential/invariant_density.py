@@ -15,9 +15,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import scipy.interpolate
@@ -164,47 +163,41 @@ class StationaryDensity:
         return DensityComparison.of_bins(bin_of, np.append(expected, 0.0), edges)
 
 
-@dataclass(frozen=True)
 class _Block:
-    """The terms of U, in the unit of ε, that couple some states, over these states' part of the box."""
+    """The terms of U that couple some states, in the unit of ε, over these states' part of the box."""
 
-    expression: sympy.Expr
-    states: tuple[int, ...]
-    symbols: tuple[sympy.Symbol, ...]
-    box: np.ndarray
-    intensity: float
-    nodes: int
-
-    @cached_property
-    def exponent(self) -> Callable[[np.ndarray], np.ndarray]:
-        """U/ε of the block, components ``(k, ...)`` to ``(...)``."""
-        function = compile_formulas([self.expression / sympy.Float(self.intensity, 17)], self.symbols)
-
-        def evaluate(components: np.ndarray) -> np.ndarray:
-            with np.errstate(all="ignore"):
-                values = function(components)[0]
-            if not np.isfinite(values).all():
-                raise NumericalFailure("the quasipotential is not finite everywhere in the box")
-            return values
-
-        return evaluate
-
-    @cached_property
-    def log_integral(self) -> float:
-        """Log ∫ exp(-U/ε) over the block's part of the box."""
-        fine, coarse = (self._log_integral(count) for count in (self.nodes, 3 * self.nodes // 4))
-        if not abs(fine - coarse) <= QUADRATURE_TOLERANCE:
+    def __init__(
+        self,
+        expression: sympy.Expr,
+        states: tuple[int, ...],
+        symbols: Sequence[sympy.Symbol],
+        box: np.ndarray,
+        intensity: float,
+        nodes: int,
+    ) -> None:
+        self.states, self.box, self.nodes = states, box[list(states)], nodes
+        scaled = expression / sympy.Float(intensity, 17)
+        self.function = compile_formulas([scaled], [symbols[state] for state in states])
+        self.log_integral, coarse = (self._log_integral(count) for count in (nodes, 3 * nodes // 4))
+        if not abs(self.log_integral - coarse) <= QUADRATURE_TOLERANCE:
             raise NumericalFailure(
-                f"the integral of exp(-U/ε) has not converged (relative error {abs(fine - coarse):.1e}); take"
-                " more nodes or a smaller box"
+                "the integral of exp(-U/ε) has not converged (relative error"
+                f" {abs(self.log_integral - coarse):.1e}); take more nodes or a smaller box"
             )
-        return fine
+
+    def exponent(self, axes: Iterable[np.ndarray]) -> np.ndarray:
+        """U/ε of the block on a grid."""
+        with np.errstate(all="ignore"):
+            values = self.function(np.stack(np.meshgrid(*axes, indexing="ij")))[0]
+        if not np.isfinite(values).all():
+            raise NumericalFailure("the quasipotential is not finite everywhere in the box")
+        return values
 
     def _log_integral(self, count: int) -> float:
         # A narrow well of a single state must not fall between the nodes.
         panels = PANELS if len(self.states) == 1 else 1
         rules = [_gauss_legendre(bounds, count, panels) for bounds in self.box]
-        values = self.exponent(np.stack(np.meshgrid(*(rule[0] for rule in rules), indexing="ij")))
+        values = self.exponent(nodes for nodes, _ in rules)
         lowest = float(values.min())
         if values[(slice(1, -1),) * values.ndim].min() > lowest:
             raise NumericalFailure(
@@ -217,57 +210,13 @@ class _Block:
 
     def marginal(self, axes: dict[int, np.ndarray]) -> np.ndarray:
         """Density of the states of `axes` on a grid, an axis for each; the other ones are integrated out."""
-        if not axes:
-            return np.ones(())
-        rest = [state for state in self.states if state not in axes]
-        rules = {state: _gauss_legendre(self.box[self.states.index(state)], self.nodes) for state in rest}
-        coordinates = axes | {state: rule[0] for state, rule in rules.items()}
-        mesh = dict(zip(coordinates, np.meshgrid(*coordinates.values(), indexing="ij"), strict=True))
-        density = np.exp(-self.exponent(np.stack([mesh[state] for state in self.states])) - self.log_integral)
-        for state in reversed(rest):
-            density = density @ rules[state][1]
+        rules = [_gauss_legendre(bounds, self.nodes) for bounds in self.box]
+        nodes = (axes.get(state, rule[0]) for state, rule in zip(self.states, rules, strict=True))
+        density = np.exp(-self.exponent(nodes) - self.log_integral)
+        for place, state in reversed(list(enumerate(self.states))):
+            if state not in axes:
+                density = np.moveaxis(density, place, -1) @ rules[place][1]
         return density
-
-
-def _split_into_blocks(
-    quasipotential: sympy.Expr,
-    symbols: Sequence[sympy.Symbol],
-    *,
-    intensity: float,
-    box: np.ndarray,
-    nodes: int,
-) -> tuple[float, list[_Block]]:
-    """U as a constant, in the unit of ε, and blocks without common states; one not in U is a block."""
-    if not 0 < intensity < math.inf:
-        raise ValueError(f"the noise intensity ({intensity}) must be positive")
-    constant, groups = 0.0, [({symbol}, sympy.S.Zero) for symbol in symbols]
-    for part in sympy.Add.make_args(sympy.expand(quasipotential)):
-        if not part.free_symbols:
-            constant += float(part)
-            continue
-        coupled = [group for group in groups if group[0] & part.free_symbols]
-        groups = [group for group in groups if not group[0] & part.free_symbols]
-        groups.append((set().union(*(group[0] for group in coupled)), part + sum(e for _, e in coupled)))
-    blocks = []
-    for members, expression in groups:
-        states = tuple(index for index, symbol in enumerate(symbols) if symbol in members)
-        if len(states) > LARGEST_BLOCK:
-            names = ", ".join(str(symbols[state]) for state in states)
-            raise NumericalFailure(
-                f"the quasipotential couples {len(states)} states ({names}), of which at most"
-                f" {LARGEST_BLOCK} can be integrated together"
-            )
-        blocks.append(
-            _Block(
-                expression=expression,
-                states=states,
-                symbols=tuple(symbols[state] for state in states),
-                box=np.asarray(box, dtype=float)[list(states)],
-                intensity=intensity,
-                nodes=nodes,
-            )
-        )
-    return constant, blocks
 
 
 def _gauss_legendre(bounds: np.ndarray, count: int, panels: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -287,47 +236,23 @@ def normalisation_bessel(
     ``Z = π sqrt(a₂/(8a₁)) exp(s - a₃/ε) [I_{1/4}(s) + I_{-1/4}(s)] Π sqrt(πε/b_k)``; a₂ < 0 (one well)
     changes the sign of I_{1/4}, and a₂ = 0 leaves a Gamma function.
 
-    Parameters
-    ----------
-    quasipotential
-        U.
-    symbols
-        The d states.
-    intensity
-        ε, in the unit of U.
-
-    Returns
-    -------
-    float or None
-        Z, in the product of the states' units; None where U has another form, or is not bounded below.
-
-    Raises
-    ------
-    ValueError
-        When ε is not positive.
+    Z is in the product of the states' units, and ε in the unit of U, positive (`ValueError`). None where U
+    has another form, or is not bounded below.
     """
     if not 0 < intensity < math.inf:
         raise ValueError(f"the noise intensity ({intensity}) must be positive")
     if not quasipotential.is_polynomial(*symbols):
         return None
-    # Coefficients by state and power; a mixed term stands as power -1, which no form has.
-    powers: dict[int | None, dict[int, float]] = {}
+    constant, powers = 0.0, [dict[int, float]() for _ in symbols]
     for exponents, coefficient in sympy.Poly(quasipotential, *symbols).terms():
         present = [(index, power) for index, power in enumerate(exponents) if power]
-        if coefficient != 0 and not present:
-            powers.setdefault(None, {})[0] = float(coefficient)
-        for index, power in present if coefficient != 0 else ():
-            powers.setdefault(index, {})[power if len(present) == 1 else -1] = float(coefficient)
-    quartic, quadratic, constant = [], [], 0.0
-    for state, coefficients in powers.items():
-        if state is None:
-            constant = coefficients[0]
-        elif set(coefficients) <= {2, 4} and 4 in coefficients:
-            quartic.append((coefficients[4], -coefficients.get(2, 0.0)))
-        elif set(coefficients) == {2}:
-            quadratic.append(coefficients[2])
-        else:
+        if len(present) > 1:
             return None
+        for index, power in present:
+            powers[index][power] = float(coefficient)
+        constant += 0.0 if present else float(coefficient)
+    quartic = [(own[4], -own.get(2, 0.0)) for own in powers if own.keys() in ({4}, {2, 4})]
+    quadratic = [own[2] for own in powers if own.keys() == {2}]
     if len(quartic) != 1 or len(quadratic) != len(symbols) - 1 or min([quartic[0][0], *quadratic]) <= 0:
         return None
     a1, a2 = quartic[0]
@@ -358,19 +283,15 @@ def marginal_density(
 
     Parameters
     ----------
-    quasipotential
-        U, any formula.
-    symbols
-        The d states.
+    quasipotential, symbols
+        U, any formula, and the d states.
     intensity
         ε, in the unit of U.
     box
         Shape ``(d, 2)``, in the states' units. For Z over all of space it must hold all of the density.
-    points
-        Grid points along each of the two.
-    nodes
-        Gauss–Legendre nodes along each state of a block of two or three, and in each of the panels of a state
-        by itself.
+    points, nodes
+        Grid points along each of the two; and Gauss–Legendre nodes along each state of a block of two or
+        three, and in each of the panels of a state by itself.
 
     Raises
     ------
@@ -380,19 +301,34 @@ def marginal_density(
         When more than three states are coupled, U is not finite in the box or lowest at its rim, or the
         quadrature has not converged.
     """
-    constant, blocks = _split_into_blocks(quasipotential, symbols, intensity=intensity, box=box, nodes=nodes)
+    if not 0 < intensity < math.inf:
+        raise ValueError(f"the noise intensity ({intensity}) must be positive")
+    # U is a constant and blocks without common states; a state that is not in U is a block.
+    constant, groups = 0.0, [({symbol}, sympy.S.Zero) for symbol in symbols]
+    for part in sympy.Add.make_args(sympy.expand(quasipotential)):
+        if not part.free_symbols:
+            constant += float(part)
+            continue
+        coupled = [group for group in groups if group[0] & part.free_symbols]
+        groups = [group for group in groups if not group[0] & part.free_symbols]
+        groups.append((set().union(*(group[0] for group in coupled)), part + sum(e for _, e in coupled)))
+    blocks = []
+    for members, expression in groups:
+        states = tuple(index for index, symbol in enumerate(symbols) if symbol in members)
+        if len(states) > LARGEST_BLOCK:
+            names = ", ".join(str(symbols[state]) for state in states)
+            raise NumericalFailure(
+                f"the quasipotential couples {len(states)} states ({names}), of which at most"
+                f" {LARGEST_BLOCK} can be integrated together"
+            )
+        blocks.append(_Block(expression, states, symbols, np.asarray(box, dtype=float), intensity, nodes))
     total = float(np.exp(sum(block.log_integral for block in blocks) - constant / intensity))
     plane = tuple(range(min(len(symbols), 2)))
     axes = {state: np.linspace(box[state][0], box[state][1], points) for state in plane}
-    if len(plane) == 1:
-        values = blocks[0].marginal(axes)[None]
-        return StationaryDensity(plane, intensity, axes[0], np.zeros(0), values, total)
-    values = np.ones((points, points))
+    values = np.ones((1, 1))
     for block in blocks:
-        kept = [state for state in plane if state in block.states]
-        density = block.marginal({state: axes[state] for state in kept})
-        if len(kept) == 2:
-            values = values * density.T
-        elif kept:
-            values = values * (density[None, :] if kept[0] == 0 else density[:, None])
-    return StationaryDensity(plane, intensity, axes[0], axes[1], values, total)
+        kept = {state: axes[state] for state in plane if state in block.states}
+        if kept:
+            shape = [points if state in kept else 1 for state in (1, 0)]
+            values = values * block.marginal(kept).T.reshape(shape)
+    return StationaryDensity(plane, intensity, axes[0], axes.get(1, np.zeros(0)), values, total)
