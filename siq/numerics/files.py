@@ -137,8 +137,8 @@ def validate(document: Document, model: type[Model]) -> Model:
         cause = first.get("ctx", {}).get("error")
         message = first["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ").rstrip(".")
         remedy = message[:1].lower() + message[1:]
-        ours = isinstance(cause, Fault)
-        fault = cause if ours else Fault(f"the value {first['input']!r} cannot be used", remedy)
+        ours = cause if isinstance(cause, Fault) else None
+        fault = ours or Fault(f"the value {first['input']!r} cannot be used", remedy)
     raise fault.at(document.file, document.place(keys))
 
 

@@ -211,7 +211,7 @@ def tracked_edge(
                 return np.stack([low, high])
             way = low + share * (high - low)
 
-    places = [each.position for each in (*attractors, *cycles)]
+    places = [*(each.position for each in attractors), *(each.position for each in cycles)]
     bend = FIRST_WAY_BEND * width * generator.standard_normal(len(width))
     pair = bisected(places[one], places[two], bend)
     yield np.zeros(1), pair.mean(axis=0)[None], pair.mean(axis=0)

@@ -47,18 +47,11 @@ class _CardPart(BaseModel):
 
 
 class StateEntry(_CardPart):
-    """One state of a card: its unit, and the interval in which initial states are drawn.
+    """One state of a card: its unit, and the interval in which initial states are drawn."""
 
-    Attributes
-    ----------
-    unit
-        Compared with the units of recordings; nothing is converted.
-    domain
-        The interval ``[lower, upper]``, in this unit: initial states are drawn from it, and scores use it.
-        Only a simulation needs it. Where there are recordings to compare with, they tell it.
-    """
-
-    unit: str = "1"
+    unit: str = "1"  #: compared with the units of recordings; nothing is converted
+    #: The interval ``[lower, upper]``, in this unit: initial states are drawn from it, and scores use it.
+    #: Only a simulation needs it. Where there are recordings to compare with, they tell it.
     domain: tuple[Number, Number] | None = None
 
     @field_validator("domain")
@@ -70,49 +63,26 @@ class StateEntry(_CardPart):
 
 
 class ParameterEntry(_CardPart):
-    """One parameter of a card.
+    """One parameter of a card."""
 
-    Attributes
-    ----------
-    value
-        Its value.
-    unit
-        Its unit, for people.
-    fixed
-        ``true`` when you are sure of the value: no recalibration changes it then.
-    """
-
-    value: Number
-    unit: str = "1"
-    fixed: bool = False
+    value: Number  #: its value
+    unit: str = "1"  #: for people
+    fixed: bool = False  #: ``true`` when you are sure of the value: no recalibration changes it then
 
 
 class InputEntry(_CardPart):
-    """An exogenous signal u(t), a column of the recordings.
+    """An exogenous signal u(t), a column of the recordings."""
 
-    Attributes
-    ----------
-    unit
-        Compared with the units of recordings.
-    interpolation
-        How it runs between samples: ``zero_order`` for what a converter puts out, ``linear``, or
-        ``band_limited`` for what was filtered before it was sampled.
-    """
-
-    unit: str = "1"
+    unit: str = "1"  #: compared with the units of recordings
+    #: How it runs between samples: ``zero_order`` for what a converter puts out, ``linear``, or
+    #: ``band_limited`` for what was filtered before it was sampled.
     interpolation: Literal["zero_order", "linear", "band_limited"] = "linear"
 
 
 class ExactEntry(_CardPart):
-    """Exact answers, where known. They serve scoring only; no method reads them.
+    """Exact answers, where known. They serve scoring only; no method reads them."""
 
-    Attributes
-    ----------
-    quasipotential
-        U as a formula of the states.
-    """
-
-    quasipotential: Formula | None = None
+    quasipotential: Formula | None = None  #: U as a formula of the states
 
 
 class SystemCard(_CardPart):

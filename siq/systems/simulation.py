@@ -27,10 +27,6 @@ from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import find_equilibria
 from siq.systems.formulas import compile_formulas
 
-Drift = Callable[[np.ndarray], np.ndarray]
-"""F of components: ``(d, n)`` to ``(d, n)``."""
-
-
 TRAJECTORIES = 1000  # enough for every state of a box in three dimensions, and simulated in seconds
 STATES = 400  # of the domain, at which rates are asked for
 TURNED = 0.1  # of a time constant in the step of a pair: the flow differs from f by so much, and is known
@@ -41,31 +37,18 @@ MOST_STEPS = 100  # of a pair, between pairs: beyond, a slow system would cost m
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class SimulationEntry:
-    """Sampling as a study gives it; values left out follow from the system, see `completed`.
+    """Sampling as a study gives it; values left out follow from the system, see `completed`."""
 
-    Attributes
-    ----------
-    trajectories
-        How many trajectories are simulated.
-    pairs
-        Pairs along each trajectory.
-    pair_step
-        h, the time between the two states of a pair, in the card's unit of time; by default a tenth of the
-        fastest time constant, rounded down.
-    interval
-        Time between the starts of pairs; by default such that a trajectory lasts three of the slowest time
-        constants at an attractor.
-    substeps
-        Runge–Kutta steps within h; with noise, steps of Euler and Maruyama.
-    noise_intensity
-        ε of ``√ε D^(1/2) dW``. The paper's ε = 0.01 in section 3.1.1 is 0.02 here.
-    """
-
-    trajectories: Annotated[int, Field(ge=2)] = TRAJECTORIES
-    pairs: Annotated[int, Field(ge=1)] = 50
+    trajectories: Annotated[int, Field(ge=2)] = TRAJECTORIES  #: how many are simulated
+    pairs: Annotated[int, Field(ge=1)] = 50  #: along each trajectory
+    #: h, the time between the two states of a pair, in the card's unit of time; by default a tenth of the
+    #: fastest time constant, rounded down.
     pair_step: Annotated[float, Field(gt=0)] | None = None
+    #: Time between the starts of pairs; by default such that a trajectory lasts three of the slowest time
+    #: constants at an attractor.
     interval: Annotated[float, Field(gt=0)] | None = None
-    substeps: Annotated[int, Field(ge=1)] = 5
+    substeps: Annotated[int, Field(ge=1)] = 5  #: Runge–Kutta steps in h; with noise, of Euler and Maruyama
+    #: ε of ``√ε D^(1/2) dW``. The paper's ε = 0.01 in section 3.1.1 is 0.02 here.
     noise_intensity: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
 
     def completed(self, dynamics: Dynamics) -> SimulationEntry:
@@ -263,7 +246,8 @@ def _rates(dynamics: Dynamics) -> tuple[float, float]:
     Eigenvalues of the Jacobian, which no choice of the states' units can alter. Where there is no attractor
     the slow rates of the domain stand in for its relaxation.
     """
-    x = np.random.default_rng(0).uniform(*dynamics.box.T, size=(STATES, dynamics.dimension))
+    low, high = dynamics.box.T
+    x = np.random.default_rng(0).uniform(low, high, size=(STATES, dynamics.dimension))
     sizes = np.abs(np.linalg.eigvals(dynamics.jacobian(x))).max(axis=1)
     fastest = float(np.quantile(sizes, FASTEST)) or 1.0
     relaxing = [
@@ -279,9 +263,9 @@ def fault_over_domain(dynamics: Dynamics) -> tuple[str, str] | None:
     States at random and the corners tell what overflows; a divisor that changes its sign between them is zero
     somewhere, though no state of a sample meets it.
     """
-    corners = dynamics.box.T
-    x = np.random.default_rng(0).uniform(*corners, size=(STATES, dynamics.dimension))
-    x = np.concatenate([x, corners])
+    low, high = dynamics.box.T
+    x = np.random.default_rng(0).uniform(low, high, size=(STATES, dynamics.dimension))
+    x = np.concatenate([x, low[None], high[None]])
     with np.errstate(all="ignore"):
         flow, slopes = dynamics.drift(x), dynamics.jacobian(x)
         for index, (name, formula) in enumerate(zip(dynamics.states, dynamics.formulas, strict=True)):
