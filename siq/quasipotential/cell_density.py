@@ -55,15 +55,14 @@ class SampledPotential:
     wells
         Their number, k.
     prefactor
-        Of exp(-U/ε), where it is known and not one: of one state, D at the first attractor over D, of the
-        shape of `values`.
+        Of exp(-U/ε): of one state, D at the first attractor over D, of the shape of `values`; elsewhere 1.
     """
 
     box: np.ndarray
     values: np.ndarray
     well: np.ndarray
     wells: int
-    prefactor: np.ndarray | None = None
+    prefactor: np.ndarray | float = 1.0
 
     @classmethod
     def of(
@@ -92,31 +91,23 @@ class SampledPotential:
         least = values.min(axis=0)
         known = np.isfinite(least)
         # Of one state the prefactor of exp(-U/ε) is 1/D. Where that of D is not positive no state can be.
-        prefactor = None
+        prefactor: np.ndarray | float = 1.0
         if len(box) == 1 and not (noise := potential.wells[0].dynamics.diffusion).constant:
             own = noise.at(np.stack([potential.wells[0].attractor, *empty.axes[0][:, None]]))[:, 0, 0]
             prefactor = own[0] / np.where(own[1:] > 0, own[1:], np.inf)
-        return cls(
-            box,
-            np.where(known, least, np.nan),
-            np.where(known, values.argmin(axis=0), -1),
-            len(potential.wells),
-            prefactor,
-        )
+        least, well = np.where(known, least, np.nan), np.where(known, values.argmin(axis=0), -1)
+        return cls(box, least, well, len(potential.wells), prefactor)
 
     @property
     def widths(self) -> np.ndarray:
         """Of a cell, shape ``(d,)``."""
-        widths: np.ndarray = np.ptp(self.box, axis=1) / self.values.shape
-        return widths
+        return np.asarray(np.ptp(self.box, axis=1) / self.values.shape)
 
     @property
     def axes(self) -> list[np.ndarray]:
         """The middles of the cells along each state."""
-        return [
-            low + (np.arange(count) + 0.5) * width
-            for (low, _), count, width in zip(self.box, self.values.shape, self.widths, strict=True)
-        ]
+        sides = zip(self.box[:, 0], self.values.shape, self.widths, strict=True)
+        return [low + (np.arange(count) + 0.5) * width for low, count, width in sides]
 
     @property
     def known(self) -> np.ndarray:
@@ -151,15 +142,9 @@ class SampledPotential:
         rims = np.array([-np.inf, *np.atleast_1d(scipy.ndimage.minimum(near, part, np.arange(1, parts + 1)))])
         inside = (slice(1, -1),) * values.ndim
         lowest = np.where(known, np.inf, rims[part][inside])
-        lowest[~known] = np.maximum(lowest[~known], self._entered(dynamics))
-        # A cell is where f leads from its middle, or from the middle of a cell beside it.
-        least: np.ndarray = scipy.ndimage.minimum_filter(lowest, footprint=around, mode="nearest")
-        return np.where(known, np.inf, least)
-
-    def _entered(self, dynamics: Dynamics) -> np.ndarray:
-        """U where f enters the known region from each unknown cell, -∞ where it does not."""
-        low = scipy.ndimage.minimum_filter(np.where(self.known, self.values, np.inf), 3, mode="nearest")
-        x = self.middles(~self.known)
+        # U where f enters the known region from each unknown cell, -∞ where it does not.
+        low = scipy.ndimage.minimum_filter(values, 3, mode="nearest")
+        x = self.middles(~known)
         levels = np.full(x.shape[1], -np.inf)
         function = dynamics.drift_of_components
         widths = self.widths[:, None]
@@ -173,13 +158,16 @@ class SampledPotential:
                 step = np.minimum(STRIDE / speed, longest)
             x = runge_kutta_step(function, x, np.where(np.isfinite(step), step, 0.0))
             index, inside = self.places(x)
-            arrived = inside & self.known[tuple(index)]
+            arrived = inside & known[tuple(index)]
             levels[running[arrived]] = low[tuple(index)][arrived]
             going = ~arrived & ((x > wide[:, :1]) & (x < wide[:, 1:])).all(axis=0)
             x, running = x[:, going], running[going]
             if not running.size:
                 break
-        return levels
+        lowest[~known] = np.maximum(lowest[~known], levels)
+        # A cell is where f leads from its middle, or from the middle of a cell beside it.
+        least = scipy.ndimage.minimum_filter(lowest, footprint=around, mode="nearest")
+        return np.where(known, np.inf, least)
 
     def density(self, coarse: SampledPotential, lowest: np.ndarray, *, intensity: float) -> KnownDensity:
         """The density for one ε, in the unit of U.
@@ -193,10 +181,9 @@ class SampledPotential:
         if not self.known.any():
             raise NumericalFailure("U is known nowhere in the box")
         bottom = float(np.nanmin(self.values))  # taken out of the exponents, which would run out of range
-        weights, wide = (
-            np.exp(-(np.nan_to_num(one.values, nan=np.inf) - bottom) / intensity)
-            * (1.0 if one.prefactor is None else one.prefactor)
-            for one in (self, coarse)
+        weights, wide, above = (
+            np.exp(-(np.where(np.isnan(u), np.inf, u) - bottom) / intensity) * one.prefactor
+            for one, u in ((self, self.values), (coarse, coarse.values), (coarse, lowest))
         )
         total, rough = (weights.sum() * self.widths.prod(), wide.sum() * coarse.widths.prod())
         change = float(abs(rough / total - 1))
@@ -205,19 +192,12 @@ class SampledPotential:
                 f"the integral of exp(-U/ε) changes by {change:.1%} if cells are twice as wide; the wells are"
                 " too narrow for the box"
             )
-        above = np.exp(-(lowest - bottom) / intensity) * (
-            1.0 if coarse.prefactor is None else coarse.prefactor
-        )
         elsewhere = float(above.sum() * coarse.widths.prod())
         shares = np.bincount(self.well[self.known], weights[self.known], minlength=self.wells)
+        normalisation = float(total * np.exp(-bottom / intensity))
+        unknown = elsewhere / (elsewhere + float(total))
         return KnownDensity(
-            potential=self,
-            intensity=intensity,
-            normalisation=float(total * np.exp(-bottom / intensity)),
-            change=change,
-            unknown=elsewhere / (elsewhere + float(total)),
-            probabilities=weights / weights.sum(),
-            shares=shares / shares.sum(),
+            self, intensity, normalisation, change, unknown, weights / weights.sum(), shares / shares.sum()
         )
 
     def simulated_shares(self, start: np.ndarray, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -232,14 +212,14 @@ class SampledPotential:
             return np.where(inside, self.well[tuple(index)], -1)
 
         count, where = self.wells, wells_of(samples)
-        counted = np.bincount(where[where >= 0], minlength=count)
         first, last = wells_of(start), where[-1]
         known = (first >= 0) & (last >= 0)
+        counted, changed, began = (
+            np.bincount(one, minlength=count)
+            for one in (where[where >= 0], first[known & (first != last)], first[known])
+        )
         with np.errstate(invalid="ignore"):  # no walker started in a well of no probability
-            changed = np.bincount(first[known & (first != last)], minlength=count) / np.bincount(
-                first[known], minlength=count
-            )
-            return counted / counted.sum(), changed
+            return counted / counted.sum(), changed / began
 
 
 @dataclass(frozen=True)
@@ -248,20 +228,16 @@ class KnownDensity:
 
     Attributes
     ----------
-    potential
-        U on the cells.
-    intensity
-        ε.
-    normalisation
-        Z over the cells in which U is known, in the product of the states' units.
-    change
-        By how much Z changes, relatively, if cells are twice as wide.
+    potential, intensity
+        U on the cells, and ε.
+    normalisation, change
+        Z over the cells in which U is known, in the product of the states' units; and by how much it changes,
+        relatively, if cells are twice as wide.
     unknown
         The share of all probability in the box that the other cells can hold at most.
-    probabilities
-        Of the cells, of the shape of `SampledPotential.values`, 1 in total; zero where U is not known.
-    shares
-        The wells' shares of it, shape ``(k,)``.
+    probabilities, shares
+        Of the cells, of the shape of `SampledPotential.values`, 1 in total, zero where U is not known; and
+        the wells' shares of it, shape ``(k,)``.
     """
 
     potential: SampledPotential
@@ -285,14 +261,9 @@ class KnownDensity:
         )  # fmt: skip
 
     def compare(self, samples: np.ndarray, *, bins: int = BINS) -> DensityComparison:
-        """Compare the marginal density with a simulation, both within the region where U is known.
+        """Compare the marginal density with samples ``(d, times, walkers)``, both where U is known.
 
-        Parameters
-        ----------
-        samples
-            Shape ``(d, times, walkers)``.
-        bins
-            Along each state, a divisor of the number of cells.
+        The number of bins along each state is a divisor of the number of cells.
         """
         potential = self.potential
         shape = potential.values.shape[:2]
@@ -318,8 +289,7 @@ class KnownDensity:
         cumulative = np.cumsum(flat[order])
         place = np.searchsorted(cumulative / cumulative[-1], quantiles, side="right")
         cells = order[np.minimum(place, flat.size - 1)]
-        groups = range(min(WALKER_GROUPS, count))
-        cells = np.concatenate([cells[group::WALKER_GROUPS] for group in groups])
+        cells = np.concatenate([cells[group::WALKER_GROUPS] for group in range(min(WALKER_GROUPS, count))])
         index = np.stack(np.unravel_index(cells, potential.values.shape))
         within = generator.uniform(size=index.shape)
         return np.asarray(potential.box[:, :1] + (index + within) * potential.widths[:, None])
@@ -338,15 +308,8 @@ def shares_by_rates(
 
     Unlike the integral of exp(-U/ε) over a well this has the prefactor of the density in it.
 
-    Parameters
-    ----------
-    ways
-        Start, end, barrier and prefactor of every way out, these NaN or None where not known; ways that end
-        at no well (None) do not count.
-    count
-        Number of wells, k.
-    intensity
-        ε.
+    `ways` are start, end, barrier and prefactor of every way out, these NaN or None where not known; those
+    that end at no well (None) do not count. There are `count` wells.
     """
     table = np.array([way for way in ways if way[1] is not None], dtype=float).reshape(-1, 4)
     if not np.isfinite(table).all():
