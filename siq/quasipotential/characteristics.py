@@ -194,11 +194,9 @@ class Fan:
     ----------
     attractor, hessian, level
         A, shape ``(d,)``; M, shape ``(d, d)``; and the value of V up to which curves were followed.
-    points, momenta, values, hessians
-        x, p = ∇V, V (not U) and ∇²V at all points of all curves, sorted by curve and along it: shapes
-        ``(n, d)``, ``(n, d)``, ``(n,)`` and ``(n, d, d)``. ∇²V diverges towards a caustic.
-    curve
-        Shape ``(n,)``: index of the point's curve.
+    points, momenta, values, hessians, curve
+        x, p = ∇V, V (not U) and ∇²V at all n points of all curves, and which curve a point belongs to; sorted
+        by curve and along it. ∇²V diverges towards a caustic.
     directions, ends
         The unit vectors from which the c curves start, in the metric in which M is the unit matrix, shape
         ``(c, d)``; and an `End` for every curve.
@@ -248,10 +246,8 @@ class Fan:
         upper = np.zeros(len(scaled), dtype=bool)
         # So close to the attractor V is smooth, and all curves are neighbours of each other.
         asked = np.flatnonzero(np.linalg.norm(scaled, axis=1) > 2 * SHEET_DISTANCE)
-        if not len(asked):
-            return ~upper
         tree = cKDTree(scaled[asked])
-        for block in np.array_split(asked, max(len(asked) // CHUNK, 1)):
+        for block in np.array_split(asked, max(len(asked) // CHUNK, 1)) if len(asked) else ():
             near = tree.query_ball_point(scaled[block], SHEET_DISTANCE)
             at = np.repeat(block, [len(others) for others in near])
             neighbour = asked[np.concatenate([np.asarray(others, dtype=int) for others in near])]
@@ -265,12 +261,11 @@ class Fan:
         return count == before_curve
 
     def value_near(self, x: np.ndarray, *, sheet: np.ndarray, distance: float = 0.1) -> np.ndarray:
-        """V at points, to second order from the nearest point of a fan: ``(m, d)`` to ``(m,)``.
+        """V at points ``(m, d)``, to second order from the nearest point of a sheet, see `lowest_sheet`.
 
-        `sheet` masks the points of the fan that may be used, see `lowest_sheet`. Beyond `distance`, in the
-        metric in which the level is at about 1, the value is NaN; so it is where the second order is no small
-        correction, close to a caustic. The error is of third order in the distance, but where V has a kink
-        between x and the nearest point, of first.
+        NaN beyond `distance`, in the metric in which the level is at about 1, and where the second order is
+        no small correction, close to a caustic. The error is of third order in the distance, but where V has a
+        kink between x and the nearest point, of first.
         """
         distances, _, values, bend = self.expanded(x, sheet)
         # Towards a caustic ∇²V grows without bound, and two terms no longer tell V.
@@ -317,22 +312,16 @@ def characteristics(
 
     Parameters
     ----------
-    dynamics
-        f, twice differentiable, and D.
-    attractor
-        A, shape ``(d,)``, a stable equilibrium.
-    level
-        V (not U) at which curves end, such as 0.99 of the barrier of V.
-    box
-        Shape ``(d, 2)``, in the states' units.
+    dynamics, attractor
+        f, twice differentiable, and D; and A, shape ``(d,)``, a stable equilibrium.
+    level, box
+        V (not U) at which curves end, such as 0.99 of the barrier of V; and the states' box, ``(d, 2)``.
     directions
         Shape ``(c, d)``: where the curves start; of any length.
-    start
-        V on the first ellipsoid, as a share of the level.
-    start_degree
-        Degree of the power series that gives p, V and the tangents there; 2 is the quadratic form of M
-        alone. With it V is nearly as good, but the tangents are off by ``start ** ½``, which can grow to a
-        false caustic where curves draw together. Where f has kinks close to A, 2 is what remains.
+    start, start_degree
+        V on the first ellipsoid, as a share of the level; and the degree of the power series that gives p, V
+        and the tangents there. With degree 2 V is nearly as good, but the tangents are off by ``start ** ½``,
+        which can grow to a false caustic where curves draw together. Where f has kinks close to A, 2 remains.
     spacing
         Largest distance between points along a curve; the level is at about 1.
     time_limit
@@ -487,10 +476,9 @@ def adapted_fan(
         As for `characteristics`.
     generator
         Draws the first directions where there are more than two states.
-    count, most
-        Number of curves at first, and at most: in four and more dimensions that is what limits the spread.
-    rounds
-        How often curves are put in between, up to seven into every gap.
+    count, most, rounds
+        Number of curves at first, and at most; and how often curves are put in between, up to seven into
+        every gap.
     gap
         Distance between the ends of neighbours that is close enough; the level is at about 1. Where a saddle
         or a caustic parts neighbours, a gap stays however many curves are put into it.
@@ -584,22 +572,23 @@ def ascending_integrals(
     step = RELAXATIONS / slowest / steps
     far = RUNAWAY_WIDTHS * np.where(width > 0, width, 1.0)
 
-    def terms(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        slope = gradient(points)
-        return slope, dynamics.drift(points), dynamics.diffusion.push(points, slope)
+    def terms(points: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+        """Velocity backwards, and what the integrand is made of."""
+        slope, flow = gradient(points), dynamics.drift(points)
+        push = dynamics.diffusion.push(points, slope)
+        return -(flow + 2 * push), (points, slope, flow, push)
 
     lost = np.zeros(len(x), dtype=bool)
     with np.errstate(over="ignore", invalid="ignore"):
-        slope, flow, push = terms(x)
-        velocity, before = -(flow + 2 * push), integrand(x, slope, flow, push)
+        velocity, parts = terms(x)
+        before = integrand(*parts)
         total = np.zeros_like(before)
         for _ in range(steps):
-            _, flow, push = terms(x + step * velocity)
-            moved = x + step / 2 * (velocity - (flow + 2 * push))
+            moved = x + step / 2 * (velocity + terms(x + step * velocity)[0])
             lost |= ~(np.abs(moved - middle) < far).all(axis=1)
             x = np.where(lost[:, None], x, moved)
-            slope, flow, push = terms(x)
-            velocity, after = -(flow + 2 * push), integrand(x, slope, flow, push)
+            velocity, parts = terms(x)
+            after = integrand(*parts)
             total += step / 2 * (before + after)
             before = after
     return total, x, lost
@@ -655,9 +644,9 @@ def relative_error(
 
     Infinite where the errors of more than a tenth of the points cannot be told.
     """
-    if isinstance(found, Dynamics) or found.noise_free or not len(x):
-        return 0.0
     errors = potential_errors(found, gradient, attractor, x)
+    if not errors.any():
+        return 0.0
     known = np.isfinite(errors)
     if known.mean() < 1 - MAX_UNKNOWN_SHARE:
         return np.inf
