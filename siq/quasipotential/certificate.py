@@ -37,12 +37,7 @@ from siq.quasipotential.certificate_tests import (
     check_agreement,
     check_existence,
 )
-from siq.quasipotential.characteristics import (
-    SHEET_MARGIN,
-    End,
-    Fan,
-    adapted_fan,
-)
+from siq.quasipotential.characteristics import SHEET_MARGIN, End, Fan, adapted_fan
 from siq.quasipotential.characteristics import relative_error as field_error
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.wells import Well
@@ -192,12 +187,11 @@ def certify(
         tests["branch"] = Verdict.refused(reason, options.branch)
     # A formula is no solution if the error that its own residual leaves open is too large. What the
     # uncertainty of f adds is no fault of the formula, and stated as long as a first order tells it.
-    known = from_field <= MAX_ERROR_FROM_FIELD
-    reason = "the error of V that its residual leaves open is too large"
-    if own_error <= options.error:
-        reason = "" if known else "f is not known well enough to tell V: record more"
+    known, small = from_field <= MAX_ERROR_FROM_FIELD, own_error <= options.error
+    reason = "f is not known well enough to tell V: record more"
+    reason = reason if small else "the error of V that its residual leaves open is too large"
     value = own_error if known else from_field
-    tests["error"] = Verdict(value, options.error, own_error <= options.error and known, reason)
+    tests["error"] = Verdict(value, options.error, small and known, "" if small and known else reason)
     if not isinstance(found, Dynamics):
         if portrait.attractors:
             tests["existence"] = check_existence(found, portrait, seed=seed)
@@ -217,19 +211,16 @@ def certify(
             agreement = []
             for values, two, erring in compare:
                 its = max(_error_of_well(one, evidence) for one in erring)
-                limit = (
-                    MIN_DIFFERENCE + min(error, options.error) + min(its, options.error) + 6 * relative_error
-                )
-                agreement.append(check_agreement(values, two, limit=limit))
+                limit = MIN_DIFFERENCE + min(error, options.error) + min(its, options.error)
+                agreement.append(check_agreement(values, two, limit=limit + 6 * relative_error))
             tests["agreement"] = Verdict.worst(agreement)
         elif compared:
             tests["agreement"] = Verdict.refused(ALONE)
         if found.prediction is not None:
             tests["prediction"] = found.prediction
     if (fault := portrait.fault()) is not None:
-        tests["branch"] = Verdict.refused(
-            sentence(fault), tests["branch"].limit if "branch" in tests else 0.0
-        )
+        limit = tests["branch"].limit if "branch" in tests else 0.0
+        tests["branch"] = Verdict.refused(sentence(fault), limit)
     refused = [verdict.reason for verdict in tests.values() if not verdict.passed]
     tested_on = "; ".join(dict.fromkeys(candidate.tested_on for candidate in candidates))
     return Certificate(tests, error, "; ".join(dict.fromkeys(refused)), scope, tested_on)
@@ -308,8 +299,7 @@ def caustics_below(
     polynomial follows it, and the error that is stated comes from there.
     """
     remarks = []
-    width = portrait.box[:, 1] - portrait.box[:, 0]
-    box = np.stack([portrait.box[:, 0] - width / 4, portrait.box[:, 1] + width / 4], axis=1)
+    box = portrait.box + np.ptp(portrait.box, axis=1)[:, None] * np.array([-0.25, 0.25])
     for well in wells if error > MIN_EXPLAINED_ERROR else ():
         fan = adapted_fan(
             dynamics, well.attractor, level=0.98 * well.level, box=box,

@@ -29,7 +29,6 @@ bounds the error.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
@@ -406,8 +405,8 @@ def _lost_shares(
 ) -> np.ndarray:
     """Share of the f that the data allow in which each equilibrium does not exist: shape ``(k,)``.
 
-    It is lost where it vanishes together with another one, where its stability changes, and where it has
-    jumped.
+    Each is followed by Newton's method. It is lost where it vanishes together with another one, where its
+    stability changes, and where it has jumped.
     """
     if found.noise_free or not equilibria:
         return np.zeros(len(equilibria))
@@ -416,36 +415,19 @@ def _lost_shares(
     own = normal_draws(np.zeros(len(found.support)), found.covariance, EXISTENCE_DRAWS, generator=generator)
     changes[:, found.support[:, 1], found.support[:, 0]] = own
     changes += found.drawn_alternatives(EXISTENCE_DRAWS, generator=generator)
-    followed = [_followed(found, one, changes, width) for one in equilibria]
-    places, lost = (np.array(each) for each in zip(*followed, strict=True))
     starts = np.array([one.position for one in equilibria])
-    far = np.abs((places - starts[:, None]) / width).max(axis=2)
-    met = np.zeros_like(lost)
-    for one, two in itertools.combinations(range(len(equilibria)), 2):
-        same = np.abs((places[one] - places[two]) / width).max(axis=1) < EQUILIBRIUM_MERGE_TOLERANCE
-        same &= ~lost[one] & ~lost[two]
-        # Whichever came from afar has jumped; both have where they come from equally far.
-        met[one] |= same & (far[one] > far[two] / 2)
-        met[two] |= same & (far[two] > far[one] / 2)
-    return np.asarray((lost | met).mean(axis=1))
-
-
-def _followed(
-    found: FieldEstimate, one: Equilibrium, changes: np.ndarray, width: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Where changes of f lead an equilibrium by Newton's method, ``(n, d)``; a mask of those that lose it."""
-    library, d = found.library, found.library.dimension
+    unstable = np.repeat([one.unstable for one in equilibria], EXISTENCE_DRAWS)
     first = [term.diff(symbol) for term in library.terms for symbol in library.symbols]
-    derivative = compile_formulas(first, library.symbols)
+    derivative, d = compile_formulas(first, library.symbols), library.dimension
 
     def jacobians(x: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
         slopes = derivative(np.ascontiguousarray(x.T)).T.reshape(len(x), library.size, d)
         return np.einsum("nqj,nqi->nij", slopes, coefficients)
 
-    x = np.repeat(one.position[None], len(changes), axis=0)
-    lost = np.zeros(len(changes), dtype=bool)
+    start = x = np.repeat(starts, EXISTENCE_DRAWS, axis=0)
+    lost = np.zeros(len(x), dtype=bool)
     for step in range(1, EXISTENCE_STEPS + 1):
-        coefficients = found.coefficients + changes * step / EXISTENCE_STEPS
+        coefficients = np.tile(found.coefficients + changes * step / EXISTENCE_STEPS, (len(starts), 1, 1))
         moved = np.full(len(x), np.inf)
         for _ in range(NEWTON_STEPS):
             value = np.einsum("nq,nqi->ni", library.evaluate(x), coefficients)
@@ -454,11 +436,17 @@ def _followed(
             change = np.linalg.solve(matrix, value[..., None])[..., 0]
             moved = np.abs(change / width).max(axis=1)
             lost |= ~(moved < 1.0)
-            x = np.where(lost[:, None], one.position, x - change)
-        unstable = (np.linalg.eigvals(jacobians(x, coefficients)).real > 0).sum(axis=1)
-        lost |= (moved > NEWTON_TOLERANCE) | (unstable != one.unstable)
-        x = np.where(lost[:, None], one.position, x)
-    return x, lost
+            x = np.where(lost[:, None], start, x - change)
+        positive_rates = (np.linalg.eigvals(jacobians(x, coefficients)).real > 0).sum(axis=1)
+        lost |= (moved > NEWTON_TOLERANCE) | (positive_rates != unstable)
+        x = np.where(lost[:, None], start, x)
+    places, lost = x.reshape(len(starts), -1, d), lost.reshape(len(starts), -1)
+    far = np.abs((places - starts[:, None]) / width).max(axis=2)
+    same = np.abs((places[:, None] - places) / width).max(axis=3) < EQUILIBRIUM_MERGE_TOLERANCE
+    same &= ~lost[:, None] & ~lost & ~np.eye(len(starts), dtype=bool)[:, :, None]
+    # Whichever came from afar has jumped; both have where they come from equally far.
+    met = (same & (far[:, None] > far / 2)).any(axis=1)
+    return np.asarray((lost | met).mean(axis=1))
 
 
 def check_existence(found: FieldEstimate, portrait: PhasePortrait, *, seed: int = 0) -> Verdict:

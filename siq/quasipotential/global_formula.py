@@ -91,18 +91,11 @@ def refine_globally(
     precision: float = 1e-7,
     sparse: bool = True,
 ) -> GlobalFormula:
-    """Refine V from a start, and keep only the terms that the data support.
+    """Refine V from a start, coefficients ``(q,)`` over the library of f; keep the terms that data support.
 
-    Parameters
-    ----------
-    start
-        Coefficients of V over the library of f, shape ``(q,)``.
-    found, points
-        The identified f with its uncertainty, and where the equation is asked for, shape ``(n, d)``.
-    false_terms
-        Probability that the uncertainty of f alone brings any false term into V.
-    precision
-        Terms that contribute less than this share of V are dropped in any case; none at all if not `sparse`.
+    The equation is asked for at points ``(n, d)``. `false_terms` is the probability that the uncertainty of f
+    alone brings any false term into V. Terms that contribute less than the share `precision` of V are dropped
+    in any case; none at all if not `sparse`.
     """
     library = found.library
     basis = LibraryBasis.of_potential(library)
@@ -111,10 +104,11 @@ def refine_globally(
     critical = float(-scipy.special.ndtri(false_terms / (2 * basis.size)))
     # Dropping terms changes the others, hence the errors: repeat until nothing more can go.
     for _ in range(6 if sparse else 0):
-        kept = _eliminate(equation, solution, found, critical=critical, precision=precision)
+        kept = _eliminate(equation, solution, found, critical, precision)
         if len(kept) == basis.size or not len(kept):
             break
-        equation, basis = equation.restricted(kept), basis.restricted(kept)
+        equation = replace(equation, gradients=equation.gradients[:, :, kept])
+        basis = LibraryBasis(library, basis.chosen[kept])
         solution, left = equation.gauss_newton(solution[kept])
     # Coefficients of V follow those of f to first order; a residual that no V here can remove adds to their
     # uncertainty.
@@ -148,7 +142,6 @@ def _eliminate(
     equation: HamiltonJacobi,
     coefficients: np.ndarray,
     found: FieldEstimate,
-    *,
     critical: float,
     precision: float,
 ) -> np.ndarray:
@@ -170,19 +163,17 @@ def _eliminate(
         orthogonal, upper = np.linalg.qr(columns / scale)
         diagonal = np.abs(np.diag(upper))
         if diagonal.min() > 1e-10 * diagonal.max():
-            inverse = scipy.linalg.solve_triangular(upper, orthogonal.T)
+            inverse = scipy.linalg.solve_triangular(upper, orthogonal.T) / scale[:, None]
         else:
-            inverse = np.linalg.pinv(columns / scale, rcond=1e-11)
-        inverse = inverse / scale[:, None]
+            inverse = _left_inverse(columns)
         current = inverse @ triangle[:, m]
         misfit = triangle[:, m] - columns @ current
         response = inverse @ triangle[:, m + 1 :]
         variance = np.einsum("mp,pq,mq->m", response, found.covariance, response)
         variance = variance + misfit @ misfit / rows * (inverse**2).sum(axis=1)
         contribution = np.abs(current) * spread[active] / size
-        strength = np.minimum(
-            np.abs(current) / (critical * np.sqrt(variance) + 1e-300), contribution / precision
-        )
+        certainty = np.abs(current) / (critical * np.sqrt(variance) + 1e-300)
+        strength = np.minimum(certainty, contribution / precision)
         weakest = int(np.argmin(strength))
         if strength[weakest] >= 1:
             break
@@ -213,8 +204,7 @@ def with_circulation(
     circulatory = found.coefficients + np.einsum("ikj,j->ki", downhill, best.potential)
     # δg = δf + D∇δV with δV = S δf, coefficient by coefficient
     response = np.einsum("ikj,jp->ikp", downhill, best.sensitivity)
-    for column, (component, term) in enumerate(found.support):
-        response[component, term, column] += 1.0
+    response[*found.support.T, np.arange(len(found.support))] += 1.0
     errors = np.sqrt(np.einsum("ikp,pr,ikr->ki", response, found.covariance, response))
     values = library.evaluate(points)
     size = np.sqrt((values**2).mean(axis=0))[:, None]
@@ -235,10 +225,7 @@ def with_circulation(
 
 
 def _fit_orthogonal(
-    found: FieldEstimate,
-    potential: np.ndarray,
-    circulatory: np.ndarray,
-    points: np.ndarray,
+    found: FieldEstimate, potential: np.ndarray, circulatory: np.ndarray, points: np.ndarray
 ) -> GlobalFormula | None:
     """Fit V and g on their terms so that f = -D∇V + g, ∇V·g = 0, is closest to the identified f.
 
@@ -253,8 +240,7 @@ def _fit_orthogonal(
     count = len(terms)
     whole = np.zeros((d, q, count + len(places)))
     whole[:, :, :count] = -library.downhill(noise)[:, :, terms]
-    for column, (i, k) in enumerate(places):
-        whole[i, k, count + column] = 1.0
+    whole[*places.T, count + np.arange(len(places))] = 1.0
     components, functions = found.support.T
     listed = np.zeros((d, q), dtype=bool)
     listed[components, functions] = True
@@ -266,9 +252,7 @@ def _fit_orthogonal(
     absent = (sizes[:, :, None] * whole)[~listed]
     absent = absent[np.abs(absent).any(axis=1)]
     gradients = np.einsum("nk,kij->nij", values, library.derivatives[:, :, terms])
-    circulation = np.zeros((len(points), d, len(places)))
-    for column, (i, k) in enumerate(places):
-        circulation[:, i, column] = values[:, k]
+    circulation = np.einsum("nk,ikj->nij", values, whole[:, :, count:])
     slopes = np.sqrt(noise.contract(points, gradients.transpose(0, 2, 1)))
     scale = positive(np.concatenate([np.sqrt((slopes**2).mean(axis=0)) / usual, sizes[of_circulatory]]))
     weight = 1 / np.maximum(speed, 1e-3 * speed.max()) / usual / np.sqrt(len(points))
@@ -276,14 +260,9 @@ def _fit_orthogonal(
     def constraints(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Weighted ∇V·g at the points and the terms that f does not have, with their derivatives."""
         gradient, turning = gradients @ theta[:count], circulation @ theta[count:]
-        slope = np.concatenate(
-            [
-                weight[:, None] * np.einsum("nd,ndj->nj", turning, gradients),
-                weight[:, None] * np.einsum("nd,ndj->nj", gradient, circulation),
-            ],
-            axis=1,
-        )
+        slopes = (np.einsum("nd,ndj->nj", turning, gradients), np.einsum("nd,ndj->nj", gradient, circulation))
         product = weight * (gradient * turning).sum(axis=1)
+        slope = weight[:, None] * np.concatenate(slopes, axis=1)
         return np.concatenate([product, absent @ theta]), np.concatenate([slope, absent])
 
     theta = np.concatenate([potential[of_potential], circulatory.T[of_circulatory]])
@@ -292,8 +271,6 @@ def _fit_orthogonal(
     )
     # Coefficients in units of what each of them does to f, so that the units of the states do not matter.
     design = whiten @ whole[components, functions] / scale
-    tangent = np.zeros((len(theta), 0))
-    rank = 0
     for _ in range(MAX_STEPS):
         violation, slope = constraints(theta)
         left, singular, right = np.linalg.svd(slope / scale, full_matrices=True)
@@ -307,19 +284,16 @@ def _fit_orthogonal(
         theta = theta + step / scale
         if np.linalg.norm(step) <= 1e-13 * np.linalg.norm(theta * scale):
             break
-    violation, _slope = constraints(theta)
-    if not np.isfinite(theta).all() or np.abs(violation).max() > 1e-8:
+    if not np.isfinite(theta).all() or np.abs(constraints(theta)[0]).max() > 1e-8:
         return None
     inverse = tangent @ np.linalg.pinv(design @ tangent) / scale[:, None]
     covariance = inverse @ inverse.T
     distance = whiten @ found.values - design @ (theta * scale)
-    fitted_potential, fitted = np.zeros(q), np.zeros((d, q))
-    fitted_potential[of_potential] = theta[:count]
-    fitted[of_circulatory] = theta[count:]
-    potential_covariance, errors = np.zeros((q, q)), np.zeros((d, q))
-    potential_covariance[np.ix_(terms, terms)] = covariance[:count, :count]
-    errors[of_circulatory] = np.sqrt(np.maximum(np.diag(covariance)[count:], 0))
+    of_v, of_v_covariance, of_g, of_g_errors = (np.zeros(n) for n in (q, (q, q), (d, q), (d, q)))
+    of_v[terms], of_g[of_circulatory] = theta[:count], theta[count:]
+    of_v_covariance[np.ix_(terms, terms)] = covariance[:count, :count]
+    of_g_errors[of_circulatory] = np.sqrt(np.maximum(np.diag(covariance)[count:], 0))
     return GlobalFormula(
-        fitted_potential, potential_covariance, circulatory=fitted.T, circulatory_errors=errors.T, joint=True,
+        of_v, of_v_covariance, circulatory=of_g.T, circulatory_errors=of_g_errors.T, joint=True,
         freedom=len(found.values) - tangent.shape[1], chi_square=float(distance @ distance),
     )  # fmt: skip

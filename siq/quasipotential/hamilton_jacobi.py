@@ -71,10 +71,6 @@ class LibraryBasis:
         """Number of functions, m."""
         return len(self.chosen)
 
-    def restricted(self, rows: np.ndarray) -> LibraryBasis:
-        """Some of the functions."""
-        return LibraryBasis(self.library, self.chosen[rows])
-
     def values(self, x: np.ndarray) -> np.ndarray:
         """Points ``(n, d)`` to values ``(n, m)``."""
         return self.library.evaluate(x)[:, self.chosen]
@@ -255,10 +251,6 @@ class HamiltonJacobi:
         """Rms of each function's gradient over the points, in the metric of the noise: shape ``(m,)``."""
         steepness = self.measure.contract(self.points, self.gradients.transpose(0, 2, 1))
         return np.sqrt(np.asarray(steepness.mean(axis=0)))
-
-    def restricted(self, rows: np.ndarray) -> HamiltonJacobi:
-        """The equation with some of the functions only."""
-        return replace(self, gradients=self.gradients[:, :, rows])
 
     def robust_fit(
         self,

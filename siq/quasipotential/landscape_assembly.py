@@ -20,13 +20,7 @@ from pydantic.dataclasses import dataclass
 from siq.errors import InputError, NumericalFailure
 from siq.inference.field_estimate import AnyField, FieldEstimate, dynamics_of
 from siq.numerics.randomness import Purpose, generator
-from siq.quasipotential.certificate import (
-    Certificate,
-    Evidence,
-    caustics_below,
-    certify,
-    references_about,
-)
+from siq.quasipotential.certificate import Certificate, Evidence, caustics_below, certify, references_about
 from siq.quasipotential.certificate_tests import CertificateOptions
 from siq.quasipotential.landscape import Landscape, LandscapeOptions, NoLandscape, heights_of_attractors
 from siq.quasipotential.path_chains import evenly

@@ -55,12 +55,7 @@ from siq.quasipotential.formulas import (
     decomposition_from_coefficients,
     term_coefficients,
 )
-from siq.quasipotential.global_formula import (
-    GlobalFormula,
-    fit_values,
-    refine_globally,
-    with_circulation,
-)
+from siq.quasipotential.global_formula import GlobalFormula, fit_values, refine_globally, with_circulation
 from siq.quasipotential.hamilton_jacobi import LibraryBasis, affordable_degree
 from siq.quasipotential.occupancy import OccupancyCheck, check_occupancy
 from siq.quasipotential.rates import NoiseStrength

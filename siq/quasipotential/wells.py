@@ -134,10 +134,7 @@ class Well(Expansion):
         return believed
 
     def residual_at(self, x: np.ndarray) -> np.ndarray:
-        """∣∇V·(f + D∇V)∣ / (∣∇V∣ ∣f∣) at points ``(n, d)``, in the metric of the noise: shape ``(n,)``.
-
-        At the attractor, where both vanish, it is zero.
-        """
+        """∣∇V·(f + D∇V)∣ / (∣∇V∣ ∣f∣) at points ``(n, d)``, in the metric of the noise: shape ``(n,)``."""
         numerator, size = self._terms(x)
         # At the attractor both vanish, and what is left of them is rounding.
         return np.asarray(numerator / np.maximum(size, ROUNDING_SHARE * self._size))
@@ -264,22 +261,12 @@ def local_well(
     saddle: Equilibrium | Cycle | None = None,
     path: MinimumActionPath | None = None,
 ) -> Well:
-    """V about one attractor, of the lowest degree that no other betters by much.
+    """V about attractor `index` of a portrait, of the lowest degree that no other betters by much.
 
-    Parameters
-    ----------
-    dynamics, portrait, index
-        f and D, their attractors, saddles and basins, and which attractor.
-    options, seed
-        Degrees, reach and tolerance; and what decides which points are used where there are too many.
-    saddle, path
-        The lowest saddle, or bounding cycle, and the path of least action to it, where that has told V there
-        before, as it does for given equations.
-
-    Raises
-    ------
-    NumericalFailure
-        When no degree gives a formula.
+    The options have degrees, reach and tolerance; the seed decides which points are used where there are too
+    many. The lowest saddle, or bounding cycle, and the path of least action to it are given where that has
+    told V there before, as it does for given equations. When no degree gives a formula, this fails with
+    `NumericalFailure`.
     """
     attractor, basin = portrait.attractors[index], portrait.basins[index]
     saddles = portrait.saddles[index] if saddle is None else [saddle]
@@ -298,11 +285,10 @@ def local_well(
                     dynamics, attractor, basin, saddles, degree=degree, generator=generator, depth=depth
                 )
             else:  # the same formula in powers up to a higher degree; the lower ones come first
-                lower = wells[-1]
-                basis = PowerBasis.up_to(degree, lower.basis.symbols, lower.basis.center, lower.basis.scale)
-                padding = np.zeros(basis.size - lower.basis.size)
-                coefficients = np.concatenate([lower.coefficients, padding])
-                well = replace(lower, basis=basis, coefficients=coefficients)
+                well, old = wells[-1], wells[-1].basis
+                basis = PowerBasis.up_to(degree, old.symbols, old.center, old.scale)
+                coefficients = np.pad(well.coefficients, (0, basis.size - old.size))
+                well = replace(well, basis=basis, coefficients=coefficients)
             if depth is not None:
                 told = {"goal": options.reach * depth, "rows": kept, "path": path, "generator": generator}
                 start, well = well, _extend_well(well, basin, **told)
@@ -367,13 +353,10 @@ def _grow_well(
     quadratic = 0.5 * np.einsum("ni,ij,nj->n", offsets, hessian, offsets).reshape(basin.states.shape[:2])
     size = np.quantile(quadratic[:, 0], 0.5) if depth is None else depth
     basis = PowerBasis.up_to(degree, dynamics.symbols, attractor.position, extent * np.sqrt(2 * size))
-    order = basis.exponents.sum(axis=1)
-    free = order > 2
+    free = basis.exponents.sum(axis=1) > 2
     coefficients = np.zeros(basis.size)
-    for index in np.flatnonzero(~free):
-        i, j = np.repeat(np.arange(len(extent)), basis.exponents[index])
-        factor = 0.5 if i == j else 1.0
-        coefficients[index] = factor * hessian[i, j] * basis.scale[i] * basis.scale[j]
+    i, j = np.array([np.repeat(np.arange(len(extent)), row) for row in basis.exponents[~free]]).T
+    coefficients[~free] = np.where(i == j, 0.5, 1.0) * hessian[i, j] * basis.scale[i] * basis.scale[j]
     values = basis.values(flat) @ coefficients
     # The first level has points enough for all coefficients.
     reached = np.sort(basin.highest(values.reshape(basin.states.shape[:2]))[tuple(basin.chosen.T)])
@@ -633,19 +616,18 @@ def _towards_path(well: Well, x: np.ndarray, path: MinimumActionPath, free: np.n
     if not len(where) or not len(x):
         return well.coefficients
     old, along = well.basis.gradients(x), well.basis.gradients(where)
-    size = np.sqrt(noise.contract(where, slopes))
-    weight = np.sqrt(len(x) / len(where)) / size
+    weight = np.sqrt(len(x) / len(where)) / np.sqrt(noise.contract(where, slopes))
     rest = slopes - along @ well.coefficients
     steep = np.sqrt(noise.contract(x, old @ well.coefficients))
     steep = np.maximum(steep, np.median(steep))
-    roots = noise.root_at(where), noise.root_at(x)
+    root = noise.root_at(where)
     rows = [
-        np.einsum("n,nij,nim->njm", weight, roots[0], along[:, :, free], optimize=True),
-        np.einsum("n,nij,nim->njm", 1 / steep, roots[1], old[:, :, free], optimize=True),
+        np.einsum("n,nij,nim->njm", weight, root, along[:, :, free], optimize=True),
+        np.einsum("n,nij,nim->njm", 1 / steep, noise.root_at(x), old[:, :, free], optimize=True),
     ]
-    wanted = np.einsum("n,nij,ni->nj", weight, roots[0], rest).ravel()
     matrix = np.concatenate([one.reshape(-1, one.shape[2]) for one in rows])
-    right = np.concatenate([wanted, np.zeros(len(matrix) - len(wanted))])
+    right = np.zeros(len(matrix))
+    right[: where.size] = np.einsum("n,nij,ni->nj", weight, root, rest).ravel()
     scale = positive(np.linalg.norm(matrix, axis=0))
     coefficients = well.coefficients.copy()
     coefficients[free] += np.linalg.lstsq(matrix / scale, right, rcond=SINGULAR_RATIO)[0] / scale

@@ -36,19 +36,8 @@ from siq.report.formatting import (
     vector_mathml,
     with_unit,
 )
-from siq.report.landscape import (
-    answer_lines,
-    comparison_table,
-    in_words,
-    landscape_tables,
-    record_table,
-)
-from siq.report.page import (
-    FormulaRow,
-    ReportContent,
-    ReportFigure,
-    compose,
-)
+from siq.report.landscape import answer_lines, comparison_table, in_words, landscape_tables, record_table
+from siq.report.page import FormulaRow, ReportContent, ReportFigure, compose
 from siq.report.summary import LandscapeSummary, well_name
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics

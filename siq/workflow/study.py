@@ -28,14 +28,7 @@ from siq.quasipotential.certificate_tests import CertificateOptions
 from siq.quasipotential.landscape import LandscapeOptions
 from siq.quasipotential.landscape_assembly import fault_for_landscape
 from siq.quasipotential.refinement import RefinementOptions
-from siq.systems.cards import (
-    DiffusionEntry,
-    Name,
-    Number,
-    SystemCard,
-    build_system,
-    diffusion_rows,
-)
+from siq.systems.cards import DiffusionEntry, Name, Number, SystemCard, build_system, diffusion_rows
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, symbol
 from siq.systems.formulas import FormulaError
