@@ -36,40 +36,24 @@ LARGEST_LOG_ODDS = math.log(1e6)  # beyond which odds are not told
 class Findings:
     """What the page is made from.
 
-    Attributes
-    ----------
-    statement
-        The content of ``verdict.json``.
-    before, after
-        The simulation of the card, and the one that the verdict ends with.
-    dictionary
-        The mechanisms that could be named.
-    candidates
-        Columns ``label shapes gain stage beside``.
-    figures
-        SVG files by the names of their captions, as far as there was something to draw.
-    wells, escape, notes
-        See `workflow.consequences.compare_landscapes`.
-    scores
-        Columns ``simulation score output rms unit published``, of public benchmarks only.
-    held_out
-        Columns ``output measured before recalibrated augmented scored``, one row per sample.
-    folder
-        Where the whole tables are.
+    Of the tables, `candidates` has the columns ``label shapes gain stage beside``, `scores` of public
+    benchmarks ``simulation score output rms unit published``, and `held_out` a row for each sample with
+    ``output measured before recalibrated augmented scored``; for `wells`, `escape` and `notes` see
+    `workflow.consequences.compare_landscapes`.
     """
 
-    statement: Statement
-    before: Dynamics
-    after: Dynamics
-    dictionary: Sequence[Mechanism]
+    statement: Statement  # the content of verdict.json
+    before: Dynamics  # the simulation of the card
+    after: Dynamics  # the one that the verdict ends with
+    dictionary: Sequence[Mechanism]  # the mechanisms that could be named
     candidates: pd.DataFrame
-    figures: Mapping[str, bytes]
+    figures: Mapping[str, bytes]  # SVG files by the names of their captions
     wells: pd.DataFrame = field(default_factory=pd.DataFrame)
     escape: pd.DataFrame = field(default_factory=pd.DataFrame)
     notes: Sequence[str] = ()
     scores: pd.DataFrame = field(default_factory=pd.DataFrame)
     held_out: pd.DataFrame = field(default_factory=pd.DataFrame)
-    folder: str = "tables"
+    folder: str = "tables"  # where the whole tables are
 
     @property
     def kind(self) -> str:
@@ -95,20 +79,10 @@ class Findings:
 def mismatch_answer(statement: Statement, *, title: str) -> dict[str, Any]:
     """The content of ``answer.json``: the sentence that the page opens with, and the number beside it.
 
-    Parameters
-    ----------
-    statement
-        The content of ``verdict.json``.
-    title
-        What the page is headed.
-
-    Returns
-    -------
-    dict
-        ``title``, ``sentence``, ``verdict``, ``compared`` (false where no fit of the simulation has a
-        result), ``held_out_before`` (the simulation as given), ``held_out_after`` (the one that the verdict
-        ends with) and ``held_out_noise``. The errors are root mean squares on recordings held out, as a share
-        of the spread of what was measured; null where a simulation ran away.
+    It is false that errors are ``compared`` where no fit of the simulation has a result. ``held_out_before``
+    is of the simulation as given, ``held_out_after`` of the one that the verdict ends with. The errors are
+    root mean squares on recordings held out, as a share of the spread of what was measured; null where a
+    simulation ran away.
     """
     errors = statement.errors
     return {
@@ -123,15 +97,7 @@ def mismatch_answer(statement: Statement, *, title: str) -> dict[str, Any]:
 
 
 def diagnosis_text(statement: Statement, system: Dynamics) -> str:
-    """The report as text.
-
-    Parameters
-    ----------
-    statement
-        What the diagnosis states.
-    system
-        The simulation that was diagnosed, for units.
-    """
+    """The report as text; units are those of the simulation that was diagnosed."""
     units = {entry.name: entry.unit for entry in system.parameters}
     template = environment().get_template("diagnosis_report.j2")
     text = template.render(sentences_of(statement), st=statement, units=units, metric=METRIC)
@@ -215,18 +181,10 @@ def largest_difference(table: pd.DataFrame, *, after: str) -> dict[str, Any] | N
     the middle of all recordings, so that a single runaway does not decide. Of its recordings it is the one
     in which the difference is largest.
 
-    Parameters
-    ----------
-    table
-        Columns ``recording output measured before recalibrated augmented scored``.
-    after
-        The simulation that the verdict ends with: ``"augmented"``, ``"recalibrated"``, or ``"before"``.
-
-    Returns
-    -------
-    dict or None
-        ``recording`` and ``output``; root mean square differences there, in the unit of the output,
-        ``before`` and ``after``, infinite where a simulation runs away; how many ``recordings`` there are.
+    The table is `Findings.held_out` with recordings, and `after` the simulation that the verdict ends with:
+    ``"augmented"``, ``"recalibrated"``, or ``"before"``. The result has ``recording`` and ``output``; root
+    mean square differences there, in the unit of the output, ``before`` and ``after``, infinite where a
+    simulation runs away; and how many ``recordings`` there are.
     """
     scored = table[table["scored"].astype(bool) & table["measured"].notna()]
     if scored.empty:

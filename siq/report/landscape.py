@@ -37,16 +37,9 @@ MOST_COLUMNS = 4  # wells that are columns of a table; more are rows
 def answer_lines(
     summary: LandscapeSummary, *, seen: RecordStates | None = None, certified: bool = False
 ) -> list[str]:
-    """The answer in one sentence, and what has to be known of it.
+    """The answer in one sentence, and what has to be known of it; nothing is added where it is certified.
 
-    Parameters
-    ----------
-    summary
-        The landscape.
-    seen
-        The two states that the recordings show without any formula, None where nothing is known of them.
-    certified
-        Whether the landscape may be believed: then nothing is added.
+    `seen` are the two states that the recordings show without any formula.
     """
     return paragraphs(
         "answer.j2", s=summary, seen="" if seen is None else seen.sentence(), certified=certified
@@ -71,19 +64,9 @@ def landscape_tables(
 ) -> dict[str, tuple[pd.DataFrame, pd.DataFrame | None]]:
     """The tables of a landscape, each as it is shown and as numbers; empty of one without stable states.
 
-    Parameters
-    ----------
-    summary
-        The landscape, None where there is none.
-    noises
-        Strengths ε for which mean times are told.
-
-    Returns
-    -------
-    dict
-        ``wells``: a column for each, and as numbers a row for each. ``exits``: a row for every way out of
-        every well. ``equilibria``: all states at which f vanishes, with the eigenvalues of f there.
-        ``cycles``: the unstable ones. ``times``: how long each well lasts under the noise strengths.
+    ``wells`` have a column each, and as numbers a row; ``exits`` are the ways out of every well,
+    ``equilibria`` all states at which f vanishes, with the eigenvalues of f there, ``cycles`` the unstable
+    ones. ``times`` are how long each well lasts under the noise strengths ε.
     """
     if summary is None or not summary.wells:
         return dict.fromkeys(("wells", "exits", "equilibria", "cycles", "times"), (pd.DataFrame(), None))
@@ -242,15 +225,7 @@ def in_words(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def record_table(record: pd.DataFrame, time_unit: str) -> pd.DataFrame:
-    """Mean visits to each well, counted on the record and predicted.
-
-    Parameters
-    ----------
-    record
-        The rows of one run of the table of that name.
-    time_unit
-        Of the recordings.
-    """
+    """Mean visits to each well, counted on the record and predicted, from the rows of one run of `record`."""
     words, rows = texts("tables"), []
     for one in record.to_dict("records"):
         visits = visits_of(one)
@@ -276,13 +251,7 @@ def record_table(record: pd.DataFrame, time_unit: str) -> pd.DataFrame:
 
 
 def comparison_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Numbers by the trajectories with those of the equations; of several runs the largest difference.
-
-    Parameters
-    ----------
-    table
-        `beside_equations`.
-    """
+    """Numbers by the trajectories with those of the equations; of several runs the largest difference."""
 
     def text(value: float, digits: int = 5) -> str:
         return value_text(value, digits=digits) if np.isfinite(value) else ""

@@ -38,150 +38,68 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FormulaRow:
-    """One formula.
+    """One formula."""
 
-    Attributes
-    ----------
-    quantity
-        What the formula gives: ``"U"``, ``"f"``, typeset or as text.
-    formula
-        Typeset by `siq.report.formatting`; plain text is shown as text.
-    note
-        What to know of it, in a sentence.
-    exact
-        The exact formula, where one is known.
-    whole
-        The formula in full, folded away, where `formula` leaves small terms out.
-    """
-
-    quantity: Markup | str
-    formula: Markup | str
-    note: str = ""
-    exact: Markup | str | None = None
-    whole: Markup | str | None = None
+    quantity: Markup | str  # what the formula gives: "U", "f", typeset or as text
+    formula: Markup | str  # typeset by `siq.report.formatting`; plain text is shown as text
+    note: str = ""  # what to know of it, in a sentence
+    exact: Markup | str | None = None  # the exact formula, where one is known
+    whole: Markup | str | None = None  # in full, folded away, where `formula` leaves small terms out
 
 
 @dataclass(frozen=True)
 class ReportTable:
-    """A table of the report; it can be downloaded as CSV, with all its rows.
+    """A table of the report; it can be downloaded as CSV, with all its rows."""
 
-    Attributes
-    ----------
-    caption
-        What the table shows, in a sentence.
-    frame
-        The table; its index is not shown, and neither are columns that hold nothing.
-    column_help
-        What the columns mean, by name.
-    whole
-        Where it lies as a file, for one that is cut.
-    rows_shown
-        After how many rows the table is cut.
-    data
-        What is downloaded, where that is more than what is shown.
-    rows_named
-        Whether the first column names the rows.
-    """
-
-    caption: str
-    frame: pd.DataFrame
-    column_help: Mapping[str, str] = field(default_factory=dict)
-    whole: str = ""
-    rows_shown: int = 30
-    data: pd.DataFrame | None = None
-    rows_named: bool = False
+    caption: str  # what the table shows, in a sentence
+    frame: pd.DataFrame  # the table; its index is not shown, and neither are columns that hold nothing
+    column_help: Mapping[str, str] = field(default_factory=dict)  # what the columns mean, by name
+    whole: str = ""  # where it lies as a file, for one that is cut
+    rows_shown: int = 30  # after how many rows the table is cut
+    data: pd.DataFrame | None = None  # what is downloaded, where that is more than what is shown
+    rows_named: bool = False  # whether the first column names the rows
 
 
 @dataclass(frozen=True)
 class ReportFigure:
-    """A figure of the report; it can be downloaded.
+    """A figure of the report; it can be downloaded."""
 
-    Attributes
-    ----------
-    caption
-        What the figure shows, in sentences.
-    alternative
-        What somebody who cannot see it should know of it.
-    image
-        The bytes of the file.
-    kind
-        Its format.
-    vector
-        The same as SVG, for the download.
-    """
-
-    caption: str
-    alternative: str
-    image: bytes
-    kind: Literal["svg", "png"] = "svg"
-    vector: bytes | None = None
+    caption: str  # what the figure shows, in sentences
+    alternative: str  # what somebody who cannot see it should know of it
+    image: bytes  # the bytes of the file
+    kind: Literal["svg", "png"] = "svg"  # its format
+    vector: bytes | None = None  # the same as SVG, for the download
 
 
 @dataclass(frozen=True)
 class ReportSection:
-    """A section of the report.
+    """A section of the report."""
 
-    Attributes
-    ----------
-    heading
-        Its heading.
-    text
-        Paragraphs.
-    formulas, tables, figures
-        Below the text, in this order.
-    notes
-        Paragraphs below all of it, in small print.
-    folded
-        Whether it is closed until a reader opens it.
-    listing
-        Lines of code, such as commands.
-    """
-
-    heading: str
-    text: Sequence[str] = ()
-    formulas: Sequence[FormulaRow] = ()
+    heading: str  # its heading
+    text: Sequence[str] = ()  # paragraphs
+    formulas: Sequence[FormulaRow] = ()  # below the text, before tables and figures
     tables: Sequence[ReportTable] = ()
     figures: Sequence[ReportFigure] = ()
-    notes: Sequence[str] = ()
-    folded: bool = False
-    listing: str = ""
+    notes: Sequence[str] = ()  # paragraphs below all of it, in small print
+    folded: bool = False  # whether it is closed until a reader opens it
+    listing: str = ""  # lines of code, such as commands
 
 
 @dataclass(frozen=True)
 class ReportContent:
-    """All that a report says, in the order in which it is read.
+    """All that a report says, in the order in which it is read."""
 
-    Attributes
-    ----------
-    title
-        Title of the study.
-    answer
-        The answer: a sentence that stands alone, and what has to be known of it.
-    badge, good, promise
-        Whether it may be believed, in two words, as a flag, and what that means in plain words.
-    figure, table
-        What it looks like, beside each other.
-    figure_first
-        Whether the figure stands above the answer.
-    interactive
-        A view that can be turned, with its script; None where there is none.
-    sections
-        Everything else.
-    language
-        Language of the page, for hyphenation and screen readers.
-    """
-
-    title: str
-    answer: Sequence[str] = ()
-    badge: str = ""
-    good: bool = False
-    promise: Sequence[str] = ()
-    figure: ReportFigure | None = None
-    table: ReportTable | None = None
-    figure_first: bool = False
-    interactive: Markup | None = None
-    sections: Sequence[ReportSection] = ()
-    language: str = "en"
+    title: str  # title of the study
+    answer: Sequence[str] = ()  # the answer: a sentence that stands alone, and what has to be known of it
+    badge: str = ""  # whether it may be believed, in two words
+    good: bool = False  # the same as a flag
+    promise: Sequence[str] = ()  # what that means, in plain words
+    figure: ReportFigure | None = None  # what it looks like
+    table: ReportTable | None = None  # beside the figure
+    figure_first: bool = False  # whether the figure stands above the answer
+    interactive: Markup | None = None  # a view that can be turned, with its script
+    sections: Sequence[ReportSection] = ()  # everything else
+    language: str = "en"  # language of the page, for hyphenation and screen readers
 
 
 class _PageWriter:
@@ -262,18 +180,9 @@ class _PageWriter:
 
 
 def compose(template: str, *, title: str, interactive: Markup | None = None, **values: Any) -> ReportContent:
-    """Fill a page from a template of text, which has the writer as ``page``.
+    """Fill a page from a template of text, which reads `values` and has the writer as ``page``.
 
-    Parameters
-    ----------
-    template
-        Its file among the templates of this package.
-    title
-        Of the page.
-    interactive
-        A view of U that can be turned.
-    values
-        What the template reads.
+    `interactive` is a view of U that can be turned.
     """
     writer = _PageWriter()
     environment().get_template(template).render(page=writer, **values)
@@ -281,18 +190,7 @@ def compose(template: str, *, title: str, interactive: Markup | None = None, **v
 
 
 def render_report(content: ReportContent) -> str:
-    """Render a report as one HTML page.
-
-    Parameters
-    ----------
-    content
-        What the page says. All text is escaped, but for formulas that are `markupsafe.Markup`.
-
-    Returns
-    -------
-    str
-        The page. The same content gives the same page.
-    """
+    """Render a report as one HTML page; the same content gives the same page."""
     return render_template("report.html.j2", content)
 
 
@@ -464,16 +362,8 @@ SURFACE = 0.9  # of the height of the lowest saddle: where the surface is at fir
 def interactive_view(landscape: LandscapeSummary) -> Markup | None:
     """A view of U that can be turned and cut; None of one state, and where U is known nowhere.
 
-    Parameters
-    ----------
-    landscape
-        The landscape. Of more than four states those are shown along which the wells lie apart, with the
-        others held at the lowest saddle.
-
-    Returns
-    -------
-    markupsafe.Markup or None
-        A ``<section>`` with its style, controls, data and script, to be put into a page once.
+    It is a ``<section>`` with its style, controls, data and script, to be put into a page once. Of more than
+    four states those are shown along which the wells lie apart, with the others held at the lowest saddle.
     """
     count = len(landscape.names)
     if count < 2:

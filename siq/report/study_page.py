@@ -60,49 +60,24 @@ SUMMARY_COLUMNS = (
 
 @dataclass(frozen=True)
 class StudyResults:
-    """What a study left behind.
+    """What a study left behind."""
 
-    Attributes
-    ----------
-    tables
-        By name, see `siq.workflow.tables.COLUMNS`; `landscape_errors` and `escape` with a card only,
-        `beside_equations`, `invariant` and those of a sweep where the study asks for it.
-    folder
-        Where the whole tables are.
-    images, vectors
-        The figures that there are by name, as PNG and as SVG.
-    landscape
-        The landscape that the page opens with; None where there is none.
-    models, shown
-        The formulas of all runs, and the run and the method whose formulas are printed.
-    exact
-        The exact formulas, where they are known.
-    record
-        f and D of the run that is shown, None where there is none.
-    interactive
-        A view of U that can be turned, None where there is none.
-    inspection
-        What is in the recordings, line by line; None where they were simulated.
-    seen
-        The two states that they show by themselves; None where nothing is known of that.
-    system, certificate
-        f and D that were given as equations, and the certificate of their formulas; None of recordings.
-    """
-
+    # By name, see `siq.workflow.tables.COLUMNS`; `landscape_errors` and `escape` with a card only,
+    # `beside_equations`, `invariant` and those of a sweep where the study asks for it.
     tables: Mapping[str, pd.DataFrame]
-    folder: Path
-    images: Mapping[str, bytes]
-    vectors: Mapping[str, bytes]
-    landscape: LandscapeSummary | None = None
-    models: ModelFiles = field(default_factory=lambda: ModelFiles(()))
-    shown: Shown = (0, Method.REFINED)
-    exact: SymbolicDecomposition | None = None
-    record: FieldEstimate | None = None
-    interactive: Markup | None = None
-    inspection: Sequence[str] | None = None
-    seen: RecordStates | None = None
-    system: Dynamics | None = None
-    certificate: Mapping[str, Any] | None = None
+    folder: Path  # where the whole tables are
+    images: Mapping[str, bytes]  # the figures that there are by name, as PNG
+    vectors: Mapping[str, bytes]  # the same as SVG
+    landscape: LandscapeSummary | None = None  # that the page opens with; None where there is none
+    models: ModelFiles = field(default_factory=lambda: ModelFiles(()))  # the formulas of all runs
+    shown: Shown = (0, Method.REFINED)  # the run and the method whose formulas are printed
+    exact: SymbolicDecomposition | None = None  # the exact formulas, where they are known
+    record: FieldEstimate | None = None  # f and D of the run that is shown, None where there is none
+    interactive: Markup | None = None  # a view of U that can be turned, None where there is none
+    inspection: Sequence[str] | None = None  # of the recordings, line by line; None where simulated
+    seen: RecordStates | None = None  # the two states that they show by themselves
+    system: Dynamics | None = None  # f and D that were given as equations; None of recordings
+    certificate: Mapping[str, Any] | None = None  # of the formulas of these
 
     def table(self, name: str) -> pd.DataFrame | None:
         """A table that has rows, None otherwise."""
@@ -129,16 +104,7 @@ def study_page(
 ) -> ReportContent:
     """All that the page of a study says.
 
-    Parameters
-    ----------
-    study
-        What was asked.
-    results
-        What came of it.
-    command
-        How to make the page again.
-    versions
-        Of the programs that took part, by name.
+    `command` makes the page again; `versions` are those of the programs that took part, by name.
     """
     (run, method), summary, given = results.shown, results.landscape, results.system
     several, beside_paper = study.runs > 1, study.published is not None
@@ -281,12 +247,9 @@ def _answer(results: StudyResults, *, certified: bool) -> list[str]:
 def answer_data(page: ReportContent, study: Study, results: StudyResults) -> dict[str, Any]:
     """The content of ``answer.json``, for a terminal or another program.
 
-    Returns
-    -------
-    dict
-        ``title`` and ``sentence`` as on the page; ``certified``, whether the formulas of all runs, of some or
-        of none passed their certificates; ``formulas``, how many runs ended with a refined formula (of
-        equations: with a landscape), of how many ``runs``; in how many a step ``failed``.
+    ``title`` and ``sentence`` are as on the page. ``certified`` is whether the formulas of all runs, of some
+    or of none passed their certificates; ``formulas``, how many runs ended with a refined formula (of
+    equations: with a landscape), of how many ``runs``; in how many a step ``failed``.
     """
     outcomes = results.tables["outcomes"]
     if results.system is not None:

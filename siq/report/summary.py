@@ -67,72 +67,32 @@ def energy_unit(units: Sequence[str], time_unit: str) -> str:
 
 @dataclass(frozen=True)
 class EquilibriumSummary:
-    """An equilibrium that is no well, such as a saddle; U there is as high as the lowest exit over it.
+    """An equilibrium that is no well, such as a saddle; U there is as high as the lowest exit over it."""
 
-    Attributes
-    ----------
-    kind
-        ``attractor``, ``saddle``, ``repeller`` or ``degenerate``.
-    position
-        Shape ``(d,)``.
-    height
-        U there, NaN where it is not known.
-    eigenvalues
-        Of the Jacobian.
-    label
-        The letter of a well; empty for others.
-    """
-
-    kind: str
-    position: np.ndarray
-    height: float
-    eigenvalues: tuple[complex, ...] = ()
-    label: str = ""
+    kind: str  # attractor, saddle, repeller or degenerate
+    position: np.ndarray  # shape (d,)
+    height: float  # U there, NaN where it is not known
+    eigenvalues: tuple[complex, ...] = ()  # of the Jacobian
+    label: str = ""  # the letter of a well; empty for others
 
 
 @dataclass(frozen=True)
 class WellSummary:
-    """A stable state.
+    """A stable state."""
 
-    Attributes
-    ----------
-    label
-        A, B, and so on, in the order of the attractors.
-    position, position_errors
-        Of the attractor, with standard errors, NaN where not known.
-    height
-        U at the attractor, zero where that of all wells is not known.
-    basin
-        Share of the recorded states that lead there.
-    depth, depth_error
-        The lowest barrier of U out of it, NaN where none is known.
-    beyond
-        The name of the well behind that barrier, None where it leads out of the recorded region.
-    known_up_to
-        U up to which the formula holds, NaN where there is none.
-    exits
-        What mean times follow from, in the order of the exits.
-    leverage
-        Relative standard error of ΔU/ε from an estimated D over that of ε.
-    visits
-        How long visits to it last, None where this was not compared.
-    cycle
-        The limit cycle, None of a point.
-    """
-
-    label: str
-    position: np.ndarray
-    position_errors: np.ndarray
-    height: float
-    basin: float
-    depth: float
-    depth_error: float
-    beyond: str | None
-    known_up_to: float
-    exits: tuple[EscapeRate, ...]
-    leverage: float = 1.0
-    visits: VisitTest | None = None
-    cycle: Cycle | None = None
+    label: str  # A, B, and so on, in the order of the attractors
+    position: np.ndarray  # of the attractor
+    position_errors: np.ndarray  # standard errors, NaN where not known
+    height: float  # U at the attractor, zero where that of all wells is not known
+    basin: float  # share of the recorded states that lead there
+    depth: float  # the lowest barrier of U out of it, NaN where none is known
+    depth_error: float  # its standard error
+    beyond: str | None  # the well behind that barrier, None where it leads out of the recorded region
+    known_up_to: float  # U up to which the formula holds, NaN where there is none
+    exits: tuple[EscapeRate, ...]  # what mean times follow from, in the order of the exits
+    leverage: float = 1.0  # relative standard error of ΔU/ε from an estimated D over that of ε
+    visits: VisitTest | None = None  # how long visits to it last, None where this was not compared
+    cycle: Cycle | None = None  # the limit cycle, None of a point
 
     @property
     def kind(self) -> str:
@@ -154,63 +114,25 @@ class WellSummary:
 
 @dataclass(frozen=True)
 class LandscapeSummary:
-    """Wells, exits and U of a landscape.
+    """Wells, exits and U of a landscape."""
 
-    Main attributes
-    ---------------
-    names, units
-        Of the states, ``1`` where nobody said.
-    time_unit
-        Of the recordings, likewise.
-    wells
-        The attractors in the order of the tables, as A, B, C and so on.
-    ways
-        The ways out of the wells.
-    noise
-        That drives the system, None where nobody knows it.
-
-    Other attributes
-    ----------------
-    given
-        Whether f was given as equations, and not identified from recordings.
-    run
-        The run of a study whose landscape it is.
-    remarks
-        What has to be known of it.
-    unstable_cycles
-        Which part basins.
-    formulas
-        V about each attractor, None where there is none.
-    points
-        Recorded states, shape ``(n, d)``; there may be none.
-    dynamics
-        f and D, where a plot needs their errors.
-    matched
-        Whether U is known over all wells; otherwise each well is drawn from its own bottom.
-    formula
-        One V over all wells, within the box of the recorded states; None where wells have their own.
-    equilibria
-        All of them, in the order in which they were found.
-    size
-        How large each state becomes, shape ``(d,)``; of states of one unit, how large any does.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    time_unit: str
-    wells: tuple[WellSummary, ...]
-    ways: tuple[Transition, ...]
-    noise: NoiseStrength | None
-    given: bool = False
-    run: int = 0
-    remarks: tuple[str, ...] = ()
-    unstable_cycles: tuple[Cycle, ...] = ()
-    formulas: tuple[Well | None, ...] = ()
-    points: np.ndarray | None = None
-    dynamics: Dynamics | None = None
-    matched: bool = True
-    formula: SymbolicDecomposition | None = None
-    equilibria: tuple[EquilibriumSummary, ...] = ()
+    names: tuple[str, ...]  # of the states
+    units: tuple[str, ...]  # of the states, 1 where nobody said
+    time_unit: str  # of the recordings, likewise
+    wells: tuple[WellSummary, ...]  # the attractors in the order of the tables, as A, B, C and so on
+    ways: tuple[Transition, ...]  # the ways out of the wells
+    noise: NoiseStrength | None  # that drives the system, None where nobody knows it
+    given: bool = False  # whether f was given as equations, and not identified from recordings
+    run: int = 0  # the run of a study whose landscape it is
+    remarks: tuple[str, ...] = ()  # what has to be known of it
+    unstable_cycles: tuple[Cycle, ...] = ()  # which part basins
+    formulas: tuple[Well | None, ...] = ()  # V about each attractor, None where there is none
+    points: np.ndarray | None = None  # recorded states, shape (n, d); there may be none
+    dynamics: Dynamics | None = None  # f and D, where a plot needs their errors
+    matched: bool = True  # whether U is known over all wells; if not, each is drawn from its own bottom
+    formula: SymbolicDecomposition | None = None  # one V over all wells, in the box of the recorded states
+    equilibria: tuple[EquilibriumSummary, ...] = ()  # all of them, in the order in which they were found
+    # How large each state becomes, shape (d,); of states of one unit, how large any does.
     size: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @property
@@ -261,13 +183,7 @@ class LandscapeSummary:
 
     @cached_property
     def box(self) -> np.ndarray:
-        """Limits of what is drawn, shape ``(d, 2)``.
-
-        Raises
-        ------
-        ValueError
-            When there are neither wells nor equilibria.
-        """
+        """Limits of what is drawn, shape ``(d, 2)``; a `ValueError` without wells and equilibria."""
         winding = bool(self.cycles or self.parting)  # exits wind then, and leave their wells
         seen = [
             *(well.position[None] for well in self.wells), *self.cycles, *self.parting,
@@ -318,13 +234,7 @@ class LandscapeSummary:
         return self.top + ROOM * (self.top - lowest)
 
     def plane(self, states: Sequence[str] | None = None) -> tuple[int, int]:
-        """Places of the two states that make the plane; by default those along which the wells lie apart.
-
-        Raises
-        ------
-        ValueError
-            When they are not two states of the landscape.
-        """
+        """Places of the two states that make the plane; by default those along which the wells lie apart."""
         names = self.names
         if states is not None:
             if len(set(states)) != 2 or not set(states) <= set(names):
@@ -385,19 +295,18 @@ def summarise(
     record: pd.DataFrame | None = None,
     run: int = 0,
 ) -> LandscapeSummary:
-    """The summary of a landscape, be it in memory or read from its file.
+    """The summary of a landscape, be it in memory or read from its file; one of a summary is itself.
 
     Parameters
     ----------
     landscape
-        The landscape, or its summary, which is returned; None where recordings led to none.
+        None where recordings led to none.
     recordings
         Recorded states, or an array ``(n, d)`` of them; by default those that the landscape was fitted to.
     dynamics
         f and D, where there is no landscape.
     formula
-        With one V that holds over all wells: it counts in the box of the recorded states where no well has a
-        formula of its own.
+        With one V over all wells: it counts in the box of the recorded states where no well has its own.
     record, run
         Visits to the wells by run, the table of that name, and the run of the landscape.
     """
@@ -456,10 +365,8 @@ def summarise(
         units=units,
         time_unit=dynamics.time_unit,
         wells=tuple(
-            _well(landscape, index, float(height), [way for way in ways if way.start == index], size, visits)
-            for index, (height, visits) in enumerate(
-                zip(heights, _visits(landscape, record, run), strict=True)
-            )
+            _well(landscape, index, float(heights[index]), size, visits)
+            for index, visits in enumerate(_visits(landscape, record, run))
         ),
         ways=ways,
         noise=landscape.noise,
@@ -497,19 +404,12 @@ def visits_of(row: Mapping[Any, Any]) -> VisitTest:
 
 
 def _well(
-    landscape: Landscape,
-    index: int,
-    height: float,
-    ways: Sequence[Transition],
-    size: np.ndarray,
-    visits: VisitTest | None,
+    landscape: Landscape, index: int, height: float, size: np.ndarray, visits: VisitTest | None
 ) -> WellSummary:
-    attractor, formula, errors = (
-        landscape.attractors[index],
-        landscape.wells[index],
-        landscape.position_errors,
-    )
-    lowest = min((w for w in ways if math.isfinite(w.barrier)), key=lambda way: way.barrier, default=None)
+    attractor, formula = landscape.attractors[index], landscape.wells[index]
+    errors = landscape.position_errors
+    ways = [way for way in landscape.transitions if way.start == index and math.isfinite(way.barrier)]
+    lowest = min(ways, key=lambda way: way.barrier, default=None)
     place, known = settled(attractor.position, np.nan if errors is None else errors[index], size)
     return WellSummary(
         label=well_name(index),
@@ -521,7 +421,7 @@ def _well(
         depth_error=math.nan if lowest is None else lowest.error,
         beyond=None if lowest is None or lowest.end is None else well_name(lowest.end),
         known_up_to=math.nan if formula is None else 2 * formula.level,
-        exits=tuple(way.exit for way in ways),
+        exits=tuple(landscape.exits(index)),
         leverage=1.0 if lowest is None else lowest.leverage,
         visits=visits,
         cycle=attractor if isinstance(attractor, Cycle) else None,

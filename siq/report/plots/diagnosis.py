@@ -1,4 +1,9 @@
-"""Figures of a diagnosis: recordings beside simulations, what is missing and where."""
+"""Figures of a diagnosis: recordings beside simulations, what is missing and where.
+
+A figure without anything to draw is None. Tables of what was held out have the columns ``recording t output
+measured before recalibrated augmented scored``, a row for each sample and output. `units` are those of
+states, inputs and outputs by name, `time_unit` that of time.
+"""
 
 from __future__ import annotations
 
@@ -60,24 +65,9 @@ def plot_before_after(
 ) -> Figure | None:
     """Draw the held-out recording that differs most, with the simulation before and after.
 
-    Parameters
-    ----------
-    table
-        Columns ``recording t output measured before recalibrated augmented scored``.
-    after
-        The simulation that the verdict ends with: ``"augmented"``, ``"recalibrated"``, or ``"before"`` where
-        nothing is to be changed.
-    noise
-        Variance of the sensor's noise by output, for a band of ± 2 standard deviations.
-    units
-        Units of the outputs.
-    time_unit
-        Of ``t``.
-
-    Returns
-    -------
-    matplotlib.figure.Figure or None
-        The course above, simulation minus recording below; None where no recording was held out.
+    The course stands above, simulation minus recording below. `after` is the simulation that the verdict ends
+    with: ``"augmented"``, ``"recalibrated"``, or ``"before"`` where nothing is to be changed; `noise` the
+    variance of the sensor's noise by output, for a band of ± 2 standard deviations.
     """
     largest = largest_difference(table, after=after)
     if largest is None:
@@ -100,21 +90,8 @@ def plot_held_out(
 ) -> Figure | None:
     """Draw held-out recordings with the free runs of all three simulations.
 
-    Parameters
-    ----------
-    table
-        Columns ``recording t output measured before recalibrated augmented scored``, one row per sample and
-        output.
-    units
-        Units of the outputs.
-    time_unit
-        Of ``t``.
-
-    Returns
-    -------
-    matplotlib.figure.Figure or None
-        Two panels below each other for each of up to four pairs of recording and output: the courses, and
-        simulation minus recording. None where no recording was held out.
+    Each of up to four pairs of recording and output has two panels below each other: the courses, and
+    simulation minus recording.
     """
     scored = table[table["scored"].astype(bool)]
     if scored.empty:
@@ -198,21 +175,9 @@ BAND = 1.96  # standard errors within which 95 % lie
 def plot_described(
     described: Sequence[Mapping[str, Any]], *, units: Mapping[str, str] | None = None, time_unit: str = "1"
 ) -> Figure | None:
-    """Draw every curve and every surface of a model.
+    """Draw every curve and every surface of a model, a panel for each, with bands of 95 % between knots.
 
-    Parameters
-    ----------
-    described
-        As ``verdict.json`` has them; see `siq.diagnosis.statement.StatedTerm`.
-    units
-        Units of states and inputs.
-    time_unit
-        Of time.
-
-    Returns
-    -------
-    matplotlib.figure.Figure or None
-        A panel for each, with bands of 95 % between values at knots. None where there is no such function.
+    They are as ``verdict.json`` has them; see `siq.diagnosis.statement.StatedTerm`.
     """
     shown = [each for each in described if each.get("curve") or each.get("surface")]
     if not shown:
@@ -432,22 +397,10 @@ def plot_curves(
 ) -> Figure | None:
     """Draw what is missing in equations against coordinates, before and after mechanisms were added.
 
-    Parameters
-    ----------
-    curves
-        Columns ``stage equation coordinate across at missing standard_error gain``, one row per knot.
-    named
-        Equation and coordinate of the mechanism that was named; its curve is drawn first.
-    units
-        Units of states and inputs.
-    time_unit
-        Of time, for coordinates and rates.
-
-    Returns
-    -------
-    matplotlib.figure.Figure or None
-        Up to three panels below each other, by what a function of the coordinate alone explains; bands: ± 2
-        standard errors, cut off at the edge of the panel. None where there is no curve.
+    There are up to three panels, by what a function of the coordinate alone explains, with bands of ± 2
+    standard errors, cut off at the edge. The table has the columns ``stage equation coordinate across at
+    missing standard_error gain``, a row for each knot. The curve of the mechanism that was named, given by
+    equation and coordinate, is drawn first.
     """
     before = curves[curves["stage"] == "before"] if len(curves) else curves
     if before.empty:
@@ -559,25 +512,10 @@ def plot_missing(
     time_unit: str = "1",
     source: str = "",
 ) -> Figure | None:
-    """Draw the missing part of equations over a plane of the state space.
+    """Draw the missing part of up to two equations over the plane of two states, `names`.
 
-    Parameters
-    ----------
-    points
-        States in the plane, shape ``(n, 2)``.
-    missing
-        What must be added to each equation there, shape ``(n,)`` each; means over cells are drawn.
-    names
-        Names of the two states.
-    units, time_unit
-        Units of states and time.
-    source
-        Where the numbers are from, in words.
-
-    Returns
-    -------
-    matplotlib.figure.Figure or None
-        A panel for each of up to two equations, below each other; None where nothing is missing anywhere.
+    At states ``(n, 2)`` something must be added to each equation, shape ``(n,)`` each, of which means over
+    cells are drawn. `source` says in words where the numbers are from.
     """
     shown = {name: values for name, values in missing.items() if np.isfinite(values).any()}
     shown = dict(sorted(shown.items(), key=lambda each: -float(np.nanstd(each[1])))[:2])
@@ -609,16 +547,9 @@ def plot_missing(
 def plot_candidates(table: pd.DataFrame) -> Figure | None:
     """Draw how much mechanisms explain: what was found, what was fitted in its place, what would add to it.
 
-    Parameters
-    ----------
-    table
-        Columns ``label gain stage``, one row per probe; of each label the best counts. For the stages see
-        `siq.diagnosis.diagnosis.tables_of`.
-
-    Returns
-    -------
-    matplotlib.figure.Figure or None
-        The best ten, as bars, those that were found first; None where nothing would gain anything.
+    The best ten are bars, those that were found first. The table has the columns ``label gain stage``, a row
+    for each probe, of which the best of each label counts; for the stages see
+    `siq.diagnosis.diagnosis.tables_of`.
     """
     positive = table[table["gain"] > 0] if len(table) else table
     if positive.empty:
@@ -645,17 +576,8 @@ def plot_candidates(table: pd.DataFrame) -> Figure | None:
 def plot_escapes(table: pd.DataFrame, *, time_unit: str = "1") -> Figure | None:
     """Draw mean escape times of two simulations against the inverse of the noise intensity.
 
-    Parameters
-    ----------
-    table
-        Columns ``transition intensity simulation time``, one row per way out, simulation and ε.
-    time_unit
-        Of the times.
-
-    Returns
-    -------
-    matplotlib.figure.Figure or None
-        A colour for each way out, a line style for each simulation; None where there is no way out.
+    Ways out have colours, simulations line styles. The table has the columns ``transition intensity
+    simulation time``, a row for each way out, simulation and ε.
     """
     if table.empty:
         return None
