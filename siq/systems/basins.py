@@ -139,11 +139,10 @@ def sides_of(
 ) -> np.ndarray:
     """Where f leads from both sides of each unstable direction of a saddle, see `ends_of`."""
     values, vectors = np.linalg.eig(dynamics.jacobian(saddle.position[None])[0])
-    width, starts = np.ptp(box, axis=1), []
-    for vector in vectors[:, values.real > 0].T:
-        direction = vector.real / np.abs(vector.real / width).max()
-        starts += [saddle.position + 1e-3 * direction, saddle.position - 1e-3 * direction]
-    return ends_of(dynamics, np.array(starts), attractors, cycles, box=box)
+    unstable = vectors[:, values.real > 0].real.T
+    steps = 1e-3 * (unstable / np.abs(unstable / np.ptp(box, axis=1)).max(axis=1, keepdims=True))
+    starts = saddle.position + np.stack([steps, -steps], axis=1).reshape(-1, len(box))
+    return ends_of(dynamics, starts, attractors, cycles, box=box)
 
 
 def ends_of(

@@ -214,10 +214,9 @@ class Diffusion:
         except np.linalg.LinAlgError:
             root = np.full(matrices.shape, np.nan)
         if not np.isfinite(root).all():
-            lowest = np.full(len(x), -np.inf)  # eigenvalues, in units in which the diagonal is one
-            for k in np.flatnonzero(np.isfinite(matrices).all(axis=(1, 2))):
-                scale = np.sqrt(positive(np.diag(matrices[k])))
-                lowest[k] = np.linalg.eigvalsh(matrices[k] / np.outer(scale, scale))[0]
+            known = np.isfinite(matrices).all(axis=(1, 2))
+            lowest = np.full(len(x), -np.inf)  # eigenvalues
+            lowest[known] = np.linalg.eigvalsh(_scaled(matrices[known]))[:, 0]
             raise _indefinite(x[np.argmin(lowest)])
         return root
 
@@ -281,8 +280,7 @@ class _Constant(Diffusion):
         matrix = np.asarray(matrix, dtype=float)
         if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
             raise Fault("the diffusion is not a square matrix", "give one row and one column a state")
-        scale = np.sqrt(positive(np.diag(matrix)))
-        scaled = matrix / np.outer(scale, scale)
+        scaled = _scaled(matrix)
         if not np.isfinite(scaled).all() or np.abs(scaled - scaled.T).max() > ROUNDING:
             raise Fault("the diffusion is not symmetric", "correct the matrix")
         if np.linalg.eigvalsh(scaled)[0] < -ROUNDING:
@@ -299,7 +297,7 @@ class _Constant(Diffusion):
 
     @cached_property
     def regular(self) -> bool:  # type: ignore[override]
-        return bool(np.linalg.eigvalsh(self.matrix / np.outer(self.scale, self.scale))[0] > ROUNDING)
+        return bool(np.linalg.eigvalsh(_scaled(self.matrix))[0] > ROUNDING)
 
     @property
     def formulas(self) -> tuple[tuple[sympy.Expr, ...], ...]:  # type: ignore[override]
@@ -416,6 +414,12 @@ class _InUnits(Diffusion):
     def whitening_at(self, y: np.ndarray) -> np.ndarray:
         own = self.noise.whitening_at(self.center + y @ self.units.T) @ self.units
         return np.asarray(own / np.sqrt(self.factor))
+
+
+def _scaled(matrices: np.ndarray) -> np.ndarray:
+    """D in units in which its diagonal is one: ``(..., d, d)``."""
+    scale = np.sqrt(positive(np.diagonal(matrices, axis1=-2, axis2=-1)))
+    return matrices / (scale[..., :, None] * scale[..., None, :])
 
 
 def _indefinite(point: np.ndarray) -> NumericalFailure:

@@ -416,8 +416,7 @@ class RecordedRegion:
         # Of the 2d-th neighbour: states on one descent lie closer to each other than descents do.
         neighbours = min(2 * len(width) + 1, len(states))
         self._spacing = np.atleast_2d(self._tree.query(places, k=neighbours)[0])[:, -1]
-        some = elsewhere is not None and len(elsewhere)
-        self._elsewhere = cKDTree(elsewhere / self._width) if some else None
+        self._elsewhere = cKDTree((states[:0] if elsewhere is None else elsewhere) / self._width)
 
     @classmethod
     def of_basin(cls, portrait: PhasePortrait, index: int) -> RecordedRegion:
@@ -426,21 +425,16 @@ class RecordedRegion:
         others = portrait.states_elsewhere(index)
         away = [descents.paths[descents.ends != index][:, 0], *([] if others is None else [others])]
         basin, box = portrait.basins[index], portrait.box
-        return cls(basin.points(np.arange(len(basin.chosen))), np.concatenate(away), box[:, 1] - box[:, 0])
-
-    def _closer_elsewhere(self, places: np.ndarray, distance: np.ndarray) -> np.ndarray:
-        if self._elsewhere is None:
-            return np.zeros(len(places), dtype=bool)
-        return np.asarray(self._elsewhere.query(places)[0] < distance)
+        return cls(basin.points(np.arange(len(basin.chosen))), np.concatenate(away), np.ptp(box, axis=1))
 
     def across(self, x: np.ndarray) -> np.ndarray:
         """Mask of points ``(n, d)`` that lie closer to states which lead elsewhere."""
         places = x / self._width
-        return self._closer_elsewhere(places, self._tree.query(places)[0])
+        return np.asarray(self._elsewhere.query(places)[0] < self._tree.query(places)[0])
 
     def recorded(self, x: np.ndarray) -> np.ndarray:
         """Mask of points ``(n, d)`` among the states that lead to the attractor."""
         places = x / self._width
         distance, nearest = self._tree.query(places)
         near = distance <= NEIGHBOUR_SPACINGS * self._spacing[nearest]
-        return np.asarray(near & ~self._closer_elsewhere(places, distance))
+        return np.asarray(near & ~(self._elsewhere.query(places)[0] < distance))
