@@ -264,8 +264,8 @@ class Fan:
         """V at points ``(m, d)``, to second order from the nearest point of a sheet, see `lowest_sheet`.
 
         NaN beyond `distance`, in the metric in which the level is at about 1, and where the second order is
-        no small correction, close to a caustic. The error is of third order in the distance, but where V has a
-        kink between x and the nearest point, of first.
+        no small correction, close to a caustic. The error is of third order in the distance; of first where V
+        has a kink between x and the nearest point.
         """
         distances, _, values, bend = self.expanded(x, sheet)
         # Towards a caustic ∇²V grows without bound, and two terms no longer tell V.

@@ -69,14 +69,12 @@ class MinimumActionPath:
 
     Attributes
     ----------
-    points
-        Shape ``(n, d)``, in the states' units: from the start to the end, both included.
-    momenta
-        Shape ``(n, d)``: p there, which is ∇V where V is smooth; the path follows ``ẋ = f + 2Dp``.
-    values
-        Shape ``(n,)``: the action up to each point, that is U, not V, if the start is an attractor.
-    action
-        Of the whole path: the barrier of U, if the end is a saddle.
+    points, momenta
+        Shape ``(n, d)``, in the states' units, from the start to the end, both included; and p there, which
+        is ∇V where V is smooth. The path follows ``ẋ = f + 2Dp``.
+    values, action
+        Shape ``(n,)``: the action up to each point, that is U, not V, if the start is an attractor; and that
+        of the whole path: the barrier of U, if the end is a saddle.
     error
         Estimated error of the finest chain or mesh, from the two finest ones. That of `action`, which like
         points, momenta and values of a chain is extrapolated from both, is mostly far smaller.
@@ -93,7 +91,7 @@ class MinimumActionPath:
     smooth
         Whether no neighbouring solution crosses the path; only then it is a minimum.
     downhill
-        Shape ``(m, d)``: how f leads on from the end to another attractor, without any action. None where
+        Shape ``(m, d)``: how f leads on from the end to another attractor, without any action; None where
         that was not asked for.
     """
 

@@ -93,11 +93,9 @@ def minimum_action_path(
     end
         Shape ``(d,)``: mostly a saddle, but any state will do. Where the path has to cross a saddle, it is
         found faster and better in two parts: see `transition_path`. Or an unstable cycle.
-    nodes
-        Points of the first chain. It has more where the path winds; and their number is doubled until the
-        action is known.
-    tolerance
-        Error of the finest chain, as a share of its action.
+    nodes, tolerance
+        Points of the first chain, of which there are more where the path winds; their number is doubled until
+        the error of the finest chain is that share of its action.
     initial
         First guesses, each of shape ``(k, d)`` with k ≥ 2, instead of the own ones: the path that would be
         right were f linear, the straight line, and lines bent to all sides.
@@ -253,14 +251,11 @@ def transition_path(
 
     Parameters
     ----------
-    dynamics, nodes, tolerance, initial
+    dynamics, start, nodes, tolerance, initial
         As for `minimum_action_path`; `nodes` is the number of points downhill, too.
-    start
-        An attractor, shape ``(d,)``, or a stable cycle.
-    over
-        A saddle with one unstable direction, or an unstable cycle.
-    end
-        The other attractor, or stable cycle; None where f leads out of the region.
+    over, end
+        A saddle with one unstable direction, or an unstable cycle; and the other attractor, or stable cycle,
+        None where f leads out of the region.
     box
         Shape ``(d, 2)``: of the states, in whose widths ways about cycles are measured.
 

@@ -56,7 +56,6 @@ import scipy.linalg
 import sympy
 from scipy.integrate import quad, simpson
 from scipy.interpolate import CubicSpline
-from scipy.optimize import brentq
 
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import AnyField
@@ -110,10 +109,9 @@ def _energy_loss_per_cycle(
     """
     if dynamics.diffusion.regular:
         return None, None, False
-    loss = _particle_loss(dynamics)
-    if loss is not None:
-        saddle, attractor = path.points[-1], path.points[0]
-        return loss(saddle, attractor), loss(saddle, 2 * saddle - attractor) if beyond else None, True
+    saddle, attractor = path.points[-1], path.points[0]
+    if (loss := _particle_loss(dynamics, saddle, attractor)) is not None:
+        return loss, _particle_loss(dynamics, saddle, 2 * saddle - attractor) if beyond else None, True
     away = np.linalg.norm((path.points - path.points[-1]) / np.ptp(path.points, axis=0), axis=1)[::-1]
     back = np.flatnonzero((away < RETURN_DISTANCE * np.maximum.accumulate(away)) & (np.arange(len(away)) > 0))
     if not len(back):
@@ -124,7 +122,7 @@ def _energy_loss_per_cycle(
     return float(path.action - path.values[::-1][nearest]), None, False
 
 
-def _particle_loss(dynamics: Dynamics) -> Callable[[np.ndarray, np.ndarray], float] | None:
+def _particle_loss(dynamics: Dynamics, saddle: np.ndarray, towards: np.ndarray) -> float | None:
     """Of a damped particle in one dimension ``2γ²/D ∮ v² dt`` of the orbit from a saddle to one side."""
     if dynamics.dimension != 2 or not dynamics.diffusion.constant:
         return None
@@ -138,26 +136,21 @@ def _particle_loss(dynamics: Dynamics) -> Callable[[np.ndarray, np.ndarray], flo
             break
     else:
         return None
-
-    def loss(saddle: np.ndarray, towards: np.ndarray) -> float:
-        top, step = saddle[place], towards[place] - saddle[place]
-        places = top + step * np.linspace(0, ORBIT_REACH, ORBIT_STEPS * int(ORBIT_REACH) + 1)
-        forces = np.broadcast_to(np.asarray(force(places), dtype=float), places.shape)
-        # The height of the potential above the saddle, by Simpson's rule on pairs of steps.
-        pairs = (forces[:-2:2] + 4 * forces[1:-1:2] + forces[2::2]) / 6
-        height = -np.r_[0.0, np.cumsum(pairs)] * 2 * (places[1] - top)
-        higher = np.flatnonzero(height[1:] > 0)
-        if not len(higher) or higher[0] == 0:
-            raise NumericalFailure("an orbit at the height of the saddle does not turn back within reach")
-        last = higher[0] + 1
-        turning = brentq(lambda share: np.interp(share, np.arange(len(height)), height), last - 1, last)
-        speeds = np.sqrt(np.maximum(-2 * height[:last] / float(speed), 0.0))
-        # v vanishes as a root at the turning point: of the last piece two thirds of its height count.
-        spacing = abs(places[2] - top)
-        area = spacing * (np.trapezoid(speeds) + 2 / 3 * speeds[-1] * (turning - (last - 1)))
-        return float(4 * float(friction) ** 2 / (float(noise[1 - place]) * float(speed)) * area)
-
-    return loss
+    top, step = saddle[place], towards[place] - saddle[place]
+    places = top + step * np.linspace(0, ORBIT_REACH, ORBIT_STEPS * int(ORBIT_REACH) + 1)
+    forces = np.broadcast_to(np.asarray(force(places), dtype=float), places.shape)
+    # The height of the potential above the saddle, by Simpson's rule on pairs of steps.
+    pairs = (forces[:-2:2] + 4 * forces[1:-1:2] + forces[2::2]) / 6
+    height = -np.r_[0.0, np.cumsum(pairs)] * 2 * (places[1] - top)
+    higher = np.flatnonzero(height[1:] > 0)
+    if not len(higher) or higher[0] == 0:
+        raise NumericalFailure("an orbit at the height of the saddle does not turn back within reach")
+    last = higher[0] + 1
+    turning = last - height[last] / (height[last] - height[last - 1])
+    speeds = np.sqrt(np.maximum(-2 * height[:last] / float(speed), 0.0))
+    # v vanishes as a root at the turning point: of the last piece two thirds of its height count.
+    area = abs(places[2] - top) * (np.trapezoid(speeds) + 2 / 3 * speeds[-1] * (turning - (last - 1)))
+    return float(4 * float(friction) ** 2 / (float(noise[1 - place]) * float(speed)) * area)
 
 
 @dataclass(frozen=True)
@@ -166,10 +159,8 @@ class NoiseStrength:
 
     Attributes
     ----------
-    intensity, standard_error
-        ε and its standard error.
-    source
-        Whether it was estimated from recordings, or given.
+    intensity, standard_error, source
+        ε, its standard error, and whether it was estimated from recordings, or given.
     """
 
     intensity: float
@@ -183,8 +174,8 @@ class EscapeRate:
 
     Attributes
     ----------
-    barrier
-        ΔU = 2ΔV, in the unit of ε; NaN where it is not known.
+    barrier, standard_error
+        ΔU = 2ΔV, in the unit of ε, NaN where it is not known; and its standard error.
     prefactor
         K, in time units, the exponential of the integral included; NaN where the law does not hold.
     exponent
@@ -192,13 +183,10 @@ class EscapeRate:
     remarks
         What speaks against the law here without refuting it.
     loss, loss_beyond
-        What one cycle at the height of the saddle loses of U by friction, in the well that is left, where
-        noise acts on some states only and they turn; and in the well beyond, where there is one. None where
-        not known.
+        What one cycle at the height of the saddle loses of U by friction, where noise acts on some states
+        only and they turn: in the well that is left, and in the well beyond, if any. None where not known.
     particle
         Whether the system is a damped particle in one dimension, so that the rate is known for any noise.
-    standard_error
-        Of ΔU.
     prefactor_error, covariance
         Standard error of ln K, None where not known, and its covariance with ΔU.
     leverage
@@ -240,11 +228,8 @@ class EscapeRate:
     def mean_time(self, intensity: float) -> float:
         """E[τ] for the noise intensity ε, with a relative error of O(ε/ΔU).
 
-        Raises
-        ------
-        NumericalFailure
-            When the law has no prefactor; when ε is not below the barrier, so that there is nothing to escape
-            from; or when damping is too weak for ε.
+        Raises `NumericalFailure` when the law has no prefactor; when ε is not below the barrier, so that
+        there is nothing to escape from; or when damping is too weak for ε.
         """
         if np.isnan(self.prefactor):
             raise NumericalFailure("the law of escape does not hold")
@@ -302,6 +287,12 @@ def escape_rate(
 ) -> EscapeRate:
     """The law of escape along a minimum action path from an attractor to a saddle.
 
+    The law fails, with another power of ε in the prefactor, where V has no second derivatives at the saddle:
+    as for Maier and Stein's system with β > 4, and in general where the saddle attracts more slowly than it
+    repels. This is looked for and refused. If it attracts less than twice as fast, the law holds, but with an
+    error of a small power of ε instead of O(ε), which is remarked. It is not looked for whether there is a
+    lower saddle, and ε must be far below the barrier.
+
     Parameters
     ----------
     dynamics
@@ -313,15 +304,6 @@ def escape_rate(
         ∇²V of a formula, points ``(n, d)`` to ``(n, d, d)``; by default it is integrated along the path.
     beyond
         Whether beyond the saddle lies another well; it matters where damping is weak.
-
-    Returns
-    -------
-    EscapeRate
-        The law fails, with another power of ε in the prefactor, where V has no second derivatives at the
-        saddle: as for Maier and Stein's system with β > 4, and in general where the saddle attracts more
-        slowly than it repels. This is looked for and refused. If it attracts less than twice as fast, the law
-        holds, but with an error of a small power of ε instead of O(ε), which is remarked. It is not looked
-        for whether there is a lower saddle, and ε must be far below the barrier.
 
     Raises
     ------
@@ -588,10 +570,8 @@ class MeanTime:
     ----------
     value
         E[τ], in the unit of time.
-    data_error
-        Relative standard error from f and from the noise.
-    law_error
-        Relative error of the law itself, about ε/ΔU.
+    data_error, law_error
+        Relative errors: the standard error from f and from the noise; and that of the law, about ε/ΔU.
     complete
         Whether every way out counts; where one has no rate, the mean residence time is at most `value`.
     """
@@ -621,14 +601,9 @@ def mean_residence_time(exits: Sequence[EscapeRate], noise: NoiseStrength | None
     if noise is None:
         return None
     times = [one.mean_exit_time(noise) for one in exits]
-    known = [one for one in times if one is not None]
-    if not known:
+    known = np.array([(1 / one.value, one.data_error, one.law_error) for one in times if one is not None])
+    if not len(known):
         return None
-    rates = np.array([1 / one.value for one in known])
-    shares = rates / rates.sum()
-    return MeanTime(
-        float(1 / rates.sum()),
-        float(sum(share * one.data_error for share, one in zip(shares, known, strict=True))),
-        float(sum(share * one.law_error for share, one in zip(shares, known, strict=True))),
-        complete=len(known) == len(times),
-    )
+    rates, errors = known[:, 0], known[:, 1:]
+    data_error, law_error = (float(one) for one in rates / rates.sum() @ errors)
+    return MeanTime(float(1 / rates.sum()), data_error, law_error, complete=len(known) == len(times))

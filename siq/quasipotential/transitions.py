@@ -47,34 +47,26 @@ PATH_TOLERANCE = 1e-5  # of the action; prefactors follow the end of the path an
 class Transition:
     """The way out of one well over one saddle.
 
-    Main attributes
-    ---------------
-    start, end
-        Indices of the attractors; `end` is None where the saddle leads back, or out of the recorded region.
-    saddle
-        The saddle, or the unstable cycle.
-    path
-        The path of least action and the way down, None where none was found.
-    barrier
-        ΔU by the formula and the end of the path; NaN where neither is known.
-    standard_error
-        Of the barrier, from the uncertainty of f.
+    Attributes
+    ----------
+    start, end, from_cycle
+        Indices of the attractors, `end` None where the saddle leads back, or out of the recorded region; and
+        whether the first is a cycle.
+    saddle, path
+        The saddle, or the unstable cycle; and the path of least action with the way down, None where none was
+        found.
+    barrier, standard_error, formula_share
+        ΔU by the formula and the end of the path, NaN where neither is known; its standard error from that of
+        f; and the share of it that the formula accounts for.
+    by_rivals
+        What other terms of f that fit nearly as well have added to the barrier, in the mean.
     rate
         Law of the mean escape time at the action of the path, with the error of its prefactor; None where it
         fails.
-    remarks
-        What is not known.
-
-    Other attributes
-    ----------------
-    formula_share
-        Share of the barrier that the formula accounts for.
-    by_rivals
-        What other terms of f that fit nearly as well have added to the barrier, in the mean.
     leverage
         Relative standard error of ΔU/ε from an estimated D over that of ε.
-    from_cycle
-        Whether the attractor is a cycle.
+    remarks
+        What is not known.
     """
 
     start: int
@@ -131,15 +123,8 @@ class Transition:
 def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool = False) -> list[Transition]:
     """Every way out of every well over the saddles next to it, from f alone: without barriers and rates.
 
-    Parameters
-    ----------
-    dynamics
-        f and D.
-    portrait
-        Attractors and saddles.
-    beyond_region
-        Whether a saddle behind which lies no attractor of the region is a way out, too: of a given f the
-        path up to it is as good as any other. Of an identified one nothing is known beyond.
+    `beyond_region` says whether a saddle behind which lies no attractor of the region is a way out, too: of a
+    given f the path up to it is as good as any other. Of an identified one nothing is known beyond.
     """
     points, box, cycles = len(portrait.attractors), portrait.box, portrait.cycles
     settled: list[np.ndarray | Cycle] = [*(one.position for one in portrait.attractors), *cycles]
@@ -204,17 +189,9 @@ def transitions(
 ) -> list[Transition]:
     """Ways out with their barriers and escape times.
 
-    Parameters
-    ----------
-    found
-        f with its uncertainty.
-    ways
-        See `ways_out`.
-    wells
-        The formula about each attractor, cycles after points; None where there is none.
+    `wells` are the formulas about each attractor, cycles after points; None where there is none.
     """
     found_ways, dynamics = [], dynamics_of(found)
-    missing = missing_diffusion(dynamics)
     for way in ways:
         path, well = way.path, wells[way.start]
         if path is None:
@@ -226,7 +203,7 @@ def transitions(
         try:
             if way.from_cycle or isinstance(way.saddle, Cycle):
                 raise NumericalFailure("no law is implemented for ways that begin or end on a cycle")
-            if missing is not None:
+            if (missing := missing_diffusion(dynamics)) is not None:
                 raise NumericalFailure(missing)
             rate = escape_rate(dynamics, path, beyond=way.end is not None)
             remarks += rate.remarks
@@ -241,10 +218,7 @@ def transitions(
                 remarks.append(Remark("quasipotential.formula_differs_from_path"))
             if isinstance(found, Dynamics) and path.converged:  # nothing about f is to be averaged
                 barrier, share = path.action, 0.0
-        logger.info(
-            "barrier of U from attractor %d: %.5g by formula, %.5g by the path",
-            way.start, barrier, path.action,
-        )  # fmt: skip
+        logger.info("barrier of U from attractor %d: %.5g, %.5g by the path", way.start, barrier, path.action)
         spread, by_rivals = barrier_uncertainty(path, found)
         if abs(by_rivals) > NOTEWORTHY_CHANGE * spread:
             remarks.append(Remark("quasipotential.barrier_by_alternative_terms", {"change": by_rivals}))
@@ -260,14 +234,12 @@ def transitions(
 
 def _barrier_by_formula(path: MinimumActionPath, well: Well) -> tuple[float, float]:
     """The barrier of U by a formula and the end of the path, and the share that the formula accounts for."""
-    points, action = path.points, path.values
-    formula = 2 * well.known_values(points)
+    formula = 2 * well.known_values(path.points)
     known = np.flatnonzero(np.isfinite(formula))
     if not len(known):
         return float(path.action), 0.0
-    last = known[-1]
-    barrier = formula[last] + path.action - action[last]
-    return float(barrier), float(formula[last] / barrier)
+    barrier = formula[known[-1]] + path.action - path.values[known[-1]]
+    return float(barrier), float(formula[known[-1]] / barrier)
 
 
 def barrier_uncertainty(path: MinimumActionPath, found: AnyField) -> tuple[float, float]:
@@ -315,9 +287,8 @@ def position_standard_errors(found: AnyField, position: np.ndarray) -> np.ndarra
     """Standard errors of an equilibrium's position, shape ``(d,)``: of f = 0 follows δx = -J⁻¹ δf."""
     if isinstance(found, Dynamics):
         return np.zeros(len(position))
-    terms = found.library.evaluate(position[None])[0]
     try:
         moved = np.linalg.inv(found.dynamics.jacobian(position[None])[0])
     except np.linalg.LinAlgError:
         return np.full(found.library.dimension, np.nan)
-    return np.sqrt(found.variance(np.einsum("k,ij->ikj", terms, moved)))
+    return np.sqrt(found.variance(np.einsum("k,ij->ikj", found.library.evaluate(position[None])[0], moved)))
