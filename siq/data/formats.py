@@ -83,7 +83,7 @@ def open_columns(path: str | Path | pd.DataFrame) -> ColumnFile:
     suffix, exists, begin = path.suffix.lower(), path.exists(), b""
     reader = READERS.get(suffix)
     if not exists and (reader or not suffix):
-        raise _missing_file(path)
+        raise _missing_file(file)
     try:
         if exists:
             with path.open("rb") as stream:
@@ -102,9 +102,10 @@ def open_columns(path: str | Path | pd.DataFrame) -> ColumnFile:
     return reader(file)
 
 
-def _missing_file(path: Path) -> InputError:
+def _missing_file(file: str) -> InputError:
     """What to say of a file as the user named it: where it was looked for, and what has nearly its name."""
-    folder, remedy = path.parent, "check the name and the folder"
+    path, remedy = Path(file), "check the name and the folder"
+    folder = path.parent
     if folder.is_dir():
         names = {each.name.casefold(): each for each in folder.iterdir() if not each.name.startswith(".")}
         near = difflib.get_close_matches(path.name.casefold(), names, n=1)
@@ -112,7 +113,7 @@ def _missing_file(path: Path) -> InputError:
         remedy = f"perhaps you meant '{names[near[0]]}'" if near else remedy
     else:
         remedy = f"there is no folder '{folder}' either"
-    return InputError(path, "", f"No such file; it was looked for at {path.absolute()}", remedy)
+    return InputError(file, "", f"No such file; it was looked for at {path.absolute()}", remedy)
 
 
 def _open_frame(frame: pd.DataFrame) -> ColumnFile:

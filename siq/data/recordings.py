@@ -108,7 +108,7 @@ class Recordings:
         ----------
         frame
             As `read_recordings` reads a file; units may stand in the metadata ``frame.attrs["units"]``, too.
-            An index called ``recording`` or ``t`` counts as a column.
+            An index called ``recording`` or ``t`` counts as a column. Without ``recording`` it is one.
         columns, units
             See `read_recordings`; the units are those of columns that say none.
 

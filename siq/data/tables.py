@@ -22,7 +22,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from siq.data.formats import Column, ColumnFile, open_columns
+from siq.data.formats import Column, open_columns
 from siq.data.layout import layout_of
 from siq.data.recordings import TABLE, Recordings
 from siq.errors import InputError
@@ -67,23 +67,20 @@ def read_tables(
 
     See `siq.data.recordings.read_recordings`.
     """
-    if isinstance(source, pd.DataFrame):
-        return _checked(TABLE, open_columns(source), columns, units, gaps)
-    if not Path(source).is_dir():
-        return _checked(str(source), open_columns(source), columns, units, gaps)
+    if isinstance(source, pd.DataFrame) or not Path(source).is_dir():
+        return _checked(source, columns, units, gaps)
     files = files_of(Path(source))
-    tables = [_checked(str(file), open_columns(file), columns, units, gaps) for file in files]
-    return _joined(files, tables, str(source))
+    return _joined(files, [_checked(file, columns, units, gaps) for file in files], str(source))
 
 
 def _checked(
-    file: str,
-    source: ColumnFile,
+    table: str | Path | pd.DataFrame,
     columns: Sequence[str] | None,
     units: Mapping[str, str] | None,
     gaps: bool,
 ) -> Recordings:
-    """Check a table that has been opened; raises InputError for the first thing that cannot be used."""
+    """Read and check a table; raises InputError for the first thing that cannot be used."""
+    file, source = TABLE if isinstance(table, pd.DataFrame) else str(table), open_columns(table)
     layout = layout_of(file, source, columns)
     used = [layout.time, *layout.states]
     cells = source.load([*([] if layout.recording is None else [layout.recording]), *used])
