@@ -140,15 +140,9 @@ def certify(
     where it claims to hold, and it has to claim more than half of them. Where f is given nothing was
     recorded, and what tests predictions, motion, and whether uncertain wells exist has no object.
 
-    Parameters
-    ----------
-    formulas, evidence
-        V and g of the region, or V about the attractors; and what they are tested with.
-    others, compared
-        V about the attractors by the other route, and whether both were asked for: then a formula that only
-        one of them found is refused.
-    relative_error
-        Relative standard error of a V of the region from the uncertainty of f.
+    `others` are V about the attractors by the other route, and `compared` is whether both were asked for:
+    then a formula that only one of them found is refused. `relative_error` is the relative standard error of
+    a V of the region from the uncertainty of f.
     """
     found, portrait, options, seed = evidence.found, evidence.portrait, evidence.options, evidence.seed
     wells = () if isinstance(formulas, SymbolicDecomposition) else tuple(formulas)

@@ -265,18 +265,11 @@ class HamiltonJacobi:
         """Coefficients by Gauss–Newton with weights that fall with the square of the residual (Cauchy's).
 
         Where V stops to be smooth, by caustics or by a kink, the residual is large and counts for nothing,
-        instead of spoiling the formula elsewhere.
+        instead of spoiling the formula elsewhere. Below the residual `finest` nothing is an outlier.
 
-        Parameters
-        ----------
-        start, free
-            Coefficients to start from, and a mask of those that may change: shape ``(m,)``.
-        rounds, steps
-            How often the weights are made, and the most steps of Gauss–Newton with each of them.
-        finest
-            Residual below which nothing is an outlier.
-        orthonormal
-            Whether to fit combinations of functions that are orthonormal over the points.
+        Of the coefficients ``(m,)`` to start from those change that are `free`, a mask. Weights are made so
+        many `rounds`, with at most so many `steps` each. If `orthonormal`, combinations of functions are
+        fitted that are orthonormal over the points.
         """
         equation, theta, moving = self, start, free
         if orthonormal:
@@ -304,12 +297,8 @@ class HamiltonJacobi:
         The residual alone would draw a bad start to V = 0, which solves the equation, too. What is left is
         the root mean square of the weighted one over that of ∇V; infinite for V = 0, or all but 0.
 
-        Parameters
-        ----------
-        start, free
-            Coefficients to start from, and a mask of those that may change, by default all: shape ``(m,)``.
-        steps, tolerance
-            Most steps, and the relative change of the coefficients at which to end.
+        Of the coefficients ``(m,)`` to start from those change that are `free`, a mask, by default all, until
+        their relative change is below the tolerance.
         """
         coefficients = start.copy()
         free = np.ones(len(start), dtype=bool) if free is None else free

@@ -108,19 +108,13 @@ class GlobalQuasipotential:
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """U at points ``(n, d)``: shape ``(n,)``, NaN where it is not known."""
-        return least_over_wells(self.by_well(x))
+        return np.fmin.reduce(self.by_well(x))
 
     def by_well(self, x: np.ndarray) -> np.ndarray:
         """``W_i + U_i`` at points, shape ``(k, n)``, NaN where the formula of a well is not believed."""
         return np.stack(
             [h + 2 * one.known_values(x) for h, one in zip(self.heights, self.wells, strict=True)]
         )
-
-
-def least_over_wells(values: np.ndarray) -> np.ndarray:
-    """The least of ``(k, n)`` values that are known, shape ``(n,)``; NaN where none is."""
-    least = np.where(np.isfinite(values), values, np.inf).min(axis=0)
-    return np.where(np.isfinite(least), least, np.nan)
 
 
 def heights_of_attractors(barriers: np.ndarray) -> np.ndarray:
@@ -352,7 +346,7 @@ class Landscape:
         if self.field_estimate is None or whole is None:
             return errors
         by_well = whole.by_well(x)
-        least = least_over_wells(by_well)
+        least = np.fmin.reduce(by_well)
         for well, values in zip(whole.wells, by_well, strict=True):
             mine = values <= least + LEVEL_TOLERANCE * well.level  # false of NaN
             if mine.any():

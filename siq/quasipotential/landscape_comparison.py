@@ -27,7 +27,7 @@ from siq.inference.field_estimate import STANDARD_ERRORS, FieldEstimate
 from siq.numerics.files import whole_file
 from siq.numerics.text import place_text
 from siq.quasipotential.characteristics import adapted_fan
-from siq.quasipotential.landscape import Landscape, heights_of_attractors, least_over_wells
+from siq.quasipotential.landscape import Landscape, heights_of_attractors
 from siq.quasipotential.paths import minimum_action_path
 from siq.quasipotential.rates import NoiseStrength, mean_residence_time
 from siq.remarks import Remark, sentence
@@ -78,12 +78,12 @@ class ReferenceLandscape:
     @property
     def values(self) -> np.ndarray:
         """The global U by characteristics, shape ``(n,)``, NaN where no curve tells."""
-        return least_over_wells(self.characteristics + self.heights[:, None])
+        return np.fmin.reduce(self.characteristics + self.heights[:, None])
 
     @property
     def mesh_values(self) -> np.ndarray:
         """The global U on the mesh, shape ``(n,)``."""
-        return least_over_wells(self.mesh + self.heights[:, None])
+        return np.fmin.reduce(self.mesh + self.heights[:, None])
 
     @property
     def level(self) -> float:
@@ -123,19 +123,13 @@ def reference_landscape(
     generator: np.random.Generator,
     mesh: Callable[[np.ndarray, float], Potential | None] | None = None,
 ) -> ReferenceLandscape:
-    """Compute the references; a `NumericalFailure` without an attractor, or without any saddle.
+    """Compute the references of the exact f in a box ``(d, 2)``.
 
-    Parameters
-    ----------
-    dynamics, portrait, box
-        The exact f, its attractors and saddles, and the region of interest, shape ``(d, 2)``.
-    reach
-        Level up to which curves are followed, as a share of each well's lowest barrier.
-    generator
-        Draws first directions and points in more than two dimensions.
-    mesh
-        Of two states, V (not U) about an attractor up to a level by a method that shares no code with the
-        others (`siq.validation.mesh.mesh_potential`).
+    Curves are followed up to a level, `reach`, as a share of each well's lowest barrier; the generator draws
+    first directions, and points in more than two dimensions. Of two states `mesh` gives V (not U) about an
+    attractor up to a level by a method that shares no code with the others
+    (`siq.validation.mesh.mesh_potential`). Without an attractor, or without any saddle, this fails with
+    `NumericalFailure`.
     """
     attractors = np.array([one.position for one in portrait.attractors])
     if not len(attractors):

@@ -248,20 +248,7 @@ def write_landscape(path: str | Path, landscape: Landscape) -> None:
 
 
 def read_landscape(path: str | Path, *, dynamics: Dynamics) -> Landscape | None:
-    """Read what `write_landscape` wrote; None where the file is empty since there was nothing to write.
-
-    Parameters
-    ----------
-    path
-        The file.
-    dynamics
-        f, as it was identified beside it.
-
-    Raises
-    ------
-    InputError
-        When the file is no such record.
-    """
+    """Read what `write_landscape` wrote, of an f that was identified beside it; None of an empty file."""
     try:
         text = Path(path).read_text(encoding="utf-8")
         return landscape_from_data(json.loads(text), dynamics) if text else None

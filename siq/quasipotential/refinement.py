@@ -391,13 +391,9 @@ class RefinementContext:
         """Refine networks with their weights in random order, and test the result as the real one is.
 
         Gauss–Newton from a random start ends nowhere, at a false solution that is as exact as the true one,
-        or at the true one. The tests have to refuse the first two; `same_as_refined` tells the third.
-
-        Returns
-        -------
-        dict
-            A certificate as it stands in `model.json`. `same_as_refined` among its tests has the largest
-            relative difference from the refined V in any well; it takes no part in whether it is certified.
+        or at the true one. The tests have to refuse the first two. Among those of the certificate, as it
+        stands in `model.json`, `same_as_refined` has the largest relative difference from the refined V in
+        any well; it takes no part in whether it is certified.
         """
         assert self.networks is not None
         draw = generator(self.seed, self.number, Purpose.SHUFFLE)
@@ -406,10 +402,9 @@ class RefinementContext:
         try:
             _, formulas, made = self._by_routes(options, randomised, None)
         except (NumericalFailure, np.linalg.LinAlgError) as error:
-            nothing = Verdict.refused(
-                f"refinement from random weights led to no V: {error}", self.limits.hamilton_jacobi
-            )
-            return uncertified(nothing.reason) | {"tests": {"hamilton_jacobi": nothing.as_data()}}
+            reason = f"refinement from random weights led to no V: {error}"
+            nothing = Verdict.refused(reason, self.limits.hamilton_jacobi)
+            return uncertified(reason) | {"tests": {"hamilton_jacobi": nothing.as_data()}}
         data = made.as_data()
         if refined is None or certificate is None:
             return data

@@ -22,7 +22,7 @@ from siq.data.recordings import Recordings
 from siq.data.two_states import DwellCount
 from siq.numerics.text import place_text, squared
 from siq.quasipotential.formulas import SymbolicDecomposition
-from siq.quasipotential.landscape import Landscape, least_over_wells
+from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.occupancy import VisitTest
 from siq.quasipotential.rates import EscapeRate, MeanTime, NoiseStrength, mean_residence_time
 from siq.quasipotential.transitions import Transition
@@ -179,7 +179,7 @@ class LandscapeSummary:
         known = [(w.height, v) for w, v in zip(self.wells, self.formulas, strict=False) if v is not None]
         if not known:
             return np.full(len(x), np.nan)
-        return least_over_wells(np.stack([height + 2 * v.known_values(x) for height, v in known]))
+        return np.fmin.reduce(np.stack([height + 2 * v.known_values(x) for height, v in known]))
 
     @cached_property
     def box(self) -> np.ndarray:
