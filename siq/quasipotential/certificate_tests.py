@@ -440,13 +440,13 @@ def _lost_shares(
         positive_rates = (np.linalg.eigvals(jacobians(x, coefficients)).real > 0).sum(axis=1)
         lost |= (moved > NEWTON_TOLERANCE) | (positive_rates != unstable)
         x = np.where(lost[:, None], start, x)
-    places, lost = x.reshape(len(starts), -1, d), lost.reshape(len(starts), -1)
+    places, gone = x.reshape(len(starts), -1, d), lost.reshape(len(starts), -1)
     far = np.abs((places - starts[:, None]) / width).max(axis=2)
     same = np.abs((places[:, None] - places) / width).max(axis=3) < EQUILIBRIUM_MERGE_TOLERANCE
-    same &= ~lost[:, None] & ~lost & ~np.eye(len(starts), dtype=bool)[:, :, None]
+    same &= ~gone[:, None] & ~gone & ~np.eye(len(starts), dtype=bool)[:, :, None]
     # Whichever came from afar has jumped; both have where they come from equally far.
     met = (same & (far[:, None] > far / 2)).any(axis=1)
-    return np.asarray((lost | met).mean(axis=1))
+    return np.asarray((gone | met).mean(axis=1))
 
 
 def check_existence(found: FieldEstimate, portrait: PhasePortrait, *, seed: int = 0) -> Verdict:

@@ -225,11 +225,15 @@ def _wells_from_data(method: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...
         return ()
     equations = [_expression_from_data(part, symbols) for part in method["f"]]
     dynamics = Dynamics.of(symbols, equations, diffusion=Diffusion.of_rows(symbols, method["D"]))
+
+    def field_of(value: Any) -> Any:
+        return np.array(value) if isinstance(value, list) else value
+
     return tuple(
         Well(
             PowerBasis.from_data(one["V"], symbols), np.array(one["V"]["coefficients"]), dynamics,
             points=np.zeros((0, len(symbols))), trials=tuple(DegreeTrial(**each) for each in one["degrees"]),
-            **{name: np.array(one[name]) if isinstance(one[name], list) else one[name] for name in WELL},
+            **{name: field_of(one[name]) for name in WELL},
         )
         for one in method["wells"]
     )  # fmt: skip

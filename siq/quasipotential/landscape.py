@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import pandas as pd
@@ -371,7 +371,7 @@ class Landscape:
         recorded region; ΔU is in the unit of ε, with its standard error from the uncertainty of f, NaN where
         it is not known.
         """
-        types = {"start": int, "end": "Int64", "barrier": float, "standard_error": float}
+        types: dict[str, Any] = {"start": int, "end": "Int64", "barrier": float, "standard_error": float}
         rows = [[getattr(way, name) for name in types] for way in self.transitions]
         return pd.DataFrame(rows, columns=list(types)).astype(types)
 

@@ -94,8 +94,8 @@ class ReferenceLandscape:
     @classmethod
     def missing(cls, dimension: int, reason: str) -> ReferenceLandscape:
         """An empty reference, with the reason why there is none."""
-        shapes = ((0, dimension), (0, dimension), (0, 0), (0, 0), 0, 0, 0)
-        return cls(*map(np.zeros, shapes), reason=reason)
+        of_none, nothing, none = np.zeros((0, dimension)), np.zeros(0), np.zeros((0, 0))
+        return cls(of_none, of_none, none, none, nothing, nothing, nothing, reason)
 
     def write(self, path: str | Path) -> None:
         """Write the references as a NumPy archive of plain arrays, whole or not at all."""

@@ -201,10 +201,10 @@ def refine(
             # start: one alone does not tell an odd power from an even one, and goes on wrongly in the others.
             for some in (group, *([well] for well in group if len(group) > 1)) if group else ():
                 inside = [well.inside() for well in some]
-                values = [well.values(x) for well, x in zip(some, inside, strict=True)]
-                yield fit_values(library, inside, values)
+                heights = [well.values(x) for well, x in zip(some, inside, strict=True)]
+                yield fit_values(library, inside, heights)
 
-    accepted: dict[str, float] = {"false_terms": options.false_terms, "precision": options.precision}
+    accepted: dict[str, Any] = {"false_terms": options.false_terms, "precision": options.precision}
     best, good = None, False
     for start in starts():
         trial = refine_globally(start, found, points, **accepted)
@@ -241,7 +241,7 @@ def _over_library(found: FieldEstimate, library: CandidateLibrary) -> FieldEstim
         return new
 
     support = np.column_stack([found.support[:, 0], places[found.support[:, 1]]])
-    average = None if found.alternatives is None else tuple(map(moved, found.alternatives))
+    average = found.alternatives and (moved(found.alternatives[0]), moved(found.alternatives[1]))
     coefficients = moved(found.coefficients)
     return replace(found, library=library, coefficients=coefficients, support=support, alternatives=average)
 
