@@ -41,7 +41,7 @@ from scipy.interpolate import Akima1DInterpolator, PchipInterpolator, PPoly
 
 from siq.errors import NumericalFailure
 from siq.quasipotential.characteristics import HamiltonianFlow, crossed
-from siq.quasipotential.path_chains import MinimumActionPath, unwound
+from siq.quasipotential.path_chains import MinimumActionPath, bent_lines, unwound
 from siq.quasipotential.power_series import local_series
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import classify, hessian_at
@@ -55,7 +55,7 @@ START = 0.003  # where solutions begin, and the power series errs by its fifth p
 FIRST_END = 0.1  # there the first end lies
 LONGEST_STEP = 0.3  # of the end; it is halved where Newton's method does not follow ...
 SHORTEST_STEP = 0.004  # ... and a curve given up below this: it leaves the well, or V is not smooth there
-BENDS, BEND = 4, 0.4  # curves beside the straight one, and how far they leave it
+BENDS = 2  # directions of curves beside the straight one
 APPROACH, LAST_APPROACH = 0.1, 0.002  # how far from S the end is at first, and in the answer
 APPROACH_FACTOR = 3.0  # by so much nearer in one step
 LEAST_SHARE = 0.05  # numerical: of the way to the conditions at the saddle, in one step
@@ -255,14 +255,9 @@ def hamiltonian_paths(
                 finished(backwards)
             side = np.sign(problem.left @ (down[far[0]] - problem.end))
         lasts = [problem.end + side * APPROACH * one / np.linalg.norm(one) for one in problem.arrivals]
-    share = np.linspace(0, 1, 201)[:, None]
     for last in lasts:
         solutions = list(known)
-        across = np.linalg.svd(last[None])[2][1 : BENDS // 2 + 1]
-        bent = [
-            share * last + BEND * side * np.sin(np.pi * share) * way for way in across for side in (1, -1)
-        ]
-        for curve in (share * last, *bent, *map(problem.scaled, curves)):
+        for curve in (*bent_lines(last, BENDS), *map(problem.scaled, curves)):
             solution = _followed(problem, curve)
             if solution is not None and all(apart(solution, one) for one in solutions):
                 solutions.append(solution)
@@ -497,18 +492,18 @@ def _path(problem: _HamiltonianProblem, solution: PPoly, error: float, tolerance
 def _smooth(problem: _HamiltonianProblem, solution: PPoly) -> bool:
     """Whether no neighbour crosses the path, by the tangents of those that leave A beside it."""
     d, times = problem.dimension, solution.x
-    middles = (times[1:] + times[:-1]) / 2
-    at_nodes, between = (problem.matrices(solution(t)).transpose(2, 0, 1) for t in (times, middles))
-    first = solution(times[0])[None, :d]
-    frame = np.linalg.qr(np.concatenate([np.eye(d), problem.curvature(first)[0]]))[0]
-    for index, step in enumerate(np.diff(times)):
-        k1 = at_nodes[index] @ frame
-        k2 = between[index] @ (frame + step / 2 * k1)
-        k3 = between[index] @ (frame + step / 2 * k2)
-        moved = frame + step / 6 * (k1 + 2 * k2 + 2 * k3 + at_nodes[index + 1] @ (frame + step * k3))
-        new, upper = np.linalg.qr(moved)
-        new *= np.sign(np.diag(upper))
-        if crossed(frame[None, :d], new[None, :d])[0]:
-            return False
-        frame = new
-    return True
+    length, one = np.diff(times)[:, None, None], np.eye(2 * d)
+    # Over each piece of the mesh the tangents change by a matrix: one step of the rule of Runge and Kutta.
+    at_nodes, between = (
+        problem.matrices(solution(t)).transpose(2, 0, 1) for t in (times, (times[1:] + times[:-1]) / 2)
+    )
+    k1 = at_nodes[:-1]
+    k2 = between @ (one + length / 2 * k1)
+    k3 = between @ (one + length / 2 * k2)
+    k4 = at_nodes[1:] @ (one + length * k3)
+    frames = [np.linalg.qr(np.vstack([one[:d, :d], problem.curvature(solution(times[0])[None, :d])[0]]))[0]]
+    for change in one + length / 6 * (k1 + 2 * k2 + 2 * k3 + k4):
+        new, upper = np.linalg.qr(change @ frames[-1])
+        frames.append(new * np.sign(np.diag(upper)))
+    tangents = np.array(frames)[:, :d]
+    return not crossed(tangents[:-1], tangents[1:]).any()

@@ -349,16 +349,12 @@ class VisitTest:
 
     Attributes
     ----------
-    well
-        Index of the attractor.
+    well, method
+        Index of the attractor; and ``operator``, of Fokker and Planck, or ``law``, of Eyring and Kramers.
     held_out, whole
         Counted on recordings that no fit saw, and on all.
-    predicted
-        Mean time, in the unit of time.
-    error
-        Its relative standard error.
-    method
-        ``operator``: of Fokker and Planck; ``law``: of Eyring and Kramers.
+    predicted, error
+        Mean time, in the unit of time, and its relative standard error.
     probability
         Of a count as far off as the one of the held-out recordings, if the prediction holds within its error.
     """
@@ -380,10 +376,8 @@ class DensityTest:
     ----------
     well, state
         Indices of the attractor, and of the state.
-    distance
-        The largest difference of the two distribution functions.
-    independent
-        How many independent samples the held-out recordings hold.
+    distance, independent
+        The largest difference of the two distribution functions; and how many independent samples there are.
     probability
         Of as large a distance, were the prediction true within its error.
     edges, counted, predicted
@@ -404,14 +398,8 @@ class DensityTest:
 class OccupancyCheck:
     """Visits to the wells, and the spread of states about them, against the record.
 
-    Attributes
-    ----------
-    visits, densities
-        As counted, and as predicted.
-    missing
-        Why neither is compared; None where they are.
-    unseen
-        Two states between which the record hops, where a single one was identified; None elsewhere.
+    `missing` says why neither is compared. `unseen` are two states between which the record hops, where a
+    single one was identified.
     """
 
     visits: tuple[VisitTest, ...] = ()
@@ -438,7 +426,7 @@ class OccupancyCheck:
             return Verdict(rarity, limit, True)
         visits = next((one for one in self.visits if one.probability == least), None)
         if visits is None:
-            worst = min(self.densities, key=lambda one: one.probability)
+            worst = next(one for one in self.densities if one.probability == least)
             reason = f"states in well {worst.well + 1} are spread otherwise than what was identified says"
         else:
             counted = f"{visits.held_out.mean:.3g}" if visits.held_out.visits else "no end"

@@ -370,16 +370,19 @@ class PathProblem(ScaledSystem):
 
         That would be the right one were f linear: ``ẋ = (J + 2DM) x``, backwards from the end.
         """
-        share = np.linspace(0, 1, 201)[:, None]
-        line = share * self.end
-        chains = [line]
-        # The columns of the right factor span what is across the line.
-        across = np.linalg.svd(self.end[None])[2][1 : MOST_BENDS + 1]
-        chains += [line + BEND * side * np.sin(np.pi * share) * way for way in across for side in (1, -1)]
+        chains = bent_lines(self.end, MOST_BENDS)
         if self.hessian is None:
             return chains, 0.0
         linear = _spiral(self, self.end, START_LEVEL * self.level(self.end[None])[0])
         return [linear, *chains], total_turn(linear @ np.linalg.cholesky(self.hessian))
+
+
+def bent_lines(end: np.ndarray, directions: int) -> list[np.ndarray]:
+    """The straight line from zero to a point, and lines bent to both sides in so many directions."""
+    share = np.linspace(0, 1, 201)[:, None]
+    # The columns of the right factor span what is across the line.
+    across, bow = np.linalg.svd(end[None])[2][1 : directions + 1], BEND * np.sin(np.pi * share)
+    return [share * end, *(share * end + side * bow * way for way in across for side in (1, -1))]
 
 
 def total_turn(y: np.ndarray) -> float:
@@ -508,8 +511,40 @@ class _Across:
             normal[-1] = np.linalg.svd(problem.finish.slope(y[-1])[None])[2][1:].T
         self.normal = normal[self.range]
         self.slope = np.einsum("nij,ni->nj", self.normal, slope[self.range]).ravel()
-        self.exact = _banded(*exact, self.normal, self.range.start, (first, last))
-        self.frozen = _banded(*frozen, self.normal, self.range.start, (first, last))
+        self.exact, self.frozen = (self._banded(*blocks, first, last) for blocks in (exact, frozen))
+
+    def _banded(
+        self,
+        middle: np.ndarray,
+        mixed: np.ndarray,
+        forward: np.ndarray,
+        first: np.ndarray,
+        last: np.ndarray,
+    ) -> np.ndarray:
+        """The matrix of the moves, in the lower form of scipy's solvers.
+
+        Of second derivatives of the segments by middles, by differences and middles, and by differences; and
+        of what is added to the blocks of the first point and of the last.
+        """
+        count, _, m = self.normal.shape
+        transposed = mixed.transpose(0, 2, 1)
+        both = (mixed + transposed) / 2
+        diagonal = np.zeros((len(middle) + 1, *first.shape))
+        diagonal[1:] += middle / 4 + forward + both
+        diagonal[:-1] += middle / 4 + forward - both
+        diagonal[0] += first
+        diagonal[-1] += last
+        # Row of the next point, column of this one.
+        below = (middle / 4 - forward + (mixed - transposed) / 2)[self.range.start :][: count - 1]
+        turned = self.normal.transpose(0, 2, 1)
+        diagonal = turned @ diagonal[self.range] @ self.normal
+        below = turned[1:] @ below @ self.normal[:-1]
+        matrix = np.zeros((2 * m, count * m))
+        for column, row in np.ndindex(m, m):
+            if row >= column:
+                matrix[row - column, column::m] = diagonal[:, row, column]
+            matrix[m + row - column, column::m][: count - 1] = below[:, row, column]
+        return matrix
 
     def step(self, shift: float) -> np.ndarray | None:
         """Newton's step with a shift; None where the matrix is not positive definite."""
@@ -536,38 +571,3 @@ class _Across:
         _, vectors = scipy.linalg.eig_banded(self.exact, lower=True, select="i", select_range=(0, 0))
         way = vectors[:, 0] / np.abs(vectors).max()
         return [side * size * way for size in KICKS for side in (1, -1)]
-
-
-def _banded(
-    middle: np.ndarray,
-    mixed: np.ndarray,
-    forward: np.ndarray,
-    normal: np.ndarray,
-    start: int,
-    ends: tuple[np.ndarray, np.ndarray],
-) -> np.ndarray:
-    """The matrix of the moves ``normal`` from point `start` on, in the lower form of scipy's solvers.
-
-    It is made of second derivatives of the segments by middles, by differences and middles, and by
-    differences. `ends` are added to the blocks of the first point and of the last.
-    """
-    count, _, m = normal.shape
-    transposed = mixed.transpose(0, 2, 1)
-    both = (mixed + transposed) / 2
-    diagonal = np.zeros((len(middle) + 1, *ends[0].shape))
-    diagonal[1:] += middle / 4 + forward + both
-    diagonal[:-1] += middle / 4 + forward - both
-    diagonal[0] += ends[0]
-    diagonal[-1] += ends[1]
-    # Row of the next point, column of this one.
-    below = middle / 4 - forward + (mixed - transposed) / 2
-    turned = normal.transpose(0, 2, 1)
-    diagonal = turned @ diagonal[start : start + count] @ normal
-    below = turned[1:] @ below[start : start + count - 1] @ normal[:-1]
-    matrix = np.zeros((2 * m, count * m))
-    for column in range(m):
-        for row in range(column, m):
-            matrix[row - column, column::m] = diagonal[:, row, column]
-        for row in range(m):
-            matrix[m + row - column, column::m][: count - 1] = below[:, row, column]
-    return matrix

@@ -146,7 +146,7 @@ def minimum_action_path(
     if not chains:
         last = problem.points(problem.end[None])[0]
         raise NumericalFailure(
-            f"no path from {problem.start.tolist()} to {last.tolist()} was found that has a finite action"
+            f"no path from {problem.center.tolist()} to {last.tolist()} was found that has a finite action"
         )
     (fine, action, minimum), known = problem.descended(chains[0][0], count, chains[0][1]), False
     while not known and 2 * len(fine) < MOST_NODES:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import sympy
 from known_paths import MATRICES, pairs, path_of, resonator, rotating, transformed
 from known_systems import (
     KnownSystem,
@@ -18,6 +19,7 @@ from scipy.integrate import solve_ivp
 from siq.errors import NumericalFailure
 from siq.quasipotential.path_chains import MinimumActionPath
 from siq.quasipotential.paths import minimum_action_path, transition_path
+from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import find_equilibria
 
 pytestmark = pytest.mark.portable
@@ -198,6 +200,13 @@ def test_a_path_needs_two_states() -> None:
     known = archetype(2)
     with pytest.raises(ValueError, match="where it starts"):
         path_of(known, known.attractors[0])
+
+
+def test_a_path_through_states_without_noise_is_refused() -> None:
+    state = sympy.symbols("x", real=True)
+    system = Dynamics.of((state,), (-state,), diffusion=((1 - state**2,),))
+    with pytest.raises(NumericalFailure, match=r"no path from \[0.0\] to \[0.5\] .* finite action"):
+        minimum_action_path(system, np.zeros(1), np.array([0.5]), initial=[np.array([[0.0], [2.0], [0.5]])])
 
 
 def test_a_way_that_ends_at_another_attractor_is_soon_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
