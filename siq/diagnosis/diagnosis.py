@@ -44,8 +44,8 @@ def _withdrawn(found: Investigation) -> Investigation:
     """An investigation without its names, and with models of what has none.
 
     Where nothing else speaks of a mismatch there is none: evidence that recordings held out refute is no
-    evidence. Process noise that is needed speaks of one, and so does structure that the recalibrated
-    simulation leaves, or a function without a name that is certain by the odds that a name takes.
+    evidence. Process noise that is needed speaks of one, structure that the recalibrated simulation leaves,
+    or a function without a name that is certain by the odds that a name takes.
     """
     names = [each.best.candidate.label for each in found.search.found]
     LOGGER.info("%s: not named, since held-out recordings are predicted worse", names)
@@ -278,20 +278,15 @@ NOISE_COLUMNS = ["stage", "kind", "name", "variance"]
 
 
 def tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
-    """The tables that figures are drawn from.
+    """The tables that figures are drawn from, by name.
 
-    Returns
-    -------
-    dict
-        ``curves``: what is missing against each coordinate, in the unit of the equation.
-        ``candidates``: every mechanism that was fitted, and every probe that was only screened, with what it
-        gains ``beside`` the mechanisms that were in place. Stages: ``found``; fitted in its place: ``same``,
-        ``needless`` and ``less`` (see `siq.diagnosis.statement.Alternative`); screened: ``further``, on top
-        of all that was found, and ``instead``, in the place of the last that was found.
-        ``held_out``: recordings and their three simulations.
-        ``forces``: what the recalibrated simulation lacks at each sample, as far as process noise was
-        admitted.
-        ``noise``: of the sensors by output, and of process noise by state.
+    ``curves``: what is missing against each coordinate, in the unit of the equation. ``candidates``: every
+    mechanism that was fitted, and every probe that was only screened, with what it gains ``beside`` those in
+    place. Stages: ``found``; fitted in its place: ``same``, ``needless`` and ``less`` (see
+    `siq.diagnosis.statement.Alternative`); screened: ``further``, on top of all that was found, and
+    ``instead``, in the place of the last. ``held_out``: recordings and their three simulations. ``forces``:
+    what the recalibrated simulation lacks at each sample, as far as process noise was admitted. ``noise``: of
+    the sensors by output, and of process noise by state.
     """
     case, found, shown = diagnosis.case, diagnosis.investigation, diagnosis.held_out
     recalibrated, data = found.search.recalibrated, case.kept

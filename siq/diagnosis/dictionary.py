@@ -231,9 +231,7 @@ def standard_dictionary() -> tuple[Mechanism, ...]:
 
 
 def _read_dictionary(path: str | Path) -> tuple[Mechanism, ...]:
-    """Read a file ``mechanisms: [...]``."""
-    document = read_document(path)
-    return validate(document, _Dictionary).mechanisms
+    return validate(read_document(path), _Dictionary).mechanisms
 
 
 def dictionary_of(
@@ -264,20 +262,9 @@ def units_of(model: Dynamics) -> dict[str, str]:
 
 
 def unit_of(formula: str, units: Mapping[str, str]) -> str:
-    """The unit of a formula of quantities, such as ``"v/T/x**2"``.
+    """The unit of a formula of quantities, such as ``"v/T/x**2"``, whose units are known: ``"1/(m*s)"``.
 
-    Parameters
-    ----------
-    formula
-        Products and powers of quantities.
-    units
-        The unit of each, such as ``"m/s"``; ``"1"`` for a number. What cannot be read as a product of powers
-        (``"°C"``) is kept as one word.
-
-    Returns
-    -------
-    str
-        Such as ``"1/(m*s)"``.
+    A number has the unit ``"1"``. What cannot be read as a product of powers (``"°C"``) is kept as one word.
     """
     words: dict[str, sympy.Symbol] = {}
     known = {name: _parse(unit, words) for name, unit in units.items()}
@@ -310,21 +297,18 @@ class Roles:
 
     Attributes
     ----------
-    motions
-        Pairs of position and velocity, ``x' = v``.
-    angles
-        Positions that are angles: in radians, or within a sine or cosine of the equations.
+    motions, angles
+        Pairs of position and velocity, ``x' = v``; and positions that are angles: in radians, or within a
+        sine or cosine of the equations.
     amplitudes
         Pairs of quadratures: but for a constant drive, the equations look the same from every angle, and turn
         the state.
-    populations
-        States that stay zero once they are.
-    feeding
-        Pairs of prey and predator: populations whose meetings make the one fewer and the other more.
-    levels
-        States whose own outflow goes with their square root.
-    cascades
-        Pairs of levels of which the first flows into the second.
+    populations, feeding
+        States that stay zero once they are; and pairs of prey and predator, whose meetings make the one fewer
+        and the other more.
+    levels, cascades
+        States whose own outflow goes with their square root; and pairs of which the first flows into the
+        second.
     stores
         All others that have a unit: a charge, a temperature, a concentration. Of a mere number nothing is
         known that a mechanism could be written for.
@@ -408,21 +392,9 @@ def meetings(equation: sympy.Expr, one: str, other: str) -> sympy.Expr:
 def trial_points(
     model: Dynamics, count: int = TRIAL_POINTS, *, either_sign: bool = False
 ) -> tuple[np.ndarray, Signals]:
-    """States and signals at which formulas are compared; any will do that are the same each time.
+    """So many states ``(d, count)`` and signals at which formulas are compared; the same each time.
 
-    Parameters
-    ----------
-    model
-        Its domain is where the states lie.
-    count
-        How many points.
-    either_sign
-        Whether inputs, and states without a domain, are of either sign.
-
-    Returns
-    -------
-    np.ndarray, Signals
-        States of shape ``(d, count)``, and the signals there.
+    They lie in the domain of a model. Where there is none they may be of either sign, and so may inputs.
     """
     generator = np.random.default_rng(0)
     known = np.isfinite(model.limits).all(axis=1)
@@ -459,19 +431,19 @@ def _turns(model: Dynamics, first: int, second: int) -> bool:
         return False
     x, signals = trial_points(model)
     angle = np.linspace(0.3, 5.9, TRIAL_POINTS)
-    turned = x.copy()
-    turned[first] = np.cos(angle) * x[first] - np.sin(angle) * x[second]
-    turned[second] = np.sin(angle) * x[first] + np.cos(angle) * x[second]
+
+    def turned(v: np.ndarray) -> np.ndarray:
+        result = v.copy()
+        result[first] = np.cos(angle) * v[first] - np.sin(angle) * v[second]
+        result[second] = np.sin(angle) * v[first] + np.cos(angle) * v[second]
+        return result
+
     still = x.copy()
     still[[first, second]] = 0.0
-    rates = model.functions.rates
-    free = rates(x, signals, model.values) - rates(still, signals, model.values)
-    after = rates(turned, signals, model.values) - rates(still, signals, model.values)
-    expected = free.copy()
-    expected[first] = np.cos(angle) * free[first] - np.sin(angle) * free[second]
-    expected[second] = np.sin(angle) * free[first] + np.cos(angle) * free[second]
+    at_rest = model.functions.rates(still, signals, model.values)
+    free, after = (model.functions.rates(each, signals, model.values) - at_rest for each in (x, turned(x)))
     size = np.abs(free).max()
-    if not (np.isfinite(free).all() and np.abs(after - expected).max() <= FORMULA_TOLERANCE * size):
+    if not (np.isfinite(free).all() and np.abs(after - turned(free)).max() <= FORMULA_TOLERANCE * size):
         return False
     turning = x[first] * free[second] - x[second] * free[first]
     return bool(np.abs(turning).max() > FORMULA_TOLERANCE * np.abs(x[[first, second]]).max() * size)
@@ -497,16 +469,11 @@ def _has_root(equation: sympy.Expr, name: str) -> bool:
 
 
 def assignments(form: Form, model: Dynamics, roles: Roles) -> Iterator[dict[str, str]]:
-    """Every way of filling a form's roles.
+    """Every way of filling a form's roles: from each role to the name that fills it.
 
     Position (or displacement, or angle) and velocity, the two quadratures of a rotating frame, prey and
     predator, and upper and lower level are filled in pairs where the form names them one after the other.
     Nothing fills two roles, and of a symmetric form's ways only one is kept.
-
-    Yields
-    ------
-    dict
-        From each role to the name that fills it.
     """
     kinds = list(form.roles.values())
     names = list(form.roles)

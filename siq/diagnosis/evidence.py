@@ -26,6 +26,7 @@ from siq.errors import NumericalFailure
 from siq.inference.kalman_filter import Noise, Whitened, solve, whiten
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
+from siq.remarks import Remark, sentence
 
 BLOCK_CORRELATION_TIMES = 4.0  # correlation times in a block
 AUTOCORRELATION_95 = 1.96  # standard deviations of an autocorrelation of white errors, which are 1/√n
@@ -33,7 +34,8 @@ AUTOCORRELATION_95 = 1.96  # standard deviations of an autocorrelation of white 
 # constant, a straight line or a parabola, for which there are names.
 SMOOTH_LENGTHS = (0.125, 0.25)
 PRIOR_JITTER = 1e-9  # numerical: on the diagonal of a prior's covariance
-BUDGET_SPENT = "the budget was spent before it was tried"
+BUDGET_SPENT = "diagnosis.not_reached"
+OVERFLOWS = "diagnosis.overflows"
 NUMERICAL_ERRORS = (ArithmeticError, ValueError, np.linalg.LinAlgError)
 """What ends a candidate, never the search: an overflow, a division by zero, a singular matrix."""
 
@@ -81,18 +83,25 @@ class FittedCandidate:
 
 @dataclass(frozen=True)
 class NotFitted:
-    """A candidate that promised something and could not be judged, with the reason in words."""
+    """A candidate that promised something and could not be judged, and why."""
 
     mechanism: str
     label: str
-    reason: str
+    remark: Remark
 
     @classmethod
     def of(cls, candidate: MechanismCandidate, why: str | Exception) -> NotFitted:
-        """Of a candidate, with the reason or what ended its fit."""
-        if isinstance(why, Exception):
-            why = str(why) if isinstance(why, NumericalFailure) else f"{type(why).__name__}: {why}"
-        return cls(candidate.name, candidate.label, why)
+        """Of a candidate, with the code of a remark or what ended its fit."""
+        if isinstance(why, str):
+            return cls(candidate.name, candidate.label, Remark(why))
+        kind = "" if isinstance(why, NumericalFailure) else type(why).__name__
+        values = {"error": kind, "message": str(why)}
+        return cls(candidate.name, candidate.label, Remark("diagnosis.fit_failed", values))
+
+    @property
+    def reason(self) -> str:
+        """Why, in words."""
+        return sentence(self.remark)
 
 
 def residuals(

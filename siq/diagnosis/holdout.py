@@ -166,44 +166,39 @@ def _cross_validation_folds(
     Of recordings, so many at equal distances are a part; a single one is cut into stretches, of which the
     rest has two recordings unless it is the first or the last that is left out.
     """
-    count = len(learned.labels)
+    count, rows = len(learned.labels), len(learned.t)
     if count > 1:
-        pieces = list(zip(learned.first[:-1], learned.first[1:], strict=True))
-        owner = np.arange(count)
-        groups = [np.arange(part, count, min(FOLDS, count)) for part in range(min(FOLDS, count))]
+        edges, owner = learned.first, list(range(count))
+        groups = [list(range(part, count, FOLDS)) for part in range(min(FOLDS, count))]
     else:
-        parts = max(min(FOLDS, len(learned.t) // MIN_STRETCH_SAMPLES), 2)
-        edges = np.linspace(0, len(learned.t), parts + 1).round().astype(int)
-        pieces, owner = list(itertools.pairwise(edges)), np.zeros(parts, dtype=int)
-        groups = [np.array([part]) for part in range(parts)]
+        parts = max(min(FOLDS, rows // MIN_STRETCH_SAMPLES), 2)
+        edges, owner = np.linspace(0, rows, parts + 1).round().astype(int), [0] * parts
+        groups = [[part] for part in range(parts)]
+    pieces = list(itertools.pairwise(edges))
 
-    def stretches(chosen: Sequence[tuple[int, int]], of: Iterable[int]) -> tuple[Measurements, np.ndarray]:
+    def stretches(chosen: Sequence[tuple[int, int]], of: Sequence[int]) -> tuple[Measurements, np.ndarray]:
         """Stretches of rows as recordings of their own, and their rows; the inputs stay whole."""
-        rows, of = np.concatenate([np.arange(begin, end) for begin, end in chosen]), list(of)
+        at = np.concatenate([np.arange(begin, end) for begin, end in chosen])
+        named = zip(of, chosen, strict=True)
         return replace(
             learned,
-            labels=tuple(
-                f"{learned.labels[place]}, rows {a} to {b}" for place, (a, b) in zip(of, chosen, strict=True)
-            ),
-            first=np.concatenate([[0], np.cumsum([end - begin for begin, end in chosen])]),
-            t=learned.t[rows],
-            outputs=learned.outputs[rows],
+            labels=tuple(f"{learned.labels[place]}, rows {a} to {b}" for place, (a, b) in named),
+            first=np.cumsum([0, *(end - begin for begin, end in chosen)]),
+            t=learned.t[at],
+            outputs=learned.outputs[at],
             courses=tuple(learned.courses[place] for place in of) if learned.courses else learned.courses,
-        ), rows
+        ), at
 
     for group in groups:
-        others = np.setdiff1d(np.arange(len(pieces)), group)
+        out = [pieces[place] for place in group]
+        others = [place for place in range(len(pieces)) if place not in group]
         kept = [pieces[place] for place in others]
-        owners = owner[others]
         if count == 1:  # what was not cut stays one recording
-            joined: list[tuple[int, int]] = []
-            for begin, end in kept:
-                if joined and joined[-1][1] == begin:
-                    joined[-1] = (joined[-1][0], end)
-                else:
-                    joined.append((begin, end))
-            kept, owners = joined, np.zeros(len(joined), dtype=int)
-        yield stretches([pieces[place] for place in group], owner[group])[0], *stretches(kept, owners)
+            ((begin, end),) = out
+            kept = [(a, b) for a, b in ((0, begin), (end, rows)) if b > a]
+            others = others[: len(kept)]
+        rest = stretches(kept, [owner[place] for place in others])
+        yield stretches(out, [owner[place] for place in group])[0], *rest
 
 
 def errors_left_out(

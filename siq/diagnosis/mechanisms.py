@@ -21,7 +21,7 @@ import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 import sympy
@@ -63,10 +63,7 @@ def places_of(search: Shape, data: Measurements, model: Dynamics, x: np.ndarray)
     if search.samples:
         return factors * np.median(steps)
     if search.frequencies is not None:
-        longest = max(
-            data.t[end - 1] - data.t[begin]
-            for begin, end in zip(data.first[:-1], data.first[1:], strict=True)
-        )
+        longest = (data.t[data.first[1:] - 1] - data.t[data.first[:-1]]).max()
         # From one period in the longest recording to four samples a period.
         return np.linspace(2 * np.pi / longest, np.pi / (2 * np.median(steps)), search.frequencies)
     if search.recorded is not None:
@@ -197,42 +194,26 @@ class MechanismCandidate:
 
     def rebased(self, before: Dynamics, now: Dynamics) -> MechanismCandidate:
         """It on top of a model that has grown since."""
-        names = {parameter.name for parameter in now.parameters}
-        model = self.model
-        renamed = {name: name for name in self.new}
-        for name in self.new:
-            if name in names:
-                stem, _, number = name.rpartition("_")
-                k = int(number)
-                while f"{stem}_{k}" in names or f"{stem}_{k}" in renamed.values():
-                    k += 1
-                renamed[name] = f"{stem}_{k}"
+        model, renamed = self.model, {name: name for name in self.new}
+        taken = {parameter.name for parameter in now.parameters}
+        for name in (each for each in self.new if each in taken):
+            (renamed[name],) = fresh_names(name.rpartition("_")[0], 1, {*taken, *renamed.values()})
         change = {symbol(old): symbol(new) for old, new in renamed.items() if old != new}
 
-        def merge(theirs: sympy.Expr, old: sympy.Expr, ours: sympy.Expr) -> sympy.Expr:
+        def merged(theirs: sympy.Expr, old: sympy.Expr, ours: sympy.Expr) -> sympy.Expr:
             return ours + (theirs - old).xreplace(change)
 
-        count = len(before.parameters)
-        equations = [
-            merge(t, o, n)
-            for t, o, n in zip(
-                model.equations[: before.dimension], before.equations, now.equations, strict=True
-            )
-        ]
-        outputs = [
-            (name, merge(t, o, n))
-            for (name, t), (_, o), (_, n) in zip(model.outputs, before.outputs, now.outputs, strict=True)
-        ]
-        new = tuple(replace(p, name=renamed[p.name]) for p in model.parameters[count:])
+        rows = itertools.zip_longest(
+            model.equations, before.equations, now.equations, fillvalue=sympy.Integer(0)
+        )
+        measured = zip(model.outputs, before.outputs, now.outputs, strict=True)
+        new = (replace(p, name=renamed[p.name]) for p in model.parameters[len(before.parameters) :])
         return replace(
             self,
             model=replace(
                 model,
-                equations=(
-                    *equations,
-                    *(each.xreplace(change) for each in model.equations[before.dimension :]),
-                ),
-                outputs=tuple(outputs),
+                equations=tuple(merged(*each) for each in rows),
+                outputs=tuple((name, merged(t, o, n)) for (name, t), (_, o), (_, n) in measured),
                 parameters=(*now.parameters, *new),
             ),
             changes=tuple((name, formula.xreplace(change)) for name, formula in self.changes),
@@ -278,22 +259,26 @@ class MechanismCandidate:
         )
 
 
-def with_added(
+def added(
     model: Dynamics,
     equations: Mapping[str, sympy.Expr],
     outputs: Mapping[str, sympy.Expr],
     parameters: Sequence[Parameter],
-) -> Dynamics:
-    """A model with formulas added to equations and outputs, by name, and with further parameters."""
-    zero = sympy.Integer(0)
-    return replace(
-        model,
-        parameters=(*model.parameters, *parameters),
-        equations=tuple(
-            before + equations.get(name, zero)
-            for name, before in zip(model.states, model.equations, strict=True)
+    **about: Any,
+) -> MechanismCandidate:
+    """A candidate that adds formulas to equations and outputs, by name; its parameters are amplitudes."""
+    rows = zip(model.states, model.equations, strict=True)
+    return MechanismCandidate(
+        model=replace(
+            model,
+            parameters=(*model.parameters, *parameters),
+            equations=tuple(before + equations.get(name, 0) for name, before in rows),
+            outputs=tuple((name, before + outputs.get(name, 0)) for name, before in model.outputs),
         ),
-        outputs=tuple((name, before + outputs.get(name, zero)) for name, before in model.outputs),
+        amplitudes=tuple(each.name for each in parameters),
+        equations=tuple(equations),
+        changes=tuple({**equations, **outputs}.items()),
+        **about,
     )
 
 
@@ -324,9 +309,8 @@ def build_candidate(
     before = dict(zip(model.states, model.equations, strict=True))
     changes = [(name, formula) for name, formula in equations.items() if formula != before[name]]
     for role, text in form.terms.items():
-        added = parse(text)
-        equations[assignment[role]] += added
-        changes.append((assignment[role], added))
+        equations[assignment[role]] += parse(text)
+        changes.append((assignment[role], parse(text)))
     for role, text in form.outputs.items():
         outputs[assignment[role]] = parse(text, **{role: outputs[assignment[role]]})
         changes.append((assignment[role], outputs[assignment[role]]))
@@ -447,9 +431,8 @@ def _labelled(candidate: MechanismCandidate, model: Dynamics) -> MechanismCandid
     return replace(candidate, label=label, equations=places)
 
 
-INDEPENDENCE_TOLERANCE = (
-    1e-6  # of a column's length, left by others: between rounding and what any shape leaves
-)
+# Of a column's length, left by others: between rounding and what any shape leaves.
+INDEPENDENCE_TOLERANCE = 1e-6
 
 
 def _beyond_parameters(
@@ -467,7 +450,7 @@ def _beyond_parameters(
     by_parameter = model.functions.slopes(x, signals, values)[1]
     outputs_by_parameter = model.functions.output_slopes(x, signals, values)[1]
     own = np.concatenate([by_parameter, outputs_by_parameter]).swapaxes(1, 2)
-    own = own.reshape(own.shape[0] * count, len(model.free))
+    own = own.reshape(len(own) * count, len(model.free))
     result: list[MechanismCandidate | None] = []
     for each in candidates:
         new = _new_columns(own, _columns(model, each, x, signals, values))
@@ -544,10 +527,9 @@ def _typical(shape: Shape, model: Dynamics, x: np.ndarray, signals: Signals) -> 
     text = shape.scale_of or shape.inverse_scale_of or shape.quantiles_of
     if text is None:
         return at if at > 0 else 1.0
-    names = [*(symbol(name) for name in model.states), *(symbol(entry.name) for entry in model.inputs), TIME]
-    course = compile_values([parse_formula(text, model.names)], names, common=False)(
-        *x, *signals.inputs, signals.t
-    )[0]
+    names = [symbol(name) for name in (*model.states, *(entry.name for entry in model.inputs), "t")]
+    compiled = compile_values([parse_formula(text, model.names)], names, common=False)
+    (course,) = compiled(*x, *signals.inputs, signals.t)
     return float(_sized(shape, np.array(at), np.broadcast_to(course, x.shape[1:])))
 
 
@@ -597,9 +579,8 @@ def candidates_of(
 ) -> list[MechanismCandidate]:
     """Every place at which a mechanism of the dictionary may be at work in a system.
 
-    Process noise is not among them: it changes no equation (`siq.inference.maximum_likelihood` has it). Nor
-    is what the simulation's own parameters can do (`siq.diagnosis.mechanisms`), which no recording could tell
-    from other values of these.
+    Process noise is not among them: it changes no equation. Nor is what the simulation's own parameters can
+    do, which no recording could tell from other values of these.
 
     Raises
     ------
@@ -632,8 +613,8 @@ def candidates_of(
     for each, filled in models.values():
         label = each.label
         if by_label[label] > 1:
-            added = "; ".join(str(formula) for _, formula in each.changes)
-            label = f"{label} ({filled if by_roles[label, filled] == 1 else added})"
+            formulas = "; ".join(str(formula) for _, formula in each.changes)
+            label = f"{label} ({filled if by_roles[label, filled] == 1 else formulas})"
         result.append(replace(each, label=label))
     return result
 
@@ -659,19 +640,13 @@ def generic_candidates(
             units = {f"_{k}": unit for k, unit in enumerate(model.units)}
             per = "*".join(f"_{k}**{power}" for k, power in enumerate(powers) if power)
             unit = unit_of(f"_{place}/_t" + (f"/({per})" if per else ""), {**units, "_t": model.time_unit})
-            added = {name: symbol(new) * monomial}
+            among = ", ".join(s for s, p in zip(model.states, powers, strict=True) if p)
             found.append(
-                MechanismCandidate(
-                    name=GENERIC,
-                    label=f"{GENERIC} {monomial} in {name}",
-                    model=with_added(model, added, {}, [Parameter(new, 0.0, unit)]),
-                    amplitudes=(new,),
-                    equations=(name,),
-                    coordinate=", ".join(s for s, p in zip(model.states, powers, strict=True) if p)
-                    or "constant",
-                    changes=tuple(added.items()),
+                added(
+                    model, {name: symbol(new) * monomial}, {}, [Parameter(new, 0.0, unit)],
+                    name=GENERIC, label=f"{GENERIC} {monomial} in {name}", coordinate=among or "constant",
                 )
-            )
+            )  # fmt: skip
     have_names = {_added_square(each) for each in named} - {None}
     found = [each for each in found if _added_square(each) not in have_names]
     return [each for each in _beyond_parameters(model, found) if each is not None]

@@ -84,8 +84,8 @@ class _MissingEffect:
         effect = own[:, tested[: len(linear)]] @ values[tested[: len(linear)]]
         left = white.innovations - own @ change
         self.correlated = correlation_time_of(left, white.recording, outputs=len(fit.model.outputs))
-        self._target = self.projected((left + effect)[:, None])[:, 0]
-        self._freedom = (white.degrees_of_freedom - len(rest)) / self.correlated
+        self.target = self.projected((left + effect)[:, None])[:, 0]
+        self.freedom = (white.degrees_of_freedom - len(rest)) / self.correlated
         self._columns = self.projected(own[:, tested])
 
     def projected(self, columns: np.ndarray) -> np.ndarray:
@@ -97,18 +97,14 @@ class _MissingEffect:
 
         An amplitude has the size that the effect has; a shape may be off by as much as it is.
         """
-        total = float(self._target @ self._target)
+        total = float(self.target @ self.target)
         gram = self._columns.T @ self._columns
         own = np.diag(gram)[: self._linear]
         unit, wide = np.zeros(len(gram)), np.zeros(len(gram))
         unit[: self._linear] = 1.0 / np.where(own > 0, own, np.inf) / self._linear
         wide[self._linear :] = self._values[self._linear :] ** 2
         priors = [np.diag(size * unit + wide) for size in sizes_of_effects(total)]
-        return averaged_evidence(gram, self._columns.T @ self._target, priors, total, self._freedom)
-
-    def log_evidence_of_function(self, columns: np.ndarray, knots: np.ndarray) -> float:
-        """The log-likelihood of a smooth function, averaged likewise; see `evidence_of_function`."""
-        return evidence_of_function(self.projected(columns), self._target, knots, freedom=self._freedom)
+        return averaged_evidence(gram, self._columns.T @ self.target, priors, total, self.freedom)
 
 
 def _log_odds_of_a_name(fit: Fit, candidates: Sequence[MechanismCandidate], context: FitContext) -> float:
@@ -125,7 +121,9 @@ def _log_odds_of_a_name(fit: Fit, candidates: Sequence[MechanismCandidate], cont
         ours = problem.log_evidence_of_mechanisms()
         further = white.columns[:, len(fit.model.free) :]
         theirs += [
-            problem.log_evidence_of_function(further[:, group], place.knots)
+            evidence_of_function(
+                problem.projected(further[:, group]), problem.target, place.knots, freedom=problem.freedom
+            )
             for place, group in zip(some, groups, strict=True)
             if np.isfinite(further[:, group]).all()
         ]
@@ -199,33 +197,15 @@ def _best_shares(effects: np.ndarray, groups: Sequence[np.ndarray], most: int) -
     return 1 - (left**2).sum(axis=0) / size
 
 
-@dataclass(frozen=True)
-class _ResidualModelComparison:
-    """How likely a mechanism is where something is left, and what was fitted to know it.
-
-    Attributes
-    ----------
-    log_odds
-        Logarithm of the odds that it is the mechanism, rather than a function in its place.
-    on_top
-        Functions on top of the mechanism.
-    instead
-        Functions in its place, alone and with another on top.
-    predicts_better
-        Whether an explanation with the mechanism predicts parts left out better than every one without it, by
-        more than appears by chance; asked only where the odds decide nothing.
-    """
-
-    log_odds: float
-    on_top: tuple[AugmentedModel, ...]
-    instead: tuple[AugmentedModel, ...]
-    predicts_better: bool = False
-
-
 def _residual_model_comparison(
     trial: FittedCandidate, recalibrated: Fit, context: FitContext
-) -> _ResidualModelComparison | None:
-    """Hold a mechanism against functions in its place, whatever else is missing being a function for both."""
+) -> tuple[float, bool, tuple[AugmentedModel, ...], tuple[AugmentedModel, ...]] | None:
+    """Hold a mechanism against functions in its place, whatever else is missing being a function for both.
+
+    Returned are the log-odds that it is the mechanism; whether, where these decide nothing, an explanation
+    with it predicts parts left out better than every one without it, by more than appears by chance;
+    functions on top of it; and functions in its place, alone and with another on top.
+    """
     if trial.fit.has_process_noise or trial.fit.model.dimension > recalibrated.model.dimension:
         return None
     data, options = context.data, context.study.search
@@ -266,7 +246,7 @@ def _residual_model_comparison(
             blocks.append(None if least_error is None else in_blocks(least_error))
         predicts_better = None not in blocks and change_between(*blocks) == "better"
         LOGGER.info("parts left out are predicted better with it: %s", predicts_better)
-    return _ResidualModelComparison(log_odds, tuple(on_top), tuple(instead), predicts_better)
+    return log_odds, predicts_better, tuple(on_top), tuple(instead)
 
 
 @dataclass(frozen=True)
@@ -407,23 +387,22 @@ def decide_naming(
     """
     least = context.study.search.least_log_odds
     decision = _judge_mechanisms(whole, left, context, generator=generator)
-    compared: _ResidualModelComparison | None = None
+    compared = None
     # Only few functions are fitted; along the trajectories of a fit all are compared. Where these speak
     # against the name as clearly as something would have to speak for it, the few prove nothing.
     if not decision.convincing and _log_odds(whole, 1, [0], context) > -least:
         compared = _residual_model_comparison(whole.found[0].best, whole.recalibrated, context)
-    if compared is not None and (compared.log_odds >= least or compared.predicts_better):
-        first, odds = replace(whole, found=whole.found[:1], fit=whole.found[0].best.fit), compared.log_odds
+    odds, predicts_better, on_top, instead = compared or (-np.inf, False, None, None)
+    if odds >= least or predicts_better:
+        first = replace(whole, found=whole.found[:1], fit=whole.found[0].best.fit)
         decision = replace(
             decision, search=first, remainder=left[0], log_odds=(odds,), convincing=True,
             verdict=MismatchVerdict.MISSING_PHYSICS, remarks=(_remainder_remark(left[0], unnamed=True),),
         )  # fmt: skip
     search = decision.search
     if not decision.verdict.names:
-        instead = None if compared is None else compared.instead
         return replace(decision, models=fit_unnamed_models(search, context, functions=instead))
     if len(whole.found) > len(search.found) or decision.remainder.doubtful or search.fit.has_process_noise:
-        on_top = None if compared is None else compared.on_top
         models = fit_models_of_remainder(search, whole, context, functions=on_top)
         decision = replace(decision, models=models)
     with context.budget.exempt():

@@ -19,7 +19,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from siq.diagnosis.evidence import BUDGET_SPENT, NUMERICAL_ERRORS, NotFitted, orthonormal
+from siq.diagnosis.evidence import BUDGET_SPENT, NUMERICAL_ERRORS, OVERFLOWS, NotFitted, orthonormal
 from siq.diagnosis.mechanisms import MechanismCandidate, along, places_of
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent, evaluation
@@ -253,7 +253,6 @@ LEAST_PORTION = 10  # columns
 NEGATIVE_ERRORS = 2.0  # standard errors below zero, from which on an amplitude is taken for negative
 COLLINEAR = 0.02  # share of a column left by the parameters, below which its amplitude knows no bounds
 PROBE_SUBSTEPS = 2  # what a little of a mechanism does need not be known to many digits
-OVERFLOWS = "its effect along the recorded motion is beyond all numbers"
 AnyTerm = TypeVar("AnyTerm", bound=Term)
 
 

@@ -38,17 +38,9 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Why a mechanism is believed; None where a test does not apply.
+    """Why a mechanism is believed (`siq.diagnosis.evidence.FittedCandidate`); None where no test applies.
 
-    Attributes
-    ----------
-    delta_chi2, delta_bic
-        What it gains, see `siq.diagnosis.evidence.FittedCandidate`.
-    p_white, p_cluster
-        Probabilities of as much by chance: if all errors are independent, and whatever errors within a
-        recording have to do with each other.
-    log_odds
-        Logarithm of the odds that it is this mechanism, rather than a function without a name.
+    The log-odds are those that it is this mechanism, rather than a function without a name.
     """
 
     delta_chi2: float | None
@@ -65,19 +57,10 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Alternative:
-    """A mechanism that was fitted in the place of one that was found.
+    """A mechanism that was fitted in the place of one that was found; its gain is over the same simulation.
 
-    Attributes
-    ----------
-    name, label
-        As of `StatedTerm`.
-    delta_chi2
-        What it gains, compared with the same simulation.
-    further_parameters
-        How many more it has than the one that was found.
-    standing
-        ``same``: it explains the recordings as well. ``needless``: it explains as much, with further
-        parameters that gain no more than they would by chance. ``less``: it explains less.
+    It has so many further parameters. It explains the recordings as well (``same``); as much, with further
+    parameters that gain no more than they would by chance (``needless``); or less (``less``).
     """
 
     name: str
@@ -89,15 +72,7 @@ class Alternative:
 
 @dataclass(frozen=True)
 class DescribedCurve:
-    """A function of one coordinate with its band.
-
-    Attributes
-    ----------
-    coordinate
-        Of which it is a function.
-    at, value, standard_error
-        In the units of the card; each as long.
-    """
+    """A function of one coordinate with its standard errors, in the units of the card; each as long."""
 
     coordinate: str
     at: tuple[float, ...]
@@ -107,16 +82,10 @@ class DescribedCurve:
 
 @dataclass(frozen=True)
 class DescribedSurface:
-    """A function of two coordinates on a grid, with its standard errors.
+    """A function of two coordinates with its standard errors, in the units of the card.
 
-    Attributes
-    ----------
-    coordinates
-        Of which it is a function.
-    at
-        The grid, along the first and along the second of them, in the units of the card.
-    value, standard_error
-        A row for each place along the first coordinate.
+    It is given on a grid, along the first and along the second of them; values have a row for each place
+    along the first.
     """
 
     coordinates: tuple[str, str]
@@ -136,24 +105,21 @@ class StatedTerm:
     kind
         ``mechanism``: one of the dictionary. ``formula``: a sum of a few powers. ``curve``, ``surface``: a
         smooth function of one coordinate, or of two, as a sum of Gaussian bumps.
-    terms
-        Formula that is added, by equation; see `siq.diagnosis.mechanisms.MechanismCandidate.changes`.
-    parameters
-        Those that it brings.
-    evidence
-        Why it is believed.
-    equations
-        States in whose equations it changes something; none for a fault of the sensor.
-    beside
-        Labels of what was in place when it was judged.
+    terms, parameters
+        What is added, by equation; see `siq.diagnosis.mechanisms.MechanismCandidate.changes`; and what it
+        brings.
+    evidence, beside
+        Why it is believed, and labels of what was in place when it was judged.
+    equations, outputs
+        States in whose equations it changes something; or what is measured otherwise, for a fault of a
+        sensor.
     share_of_excess, indistinguishable_from, rivals
         Of a mechanism that was found: what all mechanisms together explain of the excess over noise; names of
         mechanisms that explain the recordings as well, None where it is not named itself; and what else was
         fitted in its place, the one that gains most first.
-    outputs, coordinates, curve, surface
-        Of a part of a model: what is measured otherwise, for a fault of the sensor; what it depends on; and
-        its values, where it is a function of one coordinate or a surface. A curve in two coordinates is the
-        coefficient of the second.
+    coordinates, curve, surface
+        Of a part of a model: what it depends on; and its values, where it is a function of one coordinate or
+        a surface. A curve in two coordinates is the coefficient of the second.
     """
 
     name: str
@@ -188,22 +154,19 @@ class Description:
 
     Attributes
     ----------
-    share_described
-        Share of the excess that the mechanisms in `by` describe.
-    by
-        Mechanisms that explain a part, and are not named.
+    share_described, by
+        Share of the excess that these mechanisms describe, which explain a part and are not named.
     p_residuals_random
         p-value of the test that what is left is noise: how often noise alone would look as structured.
     random_forces_admitted
         Whether the fit needed process noise.
     too_faint
-        Whether the mechanisms in `by` explain enough, and are not named since a function without a name is
-        nearly as likely.
+        Whether the mechanisms explain enough, and a function without a name is nearly as likely.
     p_alike
         Probability that as many mechanisms explain as much of an effect that has no name; None where nothing
         is left.
     misleading
-        Whether the mechanisms in `by` are not named since recordings held out are predicted worse with them.
+        Whether the mechanisms are not named since recordings held out are predicted worse with them.
     """
 
     share_described: float
@@ -241,22 +204,17 @@ class Location:
 
     Attributes
     ----------
-    equations
-        Share of each equation in the excess, largest first; empty for a fault of a sensor.
-    coordinate
+    equations, outputs
+        Share of each equation in the excess, largest first; or what is measured otherwise, for a fault of a
+        sensor.
+    coordinate, unit
         Along which it acts.
     region
         The part of the coordinate's range where it can be seen, by coordinate.
     time
         First and last time of it, where it acts along time only.
-    recordings
-        Labels of those that show it.
-    recordings_total
-        How many it was sought in.
-    outputs
-        What is measured otherwise, for a fault of a sensor.
-    unit
-        Of the coordinate.
+    recordings, recordings_total
+        Labels of those that show it, and how many it was sought in.
     """
 
     equations: dict[str, float]
@@ -275,26 +233,19 @@ class Statement:
 
     Attributes
     ----------
-    verdict
-        One of four.
-    mechanisms
-        What is named.
-    description
-        Of a mismatch without a name.
-    described
-        The model of what has no name that is part of the new card; empty where nothing that was added helped.
+    verdict, mechanisms
+        One of four, and what is named.
+    description, described
+        Of a mismatch without a name; and the model of it that is part of the new card, empty where nothing
+        that was added helped.
     location
         Where the mismatch sits, if there is one.
-    recalibration
-        The simulation's own parameters.
-    errors
-        On held-out recordings.
+    recalibration, errors
+        The simulation's own parameters, and errors on held-out recordings.
     excluded
         Bounds of what was not found, where nothing is missing.
-    remarks
-        Reservations.
-    not_fitted
-        What could not be judged.
+    remarks, not_fitted
+        Reservations, and what could not be judged.
     explanations
         Logarithms of the marginal likelihoods of whole explanations, less that of the likeliest, which is the
         first; see `siq.diagnosis.evidence.log_evidences`.
@@ -323,7 +274,7 @@ class Statement:
     @property
     def not_tried(self) -> tuple[str, ...]:
         """Labels of the mechanisms that the budget did not reach."""
-        return tuple(each.label for each in self.not_fitted if each.reason == BUDGET_SPENT)
+        return tuple(each.label for each in self.not_fitted if each.remark.code == BUDGET_SPENT)
 
     @property
     def random_forces(self) -> bool:
@@ -364,6 +315,8 @@ class Statement:
         data["explanations"] = [
             {"what": what, "log_evidence": value} for what, value in data["explanations"].items()
         ]
+        for each, stated in zip(data["not_fitted"], self.not_fitted, strict=True):
+            each["reason"] = stated.reason
         data["fit"] = {"metric": METRIC} | data.pop("errors")
         data |= {"partial": self.partial, "not_tried": list(self.not_tried), "budget": data.pop("account")}
         data["remark_codes"] = data.pop("remarks")

@@ -221,18 +221,9 @@ def _measurements_of(recordings: Recordings | pd.DataFrame | str | Path, system:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What is compared with what.
+    """What is compared with what: the simulation, recordings to learn from, and those held out.
 
-    Attributes
-    ----------
-    system
-        The simulation.
-    learn, kept
-        Recordings to learn from, and those held out.
-    settings
-        How to go about it.
-    dictionary
-        The mechanisms that may be named.
+    The settings say how, and the dictionary has the mechanisms that may be named.
     """
 
     system: Dynamics
@@ -251,16 +242,8 @@ def comparison_of(
 ) -> Comparison:
     """Check a simulation, recordings and settings against each other.
 
-    Parameters
-    ----------
-    system
-        The simulation. A state needs no domain; the recordings tell where it lies.
-    recordings
-        With a column for each output and each input.
-    settings
-        What is held out, what is known of the noise, and what counts as found.
-    file
-        What messages about the settings call them.
+    Recordings have a column for each output and each input. A state needs no domain; the recordings tell
+    where it lies. Messages about the settings call them `file`.
 
     Raises
     ------

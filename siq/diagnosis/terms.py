@@ -20,7 +20,7 @@ import sympy
 
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
 from siq.diagnosis.evidence import correlation_time_of, evidence_of_function
-from siq.diagnosis.mechanisms import FORMULA, MechanismCandidate, along, fresh_names, with_added
+from siq.diagnosis.mechanisms import FORMULA, MechanismCandidate, added, along, fresh_names
 from siq.diagnosis.screening import Entry, Probe, Projection, Ranked, Trajectories, linearised_with, rank
 from siq.inference.kalman_filter import whiten
 from siq.inference.maximum_likelihood import Fit
@@ -142,39 +142,31 @@ class Place:
         self, model: Dynamics, formula: sympy.Expr, names: Sequence[str], units: Sequence[str]
     ) -> MechanismCandidate:
         """A simulation with a formula here, whose amplitudes have names and units."""
-        added = {name: formula * factor for name, factor in self.equations}
-        read = {name: formula * factor for name, factor in self.outputs}
         parameters = [Parameter(name, 0.0, unit) for name, unit in zip(names, units, strict=True)]
         name = f"a function of {' and '.join(self.words)}"
-        where = f"{'the measurement of ' if self.outputs else ''}{', '.join(self.targets)}"
-        return MechanismCandidate(
+        return added(
+            model,
+            {name: formula * factor for name, factor in self.equations},
+            {name: formula * factor for name, factor in self.outputs},
+            parameters,
             name=name,
-            label=f"{name} in {where}",
-            model=with_added(model, added, read, parameters),
-            amplitudes=tuple(names),
-            equations=tuple(name for name, _ in self.equations),
+            label=f"{name} in {'the measurement of ' if self.outputs else ''}{', '.join(self.targets)}",
             coordinate="measurement" if self.outputs else ", ".join(self.words),
-            changes=tuple({**added, **read}.items()),
             kind=FORMULA,
             place=self,
         )
 
     def unit(self, model: Dynamics, first: int, second: int) -> str:
         """Unit of the coefficient of a term with so many factors of either coordinate."""
-        known = units_of(model)
-        units = {"_t": model.time_unit}
-        if (
-            len(self.equations) > 1
-        ):  # of a rotating frame: the function is multiplied by the states themselves
-            first_unit = known.get(self.words[0], known[self.targets[0]])
-            units |= {"_whole": "1", "_first": first_unit}
+        known, (word, *further) = units_of(model), self.words
+        target = self.targets[0] if self.equations else word
+        if len(self.equations) > 1:  # of a rotating frame: it is multiplied by the states themselves
+            whole, first_unit = "1", known.get(word, known[target])
         else:
-            target = self.targets[0] if self.equations else self.words[0]
-            units |= {"_whole": known.get(target, "1"), "_first": known.get(self.words[0], "1")}
-        factor = self.words[1] if len(self.words) > 1 else ""
-        units["_second"] = known.get(self.targets[0] if factor == "amplitude" else factor, "1")
-        per = "/_t" if self.equations else ""
-        return unit_of(f"_whole{per}/_first**{first}/_second**{second}", units)
+            whole, first_unit = known.get(target, "1"), known.get(word, "1")
+        factor = target if further == ["amplitude"] else "".join(further)
+        units = {"_t": model.time_unit, "_w": whole, "_1": first_unit, "_2": known.get(factor, "1")}
+        return unit_of(f"_w{'/_t' if self.equations else ''}/_1**{first}/_2**{second}", units)
 
 
 def _amplitude(first: str, second: str) -> sympy.Expr:

@@ -117,12 +117,7 @@ def runs_freely(fit: Fit, alone: Fit, data: Measurements) -> bool:
 
 
 def _fitted_term(
-    candidate: MechanismCandidate,
-    level: float,
-    fit: Fit,
-    context: FitContext,
-    *,
-    begin: Fit | None = None,
+    candidate: MechanismCandidate, level: float, fit: Fit, context: FitContext, *, begin: Fit | None = None
 ) -> list[FittedCandidate]:
     """A function as part of a model, or nothing where it cannot be fitted."""
     kind, data, budget = candidate.kind, context.data, context.budget
@@ -133,30 +128,23 @@ def _fitted_term(
             known = {each.name: each.value for each in begun.model.parameters}
             new = candidate.new
             known |= {each.name: each.value for each in candidate.model.parameters if each.name in new}
-            values = np.array([known.get(each.name, 0.0) for each in candidate.model.parameters])
+            values = [known.get(each.name, 0.0) for each in candidate.model.parameters]
+            model = candidate.model.with_values(np.array(values))
             if not begun.has_process_noise:  # a function that was nearly right may lead no further
                 begun = replace(begun, noise=replace(begun.noise, process=fit.noise.process))
-            trial = fit_with_process_noise_as_needed(
-                candidate.model.with_values(values), data, begun, level=level, budget=budget
-            )
+            trial = fit_with_process_noise_as_needed(model, data, begun, level=level, budget=budget)
             # A function may be steeper than the simulation, whose steps are then too long to follow it.
             needed = substeps_needed(trial.model, data, trial.model.values, trial.x, tolerance=SUBSTEP_ERROR)
             if trial.converged and needed > trial.substeps:
                 finer = replace(trial, substeps=needed)
                 trial = fit_with_process_noise_as_needed(trial.model, data, finer, budget=budget)
-            if (
-                not (trial.has_process_noise or fit.has_process_noise)
-                and trial.log_likelihood < fit.log_likelihood
-            ):
+            forced = trial.has_process_noise or fit.has_process_noise
+            if not forced and trial.log_likelihood < fit.log_likelihood:
                 # Nothing added is as likely as that: steps of all samples at once have led away.
                 damped = fit_trajectories(
-                    candidate.model.with_values(values),
-                    data,
-                    begin=begun.x[data.first[:-1]],
-                    noise=begun.noise.of_states(candidate.model.dimension),
-                    substeps=trial.substeps,
-                    budget=budget,
-                )
+                    model, data, begin=begun.x[data.first[:-1]],
+                    noise=begun.noise.of_states(model.dimension), substeps=trial.substeps, budget=budget,
+                )  # fmt: skip
                 trial = preferred_fit(trial, damped)
             if not trial.converged:
                 raise NumericalFailure(trial.fault or "its fit does not settle")

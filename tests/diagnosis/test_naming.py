@@ -134,11 +134,13 @@ def test_a_name_stands_beside_a_rest_where_no_function_does_as_well_in_its_place
     cost = 1.0 + np.log(10)
     best = max(on_top - cost if on_top else 0.0, 12.0)
     expected = best + np.log(0.9) - np.log(2 * 2) - max(instead - cost, pairs - 2 * cost)
-    assert found is not None and found.log_odds == pytest.approx(expected)
-    assert bool(found.log_odds >= np.log(19)) is given
-    undecided = abs(found.log_odds) < context.study.search.least_log_odds
+    assert found is not None
+    log_odds, predicts_better, *_ = found
+    assert log_odds == pytest.approx(expected)
+    assert bool(log_odds >= np.log(19)) is given
+    undecided = abs(log_odds) < context.study.search.least_log_odds
     # Functions on top of the mechanism foresee as badly as those in its place here.
-    assert found.predicts_better is (undecided and foreseen == 0.5)
+    assert predicts_better is (undecided and foreseen == 0.5)
 
 
 def test_what_random_forces_stand_in_for_has_no_model_beside_which_a_name_could_stand() -> None:

@@ -395,7 +395,8 @@ def test_a_simulation_that_cannot_be_fitted_has_a_page(models):
 
 
 def test_what_could_not_be_judged_is_on_the_page(models):
-    further = {"not_fitted": [{"mechanism": "m", "label": "drag in v", "reason": "it overflows"}]}
+    remark = {"code": "diagnosis.fit_failed", "values": {"error": "", "message": "it overflows"}}
+    further = {"not_fitted": [{"mechanism": "m", "label": "drag in v", "remark": remark}]}
     page = mismatch_page(findings(models, verdict=further), title="t", commands=())
     assert "Drag in v could not be judged: it overflows." in page
 
