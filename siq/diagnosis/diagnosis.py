@@ -251,10 +251,10 @@ def solve_case(
     except NUMERICAL_ERRORS as error:
         raise NumericalFailure(f"the simulation cannot be fitted to the recordings: {error}") from error
     final, model = found.final, found.final.model
-    if shown.described_fit is not None and shown.adopted:
-        final, model = shown.described_fit, shown.model
+    if shown.described is not None:
+        final, model = shown.fit, shown.fit.model
     elif found.verdict.names:
-        model = shown.model
+        model = shown.fit.model
     process = final.noise.process if found.process_noise else None
     recalibrated = found.search.recalibrated
     return Diagnosis(
@@ -291,11 +291,11 @@ def tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
     case, found, shown = diagnosis.case, diagnosis.investigation, diagnosis.held_out
     recalibrated, data = found.search.recalibrated, case.kept
     curves = [
-        (", ".join(each.place.targets), each.place.words[0], each.place.across, *point,
+        (", ".join(each.term.targets), each.term.words[0], each.term.across, *point,
          each.gain, each.p_value, stage)
         for stage, structure in (("before", found.remainder.before), ("after", found.remainder.after))
         for each in structure.curves
-        for point in zip(each.place.knots, each.values, each.standard_errors, strict=True)
+        for point in zip(each.term.knots, each.amplitudes, each.standard_errors, strict=True)
     ]  # fmt: skip
     held_out = [
         pd.DataFrame(

@@ -173,49 +173,23 @@ def probability_by_chance(
 ) -> float:
     """Probability of a mechanism by chance, where errors of a recording are autocorrelated.
 
-    Among many recordings, at least half of `blocks`, each counts as one (`_clustered_probability`). Of a few,
-    blocks are too few to know a covariance from them; how long errors are correlated is known all the same
-    (`_correlated_probability`), if there is a fit without the mechanism.
+    Of recordings fewer than half of `blocks`, a covariance cannot be known; how long errors are correlated is
+    known all the same (`_correlated_probability`). Else it is a Wald test with the covariance of the scores
+    of whole recordings in the place of that of white errors. The residuals are those with the mechanism, so
+    that a real effect does not inflate its own error. Few recordings in which there is process noise, or of
+    which there is no fit without the mechanism, are cut into at least `blocks`, of several correlation times
+    each.
     """
-    many = len(data.labels) >= blocks // 2
-    if before is None or many or fit.has_process_noise or before.has_process_noise:
-        return _clustered_probability(fit, data, candidate, blocks=blocks)
-    gained = 2 * (fit.log_likelihood - before.log_likelihood)
-    return _correlated_probability(fit, data, candidate, gained=gained)
-
-
-def _correlated_probability(
-    fit: Fit, data: Measurements, candidate: MechanismCandidate, *, gained: float
-) -> float:
-    """Probability by chance of a gain in twice the log-likelihood, where errors are autocorrelated.
-
-    It weighs less by their correlation time. Places at which a shape was looked for are chances, too.
-    """
-    white, _, left = residuals(fit, data)
-    weights = np.bincount(white.recording)
-    times = [_correlation_time(left[white.recording == place]) for place in range(len(weights))]
-    together = float(np.average(times, weights=weights))
-    places = [each.frequencies or len(each.at) for each in candidate.searches]
-    alone = float(scipy.stats.chi2.sf(max(gained, 0.0) / together, max(len(candidate.new), 1)))
-    return min(1.0, float(np.prod(places)) * alone)
-
-
-def _clustered_probability(
-    fit: Fit, data: Measurements, candidate: MechanismCandidate, *, blocks: int
-) -> float:
-    """Probability of a mechanism by chance, whatever errors within a recording are like.
-
-    A Wald test with the covariance of the scores of whole recordings in the place of that of white errors.
-    The residuals are those with the mechanism, so that a real effect does not inflate its own error. Where
-    there are fewer recordings than half of `blocks` they are cut into at least that many, of several
-    correlation times each.
-    """
+    few = len(data.labels) < blocks // 2
+    if few and not (before is None or fit.has_process_noise or before.has_process_noise):
+        gained = 2 * (fit.log_likelihood - before.log_likelihood)
+        return _correlated_probability(fit, data, candidate, gained=gained)
     white, change, left = residuals(fit, data)
     names = [fit.model.parameters[place].name for place in fit.model.free]
     tested = np.array([names.index(name) for name in (candidate.amplitudes or candidate.shapes)], dtype=int)
     values = fit.model.values[[fit.model.free[place] for place in tested]] + change[tested]
     owner = white.recording
-    if len(data.labels) < blocks // 2:
+    if few:
         owner = _blocks_of(owner, left, least=blocks)
     others = np.setdiff1d(np.arange(white.columns.shape[1]), tested)
     nuisance = np.linalg.qr(white.columns[:, others])[0] if len(others) else np.zeros((len(left), 0))
@@ -233,6 +207,22 @@ def _clustered_probability(
     statistic = float(weighted @ np.linalg.lstsq(spread, weighted, rcond=1e-10)[0])
     factor = (count - width) / (width * (count - 1))
     return float(scipy.stats.f.sf(statistic * factor, width, count - width))
+
+
+def _correlated_probability(
+    fit: Fit, data: Measurements, candidate: MechanismCandidate, *, gained: float
+) -> float:
+    """Probability by chance of a gain in twice the log-likelihood, where errors are autocorrelated.
+
+    It weighs less by their correlation time. Places at which a shape was looked for are chances, too.
+    """
+    white, _, left = residuals(fit, data)
+    weights = np.bincount(white.recording)
+    times = [_correlation_time(left[white.recording == place]) for place in range(len(weights))]
+    together = float(np.average(times, weights=weights))
+    places = [each.frequencies or len(each.at) for each in candidate.searches]
+    alone = float(scipy.stats.chi2.sf(max(gained, 0.0) / together, max(len(candidate.new), 1)))
+    return min(1.0, float(np.prod(places)) * alone)
 
 
 def orthonormal(columns: np.ndarray) -> np.ndarray:

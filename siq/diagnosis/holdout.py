@@ -75,26 +75,17 @@ class HeldOutErrors:
     squares: Mapping[str, tuple[float, ...]] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(
-        cls,
-        runs: Mapping[str, np.ndarray | None],
-        *,
-        noise_floor: float | None = None,
-    ) -> HeldOutErrors:
+    def of(cls, runs: Mapping[str, np.ndarray | None], *, noise_floor: float | None = None) -> HeldOutErrors:
         """From normalised squared errors of the same values, shape ``(values,)``, by the names above.
 
         They are None where the simulation ran away (`siq.inference.trajectories.squared_errors`).
         """
         known = {name: each for name, each in runs.items() if each is not None}
-        errors = {name: float(np.sqrt(each.mean())) for name, each in known.items()}
         return cls(
-            errors.get("before"),
-            errors.get("recalibrated"),
-            errors.get("augmented"),
-            noise_floor,
-            max((len(each) for each in known.values()), default=0),
-            errors.get("named"),
-            {name: in_blocks(each) for name, each in known.items()},
+            **{name: float(np.sqrt(each.mean())) for name, each in known.items()},
+            noise_floor=noise_floor,
+            values=max(map(len, known.values()), default=0),
+            squares={name: in_blocks(each) for name, each in known.items()},
         )
 
     @property

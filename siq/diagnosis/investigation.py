@@ -148,27 +148,23 @@ class HeldOutRuns:
     ----------
     before, recalibrated, augmented
         Outputs ``(n, m)`` of the simulation as it is, with its parameters refitted, and with what was found.
-    model
-        The augmented simulation that was run.
+    fit
+        Of the augmented simulation that was run.
     errors
         Of the three.
     independent
         Whether the recordings are others than those that were learned from, rather than a later part.
-    described, described_fit
-        The model of what has no name that was run, and its estimates; None where nothing was described.
-    adopted
-        Whether that model is part of the new card, since it makes predictions better.
+    described
+        The model of what has no name that is part of the new card, since it makes predictions better.
     """
 
     before: np.ndarray
     recalibrated: np.ndarray
     augmented: np.ndarray
-    model: Dynamics
+    fit: Fit
     errors: HeldOutErrors
     independent: bool = True
     described: AugmentedModel | None = None
-    described_fit: Fit | None = None
-    adopted: bool = False
 
 
 def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRuns:
@@ -241,7 +237,8 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         best = int(np.argmin([mean_error(each) for each in errors]))
         left_out = errors_left_out(without, learned, noise=noise, candidates=names)
         adopted = best if first_better(left_out, [errors[best]], [0.0]) == 0 else None
-    described, fit = (None, plain) if named or not choices else choices[0]
+    fit = plain if named or not choices else choices[0][1]
+    described = None
     if adopted is not None:
         described, fit = choices[adopted]
     before, refitted, augmented = (run(each, data) for each in (card, recalibrated, fit))
@@ -259,10 +256,8 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         before=before,
         recalibrated=refitted,
         augmented=augmented,
-        model=fit.model,
+        fit=fit,
         errors=HeldOutErrors.of(squares, noise_floor=floor),
         independent=not set(learned.labels) & set(data.labels),
         described=described,
-        described_fit=fit if described is not None else None,
-        adopted=adopted is not None,
     )

@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
+import scipy.linalg
 import sympy
 
 from siq.diagnosis.dictionary import (
@@ -36,6 +37,7 @@ from siq.diagnosis.dictionary import (
     meetings,
     trial_points,
     unit_of,
+    units_of,
 )
 from siq.errors import InputError
 from siq.inference.maximum_likelihood import Fit
@@ -240,13 +242,9 @@ class MechanismCandidate:
 
     def admits(self, fit: Fit) -> bool:
         """Whether parameters of a fit that may have one sign only have it, or are zero within errors."""
-        names = [fit.model.parameters[place].name for place in fit.model.free]
-        values = fit.model.values[list(fit.model.free)]
-        return not any(
-            values[place] < -2 * fit.standard_errors[place]
-            for place, name in enumerate(names)
-            if name in self.positive
-        )
+        free = (fit.model.parameters[place] for place in fit.model.free)
+        pairs = zip(free, fit.standard_errors, strict=True)
+        return not any(each.value < -2 * error for each, error in pairs if each.name in self.positive)
 
     def repeats(self, found: MechanismCandidate) -> bool:
         """Whether it is what was found already: the same, or in another form at the same place.
@@ -316,9 +314,7 @@ def build_candidate(
         changes.append((assignment[role], outputs[assignment[role]]))
     if tuple(equations.values()) == model.equations and outputs == dict(model.outputs):
         return None
-    known = dict(zip(model.states, model.units, strict=True))
-    known |= {entry.name: entry.unit for entry in model.inputs}
-    known |= {entry.name: entry.unit for entry in model.parameters}
+    known = units_of(model) | {entry.name: entry.unit for entry in model.parameters}
     for name, formula in model.outputs:
         known.setdefault(name, known.get(str(formula), "1"))
     units = {role: known.get(name, "1") for role, name in assignment.items()} | {"T": model.time_unit}
@@ -415,17 +411,11 @@ def _in_names(shape: Shape, names: Mapping[str, sympy.Expr], assignment: Mapping
 def _labelled(candidate: MechanismCandidate, model: Dynamics) -> MechanismCandidate:
     """A candidate with the equations that it changes in a model, which its label tells with its variant."""
     augmented = candidate.model
-    places = tuple(
-        state
-        for state, before, after in zip(model.states, model.equations, augmented.equations, strict=False)
-        if before != after
-    )
-    measured = [
-        output
-        for (output, before), (_, after) in zip(model.outputs, augmented.outputs, strict=True)
-        if before != after
-    ]
-    label = f"{candidate.name} {candidate.variant}".rstrip() + f" in {', '.join(places or measured)}"
+    rows = zip(model.states, model.equations, augmented.equations, strict=False)
+    places = tuple(state for state, before, after in rows if before != after)
+    rows = zip(model.output_names, model.outputs, augmented.outputs, strict=True)
+    label = f"{candidate.name} {candidate.variant}".rstrip() + " in "
+    label += ", ".join(places or [output for output, before, after in rows if before != after])
     if not (places or candidate.variant):
         label += f", by {', '.join(entry.name for entry in augmented.parameters[len(model.parameters) :])}"
     return replace(candidate, label=label, equations=places)
@@ -471,8 +461,7 @@ def _new_columns(own: np.ndarray, columns: np.ndarray) -> list[bool]:
     if whole.sum() <= own.shape[1] + columns.shape[1]:
         return [True] * columns.shape[1]
     own, columns = _of_unit_length(own[whole]), _of_unit_length(columns[whole])
-    left, sizes, _ = np.linalg.svd(own, full_matrices=False)
-    basis = left[:, sizes > INDEPENDENCE_TOLERANCE * sizes.max(initial=0.0)]
+    basis = scipy.linalg.orth(own, INDEPENDENCE_TOLERANCE) if own.shape[1] else own
     new = []
     for column in columns.T:
         rest = column - basis @ (basis.T @ column)
@@ -540,24 +529,19 @@ def _without_amplitudes(
 
     What is left adds to these, so that it may have either sign.
     """
-    zero = dict.fromkeys(map(symbol, names), 0)
+    zero, whole = dict.fromkeys(map(symbol, names), 0), candidate.model
 
     def less(formula: sympy.Expr, before: sympy.Expr | None) -> sympy.Expr:
         left = formula.subs(zero)
         return before if before is not None and sympy.expand(left - before) == 0 else left
 
-    whole = candidate.model
+    rows = itertools.zip_longest(whole.equations, model.equations)
+    measured = zip(whole.outputs, model.outputs, strict=True)
     reduced = replace(
         whole,
         parameters=tuple(each for each in whole.parameters if each.name not in names),
-        equations=tuple(
-            less(formula, before)
-            for formula, before in itertools.zip_longest(whole.equations, model.equations)
-        ),
-        outputs=tuple(
-            (name, less(formula, before))
-            for (name, formula), (_, before) in zip(whole.outputs, model.outputs, strict=True)
-        ),
+        equations=tuple(less(*each) for each in rows),
+        outputs=tuple((name, less(formula, before)) for (name, formula), (_, before) in measured),
     )
     changes = ((name, formula.subs(zero)) for name, formula in candidate.changes)
     left = replace(

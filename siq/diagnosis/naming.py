@@ -25,7 +25,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.special
 
-from siq.diagnosis.dictionary import Roles
 from siq.diagnosis.evidence import (
     NUMERICAL_ERRORS,
     SMOOTH_LENGTHS,
@@ -57,7 +56,6 @@ from siq.errors import NumericalFailure
 from siq.inference.budget import UNLIMITED, Account
 from siq.inference.kalman_filter import Noise, Whitened, solve, whiten
 from siq.inference.maximum_likelihood import Fit
-from siq.inference.measurements import Measurements
 from siq.remarks import Remark
 
 LOGGER = logging.getLogger(__name__)
@@ -148,7 +146,22 @@ def _false_match_rate(
         for probe in Probe.all_of(each, data, context.model, recalibrated.x)
     ]
     noise = Noise(whole.fit.noise.measurement, np.zeros(model.dimension))
-    effects = _drawn_effects(recalibrated, data, context.roles, noise, generator=generator)
+    # Effects of smooth functions at places drawn at random on the innovations.
+    places = places_in(model, context.roles, data, recalibrated.x)
+    counts = iter(generator.multinomial(EFFECTS_DRAWN, np.full(len(places), 1 / max(len(places), 1))))
+    drawn = []
+    for some in portions(recalibrated, data, places):
+        response, slices = linearised_with(recalibrated, data, some)
+        further = whiten(response, data, noise).columns[:, count:]
+        for place, group in zip(some, slices, strict=True):
+            draws, columns = next(counts), further[:, group]
+            if np.isfinite(columns).all():
+                for _ in range(draws):
+                    root = np.linalg.cholesky(smooth_prior(place.knots, generator.choice(SMOOTH_LENGTHS)))
+                    drawn.append(columns @ (root @ generator.normal(size=place.width)))
+    if not drawn:
+        raise NumericalFailure("no effect can be drawn")
+    effects = np.stack(drawn, axis=1)
     response, slices = linearised_with(recalibrated, data, probes)
     white = whiten(response, data, noise)
     own = orthonormal(white.columns[:, :count])
@@ -160,27 +173,6 @@ def _false_match_rate(
     groups = [orthonormal(each - own @ (own.T @ each)) for each in groups if np.isfinite(each).all()]
     best = _best_shares(effects, groups, mechanisms)
     return float((np.sum(best >= share) + 1) / (len(best) + 1))
-
-
-def _drawn_effects(
-    fit: Fit, data: Measurements, roles: Roles, noise: Noise, *, generator: np.random.Generator
-) -> np.ndarray:
-    """Effects of smooth functions at sites drawn at random on the innovations, shape ``(n, draws)``."""
-    places = places_in(fit.model, roles, data, fit.x)
-    if not places:
-        return np.zeros((data.outputs.size, 0))
-    counts = iter(generator.multinomial(EFFECTS_DRAWN, np.full(len(places), 1 / len(places))))
-    drawn = []
-    for some in portions(fit, data, places):
-        response, groups = linearised_with(fit, data, some)
-        further = whiten(response, data, noise).columns[:, len(fit.model.free) :]
-        for place, group in zip(some, groups, strict=True):
-            count, columns = next(counts), further[:, group]
-            if np.isfinite(columns).all():
-                for _ in range(count):
-                    root = np.linalg.cholesky(smooth_prior(place.knots, generator.choice(SMOOTH_LENGTHS)))
-                    drawn.append(columns @ (root @ generator.normal(size=place.width)))
-    return np.stack(drawn, axis=1) if drawn else np.zeros((data.outputs.size, 0))
 
 
 def _best_shares(effects: np.ndarray, groups: Sequence[np.ndarray], most: int) -> np.ndarray:

@@ -26,7 +26,7 @@ import scipy.stats
 
 from siq.diagnosis.dictionary import Roles, roles_of
 from siq.diagnosis.mechanisms import lattice_step
-from siq.diagnosis.screening import Projection, linearised_with, portions
+from siq.diagnosis.screening import Projection, Ranked, linearised_with, portions
 from siq.diagnosis.terms import Place, places_in
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget
@@ -39,34 +39,15 @@ LAGS = 12  # of autocorrelations
 
 
 @dataclass(frozen=True)
-class Curve:
-    """What is missing in an equation along a coordinate, as far as the data tell.
-
-    Attributes
-    ----------
-    place
-        Where.
-    values, standard_errors
-        At the knots, less what the parameters can do, in the unit of the equation; shape ``(k,)``.
-    gain, p_value
-        Decrease of the sum of squared innovations, and the probability of as much by chance.
-    """
-
-    place: Place
-    values: np.ndarray
-    standard_errors: np.ndarray
-    gain: float
-    p_value: float
-
-
-@dataclass(frozen=True)
 class Structure:
     """What residuals show.
 
     Attributes
     ----------
     curves
-        One for every direction, the one that explains most first.
+        What is missing in an equation along a coordinate, for all of them, what explains most first: values
+        at the knots, less what the parameters can do, in the unit of the equation, and the decrease of the
+        sum of squared innovations.
     p_curves, p_autocorrelation
         Probabilities that the best of them is chance, for as many as were tried, and that innovations are as
         correlated in time by chance.
@@ -74,7 +55,7 @@ class Structure:
         Sum of squared innovations and its degrees of freedom, at the measurement noise of the fit.
     """
 
-    curves: tuple[Curve, ...]
+    curves: tuple[Ranked[Place], ...]
     p_curves: float
     p_autocorrelation: float
     total: float
@@ -107,7 +88,7 @@ def _structure_of(data: Measurements, fit: Fit, roles: Roles, *, noise: Noise | 
             rank = int((np.linalg.svd(own, compute_uv=False) > 1e-9 * max(np.abs(own).max(), 1e-300)).sum())
             p_value = float(scipy.stats.chi2.sf(max(gain, 0.0) / scale, max(rank, 1)))
             errors = np.sqrt(np.diag(covariance) * scale)
-            curves.append(Curve(place, values, errors, gain, p_value))
+            curves.append(Ranked(place, gain, 1.0, values, errors, finite=True, p_value=p_value))
     curves.sort(key=lambda each: -each.gain)
     best = min((each.p_value for each in curves), default=1.0)
     return Structure(
@@ -181,7 +162,7 @@ class Remainder:
         # What is left is the excess that remains, or what a function of one coordinate still finds: where a
         # fit without process noise takes a misfit for noise, only the latter shows it.
         best = alone.curves[0] if alone.curves else None
-        systematic = 0.0 if best is None else best.gain - 2 * best.place.width
+        systematic = 0.0 if best is None else best.gain - 2 * best.term.width
         left = max(alone.total - alone.freedom, systematic, 0.0)
         share = float(np.clip(1 - left / (before.total - before.freedom), 0.0, 1.0))
         return cls(before, after, share)
@@ -224,7 +205,7 @@ def explained_by_quantisation(
         Parameters and states that fit the values before rounding, with errors of the fit to the readings,
         which rounding makes wider; what is left of the values; and the names of the outputs that are rounded.
     """
-    steps = _quantisation_steps(data)
+    steps = np.array([lattice_step(column) or 0.0 for column in data.outputs.T])
     # What rounding does under noise half as wide as a step is white (Widrow and Kollár 2008), and fitted.
     coarse = steps > np.sqrt(strict.noise.measurement)
     if not (strict.converged and coarse.any()):
@@ -259,11 +240,6 @@ def explained_by_quantisation(
         return None
     names = tuple(name for name, wide in zip(fit.model.output_names, coarse, strict=True) if wide)
     return replace(strict, model=fit.model, x=fit.x), left, names
-
-
-def _quantisation_steps(data: Measurements) -> np.ndarray:
-    """The step on whose multiples the values of each output lie, zero where there is none; shape ``(m,)``."""
-    return np.array([lattice_step(column) or 0.0 for column in data.outputs.T])
 
 
 def _before_quantisation(

@@ -32,6 +32,8 @@ from siq.systems.formulas import compile_values
 
 Entry = tuple[int, int | slice, np.ndarray]
 """A row of f or h, the columns of a term that act there, and their values."""
+Evaluated = Callable[[np.ndarray, np.ndarray, int | None], Iterator[Entry]]
+"""From states ``(d, n)``, parameters and a node to what a term does to f there; without a node, to h."""
 
 
 @dataclass(frozen=True)
@@ -70,10 +72,8 @@ class Term(Protocol):
     def width(self) -> int:
         """The number of coefficients."""
 
-    def columns(
-        self, trajectories: Trajectories
-    ) -> Callable[[np.ndarray, np.ndarray, int | None], Iterator[Entry]]:
-        """What a unit of each does, from states ``(d, n)``, parameters and a node; without a node to h."""
+    def columns(self, trajectories: Trajectories) -> Evaluated:
+        """What a unit of each does along trajectories."""
 
 
 @dataclass(frozen=True)
@@ -127,9 +127,7 @@ class Probe:
         # As numpy has them: a division by zero is then infinite, and no error.
         return (*values, *(np.float64(shapes.get(each.name, 0.0)) for each in new))
 
-    def columns(
-        self, trajectories: Trajectories
-    ) -> Callable[[np.ndarray, np.ndarray, int | None], Iterator[Entry]]:
+    def columns(self, trajectories: Trajectories) -> Evaluated:
         """See `Term`."""
         model, grid, candidate = trajectories.model, trajectories.grid, self.candidate
         if id(candidate) not in trajectories.compiled:  # once for all probes of a candidate
@@ -217,11 +215,13 @@ def _at_samples(nodes: Sequence[np.ndarray], grid: Grid) -> np.ndarray:
     return states
 
 
-class TermColumns:
+class _TermColumns:
     """The columns of terms, one behind the other: `siq.inference.kalman_filter.Columns`."""
 
     def __init__(self, terms: Sequence[Term], trajectories: Trajectories) -> None:
-        self._model, self.slices = trajectories.model, slices_of(terms)
+        ends = itertools.accumulate(each.width for each in terms)
+        self._model = trajectories.model
+        self.slices = [slice(end - each.width, end) for each, end in zip(terms, ends, strict=True)]
         self._parts = [
             (each.columns(trajectories), part) for each, part in zip(terms, self.slices, strict=True)
         ]
@@ -238,12 +238,6 @@ class TermColumns:
     def outputs(self, x: np.ndarray, values: np.ndarray) -> np.ndarray:
         """See `siq.inference.kalman_filter.Columns`."""
         return self.rates(x, values, None)
-
-
-def slices_of(terms: Sequence[Term]) -> list[slice]:
-    """Which columns are those of which term, where they stand one behind the other."""
-    ends = itertools.accumulate(each.width for each in terms)
-    return [slice(end - each.width, end) for each, end in zip(terms, ends, strict=True)]
 
 
 NOISE_LEVELS = (1.0, 0.1, 1e-2, 1e-3, 1e-4, 0.0)
@@ -276,7 +270,7 @@ def linearised_with(
     """
     grid = Grid(data, min(fit.substeps, substeps))
     with np.errstate(all="ignore"):  # what overflows is left out of the screening
-        columns = TermColumns(terms, Trajectories(fit.model, grid, fit.x))
+        columns = _TermColumns(terms, Trajectories(fit.model, grid, fit.x))
         coarse = linearise(fit.model, grid, fit.model.values, fit.linearised_at, columns=columns)
     known, parameters = fit.linearisation, len(fit.model.free)
     further, measured = coarse.response[:, :, parameters:], coarse.measured_response[:, :, parameters:]
@@ -390,6 +384,8 @@ class Ranked(Generic[AnyTerm]):
         There; shape ``(k,)``, none where they are averaged over.
     finite
         Whether what it does to what is measured is a number at any level.
+    p_value
+        Probability of as much by chance, where that is asked.
     """
 
     term: AnyTerm
@@ -398,6 +394,7 @@ class Ranked(Generic[AnyTerm]):
     amplitudes: np.ndarray = field(default_factory=lambda: np.zeros(0))
     standard_errors: np.ndarray = field(default_factory=lambda: np.zeros(0))
     finite: bool = False
+    p_value: float = np.nan
 
 
 Judge = Callable[[AnyTerm, Projection, slice], tuple[float, np.ndarray, np.ndarray] | None]

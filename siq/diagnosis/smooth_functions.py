@@ -25,10 +25,11 @@ from functools import cached_property
 import numpy as np
 import scipy.linalg
 import sympy
+from scipy.spatial.distance import cdist
 
 from siq.diagnosis.evidence import FittedCandidate, correlation_time_of, evidences_by_size
 from siq.diagnosis.mechanisms import CURVE, SURFACE, MechanismCandidate, along, fresh_names
-from siq.diagnosis.screening import PROBE_SUBSTEPS, Projection, at_noise_levels, linearised_with
+from siq.diagnosis.screening import PROBE_SUBSTEPS, at_noise_levels, linearised_with
 from siq.diagnosis.terms import Place
 from siq.errors import NumericalFailure
 from siq.inference.kalman_filter import Whitened
@@ -126,7 +127,7 @@ class Bumps:
 
     def values(self, courses: np.ndarray) -> np.ndarray:
         """Every bump along courses ``(c, n)`` of the coordinates, shape ``(b, n)``."""
-        return np.exp(-0.5 * _squares(courses.T / self.lengths, self.centres / self.lengths)).T
+        return np.exp(-0.5 * cdist(courses.T / self.lengths, self.centres / self.lengths, "sqeuclidean")).T
 
     def expected(self, names: tuple[str, ...]) -> JointExpectation:
         """What is expected of the heights, by their names."""
@@ -144,17 +145,12 @@ class Bumps:
 
 def _triangle_of(points: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """Lower triangle of the covariance of a process of unit size at points ``(b, c)``, shape ``(b, b)``."""
-    likeness = np.exp(-0.5 * _squares(points / lengths, points / lengths))
+    likeness = np.exp(-0.5 * cdist(points / lengths, points / lengths, "sqeuclidean"))
     return np.linalg.cholesky(likeness + COVARIANCE_JITTER * np.eye(len(points)))
 
 
 def _rounded(value: float) -> sympy.Expr:
     return sympy.Float(float(f"{value:.6g}"))
-
-
-def _squares(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Squared distances of points ``(n, c)`` and ``(b, c)``, shape ``(n, b)``."""
-    return ((one[:, None, :] - other[None, :, :]) ** 2).sum(axis=2)
 
 
 @dataclass(frozen=True)
@@ -355,10 +351,11 @@ class Smoothness:
         response, _ = linearised_with(
             fit, data, [replace(place, basis=fine)], substeps=fit.substeps if known else PROBE_SUBSTEPS
         )
-        levels: list[tuple[float, Projection]] = []
+        levels: list[tuple[float, np.ndarray, np.ndarray, float, float, float]] = []
         highest, correlated = -np.inf, 1.0
         for level, problem in at_noise_levels(response, fit, data, lambda white: _without(white, fit, known)):
-            levels.append((level, problem))
+            gram, total = problem.columns.T @ problem.columns, problem.total
+            levels.append((level, gram, problem.overlap, total, problem.freedom, problem.likelihood(total)))
             rest = problem.unexplained
             likelihood = problem.likelihood(float(rest @ rest))
             if likelihood > highest:
@@ -367,10 +364,9 @@ class Smoothness:
                 correlated = correlation_time_of(rest, recording, outputs=outputs)
         alone, values = -np.inf, list[np.ndarray]()
         highest, best = -np.inf, None
-        for level, problem in levels:
-            gram = problem.columns.T @ problem.columns / correlated
-            overlap, total = problem.overlap / correlated, problem.total / correlated
-            degrees, likelihood = problem.freedom / correlated, problem.likelihood(problem.total) / correlated
+        for level, gram, overlap, total, degrees, likelihood in levels:
+            gram, overlap, total = gram / correlated, overlap / correlated, total / correlated
+            degrees, likelihood = degrees / correlated, likelihood / correlated
             alone = max(alone, likelihood)
             for shares, shape in zip(choices, shapes, strict=True):
                 gained, scale, rest = evidences_by_size(

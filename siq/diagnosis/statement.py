@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, TypeAdapter
 from pydantic_core import to_jsonable_python
 
-from siq.diagnosis.evidence import BUDGET_SPENT, FittedCandidate, NotFitted
+from siq.diagnosis.evidence import BUDGET_SPENT, NotFitted
 from siq.diagnosis.holdout import HeldOutErrors
 from siq.diagnosis.mechanisms import GENERIC, MECHANISM, PROCESS_NOISE, Kind
 from siq.diagnosis.search import Standing
@@ -48,11 +48,6 @@ class Evidence:
     p_white: float | None
     p_cluster: float | None
     log_odds: float | None = None
-
-    @classmethod
-    def of(cls, trial: FittedCandidate, log_odds: float | None = None) -> Evidence:
-        """Of a candidate that was fitted."""
-        return cls(trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster, log_odds)
 
 
 @dataclass(frozen=True)

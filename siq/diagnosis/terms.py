@@ -10,7 +10,7 @@ powers becomes part of the simulation.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -21,7 +21,16 @@ import sympy
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
 from siq.diagnosis.evidence import correlation_time_of, evidence_of_function
 from siq.diagnosis.mechanisms import FORMULA, MechanismCandidate, added, along, fresh_names
-from siq.diagnosis.screening import Entry, Probe, Projection, Ranked, Trajectories, linearised_with, rank
+from siq.diagnosis.screening import (
+    Entry,
+    Evaluated,
+    Probe,
+    Projection,
+    Ranked,
+    Trajectories,
+    linearised_with,
+    rank,
+)
 from siq.inference.kalman_filter import whiten
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
@@ -92,9 +101,7 @@ class Place:
         course = np.clip(courses[0], self.knots[0], self.knots[-1])
         return scipy.interpolate.make_interp_spline(self.knots, unit, bc_type="natural")(course).T
 
-    def columns(
-        self, trajectories: Trajectories
-    ) -> Callable[[np.ndarray, np.ndarray, int | None], Iterator[Entry]]:
+    def columns(self, trajectories: Trajectories) -> Evaluated:
         """See `siq.diagnosis.screening.Term`."""
         model, grid = trajectories.model, trajectories.grid
         targets = (*self.equations, *self.outputs)  # it has either
@@ -269,11 +276,11 @@ def rank_places(fit: Fit, data: Measurements, roles: Roles) -> list[Ranked[Place
 
 
 def _ranked(fit: Fit, data: Measurements, places: Sequence[Place]) -> list[Ranked[Place]]:
-    ranked = rank(fit, data, places, judge=by_evidence)[0]
+    ranked = rank(fit, data, places, judge=_by_evidence)[0]
     return sorted((each for each in ranked if each.finite), key=lambda each: -each.gain)
 
 
-def by_evidence(
+def _by_evidence(
     place: Place, problem: Projection, group: slice
 ) -> tuple[float, np.ndarray, np.ndarray] | None:
     """A `siq.diagnosis.screening.Judge`: the likelihood averaged over all smooth functions in a place."""
@@ -289,18 +296,8 @@ def formula_in(
 ) -> MechanismCandidate | None:
     """The simulation of a fit with a formula in a place, of the powers that it needs; None if it needs none.
 
-    Its place is that of a function of the second coordinate, where the first is in none of them.
-    """
-    terms = _few_powers(place, fit, data, level=level, degree=degree)
-    return _with_formula(fit.model, *_simplest(place, terms)) if terms else None
-
-
-def _few_powers(
-    place: Place, fit: Fit, data: Measurements, *, level: float, degree: int
-) -> tuple[Power, ...]:
-    """Powers of which each earns its place, one after the other (Schwarz).
-
-    Errors count as correlated as all of the powers leave them (`siq.diagnosis.evidence`).
+    Each earns its place, one after the other (Schwarz). Errors count as correlated as all of the powers leave
+    them. Its place is that of a function of the second coordinate, where the first is in none of them.
     """
     terms = _powers(place, degree=degree)
     response, _ = linearised_with(fit, data, [Probe(_with_formula(fit.model, place, terms), ())])
@@ -325,7 +322,9 @@ def _few_powers(
             break
         chosen.append(best)
         total = sums[best]
-    return tuple(terms[power] for power in sorted(chosen))
+    if not chosen:
+        return None
+    return _with_formula(fit.model, *_simplest(place, [terms[power] for power in sorted(chosen)]))
 
 
 def _with_formula(model: Dynamics, place: Place, terms: Sequence[Power]) -> MechanismCandidate:

@@ -57,13 +57,12 @@ def statement_of_failure(reason: str) -> Statement:
 def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
     """What follows from an investigation, and from the runs of recordings held out."""
     search, verdict = investigation.search, investigation.verdict
-    described = shown.described if shown.adopted else None
-    described_fit = shown.described_fit if shown.adopted else None
-    found = _found_mechanisms(investigation, described_fit if verdict.names else None)
+    described = shown.described
+    final = investigation.final if described is None else shown.fit
+    found = _found_mechanisms(investigation, final if verdict.names else search.fit)
     names = tuple(each.best.candidate.label for each in search.found) if verdict.names else ()
     parts = () if described is None else described.parts
     labels = [each.candidate.label for each in parts]
-    final = investigation.final if described_fit is None else described_fit
     errors = _standard_errors(final)
     remarks = list(investigation.remarks)
     if investigation.account.partial:
@@ -87,9 +86,7 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
         if verdict is MismatchVerdict.UNEXPLAINED
         else None,
         described=tuple(
-            _stated_function(part, described_fit, (*names, *labels[:place]))
-            for place, part in enumerate(parts)
-            if described_fit is not None
+            _stated_function(part, final, (*names, *labels[:place])) for place, part in enumerate(parts)
         ),
         location=_locate(investigation, described) if verdict.mismatch else None,
         recalibration={
@@ -150,7 +147,7 @@ def _excluded(investigation: Investigation) -> dict[str, UpperBound]:
     return dict(sorted(bounds.items()))
 
 
-def _found_mechanisms(investigation: Investigation, card: Fit | None) -> tuple[StatedTerm, ...]:
+def _found_mechanisms(investigation: Investigation, card: Fit) -> tuple[StatedTerm, ...]:
     """Every mechanism that was found, whether it is named or only describes; the estimates are the card's."""
     search = investigation.search
     if investigation.process_noise:
@@ -193,7 +190,7 @@ def _found_mechanisms(investigation: Investigation, card: Fit | None) -> tuple[S
         stated.append(
             _stated(
                 trial,
-                search.fit if card is None else card,
+                card,
                 log_odds=odds,
                 share_of_excess=investigation.remainder.share,
                 indistinguishable_from=tuple(sorted(alike)) if investigation.verdict.names else None,
@@ -217,7 +214,7 @@ def _stated(trial: FittedCandidate, fit: Fit, *, log_odds: float | None = None, 
             for name in candidate.new
             if name in known
         },
-        evidence=Evidence.of(trial, log_odds),
+        evidence=Evidence(trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster, log_odds),
         equations=candidate.equations,
         **further,
     )
@@ -307,7 +304,7 @@ def _locate(investigation: Investigation, described: AugmentedModel | None = Non
         (
             each
             for each in curves
-            if each.place.words[0] == coordinate and set(each.place.targets) & set(equations)
+            if each.term.words[0] == coordinate and set(each.term.targets) & set(equations)
         ),
         None,
     )
@@ -316,14 +313,14 @@ def _locate(investigation: Investigation, described: AugmentedModel | None = Non
         equations, coordinate, curve = tuple(name for name, q in driven if q > 0), "random", None
     region = {}
     if curve is not None:  # where the missing part is seen beyond its error
-        size, knots = np.abs(curve.values), curve.place.knots
+        size, knots = np.abs(curve.amplitudes), curve.term.knots
         seen = (size > VISIBLE_ERRORS * curve.standard_errors) & (size > VISIBLE_SHARE * size.max())
         knots = knots[seen] if seen.any() else knots
-        region = {curve.place.words[0]: (float(knots.min()), float(knots.max()))}
+        region = {curve.term.words[0]: (float(knots.min()), float(knots.max()))}
     # What any one equation could explain, as a share of the excess over noise.
     gains: dict[str, float] = {}
     for each in curves:
-        for name in each.place.targets:
+        for name in each.term.targets:
             gains[name] = max(gains.get(name, 0.0), each.gain)
     total = max(investigation.remainder.before.total - investigation.remainder.before.freedom, 1e-300)
     # Recordings whose residuals, process noise not admitted, exceed noise by a fair share of the excess.
@@ -356,16 +353,16 @@ def _most_telling(structure: Structure, roles: Roles) -> tuple[tuple[str, ...], 
     coordinate tells nearly all, a force depends on the course of the motion, position and velocity both.
     """
     best = structure.curves[0]
-    equations, coordinate = best.place.targets, best.place.words[0]
+    equations, coordinate = best.term.targets, best.term.words[0]
     own = next((pair for pair in roles.motions if pair[1] in equations), equations)
     if coordinate in (*own, "amplitude"):
         return equations, coordinate
     motion = {*roles.states, *(name for pair in roles.motions for name in pair), "amplitude"}
     others, share = (own, NEARLY_ALL) if coordinate in motion else (motion, MOTION_SHARE)
     for curve in structure.curves:
-        there = set(equations) <= set(curve.place.targets)
-        if there and curve.place.words[0] in others and curve.gain >= share * best.gain:
-            return curve.place.targets, curve.place.words[0]
+        there = set(equations) <= set(curve.term.targets)
+        if there and curve.term.words[0] in others and curve.gain >= share * best.gain:
+            return curve.term.targets, curve.term.words[0]
     excess = structure.total - structure.freedom
     if len(own) > len(equations) and best.gain < NEARLY_ALL * excess:
         return equations, ", ".join(own)

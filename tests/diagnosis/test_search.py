@@ -16,8 +16,8 @@ from siq.diagnosis.dictionary import Roles, Shape
 from siq.diagnosis.evidence import FittedCandidate, _blocks_of, _correlated_probability, _correlation_time
 from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.diagnosis.naming import Investigation, _judge_mechanisms
-from siq.diagnosis.residual_structure import Curve, Remainder, Structure
-from siq.diagnosis.screening import _rank_along, by_likelihood
+from siq.diagnosis.residual_structure import Remainder, Structure
+from siq.diagnosis.screening import Ranked, _rank_along, by_likelihood
 from siq.diagnosis.search import AcceptedMechanism, FitContext, Search, _accepted, _better_without
 from siq.diagnosis.study import MismatchStudy, SearchOptions
 from siq.diagnosis.terms import ONE, Place
@@ -142,7 +142,7 @@ def place(coordinate: str, *equations: str) -> Place:
 
 def structure(excess: float, *gains: tuple[str, str, float]) -> Structure:
     curves = [
-        Curve(place(coordinate, equation), np.zeros(4), np.ones(4), gain, 0.0)
+        Ranked(place(coordinate, equation), gain, 1.0, np.zeros(4), np.ones(4))
         for equation, coordinate, gain in gains
     ]
     return Structure(tuple(curves), 0.0, 0.0, excess + 100, 100)
@@ -191,13 +191,13 @@ POPULATIONS = Roles(populations=("prey", "predator"), states=("prey", "predator"
 )
 def test_the_coordinate_that_tells_most(roles: Roles, found: Structure, expected: str) -> None:
     equations, coordinate = _most_telling(found, roles)
-    assert equations == found.curves[0].place.targets
+    assert equations == found.curves[0].term.targets
     assert coordinate == expected
 
 
 def test_of_a_rotating_frame_the_motion_is_its_amplitude() -> None:
-    across = Curve(place("amplitude", "P", "Q"), np.zeros(4), np.ones(4), 128.0, 0.0)
-    assert across.place.across
+    across = Ranked(place("amplitude", "P", "Q"), 128.0, 1.0, np.zeros(4), np.ones(4))
+    assert across.term.across
     found = structure(370, ("Q", "t", 150.0))
     found = replace(found, curves=(*found.curves, across))
     assert _most_telling(found, FRAME) == (("P", "Q"), "amplitude")
