@@ -43,25 +43,7 @@ def own_path(path: Path, *, start: Path | None = None) -> str:
 
 
 def write_generated(path: Path, name: str) -> Path:
-    """Write the shortest study for recordings, once they have been read.
-
-    Parameters
-    ----------
-    path
-        A file of recordings, or a folder of files.
-    name
-        Of the study.
-
-    Returns
-    -------
-    pathlib.Path
-        The study.
-
-    Raises
-    ------
-    InputError
-        When the recordings cannot be used.
-    """
+    """Write the shortest study for a file of recordings, or a folder of files, once they have been read."""
     read_recordings(path)  # before anything starts or is written
     study = GENERATED / f"{name}.yaml"
     text = f"name: {_scalar(name)}\nrecordings: {{file: {_scalar(own_path(path, start=study.parent))}}}\n"
@@ -71,26 +53,10 @@ def write_generated(path: Path, name: str) -> Path:
 
 
 def init_study(path: Path, *, output: Path | None = None, replace: bool = False) -> Path:
-    """Write a study with comments for a file of recordings.
+    """Write a study with comments for a file of recordings, or a folder of files.
 
-    Parameters
-    ----------
-    path
-        A file of recordings, or a folder of files.
-    output
-        Where to write it; by default named as the recordings, in the folder in which you are.
-    replace
-        Whether a file that is there may be replaced.
-
-    Returns
-    -------
-    pathlib.Path
-        The study.
-
-    Raises
-    ------
-    InputError
-        When the recordings cannot be used, or the study is there already.
+    By default it is named as the recordings, in the folder in which you are. Fails with `InputError` when the
+    recordings cannot be used, or the study is there already and is not to be replaced.
     """
     if is_study(path):
         raise InputError(path, "", "this is a study already", f"run it by: siq run {path}")
@@ -184,28 +150,9 @@ outputs: {x: x, v: v}
 
 
 def write_example(name: str, folder: Path, *, replace: bool = False) -> tuple[list[Path], str]:
-    """Write an example.
+    """Write the example ``double-well`` or ``mismatch`` into a folder: its files, and what to try with them.
 
-    Parameters
-    ----------
-    name
-        ``double-well`` or ``mismatch``.
-    folder
-        Where to; it is made where it is not there.
-    replace
-        Whether files that are there may be replaced.
-
-    Returns
-    -------
-    files
-        What was written.
-    command
-        What to try with it.
-
-    Raises
-    ------
-    InputError
-        When a file is there already; then none is written.
+    When a file is there already and is not to be replaced, this is an `InputError`, and none is written.
     """
     if name == "double-well":
         study = folder / "double-well.yaml"

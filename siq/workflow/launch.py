@@ -52,34 +52,17 @@ EVERY = 15.0
 
 @dataclass
 class _Progress:
-    """Where a workflow stands, from its events.
+    """Where a workflow stands, from its events."""
 
-    Attributes
-    ----------
-    clock
-        Seconds of any clock that does not go back.
-    total, done
-        Jobs.
-    running
-        What runs, by number of the job, in the words of its rule.
-    failed
-        The jobs that failed: what they were about, and their logs.
-    errors
-        What Snakemake itself says of a fault.
-    broken
-        Whether a job ended by a fault of ours, with a traceback.
-    planned
-        What is to run, in the words of the rules.
-    """
-
-    clock: Callable[[], float] = time.monotonic
-    total: int = 0
-    done: int = 0
-    running: dict[int, str] = field(default_factory=dict)
+    clock: Callable[[], float] = time.monotonic  # seconds of any clock that does not go back
+    total: int = 0  # jobs
+    done: int = 0  # of these
+    running: dict[int, str] = field(default_factory=dict)  # by number of the job, in words of its rule
+    # The jobs that failed: what they were about, and their logs.
     failed: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
-    errors: list[str] = field(default_factory=list)
-    broken: bool = False
-    planned: list[str] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)  # what Snakemake itself says of a fault
+    broken: bool = False  # whether a job ended by a fault of ours, with a traceback
+    planned: list[str] = field(default_factory=list)  # what is to run, in the words of the rules
     _doing: dict[str, str] = field(default_factory=dict)
     _rules: dict[int, str] = field(default_factory=dict)
     _words: dict[int, str] = field(default_factory=dict)
@@ -172,17 +155,7 @@ def _duration(seconds: float) -> str:
 
 
 class Screen:
-    """Shows the line: rewritten in place on a terminal, now and then in a log.
-
-    Parameters
-    ----------
-    stream
-        Where to.
-    columns
-        Width of the terminal; None where the stream is none.
-    clock
-        As `Progress.clock`.
-    """
+    """Shows the line: rewritten in place on a terminal of so many columns, now and then in a log."""
 
     def __init__(
         self, stream: TextIO, *, columns: int | None, clock: Callable[[], float] = time.monotonic
@@ -218,21 +191,10 @@ class Screen:
 
 
 def follow(lines: Iterable[str], screen: Screen, progress: _Progress) -> list[str]:
-    """Read what a workflow writes, show where it stands, and pass on what its jobs say.
+    """Read what a workflow writes, show where it stands, and pass on what its jobs say, which is returned.
 
-    The traceback of a job is not passed on: it stands in the job's log, which `faults` names.
-
-    Parameters
-    ----------
-    lines
-        As they come; an empty one only has the time that is left shown anew.
-    screen, progress
-        What is shown, and what is followed.
-
-    Returns
-    -------
-    list of str
-        The lines that were passed on.
+    The traceback of a job is not passed on: it stands in the job's log, which `_faults` names. An empty line
+    only has the time that is left shown anew.
     """
     passed_on: list[str] = []
     in_traceback = False
@@ -284,33 +246,15 @@ def _need_workflow() -> None:
 
 @dataclass(frozen=True)
 class Request:
-    """What Snakemake is asked for.
+    """What Snakemake is asked for."""
 
-    Attributes
-    ----------
-    targets
-        Files or rules.
-    study
-        A study to be given by ``--configfile``.
-    settings
-        Keys of the configuration, as ``--config`` takes them.
-    cores
-        A number, or ``all``.
-    verbose
-        Whether Snakemake speaks for itself.
-    dry_run
-        Whether it only says what would run.
-    further
-        Options that are passed on.
-    """
-
-    targets: tuple[str, ...] = ()
-    study: Path | None = None
-    settings: tuple[str, ...] = ()
-    cores: str = "all"
-    verbose: bool = False
-    dry_run: bool = False
-    further: tuple[str, ...] = ()
+    targets: tuple[str, ...] = ()  # files or rules
+    study: Path | None = None  # a study to be given by --configfile
+    settings: tuple[str, ...] = ()  # keys of the configuration, as --config takes them
+    cores: str = "all"  # a number, or all
+    verbose: bool = False  # whether Snakemake speaks for itself
+    dry_run: bool = False  # whether it only says what would run
+    further: tuple[str, ...] = ()  # options that are passed on
 
     def command(self) -> list[str]:
         """The command line; what it has to make stands behind ``--``, where no option can take it."""
@@ -385,20 +329,9 @@ RESULTS = Path("results")
 def run_study(given: str, asked: Request) -> Exit:
     """Answer a study, recordings without a study, or a study that comes with the workflow.
 
-    Parameters
-    ----------
-    given
-        Path of a study (YAML) or of recordings (a file, or a folder of files), or the name of a study in
-        ``config/studies``.
-    asked
-        How to run it; what to make is added.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be used.
-    MissingExtra
-        When the workflow is not installed.
+    Given is the path of a study (YAML) or of recordings (a file, or a folder of files), or the name of a
+    study in ``config/studies``; to what is `asked`, what to make is added. Fails with `InputError` when the
+    file cannot be used, with `MissingExtra` when the workflow is not installed.
     """
     _need_workflow()
     path = Path(given).expanduser()
@@ -434,19 +367,7 @@ def run_study(given: str, asked: Request) -> Exit:
 def diagnose_cases(folder: str, asked: Request) -> Exit:
     """Compare simulations with recordings: every case of a folder, or the one that the folder is.
 
-    Parameters
-    ----------
-    folder
-        With ``system.yaml`` and recordings, or with folders that have them.
-    asked
-        How to run it; what to make is added.
-
-    Raises
-    ------
-    InputError
-        When there is no such folder.
-    MissingExtra
-        When the workflow is not installed.
+    It has ``system.yaml`` and recordings, or folders that have them. Fails as `run_study` does.
     """
     _need_workflow()
     place = Path(folder).expanduser()

@@ -51,17 +51,7 @@ __all__ = ["Analysis", "PipelineSettings", "analyse", "landscape_from_recordings
 def draw_run(
     settings: PipelineSettings, source: Dynamics | Recordings, *, number: int
 ) -> StepResult[Recordings]:
-    """The trajectories of run `number`.
-
-    Parameters
-    ----------
-    settings
-        What is drawn.
-    source
-        The system to be simulated, or the recordings: run 0 takes them all, further runs resample them.
-    number
-        Of the run.
-    """
+    """The trajectories of run `number`: of a system simulated, of recordings all in run 0, then resampled."""
     if isinstance(source, Recordings):
         hidden = settings.identification.hidden_velocities
         source = in_stretches(without_slow_drift(source), hidden_velocities=hidden)
@@ -141,29 +131,17 @@ def _regressed(
     potential, circulatory, vector_field = networks.evaluate(points)
     below = points_below(potential, level=options.level)
     library = candidate_library(
-        recordings.names,
-        degree=options.degree,
-        potential_degree=options.potential_degree,
-        circulatory_degree=options.circulatory_degree,
-        further=options.functions,
-    )
-    result = sparse_decomposition(
-        library,
-        points[below],
-        potential[below],
-        circulatory[below],
-        vector_field[below],
-        # D that nobody gave is that of the networks, in their precision.
-        diffusion=settings.space.constant_noise(points.shape[1]) or Diffusion(networks.diffusion),
-        options=options,
-    )
+        recordings.names, degree=options.degree, potential_degree=options.potential_degree,
+        circulatory_degree=options.circulatory_degree, further=options.functions,
+    )  # fmt: skip
+    # D that nobody gave is that of the networks, in their precision.
+    noise = settings.space.constant_noise(points.shape[1]) or Diffusion(networks.diffusion)
+    parts = (points[below], potential[below], circulatory[below], vector_field[below])
+    result = sparse_decomposition(library, *parts, diffusion=noise, options=options)
     formulas = decomposition_from_coefficients(
-        library,
-        potential=result.potential,
-        circulatory=result.circulatory,
-        vector_field=result.vector_field,
-        points=points[below],
-    )
+        library, potential=result.potential, circulatory=result.circulatory,
+        vector_field=result.vector_field, points=points[below],
+    )  # fmt: skip
     return formulas, result
 
 
@@ -207,14 +185,8 @@ def refine_run(
 ) -> RefinedRun:
     """V about every attractor of the identified f, or over the region, with its certificate.
 
-    Parameters
-    ----------
-    settings
-        Routes, degrees, and the limits of the certificate.
-    recordings, identified, trained
-        Trajectories, f and networks of the run.
-    regressed
-        The formulas of the networks, which are certified beside the refined ones; None where there are none.
+    It follows from trajectories, f and networks of the run; `regressed` are the formulas of the networks,
+    which are certified beside the refined ones.
     """
     number, networks = identified.outcome.run, trained.result
     formulas = {} if regressed is None else {Method.REGRESSION: regressed}
@@ -320,25 +292,13 @@ def _noise_strength(settings: PipelineSettings, record: FieldEstimate) -> NoiseS
 
 @dataclass(frozen=True)
 class Analysis:
-    """What the steps found; each has its outcome, and says why where it has no result.
+    """What the steps found; each has its outcome, and says why where it has no result."""
 
-    Attributes
-    ----------
-    identified
-        f, and the test of its predictions.
-    trained, regressed
-        The networks, and the published method's formulas of them; `regressed` is None where not asked for.
-    refined
-        Formulas by method, with their certificates.
-    landscape
-        Wells, barriers, ways; None where not asked for.
-    """
-
-    identified: StepResult[FieldEstimate]
-    trained: StepResult[TrainedNetworks]
-    regressed: StepResult[SymbolicDecomposition] | None
-    refined: RefinedRun
-    landscape: StepResult[Landscape] | None
+    identified: StepResult[FieldEstimate]  # f, and the test of its predictions
+    trained: StepResult[TrainedNetworks]  # the networks
+    regressed: StepResult[SymbolicDecomposition] | None  # the published method's formulas, where asked for
+    refined: RefinedRun  # formulas by method, with their certificates
+    landscape: StepResult[Landscape] | None  # wells, barriers, ways; None where not asked for
 
     @property
     def outcomes(self) -> tuple[Outcome, ...]:
@@ -355,23 +315,10 @@ class Analysis:
 def analyse(
     recordings: Recordings, settings: PipelineSettings | None = None, *, number: int = 0, device: str = "auto"
 ) -> Analysis:
-    """All that recordings give.
+    """All that recordings give, also where a step failed, which its outcome then says.
 
-    Parameters
-    ----------
-    recordings
-        Trajectories.
-    settings
-        What the steps are told.
-    number
-        Of the run: another one has other random numbers.
-    device
-        On which networks are trained: ``auto``, ``cpu``, ``cuda``.
-
-    Returns
-    -------
-    Analysis
-        Also where a step failed, which its outcome then says.
+    A run of another `number` has other random numbers. Networks are trained on the device ``auto``, ``cpu``
+    or ``cuda``.
     """
     settings = settings or PipelineSettings()
     networks, hidden = settings.training is not None, settings.identification.hidden_velocities

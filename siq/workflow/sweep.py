@@ -65,31 +65,15 @@ class _SweptWay:
 
 @pydantic_dataclass(frozen=True, config=PLAIN)
 class SweptPoint:
-    """The landscape at one value of the parameters.
+    """The landscape at one value of the parameters."""
 
-    Attributes
-    ----------
-    values
-        Of the parameters, in their order.
-    equilibria
-        All that were found, the unstable ones too.
-    wells, ways
-        Attractors and the ways out of them.
-    settled
-        Share of the states of the domain from which f leads to one of the wells.
-    reason
-        Why there is no landscape, in words; empty where there is one.
-    notes
-        What could not be done, in words.
-    """
-
-    values: tuple[float, ...]
-    equilibria: tuple[tuple[float, ...], ...]
-    wells: tuple[_SweptWell, ...] = ()
-    ways: tuple[_SweptWay, ...] = ()
-    settled: float = 0.0
-    reason: str = ""
-    notes: tuple[str, ...] = ()
+    values: tuple[float, ...]  # of the parameters, in their order
+    equilibria: tuple[tuple[float, ...], ...]  # all that were found, the unstable ones too
+    wells: tuple[_SweptWell, ...] = ()  # attractors
+    ways: tuple[_SweptWay, ...] = ()  # the ways out of them
+    settled: float = 0.0  # share of the states of the domain from which f leads to one of the wells
+    reason: str = ""  # why there is no landscape, in words; empty where there is one
+    notes: tuple[str, ...] = ()  # what could not be done, in words
 
 
 def _with_parameters(
@@ -514,18 +498,9 @@ def _check_parameters(system: Dynamics, names: Iterable[str], *, with_noise: boo
 def collected(
     system: Dynamics, names: tuple[str, ...], points: Sequence[SweptPoint], *, noise: float | None = None
 ) -> Sweep:
-    """Tables of all points.
+    """Tables of all points, in any order, of one or two parameters; the system is that of any of them.
 
-    Parameters
-    ----------
-    system
-        The system at any of the points.
-    names
-        Of the one or two parameters.
-    points
-        In any order.
-    noise
-        ε; None for neither times nor weights.
+    Without noise ε there are neither times nor weights.
     """
     points = sorted(points, key=lambda point: point.values)
     remarks: list[Remark] = []

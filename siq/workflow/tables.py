@@ -111,216 +111,67 @@ def why_no_landscape(outcomes: Iterable[Outcome]) -> str:
     return "the recorded states lead to no stable state"
 
 
-COLUMNS: Mapping[str, Mapping[str, str]] = {
-    "coefficients": {
-        "run": "int64",
-        "method": "str",
-        "component": "str",
-        "term": "str",
-        "estimate": "float64",
-        "exact": "float64",
-        "standard_error": "float64",
-    },
-    "prediction": {"run": "int64", "method": "str", "trajectory": "int64", "error": "float64"},
-    "certificates": {
-        "run": "int64",
-        "method": "str",
-        "test": "str",
-        "value": "float64",
-        "limit": "float64",
-        "passed": "bool",
-        "reason": "str",
-    },
-    "invariant": {
-        "run": "int64",
-        "method": "str",
-        "intensity": "float64",
-        "bessel": "float64",
-        "quadrature": "float64",
-        "simulated_distance": "float64",
-        "sampling_floor": "float64",
-        "published": "float64",
-        "unknown_at_most": "float64",
-        "simulated_unknown": "float64",
-    },
-    "well_shares": {
-        "run": "int64",
-        "intensity": "float64",
-        "well": "str",
-        "share": "float64",
-        "by_rates": "float64",
-        "simulated": "float64",
-        "changed": "float64",
-    },
-    "landscape": {
-        "run": "int64",
-        "item": "str",
-        "kind": "str",
-        "position": "str",
-        "eigenvalues": "str",
-        "U": "float64",
-        "basin": "float64",
-        "barrier": "float64",
-        "standard_error": "float64",
-        "formula_share": "float64",
-        "minimum_action": "float64",
-        "prefactor": "float64",
-        "noise": "float64",
-        "barrier_over_noise": "float64",
-        "mean_time": "float64",
-        "mean_time_error": "float64",
-        "note": "str",
-    },
-    "degrees": {
-        "run": "int64",
-        "attractor": "str",
-        "degree": "int64",
-        "terms": "int64",
-        "residual": "float64",
-        "covered": "float64",
-        "chosen": "bool",
-    },
-    "record": {
-        "run": "int64",
-        "attractor": "str",
-        "visits": "int64",
-        "time": "float64",
-        "counted": "float64",
-        "lowest": "float64",
-        "highest": "float64",
-        "held_out_visits": "int64",
-        "held_out_time": "float64",
-        "held_out_counted": "float64",
-        "predicted": "float64",
-        "predicted_error": "float64",
-        "method": "str",
-        "probability": "float64",
-    },
-    "record_density": {
-        "run": "int64",
-        "attractor": "str",
-        "state": "str",
-        "lower": "float64",
-        "upper": "float64",
-        "counted": "float64",
-        "predicted": "float64",
-        "distance": "float64",
-        "independent": "float64",
-        "probability": "float64",
-    },
-    "landscape_errors": {
-        "run": "int64",
-        "source": "str",
-        "region": "str",
-        "points": "int64",
-        "covered": "float64",
-        "error": "float64",
-        "error_everywhere": "float64",
-    },
-    "beside_equations": {
-        "run": "int64",
-        "item": "str",
-        "quantity": "str",
-        "noise": "float64",
-        "equations": "float64",
-        "trajectories": "float64",
-        "standard_error": "float64",
-        "relative_difference": "float64",
-        "in_errors": "float64",
-        "note": "str",
-    },
-    "sweep": {
-        "value": "float64",
-        "second_value": "float64",
-        "well": "int64",
-        "attractor": "str",
-        "relaxation": "float64",
-        "barrier": "float64",
-        "exit": "Int64",
-        "noise": "float64",
-        "mean_time": "float64",
-        "law_error": "float64",
-        "weight": "float64",
-        "note": "str",
-    },
-    "sweep_ways": {
-        "value": "float64",
-        "second_value": "float64",
-        "well": "int64",
-        "exit": "Int64",
-        "barrier": "float64",
-        "prefactor": "float64",
-        "relaxation": "float64",
-        "note": "str",
-    },
-    "branches": {
-        "branch": "int64",
-        "well": "int64",
-        "value": "float64",
-        "position": "str",
-        "unstable": "int64",
-        "growth": "float64",
-        "frequency": "float64",
-    },
-    "bifurcations": {
-        "kind": "str",
-        "value": "float64",
-        "position": "str",
-        "branch": "int64",
-        "frequency": "float64",
-        "residual": "float64",
-    },
-    "bifurcation_curves": {
-        "curve": "int64",
-        "kind": "str",
-        "value": "float64",
-        "second_value": "float64",
-        "position": "str",
-        "frequency": "float64",
-    },
-    "escape": {
-        "transition": "str",
-        "intensity": "float64",
-        "predicted": "float64",
-        "simulated": "float64",
-        "simulated_error": "float64",
-        "escapes": "int64",
-        "note": "str",
-    },
-    "rrmse": {
-        "run": "int64",
-        "method": "str",
-        "rrmse": "float64",
-        "support_correct": "boolean",
-        "certified": "bool",
-        "network_error": "float64",
-        "stated_error": "float64",
-    },
-    "outcomes": {"run": "int64", "step": "str", "status": "str", "reason": "str"},
-    "timings": {"run": "int64", "step": "str", "seconds": "float64"},
-    "training": {
-        "run": "int64",
-        "step": "int64",
-        "training_loss": "float64",
-        "held_out_loss": "float64",
-        "dynamics": "float64",
-        "orthogonality": "float64",
-        "learning_rate": "float64",
-    },
-    "summary": {
-        "method": "str",
-        "quantity": "str",
-        "exact": "float64",
-        "mean": "float64",
-        "standard_deviation": "float64",
-        "median": "float64",
-        "inclusion_frequency": "float64",
-        "runs": "int64",
-        "published": "float64",
-        "published_standard_deviation": "float64",
-        "source": "str",
-    },
+_TYPES = {  # of a column, wherever it stands; of all others float64
+    "int64": (
+        "run trajectory well degree terms visits held_out_visits points branch unstable curve escapes runs"
+    ),
+    "str": (
+        "method component term test reason item kind position eigenvalues note attractor state source "
+        "region quantity transition step status"
+    ),
+    "bool": "passed chosen certified",
+    "Int64": "exit",
+    "boolean": "support_correct",
 }
+_TABLES = {
+    "coefficients": "run method component term estimate exact standard_error",
+    "prediction": "run method trajectory error",
+    "certificates": "run method test value limit passed reason",
+    "invariant": (
+        "run method intensity bessel quadrature simulated_distance sampling_floor published unknown_at_most "
+        "simulated_unknown"
+    ),
+    "well_shares": "run intensity well:str share by_rates simulated changed",
+    "landscape": (
+        "run item kind position eigenvalues U basin barrier standard_error formula_share minimum_action "
+        "prefactor noise barrier_over_noise mean_time mean_time_error note"
+    ),
+    "degrees": "run attractor degree terms residual covered chosen",
+    "record": (
+        "run attractor visits time counted lowest highest held_out_visits held_out_time held_out_counted "
+        "predicted predicted_error method probability"
+    ),
+    "record_density": "run attractor state lower upper counted predicted distance independent probability",
+    "landscape_errors": "run source region points covered error error_everywhere",
+    "beside_equations": (
+        "run item quantity noise equations trajectories standard_error relative_difference in_errors note"
+    ),
+    "sweep": (
+        "value second_value well attractor relaxation barrier exit noise mean_time law_error weight note"
+    ),
+    "sweep_ways": "value second_value well exit barrier prefactor relaxation note",
+    "branches": "branch well value position unstable growth frequency",
+    "bifurcations": "kind value position branch frequency residual",
+    "bifurcation_curves": "curve kind value second_value position frequency",
+    "escape": "transition intensity predicted simulated simulated_error escapes note",
+    "rrmse": "run method rrmse support_correct certified network_error stated_error",
+    "outcomes": "run step status reason",
+    "timings": "run step seconds",
+    "training": "run step:int64 training_loss held_out_loss dynamics orthogonality learning_rate",
+    "summary": (
+        "method quantity exact mean standard_deviation median inclusion_frequency runs published "
+        "published_standard_deviation source"
+    ),
+}
+
+
+def _types(columns: str) -> dict[str, str]:
+    known = {name: kind for kind, names in _TYPES.items() for name in names.split()}
+    parts = (column.partition(":") for column in columns.split())
+    return {name: kind or known.get(name, "float64") for name, _, kind in parts}
+
+
+COLUMNS: Mapping[str, Mapping[str, str]] = {name: _types(columns) for name, columns in _TABLES.items()}
 """Columns of every table, in order, with their types: the contract with whoever reads the results."""
 
 

@@ -45,27 +45,11 @@ Runs = Mapping[int, tuple[Recordings | None, FieldEstimate | None]]
 def train_block(
     settings: PipelineSettings, runs: Runs, *, folder: Path | None = None, device: str = "auto"
 ) -> tuple[dict[int, StepResult[TrainedNetworks]], list[TrainedNetworks], pd.DataFrame]:
-    """Train the networks of a block of runs.
+    """Train the networks of a block of runs, on the device ``auto``, ``cpu`` or ``cuda``.
 
-    Parameters
-    ----------
-    settings
-        What the networks are told.
-    runs
-        By number.
-    folder
-        Where a killed training leaves what it goes on from; None keeps nothing. See `clean`.
-    device
-        ``auto``, ``cpu``, ``cuda``.
-
-    Returns
-    -------
-    results
-        Of every run.
-    networks
-        Of the runs that have data, by their positions, be they good for anything or not.
-    history
-        The loss, see the table `training`.
+    In the folder a killed training leaves what it goes on from; see `clean`. Given are the results of every
+    run; the networks of those that have data, by their positions, be they good for anything or not; and the
+    loss, the table `training`.
     """
     assert settings.training is not None  # networks are asked for
     data, results = _training_data(settings, runs)
@@ -74,16 +58,9 @@ def train_block(
     diffusion = _diffusion(settings, runs, data)
     ready, faults = _checks(settings, runs, data, diffusion)
     block = Block(
-        data,
-        ready,
-        options=settings.training,
-        diffusion=diffusion,
-        seed=settings.seed,
-        folder=folder,
-        mark=_fingerprint(settings, runs, data),
-        device=choose_device(device),
-        faults=faults,
-    )
+        data, ready, options=settings.training, diffusion=diffusion, seed=settings.seed, folder=folder,
+        mark=_fingerprint(settings, runs, data), device=choose_device(device), faults=faults,
+    )  # fmt: skip
     block.train()
     for number in data:
         outcome = _outcome_of(block, number)
