@@ -90,46 +90,26 @@ class SystemCard(_CardPart):
 
     A state that is in no output is hidden. The time is called ``t`` in formulas of a system with inputs or
     of a mismatch study; see `siq.systems.dynamics`.
-
-    Attributes
-    ----------
-    name
-        Letters, digits, ``_``, ``.`` and ``-``; in ``config/systems/`` the file is called the same.
-    title
-        What people call the system; by default the name.
-    time_unit
-        Unit of t.
-    states
-        The states by name. Their order is that of the state vector.
-    inputs
-        Signals that drive the system, by name. Only a diagnosis reads them.
-    parameters
-        Constants of the equations, by name.
-    equations
-        The time derivative of each state, as a formula.
-    outputs
-        What a recording measures, as formulas by name; by default the states. Only a diagnosis reads them.
-    diffusion
-        D of ``dx = f dt + √ε D^(1/2) dW``: ``identity``, the diagonal as a list, or the whole matrix as a
-        list of rows, in squared units of the states per unit of time. An entry is a number, or a formula of
-        the states and parameters in the sense of Itô, such as ``[1 + 0.8*x, 1]``; parameters count with the
-        values of the card. A zero says that no noise acts on a state. Where a landscape is asked for, noise
-        has to act on every state if f comes from trajectories, and to reach it at least by way of other
-        states if the equations are given.
-    exact
-        Exact answers, where they are known.
     """
 
+    #: Letters, digits, ``_``, ``.`` and ``-``; in ``config/systems/`` the file is called the same.
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
-    title: str = ""
-    time_unit: str = "1"
-    states: dict[Name, StateEntry] = Field(min_length=1)
-    inputs: dict[Name, InputEntry] = {}
-    parameters: dict[Name, ParameterEntry] = {}
-    equations: dict[str, Formula]
+    title: str = ""  #: what people call the system; by default the name
+    time_unit: str = "1"  #: of t
+    states: dict[Name, StateEntry] = Field(min_length=1)  #: by name, in the order of the state vector
+    inputs: dict[Name, InputEntry] = {}  #: signals that drive it, by name; only a diagnosis reads them
+    parameters: dict[Name, ParameterEntry] = {}  #: constants of the equations, by name
+    equations: dict[str, Formula]  #: the time derivative of each state
+    #: What a recording measures, as formulas by name; by default the states. Only a diagnosis reads them.
     outputs: Annotated[dict[Name, Formula], Field(min_length=1)] | None = None
+    #: D of ``dx = f dt + √ε D^(1/2) dW``: ``identity``, the diagonal as a list, or the whole matrix as a list
+    #: of rows, in squared units of the states per unit of time. An entry is a number, or a formula of the
+    #: states and parameters in the sense of Itô, such as ``[1 + 0.8*x, 1]``; parameters count with the values
+    #: of the card. A zero says that no noise acts on a state. Where a landscape is asked for, noise has to
+    #: act on every state if f comes from trajectories, and to reach it at least by way of other states if
+    #: the equations are given.
     diffusion: DiffusionEntry = "identity"
-    exact: ExactEntry = ExactEntry()
+    exact: ExactEntry = ExactEntry()  #: exact answers, where they are known
 
     @model_validator(mode="after")
     def _consistent(self) -> SystemCard:

@@ -266,7 +266,11 @@ class Diffusion:
 
     def extended(self, count: int) -> Diffusion:
         """D in a system of `count` further states, on which this noise does not act."""
-        raise NotImplementedError
+        if self.constant:
+            return Diffusion(np.pad(self.matrix, (0, count)))
+        further = sympy.symbols(f"_further:{count}", real=True)
+        rows = sympy.diag(sympy.Matrix(self.formulas), sympy.zeros(count)).tolist()
+        return Diffusion.of_formulas((*self.symbols, *further), rows)
 
     def in_units(self, center: np.ndarray, units: np.ndarray, factor: float) -> Diffusion:
         """``factor · units⁻¹ D units⁻ᵀ`` as a D of the states y, ``x = center + units y``."""
@@ -326,9 +330,6 @@ class _Constant(Diffusion):
     def kicks(self, x: np.ndarray, numbers: np.ndarray) -> np.ndarray:
         return np.asarray(self.root @ numbers)
 
-    def extended(self, count: int) -> Diffusion:
-        return Diffusion(np.pad(self.matrix, (0, count)))
-
 
 class _Formulas(Diffusion):
     constant = False
@@ -381,12 +382,6 @@ class _Formulas(Diffusion):
             raise _indefinite(x[:, int(np.argmin(levels[:, 0]))])
         along = np.einsum("nji,jn->ni", vectors, numbers) * np.sqrt(np.maximum(levels, 0.0))
         return np.where(finite, np.einsum("nij,nj->in", vectors, along), np.nan)
-
-    def extended(self, count: int) -> Diffusion:
-        further = sympy.symbols(f"_further:{count}", real=True)
-        rows = [(*row, *(sympy.S.Zero,) * count) for row in self.formulas]
-        nothing = [(sympy.S.Zero,) * (self.dimension + count)] * count
-        return _Formulas((*self.symbols, *further), [*rows, *nothing])
 
 
 class _InUnits(Diffusion):
