@@ -84,9 +84,6 @@ def residual_noise(
     d, diffusion = found.library.dimension, found.diffusion
     unit = np.eye(d)
     pairs = snapshot_pairs(recordings, pair_step=pair_step)
-    sample = snapshot_pairs(recordings, pair_step=MAX_GAP * float(pairs.h.max()))
-    if len(sample.h) > MAX_PAIRS:  # whole stretches, so that neighbours stay neighbours
-        sample = sample.take(np.arange(MAX_PAIRS))
     if found.noise_free:
         covariance = diffusion.matrix if diffusion.constant else unit
         return NoiseDiagnosis("none", 0.0, covariance, 0.0, 0.0, np.zeros(d))
@@ -102,6 +99,9 @@ def residual_noise(
         if found.noise is not None:  # its own formula says ε without the chance of the residuals
             intensity = found.intensity
         covariance = found.noise_rate / intensity
+    sample = snapshot_pairs(recordings, pair_step=MAX_GAP * float(pairs.h.max()))
+    if len(sample.h) > MAX_PAIRS:  # whole stretches, so that neighbours stay neighbours
+        sample = sample.take(np.arange(MAX_PAIRS))
     correlations, scores = neighbour_correlations(found, sample)
     worst = int(np.argmax(np.abs(scores)))
     correlation, score = float(correlations[worst]), float(scores[worst])
@@ -204,22 +204,18 @@ def _rounding_bias(found: FieldEstimate, pairs: SnapshotPairs, rounding: np.ndar
     does not average out. To first order the coefficients of an equation are off by
     ``-(Σ h θθᵀ)⁻¹ Σ ∂θ/∂x R``, R the variance of the rounding.
     """
-    errors = np.sqrt(np.diag(found.covariance))
-    largest = 0.0
-    for state in range(found.library.dimension):
+    errors, symbols, largest = np.sqrt(np.diag(found.covariance)), found.library.symbols, []
+    x = np.ascontiguousarray(pairs.x0.T)
+    for state, symbol in enumerate(symbols):
         own = found.support[:, 0] == state
         terms = [found.library.terms[k] for k in found.support[own, 1]]
-        symbol = found.library.symbols[state]
-        x = np.ascontiguousarray(pairs.x0.T)
-        values = compile_formulas(terms, found.library.symbols)(x)
-        slopes = compile_formulas([term.diff(symbol) for term in terms], found.library.symbols)(x)
+        values = compile_formulas(terms, symbols)(x)
+        slopes = compile_formulas([term.diff(symbol) for term in terms], symbols)(x)
         scale = np.sqrt((values**2 * pairs.h).sum(axis=1))
-        scaled = values / scale[:, None]
-        bias = (
-            np.linalg.lstsq((scaled * pairs.h) @ scaled.T, slopes.sum(axis=1) / scale, rcond=None)[0] / scale
-        )
-        largest = max(largest, float((np.abs(bias) * rounding[state] ** 2 / errors[own]).max()))
-    return largest
+        scaled, goal = values / scale[:, None], slopes.sum(axis=1) / scale
+        bias = np.linalg.lstsq((scaled * pairs.h) @ scaled.T, goal, rcond=None)[0] / scale
+        largest.append((np.abs(bias) * rounding[state] ** 2 / errors[own]).max())
+    return float(max(largest))
 
 
 def rounding_text(recordings: Recordings, *, coarse: bool = False) -> str | None:
@@ -229,8 +225,7 @@ def rounding_text(recordings: Recordings, *, coarse: bool = False) -> str | None
     """
     alike: dict[tuple[float, str], dict[str, Any]] = {}
     for name, unit, values in zip(recordings.titles, recordings.units, recordings.values.T, strict=True):
-        step = resolution_step(values)
-        if step is None:
+        if (step := resolution_step(values)) is None:
             continue
         error, behind = rounding_error(step), f" {unit}" if unit else ""
         if coarse and error < COARSE_ROUNDING * np.sqrt(np.mean(np.diff(values) ** 2)):
@@ -254,8 +249,7 @@ def unexplained_probability(
     residuals have n degrees of freedom, unless these are given.
     """
     basis = np.linalg.qr(columns / positive(np.linalg.norm(columns, axis=0)))[0]
-    explained = ((basis.T @ rest) ** 2).sum(axis=0)
-    count = columns.shape[1]
+    explained, count = ((basis.T @ rest) ** 2).sum(axis=0), columns.shape[1]
     if variance is not None:
         probability = scipy.special.chdtrc(count, explained / variance)
     else:
@@ -275,9 +269,8 @@ def mean_residual_probability(found: FieldEstimate, pairs: SnapshotPairs, *, see
     if isinstance(pairs, LaggedPairs):
         rest = residuals(found, pairs)
         spread = np.diag(found.noise_rate) * float(np.median(pairs.h)) * copies(pairs)
-        return unexplained_probability(
-            pairs.directions(library), rest, variance=spread * (1 + len(rest) / seen)
-        )
+        variance = spread * (1 + len(rest) / seen)
+        return unexplained_probability(pairs.directions(library), rest, variance=variance)
     # Copies of resampled recordings would count as evidence that there is not.
     _, single = np.unique(np.column_stack([pairs.x0, pairs.xh]), axis=0, return_index=True)
     pairs = pairs.take(single)
@@ -295,16 +288,13 @@ def predict(dynamics: Dynamics, recordings: Recordings) -> np.ndarray:
     In the order of ``recordings.values``, shape ``(n, d)``; not finite where the prediction runs away, or f
     is too fast to be followed from sample to sample.
     """
-    starts = np.flatnonzero(np.diff(recordings.recording, prepend=-1))
+    states, starts = recordings.values, np.flatnonzero(np.diff(recordings.recording, prepend=-1))
     lengths = np.diff(np.append(starts, len(recordings.t)))
-    width = np.ptp(recordings.values, axis=0)
-    width = np.where(width > 0, width, 1.0)
-    center = recordings.values.mean(axis=0)
-    jacobian = dynamics.jacobian(recordings.values) * width / width[:, None]
+    width, center = positive(np.ptp(states, axis=0)), states.mean(axis=0)
+    jacobian = dynamics.jacobian(states) * width / width[:, None]
     rate = float(np.quantile(np.linalg.norm(jacobian, axis=(1, 2)), 0.999))
-    predicted = np.full_like(recordings.values, np.nan)
-    predicted[starts] = recordings.values[starts]
-    x = recordings.values[starts].T.copy()
+    predicted, x = np.full_like(states, np.nan), states[starts].T.copy()
+    predicted[starts] = states[starts]
     with np.errstate(over="ignore", invalid="ignore"):
         for place in range(1, int(lengths.max())):
             near = (np.abs(x - center[:, None]) < RUNAWAY_WIDTHS * width[:, None]).all(axis=0)
@@ -331,11 +321,10 @@ def prediction_errors(dynamics: Dynamics, recordings: Recordings) -> np.ndarray:
     infinite error.
     """
     difference = ((predict(dynamics, recordings) - recordings.values) ** 2).sum(axis=1)
-    size = (recordings.values**2).sum(axis=1)
-    count = len(recordings.labels)
     difference = np.where(np.isfinite(difference), difference, np.inf)
-    total = np.bincount(recordings.recording, weights=difference, minlength=count)
-    return np.sqrt(total / np.bincount(recordings.recording, weights=size, minlength=count))
+    squares = difference, (recordings.values**2).sum(axis=1)
+    total, size = (np.bincount(recordings.recording, one, len(recordings.labels)) for one in squares)
+    return np.asarray(np.sqrt(total / size))
 
 
 def check_prediction(
@@ -359,13 +348,11 @@ def check_prediction(
         return Verdict.of(float(np.median(errors)), limits.prediction, UNPREDICTED)
     assert mean_probability is not None
     value, limit = max(held_out_ratio - 1, 0.0), limits.held_out_ratio - 1
-    if not value <= limit:
-        return Verdict(value, limit, False, "f fits held-out recordings worse than its own")
     rarity, rare = -float(np.log10(max(mean_probability, 1e-300))), -float(np.log10(limits.false_alarms))
-    if not rarity <= rare:
+    if value <= limit and not rarity <= rare:
         reason = (
             "the residuals of f on held-out recordings have a mean, of a probability of"
             f" {mean_probability:.1g}: f misses a term"
         )
         return Verdict(rarity, rare, False, reason)
-    return Verdict(value, limit, True)
+    return Verdict.of(value, limit, "f fits held-out recordings worse than its own")

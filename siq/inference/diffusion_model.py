@@ -15,10 +15,9 @@ which is minus infinity where D is not positive at a recorded state. Its terms a
 as one does not differ from zero by its own standard error. Over a step φ changes, too: in its place stands
 ``φ + h/2 (f·∇φ + ½ tr εD∇²φ)``.
 
-Where the sensor is noisy, residuals of pairs would show that noise as well, and at states that are off by it.
-The likelihood of a Kalman filter separates them: what process noise adds to the covariance of the state over
-an interval is εD(x), averaged over what the filter knows of x there, and the innovations have the variance
-that follows. The variances of the sensors are then scored together with the coefficients of D.
+Residuals of pairs would show the noise of a sensor as well. The likelihood of a Kalman filter separates them:
+what process noise adds to the covariance of the state over an interval is εD(x), averaged over what the
+filter knows of x there. The variances of the sensors are then scored together with the coefficients of D.
 """
 
 from __future__ import annotations
@@ -92,10 +91,9 @@ class _DiffusionLikelihood:
     def reached(
         self, places: np.ndarray, values: np.ndarray, sensor: np.ndarray
     ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-        """The log-likelihood at coefficients ``(p,)`` and sensors ``(m,)``, and its derivatives by both.
+        """The log-likelihood, its score, Fisher's information, and summed outer products of single scores.
 
-        Score ``(p + m,)``, by the logarithms of the sensors' variances; Fisher's information; and the sum of
-        the outer products of single scores.
+        By coefficients ``(p,)``, then the logarithms of the sensors' variances ``(m,)``.
         """
         raise NotImplementedError
 
@@ -136,25 +134,23 @@ class _DiffusionLikelihood:
         p, sensor = len(values), self.sensor
         free = np.concatenate([np.ones(p, dtype=bool), self.free])
         inside = np.ix_(free, free)
-        logarithm, score, information, squares = self.reached(places, values, sensor)
+        now = self.reached(places, values, sensor)
         for _ in range(MAX_STEPS):
-            step = np.zeros(len(free))
-            step[free] = _inverse(information[inside]) @ score[free]
-            gain = 0.0
+            step, before = np.zeros(len(free)), now[0]
+            step[free] = _inverse(now[2][inside]) @ now[1][free]
             for _ in range(MAX_HALVINGS):
                 attempt = values + step[:p], sensor * np.exp(step[p:])
                 if self.positive(places, attempt[0]):
                     then = self.reached(places, *attempt)
-                    if then[0] > logarithm:
-                        gain = then[0] - logarithm
-                        (values, sensor), (logarithm, score, information, squares) = attempt, then
+                    if then[0] > before:
+                        (values, sensor), now = attempt, then
                         break
                 step = step / 2
-            if gain < SCORING_TOLERANCE * len(self.at_states):
+            if now[0] - before < SCORING_TOLERANCE * len(self.at_states):
                 break
         covariance = np.zeros((len(free), len(free)))
-        inverse = _inverse(information[inside])
-        covariance[inside] = inverse @ squares[inside] @ inverse
+        inverse = _inverse(now[2][inside])
+        covariance[inside] = inverse @ now[3][inside] @ inverse
         return values, sensor, covariance
 
     def _formula(
@@ -315,8 +311,8 @@ class ResidualLikelihood(_DiffusionLikelihood):
     def least_squares(self, places: np.ndarray) -> np.ndarray:
         """Coefficients by least squares of the squares of residuals."""
         values = np.zeros(len(places))
-        for i, j in {(int(i), int(j)) for i, j, _ in places}:
-            rows = (places[:, 0] == i) & (places[:, 1] == j)
+        for i, j in np.unique(places[:, :2], axis=0):
+            rows = (places[:, :2] == (i, j)).all(axis=1)
             product = self.rest[:, i] * self.rest[:, j]
             values[rows] = np.linalg.lstsq(self.functions[:, places[rows, 2]], product, rcond=None)[0]
         return values
@@ -330,21 +326,17 @@ class ResidualLikelihood(_DiffusionLikelihood):
         pulled = (precision @ self.rest[:, :, None])[:, :, 0]
         logarithm = -0.5 * float((np.linalg.slogdet(matrices)[1] + (pulled * self.rest).sum(axis=1)).sum())
         score = np.empty((len(pulled), len(places)))
+        half = np.where(np.eye(len(precision[0]), dtype=bool), 0.5, 1.0)
         for column, (i, j, k) in enumerate(places):
-            half = 0.5 if i == j else 1.0
-            score[:, column] = half * (pulled[:, i] * pulled[:, j] - precision[:, i, j])
+            score[:, column] = half[i, j] * (pulled[:, i] * pulled[:, j] - precision[:, i, j])
             score[:, column] *= self.functions[:, k]
         information = np.empty((len(places), len(places)))
-        entries = sorted({(int(i), int(j)) for i, j, _ in places})
-        for i, j in entries:
-            rows = np.flatnonzero((places[:, :2] == (i, j)).all(axis=1))
-            for k, m in entries:
-                columns = np.flatnonzero((places[:, :2] == (k, m)).all(axis=1))
-                weight = (
-                    (0.5 if i == j else 1.0)
-                    * (0.5 if k == m else 1.0)
-                    * (precision[:, i, k] * precision[:, j, m] + precision[:, i, m] * precision[:, j, k])
-                )
+        entries = np.unique(places[:, :2], axis=0)
+        at = [np.flatnonzero((places[:, :2] == entry).all(axis=1)) for entry in entries]
+        for (i, j), rows in zip(entries, at, strict=True):
+            for (k, m), columns in zip(entries, at, strict=True):
+                both = precision[:, i, k] * precision[:, j, m] + precision[:, i, m] * precision[:, j, k]
+                weight = half[i, j] * half[k, m] * both
                 left = self.functions[:, places[rows, 2]] * weight[:, None]
                 information[np.ix_(rows, columns)] = left.T @ self.functions[:, places[columns, 2]]
         return logarithm, score.sum(axis=0), information, score.T @ score
@@ -361,7 +353,7 @@ def process_noise_increments(found: FieldEstimate, pairs: SnapshotPairs, rest: n
     ``∫₀ʰ e^{Js} D e^{Jᵀs} ds`` is ``h e^{Jh/2} D e^{Jᵀh/2}`` but for the second order in Jh.
     """
     step = found.dynamics.jacobian(pairs.x0) * (_response_share(found) * pairs.h)[:, None, None]
-    if not np.isfinite(step).all() or np.abs(step).max(initial=0.0) > MAX_RELAXATION:
+    if not (np.abs(step) <= MAX_RELAXATION).all():
         step = np.zeros_like(step)
     back = np.eye(rest.shape[1]) - step + step @ step / 2
     return np.asarray((back @ rest[:, :, None])[:, :, 0] / np.sqrt(pairs.h)[:, None])
@@ -371,10 +363,9 @@ def with_process_noise_rate(found: FieldEstimate, pairs: SnapshotPairs) -> Field
     """An estimate by pairs whose `noise_rate` is that of the process noise and no longer that of residuals.
 
     Along a step the system forgets a part of what kicked it: a residual has the covariance
-    ``∫₀ʰ e^{Js} εD e^{Jᵀs} ds`` with the Jacobian J of f, and not hεD. Per time that is less than εD, by the
-    share hλ for relaxation at the rate λ: by four per cent where λ = 2/s is sampled every 0.02 s. The mean of
-    that map over the pairs is inverted. What is left is of second order in the step, where the noise moves J
-    itself. An Euler–Maruyama simulation forgets in steps of its own, and nothing within one.
+    ``∫₀ʰ e^{Js} εD e^{Jᵀs} ds`` with the Jacobian J of f, and not hεD. The mean of that map over the pairs is
+    inverted. What is left is of second order in the step, where the noise moves J itself. An Euler–Maruyama
+    simulation forgets in steps of its own, and nothing within one.
     """
     if found.noise_free or not len(pairs.h):
         return found
@@ -383,31 +374,27 @@ def with_process_noise_rate(found: FieldEstimate, pairs: SnapshotPairs) -> Field
     if not np.isfinite(step).all() or np.abs(np.linalg.eigvals(step)).max() > MAX_STEP_RELAXATION:
         return found
     n, d, _ = step.shape
-    unit, whole = np.eye(d), np.eye(d * d)
+    unit, square = np.eye(d), (n, d * d, d * d)
+    total, term = np.zeros(square), np.broadcast_to(np.eye(d * d), square)
     if found.flow.euler:  # the mean of M^k ⊗ M^k for the steps k of the simulation, M = 1 + hJ/steps
         steps = found.flow.steps
         forward = unit + step / steps
-        generator = np.einsum("nij,nkl->nikjl", forward, forward).reshape(n, d * d, d * d)
-        term, total = np.broadcast_to(whole, generator.shape), np.zeros_like(generator)
+        generator = np.einsum("nij,nkl->nikjl", forward, forward).reshape(square)
         for _ in range(steps):
             total += term / steps
             term = term @ generator
     else:  # ∫₀¹ e^{As} ⊗ e^{As} ds for A = hJ, where e^{As} ⊗ e^{As} = e^{(A ⊗ 1 + 1 ⊗ A) s}
         generator = np.einsum("nij,kl->nikjl", step, unit) + np.einsum("ij,nkl->nikjl", unit, step)
-        generator = generator.reshape(n, d * d, d * d)
-        term = np.broadcast_to(whole, generator.shape)
-        total = term.copy()
-        for order in range(1, SERIES_TERMS):
-            term = term @ generator / order
-            total += term / (order + 1)
+        for order in range(1, SERIES_TERMS + 1):
+            total += term / order
+            term = term @ generator.reshape(square) / order
     try:
         rate = np.linalg.solve(total.mean(axis=0), found.noise_rate.ravel()).reshape(d, d)
     except np.linalg.LinAlgError:
         return found
     rate = (rate + rate.T) / 2
-    if np.linalg.eigvalsh(rate)[0] < 0:
-        return found  # of noise on a part of the states the residuals have rounding, too
-    return replace(found, noise_rate=rate)
+    # Of noise on a part of the states the residuals have rounding, too.
+    return found if np.linalg.eigvalsh(rate)[0] < 0 else replace(found, noise_rate=rate)
 
 
 class InnovationLikelihood(_DiffusionLikelihood):
@@ -496,10 +483,6 @@ def estimated_diffusion(found: FieldEstimate, *, pairs: int) -> Diffusion | None
     a term into g that nothing else asks for. The correlation of so many `pairs` has the standard error
     1/√pairs.
 
-    The scale of D is a matter of convention, since a factor goes into ε. The determinant, unlike the trace
-    or the largest eigenvalue, changes by a mere factor when the unit of one state does. Noise that is alike
-    in all directions has the unit matrix, but for the error of the diagonal.
-
     There is none without noise, where noise does not reach every state, and where a state is but the
     derivative of another: what its residuals show is the noise of the other, and depends on the step of the
     pairs.
@@ -519,13 +502,7 @@ def estimated_diffusion(found: FieldEstimate, *, pairs: int) -> Diffusion | None
 
 
 def check_units(states: Sequence[str], units: Sequence[str | None]) -> None:
-    """Refuse the unit matrix for D where states, by their names, are known to have different units.
-
-    Raises
-    ------
-    NumericalFailure
-        With both states, and how D is given.
-    """
+    """Refuse the unit matrix for D, by a NumericalFailure, where states are known to have different units."""
     known = [(name, unit.strip()) for name, unit in zip(states, units, strict=True) if unit]
     other = next(((name, unit) for name, unit in known if unit != known[0][1]), None)
     if other is not None:

@@ -78,18 +78,17 @@ class FlowMap:
         """
         if integrator_step is not None:
             return cls(steps=max(round(float(np.median(h)) / integrator_step), 1), euler=True)
-        steps = 1
-        coarse = cls(steps)(field, x0, h)
-        while steps < MAX_REFINEMENT:
-            fine = cls(2 * steps)(field, x0, h)
+        flow = cls()
+        coarse = flow(field, x0, h)
+        while flow.steps < MAX_REFINEMENT:
+            fine = (finer := cls(2 * flow.steps))(field, x0, h)
             with np.errstate(over="ignore", invalid="ignore"):  # a trial f may run away
-                size = np.sqrt(((fine - x0) ** 2).mean(axis=1))
-                error = np.sqrt(((fine - coarse) ** 2).mean(axis=1))
+                size, error = (np.sqrt((one**2).mean(axis=1)) for one in (fine - x0, fine - coarse))
             # The error of the coarse result; that of the fine one is sixteen times smaller.
             if not (error > tolerance * size).any():
                 break
-            steps, coarse = 2 * steps, fine
-        return cls(steps)
+            flow, coarse = finer, fine
+        return flow
 
     @property
     def curvature_weight(self) -> float:
@@ -125,13 +124,11 @@ class NoiseFormula:
 
     def diffusion(self, intensity: float) -> Diffusion:
         """D, where ε is the intensity."""
-        d = len(self.symbols)
-        rows = [[sympy.S.Zero for _ in range(d)] for _ in range(d)]
+        matrix = sympy.zeros(len(self.symbols))
         for (i, j), term, value in zip(self.places, self.terms, self.values, strict=True):
-            rows[i][j] += sympy.Float(float(value / intensity), 17) * term
-        return Diffusion.of_formulas(
-            self.symbols, [[rows[min(i, j)][max(i, j)] for j in range(d)] for i in range(d)]
-        )
+            matrix[i, j] += sympy.Float(float(value / intensity), 17) * term
+            matrix[j, i] = matrix[i, j]
+        return Diffusion.of_formulas(self.symbols, matrix.tolist())
 
     @cached_property
     def _functions(self) -> Callable[[np.ndarray], np.ndarray]:
@@ -177,15 +174,11 @@ class NoiseFormula:
     def from_data(cls, data: Mapping[str, Any], symbols: Sequence[sympy.Symbol]) -> NoiseFormula:
         """A formula as `as_data` stored it."""
         names, rows = {each.name: each for each in symbols}, data["terms"]
-        places = [[list(names).index(row[key]) for key in ("row", "column")] for row in rows]
-        return cls(
-            tuple(symbols),
-            np.array(places),
-            tuple(parse_formula(row["term"], names) for row in rows),
-            np.array([float(row["coefficient"]) for row in rows]),
-            np.array(data["covariance"], dtype=float),
-            float(data["probability"]),
-        )
+        places = np.array([[list(names).index(row[key]) for key in ("row", "column")] for row in rows])
+        terms = tuple(parse_formula(row["term"], names) for row in rows)
+        values = np.array([float(row["coefficient"]) for row in rows])
+        covariance = np.array(data["covariance"], dtype=float)
+        return cls(tuple(symbols), places, terms, values, covariance, float(data["probability"]))
 
 
 @dataclass(frozen=True)
@@ -331,11 +324,12 @@ class NoiseDiagnosis:
         return sentence(Remark("inference.noise_fault", values))
 
     def as_data(self) -> dict[str, Any]:
-        """As it is stored in `vector_field.json`; an error that is not finite becomes null."""
-        arrays = {name: value.tolist() for name, value in vars(self).items() if isinstance(value, np.ndarray)}
-        if self.measurement_error is not None:
-            errors = self.measurement_error.tolist()
-            arrays["measurement_error"] = [one if np.isfinite(one) else None for one in errors]
+        """As it is stored in `vector_field.json`; what is not finite in an array becomes null."""
+        arrays = {
+            name: np.where(np.isfinite(value), value, None).tolist()
+            for name, value in vars(self).items()
+            if isinstance(value, np.ndarray)
+        }
         remarks = [each.as_data() for each in self.remarks]
         return vars(self) | arrays | {"diffusion": str(self.diffusion), "remarks": remarks}
 
@@ -361,21 +355,16 @@ class FieldEstimate:
 
     Attributes
     ----------
-    library
-        The q functions.
-    coefficients
-        Ξ, shape ``(q, d)``: column i holds the coefficients of f_i.
-    support
-        Shape ``(p, 2)``: the pair (component i, term k) of each of the p coefficients that are not zero.
-    covariance
-        Shape ``(p, p)``: their covariance.
+    library, coefficients
+        The q functions; and Ξ, shape ``(q, d)``: column i holds the coefficients of f_i.
+    support, covariance
+        The pair (component i, term k) of each of the p coefficients that are not zero, shape ``(p, 2)``; and
+        their covariance, shape ``(p, p)``.
     noise_rate
         Shape ``(d, d)``: covariance of the residual per unit of time. For process noise it is εD, once
         `siq.inference.diffusion_model` has put back what a step forgets.
-    residual_ratio
-        Rms of the residuals over rms of the increments.
-    flow
-        The map over a pair's step that was fitted.
+    residual_ratio, flow
+        Rms of the residuals over rms of the increments; and the map over a pair's step that was fitted.
     diffusion
         D, which recordings do not tell apart from ε: of these only the product, `noise_rate`, is identified.
     alternatives
@@ -433,9 +422,9 @@ class FieldEstimate:
         signs, logarithms = np.linalg.slogdet(matrices)
         if not (signs > 0).all():
             raise NumericalFailure("the formula of the noise is not positive at all recorded states")
-        intensity = float(np.exp(logarithms.mean() / len(matrices[0])))
-        diffusion, mean = formula.diffusion(intensity), matrices.mean(axis=0)
-        return replace(self, diffusion=diffusion, noise_rate=mean, noise=formula, constant_noise=None)
+        diffusion = formula.diffusion(float(np.exp(logarithms.mean() / len(matrices[0]))))
+        rate = matrices.mean(axis=0)
+        return replace(self, diffusion=diffusion, noise_rate=rate, noise=formula, constant_noise=None)
 
     @property
     def diffusion_source(self) -> DiffusionSource:
@@ -501,8 +490,7 @@ class FieldEstimate:
         Derivatives by all coefficients ``(..., q, d)`` to ``(...)``. The square of `bias` is a part of it,
         unless it is that `of_mean`, which has been moved by the bias.
         """
-        components, terms = self.support.T
-        own = slopes[..., terms, components]
+        own = slopes[..., self.support[:, 1], self.support[:, 0]]
         total = np.einsum("...p,pr,...r->...", own, self.covariance, own)
         if self.alternatives is not None:
             changes = np.tensordot(slopes, self.alternatives[1], axes=([-2, -1], [-2, -1]))
@@ -518,12 +506,12 @@ class FieldEstimate:
         There are none where D was given. Of a constant D only its shape changes: its determinant is 1 by
         definition, and what is left is the error of ε, which stands beside it.
         """
-        if self.noise is not None:
-            own, intensity = self.noise, self.intensity
-            return lambda x, momenta: own.push_slopes(x, momenta) / intensity
-        if self.constant_noise is None:
+        if (own := self.noise) is not None:
+            strength = self.intensity
+            return lambda x, momenta: own.push_slopes(x, momenta) / strength
+        if (constant := self.constant_noise) is None:
             return lambda x, momenta: np.zeros((len(x), 0))
-        constant, intensity = self.constant_noise, self.diffusion.intensity(self.noise_rate)
+        intensity = self.diffusion.intensity(self.noise_rate)
         scale = constant.strength_slopes(np.zeros((1, self.library.dimension)))
 
         def of_shape(x: np.ndarray, momenta: np.ndarray) -> np.ndarray:

@@ -26,6 +26,7 @@ from siq.errors import NumericalFailure
 from siq.inference.filter_kernels import carry_linearly, filter_recursion, projected_sums, smooth_backwards
 from siq.inference.measurements import Measurements
 from siq.inference.selection import triangle_of
+from siq.numerics.randomness import positive
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Input, ParametricFunctions, Signals, symbol
 
@@ -200,12 +201,9 @@ class Linearisation:
         covariance of the latter ``(n, d, d)``.
         """
         found = self.filtered(first, step, noise.measurement, noise.intensity, begin=begin, kept=True)
-        predicted, filtered, before, after, gains, variances = found[7:]
-        smoothed = smooth_backwards(
-            first, self.transition, self.measured, self.residual, found[0], predicted, before, gains,
-            variances,
-        )  # fmt: skip
-        return smoothed, filtered, after
+        predicted, filtered, before, after, *gains = found[7:]
+        chain = first, self.transition, self.measured, self.residual
+        return smooth_backwards(*chain, found[0], predicted, before, *gains), filtered, after
 
     def sums(self, first: np.ndarray, step: np.ndarray, noise: Noise) -> tuple[float, float, int]:
         """Sum of squared innovations, log-determinant and degrees of freedom, parameters at their best."""
@@ -220,13 +218,9 @@ class Linearisation:
 
     def with_parameters_changed(self, change: np.ndarray) -> Linearisation:
         """The linearisation after a change of the parameters, which are then no longer free."""
-        return replace(
-            self,
-            gap=self.gap + self.response @ change,
-            residual=self.residual - self.measured_response @ change,
-            response=np.zeros((*self.gap.shape, 0)),
-            measured_response=np.zeros((*self.residual.shape, 0)),
-        )
+        gap, residual = self.gap + self.response @ change, self.residual - self.measured_response @ change
+        none, unseen = np.zeros((*gap.shape, 0)), np.zeros((*residual.shape, 0))
+        return Linearisation(self.transition, none, gap, self.measured, unseen, residual)
 
 
 def integrate_intervals(model: Dynamics, grid: Grid, values: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -253,10 +247,14 @@ def linearise(
     those of all parameters. The mean of f over a spread of states may take the place of f as `drift`.
     """
     data, compiled, delays = grid.data, model.functions, model.lags(values)
-    dimension, rows, count = x.shape[1], grid.rows, len(grid.rows)
-    transition = np.zeros((len(x), dimension, dimension))
-    response = np.zeros((len(x), dimension, 0))
-    gap = np.zeros((len(x), dimension))
+    samples, signals = np.ascontiguousarray(x.T), grid.at_samples(delays)
+    by_state, by_parameter = compiled.output_slopes(samples, signals, values)
+    if columns is not None:
+        by_parameter = np.concatenate([by_parameter, columns.outputs(samples, values)], axis=1)
+    simulated = compiled.outputs(samples, signals, values).T
+    (n, d), rows, count = x.shape, grid.rows, len(grid.rows)
+    transition, response = np.zeros((n, d, d)), np.zeros((n, d, by_parameter.shape[1]))
+    gap = np.zeros((n, d))
     # Candidates have their own grid, and come as they are.
     together = count if columns is not None else INTERVALS
     for begin in range(0, count, together):
@@ -264,25 +262,22 @@ def linearise(
         whole = len(chosen) == count
         part = grid if whole else grid.at_intervals(chosen)
         along = drift if drift is None or whole else drift.at_intervals(chosen)
-        ends, by_state, by_parameter = _carried(
-            model, part, values, np.array(x[part.rows].T), along or compiled, columns=columns
-        )
-        if not begin:
-            response = np.zeros((len(x), *by_parameter.shape[1:]))
         at = rows[chosen]
-        transition[at], response[at] = by_state, by_parameter
+        ends, transition[at], response[at] = _carried(
+            model,
+            part,
+            values,
+            np.array(x[at].T),
+            along or compiled,
+            columns=columns,
+            width=response.shape[2],
+        )
         with np.errstate(invalid="ignore"):
             gap[at] = ends.T - x[at + 1]
-    samples = np.ascontiguousarray(x.T)
-    signals = grid.at_samples(delays)
-    by_state, by_parameter = compiled.output_slopes(samples, signals, values)
-    if columns is not None:
-        by_parameter = np.concatenate([by_parameter, columns.outputs(samples, values)], axis=1)
-    simulated = compiled.outputs(samples, signals, values).T
     return Linearisation(
-        transition=transition,
-        response=response,
-        gap=gap,
+        transition,
+        response,
+        gap,
         measured=np.ascontiguousarray(np.moveaxis(by_state, 2, 0)),
         measured_response=np.ascontiguousarray(np.moveaxis(by_parameter, 2, 0)),
         residual=data.outputs - np.where(np.isfinite(simulated), simulated, np.inf),
@@ -297,19 +292,17 @@ def _carried(
     drift: ParametricFunctions | ClosedFunctions,
     *,
     columns: Columns | None,
+    width: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States ``(d, k)`` at the ends of intervals, with their derivatives ``(k, d, d)`` and ``(k, d, p)``."""
-    delays, step = model.lags(values), grid.step
-    dimension, count = state.shape
-    transition = np.broadcast_to(np.eye(dimension), (count, dimension, dimension)).copy()
+    """States ``(d, k)`` at the ends of intervals, and their derivatives ``(k, d, d)``, ``(k, d, width)``."""
+    delays, step, (d, count) = model.lags(values), grid.step, state.shape
+    transition, response = np.broadcast_to(np.eye(d), (count, d, d)).copy(), np.zeros((count, d, width))
     for place in grid.data.restarting:
         state[place] = 0.0
         transition[:, place, place] = 0.0
-    response: np.ndarray | None = None
 
     def slopes(at: np.ndarray, node: int) -> tuple[np.ndarray, np.ndarray]:
-        signals = grid.signals(node, delays)
-        by_state, by_parameter = drift.slopes(at, signals, values)
+        by_state, by_parameter = drift.slopes(at, grid.signals(node, delays), values)
         if columns is not None:
             by_parameter = np.concatenate([by_parameter, columns.rates(at, values, node)], axis=1)
         return np.moveaxis(by_state, 2, 0), np.moveaxis(by_parameter, 2, 0)
@@ -319,13 +312,9 @@ def _carried(
             after, begin_rate, end_rate = _runge_kutta(drift, grid, values, state, part, delays)
             middle = (state + after) / 2 + step / 8 * (begin_rate - end_rate)
         at = [slopes(place, 3 * part + node) for node, place in enumerate((state, middle, after))]
-        if response is None:
-            response = np.zeros((count, dimension, at[0][1].shape[2]))
-        carry_linearly(
-            step, np.stack([each[0] for each in at]), np.stack([each[1] for each in at]), transition, response
-        )
+        jacobians, forcings = (np.stack(each) for each in zip(*at, strict=True))
+        carry_linearly(step, jacobians, forcings, transition, response)
         state = after
-    assert response is not None
     return state, transition, response
 
 
@@ -372,10 +361,9 @@ def _mean_intensity(noise: Diffusion, x: np.ndarray, spread: np.ndarray, step: n
     matrices = noise.at(x[:, :d])
     # In the middle of an interval noise of half of it is added.
     wide = spread[:, :d, :d] + matrices * step[:, None, None] / 2
-    bends = noise.derivatives(x[:, :d], 2)
-    matrices = matrices + np.einsum("nijkl,nkl->nij", bends, wide) / 2
+    bent = np.einsum("nijkl,nkl->nij", noise.derivatives(x[:, :d], 2), wide) / 2
     # On its way a fit may come where the formula is no covariance.
-    levels, vectors = np.linalg.eigh(matrices)
+    levels, vectors = np.linalg.eigh(matrices + bent)
     whole = np.zeros((len(x), x.shape[1], x.shape[1]))
     whole[:, :d, :d] = np.einsum("nik,nk,njk->nij", vectors, np.maximum(levels, 0.0), vectors)
     return whole
@@ -456,13 +444,11 @@ class Noise:
         result = replace(self, measurement=self.measurement * np.exp(logarithms), process=process)
         if self.shape is None or len(self.shape) != 1 or len(driven) < 2:
             return result
-        root = np.linalg.cholesky(self.shape[0][np.ix_(driven, driven)])
-        change = np.eye(len(driven))
+        shape, change, inside = self.shape.copy(), np.eye(len(driven)), np.ix_(driven, driven)
         change[np.tril_indices(len(driven), -1)] = vector[outputs + len(driven) :]
-        root = root @ change
+        root = np.linalg.cholesky(shape[0][inside]) @ change
         root /= np.linalg.norm(root, axis=1)[:, None]
-        shape = self.shape.copy()
-        shape[0][np.ix_(driven, driven)] = root @ root.T
+        shape[0][inside] = root @ root.T
         return replace(result, shape=shape)
 
     @property
@@ -532,12 +518,11 @@ def whiten(linearisation: Linearisation, data: Measurements, noise: Noise) -> Wh
         raise NumericalFailure("small deviations from the recorded motion grow beyond all numbers")
     used = 0
     for begin, end in zip(data.first[:-1] * outputs, data.first[1:] * outputs, strict=True):
-        scale = np.sqrt((initial[begin:end] ** 2).sum(axis=0))
-        scale[scale == 0] = 1.0
-        basis, triangle = np.linalg.qr(initial[begin:end] / scale)
+        own = initial[begin:end] / positive(np.sqrt((initial[begin:end] ** 2).sum(axis=0)))
+        basis, triangle = np.linalg.qr(own)
         values = np.abs(np.diag(triangle))
         if values.min(initial=1.0) <= RANK * values.max(initial=0.0):
-            basis, values, _ = np.linalg.svd(initial[begin:end] / scale, full_matrices=False)
+            basis, values, _ = np.linalg.svd(own, full_matrices=False)
             basis = basis[:, values > RANK * max(values[0], 1e-300)]
         innovations[begin:end] -= basis @ (basis.T @ innovations[begin:end])
         columns[begin:end] -= basis @ (basis.T @ columns[begin:end])
@@ -561,8 +546,7 @@ def solve(columns: np.ndarray, target: np.ndarray, *, least: float = RANK) -> tu
         return np.zeros(0), np.zeros((0, 0))
     if not (np.isfinite(columns).all() and np.isfinite(target).all()):
         raise NumericalFailure("the effect of a parameter on what is measured is beyond all numbers")
-    scale = np.sqrt(np.einsum("np,np->p", columns, columns))
-    scale[scale == 0] = 1.0
+    scale = positive(np.sqrt(np.einsum("np,np->p", columns, columns)))
     triangle = triangle_of(columns, target)
     left, values, right = np.linalg.svd(triangle[:, :-1] / scale, full_matrices=False)
     kept = values > least * values[0] if values[0] > 0 else np.zeros(len(values), dtype=bool)

@@ -544,11 +544,6 @@ def fit_by_multiple_shooting(
     substeps, iterations, budget
         Runge–Kutta steps between samples, by default as many as the accuracy needs; most steps of the fit;
         charged for every evaluation.
-
-    Raises
-    ------
-    BudgetSpent
-        When nothing is left of what is allowed.
     """
     with np.errstate(all="ignore"):  # what runs away is told as a fault
         shooting = _Shooting(model, data, x, substeps, budget=budget)

@@ -8,8 +8,7 @@ in two of them. With the running mean as a state of its own, which begins anew w
 
 the system is Markovian again. An exposure that is shorter than the step begins between two samples, at an
 instant at which nothing is measured. Where it is longer, of several samples one is kept, so that no two
-exposures overlap: of how the state moves these tell nearly as much as all, as long as they are close beside
-the time in which it relaxes.
+exposures overlap.
 
 Or samples show positions, and the second half of the states are velocities of which they show nothing.
 ``dx/dt = v`` holds by definition, process noise acts on velocities, and what is sought is the force in
@@ -66,13 +65,7 @@ MIN_FRICTION = 1e-6  # γ times the step, below which no γ is excluded
 
 
 def velocity_names(positions: Sequence[str]) -> tuple[str, ...]:
-    """The names of the velocities: ``v_x`` of x.
-
-    Raises
-    ------
-    NumericalFailure
-        Where a recorded column has that name already.
-    """
+    """The names of the velocities: ``v_x`` of x; a NumericalFailure where a column has that name already."""
     names = tuple(f"v_{name}" for name in positions)
     if taken := set(names) & set(positions):
         raise NumericalFailure(
@@ -109,16 +102,14 @@ def smoothed_motion(data: Measurements, names: Sequence[str]) -> tuple[np.ndarra
         )
     states = (*names, *velocity_names(names))
     free = seen_positions(Dynamics(states, (sympy.S.Zero,) * len(states), Diffusion.identity(len(states))))
-    begins = data.begins
+    begins, velocity = data.begins, np.zeros_like(data.outputs)
     rate = (data.outputs[begins + 1] - data.outputs[begins]) / data.step[begins, None]
-    velocity = np.zeros_like(data.outputs)
     velocity[begins] = rate
     begin = FIRST_FORCE * (rate**2).mean(axis=0) / float(np.median(data.step[begins]))
-    fit = fit_by_filter(
-        free, data, x=np.concatenate([data.outputs, velocity], axis=1),
-        noise=Noise.of_rate(data.with_known_noise(data.roughness), np.diag(np.append(0 * begin, begin))),
-        closure=False,
-    )  # fmt: skip
+    process = np.diag(np.append(0 * begin, begin))
+    noise = Noise.of_rate(data.with_known_noise(data.roughness), process)
+    x = np.concatenate([data.outputs, velocity], axis=1)
+    fit = fit_by_filter(free, data, x=x, noise=noise, closure=False)
     if fit.fault:
         raise NumericalFailure(f"the velocities cannot be worked out: {fit.fault}")
     return fit.x, fit.noise
@@ -173,13 +164,10 @@ class ObservationModel:
             return plain
         # The states, and their running means, which are what is measured.
         names = [f"_mean_{name}" for name in plain.states]
-        return Dynamics(
-            states=(*plain.states, *names),
-            equations=(*plain.equations, *(each / self.exposure for each in plain.symbols)),
-            diffusion=Diffusion(np.eye(2 * plain.dimension)),
-            parameters=plain.parameters,
-            outputs=tuple((name, symbol(mean)) for (name, _), mean in zip(plain.outputs, names, strict=True)),
-        )
+        states, noise = (*plain.states, *names), Diffusion.identity(2 * plain.dimension)
+        equations = (*plain.equations, *(each / self.exposure for each in plain.symbols))
+        outputs = tuple((name, symbol(mean)) for (name, _), mean in zip(plain.outputs, names, strict=True))
+        return Dynamics(states, equations, noise, parameters=plain.parameters, outputs=outputs)
 
     def measured(self, recordings: Recordings, pair_step: float | None) -> Measurements:
         """The recordings as measurements, a new one behind every gap.
@@ -195,13 +183,9 @@ class ObservationModel:
         start = data.t[ends] - self.exposure
         inside = start > data.t[ends - 1] + INSTANT_TOLERANCE * self.exposure
         at, before = ends[inside], np.searchsorted(ends[inside], data.first)
-        return replace(
-            data,
-            first=data.first + before,
-            t=np.insert(data.t, at, start[inside]),
-            outputs=np.insert(data.outputs, at, np.nan, axis=0),
-            restarting=tuple(range(d, 2 * d)),
-        )
+        t, outputs = np.insert(data.t, at, start[inside]), np.insert(data.outputs, at, np.nan, axis=0)
+        restarting = tuple(range(d, 2 * d))
+        return replace(data, first=data.first + before, t=t, outputs=outputs, restarting=restarting)
 
     def every(self, recordings: Recordings) -> int:
         """Of how many samples one is kept, so that exposures do not overlap."""
@@ -236,18 +220,12 @@ class ObservationModel:
         values = data.outputs[np.arange(len(unknown)) + unknown]  # never two in a row, nor at an end
         return values if self.exposure is None else np.column_stack([values, values])
 
-    def fitted(
-        self, support: np.ndarray, values: np.ndarray, data: Measurements, *, noise: Noise, x: np.ndarray,
-        **options: Any,
-    ) -> Fit:  # fmt: skip
-        """The fit of some terms, beginning with their values, states and noise; see `fit_by_filter`.
+    def fitted(self, support: np.ndarray, values: np.ndarray, data: Measurements, **options: Any) -> Fit:
+        """The fit of some terms, beginning with their values; see `fit_by_filter` for the options.
 
-        Raises
-        ------
-        NumericalFailure
-            When it does not settle.
+        Where it does not settle that is a NumericalFailure.
         """
-        fit = fit_by_filter(self.model(support, values), data, x=x, noise=noise, **options)
+        fit = fit_by_filter(self.model(support, values), data, **options)
         if not fit.converged:
             fault = f": {fit.fault}" if fit.fault else ""
             raise NumericalFailure(
@@ -260,15 +238,11 @@ class ObservationModel:
 def moved_by(data: Measurements) -> tuple[np.ndarray, float]:
     """Mean square of what each output moves by from a measured sample to the next, and the mean time.
 
-    Raises
-    ------
-    NumericalFailure
-        Where no sample has a next one.
+    Where no sample has a next one that is a NumericalFailure.
     """
     measured = np.flatnonzero(~np.isnan(data.outputs).all(axis=1))
-    before, after = measured[:-1], measured[1:]
-    same = data.recording[before] == data.recording[after]
-    before, after = before[same], after[same]
+    same = data.recording[measured[:-1]] == data.recording[measured[1:]]
+    before, after = measured[:-1][same], measured[1:][same]
     if not len(before):
         raise NumericalFailure(
             "no two samples are so near in time that one tells of the other; record longer"
@@ -284,13 +258,9 @@ def unbroken(recordings: Recordings, *, pair_step: float | None = None, every: i
     """
     runs = [np.arange(run.start, run.stop, every) for run in runs_of(recordings, longest=pair_step)]
     rows = np.concatenate(runs)
-    return Measurements(
-        labels=tuple(recordings.labels[recordings.recording[run[0]]] for run in runs),
-        first=np.cumsum([0, *map(len, runs)]),
-        t=recordings.t[rows],
-        outputs=np.ascontiguousarray(recordings.values[rows]),
-        courses=((),) * len(runs),
-    )
+    labels = tuple(recordings.labels[recordings.recording[run[0]]] for run in runs)
+    first, outputs = np.cumsum([0, *map(len, runs)]), np.ascontiguousarray(recordings.values[rows])
+    return Measurements(labels, first, recordings.t[rows], outputs, ((),) * len(runs))
 
 
 @dataclass(frozen=True)
@@ -402,12 +372,10 @@ class _InertialModels:
     @cached_property
     def without(self) -> Fit:
         """The model without inertia."""
-        data, (moved, step) = self.data, moved_by(self.data)
-        model = Dynamics(
-            self.library.states, (self._force,), Diffusion.identity(1), parameters=self._parameters
-        )
-        noise = Noise(0.1 * moved, moved / step)
-        fit = fit_by_filter(model, data, x=data.outputs, noise=noise, closure=False)
+        data, (moved, step), noise = self.data, moved_by(self.data), Diffusion.identity(1)
+        model = Dynamics(self.library.states, (self._force,), noise, parameters=self._parameters)
+        begin = Noise(0.1 * moved, moved / step)
+        fit = fit_by_filter(model, data, x=data.outputs, noise=begin, closure=False)
         if fit.fault:
             raise NumericalFailure(f"the model without inertia cannot be fitted: {fit.fault}")
         return fit
@@ -465,10 +433,8 @@ class _InertialModels:
         states = (*self.library.states, *velocity_names(self.library.states))
         friction = "friction" + "_" * max(map(len, states))  # no state is called so
         parameters = (*self._parameters, Parameter(friction, 0.0, fixed=fixed))
-        equation = rate(self._force, symbol(states[1]), symbol(friction))
-        return seen_positions(
-            Dynamics(states, (sympy.S.Zero, equation), Diffusion.identity(2), parameters=parameters)
-        )
+        equations = (sympy.S.Zero, rate(self._force, symbol(states[1]), symbol(friction)))
+        return seen_positions(Dynamics(states, equations, Diffusion.identity(2), parameters=parameters))
 
     def stiffness(self, values: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
         """``-F'`` where F falls through zero most steeply, and its standard error; zeros where nowhere."""

@@ -10,6 +10,7 @@ likelihood, and so is how the parameters would change.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from siq.inference.kalman_filter import Grid, Noise, profile_likelihood, whiten
 from siq.inference.maximum_likelihood import Fit, first_noise, fit_by_multiple_shooting
 from siq.inference.measurements import Measurements, first_states
 from siq.inference.trajectories import EDGE_SUBSTEPS, fit_trajectories, jumps_of, run, sharpened, spread_edges
+from siq.numerics.randomness import positive
 from siq.systems.dynamics import Dynamics
 
 DECADES = 14  # of strengths that are looked through, downwards from noise that would make all of the motion
@@ -68,20 +70,18 @@ def _average(
 ) -> tuple[np.ndarray, float]:
     """Covariance averaged over factors on the standard deviation of a noise; and the mean of that factor."""
     known = data.sensor_noise is not None and bool(np.isfinite(data.sensor_noise).all())
-    units = np.sqrt(np.diag(fit.covariance))
-    units = np.where(units > 0, units, 1.0)
+    units = positive(np.sqrt(np.diag(fit.covariance)))
 
-    def at(size: float) -> tuple[float, np.ndarray, np.ndarray] | None:
+    def at(size: float) -> tuple[float, np.ndarray, np.ndarray]:
         """Log-likelihood, change and covariance of the parameters for a factor."""
         if budget is not None:
             budget.charge(evaluation(fit.model, data))
+        noise = Noise(fit.noise.measurement, process * size**2, fit.noise.shape)
         try:
-            white = whiten(
-                fit.linearisation, data, Noise(fit.noise.measurement, process * size**2, fit.noise.shape)
-            )
+            white = whiten(fit.linearisation, data, noise)
             change, covariance = white.solve()
         except (NumericalFailure, np.linalg.LinAlgError):
-            return None
+            return -np.inf, np.zeros(len(units)), fit.covariance
         left = white.innovations - white.columns @ change
         total, freedom = float(left @ left), white.degrees_of_freedom - len(change)
         covariance = covariance if known else covariance * (total / freedom)
@@ -93,20 +93,21 @@ def _average(
 
     # Of noise that is estimated the strength is about one, and of other noise anywhere below.
     sizes = np.concatenate([[0.0], 10.0 ** (np.arange(-DECADES, 5) / 2)])
-    coarse = np.array([-np.inf if (one := at(size)) is None else one[0] for size in sizes])
+    coarse = np.array([at(size)[0] for size in sizes])
     if not np.isfinite(coarse).any():
         return fit.covariance, 0.0
     likely = np.flatnonzero(coarse > coarse.max() - UNLIKELY)
     lowest, highest = sizes[max(likely[0] - 1, 0)], sizes[min(likely[-1] + 1, len(sizes) - 1)]
-    found = [(size, *one) for size in np.linspace(lowest, highest, POINTS) if (one := at(size)) is not None]
-    if not found:
+    sizes = np.linspace(lowest, highest, POINTS)
+    values, changes, covariances = zip(*map(at, sizes), strict=True)
+    if not np.isfinite(values).any():
         return fit.covariance, 0.0
-    weights = np.exp(np.array([one[1] for one in found]) - max(one[1] for one in found))
+    weights = np.exp(np.array(values) - max(values))
     weights /= weights.sum()
     covariance = np.zeros_like(fit.covariance)
-    for weight, (_, _, change, own) in zip(weights, found, strict=True):
+    for weight, change, own in zip(weights, changes, covariances, strict=True):
         covariance += weight * (own + np.outer(change, change))
-    return covariance, float(weights @ [one[0] for one in found])
+    return covariance, float(weights @ sizes)
 
 
 def fit_with_process_noise_as_needed(
@@ -149,11 +150,6 @@ def fit_with_and_without_process_noise(
 
     Both begin with the states and noise of a fit, its process noise times the `level`; or with states `x`,
     where the model has more of them. Where the fit is `settled` it is itself the one with process noise.
-
-    Raises
-    ------
-    BudgetSpent
-        When nothing is left of what is allowed.
     """
     if budget is not None:
         budget.charge(COMPILATION)
@@ -247,21 +243,18 @@ def recalibrate(model: Dynamics, data: Measurements, *, budget: Budget | None = 
         When neither fit can be made.
     """
     x = first_states(model, data)
-    noise = first_noise(model, data, x)
-    loose = fit_by_multiple_shooting(model, data, x=x, noise=noise, estimate_process=True, budget=budget)
+    noise, fitted = first_noise(model, data, x), partial(fit_by_multiple_shooting, data=data, budget=budget)
+    loose = fitted(model, x=x, noise=noise, estimate_process=True)
     # Without process noise, beginning along the simulation as the card has it.
     begin, substeps = x[data.first[:-1]], max(loose.substeps, 1)
     followed = run(model, Grid(data, substeps), begin)
-    own = fit_by_multiple_shooting(
-        model, data, x=np.where(np.isfinite(followed), followed, x), noise=noise.without_process(),
-        estimate_process=False, budget=budget,
-    )  # fmt: skip
+    x = np.where(np.isfinite(followed), followed, x)
+    own = fitted(model, x=x, noise=noise.without_process(), estimate_process=False)
     if not own.converged:
         # Steps at all samples at once may lead anywhere, from where a search could explain nothing. Damped
         # steps of whole trajectories never make a fit worse than the card's own simulation is.
-        own = preferred_fit(
-            own, fit_trajectories(model, data, begin=begin, noise=noise, substeps=substeps, budget=budget)
-        )
+        damped = fit_trajectories(model, data, begin=begin, noise=noise, substeps=substeps, budget=budget)
+        own = preferred_fit(own, damped)
     known: Fit | None = None
     if loose.converged:
         known, strict = fit_with_and_without_process_noise(
@@ -277,10 +270,7 @@ def recalibrate(model: Dynamics, data: Measurements, *, budget: Budget | None = 
             raise NumericalFailure(strict.fault or loose.fault)
         return loose, strict
     small = Noise(strict.noise.measurement, noise.process * FAINT)
-    again = fit_by_multiple_shooting(
-        strict.model, data, x=strict.x, noise=small, estimate_process=True, substeps=strict.substeps,
-        budget=budget,
-    )  # fmt: skip
+    again = fitted(strict.model, x=strict.x, noise=small, estimate_process=True, substeps=strict.substeps)
     strict = _with_insignificant_dropped(again, strict, data)
     loosened = [each for each in (known, again) if each is not None and each.converged]
     best = max(loosened, key=lambda each: each.log_likelihood, default=None)

@@ -4,28 +4,25 @@ A pair has ``Xh = Φ_h(X0; f) + noise`` with ``f = Θ Ξ`` and the flow Φ. Defe
 linear problem: with the current f the difference between the flow and ``X0 + h f(X0)`` is subtracted from the
 data, and a few rounds reach the exact answer. All functions of a library are fitted first. Terms are dropped
 by their own uncertainty, and under noise exchanged as long as that helps (`siq.inference.selection`). What
-remains is fitted by generalised least squares with the covariance that the residuals show, which attains the
-Cramér–Rao bound. Where D depends on the state each pair has weights of its own: with one weight for all,
-coefficients are right on average, but their standard errors are not.
+remains is fitted by generalised least squares with the covariance that the residuals show. Where D depends on
+the state each pair has weights of its own: with one weight for all, standard errors would be wrong.
 
-The increment from one sample to the next is not determined by the present sample alone where neighbouring
-errors are correlated, and the regression of it on functions of that sample is biased. But a sample L steps
-earlier knows nothing of them, once L is the lag from which on the record is Markovian
-(`siq.data.correlation`). Then
+Where neighbouring errors are correlated, the regression of an increment on functions of the present sample is
+biased. But a sample L steps earlier knows nothing of them, once L is the lag from which on the record is
+Markovian (`siq.data.correlation`). Then
 
     ``Σ_t θ(x(t-L)) ⊗ (x(t+h) - Φ_h(x(t); f)) = 0``
 
-holds in the mean for the true f and no other: the functions of the earlier state are instruments. Every
-sample begins such a pair, so that they overlap, and their residuals are correlated up to the lag L. Sums of
-them have the long-run covariance ``Ω = C_0 + Σ_{k≤L} (C_k + C_kᵀ)``, from which standard errors follow, and
-the strength of the process noise: over longer times it acts as white noise of the covariance Ω/h per time.
+holds in the mean for the true f and no other: the functions of the earlier state are instruments. Such pairs
+overlap, and sums of their residuals have the long-run covariance ``Ω = C_0 + Σ_{k≤L} (C_k + C_kᵀ)``, from
+which standard errors follow, and the process noise: over longer times it is white, Ω/h per time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 import scipy.linalg
@@ -98,13 +95,7 @@ class LaggedPairs(SnapshotPairs):
 
 
 def lagged_pairs(recordings: Recordings, lag: int) -> LaggedPairs:
-    """All pairs of neighbouring samples that a sample `lag` steps earlier is known of.
-
-    Raises
-    ------
-    NumericalFailure
-        When there is none.
-    """
+    """All pairs of neighbouring samples that a sample `lag` steps earlier is known of: at least one."""
     stretches = even_stretches(recordings)
     at = stretches.within(lag)
     if not len(at):
@@ -147,8 +138,7 @@ def lost_time(found: FieldEstimate, given: LaggedPairs) -> float:
     covariances = lagged_covariances(rest - rest.mean(axis=0), given.number, given.lag)
     weighted = 2 * np.einsum("k,kij->ij", np.arange(len(covariances), dtype=float), covariances)
     whole = long_run_covariance(covariances, given.lag)
-    share = float(np.trace(np.linalg.solve(whole, weighted))) / len(whole)
-    return share * float(np.median(given.h))
+    return float(np.trace(np.linalg.solve(whole, weighted))) / len(whole) * float(np.median(given.h))
 
 
 class _PairRegression:
@@ -162,7 +152,6 @@ class _PairRegression:
         self.support = everything if support is None else support
         self.active, self.position = np.unique(self.support[:, 1], return_inverse=True)
         self._terms = compile_formulas([library.terms[k] for k in self.active], library.symbols)
-        self._second: Callable[[np.ndarray], np.ndarray] | None = None
         self.x0, self.xh, self.h = np.ascontiguousarray(pairs.x0.T), pairs.xh.T, pairs.h
         self.theta = self._terms(self.x0)
         if not np.isfinite(self.theta).all():
@@ -211,11 +200,13 @@ class _PairRegression:
     def _curvature(self, x0: np.ndarray, noise_rate: np.ndarray) -> np.ndarray:
         """Σ_jk (εD)_jk ∂²θ/∂x_j∂x_k of the active functions, shape ``(active, n)``."""
         d = self.library.dimension
-        if self._second is None:
-            by_states = zip(*self.library.second_derivatives(self.active.tolist()), strict=True)
-            self._second = compile_formulas([each for row in by_states for each in row], self.library.symbols)
         values = self._second(x0).reshape(d, d, len(self.active), -1)
         return np.einsum("ij,ijkn->kn", noise_rate, values)
+
+    @cached_property
+    def _second(self) -> Callable[[np.ndarray], np.ndarray]:
+        by_states = zip(*self.library.second_derivatives(self.active.tolist()), strict=True)
+        return compile_formulas([each for row in by_states for each in row], self.library.symbols)
 
     def triangle(self, velocity: np.ndarray) -> np.ndarray:
         """R of the QR decomposition of √h [Θ, velocity], on which every fit with one weight depends."""
@@ -246,8 +237,7 @@ class _PairRegression:
 def copies(pairs: SnapshotPairs) -> float:
     """Factor by which copies of resampled recordings make pairs look more than they are: 1 without any.
 
-    A pair that stands m times counts with weight m, but has only one residual: variances grow by Σm²/Σm,
-    which is about 2 for a bootstrap sample.
+    A pair that stands m times counts with weight m, but has only one residual: variances grow by Σm²/Σm.
     """
     _, counts = np.unique(np.column_stack([pairs.x0, pairs.xh]), axis=0, return_counts=True)
     return float((counts**2).sum() / counts.sum())
@@ -436,18 +426,13 @@ def with_stability(
     """An estimate of noisy pairs with the share of resampled recordings in which each term is chosen."""
     regression = _PairRegression(found.library, pairs)
     velocity = regression.corrected(found.coefficients.T.ravel(), found.flow, found.noise_rate)
-    weight = np.sqrt(pairs.h)[:, None]
-    order = np.argsort(pairs.recording, kind="stable")
-    parts = triangles(
-        (regression.theta.T * weight)[order], (velocity * weight)[order], blocks_of(pairs.recording[order])
-    )
+    order, weight = np.argsort(pairs.recording, kind="stable"), np.sqrt(pairs.h)[:, None]
+    blocks = blocks_of(pairs.recording[order])
+    parts = triangles((regression.theta.T * weight)[order], (velocity * weight)[order], blocks)
     critical = critical_values(found.library, false_terms=options.false_terms)
     samples = len(pairs.h) / copies(pairs)
-    shares = stability(
-        parts, lambda one: LinearProblem.of_components(one, samples=samples, critical=critical),
-        found.support, generator=generator,
-    )  # fmt: skip
-    return replace(found, stability=shares)
+    problems_of = partial(LinearProblem.of_components, samples=samples, critical=critical)
+    return replace(found, stability=stability(parts, problems_of, found.support, generator=generator))
 
 
 def with_noise_formula(

@@ -1,18 +1,17 @@
 """Sparse least squares of f: a linear problem, selection of its terms, stability, and model averaging.
 
-Backward elimination ends where no single term is superfluous. Where two terms are nearly the same function on
-the recorded states, as x²y and x⁴y are about x² = 1, it may have dropped the wrong one on its way and never
-looks back. Here supports are compared as wholes, by
+Backward elimination may drop the wrong one of two terms that are nearly the same function on the recorded
+states, as x²y and x⁴y are about x² = 1. Here supports are compared as wholes, by
 
     score = χ² + Σ c_k²,
 
 χ² being that of the residuals and c_k the number of standard errors that the term k has to be from zero.
 Terms are added, dropped and exchanged as long as that lowers the score. Of two terms that fit equally well
 the one of the lower degree is taken: the probability of a false term is shared among the degrees k as 1/k!,
-by which the coefficients of a Taylor series fall, and among the terms of a degree evenly. A price for each
-term is too much for terms that are needed together: where the origin of a state is far from its wells, a
-cubic is four monomials, none of which does much without the others. So a support is not taken that all
-functions of some degree fit better than chance would let them.
+by which the coefficients of a Taylor series fall, and among the terms of a degree evenly. Terms may be needed
+together: where the origin of a state is far from its wells, a cubic is four monomials, none of which does
+much without the others. So a support is not taken that all functions of some degree fit better than chance
+would let them.
 
 To be chosen a term has to be so strong that noise hardly brings it, and one that is there and a little weaker
 is left out: whatever follows from the formula is then off by more than its error. So what follows from f is a
@@ -204,10 +203,9 @@ def strong_terms(
 def best_support(problem: LinearProblem) -> tuple[int, ...]:
     """The support of the lowest score that is found; an empty one only where nothing else is significant.
 
-    Elimination from a rich library may leave many terms that make up together what a few of low degree would
-    do, none of which it still has, and exchanges of single terms do not lead back. So it begins from every
-    library of lower degree as well, and from nothing. From where these end the search goes on to neighbours
-    of neighbours, as long as that leads to any of the `SEARCH_BREADTH` best.
+    It begins by elimination from the libraries of every degree, since that of a rich one may leave many terms
+    for a few of low degree, and from nothing. From where these end the search goes on to neighbours of
+    neighbours, as long as that leads to any of the `SEARCH_BREADTH` best.
     """
     ends = {_improved_support(problem, ())}
     for most in np.unique(problem.critical):
@@ -232,13 +230,7 @@ def chosen_terms(
     *,
     reason: str = "; record longer",
 ) -> np.ndarray:
-    """The support ``(p, 2)`` of problems that are independent of each other.
-
-    Raises
-    ------
-    NumericalFailure
-        Where an equation has no term, with the reason.
-    """
+    """The support ``(p, 2)`` of independent problems; a NumericalFailure where an equation has no term."""
     chosen = np.concatenate([problem.labels[list(choose(problem))] for problem in problems])
     for component in np.unique(np.concatenate([problem.labels[:, 0] for problem in problems])):
         if component not in chosen[:, 0]:
@@ -371,10 +363,9 @@ def _mean_over_supports(
         for score, one in priced.neighbours(nearest):
             if score < limit:
                 scores.setdefault(one, score)
-    lowest = min(scores.values())
+    size, lowest = positive(np.linalg.norm(problem.columns, axis=0)), min(scores.values())
     odds = {one: float(np.exp(-(score - lowest) / 2)) for one, score in scores.items()}
     odds = {one: share for one, share in odds.items() if share > MIN_ODDS}
-    size = positive(np.linalg.norm(problem.columns, axis=0))
     weights = np.array(list(odds.values()))
     weights /= weights.sum()
     changes = np.array([problem.solve(one) for one in odds]) - problem.solve(support)

@@ -25,6 +25,7 @@ from siq.inference.kalman_filter import Grid, Linearisation, Noise, integrate_in
 from siq.inference.maximum_likelihood import Fit, fit_by_multiple_shooting, fit_of_states
 from siq.inference.measurements import Measurements, expectations, first_states
 from siq.numerics.integration import machine_code
+from siq.numerics.randomness import positive
 from siq.systems.dynamics import Dynamics, Tape, symbol
 from siq.systems.formulas import compile_values
 
@@ -207,11 +208,6 @@ def fit_trajectories(
     sample after sample, and lost where the motion is chaotic; to be used where that one does not settle.
     The measurement noise weighs the outputs. The fit is not converged where the simulation runs away at the
     begin, or where more simulations would be needed than are allowed.
-
-    Raises
-    ------
-    BudgetSpent
-        When nothing is left of what is allowed.
     """
     work, free = substeps * evaluation(model, data), np.array(model.free, dtype=int)
     count = int(np.isfinite(data.outputs).sum())
@@ -300,8 +296,8 @@ class _NormalEquations:
 
         Every direction is damped by its own square; initial states are eliminated recording by recording.
         """
-        scale = _sizes(np.diag(self.shared))
-        own_scale = _sizes(np.einsum("rii->ri", self.own))
+        scale = np.sqrt(positive(np.diag(self.shared)))
+        own_scale = np.sqrt(positive(np.einsum("rii->ri", self.own)))
         shared = self.shared / np.outer(scale, scale) + damping * np.eye(len(scale))
         own = self.own / (own_scale[:, :, None] * own_scale[:, None, :])
         own += damping * np.eye(own_scale.shape[1])
@@ -316,10 +312,6 @@ class _NormalEquations:
         linear = float(change @ target + (begin * own_target).sum())
         length = float(change @ change + (begin**2).sum())
         return change / scale, begin / own_scale, linear + damping * length
-
-
-def _sizes(squares: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.where(squares > 0, squares, 1.0))
 
 
 SHORTEST_PREFIX = 8  # samples
