@@ -326,7 +326,7 @@ class NoiseDiagnosis:
     def as_data(self) -> dict[str, Any]:
         """As it is stored in `vector_field.json`; what is not finite in an array becomes null."""
         arrays = {
-            name: np.where(np.isfinite(value), value, None).tolist()
+            name: np.where(np.isfinite(value), value, np.array(None)).tolist()
             for name, value in vars(self).items()
             if isinstance(value, np.ndarray)
         }
@@ -336,10 +336,9 @@ class NoiseDiagnosis:
     @classmethod
     def from_data(cls, data: Mapping[str, Any]) -> NoiseDiagnosis:
         """A diagnosis as `as_data` stored it; older files have fewer entries."""
-        blank = {"covariance": [], "measurement": [], "correlation": 0.0, "correlation_score": 0.0}
-        known = blank | {
-            each.name: data[each.name] for each in fields(cls) if data.get(each.name) is not None
-        }
+        known: dict[str, Any] = {"covariance": [], "measurement": []}
+        known |= {"correlation": 0.0, "correlation_score": 0.0}
+        known |= {each.name: data[each.name] for each in fields(cls) if data.get(each.name) is not None}
         for name in {"covariance", "measurement", "measurement_error"} & known.keys():
             known[name] = np.array(known[name], dtype=float)
         if "measurement_error" in known:

@@ -97,26 +97,21 @@ def filter_recursion(
     transition, response, gap
         Of the interval that begins at each row: shapes ``(n, d, d)``, ``(n, d, p)``, ``(n, d)``. `gap` is
         by how much the model's next state exceeds the one in hand.
-    measured, measured_response
-        Derivative of the outputs by states and parameters, ``(n, m, d)`` and ``(n, m, p)``.
-    residual
-        Measured minus modelled outputs, shape ``(n, m)``; NaN where nothing was measured.
-    variance
-        Of the measurement noise, shape ``(m,)``.
-    step
-        Lengths of the intervals, shape ``(n,)``.
-    intensity
-        Of the process noise, per time: shape ``(1, d, d)``, or ``(n, d, d)``.
+    measured, measured_response, residual
+        Derivative of the outputs by states and parameters, ``(n, m, d)`` and ``(n, m, p)``; measured minus
+        modelled outputs, shape ``(n, m)``, NaN where nothing was measured.
+    variance, step, intensity
+        Of the measurement noise, shape ``(m,)``; lengths of the intervals, shape ``(n,)``; of the process
+        noise, per time: shape ``(1, d, d)``, or ``(n, d, d)``.
     begin, begin_covariance
         Deviation of the initial state of each recording ``(recordings, d)``, and its covariance ``(d, d)``.
     functions, places
         Functions over the interval that begins at each row, ``(n, q)``, and row, column and function of the
         coefficients of the intensity by which the likelihood is derived, the row not above the column,
         ``(c, 3)``.
-    scored
-        Whether it is derived by these coefficients, and by the logarithms of the sensors' variances.
-    kept
-        Whether what a smoother needs is kept.
+    scored, kept
+        Whether it is derived by these coefficients, and by the logarithms of the sensors' variances; and
+        whether what a smoother needs is kept.
 
     Returns
     -------

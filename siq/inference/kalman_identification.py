@@ -99,11 +99,9 @@ def identify_by_likelihood(
         assert noise is not None
         x, noise = observation.states(data), observation.noise(replace(noise, shape=np.eye(d)[None]))
     whole = _fit_library(observation.model(everything, np.zeros(len(everything))), data, x, noise)
-    by_state, chance, likelihood = False, 1.0, None
-    if not hidden:
-        likelihood = InnovationLikelihood(library.symbols, whole, data)
-        chance = likelihood.constant_probability()
-        by_state = chance < false_terms and bool(whole.noise.process.any())
+    likelihood = None if hidden else InnovationLikelihood(library.symbols, whole, data)
+    chance = 1.0 if likelihood is None else likelihood.constant_probability()
+    by_state = chance < false_terms and bool(whole.noise.process.any())
     if likelihood is not None and by_state:
         # Weights that are wrong everywhere would choose wrong terms.
         formula, sensor, _ = likelihood.selected(false_terms=false_terms, probability=chance)
@@ -148,11 +146,9 @@ def identify_by_likelihood(
         if likelihood is not None and found.noise_rate.any():
             found = replace(found, constant_noise=likelihood.constant[0])
     shares = stability(parts, lambda triangle: [problem_of(triangle)], support, generator=generator)
-    return replace(
-        found,
-        alternatives=model_average([problem], support, library),
-        stability=np.concatenate([np.ones(len(observation.definitions)), shares]),
-    )
+    shares = np.append(np.ones(len(observation.definitions)), shares)
+    average = model_average([problem], support, library)
+    return replace(found, alternatives=average, stability=shares)
 
 
 def _fit_library(model: Dynamics, data: Measurements, x: np.ndarray, noise: Noise) -> Fit:
@@ -233,19 +229,15 @@ def _with_formula(
             support, fit.model.values, data, noise=noise, x=fit.linearised_at, estimate_process=False,
             estimate_sensor=False, substeps=fit.substeps,
         )  # fmt: skip
-    found = _estimate(
-        observation, support, fit, data, np.sqrt(np.diag(covariance)[len(formula.values) :]),
-        np.zeros(len(symbols)),
-        fit.covariance + likelihood.parameter_covariance(formula, sensor, covariance, fit),
-    )  # fmt: skip
+    of_sensor, of_process = np.sqrt(np.diag(covariance)[len(formula.values) :]), np.zeros(len(symbols))
+    added = likelihood.parameter_covariance(formula, sensor, covariance, fit)
+    found = _estimate(observation, support, fit, data, of_sensor, of_process, fit.covariance + added)
     states = fit.linearised_at[:, : len(symbols)]
-    slopes = formula.strength_slopes(states)
-    found = found.with_formula(formula, states)
+    slopes, found = formula.strength_slopes(states), found.with_formula(formula, states)
     assert found.diagnosis is not None
-    error = found.intensity * float(np.sqrt(slopes @ formula.covariance @ slopes))
-    return replace(
-        found, diagnosis=replace(found.diagnosis, intensity=found.intensity, intensity_error=error)
-    )
+    intensity = found.intensity
+    error = intensity * float(np.sqrt(slopes @ formula.covariance @ slopes))
+    return replace(found, diagnosis=replace(found.diagnosis, intensity=intensity, intensity_error=error))
 
 
 def _strongest_correlation(white: Whitened, data: Measurements) -> tuple[float, float]:

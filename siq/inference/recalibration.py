@@ -111,20 +111,14 @@ def _average(
 
 
 def fit_with_process_noise_as_needed(
-    model: Dynamics,
-    data: Measurements,
-    begin: Fit,
-    *,
-    level: float = 1.0,
-    x: np.ndarray | None = None,
-    budget: Budget | None = None,
+    model: Dynamics, data: Measurements, begin: Fit, *, budget: Budget | None = None, **options: Any
 ) -> Fit:
-    """Fit with process noise estimated, and without; the simpler unless the data speak against it.
+    """Of the fits of `fit_with_and_without_process_noise` the simpler, unless the data speak against it.
 
     A jump that is spread too far leaves errors which process noise stands in for. Before that is believed the
     jumps of the fit without them are followed more finely.
     """
-    loose, strict = fit_with_and_without_process_noise(model, data, begin, level=level, x=x, budget=budget)
+    loose, strict = fit_with_and_without_process_noise(model, data, begin, budget=budget, **options)
     chosen = _simpler_fit(loose, strict)
     if chosen is loose and strict.converged and strict.model.edges:
         chosen = _simpler_fit(loose, sharpened(strict, data, budget=budget))

@@ -123,9 +123,8 @@ def coarse_pairs(recordings: Recordings, lag: int, *, lost: float) -> SnapshotPa
     at = at[(np.arange(len(at)) - begins[which]) % lag == 0]
     x, t = recordings.values, recordings.t
     h = np.maximum(t[at + lag] - t[at] - lost, 0.5 * stretches.step)
-    return SnapshotPairs(
-        x[at], x[at + lag], h, parent_recordings(recordings.labels)[recordings.recording[at]]
-    )
+    recording = parent_recordings(recordings.labels)[recordings.recording[at]]
+    return SnapshotPairs(x[at], x[at + lag], h, recording)
 
 
 def lost_time(found: FieldEstimate, given: LaggedPairs) -> float:
@@ -298,17 +297,16 @@ def identify_vector_field(
     pairs: SnapshotPairs,
     *,
     options: IdentificationOptions,
-    diffusion: Diffusion | None = None,
     integrator_step: float | None = None,
 ) -> FieldEstimate:
     """f of pairs; by instruments of `LaggedPairs`, the library's functions of the earlier states.
+
+    D is the unit matrix; f does not depend on it.
 
     Parameters
     ----------
     library, pairs, options
         The candidate functions; X0, Xh and h; and what makes a term significant.
-    diffusion
-        D, by default the unit matrix; f does not depend on it.
     integrator_step
         Step of the Euler–Maruyama simulation that made the pairs, None for everything else. Then the
         increment of each step is h f exactly, and f is that of the continuous process.
@@ -325,9 +323,8 @@ def identify_vector_field(
     pairs. Those of noise-free pairs are the error of integrators, the same in neighbouring pairs: their
     standard errors are given without that gain, as a bound.
     """
-    noise = Diffusion.identity(library.dimension) if diffusion is None else diffusion
     if isinstance(pairs, LaggedPairs):
-        return _identify_by_instruments(library, pairs, options, noise)
+        return _identify_by_instruments(library, pairs, options)
     if not carries_noise(library, pairs, options=options, integrator_step=integrator_step):
         pairs = pairs.take(_evenly(len(pairs.h), options.pairs))
     regression = _PairRegression(library, pairs)
@@ -337,10 +334,9 @@ def identify_vector_field(
     samples = len(pairs.h) / (1.0 if noise_free else copies(pairs))
     problems = LinearProblem.of_components(triangle, samples=samples, critical=critical)
     choose = partial(strong_terms, precision=options.precision) if noise_free else best_support
-    chosen = chosen_terms(problems, library, choose)
-    found = FieldEstimate.on_support(
-        library, chosen, np.zeros(len(chosen)), np.eye(len(chosen)), rate, ratio, flow, noise
-    )
+    chosen, noise = chosen_terms(problems, library, choose), Diffusion.identity(library.dimension)
+    none, unit = np.zeros(len(chosen)), np.eye(len(chosen))
+    found = FieldEstimate.on_support(library, chosen, none, unit, rate, ratio, flow, noise)
 
     def fit(support: np.ndarray) -> tuple[FieldEstimate, np.ndarray]:
         nonlocal found
@@ -517,7 +513,7 @@ def weighted_triangle(
 
 
 def _identify_by_instruments(
-    library: CandidateLibrary, pairs: LaggedPairs, options: IdentificationOptions, diffusion: Diffusion
+    library: CandidateLibrary, pairs: LaggedPairs, options: IdentificationOptions
 ) -> FieldEstimate:
     """Two-stage least squares: functions and increments are projected on instruments, and fitted there."""
     q, h = library.size, pairs.h[:, None]
@@ -553,7 +549,8 @@ def _identify_by_instruments(
     chosen = chosen_terms(problems, library, reason=reason)
 
     def fit(support: np.ndarray) -> tuple[FieldEstimate, np.ndarray]:
-        found = _fit_by_instruments(_PairRegression(library, pairs, support), pairs, diffusion)
+        noise = Diffusion.identity(library.dimension)
+        found = _fit_by_instruments(_PairRegression(library, pairs, support), pairs, noise)
         return found, np.abs(found.values) / np.sqrt(np.diag(found.covariance)) / critical[support[:, 1]]
 
     found, support = fit_significant(fit, chosen)
@@ -578,9 +575,9 @@ def _fit_by_instruments(
         if settled:
             break
     assert flow is not None
-    size = positive(((pairs.xh - pairs.x0) ** 2).mean(axis=0))
+    size, rate = positive(((pairs.xh - pairs.x0) ** 2).mean(axis=0)), spread / float(np.median(pairs.h))
+    ratio, covariance = np.sqrt(((rest**2).mean(axis=0) / size).mean()), inverse @ inverse.T * copies(pairs)
+    support = regression.support
     return FieldEstimate.on_support(
-        regression.library, regression.support, values, inverse @ inverse.T * copies(pairs),
-        spread / float(np.median(pairs.h)), float(np.sqrt(((rest**2).mean(axis=0) / size).mean())), flow,
-        diffusion,
-    )  # fmt: skip
+        regression.library, support, values, covariance, rate, float(ratio), flow, diffusion
+    )
