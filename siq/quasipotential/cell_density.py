@@ -140,8 +140,7 @@ class SampledPotential:
         # Two cells wide, as U varies between the middle of a cell and the rim.
         near = scipy.ndimage.minimum_filter(np.pad(values, 1, constant_values=np.inf), 5, mode="nearest")
         rims = np.array([-np.inf, *np.atleast_1d(scipy.ndimage.minimum(near, part, np.arange(1, parts + 1)))])
-        inside = (slice(1, -1),) * values.ndim
-        lowest = np.where(known, np.inf, rims[part][inside])
+        lowest = np.where(known, np.inf, rims[part][(slice(1, -1),) * values.ndim])
         # U where f enters the known region from each unknown cell, -∞ where it does not.
         low = scipy.ndimage.minimum_filter(values, 3, mode="nearest")
         x = self.middles(~known)

@@ -41,6 +41,7 @@ from siq.quasipotential.power_series import quasipotential_series
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
 
+NO_ACTION = 1e-7  # of ∫|f||φ'|ds: less is a path without noise
 Function = Callable[[np.ndarray], np.ndarray]
 norm = partial(np.linalg.norm, axis=1)
 
@@ -108,6 +109,13 @@ class ScaledSystem:
         """ẏ, q̇ and the rate of U at positions and momenta ``(n, d)``; `turned` where it is known."""
         push = self.noise.push(y, q)
         return self.force(y) + 2 * push, self.pull(y, q, turned), 2 * np.sum(q * push, axis=1)
+
+    def residual(self, y: np.ndarray, q: np.ndarray) -> float:
+        """The largest Hamiltonian of points ``(n, d)``, in proportion to its parts."""
+        force, push = self.force(y), self.noise.contract(y, q)
+        drift = np.sum(q * force, axis=1)
+        scale = max((np.abs(drift) + push).max(), NO_ACTION * np.sum(force**2, axis=1).max())
+        return float(np.abs(drift + push).max() / scale)
 
 
 class HamiltonianFlow(ScaledSystem):

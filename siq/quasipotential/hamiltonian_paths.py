@@ -474,9 +474,7 @@ def _path(problem: _HamiltonianProblem, solution: PPoly, error: float, tolerance
     values = _values(problem, solution, places)
     values = np.r_[0.0, values[np.searchsorted(places, times)], values[-1]]
     z = solution(times).T
-    y, q = z[:, :d], z[:, d:]
-    drift, push = np.sum(q * problem.force(y), axis=1), problem.noise.contract(y, q)
-    residual = float(np.abs(drift + push).max() / (np.abs(drift) + push).max())
+    residual = problem.residual(z[:, :d], z[:, d:])
     z, times = np.vstack([np.zeros(2 * d), z]), np.r_[-np.inf, times]
     if problem.unstable is not None:
         z, times = np.vstack([z, np.r_[problem.end, np.zeros(d)]]), np.append(times, np.inf)

@@ -266,13 +266,12 @@ def _as_sampled(cores: _Cores, dynamics: Dynamics, intensity: float, step: float
 
 def _core_of(cores: _Cores, points: np.ndarray) -> np.ndarray:
     """The core of each point ``(n, d)``, -1 between them: shape ``(n,)``."""
-    found, lowest = np.full(len(points), -1), np.full(len(points), np.inf)
-    for place, (attractor, hessian, level) in enumerate(cores):
-        away = points - attractor
-        height = np.einsum("ni,ij,nj->n", away, hessian, away)
-        inside = (height <= level) & (height / level < lowest)
-        found[inside], lowest[inside] = place, (height / level)[inside]
-    return found
+    heights = [
+        np.einsum("ni,ij,nj->n", points - attractor, hessian, points - attractor) / level
+        for attractor, hessian, level in cores
+    ]
+    nearest = np.argmin([*heights, np.full(len(points), np.nextafter(1, 2))], axis=0)
+    return np.where(nearest < len(cores), nearest, -1)
 
 
 def _cores_about(dynamics: Dynamics, portrait: PhasePortrait, intensity: float) -> _Cores:

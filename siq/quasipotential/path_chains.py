@@ -40,7 +40,6 @@ from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import classify, hessian_at
 
 REST = 1e-5  # |f| at an equilibrium, in units of the Jacobian and the distance
-NO_ACTION = 1e-7  # of ∫|f||φ'|ds: less is a path without noise
 CYCLE_GRID = 8  # places between two points of a cycle, from which the closest one is sought
 NEWTON_STEPS_TO_CYCLE = 4  # from there: the error is squared in each
 CYCLE_SHIFT = 1e-3  # of the upper bound of S: above the error of tubes, below what parts two minima
@@ -194,16 +193,13 @@ class Segments:
         # ``|f||Δ| - f·Δ``, written so that nothing cancels where f and Δ are parallel.
         turn = forward / self.length[:, None] - force / self.speed[:, None]
         self.actions = 0.5 * self.speed * self.length * np.sum(turn**2, axis=1)
+        # ``∫ |f| |φ'| ds``, with which an action is compared that may be zero.
+        self.effort = float(np.sum(self.speed * self.length))
 
     @property
     def metric(self) -> np.ndarray:
         """D⁻¹ of the middles, ``(n - 1, d, d)``."""
         return self.whitening.transpose(0, 2, 1) @ self.whitening
-
-    @property
-    def effort(self) -> float:
-        """The integral ``∫ |f| |φ'| ds``, with which an action is compared that may be zero."""
-        return float(np.sum(self.speed * self.length))
 
 
 class PathProblem(ScaledSystem):

@@ -23,10 +23,10 @@ from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
 from siq.numerics.integration import dormand_prince_step, next_step
+from siq.quasipotential.characteristics import NO_ACTION
 from siq.quasipotential.hamiltonian_paths import hamiltonian_paths
 from siq.quasipotential.path_chains import (
     MOST_NODES,
-    NO_ACTION,
     MinimumActionPath,
     PathProblem,
     Segments,
@@ -35,11 +35,9 @@ from siq.quasipotential.path_chains import (
     products,
     total_turn,
 )
-from siq.systems.basins import ends_of
-from siq.systems.cycles import Cycle, unstable_direction
+from siq.systems.cycles import Cycle, states_beside
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import measure_at
-from siq.systems.phase_portrait import PhasePortrait
 
 DESCENT_POINTS = 4000  # of a way down that Hamilton's equations are told, which may wind
 TURN = 0.15  # radian from one segment of the first chain to the next
@@ -54,7 +52,6 @@ STEP_PRECISION = REST_SPEED / 10  # what jitters about a rest by more than its s
 LONGEST_DESCENT = 1e5  # in units of the shortest time
 
 # The way down about cycles, in units of the domain.
-SEPARATRIX_OFFSET = 1e-3  # from where f leads on, beside what parts two basins
 CYCLE_ARRIVAL = 1e-2  # so close to an attractor it is drawn
 LONGEST_PERIODS = 100.0  # in which it has to be there
 CYCLE_DESCENT_POINTS = 200
@@ -165,7 +162,7 @@ def minimum_action_path(
         values=problem.unit * line[:, -1],
         action=problem.unit * float(line[-1, -1]),
         error=problem.unit * error,
-        residual=_hamiltonian_residual(problem, line),
+        residual=problem.residual(points, momenta),
         converged=minimum and known,
         rivals=tuple(float(problem.unit * line[-1, -1] * share) for share in shares),
     )
@@ -186,16 +183,6 @@ def _path_nodes(problem: PathProblem, y: np.ndarray) -> np.ndarray:
     return np.column_stack([y, p, values])
 
 
-def _hamiltonian_residual(problem: PathProblem, nodes: np.ndarray) -> float:
-    """The largest Hamiltonian, in proportion to its parts."""
-    y, p = np.split(nodes[:, :-1], 2, axis=1)
-    force = problem.force(y)
-    drift = np.sum(p * force, axis=1)
-    push = problem.noise.contract(y, p)
-    scale = max((np.abs(drift) + push).max(), NO_ACTION * np.sum(force**2, axis=1).max())
-    return float(np.abs(drift + push).max() / scale)
-
-
 def _extrapolated(
     problem: PathProblem, coarse: tuple[np.ndarray, float], fine: tuple[np.ndarray, float]
 ) -> np.ndarray:
@@ -207,10 +194,10 @@ def _extrapolated(
     action = max((4 * fine[1] - coarse[1]) / 3, 0.0)
     second = _path_nodes(problem, fine[0])
     nodes = (4 * second[::2] - _path_nodes(problem, coarse[0])) / 3
-    if not _hamiltonian_residual(problem, nodes) < _hamiltonian_residual(problem, second):
+    d, ends = problem.dimension, np.zeros((2, nodes.shape[1]))
+    if not problem.residual(nodes[:, :d], nodes[:, d:-1]) < problem.residual(second[:, :d], second[:, d:-1]):
         nodes = second
         nodes[:, -1] *= action / max(fine[1], np.finfo(float).tiny)
-    d, ends = problem.end.size, np.zeros((2, nodes.shape[1]))
     if problem.finish is not None:
         ends[1, :d] = problem.finish.closest(nodes[-1:, :d])[0]
         nodes[-1, -1] = action - problem.remaining(nodes[-1, :d])
@@ -244,14 +231,13 @@ def transition_path(
     *,
     box: np.ndarray | None = None,
     nodes: int = 100,
-    tolerance: float = 1e-4,
-    initial: Sequence[np.ndarray] | None = None,
+    **options: Any,
 ) -> MinimumActionPath:
     """The path of least action to what parts two basins, with the way that f leads on from there.
 
     Parameters
     ----------
-    dynamics, start, nodes, tolerance, initial
+    dynamics, start, nodes, **options
         As for `minimum_action_path`; `nodes` is the number of points downhill, too.
     over, end
         A saddle with one unstable direction, or an unstable cycle; and the other attractor, or stable cycle,
@@ -268,7 +254,7 @@ def transition_path(
     downhill = None
     if end is not None and not about_cycle:
         downhill = descent(dynamics, np.asarray(over, float), np.asarray(end, float), nodes)
-    uphill = minimum_action_path(dynamics, start, over, nodes=nodes, tolerance=tolerance, initial=initial)
+    uphill = minimum_action_path(dynamics, start, over, nodes=nodes, **options)
     if end is None:
         downhill = uphill.points[-1:] if isinstance(over, Cycle) else np.asarray(over, float)[None]
     elif about_cycle:
@@ -320,24 +306,6 @@ def _arriving(
     return next((way for way in ways if len(way.t_events[0])), None)
 
 
-def both_sides(dynamics: Dynamics, cycle: Cycle, portrait: PhasePortrait) -> np.ndarray:
-    """Where f leads from both sides of an unstable cycle: numbers of attractors, -1 elsewhere."""
-    starts = _states_beside(dynamics, cycle, 0, portrait.box)
-    return ends_of(dynamics, starts, portrait.attractors, portrait.cycles, box=portrait.box)
-
-
-def _states_beside(dynamics: Dynamics, over: np.ndarray | Cycle, place: int, box: np.ndarray) -> np.ndarray:
-    """Two states on either side of a saddle, or of a point of an unstable cycle."""
-    width = np.ptp(box, axis=1)
-    if isinstance(over, Cycle):
-        direction, position = unstable_direction(dynamics, over, place, scale=width), over.points[place]
-    else:
-        values, vectors = np.linalg.eig(dynamics.jacobian(over[None])[0])
-        direction, position = vectors[:, np.argmax(values.real)].real, over
-    direction = SEPARATRIX_OFFSET * direction / np.abs(direction / width).max()
-    return np.stack([position + direction, position - direction])
-
-
 def _downhill(
     dynamics: Dynamics,
     over: np.ndarray | Cycle,
@@ -359,7 +327,7 @@ def _downhill(
 
     way = _arriving(
         lambda _, y: dynamics.drift((y * width)[None])[0] / width,
-        _states_beside(dynamics, over, place, box) / width, LONGEST_PERIODS * period, [arrives],
+        states_beside(dynamics, over, width=width, place=place) / width, LONGEST_PERIODS * period, [arrives],
         rtol=1e-6, atol=1e-8, max_step=period / 40,
     )  # fmt: skip
     if way is None:

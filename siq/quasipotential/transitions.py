@@ -24,7 +24,7 @@ from siq.errors import NumericalFailure
 from siq.inference.diffusion_model import defined_states
 from siq.inference.field_estimate import AnyField, dynamics_of
 from siq.quasipotential.path_chains import MinimumActionPath
-from siq.quasipotential.paths import both_sides, descent, transition_path
+from siq.quasipotential.paths import descent, transition_path
 from siq.quasipotential.rates import EscapeRate, escape_rate, prefactor_error
 from siq.quasipotential.wells import Well
 from siq.remarks import Remark, sentence
@@ -150,7 +150,7 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
         ways.append(Transition(start, end, over, path, remarks=remarks, from_cycle=start >= points))
 
     for cycle in portrait.parting:
-        ends = [int(one) for one in both_sides(dynamics, cycle, portrait)]
+        ends = sides_of(dynamics, cycle, portrait.attractors, box=box, cycles=cycles).tolist()
         for start, beyond in (ends, ends[::-1]) if ends[0] != ends[1] else ():
             if start >= 0:
                 add(start, cycle, None if beyond < 0 else beyond)

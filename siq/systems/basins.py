@@ -14,7 +14,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.optimize
@@ -22,11 +21,9 @@ import scipy.optimize
 from siq.errors import NumericalFailure
 from siq.numerics.integration import dormand_prince_step, next_step
 from siq.numerics.randomness import representative_subset
+from siq.systems.cycles import Cycle, states_beside
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, classify, crossing_rate, distinct_roots, hessian_at
-
-if TYPE_CHECKING:
-    from siq.systems.cycles import Cycle
 
 SLOWEST_TIMES = 200.0  # trajectories are followed for so many of the slowest relaxation times, ...
 UNSETTLED_TIMES = 25.0  # ... or times to cross the box where there is no attractor
@@ -131,17 +128,15 @@ def settled_on(
 
 def sides_of(
     dynamics: Dynamics,
-    saddle: Equilibrium,
+    over: Equilibrium | Cycle,
     attractors: Sequence[Equilibrium],
     *,
     box: np.ndarray,
     cycles: Sequence[Cycle] = (),
 ) -> np.ndarray:
-    """Where f leads from both sides of each unstable direction of a saddle, see `ends_of`."""
-    values, vectors = np.linalg.eig(dynamics.jacobian(saddle.position[None])[0])
-    unstable = vectors[:, values.real > 0].real.T
-    steps = 1e-3 * (unstable / np.abs(unstable / np.ptp(box, axis=1)).max(axis=1, keepdims=True))
-    starts = saddle.position + np.stack([steps, -steps], axis=1).reshape(-1, len(box))
+    """Where f leads from both sides of a saddle, or of an unstable cycle, see `ends_of`."""
+    place = over if isinstance(over, Cycle) else over.position
+    starts = states_beside(dynamics, place, width=np.ptp(box, axis=1))
     return ends_of(dynamics, starts, attractors, cycles, box=box)
 
 

@@ -52,6 +52,7 @@ LONGEST_STEP = 0.1  # of the scale, of one step of Newton's method
 NEUTRAL_MULTIPLIER_MARGIN = 1e-6  # of 1: closer to it a multiplier is not told from 1 by these integrals
 MAX_POWER_ITERATIONS = 100  # numerical: of the power iteration for unstable directions
 POWER_ITERATION_TOLERANCE = 1e-9  # numerical: its accuracy, of integrals to 1e-11
+SEPARATRIX_OFFSET = 1e-3  # of the domain: from where f leads on, beside what parts two basins
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -192,6 +193,22 @@ def unstable_direction(dynamics: Dynamics, cycle: Cycle, place: int = 0, *, scal
     _, flows, _ = _parts(dynamics, cycle.points, cycle.period / len(cycle.points), scale)
     rows = _across(dynamics.drift(cycle.points) / scale)
     return np.asarray(_unstable_rows(rows, flows, cycle.unstable)[place, 0] * scale)
+
+
+def states_beside(
+    dynamics: Dynamics, over: np.ndarray | Cycle, *, width: np.ndarray, place: int = 0
+) -> np.ndarray:
+    """States on both sides of a saddle along its k unstable directions, or of a point of an unstable cycle.
+
+    Shape ``(2k, d)``; they are off by `SEPARATRIX_OFFSET` of the widths.
+    """
+    if isinstance(over, Cycle):
+        position, unstable = over.points[place], unstable_direction(dynamics, over, place, scale=width)[None]
+    else:
+        values, vectors = np.linalg.eig(dynamics.jacobian(over[None])[0])
+        position, unstable = over, vectors[:, values.real > 0].real.T
+    steps = SEPARATRIX_OFFSET * unstable / np.abs(unstable / width).max(axis=1, keepdims=True)
+    return np.asarray(position + np.stack([steps, -steps], axis=1).reshape(-1, len(width)))
 
 
 def _across(flow: np.ndarray) -> np.ndarray:
