@@ -327,33 +327,15 @@ def completed(study: Study, system: Dynamics | None) -> Study:
 
 
 def load_study(path: str | Path) -> Study:
-    """Read and check a study file.
-
-    Raises
-    ------
-    InputError
-        With the file, the line and the remedy, for whatever the schema refuses.
-    """
+    """Read and check a study file; an `InputError` has the file, the line and the remedy."""
     return validate(read_document(path), Study)
 
 
 def load_study_system(study: Study, card: str | Path | None, *, file: str) -> Dynamics | None:
-    """The system of a study, checked together with what the study asks of it.
+    """The system of a study, checked together with what the study asks of it; None where it names no card.
 
-    Parameters
-    ----------
-    study
-        The study.
-    card
-        The card that it names, None where it names none.
-    file
-        Its file, for messages.
-
-    Raises
-    ------
-    InputError
-        When the card is missing or refused, inputs or the time drive the system, or the study's library or D
-        does not fit the states.
+    Fails with `InputError` when the card is missing or refused, inputs or the time drive the system, or the
+    study's library or D does not fit the states. The file of the study is for messages.
     """
     system = None
     if card is not None:
@@ -390,13 +372,7 @@ def _check_sweep(sweep: SweepOptions, system: Dynamics, *, file: str) -> None:
 
 
 def check_states(study: Study, states: Sequence[str], *, file: str) -> None:
-    """Check what a study says of its states, once these are known.
-
-    Raises
-    ------
-    InputError
-        When the library's functions or D do not fit the states.
-    """
+    """Refuse functions of a study's library, or a D, that do not fit its states, once these are known."""
     try:
         if study.recordings is not None and study.recordings.diffusion is not None:
             rows = diffusion_rows(study.recordings.diffusion, len(states))
