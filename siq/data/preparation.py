@@ -156,9 +156,8 @@ def joined(recordings: Recordings) -> Recordings:
     """
     matches = [_STRETCH_LABEL.fullmatch(label) for label in recordings.labels]
     parts = [(one["label"], one["of"], int(one["number"])) if one else (None, None, 0) for one in matches]
-    begins = np.array([True] + [
-        other[0] is None or (*one[:2], one[2] + 1) != other for one, other in pairwise(parts)
-    ])  # fmt: skip
+    follows = [other[0] is not None and (*one[:2], one[2] + 1) == other for one, other in pairwise(parts)]
+    begins = ~np.array([False, *follows])
     if begins.all():
         return recordings
     labels = [recordings.labels[place] for place in np.flatnonzero(begins)]

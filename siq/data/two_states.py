@@ -365,13 +365,9 @@ class RecordStates:
         """
         import pandas as pd
 
-        return pd.DataFrame(
-            [
-                (level, one.visits, one.mean, *one.limits)
-                for level, one in zip(self.levels, self.counts, strict=True)
-            ],
-            columns=["level", "visits", "mean_time", "lowest", "highest"],
-        )
+        pairs = zip(self.levels, self.counts, strict=True)
+        rows = [(level, one.visits, one.mean, *one.limits) for level, one in pairs]
+        return pd.DataFrame(rows, columns=["level", "visits", "mean_time", "lowest", "highest"])
 
     def sentence(self) -> str:
         """The same in a sentence; empty where two states are not supported."""

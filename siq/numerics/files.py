@@ -60,10 +60,7 @@ class Document:
 def read_document(path: str | Path) -> Document:
     """Read a YAML mapping, in UTF-8, and the lines of its entries.
 
-    Raises
-    ------
-    InputError
-        When the file is missing, is not YAML, is not a mapping, or has a key twice.
+    Raises InputError when the file is missing, is not YAML, is not a mapping, or has a key twice.
     """
     file = str(path)
     try:
@@ -111,10 +108,7 @@ def _loader_of(text: str) -> Any:
 def validate(document: Document, model: type[Model]) -> Model:
     """Check a document against a pydantic model and return the model's instance.
 
-    Raises
-    ------
-    InputError
-        For the first entry that the model refuses; a misspelt key is told with the nearest known one.
+    Raises InputError for the first entry that is refused; a misspelt key is told with the nearest known one.
     """
     try:
         return model.model_validate(document.data)
@@ -209,10 +203,7 @@ def case_folders(folder: Path) -> dict[str, Path]:
 def files_of(folder: Path) -> list[Path]:
     """The files of recordings in a folder, in the order of their names, without hidden and unreadable ones.
 
-    Raises
-    ------
-    InputError
-        When there are none.
+    Raises InputError when there are none.
     """
     found = sorted(
         path

@@ -207,13 +207,7 @@ def build_system(document: Document, card: SystemCard) -> Dynamics:
 
 
 def load_exact(path: str | Path) -> sympy.Expr | None:
-    """The exact U that a card knows, its parameters inserted; None for none. For scoring only.
-
-    Raises
-    ------
-    InputError
-        As `load_system`.
-    """
+    """The exact U that a card knows, its parameters inserted; None for none. Raises as `load_system`."""
     document = read_document(path)
     card = validate(document, SystemCard)
     text = card.exact.quasipotential

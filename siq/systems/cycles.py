@@ -110,12 +110,8 @@ def closed_orbit(dynamics: Dynamics, guess: np.ndarray, period: float, *, scale:
     """The periodic orbit next to a guess of its states ``(n, d)`` and its period, stable or not.
 
     The states have equal distances in time, and the first one is not repeated. The scale ``(d,)`` is the size
-    of what is looked at, as the width of a domain.
-
-    Raises
-    ------
-    NumericalFailure
-        When Newton's method ends at no orbit, or at an equilibrium.
+    of what is looked at, as the width of a domain. Raises NumericalFailure when Newton's method ends at no
+    orbit, or at an equilibrium.
     """
     x, time = guess.copy(), period
     n, d = x.shape
@@ -159,12 +155,8 @@ def hessians_along(dynamics: Dynamics, cycle: Cycle, *, reaching: bool = False) 
 
     Shape ``(n, d, d)``, at the points of the cycle; ``H f = 0``. Of an unstable cycle half the Hessian of the
     least action of a path that ends on it is taken, as V is half of U. It is zero for displacements that f
-    brings back by itself.
-
-    Raises
-    ------
-    NumericalFailure
-        When the cycle is not stable, or noise does not spread states across it.
+    brings back by itself. Raises NumericalFailure when the cycle is not of this kind, or noise does not
+    spread states across it.
     """
     if reaching == (cycle.unstable == 0) or (not reaching and not cycle.stable):
         raise NumericalFailure(f"the cycle of period {cycle.period:.6g} has no curvature of V of this kind")

@@ -81,10 +81,7 @@ class Diffusion:
     ) -> Diffusion:
         """D of formulas, d rows of d, in the symbols of the states; constant where no state stands in them.
 
-        Raises
-        ------
-        ValueError
-            When the formulas are not a symmetric matrix, or other names than the states stand in them.
+        Raises ValueError when they are not a symmetric matrix, or other names than the states stand in them.
         """
         found = _Formulas(symbols, rows)
         if any(entry.free_symbols for row in found.formulas for entry in row):
@@ -202,10 +199,7 @@ class Diffusion:
     def root_at(self, x: np.ndarray) -> np.ndarray:
         """σ at points, lower triangular where D is regular: ``(n, d)`` to ``(n, d, d)``.
 
-        Raises
-        ------
-        NumericalFailure
-            Where D is not positive definite, or formulas leave a state out.
+        Raises NumericalFailure where D is not positive definite, or formulas leave a state out.
         """
         self._check_inverse()
         matrices = self.at(x)

@@ -380,13 +380,7 @@ class Dynamics:
 
     @property
     def box(self) -> np.ndarray:
-        """The domain, shape ``(d, 2)``, where it has to be known.
-
-        Raises
-        ------
-        ValueError
-            Where nobody said it.
-        """
+        """The domain, shape ``(d, 2)``, where it has to be known; raises ValueError where nobody said it."""
         unknown = [name for name, ends in zip(self.states, self.limits, strict=True) if np.isnan(ends).any()]
         if unknown:
             raise Fault(f"no domain of {', '.join(unknown)} is known", "give the limits of each state")
@@ -499,10 +493,7 @@ class Dynamics:
     def drift_of_components(self) -> Callable[[np.ndarray], np.ndarray]:
         """f of components ``(d, ...)``, for loops over many states at once: contiguous in memory.
 
-        Raises
-        ------
-        ValueError
-            Where inputs or the time stand in f.
+        Raises ValueError where inputs or the time stand in f.
         """
         return compile_formulas(self._autonomous_formulas(), self.symbols)
 

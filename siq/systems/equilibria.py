@@ -200,12 +200,8 @@ def hessian_at(dynamics: Dynamics, equilibrium: np.ndarray) -> np.ndarray:
     """M, the Hessian of V at an equilibrium: ``M = W⁻¹`` with ``J W + W Jᵀ = -2D``, shape ``(d, d)``.
 
     It follows from f near the equilibrium alone, and at an attractor is what tells the true V from false
-    solutions of the Hamilton–Jacobi equation. D may be singular, if the noise reaches every state through J.
-
-    Raises
-    ------
-    NumericalFailure
-        Where it does not: W is singular then.
+    solutions of the Hamilton–Jacobi equation. D may be singular, if the noise reaches every state through J;
+    where it does not, W is singular, and NumericalFailure is raised.
     """
     # In units of the noise: where the states' units differ much, rounding would swallow the smaller ones.
     diffusion = dynamics.diffusion.frozen(equilibrium)  # p vanishes here, and with it what D's change does
@@ -267,12 +263,8 @@ def measure_at(dynamics: Dynamics, attractor: np.ndarray) -> Diffusion:
 
     Where D has no inverse, ``|f|² = f·D⁻¹f`` has no meaning. In its place stands ``K = -(tr J / d) W``: the
     mean rate of relaxation times the spread of states per noise. For ``f = -D∇V`` with relaxation as fast in
-    every direction it is D.
-
-    Raises
-    ------
-    NumericalFailure
-        When noise does not reach every state about the attractor, or it is none.
+    every direction it is D. Raises NumericalFailure when noise does not reach every state about the
+    attractor, or it is none.
     """
     if dynamics.diffusion.regular:
         return dynamics.diffusion

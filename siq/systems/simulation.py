@@ -68,13 +68,7 @@ class SimulationEntry:
         return replace(self, pair_step=step, interval=interval)
 
     def options(self) -> SimulationOptions:
-        """The options of the simulation, once nothing is left out.
-
-        Raises
-        ------
-        ValueError
-            When something is left out, or the interval does not fit the step.
-        """
+        """The options of the simulation; raises ValueError where one is left out, or does not fit another."""
         if self.pair_step is None or self.interval is None:
             raise ValueError("the step and the interval of the pairs are not known without the system")
         options = SimulationOptions(**vars(self))
