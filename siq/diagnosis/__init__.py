@@ -1,7 +1,7 @@
 """Diagnosis: where a simulation and recordings differ, and which physics was left out.
 
 - `study`, `dictionary`, `mechanisms`: what is compared; mechanisms written for roles, and built into models.
-- `screening`, `search`: what a little of each mechanism would gain; fitting and accepting them one by one.
+- `screening`, `search`: what a little of each term would gain, by a judge; fitting mechanisms one by one.
 - `terms`, `smooth_functions`, `unnamed_models`: unknown functions, curves, surfaces and memories.
 - `residual_structure`, `evidence`, `holdout`: what residuals show, likelihood and chance, prediction.
 - `naming`, `investigation`: which mechanisms may be named; all of it for one case.

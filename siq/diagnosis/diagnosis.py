@@ -364,9 +364,9 @@ def _candidate_rows(search: Search) -> list[tuple[str | float, ...]]:
                 rows.append((name, label, "", trial.delta_chi2, 1.0, stage, beside))
     beside = ", ".join(search.screened_with)
     stage = "further" if list(search.screened_with) == labels else "instead"
-    for each in search.screened:
-        name, label = each.term.candidate.name, each.term.candidate.label
+    for one in search.screened:
+        name, label = one.term.candidate.name, one.term.candidate.label
         if (label, beside) not in fitted:  # of what was fitted, what had been promised is of no interest
-            shapes = ", ".join(f"{shape}={value:.4g}" for shape, value in each.term.shapes)
-            rows.append((name, label, shapes, each.gain, each.level, stage, beside))
+            shapes = ", ".join(f"{shape}={value:.4g}" for shape, value in one.term.shapes)
+            rows.append((name, label, shapes, one.gain, one.level, stage, beside))
     return rows

@@ -334,29 +334,17 @@ class Roles:
 
 def roles_of(model: Dynamics) -> Roles:
     """Read the roles of a model's states off its equations."""
-    motions = tuple(
-        (name, str(equation))
-        for name, equation, definition in zip(model.states, model.equations, model.kinematic, strict=True)
-        if definition
-    )
+    equations = dict(zip(model.states, model.equations, strict=True))
+    definitions = {name for name, each in zip(model.states, model.kinematic, strict=True) if each}
+    motions = tuple((name, str(equations[name])) for name in model.states if name in definitions)
+    dynamic = tuple(name for name in model.states if name not in definitions)
     in_motion = {name for pair in motions for name in pair}
-    dynamic = tuple(
-        name for name, definition in zip(model.states, model.kinematic, strict=True) if not definition
-    )
     others = [name for name in dynamic if name not in in_motion]
-    amplitudes = tuple(
-        (a, b)
-        for place, a in enumerate(others)
-        for b in others[place + 1 :]
-        if _turns(model, model.states.index(a), model.states.index(b))
-    )
+    amplitudes = tuple(pair for pair in itertools.combinations(others, 2) if _turns(model, *pair))
     in_pairs = {name for pair in amplitudes for name in pair}
     alone = [name for name in others if name not in in_pairs]
-    equations = dict(zip(model.states, model.equations, strict=True))
     levels = tuple(name for name in alone if _has_root(equations[name], name))
-    populations = tuple(
-        name for name in alone if name not in levels and _stays_zero(model, model.states.index(name))
-    )
+    populations = tuple(name for name in alone if name not in levels and _stays_zero(model, name))
     units = dict(zip(model.states, model.units, strict=True))
     formulas = (*model.equations, *dict(model.outputs).values())
     sines = {each for formula in formulas for each in formula.atoms(sympy.sin, sympy.cos)}
@@ -366,11 +354,7 @@ def roles_of(model: Dynamics) -> Roles:
         angles=tuple(x for x, _ in motions if units[x] == "rad" or symbol(x) in turning),
         amplitudes=amplitudes,
         populations=populations,
-        feeding=tuple(
-            (prey, predator)
-            for prey, predator in itertools.permutations(populations, 2)
-            if _feeds(model, prey, predator)
-        ),
+        feeding=tuple(pair for pair in itertools.permutations(populations, 2) if _feeds(model, *pair)),
         levels=levels,
         cascades=tuple(
             (upper, lower)
@@ -425,8 +409,9 @@ def _feeds(model: Dynamics, prey: str, predator: str) -> bool:
     return bool(np.all(np.asarray(losses) <= 0) and np.all(np.asarray(gains) >= 0))
 
 
-def _turns(model: Dynamics, first: int, second: int) -> bool:
+def _turns(model: Dynamics, one: str, other: str) -> bool:
     """Whether f commutes with rotations of two states, but for a constant, and itself turns them."""
+    first, second = model.states.index(one), model.states.index(other)
     if model.units[first] != model.units[second]:
         return False
     x, signals = trial_points(model)
@@ -449,8 +434,8 @@ def _turns(model: Dynamics, first: int, second: int) -> bool:
     return bool(np.abs(turning).max() > FORMULA_TOLERANCE * np.abs(x[[first, second]]).max() * size)
 
 
-def _stays_zero(model: Dynamics, place: int) -> bool:
-    x, signals = trial_points(model)
+def _stays_zero(model: Dynamics, name: str) -> bool:
+    (x, signals), place = trial_points(model), model.states.index(name)
     moving = model.functions.rates(x, signals, model.values)[place]
     x[place] = 0.0
     rate = model.functions.rates(x, signals, model.values)[place]

@@ -104,11 +104,8 @@ class HeldOutErrors:
 
     def change(self, first: Run, second: Run) -> Change:
         """Whether the second of two simulations is better, by more than appears by chance."""
-        names = [self.better_without if each == "without" else each for each in (first, second)]
-        if any(self.error(name) is None for name in names):
-            runs = [self.error(name) is not None for name in names]
-            return "unknown" if not any(runs) else "better" if runs[1] else "worse"
-        return change_between(self.squares[names[0]], self.squares[names[1]])
+        names = (self.better_without if each == "without" else each for each in (first, second))
+        return change_between(*map(self.squares.get, names))
 
     def at_noise(self, run: Run) -> bool:
         """Whether an error is that of measurement noise alone.

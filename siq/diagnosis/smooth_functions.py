@@ -28,7 +28,7 @@ import sympy
 from scipy.spatial.distance import cdist
 
 from siq.diagnosis.evidence import FittedCandidate, correlation_time_of, evidences_by_size
-from siq.diagnosis.mechanisms import CURVE, SURFACE, MechanismCandidate, along, fresh_names
+from siq.diagnosis.mechanisms import CURVE, SURFACE, Kind, MechanismCandidate, along, fresh_names
 from siq.diagnosis.screening import PROBE_SUBSTEPS, at_noise_levels, linearised_with
 from siq.diagnosis.terms import Place
 from siq.errors import NumericalFailure
@@ -203,7 +203,7 @@ class SmoothFunction:
         known = dict(zip(names, self.begin, strict=True))
         values = [known.get(each.name, each.value) for each in candidate.model.parameters]
         begun = replace(candidate.model, expected_together=together).with_values(np.array(values))
-        kind = CURVE if len(self.place.coordinates) == 1 else SURFACE
+        kind: Kind = CURVE if len(self.place.coordinates) == 1 else SURFACE
         return replace(candidate, model=begun, kind=kind, smooth=self)
 
 

@@ -236,12 +236,10 @@ def _stated_function(part: FittedCandidate, fit: Fit, beside: tuple[str, ...]) -
         at = [place.knots]
         name, formula = candidate.changes[0]
         factor = dict((*place.equations, *place.outputs))[name]
-        columns = []
-        for amplitude in candidate.amplitudes:
-            term = _in_coordinate(formula.diff(symbol(amplitude)) / factor, place.coordinates[0])
-            value = compile_values([term], [COORDINATE], common=False)(at[0])[0]
-            columns.append(np.broadcast_to(np.asarray(value, dtype=float), at[0].shape))
-        weights = np.stack(columns, axis=1)
+        slopes = (formula.diff(symbol(amplitude)) / factor for amplitude in candidate.amplitudes)
+        terms = [_in_coordinate(each, place.coordinates[0]) for each in slopes]
+        columns = compile_values(terms, [COORDINATE], common=False)(at[0])
+        weights = np.stack([np.broadcast_to(each, at[0].shape) for each in columns], axis=1).astype(float)
         values = weights @ amplitudes
     if place is not None and at:
         rows = [list(_standard_errors(fit)).index(name) for name in candidate.amplitudes]
