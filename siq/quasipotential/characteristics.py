@@ -81,7 +81,7 @@ class ScaledSystem:
         return np.asarray(self.units.T @ hessians @ self.units / self.unit)
 
     def force(self, y: np.ndarray) -> np.ndarray:
-        """F at y, ``(n, d)``."""
+        """The drift at y, ``(n, d)``."""
         return self.dynamics.drift(self.points(y)) @ self.inverse.T / self.rate
 
     def jacobian(self, y: np.ndarray) -> np.ndarray:
