@@ -134,13 +134,13 @@ def sides_of(
     box: np.ndarray,
     cycles: Sequence[Cycle] = (),
 ) -> np.ndarray:
-    """Where f leads from both sides of a saddle, or of an unstable cycle, see `ends_of`."""
+    """Where f leads from both sides of a saddle, or of an unstable cycle, see `_ends_of`."""
     place = over if isinstance(over, Cycle) else over.position
     starts = states_beside(dynamics, place, width=np.ptp(box, axis=1))
-    return ends_of(dynamics, starts, attractors, cycles, box=box)
+    return _ends_of(dynamics, starts, attractors, cycles, box=box)
 
 
-def ends_of(
+def _ends_of(
     dynamics: Dynamics,
     starts: np.ndarray,
     attractors: Sequence[Equilibrium],
@@ -198,7 +198,7 @@ def tracked_edge(
         way = low + share * (high - low) + np.sin(np.pi * share) * bend
         while True:
             # Where a front has to cross a chain, states are still on their way after any relaxation time.
-            other = np.flatnonzero(ends_of(dynamics, way[1:-1], attractors, cycles, box=box) != one)
+            other = np.flatnonzero(_ends_of(dynamics, way[1:-1], attractors, cycles, box=box) != one)
             last = int(other[0]) if len(other) else len(way) - 2
             low, high = way[last], way[last + 1]
             if (np.abs(high - low) / width).max() <= BISECTED_DISTANCE:
