@@ -116,13 +116,13 @@ def uncertified(reason: str) -> dict[str, Any]:
 class Evidence:
     """Everything that formulas of V are tested with."""
 
-    found: AnyField  # f and D, identified without V or given
-    portrait: PhasePortrait  # which follows from them
-    points: np.ndarray  # evenly spread states that no fit saw, shape (n, d)
-    pairs: SnapshotPairs | None = None  # of held-out recordings; None where no motion was recorded
-    references: Sequence[Reference] = ()  # V by characteristics about every attractor
-    options: CertificateOptions = field(default_factory=CertificateOptions)  # the limits
-    seed: int = 0  # draws f, and the points on which the error is estimated
+    found: AnyField  #: f and D, identified without V or given
+    portrait: PhasePortrait  #: which follows from them
+    points: np.ndarray  #: evenly spread states that no fit saw, shape (n, d)
+    pairs: SnapshotPairs | None = None  #: of held-out recordings; None where no motion was recorded
+    references: Sequence[Reference] = ()  #: V by characteristics about every attractor
+    options: CertificateOptions = field(default_factory=CertificateOptions)  #: the limits
+    seed: int = 0  #: draws f, and the points on which the error is estimated
 
 
 def certify(

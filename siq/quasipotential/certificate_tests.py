@@ -100,12 +100,12 @@ class Reference:
     sheets where there was more than one.
     """
 
-    attractor: np.ndarray  # shape (d,); V is zero there
-    points: np.ndarray  # shape (n, d)
-    values: np.ndarray  # shape (n,)
-    level: float  # V up to which they were followed, NaN where they could not be
+    attractor: np.ndarray  #: shape (d,); V is zero there
+    points: np.ndarray  #: shape (n, d)
+    values: np.ndarray  #: shape (n,)
+    level: float  #: V up to which they were followed, NaN where they could not be
     error: float
-    fault: str = ""  # why there is nothing to compare with, and what would help; empty where there is
+    fault: str = ""  #: why there is nothing to compare with, and what would help; empty where there is
 
     def below(self, level: float) -> tuple[np.ndarray, np.ndarray]:
         """Points and values up to `LEVEL_SHARE` of a level that a formula claims, if it is the lower one."""
@@ -117,18 +117,18 @@ class Reference:
 class Candidate:
     """A V to be tested, with g, on the points for which it claims to hold."""
 
-    values: Function  # V: points (n, d) to (n,)
-    gradients: Function  # to (n, d)
-    hessians: Function  # to (n, d, d)
-    circulatory: Function | None  # g, to (n, d); None where it is f + D∇V by definition
-    points: np.ndarray  # held-out states where it claims to hold, shape (n, d)
-    attractors: Sequence[Equilibrium]  # those within
-    relative_error: float = 0.0  # standard error of V on the points, from the uncertainty of f
-    pairs: SnapshotPairs | None = None  # of which the first state is such; None where no motion was recorded
-    references: Sequence[Reference] = ()  # V by characteristics about the attractors
-    level: float = np.inf  # V up to which it claims to hold
-    claimed: float = 1.0  # at which share of the states of its region it does
-    tested_on: str = ""  # the points, in words
+    values: Function  #: V of points (n, d), shape (n,)
+    gradients: Function  #: ∇V, shape (n, d)
+    hessians: Function  #: ∇²V, shape (n, d, d)
+    circulatory: Function | None  #: g, shape (n, d); None where it is f + D∇V by definition
+    points: np.ndarray  #: held-out states where it claims to hold, shape (n, d)
+    attractors: Sequence[Equilibrium]  #: those within
+    relative_error: float = 0.0  #: standard error of V on the points, from the uncertainty of f
+    pairs: SnapshotPairs | None = None  #: of which the first state is such; None where no motion was recorded
+    references: Sequence[Reference] = ()  #: V by characteristics about the attractors
+    level: float = np.inf  #: V up to which it claims to hold
+    claimed: float = 1.0  #: at which share of the states of its region it does
+    tested_on: str = ""  #: the points, in words
 
     def stated_error(self, found: AnyField, *, seed: int = 0) -> float:
         """Relative L2 error of V on its points that its own residual and the uncertainty of f leave open.

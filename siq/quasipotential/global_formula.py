@@ -37,15 +37,15 @@ class GlobalFormula:
     A joint fit of V and g is one at the Cramér–Rao bound, with ∇V·g = 0 identically.
     """
 
-    potential: np.ndarray  # coefficients of V, shape (q,)
-    covariance: np.ndarray  # shape (q, q), zero for terms that are not there
-    residual: float = np.nan  # relative, of the Hamilton–Jacobi equation on the points of the fit
-    sensitivity: np.ndarray | None = None  # shape (q, p): how the coefficients follow the p of f
-    circulatory: np.ndarray | None = None  # coefficients of g, shape (q, d)
-    circulatory_errors: np.ndarray | None = None  # their standard errors
+    potential: np.ndarray  #: coefficients of V, shape (q,)
+    covariance: np.ndarray  #: shape (q, q), zero for terms that are not there
+    residual: float = np.nan  #: relative, of the Hamilton–Jacobi equation on the points of the fit
+    sensitivity: np.ndarray | None = None  #: how the coefficients follow the p of f, shape (q, p)
+    circulatory: np.ndarray | None = None  #: coefficients of g, shape (q, d)
+    circulatory_errors: np.ndarray | None = None  #: their standard errors
     joint: bool = False
-    freedom: int = 0  # of a joint fit: constraints on the coefficients of f
-    chi_square: float = 0.0  # squared distance of its f from the identified one, in the covariance of that
+    freedom: int = 0  #: constraints on the coefficients of f in a joint fit
+    chi_square: float = 0.0  #: squared distance of its f from the identified one, in the covariance of that
 
     @property
     def probability(self) -> float:

@@ -203,12 +203,12 @@ def affordable_degree(dimension: int, degree: int) -> int:
 class HamiltonJacobi:
     """The equation at some points, weighted so that fast regions do not rule."""
 
-    points: np.ndarray  # shape (n, d)
-    gradients: np.ndarray  # ∂θ_j/∂x_i there, shape (n, d, m)
-    flow: np.ndarray  # f there, shape (n, d)
-    diffusion: Diffusion  # D
-    weight: np.ndarray  # one over ∣f∣ in the metric of the noise, shape (n,)
-    measure: Diffusion  # that metric: D, or what stands in for a D without inverse (`measure_at`)
+    points: np.ndarray  #: shape (n, d)
+    gradients: np.ndarray  #: ∂θ_j/∂x_i there, shape (n, d, m)
+    flow: np.ndarray  #: f there, shape (n, d)
+    diffusion: Diffusion  #: D
+    weight: np.ndarray  #: one over ∣f∣ in the metric of the noise, shape (n,)
+    measure: Diffusion  #: that metric, D or what stands in for a D without inverse
 
     @classmethod
     def at(

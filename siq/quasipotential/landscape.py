@@ -103,8 +103,8 @@ def sentences_without_landscape(reason: str, states: RecordStates | None) -> lis
 class GlobalQuasipotential:
     """U over all wells, where it is known."""
 
-    wells: tuple[Well, ...]  # V about the attractors
-    heights: np.ndarray  # U at the attractors, shape (k,); the lowest is zero
+    wells: tuple[Well, ...]  #: V about the attractors
+    heights: np.ndarray  #: U at the attractors, shape (k,); the lowest is zero
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """U at points ``(n, d)``: shape ``(n,)``, NaN where it is not known."""

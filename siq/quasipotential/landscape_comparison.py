@@ -62,14 +62,14 @@ class ReferenceLandscape:
     not two states, or somewhere in the box f is not finite or D not positive definite.
     """
 
-    attractors: np.ndarray  # shape (k, d)
-    points: np.ndarray  # shape (n, d)
-    characteristics: np.ndarray  # U about each attractor, zero there, shape (k, n)
-    mesh: np.ndarray  # the same on a mesh
-    barriers: np.ndarray  # lowest of U out of each well, by minimum action, (k,); infinite without a saddle
-    mesh_barriers: np.ndarray  # the same on the mesh
-    heights: np.ndarray  # U at the attractors, shape (k,)
-    reason: str = ""  # why there is no reference, in words; then k and n are zero
+    attractors: np.ndarray  #: shape (k, d)
+    points: np.ndarray  #: shape (n, d)
+    characteristics: np.ndarray  #: U about each attractor, zero there, shape (k, n)
+    mesh: np.ndarray  #: the same on a mesh
+    barriers: np.ndarray  #: lowest of U out of each well, by minimum action, (k,); infinite without a saddle
+    mesh_barriers: np.ndarray  #: the same on the mesh
+    heights: np.ndarray  #: U at the attractors, shape (k,)
+    reason: str = ""  #: why there is no reference, in words; then k and n are zero
 
     def below(self, index: int, share: float) -> np.ndarray:
         """Mask of the points of one well below a share of its barrier."""

@@ -123,11 +123,11 @@ class RefinementOptions:
 class Refined:
     """The V of both routes."""
 
-    found: FieldEstimate  # over the functions of a formula for the region: those of f and of V together
-    wells: tuple[Well, ...]  # by the local route, one for each attractor
-    network_wells: tuple[Well, ...] = ()  # by the network route, where it found no formula for the region
-    remarks: tuple[Remark, ...] = ()  # what could not be done
-    formula: GlobalFormula | None = None  # V and g where one formula holds over the whole region
+    found: FieldEstimate  #: over the functions of a formula for the region, those of f and of V
+    wells: tuple[Well, ...]  #: by the local route, one for each attractor
+    network_wells: tuple[Well, ...] = ()  #: by the network route, where it found no formula for the region
+    remarks: tuple[Remark, ...] = ()  #: what could not be done
+    formula: GlobalFormula | None = None  #: V and g where one formula holds over the whole region
 
 
 def _formula_library(found: FieldEstimate, options: RefinementOptions) -> CandidateLibrary:
@@ -469,10 +469,10 @@ def _every_well_held_out(portrait: PhasePortrait, pairs: SnapshotPairs, mask: np
 class Refinement:
     """Refined formulas of a run."""
 
-    formulas: SymbolicDecomposition  # V, g and f
-    certificate: Certificate  # whether to believe them
-    record: OccupancyCheck  # f against hops and histogram of the recordings
-    remarks: tuple[Remark, ...] = ()  # what could not be done, and caustics
+    formulas: SymbolicDecomposition  #: V, g and f
+    certificate: Certificate  #: whether to believe them
+    record: OccupancyCheck  #: f against hops and histogram of the recordings
+    remarks: tuple[Remark, ...] = ()  #: what could not be done, and caustics
 
 
 def _difference(

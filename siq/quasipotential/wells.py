@@ -57,10 +57,10 @@ NEGLIGIBLE_COEFFICIENT = 1e-14  # of the largest coefficient, or of the size of 
 class DegreeTrial:
     """One degree that was tried about an attractor, on points that took no part in the fit."""
 
-    degree: int  # highest power
-    terms: int  # number of coefficients
-    residual: float  # median relative Hamilton–Jacobi residual
-    covered: float  # where the formula is believed, as a share of what the widest degree reaches
+    degree: int  #: highest power
+    terms: int  #: number of coefficients
+    residual: float  #: median relative Hamilton–Jacobi residual
+    covered: float  #: where the formula is believed, as a share of what the widest degree reaches
 
 
 @dataclass(frozen=True, eq=False)
@@ -426,9 +426,9 @@ def _grown(
                 f" needs {2 * basis.size}"
             )
         equation = HamiltonJacobi.at(basis, points, dynamics, attractor=attractor)
-        pace: dict[str, Any] = {} if last else {"tolerance": COARSE_TOLERANCE}
+        steps, tolerance = (40, 1e-13) if last else (8, COARSE_TOLERANCE)
         coefficients, residual = equation.gauss_newton(
-            coefficients, free=free, steps=40 if last else 8, **pace
+            coefficients, free=free, steps=steps, tolerance=tolerance
         )
         values = along(coefficients)
         recorded = _recorded(basin.starts(values), len(attractor))

@@ -42,18 +42,18 @@ class Findings:
     `workflow.consequences.compare_landscapes`.
     """
 
-    statement: Statement  # the content of verdict.json
-    before: Dynamics  # the simulation of the card
-    after: Dynamics  # the one that the verdict ends with
-    dictionary: Sequence[Mechanism]  # the mechanisms that could be named
+    statement: Statement  #: the content of verdict.json
+    before: Dynamics  #: the simulation of the card
+    after: Dynamics  #: the one that the verdict ends with
+    dictionary: Sequence[Mechanism]  #: the mechanisms that could be named
     candidates: pd.DataFrame
-    figures: Mapping[str, bytes]  # SVG files by the names of their captions
+    figures: Mapping[str, bytes]  #: SVG files by the names of their captions
     wells: pd.DataFrame = field(default_factory=pd.DataFrame)
     escape: pd.DataFrame = field(default_factory=pd.DataFrame)
     notes: Sequence[str] = ()
     scores: pd.DataFrame = field(default_factory=pd.DataFrame)
     held_out: pd.DataFrame = field(default_factory=pd.DataFrame)
-    folder: str = "tables"  # where the whole tables are
+    folder: str = "tables"  #: where the whole tables are
 
     @property
     def kind(self) -> str:

@@ -40,66 +40,66 @@ if TYPE_CHECKING:
 class FormulaRow:
     """One formula."""
 
-    quantity: Markup | str  # what the formula gives: "U", "f", typeset or as text
-    formula: Markup | str  # typeset by `siq.report.formatting`; plain text is shown as text
-    note: str = ""  # what to know of it, in a sentence
-    exact: Markup | str | None = None  # the exact formula, where one is known
-    whole: Markup | str | None = None  # in full, folded away, where `formula` leaves small terms out
+    quantity: Markup | str  #: what the formula gives, such as U or f, typeset or as text
+    formula: Markup | str  #: typeset by `siq.report.formatting`; plain text is shown as text
+    note: str = ""  #: what to know of it, in a sentence
+    exact: Markup | str | None = None  #: the exact formula, where one is known
+    whole: Markup | str | None = None  #: in full, folded away, where `formula` leaves small terms out
 
 
 @dataclass(frozen=True)
 class ReportTable:
     """A table of the report; it can be downloaded as CSV, with all its rows."""
 
-    caption: str  # what the table shows, in a sentence
-    frame: pd.DataFrame  # the table; its index is not shown, and neither are columns that hold nothing
-    column_help: Mapping[str, str] = field(default_factory=dict)  # what the columns mean, by name
-    whole: str = ""  # where it lies as a file, for one that is cut
-    rows_shown: int = 30  # after how many rows the table is cut
-    data: pd.DataFrame | None = None  # what is downloaded, where that is more than what is shown
-    rows_named: bool = False  # whether the first column names the rows
+    caption: str  #: what the table shows, in a sentence
+    frame: pd.DataFrame  #: the table; its index is not shown, and neither are columns that hold nothing
+    column_help: Mapping[str, str] = field(default_factory=dict)  #: what the columns mean, by name
+    whole: str = ""  #: where it lies as a file, for one that is cut
+    rows_shown: int = 30  #: after how many rows the table is cut
+    data: pd.DataFrame | None = None  #: what is downloaded, where that is more than what is shown
+    rows_named: bool = False  #: whether the first column names the rows
 
 
 @dataclass(frozen=True)
 class ReportFigure:
     """A figure of the report; it can be downloaded."""
 
-    caption: str  # what the figure shows, in sentences
-    alternative: str  # what somebody who cannot see it should know of it
-    image: bytes  # the bytes of the file
-    kind: Literal["svg", "png"] = "svg"  # its format
-    vector: bytes | None = None  # the same as SVG, for the download
+    caption: str  #: what the figure shows, in sentences
+    alternative: str  #: what somebody who cannot see it should know of it
+    image: bytes  #: the bytes of the file
+    kind: Literal["svg", "png"] = "svg"  #: its format
+    vector: bytes | None = None  #: the same as SVG, for the download
 
 
 @dataclass(frozen=True)
 class ReportSection:
     """A section of the report."""
 
-    heading: str  # its heading
-    text: Sequence[str] = ()  # paragraphs
-    formulas: Sequence[FormulaRow] = ()  # below the text, before tables and figures
+    heading: str  #: its heading
+    text: Sequence[str] = ()  #: paragraphs
+    formulas: Sequence[FormulaRow] = ()  #: below the text, before tables and figures
     tables: Sequence[ReportTable] = ()
     figures: Sequence[ReportFigure] = ()
-    notes: Sequence[str] = ()  # paragraphs below all of it, in small print
-    folded: bool = False  # whether it is closed until a reader opens it
-    listing: str = ""  # lines of code, such as commands
+    notes: Sequence[str] = ()  #: paragraphs below all of it, in small print
+    folded: bool = False  #: whether it is closed until a reader opens it
+    listing: str = ""  #: lines of code, such as commands
 
 
 @dataclass(frozen=True)
 class ReportContent:
     """All that a report says, in the order in which it is read."""
 
-    title: str  # title of the study
-    answer: Sequence[str] = ()  # the answer: a sentence that stands alone, and what has to be known of it
-    badge: str = ""  # whether it may be believed, in two words
-    good: bool = False  # the same as a flag
-    promise: Sequence[str] = ()  # what that means, in plain words
-    figure: ReportFigure | None = None  # what it looks like
-    table: ReportTable | None = None  # beside the figure
-    figure_first: bool = False  # whether the figure stands above the answer
-    interactive: Markup | None = None  # a view that can be turned, with its script
-    sections: Sequence[ReportSection] = ()  # everything else
-    language: str = "en"  # language of the page, for hyphenation and screen readers
+    title: str  #: title of the study
+    answer: Sequence[str] = ()  #: a sentence that stands alone, and what has to be known of it
+    badge: str = ""  #: whether it may be believed, in two words
+    good: bool = False  #: the same as a flag
+    promise: Sequence[str] = ()  #: what that means, in plain words
+    figure: ReportFigure | None = None  #: what it looks like
+    table: ReportTable | None = None  #: beside the figure
+    figure_first: bool = False  #: whether the figure stands above the answer
+    interactive: Markup | None = None  #: a view that can be turned, with its script
+    sections: Sequence[ReportSection] = ()  #: everything else
+    language: str = "en"  #: language of the page, for hyphenation and screen readers
 
 
 class _PageWriter:

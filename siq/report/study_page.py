@@ -62,22 +62,22 @@ SUMMARY_COLUMNS = (
 class StudyResults:
     """What a study left behind."""
 
-    # By name, see `siq.workflow.tables.COLUMNS`; `landscape_errors` and `escape` with a card only,
-    # `beside_equations`, `invariant` and those of a sweep where the study asks for it.
+    #: By name, see `siq.workflow.tables.COLUMNS`; `landscape_errors` and `escape` with a card only,
+    #: `beside_equations`, `invariant` and those of a sweep where the study asks for it.
     tables: Mapping[str, pd.DataFrame]
-    folder: Path  # where the whole tables are
-    images: Mapping[str, bytes]  # the figures that there are by name, as PNG
-    vectors: Mapping[str, bytes]  # the same as SVG
-    landscape: LandscapeSummary | None = None  # that the page opens with; None where there is none
-    models: ModelFiles = field(default_factory=lambda: ModelFiles(()))  # the formulas of all runs
-    shown: Shown = (0, Method.REFINED)  # the run and the method whose formulas are printed
-    exact: SymbolicDecomposition | None = None  # the exact formulas, where they are known
-    record: FieldEstimate | None = None  # f and D of the run that is shown, None where there is none
-    interactive: Markup | None = None  # a view of U that can be turned, None where there is none
-    inspection: Sequence[str] | None = None  # of the recordings, line by line; None where simulated
-    seen: RecordStates | None = None  # the two states that they show by themselves
-    system: Dynamics | None = None  # f and D that were given as equations; None of recordings
-    certificate: Mapping[str, Any] | None = None  # of the formulas of these
+    folder: Path  #: where the whole tables are
+    images: Mapping[str, bytes]  #: the figures that there are by name, as PNG
+    vectors: Mapping[str, bytes]  #: the same as SVG
+    landscape: LandscapeSummary | None = None  #: that the page opens with; None where there is none
+    models: ModelFiles = field(default_factory=lambda: ModelFiles(()))  #: the formulas of all runs
+    shown: Shown = (0, Method.REFINED)  #: the run and the method whose formulas are printed
+    exact: SymbolicDecomposition | None = None  #: the exact formulas, where they are known
+    record: FieldEstimate | None = None  #: f and D of the run that is shown, None where there is none
+    interactive: Markup | None = None  #: a view of U that can be turned, None where there is none
+    inspection: Sequence[str] | None = None  #: of the recordings, line by line; None where simulated
+    seen: RecordStates | None = None  #: the two states that they show by themselves
+    system: Dynamics | None = None  #: f and D that were given as equations; None of recordings
+    certificate: Mapping[str, Any] | None = None  #: of the formulas of these
 
     def table(self, name: str) -> pd.DataFrame | None:
         """A table that has rows, None otherwise."""

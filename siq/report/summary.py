@@ -69,30 +69,30 @@ def energy_unit(units: Sequence[str], time_unit: str) -> str:
 class EquilibriumSummary:
     """An equilibrium that is no well, such as a saddle; U there is as high as the lowest exit over it."""
 
-    kind: str  # attractor, saddle, repeller or degenerate
-    position: np.ndarray  # shape (d,)
-    height: float  # U there, NaN where it is not known
-    eigenvalues: tuple[complex, ...] = ()  # of the Jacobian
-    label: str = ""  # the letter of a well; empty for others
+    kind: str  #: attractor, saddle, repeller or degenerate
+    position: np.ndarray  #: shape (d,)
+    height: float  #: U there, NaN where it is not known
+    eigenvalues: tuple[complex, ...] = ()  #: of the Jacobian
+    label: str = ""  #: the letter of a well; empty for others
 
 
 @dataclass(frozen=True)
 class WellSummary:
     """A stable state."""
 
-    label: str  # A, B, and so on, in the order of the attractors
-    position: np.ndarray  # of the attractor
-    position_errors: np.ndarray  # standard errors, NaN where not known
-    height: float  # U at the attractor, zero where that of all wells is not known
-    basin: float  # share of the recorded states that lead there
-    depth: float  # the lowest barrier of U out of it, NaN where none is known
-    depth_error: float  # its standard error
-    beyond: str | None  # the well behind that barrier, None where it leads out of the recorded region
-    known_up_to: float  # U up to which the formula holds, NaN where there is none
-    exits: tuple[EscapeRate, ...]  # what mean times follow from, in the order of the exits
-    leverage: float = 1.0  # relative standard error of ΔU/ε from an estimated D over that of ε
-    visits: VisitTest | None = None  # how long visits to it last, None where this was not compared
-    cycle: Cycle | None = None  # the limit cycle, None of a point
+    label: str  #: A, B, and so on, in the order of the attractors
+    position: np.ndarray  #: of the attractor
+    position_errors: np.ndarray  #: standard errors, NaN where not known
+    height: float  #: U at the attractor, zero where that of all wells is not known
+    basin: float  #: share of the recorded states that lead there
+    depth: float  #: the lowest barrier of U out of it, NaN where none is known
+    depth_error: float  #: its standard error
+    beyond: str | None  #: the well behind that barrier, None where it leads out of the recorded region
+    known_up_to: float  #: U up to which the formula holds, NaN where there is none
+    exits: tuple[EscapeRate, ...]  #: what mean times follow from, in the order of the exits
+    leverage: float = 1.0  #: relative standard error of ΔU/ε from an estimated D over that of ε
+    visits: VisitTest | None = None  #: how long visits to it last, None where this was not compared
+    cycle: Cycle | None = None  #: the limit cycle, None of a point
 
     @property
     def kind(self) -> str:
@@ -116,23 +116,23 @@ class WellSummary:
 class LandscapeSummary:
     """Wells, exits and U of a landscape."""
 
-    names: tuple[str, ...]  # of the states
-    units: tuple[str, ...]  # of the states, 1 where nobody said
-    time_unit: str  # of the recordings, likewise
-    wells: tuple[WellSummary, ...]  # the attractors in the order of the tables, as A, B, C and so on
-    ways: tuple[Transition, ...]  # the ways out of the wells
-    noise: NoiseStrength | None  # that drives the system, None where nobody knows it
-    given: bool = False  # whether f was given as equations, and not identified from recordings
-    run: int = 0  # the run of a study whose landscape it is
-    remarks: tuple[str, ...] = ()  # what has to be known of it
-    unstable_cycles: tuple[Cycle, ...] = ()  # which part basins
-    formulas: tuple[Well | None, ...] = ()  # V about each attractor, None where there is none
-    points: np.ndarray | None = None  # recorded states, shape (n, d); there may be none
-    dynamics: Dynamics | None = None  # f and D, where a plot needs their errors
-    matched: bool = True  # whether U is known over all wells; if not, each is drawn from its own bottom
-    formula: SymbolicDecomposition | None = None  # one V over all wells, in the box of the recorded states
-    equilibria: tuple[EquilibriumSummary, ...] = ()  # all of them, in the order in which they were found
-    # How large each state becomes, shape (d,); of states of one unit, how large any does.
+    names: tuple[str, ...]  #: of the states
+    units: tuple[str, ...]  #: of the states, 1 where nobody said
+    time_unit: str  #: of the recordings, likewise
+    wells: tuple[WellSummary, ...]  #: the attractors in the order of the tables, as A, B, C and so on
+    ways: tuple[Transition, ...]  #: the ways out of the wells
+    noise: NoiseStrength | None  #: that drives the system, None where nobody knows it
+    given: bool = False  #: whether f was given as equations, and not identified from recordings
+    run: int = 0  #: the run of a study whose landscape it is
+    remarks: tuple[str, ...] = ()  #: what has to be known of it
+    unstable_cycles: tuple[Cycle, ...] = ()  #: which part basins
+    formulas: tuple[Well | None, ...] = ()  #: V about each attractor, None where there is none
+    points: np.ndarray | None = None  #: recorded states, shape (n, d); there may be none
+    dynamics: Dynamics | None = None  #: f and D, where a plot needs their errors
+    matched: bool = True  #: whether U is known over all wells; if not, each is drawn from its own bottom
+    formula: SymbolicDecomposition | None = None  #: one V over all wells, in the box of the recorded states
+    equilibria: tuple[EquilibriumSummary, ...] = ()  #: all of them, in the order in which they were found
+    #: How large each state becomes, shape (d,); of states of one unit, how large any does.
     size: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @property

@@ -54,15 +54,15 @@ EVERY = 15.0
 class _Progress:
     """Where a workflow stands, from its events."""
 
-    clock: Callable[[], float] = time.monotonic  # seconds of any clock that does not go back
-    total: int = 0  # jobs
-    done: int = 0  # of these
-    running: dict[int, str] = field(default_factory=dict)  # by number of the job, in words of its rule
-    # The jobs that failed: what they were about, and their logs.
+    clock: Callable[[], float] = time.monotonic  #: seconds of any clock that does not go back
+    total: int = 0  #: jobs
+    done: int = 0  #: of these
+    running: dict[int, str] = field(default_factory=dict)  #: by number of the job, in words of its rule
+    #: What the jobs that failed were about, and their logs.
     failed: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
-    errors: list[str] = field(default_factory=list)  # what Snakemake itself says of a fault
-    broken: bool = False  # whether a job ended by a fault of ours, with a traceback
-    planned: list[str] = field(default_factory=list)  # what is to run, in the words of the rules
+    errors: list[str] = field(default_factory=list)  #: what Snakemake itself says of a fault
+    broken: bool = False  #: whether a job ended by a fault of ours, with a traceback
+    planned: list[str] = field(default_factory=list)  #: what is to run, in the words of the rules
     _doing: dict[str, str] = field(default_factory=dict)
     _rules: dict[int, str] = field(default_factory=dict)
     _words: dict[int, str] = field(default_factory=dict)
@@ -248,13 +248,13 @@ def _need_workflow() -> None:
 class Request:
     """What Snakemake is asked for."""
 
-    targets: tuple[str, ...] = ()  # files or rules
-    study: Path | None = None  # a study to be given by --configfile
-    settings: tuple[str, ...] = ()  # keys of the configuration, as --config takes them
-    cores: str = "all"  # a number, or all
-    verbose: bool = False  # whether Snakemake speaks for itself
-    dry_run: bool = False  # whether it only says what would run
-    further: tuple[str, ...] = ()  # options that are passed on
+    targets: tuple[str, ...] = ()  #: files or rules
+    study: Path | None = None  #: a study to be given by --configfile
+    settings: tuple[str, ...] = ()  #: keys of the configuration, as --config takes them
+    cores: str = "all"  #: a number, or all
+    verbose: bool = False  #: whether Snakemake speaks for itself
+    dry_run: bool = False  #: whether it only says what would run
+    further: tuple[str, ...] = ()  #: options that are passed on
 
     def command(self) -> list[str]:
         """The command line; what it has to make stands behind ``--``, where no option can take it."""

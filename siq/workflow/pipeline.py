@@ -294,11 +294,11 @@ def _noise_strength(settings: PipelineSettings, record: FieldEstimate) -> NoiseS
 class Analysis:
     """What the steps found; each has its outcome, and says why where it has no result."""
 
-    identified: StepResult[FieldEstimate]  # f, and the test of its predictions
-    trained: StepResult[TrainedNetworks]  # the networks
-    regressed: StepResult[SymbolicDecomposition] | None  # the published method's formulas, where asked for
-    refined: RefinedRun  # formulas by method, with their certificates
-    landscape: StepResult[Landscape] | None  # wells, barriers, ways; None where not asked for
+    identified: StepResult[FieldEstimate]  #: f, and the test of its predictions
+    trained: StepResult[TrainedNetworks]  #: the networks
+    regressed: StepResult[SymbolicDecomposition] | None  #: the published method's formulas, where asked for
+    refined: RefinedRun  #: formulas by method, with their certificates
+    landscape: StepResult[Landscape] | None  #: wells, barriers, ways; None where not asked for
 
     @property
     def outcomes(self) -> tuple[Outcome, ...]:

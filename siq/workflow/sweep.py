@@ -67,13 +67,13 @@ class _SweptWay:
 class SweptPoint:
     """The landscape at one value of the parameters."""
 
-    values: tuple[float, ...]  # of the parameters, in their order
-    equilibria: tuple[tuple[float, ...], ...]  # all that were found, the unstable ones too
-    wells: tuple[_SweptWell, ...] = ()  # attractors
-    ways: tuple[_SweptWay, ...] = ()  # the ways out of them
-    settled: float = 0.0  # share of the states of the domain from which f leads to one of the wells
-    reason: str = ""  # why there is no landscape, in words; empty where there is one
-    notes: tuple[str, ...] = ()  # what could not be done, in words
+    values: tuple[float, ...]  #: of the parameters, in their order
+    equilibria: tuple[tuple[float, ...], ...]  #: all that were found, the unstable ones too
+    wells: tuple[_SweptWell, ...] = ()  #: attractors
+    ways: tuple[_SweptWay, ...] = ()  #: the ways out of them
+    settled: float = 0.0  #: share of the states of the domain from which f leads to one of the wells
+    reason: str = ""  #: why there is no landscape, in words; empty where there is one
+    notes: tuple[str, ...] = ()  #: what could not be done, in words
 
 
 def _with_parameters(
