@@ -180,8 +180,6 @@ class _DiffusionLikelihood:
         free = np.concatenate([np.ones(len(places), dtype=bool), self.free])
         null = np.concatenate([constant, np.ones(len(sensor), dtype=bool)])
         held, asked = np.flatnonzero(null & free), np.flatnonzero(~null & free)
-        if not len(asked):
-            return 1.0
         share = information[np.ix_(asked, held)] @ _inverse(information[np.ix_(held, held)])
         turn = np.zeros((len(asked), len(null)))
         turn[np.arange(len(asked)), asked] = 1.0
@@ -388,10 +386,7 @@ def with_process_noise_rate(found: FieldEstimate, pairs: SnapshotPairs) -> Field
         for order in range(1, SERIES_TERMS + 1):
             total += term / order
             term = term @ generator.reshape(square) / order
-    try:
-        rate = np.linalg.solve(total.mean(axis=0), found.noise_rate.ravel()).reshape(d, d)
-    except np.linalg.LinAlgError:
-        return found
+    rate = np.linalg.solve(total.mean(axis=0), found.noise_rate.ravel()).reshape(d, d)
     rate = (rate + rate.T) / 2
     # Of noise on a part of the states the residuals have rounding, too.
     return found if np.linalg.eigvalsh(rate)[0] < 0 else replace(found, noise_rate=rate)

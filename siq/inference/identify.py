@@ -132,7 +132,12 @@ def identify(
         if observation == "auto":
             found = case.identified()
         elif hidden:
-            found = case.with_hidden_velocities(observation)
+            if diffusion is not None:
+                raise NumericalFailure(
+                    "D is given for the positions, and noise drives the hidden velocities; leave the"
+                    " diffusion out, it is found"
+                )
+            found = case.finished(case.by_likelihood(observation))
         else:
             seen = case.by_exposure(observation)
             if seen is None:
@@ -210,13 +215,13 @@ class _Case:
         share = np.clip(-correlation, MIN_SHARE, MAX_SHARE)
         noise = Noise(share * variance, rate * (1 - 2 * share))
         try:
-            again = self._by_likelihood(ObservationModel(self.library, found.diffusion), noise)
+            again = self.by_likelihood(ObservationModel(self.library, found.diffusion), noise)
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             if ((score < -SIGNIFICANT_SCORE) & (correlation < -HARMLESS_CORRELATION)).any():
                 raise NumericalFailure(f"the sensor is noisy, and f with it is not found: {error}") from None
             return None
         assert again.diagnosis is not None and again.diagnosis.sensor_evidence is not None
-        return self._finished(again) if again.diagnosis.sensor_evidence > 1 else None
+        return self.finished(again) if again.diagnosis.sensor_evidence > 1 else None
 
     def by_exposure(self, observation: ObservationModel) -> FieldEstimate | None:
         """By the likelihood of samples that are means over an exposure; None where they are no such means.
@@ -225,22 +230,14 @@ class _Case:
         """
         try:
             moved, step = moved_by(observation.measured(self.recordings, self.pair_step))
-            found = self._by_likelihood(observation, Noise(SENSOR_SHARE * moved, moved / step))
+            found = self.by_likelihood(observation, Noise(SENSOR_SHARE * moved, moved / step))
         except (NumericalFailure, np.linalg.LinAlgError):
             return None
         assert found.diagnosis is not None
-        return None if found.diagnosis.correlated or not found.noise_rate.any() else self._finished(found)
+        return None if found.diagnosis.correlated or not found.noise_rate.any() else self.finished(found)
 
-    def with_hidden_velocities(self, observation: ObservationModel) -> FieldEstimate:
-        """By the likelihood of positions, whose velocities are states that were not recorded."""
-        if self.given is not None:
-            raise NumericalFailure(
-                "D is given for the positions, and noise drives the hidden velocities; leave the diffusion"
-                " out, it is found"
-            )
-        return self._finished(self._by_likelihood(observation))
-
-    def _by_likelihood(self, observation: ObservationModel, noise: Noise | None = None) -> FieldEstimate:
+    def by_likelihood(self, observation: ObservationModel, noise: Noise | None = None) -> FieldEstimate:
+        """By the likelihood of whole recordings, beginning with a noise; of positions without any."""
         return identify_by_likelihood(
             observation, self.recordings, noise, false_terms=self.options.false_terms,
             generator=self.draw(Purpose.STABILITY), pair_step=self.pair_step,
@@ -249,7 +246,7 @@ class _Case:
     def _pairs(self, recordings: Recordings) -> SnapshotPairs:
         return snapshot_pairs(recordings, pair_step=self.pair_step)
 
-    def _finished(self, found: FieldEstimate) -> FieldEstimate:
+    def finished(self, found: FieldEstimate) -> FieldEstimate:
         """An estimate by likelihood with its D, its strength, and its test."""
         noise, pairs = found.diagnosis, len(self._pairs(self.recordings).h)
         assert noise is not None and noise.measurement_error is not None

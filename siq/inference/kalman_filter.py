@@ -411,8 +411,6 @@ class Noise:
 
     def of_states(self, dimension: int) -> Noise:
         """A noise where there are more states, or fewer: those added are not driven."""
-        if len(self.process) == dimension:
-            return self
         driven = self.process[:dimension]
         return replace(self, process=np.append(driven, np.zeros(dimension - len(driven))))
 

@@ -186,9 +186,6 @@ def _candidate_library(
     symbols = tuple(sympy.Symbol(name, real=True) for name in states)
     exponents = monomial_exponents(len(states), degree)
     terms = [sympy.Mul(*(s**e for s, e in zip(symbols, row, strict=True))) for row in exponents]
-    degrees = [sum(row) for row in exponents]
-    in_potential = [total <= potential_degree for total in degrees]
-    in_circulatory = [total <= circulatory_degree for total in degrees]
     names: Mapping[str, sympy.Expr] = dict(zip(states, symbols, strict=True))
     for text in further:
         function = parse_formula(text, names)
@@ -197,20 +194,17 @@ def _candidate_library(
         if function in terms:
             raise FormulaError(f"the library function '{text}' is in the library already", "leave it out")
         terms.append(function)
-        in_potential.append(True)
-        in_circulatory.append(True)
+    in_potential = [sum(row) <= potential_degree for row in exponents] + [True] * len(further)
     # The library is closed once under differentiation of what V may use; what that adds serves f and g.
-    columns: dict[tuple[int, int], Mapping[sympy.Expr, float]] = {}
-    for j in range(len(terms)):
-        if in_potential[j]:
-            for i, symbol in enumerate(symbols):
-                columns[i, j] = linear_combination(terms[j].diff(symbol))
-    for combination in columns.values():
-        for function in combination:
-            if function not in terms:
-                terms.append(function)
-                in_potential.append(False)
-                in_circulatory.append(True)
+    columns = {
+        (i, j): linear_combination(terms[j].diff(symbol))
+        for j in np.flatnonzero(in_potential)
+        for i, symbol in enumerate(symbols)
+    }
+    terms = list(dict.fromkeys(itertools.chain(terms, *columns.values())))
+    in_potential += [False] * (len(terms) - len(in_potential))
+    in_circulatory = [sum(row) <= circulatory_degree for row in exponents]
+    in_circulatory += [True] * (len(terms) - len(exponents))
     position = {term: k for k, term in enumerate(terms)}
     derivatives = np.zeros((len(terms), len(states), len(terms)))
     for (i, j), combination in columns.items():
@@ -226,15 +220,12 @@ def joint_library(
     of_field: CandidateLibrary, *, degree: int, potential_degree: int, further: Sequence[str] = ()
 ) -> CandidateLibrary:
     """A library for V that also holds all of f's; V may use those functions of f that are no monomials."""
-    highest, others = degree, list(further)
-    for place, (name, term) in enumerate(zip(of_field.names, of_field.terms, strict=True)):
-        if term.is_polynomial(*of_field.symbols):
-            highest = max(highest, of_field.total_degree(place))
-        elif name not in others:
-            others.append(name)
-    return candidate_library(
-        of_field.states, degree=highest, potential_degree=potential_degree, further=others
-    )
+    plain = [term.is_polynomial(*of_field.symbols) for term in of_field.terms]
+    highest = max(degree, *(of_field.total_degree(k) for k in range(of_field.size)))
+    named = (name for name, one in zip(of_field.names, plain, strict=True) if not one)
+    others = tuple(dict.fromkeys((*further, *named)))
+    states = of_field.states
+    return candidate_library(states, degree=highest, potential_degree=potential_degree, further=others)
 
 
 def monomial_exponents(dimension: int, degree: int) -> list[tuple[int, ...]]:

@@ -67,9 +67,7 @@ class Measurements:
     @property
     def known_sensors(self) -> np.ndarray:
         """Which outputs' noise is known, shape ``(m,)``."""
-        if self.sensor_noise is None:
-            return np.zeros(self.outputs.shape[1], dtype=bool)
-        return np.isfinite(self.sensor_noise)
+        return np.isfinite(self.with_known_noise(np.full(self.outputs.shape[1], np.nan)))
 
     @property
     def roughness(self) -> np.ndarray:
@@ -123,16 +121,13 @@ class Measurements:
             for index, course in enumerate(courses):
                 inputs[index, rows] = course(t[rows])
             for index, (which, lag) in enumerate(delays):
-                course, at, half = courses[which], t[rows] - lag, wide[rows] / 2
+                course, half = courses[which], wide[rows] / 2
+                before, at, after = (np.clip(t[rows] - lag + side, begin, end) for side in (-half, 0.0, half))
+                delayed[index, rows], slopes[index, rows] = course(at), course(at, 1)
                 if course.c.shape[0] == 1 and (half > 0).all():
-                    before, after = (np.clip(at + side, begin, end) for side in (-half, half))
-                    outside = (2 * half - (after - before)) * course(np.clip(at, begin, end))
-                    total = course.antiderivative()
+                    outside, total = (2 * half - (after - before)) * course(at), course.antiderivative()
                     delayed[index, rows] = (total(after) - total(before) + outside) / (2 * half)
                     slopes[index, rows] = (course(after) - course(before)) / (2 * half)
-                else:
-                    at = np.clip(at, begin, end)
-                    delayed[index, rows], slopes[index, rows] = course(at), course(at, 1)
         return Signals(inputs=inputs, delayed=delayed, slopes=slopes, t=t)
 
     def select(self, chosen: Sequence[int]) -> Measurements:
@@ -278,13 +273,10 @@ def expectations(model: Dynamics, values: np.ndarray | None = None) -> tuple[np.
     now = (model.values if values is None else values)[list(model.free)]
     free = {model.parameters[place].name: column for column, place in enumerate(model.free)}
     fixed = {each.name: each.value for each in model.parameters}
-    rows, middle = [np.zeros((0, len(free)))], [np.zeros(0)]
-    for column in free.values():
-        expected = model.parameters[model.free[column]].expected
-        if expected:
-            rows.append(np.zeros((1, len(free))))
-            rows[-1][0, column] = 1 / abs(expected)
-            middle.append(np.array([np.sign(expected)]))
+    sizes = [model.parameters[place].expected or 0.0 for place in model.free]
+    told = np.flatnonzero(sizes)
+    rows = [np.eye(len(free))[told] / np.abs(np.array(sizes)[told])[:, None]]
+    middle = [np.sign(np.array(sizes)[told])]
     for each in model.expected_together:
         mine = [place for place, name in enumerate(each.names) if name in free]
         if mine:
