@@ -150,21 +150,6 @@ class HamiltonianFlow(ScaledSystem):
         p_rate[...] = -turned.transpose(0, 2, 1) @ p_tangents - self.bend(y, q) @ x_tangents
         return new
 
-    def pack(self, x: np.ndarray, p: np.ndarray, values: np.ndarray, hessians: np.ndarray) -> np.ndarray:
-        """States that start at points with given V and derivatives."""
-        tangents = np.broadcast_to(np.eye(self.dimension), hessians.shape)
-        rows = [self.scaled(x), self.slopes(p), values[:, None] / self.level]
-        rows += [tangents.reshape(len(x), -1), self.curvatures(hessians).reshape(len(x), -1)]
-        return self.orthonormal(np.concatenate(rows, axis=1))
-
-    def unpack(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Points, momenta, V and its Hessians, in the units of the states."""
-        y, q, v, x_tangents, p_tangents = self.parts(state)
-        # A pseudoinverse, because at a caustic itself X is singular; that Hessian is not handed on.
-        bends = self.unit * self.inverse.T @ (p_tangents @ np.linalg.pinv(x_tangents)) @ self.inverse
-        bends = (bends + bends.transpose(0, 2, 1)) / 2
-        return self.points(y), self.momenta(q), self.level * v, bends
-
     def orthonormal(self, state: np.ndarray) -> np.ndarray:
         """The same planes of tangents with orthonormal columns, which neither grow nor collapse."""
         y, q, v, x_tangents, p_tangents = self.parts(state)
@@ -343,7 +328,10 @@ def characteristics(
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     series = quasipotential_series(dynamics, flow.center, degree=start_degree)
     x = flow.center + np.sqrt(start) * directions @ flow.units.T
-    initial = flow.pack(x, series.gradients(x), series.values(x), series.hessians(x))
+    rows = [flow.scaled(x), flow.slopes(series.gradients(x)), series.values(x)[:, None] / level]
+    rows += [np.broadcast_to(np.eye(flow.dimension).ravel(), (len(x), flow.dimension**2))]
+    rows += [flow.curvatures(series.hessians(x)).reshape(len(x), -1)]
+    initial = flow.orthonormal(np.concatenate(rows, axis=1))
     if time_limit is None:
         time_limit = MAX_RELAXATION_TIMES / np.abs(np.linalg.eigvals(flow.relaxation).real).min()
     box = np.asarray(box, dtype=float)
@@ -415,7 +403,11 @@ def characteristics(
     order = np.argsort(curve, kind="stable")
     curve = curve[order]
     met = (ends[curve] == End.CAUSTIC) & np.append(curve[1:] != curve[:-1], True)
-    points, momenta, values, hessians = flow.unpack(np.concatenate(kept)[order])
+    y, q, v, x_tangents, p_tangents = flow.parts(np.concatenate(kept)[order])
+    points, momenta, values = flow.points(y), flow.momenta(q), level * v
+    # A pseudoinverse, because at a caustic itself X is singular; that Hessian is not handed on.
+    hessians = flow.unit * flow.inverse.T @ (p_tangents @ np.linalg.pinv(x_tangents)) @ flow.inverse
+    hessians = (hessians + hessians.transpose(0, 2, 1)) / 2
     return Fan(
         flow.center, flow.hessian, level, points[~met], momenta[~met], values[~met], hessians[~met],
         curve[~met], directions, ends, points[met], values[met],

@@ -167,17 +167,10 @@ class _Block:
     """The terms of U that couple some states, in the unit of ε, over these states' part of the box."""
 
     def __init__(
-        self,
-        expression: sympy.Expr,
-        states: tuple[int, ...],
-        symbols: Sequence[sympy.Symbol],
-        box: np.ndarray,
-        intensity: float,
-        nodes: int,
+        self, u: sympy.Expr, states: list[int], symbols: Sequence[sympy.Symbol], box: np.ndarray, nodes: int
     ) -> None:
-        self.states, self.box, self.nodes = states, box[list(states)], nodes
-        scaled = expression / sympy.Float(intensity, 17)
-        self.function = compile_formulas([scaled], [symbols[state] for state in states])
+        self.states, self.box, self.nodes = states, box[states], nodes
+        self.function = compile_formulas([u], [symbols[state] for state in states])
         self.log_integral, coarse = (self._log_integral(count) for count in (nodes, 3 * nodes // 4))
         if not abs(self.log_integral - coarse) <= QUADRATURE_TOLERANCE:
             raise NumericalFailure(
@@ -314,14 +307,15 @@ def marginal_density(
         groups.append((set().union(*(group[0] for group in coupled)), part + sum(e for _, e in coupled)))
     blocks = []
     for members, expression in groups:
-        states = tuple(index for index, symbol in enumerate(symbols) if symbol in members)
+        states = [index for index, symbol in enumerate(symbols) if symbol in members]
         if len(states) > LARGEST_BLOCK:
             names = ", ".join(str(symbols[state]) for state in states)
             raise NumericalFailure(
                 f"the quasipotential couples {len(states)} states ({names}), of which at most"
                 f" {LARGEST_BLOCK} can be integrated together"
             )
-        blocks.append(_Block(expression, states, symbols, np.asarray(box, dtype=float), intensity, nodes))
+        scaled = expression / sympy.Float(intensity, 17)
+        blocks.append(_Block(scaled, states, symbols, np.asarray(box, dtype=float), nodes))
     total = float(np.exp(sum(block.log_integral for block in blocks) - constant / intensity))
     plane = tuple(range(min(len(symbols), 2)))
     axes = {state: np.linspace(box[state][0], box[state][1], points) for state in plane}

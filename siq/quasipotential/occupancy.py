@@ -33,7 +33,6 @@ and Smirnov do, with as many samples as the correlation time leaves independent.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 
@@ -57,7 +56,7 @@ from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.inference.library import field_dynamics
 from siq.numerics.randomness import normal_draws
 from siq.numerics.text import place_text
-from siq.quasipotential.characteristics import ScaledSystem
+from siq.quasipotential.characteristics import Function, ScaledSystem
 from siq.quasipotential.rates import NoiseStrength, mean_residence_time
 from siq.quasipotential.transitions import transitions, ways_out
 from siq.remarks import Remark, sentence
@@ -185,16 +184,12 @@ class _CellProcess:
 
 
 def _rates(
-    flow: Callable[[np.ndarray], np.ndarray],
-    noise: Callable[[np.ndarray], np.ndarray],
-    y: np.ndarray,
-    steps: np.ndarray,
-    count: int,
+    force: Function, noise: Function, y: np.ndarray, steps: np.ndarray, count: int
 ) -> sparse.csr_matrix:
     """Rates between neighbouring cells, without those that lead out of a cell on the diagonal."""
+    pairs: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     dimension = y.shape[1]
     index = np.arange(len(y)).reshape((count,) * dimension)
-    rows, columns, values = [], [], []
     for axis in range(dimension):
         left = np.take(index, np.arange(count - 1), axis=axis).ravel()
         right = np.take(index, np.arange(1, count), axis=axis).ravel()
@@ -203,7 +198,7 @@ def _rates(
         tensor = noise(face)
         spread = tensor[:, axis, axis]
         slope = (noise(y[right])[:, axis, axis] - noise(y[left])[:, axis, axis]) / h
-        drift = flow(face)[:, axis] - slope
+        drift = force(face)[:, axis] - slope
         if dimension == 2:
             other = 1 - axis
             move = np.zeros(2)
@@ -213,9 +208,8 @@ def _rates(
             spread = spread - np.abs(tensor[:, 0, 1]) * h / steps[other]
         spread = np.maximum(spread, 1e-9 * tensor[:, axis, axis])
         z = np.clip(drift * h / spread, -STEEP, STEEP)
-        rows += [left, right]
-        columns += [right, left]
-        values += [spread / h**2 / special.exprel(-z), spread / h**2 / special.exprel(z)]  # B = 1/exprel
+        ways = ((left, right, -z), (right, left, z))  # B = 1/exprel
+        pairs += [(one, other, spread / h**2 / special.exprel(own)) for one, other, own in ways]
     if dimension == 2:
         for sign in (1, -1):
             low = index[:-1, :-1] if sign > 0 else index[:-1, 1:]
@@ -223,12 +217,9 @@ def _rates(
             start, end = low.ravel(), high.ravel()
             mixed = np.maximum(sign * noise((y[start] + y[end]) / 2)[:, 0, 1], 0) / np.prod(steps)
             used = mixed > 0
-            rows += [start[used], end[used]]
-            columns += [end[used], start[used]]
-            values += [mixed[used], mixed[used]]
-    return sparse.csr_matrix(
-        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(len(y), len(y))
-    )
+            pairs += [(start[used], end[used], mixed[used]), (end[used], start[used], mixed[used])]
+    rows, columns, values = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    return sparse.csr_matrix((values, (rows, columns)), shape=(len(y), len(y)))
 
 
 def _invariant_density(rates: sparse.csr_matrix) -> np.ndarray:

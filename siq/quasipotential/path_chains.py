@@ -24,6 +24,7 @@ M. Heymann and E. Vanden-Eijnden, Comm. Pure Appl. Math. 61 (2008) 1052: the geo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -507,21 +508,15 @@ class _Across:
             normal[-1] = np.linalg.svd(problem.finish.slope(y[-1])[None])[2][1:].T
         self.normal = normal[self.range]
         self.slope = np.einsum("nij,ni->nj", self.normal, slope[self.range]).ravel()
-        self.exact, self.frozen = (self._banded(*blocks, first, last) for blocks in (exact, frozen))
+        self.exact, self.frozen = (self._banded(blocks, first, last) for blocks in (exact, frozen))
 
-    def _banded(
-        self,
-        middle: np.ndarray,
-        mixed: np.ndarray,
-        forward: np.ndarray,
-        first: np.ndarray,
-        last: np.ndarray,
-    ) -> np.ndarray:
+    def _banded(self, blocks: Sequence[np.ndarray], first: np.ndarray, last: np.ndarray) -> np.ndarray:
         """The matrix of the moves, in the lower form of scipy's solvers.
 
         Of second derivatives of the segments by middles, by differences and middles, and by differences; and
         of what is added to the blocks of the first point and of the last.
         """
+        middle, mixed, forward = blocks
         count, _, m = self.normal.shape
         transposed = mixed.transpose(0, 2, 1)
         both = (mixed + transposed) / 2

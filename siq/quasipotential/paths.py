@@ -69,10 +69,14 @@ MOST_GUESSES = 2  # of either kind that are tried
 ACTION_DIFFERENCE = 0.02  # share of the action by which two of them differ
 
 
+LimitSet = np.ndarray | Cycle
+"""A state, shape ``(d,)``, or a cycle."""
+
+
 def minimum_action_path(
     dynamics: Dynamics,
-    start: np.ndarray | Cycle,
-    end: np.ndarray | Cycle,
+    start: LimitSet,
+    end: LimitSet,
     *,
     nodes: int = 100,
     tolerance: float = 1e-4,
@@ -225,9 +229,9 @@ def _other_minima(chains: Sequence[tuple[np.ndarray, float, bool]], best: np.nda
 
 def transition_path(
     dynamics: Dynamics,
-    start: np.ndarray | Cycle,
-    over: np.ndarray | Cycle,
-    end: np.ndarray | Cycle | None,
+    start: LimitSet,
+    over: LimitSet,
+    end: LimitSet | None,
     *,
     box: np.ndarray | None = None,
     nodes: int = 100,
@@ -307,11 +311,7 @@ def _arriving(
 
 
 def _downhill(
-    dynamics: Dynamics,
-    over: np.ndarray | Cycle,
-    begin: np.ndarray,
-    target: np.ndarray | Cycle,
-    box: np.ndarray,
+    dynamics: Dynamics, over: LimitSet, begin: np.ndarray, target: LimitSet, box: np.ndarray
 ) -> np.ndarray:
     """The way that f leads on where the one or the other is a cycle."""
     width = np.ptp(box, axis=1)
@@ -335,9 +335,7 @@ def _downhill(
     return evenly(np.vstack([begin[None], way.y.T * width]), CYCLE_DESCENT_POINTS)
 
 
-def _first_guesses(
-    problem: PathProblem, start: np.ndarray | Cycle, end: np.ndarray | Cycle
-) -> list[np.ndarray]:
+def _first_guesses(problem: PathProblem, start: LimitSet, end: LimitSet) -> list[np.ndarray]:
     """Curves from beside a start to an end, one of them a cycle, by rising action."""
     d, draw = problem.dimension, np.random.default_rng(0)
     # States on all sides of the start, and the momenta there.
