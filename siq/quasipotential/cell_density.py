@@ -268,12 +268,11 @@ class KnownDensity:
         shape = potential.values.shape[:2]
         index, inside = potential.places(samples)
         counted = inside & potential.known[tuple(index)]
-        bin_of = sum(index[state] // (count // bins) * bins**state for state, count in enumerate(shape))
         onto = _onto_plane(self.probabilities)
         rows = bins if len(shape) > 1 else 1
         expected = onto.reshape(rows, len(onto) // rows, bins, shape[0] // bins).sum(axis=(1, 3))
         edges = [np.linspace(low, high, bins + 1) for low, high in potential.box[: len(shape)]]
-        return DensityComparison.of_bins(bin_of, np.append(expected, 0.0), edges, counted=counted)
+        return DensityComparison.of_samples(samples[: len(shape)], edges, expected, counted=counted)
 
     def starting_states(self, count: int, *, generator: np.random.Generator) -> np.ndarray:
         """States drawn from the density, the share of every well exact to one walker: shape ``(d, count)``.

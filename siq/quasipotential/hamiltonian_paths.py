@@ -159,18 +159,17 @@ class _HamiltonianProblem(HamiltonianFlow):
         d, (matrix, right), (times, states) = self.dimension, last, guess
         further = len(matrix) - d
 
+        def gradient(own: np.ndarray) -> np.ndarray:
+            """∇H from what F is, and its derivatives likewise."""
+            return np.concatenate([-own[d:], own[:d]])
+
         def rates(_: np.ndarray, z: np.ndarray, k: np.ndarray | None = None) -> np.ndarray:
             own = self.field(z)
-            return own if k is None else own + k[0] * np.concatenate([-own[d:], own[:d]])
+            return own if k is None else own + k[0] * gradient(own)
 
         def derivatives(_: np.ndarray, z: np.ndarray, k: np.ndarray | None = None) -> object:
             own = self.matrices(z)
-            if k is None:
-                return own
-            velocity = self.field(z)
-            return own + k[0] * np.concatenate([-own[d:], own[:d]]), np.concatenate(
-                [-velocity[d:], velocity[:d]]
-            )[:, None]
+            return own if k is None else (own + k[0] * gradient(own), gradient(self.field(z))[:, None])
 
         def ends(first: np.ndarray, final: np.ndarray, _: np.ndarray | None = None) -> np.ndarray:
             return np.concatenate([first[d:] - self.slope(first[None, :d])[0], matrix @ final - right])

@@ -62,19 +62,23 @@ class DensityComparison:
     histogram: np.ndarray
 
     @classmethod
-    def of_bins(
+    def of_samples(
         cls,
-        bin_of: np.ndarray,
-        expected: np.ndarray,
+        samples: np.ndarray,
         edges: Sequence[np.ndarray],
+        expected: Sequence[float] | np.ndarray,
         *,
         counted: np.ndarray | None = None,
     ) -> DensityComparison:
-        """From the bin of every sample, shape ``(times, walkers)``, and the probability of each bin.
+        """Of samples ``(1 or 2, times, walkers)`` and probabilities of bins, row by row of the second state.
 
-        A bin is the row of the second state times the bins of the first, plus the column; the last one is
-        what lies outside the box. `counted` masks the samples that count; by default all.
+        A further bin is what lies outside the box. `counted` masks the samples that count; by default all.
         """
+        bins, expected = len(edges[0]) - 1, np.append(expected, 0.0)
+        places = [np.searchsorted(edge, x, side="right") - 1 for edge, x in zip(edges, samples, strict=True)]
+        inside = np.logical_and.reduce([(place >= 0) & (place < bins) for place in places])
+        rows_and_columns = sum(place * bins**power for power, place in enumerate(places))
+        bin_of = np.where(inside, rows_and_columns, bins ** len(places))
         walkers, width = bin_of.shape[-1], len(expected)
         groups = min(WALKER_GROUPS, walkers)
         group_of = np.broadcast_to(np.arange(walkers) * groups // walkers, bin_of.shape)
@@ -133,23 +137,13 @@ class StationaryDensity:
     def compare(self, samples: np.ndarray, *, bins: int = BINS) -> DensityComparison:
         """Compare the density of a formula with samples of a long stochastic simulation.
 
-        Parameters
-        ----------
-        samples
-            Shape ``(d, ..., walkers)``, all d states: what `siq.systems.simulation.simulate_stationary`
-            returns. Walkers count as independent of each other, the samples of one walker do not. Where
-            walkers never leave their well, the floor includes a scatter between wells that the choice of
-            initial states avoids.
-        bins
-            Bins along each of the states, over the box of the density.
+        Samples of all d states, ``(d, ..., walkers)``, are what `siq.systems.simulation.simulate_stationary`
+        returns, and there are so many bins along each state of the plane. Walkers count as independent of
+        each other, the samples of one walker do not. Where walkers never leave their well, the floor includes
+        a scatter between wells that the choice of initial states avoids.
         """
         axes = (self.x1, self.x2)[: len(self.plane)]
         edges = [np.linspace(axis[0], axis[-1], bins + 1) for axis in axes]
-        chosen = samples[list(self.plane)].reshape(len(axes), -1, samples.shape[-1])
-        places = [np.searchsorted(edge, x, side="right") - 1 for edge, x in zip(edges, chosen, strict=True)]
-        inside = np.logical_and.reduce([(place >= 0) & (place < bins) for place in places])
-        row_and_column = sum(place * bins**power for power, place in enumerate(places))
-        bin_of = np.where(inside, row_and_column, bins ** len(places))
         if len(edges) == 1:
             curve = scipy.interpolate.InterpolatedUnivariateSpline(self.x1, self.values[0])
             expected = [curve.integral(left, right) for left, right in itertools.pairwise(edges[0])]
@@ -160,7 +154,8 @@ class StationaryDensity:
                 for low, high in itertools.pairwise(edges[1])
                 for left, right in itertools.pairwise(edges[0])
             ]
-        return DensityComparison.of_bins(bin_of, np.append(expected, 0.0), edges)
+        chosen = samples[list(self.plane)].reshape(len(axes), -1, samples.shape[-1])
+        return DensityComparison.of_samples(chosen, edges, expected)
 
 
 class _Block:
