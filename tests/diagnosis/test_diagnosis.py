@@ -317,7 +317,7 @@ def test_what_a_name_leaves_is_described_and_no_sample_of_a_test_chooses_it(
     case = diagnosis.case
     other = replace(case.kept, outputs=case.kept.outputs[::-1] + 0.3)
     again = held_out_runs(diagnosis.investigation, other)
-    assert again.model == diagnosis.held_out.fit.model
+    assert again.fit.model == diagnosis.held_out.fit.model
     assert again.errors.augmented != diagnosis.held_out.errors.augmented
 
 
