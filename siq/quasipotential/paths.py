@@ -156,9 +156,17 @@ def minimum_action_path(
         error = abs(action - before) / 3
         known = error <= max(tolerance * action, NO_ACTION * Segments(problem, fine).effort)
     line = _extrapolated(problem, (coarse, before), (fine, action))
-    # Rivals have the error of short chains, which they share with the first one.
-    lowest = max(chains[0][1], np.finfo(float).tiny)
-    shares = [one / lowest for one in _other_minima(chains, fine)]
+
+    def tree(y: np.ndarray) -> cKDTree:
+        return cKDTree(evenly(y, int(5 * np.linalg.norm(np.diff(y, axis=0), axis=1).sum() / SAME_PATH) + 2))
+
+    # Minima that lie apart from the first chain, from what it has become, and from each other. They have the
+    # error of short chains, which they share with the first one.
+    rivals, trees = [], [tree(chains[0][0]), tree(fine)]
+    for y, its_action, is_minimum in chains[1:]:
+        if is_minimum and all(other.query(y)[0].max() > SAME_PATH for other in trees):
+            rivals.append(its_action / max(chains[0][1], np.finfo(float).tiny))
+            trees.append(tree(y))
     points, momenta = np.split(line[:, :-1], 2, axis=1)
     return MinimumActionPath(
         points=problem.points(points),
@@ -168,7 +176,7 @@ def minimum_action_path(
         error=problem.unit * error,
         residual=problem.residual(points, momenta),
         converged=minimum and known,
-        rivals=tuple(float(problem.unit * line[-1, -1] * share) for share in shares),
+        rivals=tuple(float(problem.unit * line[-1, -1] * share) for share in rivals),
     )
 
 
@@ -211,20 +219,6 @@ def _extrapolated(
         return nodes
     ends[0, :d] = problem.begin.closest(nodes[:1, :d])[0]
     return np.vstack([ends[:1], nodes])
-
-
-def _other_minima(chains: Sequence[tuple[np.ndarray, float, bool]], best: np.ndarray) -> list[float]:
-    """Actions of minima that lie apart from the first chain, from what it has become, and from each other."""
-
-    def tree(y: np.ndarray) -> cKDTree:
-        return cKDTree(evenly(y, int(5 * np.linalg.norm(np.diff(y, axis=0), axis=1).sum() / SAME_PATH) + 2))
-
-    rivals, trees = [], [tree(chains[0][0]), tree(best)]
-    for y, action, minimum in chains[1:]:
-        if minimum and all(other.query(y)[0].max() > SAME_PATH for other in trees):
-            rivals.append(action)
-            trees.append(tree(y))
-    return rivals
 
 
 def transition_path(

@@ -506,10 +506,8 @@ def prefactor_error(found: AnyField, path: MinimumActionPath) -> tuple[float | N
         if found.noise is not None:
             noise = replace(found.noise, values=found.noise.values + change[count:])
             dynamics = replace(dynamics, diffusion=noise.diffusion(found.intensity))
-        start, end = (_equilibrium_near(dynamics, path, place) for place in (0, -1))
-        if start is None or end is None:
-            return None
         try:
+            start, end = (_equilibrium_near(dynamics, path, place) for place in (0, -1))
             again = minimum_action_path(
                 dynamics, start, end, nodes=DIFFERENCE_NODES, tolerance=DIFFERENCE_TOLERANCE,
                 initial=[path.points],
@@ -545,21 +543,17 @@ def _covariance_axes(covariance: np.ndarray, draw: np.random.Generator) -> Seque
     return list((np.sqrt(count / MAX_COVARIANCE_AXES) * root @ turned).T)
 
 
-def _equilibrium_near(dynamics: Dynamics, path: MinimumActionPath, end: int) -> np.ndarray | None:
-    """Where f vanishes next to an end of a path, by Newton's method; None where it does not."""
-    x = path.points[end].copy()
-    distance = float(np.linalg.norm(path.points[-1] - path.points[0]))
+def _equilibrium_near(dynamics: Dynamics, path: MinimumActionPath, end: int) -> np.ndarray:
+    """Where f vanishes next to an end of a path, by Newton's method."""
+    x, distance = path.points[end], float(np.linalg.norm(path.points[-1] - path.points[0]))
     for _ in range(NEWTON_STEPS):
-        try:
-            step = np.linalg.solve(dynamics.jacobian(x[None])[0], dynamics.drift(x[None])[0])
-        except np.linalg.LinAlgError:
-            return None
+        step = np.linalg.solve(dynamics.jacobian(x[None])[0], dynamics.drift(x[None])[0])
         x = x - step
         if not np.linalg.norm(x - path.points[end]) < EQUILIBRIUM_REACH * distance:
-            return None
+            break
         if np.linalg.norm(step) < NEWTON_TOLERANCE * distance:
             return x
-    return None
+    raise NumericalFailure("f does not vanish next to the end of the path")
 
 
 @dataclass(frozen=True)
