@@ -309,17 +309,6 @@ class Fit:
         return bool((self.noise.process > 0).any())
 
 
-@dataclass(frozen=True)
-class _Iterate:
-    """Where a fit stands: parameters, states where f is taken, smoothed ones; covariance of a filter."""
-
-    values: np.ndarray
-    x: np.ndarray
-    along: Linearisation
-    smoothed: np.ndarray
-    spread: np.ndarray | None = None
-
-
 def fit_of_states(
     model: Dynamics, data: Measurements, *, x: np.ndarray, noise: Noise, substeps: int, converged: bool
 ) -> Fit:
@@ -327,52 +316,41 @@ def fit_of_states(
 
     The measurement noise is estimated, beginning with that of the noise.
     """
-    at = _Iterate(model.values, x, linearise(model, Grid(data, substeps), model.values, x), x)
+    along = linearise(model, Grid(data, substeps), model.values, x)
 
-    def fit() -> Fit:
-        known = _noise_along(at.along, data, noise, False, expected=expectations(model))
-        return _fit_at(model, data, at, known, substeps, converged=converged, resolution=INEXACT)
+    def fit(begin: Fit) -> Fit:
+        known = _noise_along(along, data, noise, False, expected=expectations(model))
+        return _ended(replace(begin, noise=known), data, converged=converged, resolution=INEXACT)
 
-    return _or_fault(model, at, noise, substeps, fit)
+    return _fit_from(model, x, along, noise, substeps, fit)
 
 
-def _fit_at(
-    model: Dynamics,
-    data: Measurements,
-    at: _Iterate,
-    noise: Noise,
-    substeps: int,
-    *,
-    converged: bool,
-    resolution: float,
-) -> Fit:
+def _ended(at: Fit, data: Measurements, *, converged: bool, resolution: float) -> Fit:
     """The fit whose iteration ended at parameters, states and noise."""
-    white = whiten(at.along, data, noise)
-    expected = expectations(model, at.values)
+    white, expected = whiten(at.linearisation, data, at.noise), expectations(at.model)
     change, covariance = white.solve(expected, least=resolution)
     # The last change is below the errors. The likelihood is that of the states in hand, not of a forecast.
     innovations = np.append(white.innovations, expected[1])
     total = float(innovations @ innovations)
-    together = sum(len(each.roots) for each in model.expected_together)
-    return Fit(
-        model.with_values(_changed(model, at.values, change if converged else 0 * change)), covariance,
-        at.smoothed, at.x, at.spread, noise, at.along, white.log_likelihood(total), total,
-        white.degrees_of_freedom + together - len(model.free), substeps, converged,
+    together = sum(len(each.roots) for each in at.model.expected_together)
+    return replace(
+        at, model=_changed(at.model, change) if converged else at.model, covariance=covariance,
+        log_likelihood=white.log_likelihood(total), sum_of_squares=total,
+        degrees_of_freedom=white.degrees_of_freedom + together - len(at.model.free), converged=converged,
     )  # fmt: skip
 
 
-def _or_fault(model: Dynamics, begin: _Iterate, noise: Noise, substeps: int, fit: Callable[[], Fit]) -> Fit:
-    """A fit from a begin; what leads to no number is a fit with a fault."""
-    fault = "" if begin.along.finite else RUNS_AWAY
-    if not fault:
-        try:
-            return fit()
-        except (ArithmeticError, np.linalg.LinAlgError) as error:
-            fault = str(error)
-    return Fit(
-        model, np.full((len(model.free),) * 2, np.nan), begin.smoothed, begin.x, begin.spread, noise,
-        begin.along, -np.inf, np.inf, 1, substeps, False, fault,
-    )  # fmt: skip
+def _fit_from(
+    model: Dynamics, x: np.ndarray, along: Linearisation, noise: Noise, substeps: int,
+    fit: Callable[[Fit], Fit],
+) -> Fit:  # fmt: skip
+    """A fit from a begin; what leads to no number is that begin with a fault."""
+    unknown, fault = np.full((len(model.free),) * 2, np.nan), "" if along.finite else RUNS_AWAY
+    begin = Fit(model, unknown, x, x, None, noise, along, -np.inf, np.inf, 1, substeps, False, fault)
+    try:
+        return begin if fault else fit(begin)
+    except (ArithmeticError, np.linalg.LinAlgError) as error:
+        return replace(begin, fault=str(error))
 
 
 class _Shooting:
@@ -424,10 +402,10 @@ class _Shooting:
         drift = self.closed.at(spread[rows] + intensity * data.step[rows][:, None, None] / 2)
         return linearise(self.model, self.grid, values, x, drift=drift)
 
-    def stepped(self, now: _Iterate, change: np.ndarray, noise: Noise) -> tuple[_Iterate, float] | None:
+    def stepped(self, now: Fit, change: np.ndarray) -> tuple[Fit, float] | None:
         """The step suggested, shortened until it does about what was foreseen, and the share taken."""
-        data = self.grid.data
-        still = now.along.with_parameters_changed(change)
+        data, here, noise = self.grid.data, now.linearisation, now.noise
+        still = here.with_parameters_changed(change)
         filtered = still.filtered(data.first, data.step, noise.measurement, noise.intensity)
         begin = np.empty((len(data.labels), still.gap.shape[1]))
         for place, (start, end) in enumerate(itertools.pairwise(data.first)):
@@ -437,22 +415,22 @@ class _Shooting:
         deviation = known if self.filtered else smoothed
         spread = covariance if noise.process.any() else None
         rows, scale = self.grid.rows, self.scale
-        moved = np.einsum("kij,kj->ki", now.along.transition[rows], deviation[rows])
-        moved += now.along.response[rows] @ change
-        foreseen = now.along.gap[rows] + moved - deviation[rows + 1]
+        moved = np.einsum("kij,kj->ki", here.transition[rows], deviation[rows])
+        moved += here.response[rows] @ change
+        foreseen = here.gap[rows] + moved - deviation[rows + 1]
         effect = np.sqrt(np.mean(((np.abs(moved) + np.abs(deviation[rows + 1])) / scale) ** 2))
         # A filter's gaps are its corrections at each sample, which both kinds of noise ask for anyway.
-        usual = np.sqrt(np.mean((now.along.gap[rows] / scale) ** 2)) if self.filtered else 0.0
+        usual = np.sqrt(np.mean((here.gap[rows] / scale) ** 2)) if self.filtered else 0.0
         length = 1.0
         while length >= SHORTEST_STEP:
-            values = _changed(self.model, now.values, length * change)
-            x = now.x + length * deviation
-            along = self.linearised(values, x, spread, noise)
+            model, x = _changed(now.model, length * change), now.linearised_at + length * deviation
+            along = self.linearised(model.values, x, spread, noise)
             if along.finite:
-                expected = (1 - length) * now.along.gap[rows] + length * foreseen
+                expected = (1 - length) * here.gap[rows] + length * foreseen
                 unforeseen = np.sqrt(np.mean(((along.gap[rows] - expected) / scale) ** 2))
                 if unforeseen <= NONLINEAR * length * effect + HARMLESS * usual + 1e-9:
-                    return _Iterate(values, x, along, now.x + length * smoothed, spread), length
+                    there = replace(now, model=model, x=now.linearised_at + length * smoothed)
+                    return replace(there, linearised_at=x, spread=spread, linearisation=along), length
             length /= 2
         return None
 
@@ -460,29 +438,30 @@ class _Shooting:
         self, x: np.ndarray, along: Linearisation, noise: Noise, *, estimate_process: bool, most: int
     ) -> Fit:
         """The fit that begins at the model's values and states ``(n, d)``, in at most so many steps."""
-        begin = _Iterate(self.model.values, x, along, x)
-        descended = partial(self.descended, begin, noise, estimate_process=estimate_process, most=most)
-        return _or_fault(self.model, begin, noise, self.grid.substeps, descended)
+        descended = partial(self.descended, estimate_process=estimate_process, most=most)
+        return _fit_from(self.model, x, along, noise, self.grid.substeps, descended)
 
-    def descended(self, now: _Iterate, noise: Noise, *, estimate_process: bool, most: int) -> Fit:
+    def descended(self, now: Fit, *, estimate_process: bool, most: int) -> Fit:
         """Gauss–Newton steps from a begin, at most so many."""
-        data, model = self.grid.data, self.model
+        data, noise = self.grid.data, now.noise
         before: np.ndarray | None = None
         totals: list[float] = []
         converged, settled_noise, whole = False, False, False
         for iteration in range(most):
             if noise.field is not None:  # process noise depends on where the fit stands
-                rows, middle = self.grid.rows, now.x.copy()
-                middle[rows] += (now.x[rows + 1] + now.along.gap[rows] - now.x[rows]) / 2
+                rows, x = self.grid.rows, now.linearised_at
+                middle = x.copy()
+                middle[rows] += (x[rows + 1] + now.linearisation.gap[rows] - x[rows]) / 2
                 noise = noise.along(middle, now.spread, data.step)
-            expected = expectations(model, now.values)
+            expected = expectations(now.model)
             if iteration in (0, 2) or settled_noise:
                 noise = _noise_along(
-                    now.along, data, noise, estimate_process, expected=expected, charge=self.charge,
+                    now.linearisation, data, noise, estimate_process, expected=expected, charge=self.charge,
                     coarse=not settled_noise,
                 )  # fmt: skip
+            now = replace(now, noise=noise)
             self.charge()
-            white = whiten(now.along, data, noise)
+            white = whiten(now.linearisation, data, noise)
             change, _ = white.solve(expected, least=self.resolution)
             explained = white.columns @ change
             left = white.innovations - explained
@@ -507,14 +486,12 @@ class _Shooting:
             elif len(totals) > 2 * PATIENCE and _stands_still(totals):
                 converged = True
                 break
-            step = self.stepped(now, change, noise)
+            step = self.stepped(now, change)
             if step is None:
                 break
             now, length = step
             whole = length == 1.0
-        return _fit_at(
-            model, data, now, noise, self.grid.substeps, converged=converged, resolution=self.resolution
-        )
+        return _ended(now, data, converged=converged, resolution=self.resolution)
 
 
 def fit_by_multiple_shooting(
@@ -591,8 +568,8 @@ def _stands_still(totals: list[float]) -> bool:
     return max(recent) - min(recent) < STANDSTILL * max(recent)
 
 
-def _changed(model: Dynamics, values: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Parameters' values after a change of the free ones."""
-    result = values.copy()
-    result[list(model.free)] += change
-    return result
+def _changed(model: Dynamics, change: np.ndarray) -> Dynamics:
+    """The dynamics after a change of the free parameters."""
+    values = model.values.copy()
+    values[list(model.free)] += change
+    return model.with_values(values)

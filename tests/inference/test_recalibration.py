@@ -13,7 +13,7 @@ import sympy
 from siq.diagnosis.study import _measurements_of
 from siq.inference import maximum_likelihood, recalibration
 from siq.inference.kalman_filter import Noise
-from siq.inference.maximum_likelihood import Fit, _Iterate, _Shooting, fit_by_multiple_shooting
+from siq.inference.maximum_likelihood import Fit, _Shooting, fit_by_multiple_shooting
 from siq.inference.measurements import Measurements
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter
@@ -73,7 +73,7 @@ def test_a_fit_has_not_settled_while_it_foresees_more_than_it_has() -> None:
     fit = fit_by_multiple_shooting(decay, data, x=x, noise=noise, estimate_process=False)
     assert fit.converged
 
-    def idle(self: _Shooting, now: _Iterate, change: np.ndarray, noise: Noise) -> tuple[_Iterate, float]:
+    def idle(self: _Shooting, now: Fit, change: np.ndarray) -> tuple[Fit, float]:
         return now, 1.0  # a whole step that does nothing of what it promised
 
     with pytest.MonkeyPatch.context() as patch:
