@@ -32,20 +32,12 @@ LONGEST_SETTLING = 30.0  # in units of the slowest relaxation time
 class Neighbourhood:
     """An ellipsoid about an attractor: ``½ (x - center)·hessian (x - center) ≤ level``.
 
-    Attributes
-    ----------
-    center
-        Shape ``(d,)``.
-    hessian
-        Shape ``(d, d)``, mostly M of `siq.systems.equilibria.hessian_at`: the ellipsoid then approximates a
-        level set of V.
-    level
-        In the unit of V, not of U = 2V. It should be well below that of the saddles.
+    With the Hessian of V (`siq.systems.equilibria.hessian_at`) it approximates a level set of V.
     """
 
-    center: np.ndarray
-    hessian: np.ndarray
-    level: float
+    center: np.ndarray  #: shape (d,)
+    hessian: np.ndarray  #: shape (d, d)
+    level: float  #: in the unit of V, not of U = 2V; it should be well below that of the saddles
 
     @classmethod
     def about(cls, dynamics: Dynamics, attractor: np.ndarray, *, level: float) -> Neighbourhood:
@@ -60,24 +52,12 @@ class Neighbourhood:
 
 @dataclass(frozen=True)
 class EscapeTimes:
-    """Simulated times of escape, which at weak noise are distributed exponentially.
+    """Simulated times of escape, which at weak noise are distributed exponentially."""
 
-    Attributes
-    ----------
-    times
-        Shape ``(escapes,)``, ascending: the times of those who escaped.
-    targets
-        Shape ``(escapes,)``: the index of the neighbourhood that each of them reached.
-    censored
-        Number of walkers that had not escaped when the simulation ended.
-    longest
-        How long these were followed, in time units.
-    """
-
-    times: np.ndarray
-    targets: np.ndarray
-    censored: int
-    longest: float
+    times: np.ndarray  #: of those who escaped, ascending, shape (escapes,)
+    targets: np.ndarray  #: index of the neighbourhood that each of them reached
+    censored: int  #: number of walkers that had not escaped when the simulation ended
+    longest: float  #: how long these were followed, in time units
 
     @property
     def escapes(self) -> int:

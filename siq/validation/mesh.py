@@ -57,30 +57,17 @@ Stop = Literal["boundary", "level", "everywhere"]
 class MeshQuasipotential:
     """V on the nodes of a rectangular mesh.
 
-    Attributes
-    ----------
-    axes
-        The nodes along each state, shapes ``(nx,)`` and ``(ny,)``, in the states' units.
-    values
-        Shape ``(nx, ny)``: V, not U = 2V; NaN where it was not reached.
-    attractor
-        A, shape ``(2,)``, where V is zero.
-    level
-        The highest V reached, in the unit of f·x/D. Unless a boundary was passed over, all states of lower V
-        that are connected with A have been reached.
-    stop
-        Why the work ended: the boundary of the mesh was next, or a value above the level asked for, or
-        no node was left.
-    reach
-        Longest segment, in mesh widths.
+    The work ends where the boundary of the mesh is next, or a value above the level asked for, or no node is
+    left. Unless a boundary was passed over, all states that are connected with A and have a V lower than the
+    highest one have been reached.
     """
 
-    axes: tuple[np.ndarray, np.ndarray]
-    values: np.ndarray
-    attractor: np.ndarray
-    level: float
-    stop: Stop
-    reach: int
+    axes: tuple[np.ndarray, np.ndarray]  #: nodes along each state, (nx,) and (ny,), in its unit
+    values: np.ndarray  #: V, not U = 2V, shape (nx, ny); NaN where it was not reached
+    attractor: np.ndarray  #: A, shape (2,), where V is zero
+    level: float  #: the highest V reached, in the unit of f·x/D
+    stop: Stop  #: why the work ended
+    reach: int  #: longest segment, in mesh widths
 
     def evaluate(self, x: np.ndarray) -> np.ndarray:
         """V at points, interpolated: ``(n, 2)`` to ``(n,)``.
@@ -199,7 +186,7 @@ def _drift_values(drift: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> n
     return values
 
 
-SHARE_TOLERANCE = 1e-6  # of λ: U is flat at its minimum, and off by the _square of this
+SHARE_TOLERANCE = 1e-6  # of λ: U is flat at its minimum, and off by the square of this
 MAX_SECANTS = 60  # numerical, a guard: bisection alone reaches SHARE_TOLERANCE in 20
 
 # A node has no value yet; a guess; its value, on the front; its value, behind the front.
@@ -466,7 +453,7 @@ def mesh_quasipotential(
         Longest segment, in mesh widths. By default ``3 + r/2``, r being the ratio ``|f + 2D∇V| |∇V| /
         ((f + 2D∇V)·∇V)`` in mesh widths at its largest near A, 1 if f does not turn there: the least that
         sufficed in systems with known V. Where f turns faster elsewhere, give more. V falls as the reach
-        grows: it is too high where the reach is too short, and too low, by its _square, where it is too long.
+        grows: it is too high where the reach is too short, and too low, by its square, where it is too long.
     level
         V (not U) above which nothing is asked for.
     stop_at_boundary

@@ -31,27 +31,15 @@ TWO_METHODS = "least action of a chain of points, and Hamilton's equations"
 
 @dataclass(frozen=True, eq=False)
 class KnownBarrier:
-    """How high U rises between two attractors, and how long it takes to leave the first.
+    """How high U rises between two attractors, and how long it takes to leave the first."""
 
-    Attributes
-    ----------
-    start, saddle, end
-        Shape ``(d,)``: the attractor, the pass, and the attractor behind it.
-    value, error
-        ``ΔU = U(saddle) - U(start)``, and by how much it may be wrong.
-    prefactor
-        Of the law ``E[τ] = prefactor · exp(ΔU/ε)`` for small ε; NaN where it is not known.
-    how
-        How it is known.
-    """
-
-    start: np.ndarray
-    saddle: np.ndarray
-    end: np.ndarray
-    value: float
-    error: float
-    prefactor: float
-    how: str
+    start: np.ndarray  #: the attractor, shape (d,)
+    saddle: np.ndarray  #: the pass
+    end: np.ndarray  #: the attractor behind it
+    value: float  #: ΔU = U(saddle) - U(start)
+    error: float  #: by how much it may be wrong
+    prefactor: float  #: of the law E[τ] = prefactor · exp(ΔU/ε) for small ε; NaN where it is not known
+    how: str  #: how it is known
 
 
 def _computed(*states: tuple[float, float], value: float) -> KnownBarrier:
@@ -86,28 +74,14 @@ X, Y, Z, V = sympy.symbols("x y z v", real=True)
 
 @dataclass(frozen=True)
 class ReferenceSystem:
-    """A system, and what is known of its landscape.
-
-    Attributes
-    ----------
-    name, about
-        In a word, and in a sentence.
-    source
-        Where it comes from.
-    dynamics
-        f, D and the domain.
-    quasipotential
-        U as a formula that holds in the whole domain, up to a constant; None where nobody knows one.
-    barriers
-        Between attractors, known exactly or by two methods.
-    """
+    """A system, and what is known of its landscape."""
 
     name: str
-    about: str
-    source: str
-    dynamics: Dynamics
-    quasipotential: sympy.Expr | None
-    barriers: tuple[KnownBarrier, ...]
+    about: str  #: in a sentence
+    source: str  #: where it comes from
+    dynamics: Dynamics  #: f, D and the domain
+    quasipotential: sympy.Expr | None  #: U in the whole domain, up to a constant; None where nobody knows it
+    barriers: tuple[KnownBarrier, ...]  #: between attractors, known exactly or by two methods
 
 
 def reference_systems() -> dict[str, ReferenceSystem]:
@@ -348,12 +322,8 @@ def reference_table(*, points: int = 100) -> pd.DataFrame:
     """
     rows: list[dict[str, Any]] = []
     for each in reference_systems().values():
-        own: dict[str, Any] = {
-            "system": each.name,
-            "states": list(each.dynamics.states),
-            "by": None,
-            "to": None,
-        }
+        own: dict[str, Any] = {"system": each.name, "states": list(each.dynamics.states)}
+        own |= {"by": None, "to": None}
         if each.quasipotential is not None:
             lower, upper = each.dynamics.box.T
             drawn = scipy.stats.qmc.Halton(len(lower), scramble=False).random(points)
@@ -364,12 +334,8 @@ def reference_table(*, points: int = 100) -> pd.DataFrame:
                 for x, value in zip(at, values, strict=True)
             ]
         for barrier in each.barriers:
-            way = {
-                "at": list(barrier.start),
-                "by": list(barrier.saddle),
-                "to": list(barrier.end),
-                "how": barrier.how,
-            }
+            way = {"at": list(barrier.start), "by": list(barrier.saddle), "to": list(barrier.end)}
+            way["how"] = barrier.how
             rows.append(own | way | {"quantity": "barrier", "value": barrier.value, "error": barrier.error})
             if np.isfinite(barrier.prefactor):
                 rows.append(own | way | {"quantity": "prefactor", "value": barrier.prefactor, "error": 0.0})
