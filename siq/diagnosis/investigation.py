@@ -25,7 +25,7 @@ from siq.diagnosis.residual_structure import (
     explained_by_quantisation,
     noise_nonstationarity,
 )
-from siq.diagnosis.search import FitContext, search_mechanisms
+from siq.diagnosis.search import BUDGET_FOR_FUNCTIONS, FitContext, Search, search_mechanisms
 from siq.diagnosis.study import Comparison, MismatchVerdict
 from siq.diagnosis.unnamed_models import AugmentedModel, fit_unnamed_models
 from siq.errors import NumericalFailure
@@ -62,7 +62,8 @@ def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigat
     budget.says("fitting the simulation's own parameters")
     with budget.exempt():
         recalibrated, least_squares = recalibrate(model, data, budget=budget)
-    found = search_mechanisms(context, recalibrated)
+    with budget.keeping(BUDGET_FOR_FUNCTIONS):
+        found = search_mechanisms(Search(recalibrated, (), recalibrated, ()), context)
     recalibrated = found.recalibrated  # from where a mechanism led it, if that is better
     if not (recalibrated.has_process_noise or recalibrated.log_likelihood < least_squares.log_likelihood):
         least_squares = recalibrated

@@ -121,11 +121,16 @@ def _plateau(values: np.ndarray, recording: np.ndarray, *, noise: float) -> floa
     return float(np.median(values[np.unique(np.concatenate([rows, rows + 1, rows + 2]))]))
 
 
+def coordinates_of(model: Dynamics) -> dict[str, sympy.Expr]:
+    """States, inputs and the time, by name."""
+    return {name: symbol(name) for name in (*model.states, *(each.name for each in model.inputs), "t")}
+
+
 def along(formulas: Sequence[sympy.Expr], model: Dynamics, data: Measurements, x: np.ndarray) -> np.ndarray:
     """Formulas ``(c,)`` of parameters, states, inputs and time at all samples, shape ``(c, n)``."""
     known = {symbol(each.name): each.value for each in model.parameters}
     signals = data.signals(data.t, data.recording, delays=())
-    arguments = [symbol(name) for name in (*model.states, *(each.name for each in model.inputs), "t")]
+    arguments = list(coordinates_of(model).values())
     compiled = compile_values([each.subs(known) for each in formulas], arguments, common=False)
     values = compiled(*x.T[: model.dimension], *signals.inputs, signals.t)
     return np.stack([np.broadcast_to(each, data.t.shape) for each in values])
@@ -395,17 +400,13 @@ def _rate_of(formula: sympy.Expr, model: Dynamics) -> sympy.Expr:
 
 def _in_names(shape: Shape, names: Mapping[str, sympy.Expr], assignment: Mapping[str, str]) -> Shape:
     """A search with the system's own names in its formulas."""
+    given = {key: text for key, text in shape.model_dump().items() if isinstance(text, str)}
+    recorded = ("lattice_of", "top_of", "bottom_of")
     own = {
-        key: str(parse_formula(text, names))
-        for key in ("scale_of", "inverse_scale_of", "quantiles_of", "time_of")
-        if (text := getattr(shape, key)) is not None
+        key: assignment[text] if key in recorded else str(parse_formula(text, names))
+        for key, text in given.items()
     }
-    recorded = {
-        key: assignment[role]
-        for key in ("lattice_of", "top_of", "bottom_of")
-        if (role := getattr(shape, key)) is not None
-    }
-    return shape.model_copy(update=own | recorded)
+    return shape.model_copy(update=own)
 
 
 def _labelled(candidate: MechanismCandidate, model: Dynamics) -> MechanismCandidate:
@@ -516,8 +517,8 @@ def _typical(shape: Shape, model: Dynamics, x: np.ndarray, signals: Signals) -> 
     text = shape.scale_of or shape.inverse_scale_of or shape.quantiles_of
     if text is None:
         return at if at > 0 else 1.0
-    names = [symbol(name) for name in (*model.states, *(entry.name for entry in model.inputs), "t")]
-    compiled = compile_values([parse_formula(text, model.names)], names, common=False)
+    formula, arguments = parse_formula(text, model.names), list(coordinates_of(model).values())
+    compiled = compile_values([formula], arguments, common=False)
     (course,) = compiled(*x, *signals.inputs, signals.t)
     return float(_sized(shape, np.array(at), np.broadcast_to(course, x.shape[1:])))
 

@@ -306,13 +306,7 @@ def _stands_together(
     return replace(progress, found=(*progress.found[:place], stands, *progress.found[place + 1 :]))
 
 
-def search_mechanisms(context: FitContext, recalibrated: Fit) -> Search:
-    """Look for mechanisms, one after the other, until nothing is found or its part of the budget is spent."""
-    with context.budget.keeping(BUDGET_FOR_FUNCTIONS):
-        return _extended(Search(recalibrated, (), recalibrated, ()), context, on_trial=True)
-
-
-def _extended(progress: Search, context: FitContext, *, on_trial: bool) -> Search:
+def search_mechanisms(progress: Search, context: FitContext, *, on_trial: bool = True) -> Search:
     """A search carried on until nothing more is found.
 
     Where recordings are few, what is still missing may make all errors so large that the best candidate does
@@ -374,7 +368,7 @@ def _extended(progress: Search, context: FitContext, *, on_trial: bool) -> Searc
             LOGGER.info("%s is on trial", best.best.candidate.label)
             begun = replace(progress, found=(*found, best), fit=best.best.fit)
             together = _stands_together(
-                _extended(begun, context, on_trial=False), progress, context, chance=chance
+                search_mechanisms(begun, context, on_trial=False), progress, context, chance=chance
             )
             if together is not None:
                 return together

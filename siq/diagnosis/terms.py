@@ -20,7 +20,7 @@ import sympy
 
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
 from siq.diagnosis.evidence import correlation_time_of, evidence_of_function
-from siq.diagnosis.mechanisms import FORMULA, MechanismCandidate, added, along, fresh_names
+from siq.diagnosis.mechanisms import FORMULA, MechanismCandidate, added, along, coordinates_of, fresh_names
 from siq.diagnosis.screening import (
     Entry,
     Evaluated,
@@ -106,7 +106,7 @@ class Place:
         model, grid = trajectories.model, trajectories.grid
         targets = (*self.equations, *self.outputs)  # it has either
         formulas = [*self.coordinates, *(factor for _, factor in targets)]
-        compiled = compile_values(formulas, list(map(symbol, coordinates_of(model))), common=False)
+        compiled = compile_values(formulas, list(coordinates_of(model).values()), common=False)
 
         def evaluated(x: np.ndarray, values: np.ndarray, node: int | None) -> Iterator[Entry]:
             if bool(self.outputs) is (node is None):
@@ -239,11 +239,6 @@ def products_in(
                 equations = tuple((target, factor * formula) for target, factor in place.equations)
                 found.append(replace(place, equations=equations, words=(*place.words, name)))
     return tuple(_with_knots(found, model, data, x))
-
-
-def coordinates_of(model: Dynamics) -> dict[str, sympy.Expr]:
-    """States, inputs and the time, by name."""
-    return {name: symbol(name) for name in (*model.states, *(each.name for each in model.inputs), "t")}
 
 
 def _with_knots(

@@ -26,12 +26,12 @@ import sympy
 
 from siq.diagnosis.dictionary import Form, FurtherState, Mechanism, MechanismParameter, Role, Roles, Shape
 from siq.diagnosis.evidence import NUMERICAL_ERRORS, FittedCandidate, log_evidences
-from siq.diagnosis.mechanisms import FORMULA, MECHANISM, MechanismCandidate, candidates_of
+from siq.diagnosis.mechanisms import FORMULA, MECHANISM, MechanismCandidate, candidates_of, coordinates_of
 from siq.diagnosis.residual_structure import has_structure
 from siq.diagnosis.screening import Ranked, screen_all
 from siq.diagnosis.search import FitContext, Search, best_probes
 from siq.diagnosis.smooth_functions import Smoothness
-from siq.diagnosis.terms import FUNCTIONS_FITTED, ONE, Place, coordinates_of, formula_in, rank_places
+from siq.diagnosis.terms import FUNCTIONS_FITTED, ONE, Place, formula_in, rank_places
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent
 from siq.inference.kalman_filter import substeps_needed
