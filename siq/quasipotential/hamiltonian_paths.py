@@ -33,6 +33,7 @@ W.-J. Beyn, IMA J. Numer. Anal. 9 (1990) 379: boundary conditions of orbits betw
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 
 import numpy as np
 import scipy.linalg
@@ -150,8 +151,8 @@ class _HamiltonianProblem(HamiltonianFlow):
         right[0] = self.left @ final[:d]
         return matrix, right
 
-    def solved(self, guess: _States, last: _Condition, tolerance: float) -> PPoly | None:
-        """The solution with a condition at its end, None where Newton's method does not come to one.
+    def solved(self, guess: _States, last: _Condition, tolerance: float) -> PPoly:
+        """The solution with a condition at its end; raises NumericalFailure where none is found.
 
         As H is conserved, a condition at the saddle is one too many. A further unknown k makes up for it,
         ``ż = F + k ∇H``, along which H would grow: it comes out as zero.
@@ -187,9 +188,11 @@ class _HamiltonianProblem(HamiltonianFlow):
                     fun_jac=derivatives, bc_jac=slopes, tol=tolerance, bc_tol=min(tolerance, 1e-6),
                     max_nodes=min(max(MESH_GROWTH * len(times), ENOUGH_NODES), MOST_NODES),
                 )  # fmt: skip
-            except (ValueError, np.linalg.LinAlgError):  # not finite, where a trial has run away
-                return None
-        return found.sol if found.success else None
+            except (ValueError, np.linalg.LinAlgError) as error:  # not finite, where a trial has run away
+                raise NumericalFailure("a trial of Newton's method has run away") from error
+        if not found.success:
+            raise NumericalFailure("Newton's method does not come to a solution of Hamilton's equations")
+        return found.sol
 
 
 def _on_mesh(solution: PPoly) -> _States:
@@ -231,10 +234,6 @@ def hamiltonian_paths(
     found: list[MinimumActionPath] = []
     known: list[PPoly] = []
 
-    def finished(solution: PPoly | None) -> None:
-        path = None if solution is None else _finished(problem, solution, tolerance)
-        found.extend([] if path is None else [path])
-
     def apart(one: PPoly, two: PPoly) -> bool:
         """Whether two solutions that end at one state come from different sides."""
         times = np.linspace(max(one.x[0], two.x[0]), 0.0, COMPARED_TIMES)
@@ -249,21 +248,26 @@ def hamiltonian_paths(
             far = np.flatnonzero(np.linalg.norm(down - problem.end, axis=1) >= APPROACH)
             guess = _reversed_motion(problem, beside, far)
             if guess is not None:
-                backwards = problem.solved(guess, problem.fixed(guess[1][: problem.dimension, -1]), ROUGH)
-                known += [] if backwards is None else [backwards]
-                finished(backwards)
+                with suppress(NumericalFailure):
+                    known.append(
+                        problem.solved(guess, problem.fixed(guess[1][: problem.dimension, -1]), ROUGH)
+                    )
+                    found.append(_finished(problem, known[0], tolerance))
             side = np.sign(problem.left @ (down[far[0]] - problem.end))
         lasts = [problem.end + side * APPROACH * one / np.linalg.norm(one) for one in problem.arrivals]
     for last in lasts:
         solutions = list(known)
         for curve in (*bent_lines(last, BENDS), *map(problem.scaled, curves)):
-            solution = _followed(problem, curve)
-            if solution is not None and all(apart(solution, one) for one in solutions):
-                solutions.append(solution)
-                finished(solution)
+            with suppress(NumericalFailure):
+                solution = _followed(problem, curve)
+                if all(apart(solution, one) for one in solutions):
+                    solutions.append(solution)
+                    found.append(_finished(problem, solution, tolerance))
         if not found and beside is not None and problem.unstable is not None:
             # The way down taken backwards: V falls along it, so that it crosses no ridge, but it may wind.
-            finished(_followed(problem, np.vstack([down[far][::-1], last])))
+            with suppress(NumericalFailure):
+                wound = _followed(problem, np.vstack([down[far][::-1], last]))
+                found.append(_finished(problem, wound, tolerance))
         if found:
             break
     if not found:
@@ -273,8 +277,8 @@ def hamiltonian_paths(
     return sorted(found, key=lambda path: (not path.smooth, path.action))
 
 
-def _followed(problem: _HamiltonianProblem, curve: np.ndarray) -> PPoly | None:
-    """The solution at the end of a curve, None where one of the steps fails."""
+def _followed(problem: _HamiltonianProblem, curve: np.ndarray) -> PPoly:
+    """The solution at the end of a curve; raises NumericalFailure where one of the steps fails."""
     outside = np.linalg.norm(curve, axis=1) >= FIRST_END
     curve = curve[int(np.flatnonzero(~outside).max(initial=0)) + 1 :]
     along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
@@ -285,7 +289,7 @@ def _followed(problem: _HamiltonianProblem, curve: np.ndarray) -> PPoly | None:
     solution = problem.solved(_linear(problem, at(0.0)), problem.fixed(at(0.0)), ROUGH)
     before: tuple[PPoly, float] | None = None
     place, step, failed = 0.0, LONGEST_STEP, False
-    while solution is not None and place < along[-1]:
+    while place < along[-1]:
         ahead = min(place + step, along[-1])
         times, states = _longer(problem, solution)
         if before is not None:
@@ -293,11 +297,12 @@ def _followed(problem: _HamiltonianProblem, curve: np.ndarray) -> PPoly | None:
             common = times >= before[0].x[0]
             moved_by = states[:, common] - before[0](times[common])
             states[:, common] += (ahead - place) / (place - before[1]) * moved_by
-        moved = problem.solved((times, states), problem.fixed(at(ahead)), ROUGH)
-        if moved is None:
+        try:
+            moved = problem.solved((times, states), problem.fixed(at(ahead)), ROUGH)
+        except NumericalFailure:
             step, failed = step / 2, True
             if step < SHORTEST_STEP:
-                return None
+                raise
             continue
         before = solution, place
         solution, place = moved, ahead
@@ -392,38 +397,51 @@ def _reversed_motion(problem: _HamiltonianProblem, beside: np.ndarray, far: np.n
     return times[::-REVERSED_PACE][::-1], states[:, ::-REVERSED_PACE][:, ::-1]
 
 
-def _finished(problem: _HamiltonianProblem, solution: PPoly, tolerance: float) -> MinimumActionPath | None:
+def _finished(problem: _HamiltonianProblem, solution: PPoly, tolerance: float) -> MinimumActionPath:
     """The path of a solution that ends close to the end: on to it, and solved as finely as is asked."""
-    ended: PPoly | None = solution
     last = problem.fixed(problem.end)
     if problem.unstable is not None:
         # What winds has to be known better than on the way, or H is not zero where the condition changes.
         last = problem.fixed(solution(0.0)[: problem.dimension])
-        ended = problem.solved(_on_mesh(solution), last, SWITCHED)
-        ended = None if ended is None else _as_at_saddle(problem, ended)
+        solution = _as_at_saddle(problem, problem.solved(_on_mesh(solution), last, SWITCHED))
         distance = APPROACH
-        while ended is not None and distance > LAST_APPROACH:
+        while distance > LAST_APPROACH:
             distance /= APPROACH_FACTOR
-            guess = _onward(problem, ended, distance)
-            ended = problem.solved(guess, problem.at_saddle(guess[1][:, -1]), ROUGH)
-        if ended is None:
-            return None
-        last = problem.at_saddle(ended(0.0))
-    rough = problem.solved(_longer(problem, ended), last, ROUGH / 10)
-    if rough is None:
-        return None
-    value = _values(problem, rough, rough.x)[-1]
+            guess = _onward(problem, solution, distance)
+            solution = problem.solved(guess, problem.at_saddle(guess[1][:, -1]), ROUGH)
+        last = problem.at_saddle(solution(0.0))
+    fine = problem.solved(_longer(problem, solution), last, ROUGH / 10)
+    value = _values(problem, fine, fine.x)[-1]
     for fineness in (FINE, FINE / 10, FINE / 100):
-        rough = problem.solved(_on_mesh(rough), last, fineness)
-        if rough is None:
-            return None
-        before, value = value, _values(problem, rough, rough.x)[-1]
+        fine = problem.solved(_on_mesh(fine), last, fineness)
+        before, value = value, _values(problem, fine, fine.x)[-1]
         if abs(value - before) <= tolerance * value:
             break
-    return _path(problem, rough, abs(value - before), tolerance)
+    d, (nodes, z) = problem.dimension, _on_mesh(fine)
+    # About A the path may wind: points lie as close as their distance from it, and from the end, asks for.
+    pace = np.linalg.norm(problem.field(z)[:d], axis=0) / (np.linalg.norm(z[:d], axis=0) + CENTRAL_SPACING)
+    measure = np.r_[0.0, np.cumsum((pace[1:] + pace[:-1]) / 2 * np.diff(nodes))]
+    count = int(np.clip(measure[-1] / SPACING, FEWEST_POINTS, MOST_POINTS))
+    times = PchipInterpolator(measure, nodes)(np.linspace(0.0, measure[-1], count))
+    times[0], times[-1] = nodes[0], 0.0
+    places = np.union1d(times, nodes)
+    values = _values(problem, fine, places)
+    values = np.r_[0.0, values[np.searchsorted(places, times)], values[-1]]
+    z = fine(times).T
+    residual = problem.residual(z[:, :d], z[:, d:])
+    z, times = np.vstack([np.zeros(2 * d), z]), np.r_[-np.inf, times]
+    if problem.unstable is not None:
+        z, times = np.vstack([z, np.r_[problem.end, np.zeros(d)]]), np.append(times, np.inf)
+    values, error = problem.unit * values[: len(z)], problem.unit * abs(value - before)
+    smooth = _smooth(problem, fine)
+    return MinimumActionPath(
+        points=problem.points(z[:, :d]), momenta=problem.momenta(z[:, d:]), values=values,
+        action=float(values[-1]), error=error, residual=residual,
+        converged=smooth and bool(error <= tolerance * values[-1]), times=times, smooth=smooth,
+    )  # fmt: skip
 
 
-def _as_at_saddle(problem: _HamiltonianProblem, solution: PPoly) -> PPoly | None:
+def _as_at_saddle(problem: _HamiltonianProblem, solution: PPoly) -> PPoly:
     """A solution that ends somewhere before the saddle, moved to where those end that come to it.
 
     In steps as long as Newton's method follows: of what other directions have gathered on the way the ends
@@ -434,13 +452,14 @@ def _as_at_saddle(problem: _HamiltonianProblem, solution: PPoly) -> PPoly | None
     share, step = 0.0, 1.0
     while share < 1:
         ahead = min(share + step, 1.0)
-        new = problem.solved(_on_mesh(solution), (matrix, own + ahead * (right - own)), SWITCHED)
-        if new is None:
+        try:
+            solution = problem.solved(_on_mesh(solution), (matrix, own + ahead * (right - own)), SWITCHED)
+        except NumericalFailure:
             step /= 2
             if step < LEAST_SHARE:
-                return None
-            continue
-        solution, share = new, ahead
+                raise
+        else:
+            share = ahead
     return solution
 
 
@@ -459,31 +478,6 @@ def _values(problem: _HamiltonianProblem, solution: PPoly, times: np.ndarray) ->
     if problem.unstable is not None:
         rest = problem.unstable * float(problem.left @ (final - problem.end)) ** 2 / problem.push
     return np.append(values, values[-1] + rest)
-
-
-def _path(problem: _HamiltonianProblem, solution: PPoly, error: float, tolerance: float) -> MinimumActionPath:
-    d, (nodes, z) = problem.dimension, _on_mesh(solution)
-    # About A the path may wind: points lie as close as their distance from it, and from the end, asks for.
-    pace = np.linalg.norm(problem.field(z)[:d], axis=0) / (np.linalg.norm(z[:d], axis=0) + CENTRAL_SPACING)
-    measure = np.r_[0.0, np.cumsum((pace[1:] + pace[:-1]) / 2 * np.diff(nodes))]
-    count = int(np.clip(measure[-1] / SPACING, FEWEST_POINTS, MOST_POINTS))
-    times = PchipInterpolator(measure, nodes)(np.linspace(0.0, measure[-1], count))
-    times[0], times[-1] = nodes[0], 0.0
-    places = np.union1d(times, nodes)
-    values = _values(problem, solution, places)
-    values = np.r_[0.0, values[np.searchsorted(places, times)], values[-1]]
-    z = solution(times).T
-    residual = problem.residual(z[:, :d], z[:, d:])
-    z, times = np.vstack([np.zeros(2 * d), z]), np.r_[-np.inf, times]
-    if problem.unstable is not None:
-        z, times = np.vstack([z, np.r_[problem.end, np.zeros(d)]]), np.append(times, np.inf)
-    values, error = problem.unit * values[: len(z)], problem.unit * error
-    smooth = _smooth(problem, solution)
-    return MinimumActionPath(
-        points=problem.points(z[:, :d]), momenta=problem.momenta(z[:, d:]), values=values,
-        action=float(values[-1]), error=error, residual=residual,
-        converged=smooth and bool(error <= tolerance * values[-1]), times=times, smooth=smooth,
-    )  # fmt: skip
 
 
 def _smooth(problem: _HamiltonianProblem, solution: PPoly) -> bool:

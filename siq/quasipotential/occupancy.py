@@ -406,25 +406,20 @@ class OccupancyCheck:
         if self.unseen is not None:
             rarity, limit = -float(np.log10(self.unseen.probability)), -float(np.log10(SIGNIFICANCE))
             return Verdict(rarity, limit, False, "" if self.missing is None else sentence(self.missing))
-        found = [one.probability for one in self.visits] + [one.probability for one in self.densities]
-        if self.missing is not None or not found:
+        compared = (*self.visits, *self.densities)
+        if self.missing is not None or not compared:
             return None
-        least = min(found)
-        rarity = -float(np.log10(min(max(least * len(found), 1e-300), 1.0)))
+        worst = min(compared, key=lambda one: one.probability)
+        rarity = -float(np.log10(min(max(worst.probability * len(compared), 1e-300), 1.0)))
         limit = -float(np.log10(false_alarms))
-        if rarity <= limit:
-            return Verdict(rarity, limit, True)
-        visits = next((one for one in self.visits if one.probability == least), None)
-        if visits is None:
-            worst = next(one for one in self.densities if one.probability == least)
-            reason = f"states in well {worst.well + 1} are spread otherwise than what was identified says"
-        else:
-            counted = f"{visits.held_out.mean:.3g}" if visits.held_out.visits else "no end"
+        reason = f"states in well {worst.well + 1} are spread otherwise than what was identified says"
+        if isinstance(worst, VisitTest):
+            counted = f"{worst.held_out.mean:.3g}" if worst.held_out.visits else "no end"
             reason = (
-                f"visits to well {visits.well + 1} last {visits.predicted:.3g} by what was identified, and"
+                f"visits to well {worst.well + 1} last {worst.predicted:.3g} by what was identified, and"
                 f" {counted} as counted on held-out recordings"
             )
-        return Verdict(rarity, limit, False, reason)
+        return Verdict.of(rarity, limit, reason)
 
 
 def check_occupancy(
@@ -473,11 +468,10 @@ def check_occupancy(
     sampled = _as_sampled(cores, found.dynamics, noise.intensity, usual_step(recordings))
     times, processes, unknown = _predicted_visits(found, portrait, noise, sampled, seed=seed)
     method = "operator" if processes else "law"
+    chances = [_probability_of(held[well], mean, error) for well, mean, error in times]
     tested = tuple(
-        VisitTest(
-            well, held[well], whole[well], mean, error, method, _probability_of(held[well], mean, error)
-        )
-        for well, mean, error in times
+        VisitTest(well, held[well], whole[well], mean, error, method, chance)
+        for (well, mean, error), chance in zip(times, chances, strict=True)
     )
     if not tested:
         return OccupancyCheck(missing=unknown)
@@ -485,9 +479,7 @@ def check_occupancy(
     if not any(one.visits for one in whole) and chance > NO_HOP_PROBABILITY:
         return OccupancyCheck(missing=Remark("quasipotential.record_too_short_to_hop"))
     # Each state's distribution during the visits to each well, on the held-out runs.
-    used, densities = np.zeros(len(visits), dtype=bool), []
-    for run in apart:
-        used[run] = True
+    used, densities = held_out[recordings.recording], []
     for well, *_ in times if processes else ():
         rows = np.flatnonzero(used & (visits == well))
         if len(rows) < MIN_INDEPENDENT_SAMPLES:

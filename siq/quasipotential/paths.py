@@ -370,14 +370,11 @@ def _first_guesses(problem: PathProblem, start: LimitSet, end: LimitSet) -> list
     chosen: list[tuple[float, float, np.ndarray]] = []
     # A lower path may have passed the end by further than one that is not the lowest.
     for close in (max(GUESS_ARRIVAL, least), max(GUESS_PASSED, least)):
-        new: list[tuple[float, float, np.ndarray]] = []
+        most = len(chosen) + MOST_GUESSES
         for one in found:
-            known = any(
-                abs(one[1] - other[1]) <= ACTION_DIFFERENCE * abs(other[1]) for other in (*chosen, *new)
-            )
-            if one[0] <= close and not known and len(new) < MOST_GUESSES:
-                new.append(one)
-        chosen += new
+            known = any(abs(one[1] - other[1]) <= ACTION_DIFFERENCE * abs(other[1]) for other in chosen)
+            if one[0] <= close and not known and len(chosen) < most:
+                chosen.append(one)
     return [curve for _, _, curve in chosen]
 
 
