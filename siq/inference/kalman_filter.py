@@ -62,12 +62,6 @@ class ClosedFunctions:
         found._spread = np.stack([spread[:, j, k] for j, k in self._pairs])
         return found
 
-    def at_intervals(self, chosen: np.ndarray) -> ClosedFunctions:
-        """Those of some of the intervals, by their places."""
-        found = copy(self)
-        found._spread = self._spread[:, chosen]
-        return found
-
     def rates(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
         """Mean of f at mean states ``(d, n)``: shape ``(d, n)``."""
         return self._closed.functions.rates(x, self._joined(signals), values)
@@ -240,11 +234,13 @@ def linearise(
     *,
     columns: Columns | None = None,
     drift: ClosedFunctions | None = None,
+    spread: np.ndarray | None = None,
 ) -> Linearisation:
     """Integrate every interval from the states in hand ``(n, d)``, with the derivatives.
 
     Free parameters, and behind them further right-hand sides, are the columns of the response; `values` are
-    those of all parameters. The mean of f over a spread of states may take the place of f as `drift`.
+    those of all parameters. The mean of f over a spread of states, ``(intervals, d, d)``, may take the place
+    of f as `drift`.
     """
     data, compiled, delays = grid.data, model.functions, model.lags(values)
     samples, signals = np.ascontiguousarray(x.T), grid.at_samples(delays)
@@ -259,29 +255,16 @@ def linearise(
     together = count if columns is not None else INTERVALS
     for begin in range(0, count, together):
         chosen = np.arange(begin, min(begin + together, count))
-        whole = len(chosen) == count
-        part = grid if whole else grid.at_intervals(chosen)
-        along = drift if drift is None or whole else drift.at_intervals(chosen)
+        part = grid if len(chosen) == count else grid.at_intervals(chosen)
+        along = compiled if drift is None or spread is None else drift.at(spread[chosen])
         at = rows[chosen]
-        ends, transition[at], response[at] = _carried(
-            model,
-            part,
-            values,
-            np.array(x[at].T),
-            along or compiled,
-            columns=columns,
-            width=response.shape[2],
-        )
+        begins, width = np.array(x[at].T), response.shape[2]
+        ends, transition[at], response[at] = _carried(model, part, values, begins, along, columns, width)
         with np.errstate(invalid="ignore"):
             gap[at] = ends.T - x[at + 1]
-    return Linearisation(
-        transition,
-        response,
-        gap,
-        measured=np.ascontiguousarray(np.moveaxis(by_state, 2, 0)),
-        measured_response=np.ascontiguousarray(np.moveaxis(by_parameter, 2, 0)),
-        residual=data.outputs - np.where(np.isfinite(simulated), simulated, np.inf),
-    )
+    measured, answered = (np.ascontiguousarray(np.moveaxis(each, 2, 0)) for each in (by_state, by_parameter))
+    residual = data.outputs - np.where(np.isfinite(simulated), simulated, np.inf)
+    return Linearisation(transition, response, gap, measured, answered, residual)
 
 
 def _carried(
@@ -290,7 +273,6 @@ def _carried(
     values: np.ndarray,
     state: np.ndarray,
     drift: ParametricFunctions | ClosedFunctions,
-    *,
     columns: Columns | None,
     width: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

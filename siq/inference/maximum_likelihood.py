@@ -399,8 +399,8 @@ class _Shooting:
         rows, data = self.grid.rows, self.grid.data
         intensity = noise.intensity if len(noise.intensity) == 1 else noise.intensity[rows]
         # In the middle of an interval noise of half of it is added.
-        drift = self.closed.at(spread[rows] + intensity * data.step[rows][:, None, None] / 2)
-        return linearise(self.model, self.grid, values, x, drift=drift)
+        wide = spread[rows] + intensity * data.step[rows][:, None, None] / 2
+        return linearise(self.model, self.grid, values, x, drift=self.closed, spread=wide)
 
     def stepped(self, now: Fit, change: np.ndarray) -> tuple[Fit, float] | None:
         """The step suggested, shortened until it does about what was foreseen, and the share taken."""

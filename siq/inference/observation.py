@@ -88,12 +88,8 @@ def smoothed_motion(data: Measurements, names: Sequence[str]) -> tuple[np.ndarra
     """Positions and velocities to begin with, and both noises, when nothing but noise drives the velocities.
 
     That model is linear: its smoother is a spline through the measured positions whose stiffness follows from
-    the likelihood, and no start matters. The states ``(n, d)`` have positions before velocities.
-
-    Raises
-    ------
-    NumericalFailure
-        Where recordings are too short for it, or its likelihood cannot be worked out.
+    the likelihood, and no start matters. The states ``(n, d)`` have positions before velocities. It is a
+    NumericalFailure where recordings are too short for it, or its likelihood cannot be worked out.
     """
     if np.diff(data.first).min() < MIN_SAMPLES:
         raise NumericalFailure(
@@ -267,20 +263,11 @@ def unbroken(recordings: Recordings, *, pair_step: float | None = None, every: i
 class InertiaTest:
     """The test of the inertia of one recorded position.
 
-    Attributes
-    ----------
-    gain, gain_error
-        Log-likelihood of the model with inertia over that without, at Schwarz's price, and its standard
-        error from blocks of the record.
-    friction, friction_error
-        γ and its standard error. Where inertia is not seen γ is a lower limit of 95 %, without an error.
-    relaxation
-        How fast x relaxes in the stiffest well if there is no inertia, ``-F'(x)``; 0 where there is no well.
-    frequency, frequency_error
-        ω of that well with inertia, ``√(-γ F'(x))``, and its standard error; not a number where γ is not
-        shown.
-    step
-        Time between samples.
+    The gain is the log-likelihood of the model with inertia over that without, at Schwarz's price, its error
+    from blocks of the record. The friction is γ; where inertia is not seen, a lower limit of 95 % without an
+    error. In the stiffest well x relaxes at the rate ``-F'(x)`` if there is no inertia, 0 where there is no
+    well; with inertia its frequency is ``√(-γ F'(x))``, not a number where γ is not shown. The step is the
+    time between samples.
     """
 
     gain: float

@@ -69,8 +69,7 @@ def _average(
     fit: Fit, data: Measurements, process: np.ndarray, budget: Budget | None
 ) -> tuple[np.ndarray, float]:
     """Covariance averaged over factors on the standard deviation of a noise; and the mean of that factor."""
-    known = data.sensor_noise is not None and bool(np.isfinite(data.sensor_noise).all())
-    units = positive(np.sqrt(np.diag(fit.covariance)))
+    known, units = bool(data.known_sensors.all()), positive(np.sqrt(np.diag(fit.covariance)))
 
     def at(size: float) -> tuple[float, np.ndarray, np.ndarray]:
         """Log-likelihood, change and covariance of the parameters for a factor."""
@@ -86,9 +85,8 @@ def _average(
         total, freedom = float(left @ left), white.degrees_of_freedom - len(change)
         covariance = covariance if known else covariance * (total / freedom)
         sign, volume = np.linalg.slogdet(covariance / np.outer(units, units))
-        value = profile_likelihood(total, freedom, white.log_determinant)
-        if known:
-            value = -0.5 * (total + white.log_determinant)
+        profile = profile_likelihood(total, freedom, white.log_determinant)
+        value = -0.5 * (total + white.log_determinant) if known else profile
         return value + (0.5 * volume if sign > 0 else 0.0), change, covariance
 
     # Of noise that is estimated the strength is about one, and of other noise anywhere below.

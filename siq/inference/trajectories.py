@@ -341,8 +341,7 @@ def squared_errors(run: np.ndarray, data: Measurements) -> np.ndarray | None:
     error, known = run[scored] - measured, np.isfinite(measured)
     if not np.isfinite(error[known]).all():
         return None
-    spread = np.nanvar(measured, axis=0)
-    return np.asarray((error**2 / np.where(spread > 0, spread, 1.0))[known])
+    return np.asarray((error**2 / positive(np.nanvar(measured, axis=0)))[known])
 
 
 def normalised_rms(run: np.ndarray, data: Measurements) -> float | None:
