@@ -1,8 +1,9 @@
 """Tables of every key of a schema, written from the schema itself when the pages are built.
 
 `{schema} siq.workflow.study:Study` becomes a table: key, type, default, meaning. Types and limits come from
-the annotations, meanings from the `Attributes` of the docstring. A key without a meaning is a warning,
-and `make docs` makes that an error: whoever adds a key has to say what it is.
+the annotations, meanings from the `Attributes` of the docstring, or from a comment ``#:`` at or above the
+field. A key without a meaning is a warning, and `make docs` makes that an error: whoever adds a key has to
+say what it is.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import inspect
+import re
 import types
 import typing
 from collections.abc import Iterator
@@ -36,11 +38,27 @@ def fields(schema: type) -> dict[str, FieldInfo]:
 
 
 def meanings(schema: type) -> dict[str, str]:
-    """What the docstrings of a class and of those that it extends say of each key."""
+    """What docstrings and comments ``#:`` of a class, and of those that it extends, say of each key."""
     said: dict[str, str] = {}
     for cls in reversed(schema.__mro__):
         said |= dict(_attributes(inspect.cleandoc(cls.__dict__.get("__doc__") or "")))
+        if cls.__module__.startswith("siq."):
+            said |= dict(_beside_fields(inspect.getsource(cls), schema))
     return said
+
+
+def _beside_fields(source: str, schema: type) -> Iterator[tuple[str, str]]:
+    above: list[str] = []
+    keys = {name: field.alias for name, field in getattr(schema, "model_fields", {}).items()}
+    for line in map(str.strip, source.splitlines()):
+        code, mark, text = line.partition("#:")
+        if mark and not code:
+            above.append(text.strip())
+        else:
+            words = " ".join([*above, text.strip()]).strip()
+            if words and (found := re.match(r"(\w+):", code)):
+                yield keys.get(found[1]) or found[1], f"{words[0].upper()}{words[1:].removesuffix('.')}."
+            above = []
 
 
 def _attributes(text: str) -> Iterator[tuple[str, str]]:
