@@ -362,8 +362,12 @@ def _in_order(rows: _Rows, numbers: np.ndarray, labelled: bool, remarks: list[Re
             twice += len(piece) - len(once)
             parts.append(once)
             labels.append(label if len(pieces) == 1 else f"{label}/{number}" if label != "0" else str(number))
-    counted = {"rows_sorted": was_sorted, "time_starts_over": begun, "rows_twice": twice}
-    remarks += [Remark(f"data.{code}", {"count": count}) for code, count in counted.items() if count]
+    found = (
+        Remark("data.rows_sorted", {"count": was_sorted}),
+        Remark("data.time_starts_over", {"count": begun}),
+        Remark("data.rows_twice", {"count": twice}),
+    )
+    remarks += [one for one in found if one.values["count"]]
     lengths = [len(part) for part in parts]
     return _Rows(np.concatenate(parts), np.repeat(np.arange(len(parts)), lengths), tuple(labels))
 

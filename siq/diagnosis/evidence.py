@@ -34,8 +34,7 @@ AUTOCORRELATION_95 = 1.96  # standard deviations of an autocorrelation of white 
 # constant, a straight line or a parabola, for which there are names.
 SMOOTH_LENGTHS = (0.125, 0.25)
 PRIOR_JITTER = 1e-9  # numerical: on the diagonal of a prior's covariance
-BUDGET_SPENT = "diagnosis.not_reached"
-OVERFLOWS = "diagnosis.overflows"
+BUDGET_SPENT, OVERFLOWS = Remark("diagnosis.not_reached"), Remark("diagnosis.overflows")
 NUMERICAL_ERRORS = (ArithmeticError, ValueError, np.linalg.LinAlgError)
 """What ends a candidate, never the search: an overflow, a division by zero, a singular matrix."""
 
@@ -90,10 +89,10 @@ class NotFitted:
     remark: Remark
 
     @classmethod
-    def of(cls, candidate: MechanismCandidate, why: str | Exception) -> NotFitted:
-        """Of a candidate, with the code of a remark or what ended its fit."""
-        if isinstance(why, str):
-            return cls(candidate.name, candidate.label, Remark(why))
+    def of(cls, candidate: MechanismCandidate, why: Remark | Exception) -> NotFitted:
+        """Of a candidate, with a remark or what ended its fit."""
+        if isinstance(why, Remark):
+            return cls(candidate.name, candidate.label, why)
         kind = "" if isinstance(why, NumericalFailure) else type(why).__name__
         values = {"error": kind, "message": str(why)}
         return cls(candidate.name, candidate.label, Remark("diagnosis.fit_failed", values))

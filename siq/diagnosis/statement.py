@@ -269,7 +269,7 @@ class Statement:
     @property
     def not_tried(self) -> tuple[str, ...]:
         """Labels of the mechanisms that the budget did not reach."""
-        return tuple(each.label for each in self.not_fitted if each.remark.code == BUDGET_SPENT)
+        return tuple(each.label for each in self.not_fitted if each.remark == BUDGET_SPENT)
 
     @property
     def random_forces(self) -> bool:

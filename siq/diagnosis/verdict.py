@@ -66,7 +66,7 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
     errors = _standard_errors(final)
     remarks = list(investigation.remarks)
     if investigation.account.partial:
-        untried = sum(each.remark.code == BUDGET_SPENT for each in search.untried)
+        untried = sum(each.remark == BUDGET_SPENT for each in search.untried)
         stopped_by = investigation.account.stopped_by
         remarks.append(Remark("diagnosis.partial", {"untried": untried, "stopped_by": stopped_by}))
     if not shown.independent:
