@@ -416,11 +416,9 @@ def characteristics(
 
 def _join(first: Fan, second: Fan) -> Fan:
     """Two fans of the same attractor and level as one; the curves of the second are counted on."""
-    shift = len(first.directions)
-    names = [one.name for one in fields(Fan) if one.name not in ("attractor", "hessian", "level")]
-    both = {name: [getattr(first, name), getattr(second, name)] for name in names}
-    both["curve"][1] = both["curve"][1] + shift
-    joined: dict[str, Any] = {name: np.concatenate(pair) for name, pair in both.items()}
+    second = replace(second, curve=second.curve + len(first.directions))
+    names = [one.name for one in fields(Fan)[3:]]  # all but the attractor, the Hessian and the level
+    joined: dict[str, Any] = {n: np.concatenate([getattr(first, n), getattr(second, n)]) for n in names}
     return replace(first, **joined)
 
 

@@ -406,7 +406,7 @@ class OccupancyCheck:
         if self.unseen is not None:
             rarity, limit = -float(np.log10(self.unseen.probability)), -float(np.log10(SIGNIFICANCE))
             return Verdict(rarity, limit, False, "" if self.missing is None else sentence(self.missing))
-        compared = (*self.visits, *self.densities)
+        compared: tuple[VisitTest | DensityTest, ...] = (*self.visits, *self.densities)
         if self.missing is not None or not compared:
             return None
         worst = min(compared, key=lambda one: one.probability)

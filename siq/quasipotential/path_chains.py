@@ -301,7 +301,7 @@ class PathProblem(ScaledSystem):
         dense = np.interp(np.arange(0, len(y) - 0.95, 0.1), np.arange(len(y)), length)
         y = curve(dense)
         if self.begin is not None:
-            first = max(int(np.flatnonzero(self.level(y) <= level).max(initial=0)), 0)
+            first = int(np.flatnonzero(self.level(y) <= level).max(initial=0))
             dense, y = dense[first:], y[first:]
         if self.finish is not None:
             beyond = np.flatnonzero(self.finish.level(y) > level).max(initial=len(y) - 3) + 2
