@@ -27,16 +27,7 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 from siq.data.correlation import decimals_of, resolution_step, rounding_error
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.inference.diffusion_model import process_noise_increments
-from siq.inference.field_estimate import (
-    HARMLESS_BIAS,
-    HARMLESS_CORRELATION,
-    NOISE_FREE,
-    SIGNIFICANT_SCORE,
-    FieldEstimate,
-    NoiseDiagnosis,
-    NoiseKind,
-    Verdict,
-)
+from siq.inference.field_estimate import HARMLESS_BIAS, NOISE_FREE, FieldEstimate, NoiseDiagnosis, Verdict
 from siq.inference.regression import LaggedPairs, copies, refit, residuals, weighted_triangle
 from siq.numerics.integration import runge_kutta_step
 from siq.numerics.randomness import positive
@@ -105,11 +96,10 @@ def residual_noise(
     correlations, scores = neighbour_correlations(found, sample)
     worst = int(np.argmax(np.abs(scores)))
     correlation, score = float(correlations[worst]), float(scores[worst])
-    kind: NoiseKind = "process"
-    measurement = np.zeros(d)
-    if abs(score) > SIGNIFICANT_SCORE and abs(correlation) > HARMLESS_CORRELATION:
-        kind = "measurement" if score < 0 else "coloured"
-    if kind == "measurement":
+    noise = NoiseDiagnosis("process", intensity, covariance, correlation, score, np.zeros(d))
+    if noise.correlated and score > 0:
+        noise = replace(noise, kind="coloured")
+    elif noise.correlated:
         # From the covariance of neighbouring residuals. Errors of X0 bias f by the inverse of the step, so
         # that f is fitted to the long steps as well. An error of the sample that two pairs share is carried
         # on by the flow of the second.
@@ -120,6 +110,7 @@ def residual_noise(
         rates = np.einsum("nii->ni", again.dynamics.jacobian(sample.x0[1:][joined]))
         carried = np.exp(np.minimum(rates * sample.h[1:][joined, None], 1.0)).mean(axis=0)
         measurement = np.sqrt(np.maximum(-shared / carried, 0.0))
+        noise = replace(noise, kind="measurement", measurement=measurement)
         bias = bias_of_rounding(found, pairs, recordings, measurement, correlation=correlation)
         if bias is not None:
             text = rounding_text(recordings)
@@ -127,12 +118,11 @@ def residual_noise(
             # How many decimals leave rounding below everything else: that of a recording without noise.
             moves = np.sqrt(((pairs.xh - pairs.x0) ** 2).mean(axis=0))
             step = NOISE_FREE * np.sqrt(6.0) * float(moves[moves > 0].min(initial=1.0))
-            return NoiseDiagnosis(
-                "rounding", 0.0, covariance, correlation, score, measurement, rounding=text,
-                rounding_bias=bias, decimals=max(int(np.ceil(-np.log10(step))), 1),
+            return replace(
+                noise, kind="rounding", intensity=0.0, rounding=text, rounding_bias=bias,
+                decimals=max(int(np.ceil(-np.log10(step))), 1),
                 remarks=(remark,) if bias <= HARMLESS_BIAS else (),
             )  # fmt: skip
-    noise = NoiseDiagnosis(kind, intensity, covariance, correlation, score, measurement)
     return noise.with_deviation(whole, len(pairs.h))
 
 
