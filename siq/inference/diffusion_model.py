@@ -427,7 +427,7 @@ class InnovationLikelihood(_DiffusionLikelihood):
     ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
         """By the derivatives of the filter, see `siq.inference.filter_kernels.filter_recursion`."""
         found = self._still.filtered(
-            self._data.first, self._data.step, sensor, self._intensity(places, values),
+            self._data.first, self._data.step, self._noise(places, values, sensor),
             begin_covariance=self._begin, functions=self.all_functions, places=places,
         )  # fmt: skip
         return -0.5 * (float((found[0] ** 2).sum()) + found[3]), *found[4:7]
@@ -436,12 +436,11 @@ class InnovationLikelihood(_DiffusionLikelihood):
         self, formula: NoiseFormula, sensor: np.ndarray, covariance: np.ndarray, fit: Fit
     ) -> np.ndarray:
         """Covariance of the coefficients of f by the errors of a formula and its sensors."""
-        count, driven = len(formula.values), np.ones(len(self._begin))
+        count = len(formula.values)
         places = np.column_stack([formula.places, [self.terms.index(term) for term in formula.terms]])
 
         def estimate(change: np.ndarray) -> np.ndarray:
-            shape = self._intensity(places, formula.values + change[:count])
-            noise = Noise(sensor * np.exp(change[count:]), driven, shape)
+            noise = self._noise(places, formula.values + change[:count], sensor * np.exp(change[count:]))
             return whiten(fit.linearisation, self._data, noise).solve()[0]
 
         levels, axes = np.linalg.eigh(covariance)
@@ -451,12 +450,12 @@ class InnovationLikelihood(_DiffusionLikelihood):
             total += np.outer(change, change) / 4
         return total
 
-    def _intensity(self, places: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Of the process noise at every sample; beyond the states of D nothing is driven."""
+    def _noise(self, places: np.ndarray, values: np.ndarray, sensor: np.ndarray) -> Noise:
+        """Both noises at every sample; beyond the states of D nothing is driven."""
         d, whole = len(self.symbols), len(self._begin)
         intensity = np.zeros((len(self.all_functions), whole, whole))
         intensity[:, :d, :d] = self.matrices(places, values, self.all_functions)
-        return intensity
+        return Noise(sensor, np.ones(whole), intensity)
 
 
 def constant_noise(symbols: Sequence[sympy.Symbol], rate: np.ndarray, *, samples: float) -> NoiseFormula:

@@ -162,8 +162,7 @@ class Linearisation:
         self,
         first: np.ndarray,
         step: np.ndarray,
-        variance: np.ndarray,
-        intensity: np.ndarray,
+        noise: Noise,
         *,
         begin: np.ndarray | None = None,
         begin_covariance: np.ndarray | None = None,
@@ -179,7 +178,7 @@ class Linearisation:
         d = self.gap.shape[1]
         return filter_recursion(
             first, self.transition, self.response, self.gap, self.measured, self.measured_response,
-            self.residual, variance, step, intensity,
+            self.residual, noise.measurement, step, noise.intensity,
             np.zeros((len(first) - 1, d)) if begin is None else begin,
             np.zeros((d, d)) if begin_covariance is None else begin_covariance,
             np.zeros((0, 0)) if functions is None else functions,
@@ -194,14 +193,14 @@ class Linearisation:
         Given all measurements, given those of the same sample and before, shape ``(n, d)`` each, and the
         covariance of the latter ``(n, d, d)``.
         """
-        found = self.filtered(first, step, noise.measurement, noise.intensity, begin=begin, kept=True)
+        found = self.filtered(first, step, noise, begin=begin, kept=True)
         predicted, filtered, before, after, *gains = found[7:]
         chain = first, self.transition, self.measured, self.residual
         return smooth_backwards(*chain, found[0], predicted, before, *gains), filtered, after
 
     def sums(self, first: np.ndarray, step: np.ndarray, noise: Noise) -> tuple[float, float, int]:
         """Sum of squared innovations, log-determinant and degrees of freedom, parameters at their best."""
-        found = self.filtered(first, step, noise.measurement, noise.intensity)
+        found = self.filtered(first, step, noise)
         total, logarithm, removed = projected_sums(first, *found[:3])
         return total, found[3] + logarithm, int((~np.isnan(self.residual)).sum()) - removed
 
@@ -488,9 +487,8 @@ def whiten(linearisation: Linearisation, data: Measurements, noise: Noise) -> Wh
         When the simulation, as linearised, runs away along a recording. Columns of parameters may be infinite
         all the same.
     """
-    innovations, columns, initial, log_determinant = linearisation.filtered(
-        data.first, data.step, noise.measurement, noise.intensity
-    )[:4]
+    found = linearisation.filtered(data.first, data.step, noise)
+    innovations, columns, initial, log_determinant = found[:4]
     outputs, known = innovations.shape[1], ~np.isnan(linearisation.residual).ravel()
     innovations = innovations.ravel()
     columns, initial = (each.reshape(len(innovations), -1) for each in (columns, initial))

@@ -406,7 +406,7 @@ class _Shooting:
         """The step suggested, shortened until it does about what was foreseen, and the share taken."""
         data, here, noise = self.grid.data, now.linearisation, now.noise
         still = here.with_parameters_changed(change)
-        filtered = still.filtered(data.first, data.step, noise.measurement, noise.intensity)
+        filtered = still.filtered(data.first, data.step, noise)
         begin = np.empty((len(data.labels), still.gap.shape[1]))
         for place, (start, end) in enumerate(itertools.pairwise(data.first)):
             columns = filtered[2][start:end].reshape(-1, begin.shape[1])

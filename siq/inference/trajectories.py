@@ -269,8 +269,8 @@ class _NormalEquations:
         expected: tuple[np.ndarray, np.ndarray],
     ) -> None:
         along = replace(along, gap=np.zeros_like(along.gap))
-        still = np.zeros((1, *along.transition.shape[1:]))
-        innovations, by_parameters, by_initial = along.filtered(data.first, data.step, variance, still)[:3]
+        noise = Noise(variance, np.zeros(along.gap.shape[1]))
+        innovations, by_parameters, by_initial = along.filtered(data.first, data.step, noise)[:3]
         dimension, parameters, recordings = by_initial.shape[2], by_parameters.shape[2], len(data.labels)
         self.shared, self.shared_target = np.zeros((parameters, parameters)), np.zeros(parameters)
         self.own = np.zeros((recordings, dimension, dimension))
