@@ -46,12 +46,9 @@ class SampledPotential:
 
     Attributes
     ----------
-    box
-        Shape ``(d, 2)``.
-    values
-        U, one axis for each state, NaN where it is not known.
-    well
-        Index of the well whose formula gives U, of the same shape; -1 where none does.
+    box, values, well
+        Shape ``(d, 2)``; U, one axis for each state, NaN where it is not known; and the index of the well
+        whose formula gives it, -1 where none does.
     wells
         Their number, k.
     prefactor

@@ -106,20 +106,16 @@ class StationaryDensity:
 
     Attributes
     ----------
-    plane
-        Indices of the two states, or of the only one.
-    intensity
-        ε.
+    plane, intensity
+        Indices of the two states, or of the only one; and ε.
     x1, x2
         The grid, shapes ``(n,)`` and ``(m,)``, evenly spaced: from edge to edge of the box, or, of wells, in
         the middles of its cells. With one state `x2` is empty.
     values
         Shape ``(m, n)``, ``(1, n)`` with one state: density per unit of the first state and unit of the
         second; its integral over the box is 1. NaN where it is not known.
-    normalisation
-        Z, None where it is not to be written.
-    comparison
-        A long simulation beside it, None where there is none.
+    normalisation, comparison
+        Z, None where it is not to be written; and a long simulation beside it.
     unknown
         The share of all probability that lies where the density is not known, at most; None where it is
         known everywhere.

@@ -155,13 +155,7 @@ def _particle_loss(dynamics: Dynamics, saddle: np.ndarray, towards: np.ndarray) 
 
 @dataclass(frozen=True)
 class NoiseStrength:
-    """The strength ε of ``√ε σ dW``, in the unit of U.
-
-    Attributes
-    ----------
-    intensity, standard_error, source
-        ε, its standard error, and whether it was estimated from recordings, or given.
-    """
+    """The strength ε of ``√ε σ dW``, in the unit of U, estimated from recordings or given."""
 
     intensity: float
     standard_error: float = 0.0
