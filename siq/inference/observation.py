@@ -30,7 +30,7 @@ what is known is from which γ on it would have been.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -314,8 +314,7 @@ def inertia_test(
         Where one of the models cannot be fitted, or there is more than one position.
     """
     models = _InertialModels(recordings, degree, pair_step)
-    # With γF in terms of its own, and γ behind their coefficients.
-    model = models.with_velocity(lambda force, v, friction: force - friction * v, fixed=False)
+    model = models.with_velocity(given=False)
     best = fit_by_filter(model, models.data, x=models.x, noise=models.noise, closure=False)
     friction, fastest = float(best.model.values[-1]), MAX_FRICTION / models.step
     shown = best.converged and not best.fault and 0 < friction < fastest
@@ -384,14 +383,11 @@ class _InertialModels:
                     white = whiten(one.linearisation.at_rows(rows), part, one.noise)
                     values.append(white.log_likelihood(float(white.innovations @ white.innovations)))
                 differences.append(values[0] - values[1])
-        if len(differences) < 2:
-            return gain, np.inf
         return gain, float(np.std(differences, ddof=1) * np.sqrt(len(differences)))
 
     @cached_property
     def _with_speed(self) -> Dynamics:
-        """With γ as it is given: F is that of the model without inertia."""
-        return self.with_velocity(lambda force, v, friction: friction * (force - v), fixed=True)
+        return self.with_velocity(given=True)
 
     def with_friction(self, friction: float) -> Fit:
         """With γ given, beginning with F and the noise of the model without inertia."""
@@ -413,14 +409,13 @@ class _InertialModels:
             low, high = (low, middle) if within else (middle, high)
         return high
 
-    def with_velocity(
-        self, rate: Callable[[sympy.Expr, sympy.Symbol, sympy.Symbol], sympy.Expr], *, fixed: bool
-    ) -> Dynamics:
-        """With dv/dt as a rate of F, v and γ, of which γ may be fixed."""
+    def with_velocity(self, *, given: bool) -> Dynamics:
+        """With γ as it is given, and F as without inertia; else with γF in terms of its own, and γ behind."""
         states = (*self.library.states, *velocity_names(self.library.states))
         friction = "friction" + "_" * max(map(len, states))  # no state is called so
-        parameters = (*self._parameters, Parameter(friction, 0.0, fixed=fixed))
-        equations = (sympy.S.Zero, rate(self._force, symbol(states[1]), symbol(friction)))
+        parameters = (*self._parameters, Parameter(friction, 0.0, fixed=given))
+        v, rate = symbol(states[1]), symbol(friction)
+        equations = (sympy.S.Zero, rate * (self._force - v) if given else self._force - rate * v)
         return seen_positions(Dynamics(states, equations, Diffusion.identity(2), parameters=parameters))
 
     def stiffness(self, values: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:

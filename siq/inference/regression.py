@@ -446,8 +446,6 @@ def with_noise_formula(
         When D depends on the state, and no formula for it is positive at all recorded states; or when an
         equation of f has no significant term.
     """
-    if found.noise_free:
-        return None
     likelihood = ResidualLikelihood(found, pairs, residuals(found, pairs))
     probability = likelihood.constant_probability()
     if probability >= false_terms:
