@@ -90,18 +90,19 @@ class ScaledSystem:
 
     def bend(self, y: np.ndarray, q: np.ndarray) -> np.ndarray:
         """``Σ_k q_k ∂²F_k + q·∂²D q``, the matrix before X in Ṗ: ``(n, d, d)``."""
-        second = self.dynamics.bend(self.points(y), q @ self.inverse / self.rate)
-        return np.asarray(self.units.T @ second @ self.units + self.noise.contract(y, q, 2))
+        second = self.units.T @ self.dynamics.bend(self.points(y), q @ self.inverse / self.rate) @ self.units
+        return np.asarray(second if self.noise.constant else second + self.noise.contract(y, q, 2))
 
     def turned(self, y: np.ndarray, q: np.ndarray) -> np.ndarray:
         """``G_ik = ∂_k F_i + 2 ((∂_k D)q)_i``, ``(n, d, d)``."""
-        return self.jacobian(y) + 2 * self.noise.turn(y, q)
+        jacobian = self.jacobian(y)
+        return jacobian if self.noise.constant else jacobian + 2 * self.noise.turn(y, q)
 
     def pull(self, y: np.ndarray, q: np.ndarray, turned: np.ndarray | None = None) -> np.ndarray:
         """q̇ at positions and momenta ``(n, d)``; `turned` where it is known."""
         turned = self.turned(y, q) if turned is None else turned
         # Of the slope of D the turn has twice as much.
-        return np.asarray(self.noise.contract(y, q, 1) - np.einsum("nij,ni->nj", turned, q))
+        return np.asarray(self.noise.contract(y, q, 1) - (turned.transpose(0, 2, 1) @ q[:, :, None])[:, :, 0])
 
     def velocities(
         self, y: np.ndarray, q: np.ndarray, turned: np.ndarray | None = None

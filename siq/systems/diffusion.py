@@ -400,6 +400,9 @@ class _InUnits(Diffusion):
             turned = np.einsum("ai,bj,nijkl,kc,ld->nabcd", left, left, inner, units, units, optimize=True)
         return np.asarray(self.factor * turned)
 
+    def push(self, y: np.ndarray, momenta: np.ndarray) -> np.ndarray:
+        return super().push(y, momenta) if self._constant is None else momenta @ self._constant
+
     def whitening_at(self, y: np.ndarray) -> np.ndarray:
         own = self.noise.whitening_at(self.center + y @ self.units.T) @ self.units
         return np.asarray(own / np.sqrt(self.factor))
