@@ -277,10 +277,9 @@ class Fan:
         return distance, self.values[rows], values, bend
 
     def first_caustic(self) -> tuple[np.ndarray, float] | None:
-        """The lowest caustic that a curve of the fan meets, its position and V there; or None.
+        """The lowest caustic that a curve of the fan meets, and V along the curve there; or None.
 
-        V is the value along the curve. The lowest sheet may have ended before; and curves between those of
-        the fan may meet the caustic a little lower.
+        The lowest sheet may have ended before, and curves in between may meet it a little lower.
         """
         if not len(self.caustic_values):
             return None

@@ -48,10 +48,9 @@ class DensityComparison:
     outside
         Share of the samples outside the box, which counts as a further bin, of probability 0. Of a
         landscape: share of the samples where U is not known, which are left out.
-    x1_edges, x2_edges
-        Edges of the bins, shapes ``(n + 1,)`` and ``(m + 1,)``; with one state the latter is empty.
-    histogram
-        Shape ``(m, n)``, ``(1, n)`` with one state: the samples' density, in the marginal density's unit.
+    x1_edges, x2_edges, histogram
+        Edges of the bins, shapes ``(n + 1,)`` and ``(m + 1,)``, the latter empty with one state; and the
+        samples' density, ``(m, n)`` or ``(1, n)``, in the marginal density's unit.
     """
 
     total_variation: float

@@ -63,6 +63,10 @@ MOST_BENDS = 6  # directions of bent first guesses: each costs as much as the pa
 BEND = 0.4  # of the distance: how far bent first guesses leave the straight line
 
 
+LimitSet = np.ndarray | Cycle
+"""A state, shape ``(d,)``, or a cycle."""
+
+
 @dataclass(frozen=True)
 class MinimumActionPath:
     """The path of least action between two states: a chain, or a solution of Hamilton's equations.
@@ -186,8 +190,8 @@ class Segments:
     def __init__(self, problem: PathProblem, y: np.ndarray) -> None:
         self.middles, self.forward = (y[1:] + y[:-1]) / 2, np.diff(y, axis=0)
         self.force = problem.force(self.middles)
-        self.whitening = problem.noise.whitening_at(self.middles)
-        force, forward = (products(self.whitening, part) for part in (self.force, self.forward))
+        whitening = problem.noise.whitening_at(self.middles)
+        force, forward = (products(whitening, part) for part in (self.force, self.forward))
         self.speed, self.length = (
             np.linalg.norm(part, axis=1) + np.finfo(float).tiny for part in (force, forward)
         )
@@ -196,11 +200,6 @@ class Segments:
         self.actions = 0.5 * self.speed * self.length * np.sum(turn**2, axis=1)
         # ``∫ |f| |φ'| ds``, with which an action is compared that may be zero.
         self.effort = float(np.sum(self.speed * self.length))
-
-    @property
-    def metric(self) -> np.ndarray:
-        """D⁻¹ of the middles, ``(n - 1, d, d)``."""
-        return self.whitening.transpose(0, 2, 1) @ self.whitening
 
 
 class PathProblem(ScaledSystem):
@@ -213,12 +212,7 @@ class PathProblem(ScaledSystem):
     """
 
     def __init__(
-        self,
-        dynamics: Dynamics,
-        start: np.ndarray | Cycle,
-        end: np.ndarray | Cycle,
-        *,
-        measure: Diffusion | None = None,
+        self, dynamics: Dynamics, start: LimitSet, end: LimitSet, *, measure: Diffusion | None = None
     ) -> None:
         # Of cycles, the states that are closest to the other end.
         one, two = (each.points if isinstance(each, Cycle) else each[None] for each in (start, end))
@@ -468,7 +462,8 @@ class _Across:
         self.y, self.effort = y, parts.effort
         self.range = slice(1 if problem.begin is None else 0, -1 if problem.finish is None else None)
         times = (parts.length / parts.speed)[:, None, None]
-        metric, middles, jacobian = parts.metric, parts.middles, problem.jacobian(parts.middles)
+        middles, jacobian = parts.middles, problem.jacobian(parts.middles)
+        metric = noise.precision_at(middles)
         force, forward = (products(metric, part) for part in (parts.force, parts.forward))
         twice = forward / times[:, 0] - force
         turned = jacobian + noise.turn(middles, twice)

@@ -27,6 +27,7 @@ from siq.quasipotential.characteristics import NO_ACTION
 from siq.quasipotential.hamiltonian_paths import hamiltonian_paths
 from siq.quasipotential.path_chains import (
     MOST_NODES,
+    LimitSet,
     MinimumActionPath,
     PathProblem,
     Segments,
@@ -69,10 +70,6 @@ MOST_GUESSES = 2  # of either kind that are tried
 ACTION_DIFFERENCE = 0.02  # share of the action by which two of them differ
 
 
-LimitSet = np.ndarray | Cycle
-"""A state, shape ``(d,)``, or a cycle."""
-
-
 def minimum_action_path(
     dynamics: Dynamics,
     start: LimitSet,
@@ -82,7 +79,9 @@ def minimum_action_path(
     tolerance: float = 1e-4,
     initial: Sequence[np.ndarray] | None = None,
 ) -> MinimumActionPath:
-    """The path of least action from one state to another.
+    """The path of least action from one state to another: the lowest minimum found.
+
+    No method promises that there is no lower one: `rivals` tells which others the first guesses led to.
 
     Parameters
     ----------
@@ -100,12 +99,6 @@ def minimum_action_path(
     initial
         First guesses, each of shape ``(k, d)`` with k ≥ 2, instead of the own ones: the path that would be
         right were f linear, the straight line, and lines bent to all sides.
-
-    Returns
-    -------
-    MinimumActionPath
-        The lowest minimum found. No method promises that there is no lower one: `rivals` tells which others
-        the first guesses led to.
 
     Raises
     ------
@@ -185,7 +178,7 @@ def _path_nodes(problem: PathProblem, y: np.ndarray) -> np.ndarray:
     parts = Segments(problem, y)
     # Momenta of the middles, carried over half a segment; both sides agree at a minimum.
     times = (parts.length / parts.speed)[:, None]
-    middle = products(parts.metric, (parts.forward / times - parts.force) / 2)
+    middle = products(problem.noise.precision_at(parts.middles), (parts.forward / times - parts.force) / 2)
     turn = -times / 2 * problem.pull(parts.middles, middle)
     p = np.empty_like(y)
     p[1:-1] = (middle[1:] + turn[1:] + middle[:-1] - turn[:-1]) / 2
