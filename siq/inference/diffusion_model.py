@@ -430,7 +430,7 @@ class InnovationLikelihood(_DiffusionLikelihood):
             self._data.first, self._data.step, self._noise(places, values, sensor),
             begin_covariance=self._begin, functions=self.all_functions, places=places,
         )  # fmt: skip
-        return -0.5 * (float((found[0] ** 2).sum()) + found[3]), *found[4:7]
+        return -0.5 * (float((found[0][:, :, 0] ** 2).sum()) + found[1]), *found[2:5]
 
     def parameter_covariance(
         self, formula: NoiseFormula, sensor: np.ndarray, covariance: np.ndarray, fit: Fit

@@ -115,9 +115,9 @@ def filter_recursion(
 
     Returns
     -------
-    innovations, by_parameters, by_initial
-        Shapes ``(n, m)``, ``(n, m, p)`` and ``(n, m, d)``: what a unit of each parameter, and of the initial
-        state, adds to the modelled output; all whitened, and zero where nothing was measured.
+    whitened
+        Innovations, and what a unit of each parameter, and of the initial state, adds to the modelled output,
+        in units of their standard deviation, zero where nothing was measured: shape ``(n, m, 1 + p + d)``.
     log_determinant
         Sum of the logarithms of the innovations' variances.
     score, information, squares
@@ -130,9 +130,7 @@ def filter_recursion(
     rows, dimension, columns = response.shape
     outputs = residual.shape[1]
     width = 1 + columns + dimension
-    innovations = np.zeros((rows, outputs))
-    by_parameters = np.zeros((rows, outputs, columns))
-    by_initial = np.zeros((rows, outputs, dimension))
+    whitened = np.zeros((rows, outputs, width))
     log_determinant = 0.0
     count = len(places)
     size = count + outputs if scored else 0
@@ -199,11 +197,9 @@ def filter_recursion(
                     spread += measured[k, o, i] * gain[i]
                 scale = 1.0 / np.sqrt(spread)
                 innovation = residual[k, o] - shown[0]
-                innovations[k, o] = innovation * scale
-                for c in range(columns):
-                    by_parameters[k, o, c] = shown[1 + c] * scale
-                for i in range(dimension):
-                    by_initial[k, o, i] = shown[1 + columns + i] * scale
+                whitened[k, o, 0] = innovation * scale
+                for c in range(1, width):
+                    whitened[k, o, c] = shown[c] * scale
                 log_determinant += np.log(spread)
                 if kept:
                     gains[k, o] = gain
@@ -302,8 +298,8 @@ def filter_recursion(
             squares[e, c] = squares[c, e]
             information[e, c] = information[c, e]
     return (
-        innovations, by_parameters, by_initial, log_determinant, score, information, squares,
-        predicted, filtered, before, after, gains, variances,
+        whitened, log_determinant, score, information, squares, predicted, filtered, before, after, gains,
+        variances,
     )  # fmt: skip
 
 
@@ -364,33 +360,24 @@ def smooth_backwards(
 
 
 @machine_code
-def projected_sums(
-    first: np.ndarray, innovations: np.ndarray, by_parameters: np.ndarray, by_initial: np.ndarray
-) -> tuple[float, float, int]:
+def projected_sums(first: np.ndarray, whitened: np.ndarray, kept: int) -> tuple[float, float, int]:
     """Sum of squared innovations, initial states of recordings and parameters at their best.
 
-    The logarithm of the determinant of what the initial states were projected out of, and their number, too.
+    The columns of initial states stand behind the `kept` ones. The logarithm of the determinant of what they
+    were projected out of, and their number, too.
     """
-    outputs, columns = by_parameters.shape[1:]
-    kept = 1 + columns
-    width = kept + by_initial.shape[2]
+    outputs, width = whitened.shape[1:]
     sums = np.zeros((kept, kept))
     own = np.empty((width, width))
-    line = np.empty(width)
     log_determinant = 0.0
     removed = 0
     for recording in range(len(first) - 1):
         own[:] = 0.0
         for k in range(first[recording], first[recording + 1]):
             for o in range(outputs):
-                line[0] = innovations[k, o]
-                for c in range(columns):
-                    line[1 + c] = by_parameters[k, o, c]
-                for c in range(width - kept):
-                    line[kept + c] = by_initial[k, o, c]
                 for c in range(width):
                     for e in range(c + 1):
-                        own[c, e] += line[c] * line[e]
+                        own[c, e] += whitened[k, o, c] * whitened[k, o, e]
         gone, logarithm = _eliminate(own, kept)
         removed += gone
         log_determinant += logarithm

@@ -194,15 +194,16 @@ class Linearisation:
         covariance of the latter ``(n, d, d)``.
         """
         found = self.filtered(first, step, noise, begin=begin, kept=True)
-        predicted, filtered, before, after, *gains = found[7:]
-        chain = first, self.transition, self.measured, self.residual
-        return smooth_backwards(*chain, found[0], predicted, before, *gains), filtered, after
+        predicted, filtered, before, after, *gains = found[5:]
+        innovations = np.ascontiguousarray(found[0][:, :, 0])
+        chain = first, self.transition, self.measured, self.residual, innovations
+        return smooth_backwards(*chain, predicted, before, *gains), filtered, after
 
     def sums(self, first: np.ndarray, step: np.ndarray, noise: Noise) -> tuple[float, float, int]:
         """Sum of squared innovations, log-determinant and degrees of freedom, parameters at their best."""
         found = self.filtered(first, step, noise)
-        total, logarithm, removed = projected_sums(first, *found[:3])
-        return total, found[3] + logarithm, int((~np.isnan(self.residual)).sum()) - removed
+        total, logarithm, removed = projected_sums(first, found[0], 1 + self.response.shape[2])
+        return total, found[1] + logarithm, int((~np.isnan(self.residual)).sum()) - removed
 
     def log_likelihood(self, first: np.ndarray, step: np.ndarray, noise: Noise) -> float:
         """The restricted one, the parameters at their best."""
@@ -487,11 +488,10 @@ def whiten(linearisation: Linearisation, data: Measurements, noise: Noise) -> Wh
         When the simulation, as linearised, runs away along a recording. Columns of parameters may be infinite
         all the same.
     """
-    found = linearisation.filtered(data.first, data.step, noise)
-    innovations, columns, initial, log_determinant = found[:4]
-    outputs, known = innovations.shape[1], ~np.isnan(linearisation.residual).ravel()
-    innovations = innovations.ravel()
-    columns, initial = (each.reshape(len(innovations), -1) for each in (columns, initial))
+    white, log_determinant = linearisation.filtered(data.first, data.step, noise)[:2]
+    outputs, known = white.shape[1], ~np.isnan(linearisation.residual).ravel()
+    parts = np.split(white.reshape(-1, white.shape[2]), [1, 1 + linearisation.response.shape[2]], axis=1)
+    innovations, columns, initial = map(np.ascontiguousarray, (parts[0][:, 0], *parts[1:]))
     if not (np.isfinite(innovations).all() and np.isfinite(initial).all() and np.isfinite(log_determinant)):
         raise NumericalFailure("small deviations from the recorded motion grow beyond all numbers")
     used = 0

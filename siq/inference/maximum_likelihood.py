@@ -406,11 +406,11 @@ class _Shooting:
         """The step suggested, shortened until it does about what was foreseen, and the share taken."""
         data, here, noise = self.grid.data, now.linearisation, now.noise
         still = here.with_parameters_changed(change)
-        filtered = still.filtered(data.first, data.step, noise)
+        white = still.filtered(data.first, data.step, noise)[0]
         begin = np.empty((len(data.labels), still.gap.shape[1]))
         for place, (start, end) in enumerate(itertools.pairwise(data.first)):
-            columns = filtered[2][start:end].reshape(-1, begin.shape[1])
-            begin[place] = solve(columns, filtered[0][start:end].ravel(), least=INEXACT)[0]
+            part = white[start:end].reshape(-1, white.shape[2])
+            begin[place] = solve(part[:, 1:], part[:, 0], least=INEXACT)[0]
         smoothed, known, covariance = still.smoothed(data.first, data.step, noise, begin)
         deviation = known if self.filtered else smoothed
         spread = covariance if noise.process.any() else None

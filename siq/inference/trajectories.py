@@ -270,19 +270,18 @@ class _NormalEquations:
     ) -> None:
         along = replace(along, gap=np.zeros_like(along.gap))
         noise = Noise(variance, np.zeros(along.gap.shape[1]))
-        innovations, by_parameters, by_initial = along.filtered(data.first, data.step, noise)[:3]
-        dimension, parameters, recordings = by_initial.shape[2], by_parameters.shape[2], len(data.labels)
+        white = along.filtered(data.first, data.step, noise)[0]
+        dimension, parameters, recordings = along.gap.shape[1], along.response.shape[2], len(data.labels)
         self.shared, self.shared_target = np.zeros((parameters, parameters)), np.zeros(parameters)
         self.own = np.zeros((recordings, dimension, dimension))
         self.own_target = np.zeros((recordings, dimension))
         self.between = np.zeros((recordings, parameters, dimension))
         for place, (first, end) in enumerate(itertools.pairwise(data.first)):
+            part = white[first:end].reshape(-1, white.shape[2])
             # As of a root at zero: where a derivative is no number, no direction is known.
-            columns, states = (
-                np.nan_to_num(np.concatenate(each[first:end]), posinf=0.0, neginf=0.0)
-                for each in (by_parameters, by_initial)
-            )
-            left = innovations[first:end].ravel()
+            known = np.nan_to_num(part[:, 1:], posinf=0.0, neginf=0.0)
+            columns, states = map(np.ascontiguousarray, np.split(known, [parameters], axis=1))
+            left = np.ascontiguousarray(part[:, 0])
             self.shared += columns.T @ columns
             self.shared_target += columns.T @ left
             self.between[place], self.own[place] = columns.T @ states, states.T @ states
