@@ -281,7 +281,7 @@ class ResidualLikelihood(_DiffusionLikelihood):
         rows = np.unique(np.linspace(0, n - 1, min(n, int(MAX_NUMBERS / (m * d * (d + 1))))).astype(int))
         if len(rows) < n:
             pairs, rest = pairs.take(rows), rest[rows]
-        x, share = pairs.x0, _response_share(found)
+        x, share = pairs.x0, found.flow.response_share
         self.rest = process_noise_increments(found, pairs, rest)
         first = [term.diff(one) for term in self.terms for one in symbols]
         second = [term.diff(one, other) for term in self.terms for one in symbols for other in symbols]
@@ -340,17 +340,12 @@ class ResidualLikelihood(_DiffusionLikelihood):
         return logarithm, score.sum(axis=0), information, score.T @ score
 
 
-def _response_share(found: FieldEstimate) -> float:
-    """The mean time, as a share of a step, for which the system goes on after a kick within the step."""
-    return (1 - 1 / found.flow.steps) / 2 if found.flow.euler else 0.5
-
-
 def process_noise_increments(found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray) -> np.ndarray:
     """Residuals per root of time, with what the system forgot within the step put back: shape ``(n, d)``.
 
     ``∫₀ʰ e^{Js} D e^{Jᵀs} ds`` is ``h e^{Jh/2} D e^{Jᵀh/2}`` but for the second order in Jh.
     """
-    step = found.dynamics.jacobian(pairs.x0) * (_response_share(found) * pairs.h)[:, None, None]
+    step = found.dynamics.jacobian(pairs.x0) * (found.flow.response_share * pairs.h)[:, None, None]
     if not (np.abs(step) <= MAX_RELAXATION).all():
         step = np.zeros_like(step)
     back = np.eye(rest.shape[1]) - step + step @ step / 2

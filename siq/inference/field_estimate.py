@@ -91,12 +91,13 @@ class FlowMap:
         return flow
 
     @property
-    def curvature_weight(self) -> float:
-        """Share of h²/4 by which noise shifts the mean: ``E Xh - Φ(X0) = w h²/4 ΣD_jk ∂²f/∂x_j∂x_k ε``.
+    def response_share(self) -> float:
+        """The mean time, as a share of a step, for which the system goes on after a kick within the step.
 
-        The variance grows from zero within the pair; Euler's rule sees it only after each step.
+        Half of it times h² is the weight with which noise shifts the mean, ``Σ(εD)_jk ∂²f/∂x_j∂x_k``. Euler's
+        rule sees the noise only after each of its steps.
         """
-        return 1 - 1 / self.steps if self.euler else 1.0
+        return (1 - 1 / self.steps) / 2 if self.euler else 0.5
 
 
 @dataclass(frozen=True)

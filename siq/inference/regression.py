@@ -190,7 +190,7 @@ class _PairRegression:
             correction = moved / h - matrix @ self.theta[:, part]
             if noise_rate is not None and np.any(noise_rate):
                 curvature = self._curvature(x0, noise_rate)
-                correction += flow.curvature_weight * h / 4 * (matrix @ curvature)
+                correction += flow.response_share * h / 2 * (matrix @ curvature)
             # A trial f may run away on a few pairs; one round without their correction does no harm.
             correction[:, ~(np.abs(correction) <= most).all(axis=0)] = 0.0
             quotient[:, part] -= correction
