@@ -268,7 +268,7 @@ def test_types_and_defaults_stand_as_a_study_writes_them() -> None:
     assert rows["`name`"][2] == "required"
     assert rows["`invariant`"][1] == "list of: number > 0"
     rows = {row[0]: row for row in schemas.rows(TrainingOptions, "training.")}
-    assert rows["`training.widths`"][2] == "`[50, 50, 50]`"
+    assert rows["`training.widths`"][2] == "`[20, 20]`"
     assert rows["`training.precision`"][1:3] == ("`float32` or `float64`", "`float32`")
     assert yaml.safe_load(rows["`training.relative_dynamics`"][2].strip("`")) is True
 

@@ -19,7 +19,7 @@ import sympy
 
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import read_field
-from siq.networks.decomposition import TrainedNetworks
+from siq.networks.decomposition import AnyNetworks, NetworksByWell
 from siq.numerics.integration import heun_step
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.cell_density import CELLS, SampledPotential, shares_by_rates
@@ -43,6 +43,7 @@ from siq.quasipotential.landscape_comparison import (
 )
 from siq.quasipotential.landscape_files import landscape_from_data, read_landscape
 from siq.quasipotential.transitions import Transition
+from siq.quasipotential.wells import Well
 from siq.remarks import sentence
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
@@ -50,7 +51,7 @@ from siq.systems.simulation import simulate_stationary
 from siq.validation.escapes import Neighbourhood, simulate_escapes
 from siq.validation.mesh import mesh_potential
 from siq.workflow.study import PipelineSettings
-from siq.workflow.tables import as_table
+from siq.workflow.tables import Method, as_table
 from workflow.published import PublishedFigure, published_formula, published_potentials
 from workflow.rows import concatenate
 
@@ -104,7 +105,7 @@ TABLE = "landscape_errors"
 def run_landscape_errors(
     settings: PipelineSettings,
     reference: ReferenceLandscape,
-    runs: Sequence[tuple[Landscape | None, Mapping[str, SymbolicDecomposition], TrainedNetworks | None]],
+    runs: Sequence[tuple[Landscape | None, Mapping[str, SymbolicDecomposition], AnyNetworks | None]],
     published: Mapping[str, PublishedFigure],
     published_mesh: Potential | None = None,
 ) -> pd.DataFrame:
@@ -134,6 +135,9 @@ def run_landscape_errors(
         }
         if networks is not None:
             sources["networks"] = _twice(networks.potential_at)
+        regressed = formulas.get(Method.REGRESSION)
+        if isinstance(networks, NetworksByWell) and regressed is not None and regressed.wells:
+            sources["regression, by well"] = _twice(_of_assigned_wells(networks, regressed.wells))
         for source, potential in sources.items():
             tables.append(_rows(number, source, compare_estimate(reference, potential, below=below)))
     if np.isfinite(reference.mesh).any():
@@ -158,6 +162,18 @@ def run_landscape_errors(
 
 def _rows(number: int, source: str, comparisons: Sequence[Mapping[str, object]]) -> pd.DataFrame:
     return as_table(TABLE, [{"run": number, "source": source, **one} for one in comparisons])
+
+
+def _of_assigned_wells(networks: NetworksByWell, wells: Sequence[Well]) -> Potential:
+    """V by formulas about the attractors, each in the well that networks assign points to."""
+
+    def values(x: np.ndarray) -> np.ndarray:
+        potential = np.full(len(x), np.nan)
+        for well, height, rows in zip(wells, networks.heights, networks.of_wells(x), strict=True):
+            potential[rows] = well.values(x[rows]) + height
+        return potential
+
+    return values
 
 
 def _twice(potential: Potential) -> Potential:

@@ -33,7 +33,7 @@ from siq.workflow.tables import Outcome, Status
 
 if TYPE_CHECKING:
     from siq.data.recordings import Recordings
-    from siq.networks.decomposition import TrainedNetworks
+    from siq.networks.decomposition import AnyNetworks
     from siq.workflow.study import PipelineSettings
 
 
@@ -46,7 +46,7 @@ class _StoredNetworks:
 
     path: Path
 
-    def __getitem__(self, position: int) -> TrainedNetworks:
+    def __getitem__(self, position: int) -> AnyNetworks:
         from siq.networks.decomposition import load_networks
 
         return load_networks(self.path, run=position)

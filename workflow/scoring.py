@@ -16,7 +16,7 @@ import pandas as pd
 
 from siq.inference.checks import prediction_errors
 from siq.inference.library import candidate_library
-from siq.networks.decomposition import TrainedNetworks, shuffled
+from siq.networks.decomposition import AnyNetworks, shuffled
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.formulas import SymbolicDecomposition, exact_decomposition, term_coefficients
 from siq.systems.cards import load_exact, load_system
@@ -179,7 +179,7 @@ def score_run(
     settings: PipelineSettings,
     formulas: Mapping[str, SymbolicDecomposition],
     certificates: Mapping[str, Mapping[str, Any]],
-    networks: TrainedNetworks | None,
+    networks: AnyNetworks | None,
     *,
     number: int,
     system: Dynamics | None = None,
@@ -240,13 +240,18 @@ def score_run(
 
 
 def _network_errors(
-    trained: TrainedNetworks, box: np.ndarray, exact: SymbolicDecomposition, draw: np.random.Generator
+    trained: AnyNetworks, box: np.ndarray, exact: SymbolicDecomposition, draw: np.random.Generator
 ) -> dict[str, float]:
-    """Relative L2 error on a grid over Ω of the U of the trained network, and of a randomised one."""
+    """Relative L2 error on a grid over Ω of the U of the trained networks, and of randomised ones.
+
+    It is that of the points at which they hold: networks by well know nothing elsewhere.
+    """
     randomised = shuffled(trained, generator=draw)
 
-    def error_of(networks: TrainedNetworks, grid: np.ndarray) -> float:
-        return relative_error(2 * networks.potential_at(grid.T), _exact_values(exact, grid))
+    def error_of(networks: AnyNetworks, grid: np.ndarray) -> float:
+        values = 2 * networks.potential_at(grid.T)
+        known = np.isfinite(values)
+        return relative_error(values[known], _exact_values(exact, grid[:, known]))
 
     error = error_of(trained, _domain_grid(box))
     chance = error_of(randomised, _domain_grid(box, points=COARSE))

@@ -15,7 +15,7 @@ from workflow.task import Given, task
 
 if TYPE_CHECKING:
     from siq.data.recordings import Recordings
-    from siq.networks.decomposition import TrainedNetworks
+    from siq.networks.decomposition import AnyNetworks
     from siq.quasipotential.wells import Well
     from siq.systems.dynamics import Dynamics
     from siq.workflow.models import ModelFiles
@@ -365,7 +365,7 @@ def example_hopping(given: Given, settings: PipelineSettings) -> Any:
 # What several tasks read.
 
 
-def trained_run(given: Given, run: int | None = None) -> StepResult[TrainedNetworks]:
+def trained_run(given: Given, run: int | None = None) -> StepResult[AnyNetworks]:
     """The networks of a run; of one of several where `run` says which."""
     from siq.workflow.tables import StepResult
     from siq.workflow.training import POSITION, not_trained

@@ -6,18 +6,19 @@ torch, which takes longer to import than such an evaluation does to run. Network
 
 from __future__ import annotations
 
-import json
 import zipfile
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as pydantic_dataclass
+from scipy.spatial import cKDTree
 
-from siq.errors import Fault, InputError
+from siq.errors import InputError
 from siq.numerics.files import whole_file
 
 CHUNK = 4096  # points evaluated together: few enough for their activations to stay in the processor's cache
@@ -27,41 +28,28 @@ Order = Literal[2, 4]
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class CheckOptions:
-    """When a training may end before its last step: as soon as refinement will succeed from where it is.
-
-    The check refines the networks' V by itself, with parameters of its own, so that other parameters of
-    the regression or of the refinement train nothing again.
+    """When a training may end before its last step: as soon as output weights follow from where it is.
 
     Attributes
     ----------
     first, every
         Steps before the first check, and between checks.
-    degree
-        Highest power of V in the check.
-    residual
-        Largest relative Hamilton–Jacobi residual after it.
-    difference
-        Largest relative difference of V from the local route's in any well, beside what their residuals
-        explain.
     attempts
         Trainings from fresh networks, if a training ends without having passed; every second one in another
         way, see `TrainingOptions.attempt`.
     """
 
-    first: Annotated[int, Field(ge=1)] = 1000
-    every: Annotated[int, Field(ge=1)] = 500
-    degree: Annotated[int, Field(ge=2, le=12)] = 4
-    residual: Annotated[float, Field(gt=0)] = 0.05
-    difference: Annotated[float, Field(gt=0)] = 0.02
-    attempts: Annotated[int, Field(ge=1)] = 2
+    first: Annotated[int, Field(ge=1)] = 300
+    every: Annotated[int, Field(ge=1)] = 300
+    attempts: Annotated[int, Field(ge=1)] = 4
 
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class TrainingOptions:
     """How the networks are trained; every one of these changes the result.
 
-    The defaults are those of a short training, a minute or less on one core, that ends as soon as its check
-    passes. The paper's own are spelled out in the studies ``*-published``.
+    The defaults are those of a short training, seconds on one core, that only has to find the right branch of
+    the Hamilton–Jacobi equation. The paper's own are spelled out in the studies ``*-published``.
 
     Attributes
     ----------
@@ -70,12 +58,11 @@ class TrainingOptions:
     steps
         Steps of Adam, at most.
     check
-        When a training may end earlier; None takes all its steps.
+        When a training may end earlier; None takes all its steps, and leaves the networks as they are then.
     output_weights
         Number of random tanh units whose output weights the check solves for, from where the networks have
-        come; what it finds replaces them (`siq.quasipotential.output_weights`), and neither the local route
-        nor the identified f takes part in the training. Of `check` only `first`, `every` and `attempts` count
-        then. Left out, the check is the rehearsal that `CheckOptions` describes.
+        come; what it finds replaces them (`siq.quasipotential.output_weights`). Without a check it has no
+        meaning.
     batch_size
         Pairs in the first term of the loss, and representative points in the second, per step.
     representative_share
@@ -121,15 +108,15 @@ class TrainingOptions:
         Floating-point type of the networks.
     """
 
-    widths: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)] = (50, 50, 50)
-    steps: Annotated[int, Field(ge=1)] = 4000
+    widths: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)] = (20, 20)
+    steps: Annotated[int, Field(ge=1)] = 900
     check: CheckOptions | None = CheckOptions()
-    output_weights: Annotated[int, Field(ge=10)] | None = None
-    batch_size: Annotated[int, Field(ge=1)] = 256
+    output_weights: Annotated[int, Field(ge=10)] = 400
+    batch_size: Annotated[int, Field(ge=1)] = 1000
     representative_share: Annotated[float, Field(ge=0, le=1)] = 1.0
-    learning_rate: Annotated[float, Field(gt=0)] = 5e-3
+    learning_rate: Annotated[float, Field(gt=0)] = 6e-3
     decay_rate: Annotated[float, Field(gt=0, le=1)] = 0.95
-    decay_steps: Annotated[float, Field(gt=0)] = 40.0
+    decay_steps: Annotated[float, Field(gt=0)] = 90.0
     orthogonality_weight: Annotated[float, Field(ge=0)] = 1.0
     asymmetry: Annotated[float, Field(ge=0)] = 0.1
     matching: MatchingRule = "explicit"
@@ -143,15 +130,6 @@ class TrainingOptions:
     potential_gain: Annotated[float, Field(gt=0)] = 3.0
     training_share: Annotated[float, Field(gt=0, lt=1)] = 0.7
     precision: Literal["float32", "float64"] = "float32"
-
-    @model_validator(mode="after")
-    def _consistent(self) -> TrainingOptions:
-        if self.output_weights is not None and self.check is None:
-            raise Fault(
-                "output weights are solved for when a training is checked, and this one never is",
-                "leave out 'check: null', or leave out 'output_weights'",
-            )
-        return self
 
     def attempt(self, number: int) -> TrainingOptions:
         """Options of a training that comes after `number` trainings that failed.
@@ -222,17 +200,94 @@ class TrainedNetworks:
             values.append((self.potential_scale * (_hidden(self.potential, y)[-1] + square))[:, 0])
         return np.concatenate(values).astype(float)
 
-    def _evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def gradients_at(self, x: np.ndarray) -> np.ndarray:
+        """∇V alone, shape ``(n, d)``, at half the cost of `evaluate`."""
+        return self._value_and_gradient(x)[2].astype(float)
+
+    def _value_and_gradient(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Normalised points, V ``(n, 1)`` and ∇V ``(n, d)``."""
         y = (x.astype(self.mean.dtype) - self.mean) / self.scale
         value, gradient = _value_and_gradient(self.potential, y)
         potential = self.potential_scale * (value + (y * y).sum(axis=1, keepdims=True))
-        gradient = self.potential_scale / self.scale * (gradient + 2 * y)
+        return y, potential, self.potential_scale / self.scale * (gradient + 2 * y)
+
+    def _evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        y, potential, gradient = self._value_and_gradient(x)
         circulatory = self.circulatory_scale * _hidden(self.circulatory, y)[-1]
         values = (potential[:, 0], circulatory, circulatory - gradient @ self.diffusion)
         return tuple(np.asarray(array, dtype=float) for array in values)  # type: ignore[return-value]
 
 
-def shuffled(networks: TrainedNetworks, *, generator: np.random.Generator) -> TrainedNetworks:
+@dataclass(frozen=True)
+class NetworksByWell:
+    """Networks of one run, a pair of them about each attractor, since V has a kink between its wells.
+
+    Attributes
+    ----------
+    parts
+        Networks that hold in the well of each attractor; V of each is zero there.
+    heights
+        What is added to V of each, shape ``(k,)``.
+    states, attractor_of
+        States ``(n, d)``, and in the well of which attractor each lies, shape ``(n,)``, or `NOWHERE` where
+        none of the networks holds. A point belongs to the well of the nearest of them.
+    """
+
+    NOWHERE: ClassVar[int] = -1
+
+    parts: tuple[TrainedNetworks, ...]
+    heights: np.ndarray
+    states: np.ndarray
+    attractor_of: np.ndarray
+
+    @property
+    def diffusion(self) -> np.ndarray:
+        """D, shape ``(d, d)``."""
+        return self.parts[0].diffusion
+
+    def evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """V ``(n,)``, g and f ``(n, d)`` at points ``(n, d)``, NaN in no well, in the units of the states."""
+        potential = np.full(len(x), np.nan)
+        circulatory, vector_field = np.full(x.shape, np.nan), np.full(x.shape, np.nan)
+        for index, rows in enumerate(self.of_wells(x)):
+            values, circulatory[rows], vector_field[rows] = self.parts[index].evaluate(x[rows])
+            potential[rows] = values + self.heights[index]
+        return potential, circulatory, vector_field
+
+    def potential_at(self, x: np.ndarray) -> np.ndarray:
+        """V alone, shape ``(n,)``, NaN in no well."""
+        potential = np.full(len(x), np.nan)
+        for index, rows in enumerate(self.of_wells(x)):
+            potential[rows] = self.parts[index].potential_at(x[rows]) + self.heights[index]
+        return potential
+
+    def gradients_at(self, x: np.ndarray) -> np.ndarray:
+        """∇V alone, shape ``(n, d)``, NaN in no well."""
+        gradients = np.full(x.shape, np.nan)
+        for index, rows in enumerate(self.of_wells(x)):
+            gradients[rows] = self.parts[index].gradients_at(x[rows])
+        return gradients
+
+    def of_wells(self, x: np.ndarray) -> list[np.ndarray]:
+        """Rows of points ``(n, d)`` by the well that they lie in."""
+        label, finite = np.full(len(x), self.NOWHERE), np.isfinite(x).all(axis=1)
+        label[finite] = self.attractor_of[self._tree.query(x[finite] / self._width)[1]]
+        return [np.flatnonzero(label == index) for index in range(len(self.parts))]
+
+    @cached_property
+    def _width(self) -> np.ndarray:
+        """In which distances between states are measured, shape ``(d,)``."""
+        return np.ptp(self.states, axis=0)
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.states / self._width)
+
+
+AnyNetworks = TrainedNetworks | NetworksByWell
+
+
+def shuffled(networks: AnyNetworks, *, generator: np.random.Generator) -> AnyNetworks:
     """Networks with the same weights in random order, as a null model for comparison."""
 
     def mixed(array: np.ndarray) -> np.ndarray:
@@ -241,7 +296,12 @@ def shuffled(networks: TrainedNetworks, *, generator: np.random.Generator) -> Tr
     def layers(source: tuple[Layer, ...]) -> tuple[Layer, ...]:
         return tuple((mixed(weights), mixed(biases)) for weights, biases in source)
 
-    return replace(networks, potential=layers(networks.potential), circulatory=layers(networks.circulatory))
+    def of(one: TrainedNetworks) -> TrainedNetworks:
+        return replace(one, potential=layers(one.potential), circulatory=layers(one.circulatory))
+
+    if isinstance(networks, NetworksByWell):
+        return replace(networks, parts=tuple(map(of, networks.parts)))
+    return of(networks)
 
 
 def _hidden(layers: tuple[Layer, ...], y: np.ndarray) -> list[np.ndarray]:
@@ -263,12 +323,21 @@ def _value_and_gradient(layers: tuple[Layer, ...], y: np.ndarray) -> tuple[np.nd
     return value, delta
 
 
-def save_networks(path: str | Path, runs: Sequence[TrainedNetworks]) -> None:
+def save_networks(path: str | Path, runs: Sequence[AnyNetworks]) -> None:
     """Write the networks of one or more runs, whole or not at all."""
-    write_archive(path, pack(runs))
+    parts = [one.parts if isinstance(one, NetworksByWell) else (one,) for one in runs]
+    arrays = pack([part for of_run in parts for part in of_run])
+    arrays["parts"] = np.array([len(of_run) for of_run in parts])
+    for number, one in enumerate(runs):
+        if isinstance(one, NetworksByWell):
+            arrays |= {f"{name}{number}": getattr(one, name) for name in _OF_WELLS}
+    write_archive(path, arrays)
 
 
-def load_networks(path: str | Path, *, run: int = 0) -> TrainedNetworks:
+_OF_WELLS = ("heights", "states", "attractor_of")
+
+
+def load_networks(path: str | Path, *, run: int = 0) -> AnyNetworks:
     """Read the networks of one of the runs that `save_networks` wrote.
 
     Raises
@@ -278,45 +347,47 @@ def load_networks(path: str | Path, *, run: int = 0) -> TrainedNetworks:
     """
     arrays = read_archive(path)
     try:
-        return unpack(arrays, run)
+        counts = arrays["parts"]
+        first = int(counts[:run].sum())
+        parts = tuple(unpack(arrays, first + part) for part in range(int(counts[run])))
+        if f"heights{run}" not in arrays:
+            return parts[0]
+        return NetworksByWell(parts, **{name: arrays[f"{name}{run}"] for name in _OF_WELLS})
     except (KeyError, IndexError, ValueError, TypeError):
         raise InputError(path, "", "it is not an archive of networks", "make it again") from None
 
 
-def pack(runs: Sequence[TrainedNetworks]) -> dict[str, np.ndarray]:
-    """Arrays by name, with a leading axis of runs in all but D, which runs share."""
-    first = runs[0]
-    arrays = {
-        "sizes": np.array(json.dumps([len(first.potential), len(first.circulatory)])),
-        "diffusion": first.diffusion,
-    }
-    for name in ("mean", "scale", "potential_scale", "circulatory_scale"):
-        arrays[name] = np.stack([getattr(one, name) for one in runs])
-    for name in ("potential", "circulatory"):
-        for index in range(len(getattr(first, name))):
-            weights, biases = zip(*(getattr(one, name)[index] for one in runs), strict=True)
-            arrays[f"{name}_weights{index}"] = np.stack(weights)
-            arrays[f"{name}_biases{index}"] = np.stack(biases)
+_NUMBERS = ("mean", "scale", "potential_scale", "circulatory_scale", "diffusion")
+
+
+def pack(networks: Sequence[TrainedNetworks]) -> dict[str, np.ndarray]:
+    """Arrays by name, each of which ends in the number of the networks."""
+    arrays = {"count": np.array(len(networks))}
+    for number, one in enumerate(networks):
+        arrays |= {f"{name}_{number}": getattr(one, name) for name in _NUMBERS}
+        for name in ("potential", "circulatory"):
+            layers = getattr(one, name)
+            arrays[f"{name}_{number}"] = np.array(len(layers))
+            for index, (weights, biases) in enumerate(layers):
+                arrays |= {
+                    f"{name}_{number}_weights{index}": weights,
+                    f"{name}_{number}_biases{index}": biases,
+                }
     return arrays
 
 
-def unpack(arrays: dict[str, np.ndarray], run: int) -> TrainedNetworks:
-    """One of the runs that `pack` put side by side."""
-    potential, circulatory = json.loads(str(arrays["sizes"]))
+def unpack(arrays: Mapping[str, np.ndarray], number: int) -> TrainedNetworks:
+    """One of the networks that `pack` put side by side."""
 
-    def layers(name: str, count: int) -> tuple[Layer, ...]:
+    def layers(name: str) -> tuple[Layer, ...]:
+        stem = f"{name}_{number}"
         return tuple(
-            (arrays[f"{name}_weights{index}"][run], arrays[f"{name}_biases{index}"][run])
-            for index in range(count)
+            (arrays[f"{stem}_weights{index}"], arrays[f"{stem}_biases{index}"])
+            for index in range(int(arrays[stem]))
         )
 
-    own = {field.name for field in fields(TrainedNetworks)} - {"potential", "circulatory", "diffusion"}
-    return TrainedNetworks(
-        potential=layers("potential", potential),
-        circulatory=layers("circulatory", circulatory),
-        diffusion=arrays["diffusion"],
-        **{name: arrays[name][run] for name in own},
-    )
+    numbers = {name: arrays[f"{name}_{number}"] for name in _NUMBERS}
+    return TrainedNetworks(potential=layers("potential"), circulatory=layers("circulatory"), **numbers)
 
 
 def write_archive(path: str | Path, arrays: dict[str, np.ndarray]) -> None:

@@ -38,6 +38,8 @@ class RegressionOptions:
         Highest degree of the monomials of the library.
     potential_degree, circulatory_degree
         Lower limits for V and g, where wanted.
+    well_degree
+        Highest power about each attractor, where networks come by well.
     functions
         Further library functions, as formulas of the states.
     level
@@ -64,6 +66,7 @@ class RegressionOptions:
     degree: Annotated[int, Field(ge=1, le=12)] = 5
     potential_degree: Annotated[int, Field(ge=1)] | None = None
     circulatory_degree: Annotated[int, Field(ge=0)] | None = None
+    well_degree: Annotated[int, Field(ge=2, le=16)] = 10
     functions: tuple[str, ...] = ()
     level: Annotated[float, Field(gt=0)] | None = None
     threshold: Annotated[float, Field(ge=0)] = 0.01
@@ -120,8 +123,8 @@ class RegressionResult:
 
 
 def highest_used(potential: np.ndarray, *, level: float | None) -> float:
-    """τ: `level` above the smallest of the values of V; without one, above `LOWER_SHARE` of them."""
-    top = np.quantile(potential, LOWER_SHARE) if level is None else potential.min() + level
+    """τ: `level` above the smallest of the known values of V; without one, above `LOWER_SHARE` of them."""
+    top = np.nanquantile(potential, LOWER_SHARE) if level is None else np.nanmin(potential) + level
     return float(top)
 
 

@@ -21,6 +21,8 @@ import pandas as pd
 from siq.data.recordings import SnapshotPairs
 from siq.errors import InputError, NumericalFailure, needs_extra
 from siq.networks.decomposition import (
+    AnyNetworks,
+    NetworksByWell,
     TrainedNetworks,
     TrainingOptions,
     load_networks,
@@ -481,7 +483,7 @@ def _load_checkpoint(path: str | Path, *, fingerprint: str) -> TrainingState | N
         arrays = read_archive(path)
         if str(arrays["fingerprint"]) != fingerprint:
             return None
-        networks = side_by_side([unpack(arrays, run) for run in range(len(arrays["mean"]))])
+        networks = side_by_side([unpack(arrays, run) for run in range(int(arrays["count"]))])
         count = len(networks.parameters())
         history = pd.DataFrame(arrays["history"], columns=list(HISTORY))
         return TrainingState(
@@ -500,13 +502,16 @@ MOST_STEPS_BETWEEN_CHECKPOINTS = 1000  # steps between two checkpoints, at most
 
 
 class Check(Protocol):
-    """When the training of a run may end before its last step."""
+    """When the training of a run may end before its last step, and what takes the place of its networks."""
 
     def hopeless(self) -> str | None:
         """Why no training can pass, in words; None where one can."""
 
     def accepted(self, networks: TrainedNetworks) -> TrainedNetworks | None:
-        """The networks, or what they have led to, where they are good enough."""
+        """What the networks have led to; None where they are not good enough."""
+
+    def by_wells(self) -> NetworksByWell | None:
+        """What serves where no training has passed, found without the trained networks; None for nothing."""
 
 
 class Block:
@@ -543,8 +548,8 @@ class Block:
         self.data, self.checks, self.options = data, checks, options
         self.diffusion, self.seed = diffusion, seed
         self.folder, self.mark, self.device, self.faults = folder, mark, device, faults or {}
-        self.passed: dict[int, TrainedNetworks] = {}
-        self.last: dict[int, TrainedNetworks] = {}
+        self.passed: dict[int, AnyNetworks] = {}
+        self.last: dict[int, AnyNetworks] = {}
         self.failures: dict[int, str] = {}
         self.histories: list[pd.DataFrame] = []
 
@@ -554,13 +559,17 @@ class Block:
         return self.options.check.attempts if self.options.check is not None and self.checks else 1
 
     def train(self) -> None:
-        """All attempts, as far as they are needed."""
+        """All attempts, as far as they are needed; then, where none has passed, what needs no networks."""
         for attempt in range(self.attempts):
             # A first training needs every run; a further one, those whose check could yet pass.
             hopeful = [run for run in self.data if run in self.checks and self.checks[run].hopeless() is None]
             runs = [run for run in (hopeful if attempt else self.data) if run not in self.passed]
             if runs:
                 self._attempt(attempt, runs)
+        for run, check in self.checks.items():
+            if run not in self.passed and (found := check.by_wells()) is not None:
+                self.passed[run] = self.last[run] = found
+                self.failures.pop(run, None)
 
     def _checkpoint(self, name: str) -> Path | None:
         return None if self.folder is None else self.folder / f"kept-{self.mark[:12]}-{name}.npz"
@@ -580,7 +589,9 @@ class Block:
             state = start(data, options=options, diffusion=self.diffusion, seeds=seeds)
         kept = {run: self._checkpoint(f"attempt{attempt}-run{run}") for run in runs}
         # Networks that had passed the check before the job was killed.
-        early = {run: load_networks(file) for run, file in kept.items() if file is not None and file.exists()}
+        early: dict[int, AnyNetworks] = {
+            run: load_networks(file) for run, file in kept.items() if file is not None and file.exists()
+        }
 
         def finished(step: int, networks: Networks) -> bool:
             for position, run in enumerate(runs):

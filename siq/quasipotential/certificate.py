@@ -23,7 +23,9 @@ import numpy as np
 from siq.data.recordings import SnapshotPairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import AnyField, Verdict
+from siq.networks.decomposition import AnyNetworks
 from siq.numerics.randomness import representative_subset
+from siq.numerics.text import place_text
 from siq.quasipotential.certificate_tests import (
     ERROR_POINTS,
     LEVEL_SHARE,
@@ -32,9 +34,7 @@ from siq.quasipotential.certificate_tests import (
     STATED_SIGMAS,
     Candidate,
     CertificateOptions,
-    Function,
     Reference,
-    check_agreement,
     check_existence,
 )
 from siq.quasipotential.characteristics import SHEET_MARGIN, End, Fan, adapted_fan
@@ -48,7 +48,8 @@ from siq.systems.formulas import compile_formulas
 from siq.systems.phase_portrait import PhasePortrait, RecordedRegion
 
 INDEPENDENT = ("characteristics",)  # tests of V that share nothing with a fit of V but f and D
-ALONE = "only one of the two routes that the study names led to a formula"
+ALONE = "only one of the two routes that the study names led to V"
+COMPARED_POINTS = 100  # on which the error of networks is known to a tenth, and that is enough
 MIN_DIFFERENCE = 1e-6  # a difference of the routes that no error needs to explain
 MIN_CLAIMED_SHARE = 0.5  # of the states in a well: a formula that holds at fewer is none of it (a choice)
 
@@ -129,7 +130,7 @@ def certify(
     formulas: SymbolicDecomposition | Sequence[Well],
     evidence: Evidence,
     *,
-    others: Sequence[Well] = (),
+    networks: AnyNetworks | None = None,
     compared: bool = False,
     relative_error: float = 0.0,
 ) -> Certificate:
@@ -140,9 +141,8 @@ def certify(
     where it claims to hold, and it has to claim more than half of them. Where f is given nothing was
     recorded, and what tests predictions, motion, and whether uncertain wells exist has no object.
 
-    `others` are V about the attractors by the other route, and `compared` is whether both were asked for:
-    then a formula that only one of them found is refused. `relative_error` is the relative standard error of
-    a V of the region from the uncertainty of f.
+    Where networks are to be `compared`, their own V has to agree; without networks that is refused.
+    `relative_error` is the relative standard error of a V of the region from the uncertainty of f.
     """
     found, portrait, options, seed = evidence.found, evidence.portrait, evidence.options, evidence.seed
     wells = () if isinstance(formulas, SymbolicDecomposition) else tuple(formulas)
@@ -189,27 +189,12 @@ def certify(
     if not isinstance(found, Dynamics):
         if portrait.attractors:
             tests["existence"] = check_existence(found, portrait, seed=seed)
-        # Both routes share the error of f, and have the rest of their own. One that cannot be stated explains
-        # nothing of their difference.
-        compare: list[tuple[Function, Sequence[Well], Sequence[Well]]] = [
-            (one.values, [two], [one])
-            for one in others
-            for two in wells
-            if (one.attractor == two.attractor).all()
-        ]
-        if scope == "region" and others:
-            compare = [(candidates[0].values, others, others)]
-        if others and scope == "wells" and len(compare) < len(portrait.attractors):
-            tests["agreement"] = Verdict.refused("the network route found no formula for some well")
-        elif others:
-            agreement = []
-            for values, two, erring in compare:
-                its = max(_error_of_well(one, evidence) for one in erring)
-                limit = MIN_DIFFERENCE + min(error, options.error) + min(its, options.error)
-                agreement.append(check_agreement(values, two, limit=limit + 6 * relative_error))
-            tests["agreement"] = Verdict.worst(agreement)
-        elif compared:
+        if compared and networks is None:
             tests["agreement"] = Verdict.refused(ALONE)
+        elif compared and networks is not None:
+            tests["agreement"] = check_agreement(
+                networks, formulas, evidence, error=error + 3 * relative_error
+            )
         if found.prediction is not None:
             tests["prediction"] = found.prediction
     if (fault := portrait.fault()) is not None:
@@ -267,11 +252,54 @@ def _candidate_in_well(well: Well, evidence: Evidence) -> Candidate:
     )  # fmt: skip
 
 
-def _error_of_well(well: Well, evidence: Evidence) -> float:
-    """The error of V that is stated of a well, over the points of its fit."""
-    mine = [one for one in evidence.portrait.attractors if np.array_equal(one.position, well.attractor)]
-    candidate = Candidate(well.values, well.gradients, well.hessians, None, well.inside(LEVEL_SHARE), mine)
-    return candidate.stated_error(evidence.found, seed=evidence.seed)
+def check_agreement(
+    networks: AnyNetworks,
+    formulas: SymbolicDecomposition | Sequence[Well],
+    evidence: Evidence,
+    *,
+    error: float = 0.0,
+) -> Verdict:
+    """Whether the networks' own V is that of formulas about every attractor, up to a constant.
+
+    Formulas come from the identified f, networks from pairs of samples: all that they share are the
+    recordings. The figure is the largest relative L2 difference about any attractor, and its limit what the
+    error of the formulas and that of the networks explain, which their own residual leaves open. Networks of
+    which that is more than a certificate may state tell nothing, and are refused.
+    """
+    found, options = evidence.found, evidence.options
+    verdicts = []
+    for one in evidence.references:
+        attractor = one.attractor
+        potential: SymbolicDecomposition | Well | None
+        if isinstance(formulas, SymbolicDecomposition):
+            potential = formulas
+        else:
+            potential = next((each for each in formulas if np.array_equal(each.attractor, attractor)), None)
+        if potential is None:
+            continue
+        x, _ = one.below(potential.level if isinstance(potential, Well) else np.inf)
+        # Networks by well end little above its saddle, and one formula for all wells does not.
+        known = np.isfinite(networks.potential_at(x))
+        x = x[known]
+        if len(x) < MIN_POINTS or known.mean() <= MIN_CLAIMED_SHARE:
+            verdicts.append(Verdict.refused("too few points are known at which two routes could be compared"))
+            continue
+        about = [each for each in evidence.portrait.attractors if np.array_equal(each.position, attractor)]
+        some, slopes = x[:: max(len(x) // COMPARED_POINTS, 1)], networks.gradients_at
+        theirs = Candidate(networks.potential_at, slopes, slopes, None, some, about)
+        its = theirs.stated_error(found, seed=evidence.seed)
+        if not its <= options.error:
+            size = f"{its:.0%}" if np.isfinite(its) else "any size"
+            reason = f"the networks' V is no second route: its own residual leaves an error of {size} open"
+            return Verdict.refused(reason, options.error)
+        mine, other = (
+            values(x) - values(attractor[None]) for values in (potential.values, networks.potential_at)
+        )
+        difference = float(np.linalg.norm(mine - other) / np.linalg.norm(mine))
+        limit = MIN_DIFFERENCE + min(error, options.error) + its
+        worst = place_text(x[int(np.argmax(np.abs(mine - other)))])
+        verdicts.append(Verdict.of(difference, limit, f"the two routes disagree most at {worst}"))
+    return Verdict.worst(verdicts) if verdicts else Verdict.refused(ALONE)
 
 
 def _position_text(position: np.ndarray) -> str:

@@ -13,8 +13,8 @@ without it.
 `error`            the error that V's own residual leaves is small, and that from f small enough to be known
 `existence`        stable states and saddles stay where f is changed within its uncertainty
 `characteristics`  V is that which characteristics carry, within that error
-`agreement`        both routes give the same V within their errors. Networks that do not agree with the local
-                   route are trained again: a test of consistency, and no evidence from elsewhere
+`agreement`        the networks' own V is the same within the errors of both: two routes that share the
+                   recordings and nothing else
 `prediction`       f predicts held-out recordings, and its residuals are white
 `record`           held-out recordings hop, and are spread, as f and D say (`occupancy`). Only
                    where they show process noise and two states, and where they hop or should
@@ -44,7 +44,6 @@ from siq.inference.field_estimate import AnyField, FieldEstimate, Verdict, dynam
 from siq.numerics.randomness import normal_draws
 from siq.numerics.text import percent, place_text
 from siq.quasipotential.characteristics import ascending_integrals, fastest_rate
-from siq.quasipotential.wells import Well
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, hessian_at, measure_at
@@ -273,18 +272,6 @@ def _residual_integral(
         fewest_steps=MIN_PATH_STEPS,
     )  # fmt: skip
     return np.where(lost, np.inf, total[:, 0])
-
-
-def check_agreement(first: Function, wells: Sequence[Well], *, limit: float) -> Verdict:
-    """Whether V by another route is that of every well, up to a constant, by relative L2 differences."""
-    verdicts = []
-    for well in wells:
-        x = well.inside(LEVEL_SHARE)
-        one, two = first(x) - first(well.attractor[None]), well.values(x)
-        value = float(np.linalg.norm(one - two) / np.linalg.norm(two))
-        where = place_text(x[int(np.argmax(np.abs(one - two)))])
-        verdicts.append(Verdict.of(value, limit, f"the two routes disagree most at {where}"))
-    return Verdict.worst(verdicts)
 
 
 def _check_characteristics(

@@ -197,7 +197,7 @@ def _expression_from_data(data: Mapping[str, Any], symbols: Sequence[sympy.Symbo
     return PowerBasis.from_data(data, tuple(symbols)).expression(data["coefficients"])
 
 
-def decomposition_data(one: SymbolicDecomposition) -> dict[str, Any]:
+def _decomposition_data(one: SymbolicDecomposition) -> dict[str, Any]:
     """A decomposition as it stands in the file."""
     symbols = one.symbols
     data: dict[str, Any] = {
@@ -251,7 +251,7 @@ def write_model(
     symbols = next((one.symbols for one in decompositions.values()), ())
     model = {
         "states": [symbol.name for symbol in symbols],
-        "methods": {method: decomposition_data(one) for method, one in decompositions.items()},
+        "methods": {method: _decomposition_data(one) for method, one in decompositions.items()},
         "certificate": {method: dict(one) for method, one in certificates.items() if decompositions},
     }
     with whole_file(path) as partial:

@@ -124,6 +124,11 @@ class PowerBasis:
         """Number of functions, m."""
         return len(self.exponents)
 
+    @property
+    def title(self) -> str:
+        """The functions in words."""
+        return f"powers of degree {self.exponents.sum(axis=1).max()}"
+
     def values(self, x: np.ndarray) -> np.ndarray:
         """Points ``(n, d)`` to values ``(n, m)``."""
         return self._product(self._powers(x), ())
@@ -261,6 +266,7 @@ class HamiltonJacobi:
         finest: float,
         steps: int,
         orthonormal: bool = False,
+        damping: float = 0.0,
     ) -> np.ndarray:
         """Coefficients by Gauss–Newton with weights that fall with the square of the residual (Cauchy's).
 
@@ -269,7 +275,7 @@ class HamiltonJacobi:
 
         Of the coefficients ``(m,)`` to start from those change that are `free`, a mask. Weights are made so
         many `rounds`, with at most so many `steps` each. If `orthonormal`, combinations of functions are
-        fitted that are orthonormal over the points.
+        fitted that are orthonormal over the points. `damping` is that of `gauss_newton`.
         """
         equation, theta, moving = self, start, free
         if orthonormal:
@@ -281,7 +287,7 @@ class HamiltonJacobi:
             rest = equation.relative_residuals(theta)
             scale = max(OUTLIER_SCALE * float(np.median(rest)), finest)
             weighted = replace(equation, weight=equation.weight / np.sqrt(1 + (rest / scale) ** 2))
-            theta, _ = weighted.gauss_newton(theta, free=moving, steps=steps)
+            theta, _ = weighted.gauss_newton(theta, free=moving, steps=steps, damping=damping)
         return np.asarray(turned @ theta) if orthonormal else theta
 
     def gauss_newton(
@@ -291,6 +297,7 @@ class HamiltonJacobi:
         free: np.ndarray | None = None,
         steps: int = 60,
         tolerance: float = 1e-13,
+        damping: float = 0.0,
     ) -> tuple[np.ndarray, float]:
         """Coefficients with the least squares of the residual, relative to the size of ∇V; and what is left.
 
@@ -298,7 +305,8 @@ class HamiltonJacobi:
         the root mean square of the weighted one over that of ∇V; infinite for V = 0, or all but 0.
 
         Of the coefficients ``(m,)`` to start from those change that are `free`, a mask, by default all, until
-        their relative change is below the tolerance.
+        their relative change is below the tolerance. Levenberg's damping, a share of the
+        diagonal, keeps functions small that the points hardly tell apart.
         """
         coefficients = start.copy()
         free = np.ones(len(start), dtype=bool) if free is None else free
@@ -320,7 +328,9 @@ class HamiltonJacobi:
             matrix = jacobian / (size * scale[free])
             step = None
             try:  # the normal equations, ten times as fast, where they do: the next step corrects this one
-                factor, lower = scipy.linalg.cho_factor(matrix.T @ matrix, check_finite=False)
+                normal = matrix.T @ matrix
+                normal[np.diag_indices_from(normal)] *= 1 + damping
+                factor, lower = scipy.linalg.cho_factor(normal, check_finite=False)
                 diagonal = np.diag(factor)
                 if diagonal.min() > DIAGONAL_RATIO * diagonal.max():
                     right = matrix.T @ -residual
@@ -365,7 +375,7 @@ def _orthonormalised(equation: HamiltonJacobi, free: np.ndarray) -> tuple[Hamilt
     stacked = np.einsum("nij,nim->njm", roots, equation.gradients[:, :, free], optimize=True)
     scale = positive(np.sqrt((stacked**2).sum(axis=(0, 1))))
     upper = np.linalg.qr((stacked / scale).reshape(-1, stacked.shape[2]), mode="r")
-    _, sizes, right = np.linalg.svd(upper)
+    _, sizes, right = np.linalg.svd(upper, full_matrices=False)
     determined = sizes > SINGULAR_RATIO * sizes[0]
     combined = right[determined].T / sizes[determined] / scale[:, None] * np.sqrt(len(equation.points))
     m, k, stay = len(free), int(determined.sum()), np.flatnonzero(~free)

@@ -11,24 +11,37 @@ Neither the Hessian of V at the attractors nor an f that is identified elsewhere
 branch is the right one is asked where f comes to rest: about an attractor A the quasipotential has
 ``∂f(A) + 2D ∂²V(A)`` with the eigenvalues of ``-∂f(A)ᵀ``, so that paths of least action leave it. On a false
 branch, where V is flat along a direction, some of them do not.
+
+Where V has a kink between wells no single set of weights follows it, and no training leads to one. V is then
+solved for about each attractor, without trained networks: Newton's method on the residual is policy iteration
+(Kleinman 1968, IEEE Trans. Autom. Control 13), and from any multiple of ``|x - A|²`` from which all paths of
+least action leave A it leads to the right branch. The well grows outwards as in the local route
+(`siq.quasipotential.wells`). The identified f tells which states lead to which attractor, and nothing else.
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-import scipy.linalg
 
 from siq.data.recordings import SnapshotPairs
-from siq.networks.decomposition import TrainedNetworks
+from siq.errors import NumericalFailure
+from siq.inference.field_estimate import FieldEstimate
+from siq.networks.decomposition import NetworksByWell, TrainedNetworks
 from siq.numerics.integration import runge_kutta_step
-from siq.quasipotential.hamilton_jacobi import HamiltonJacobi
+from siq.quasipotential.certificate_tests import LEVEL_SHARE
+from siq.quasipotential.hamilton_jacobi import HamiltonJacobi, PowerBasis
+from siq.quasipotential.landscape import heights_of_attractors
+from siq.quasipotential.wells import Well, grown
 from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import find_equilibria
+from siq.systems.phase_portrait import PhasePortrait, evenly_spread, phase_portrait
 
 if TYPE_CHECKING:  # needs torch, which the mathematics does without
     from siq.networks.training import TrainingData
@@ -38,6 +51,9 @@ logger = logging.getLogger(__name__)
 SPREADS = (0.1, 0.2, 0.4, 0.8)  # of the units' weights on normalised states; the held-out pairs choose
 CORRECTIONS = 3  # of f for the integrator's error; each gains about two digits
 SINGULAR_RATIO = 1e-12  # damping of least squares: combinations of units that the points leave open
+# With noise in the pairs, which the error on held-out pairs shows, all of them take part, and damping counts.
+NOISY_ERROR = 0.01  # held-out error of f, relative to the mean velocities
+DAMPINGS = (1e-5, 1e-4, 1e-3)
 SLOW_SHARE = 0.04  # of the points, by their speed: below it residuals are not divided by the speed alone
 RIDGE = 1e-8  # of the mean square gradient of a unit: how far the start may be from the networks' own V
 POINTS_PER_UNIT = 10  # representative pairs that are used, at most
@@ -45,9 +61,22 @@ STARTS = 100  # points, the slowest among them, from which fixed points of f are
 # Measured on the paper's archetypal system in three dimensions, in 50 runs and some trials before them.
 STEPS = 25  # of Gauss–Newton; a right start takes about ten
 MAX_RESIDUAL = 1e-3  # median of |∇V·(f + D∇V)|/(|∇V||f|): about 1e-5 on the right branch
+MAX_START_RESIDUAL = 0.1  # the same, above which no other units would help: the start leads nowhere
 # Of the slowest rate of approach, how fast paths of least action leave: 1 on the right branch, -1 where V is
 # flat along that direction, and in between a choice.
 ESCAPE_SHARE = 0.5
+
+
+WELL_SPREAD = 1.0  # of the units of a well, on states divided by `WELL_SCALE`
+WELL_SCALE = 0.6  # of the distance of the nearest saddle
+WELL_FIT: dict[str, Any] = {"rounds": 4, "finest": 1e-5, "steps": 8}
+WELL_DAMPING = 1e-7  # of Gauss–Newton: keeps V from running away outside the points of a fit
+WELL_REACH = 1.1  # of the level of a well: V beyond its saddle counts up to there
+MAX_WELL_RESIDUAL = (
+    0.01  # the same of a well below `LEVEL_SHARE` of its level: caustics begin near its saddle
+)
+STATES_PER_UNIT = 5  # in a well, at least: with fewer there are fewer units
+STEEPER = 1.2  # a paraboloid, until all paths leave the attractor
 
 
 @dataclass(frozen=True)
@@ -58,18 +87,33 @@ class UnitBasis:
     ----------
     weights, biases
         W and b, shapes ``(d, units)`` and ``(units,)``.
-    mean, scale
+    center, scale
         μ and σ, shape ``(d,)``.
     """
 
     weights: np.ndarray
     biases: np.ndarray
-    mean: np.ndarray
+    center: np.ndarray
     scale: np.ndarray
 
     def hidden(self, x: np.ndarray) -> np.ndarray:
         """The units alone, shape ``(n, units)``."""
         return np.tanh(self._normalised(x) @ self.weights + self.biases)
+
+    @property
+    def size(self) -> int:
+        """Number of functions, the units and the square."""
+        return len(self.biases) + 1
+
+    @property
+    def title(self) -> str:
+        """The functions in words."""
+        return f"{len(self.biases)} random units"
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """Points ``(n, d)`` to functions ``(n, m)``, each of which is zero at μ."""
+        square = (self._normalised(x) ** 2).sum(axis=1)
+        return np.column_stack([self.hidden(x) - np.tanh(self.biases), square])
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
         """Points ``(n, d)`` to gradients ``(n, d, m)``."""
@@ -88,7 +132,7 @@ class UnitBasis:
         return np.column_stack([self.hidden(x), np.ones(len(x)), self._normalised(x)])
 
     def _normalised(self, x: np.ndarray) -> np.ndarray:
-        return (x - self.mean) / self.scale
+        return (x - self.center) / self.scale
 
 
 class OutputWeights:
@@ -104,6 +148,8 @@ class OutputWeights:
         Number of units.
     generator
         Draws the units, and the points where there are too many.
+    found
+        The identified f, which tells the wells apart where they are solved for one by one; None for none.
     """
 
     def __init__(
@@ -113,8 +159,9 @@ class OutputWeights:
         diffusion: Diffusion,
         units: int,
         generator: np.random.Generator,
+        found: FieldEstimate | None = None,
     ) -> None:
-        self.diffusion = diffusion
+        self.diffusion, self.units, self.generator, self.found = diffusion, units, generator, found
         most = POINTS_PER_UNIT * units
         pairs, others = (
             part
@@ -122,25 +169,64 @@ class OutputWeights:
             else part.take(np.sort(generator.choice(len(part.h), most, replace=False)))
             for part in (data.representative, data.held_out)
         )
-        mean, scale = pairs.x0.mean(axis=0), pairs.x0.std(axis=0)
-        weights = generator.normal(size=(len(mean), units))
-        biases = generator.uniform(-2, 2, units)
-        observed, self.field_error = (others.xh - others.x0) / others.h[:, None], np.inf
-        for spread in SPREADS:
-            basis = UnitBasis(spread * weights, spread * biases, mean, scale)
-            coefficients = _field_coefficients(basis, pairs)
-            rest = observed - _mean_velocity(basis, coefficients, others.x0, others.h)
-            error = float(np.sqrt((rest**2).sum() / (observed**2).sum()))
-            logger.info("units spread by %g: held-out error of f %.1e", spread, error)
-            if error < self.field_error:
-                self.field_error, self.basis, self.coefficients = error, basis, coefficients
         self.points = pairs.x0
-        flow = self.drift(self.points)
-        self.squared_speed = diffusion.squared_speed(self.points, flow)
-        # Where f vanishes so does what is divided by its speed; about fixed points everything counts alike.
-        weight = 1 / (self.squared_speed + np.quantile(self.squared_speed, SLOW_SHARE))
-        gradients = self.basis.gradients(self.points)
-        self._equation = HamiltonJacobi(self.points, gradients, flow, diffusion, weight, diffusion)
+        weights = generator.normal(size=(self.points.shape[1], units))
+        biases = generator.uniform(-2, 2, units)
+        mean, width = self.points.mean(axis=0), self.points.std(axis=0)
+        bases = [UnitBasis(one * weights, one * biases, mean, width) for one in SPREADS]
+        # Pairs without noise take the integrator at its word, and those of even points are enough.
+        self._fit_field(bases, pairs, others, (SINGULAR_RATIO,))
+        if self.field_error > NOISY_ERROR:
+            self._fit_field(bases, data.training, data.held_out, DAMPINGS)
+        # V is sought over the units that suit f; if they follow it badly, over those of another spread.
+        self._bases = [self.basis, *(one for one in bases if one is not self.basis)]
+        self._flow = self.drift(self.points)
+        self.squared_speed = diffusion.squared_speed(self.points, self._flow)
+
+    def _fit_field(
+        self,
+        bases: Sequence[UnitBasis],
+        pairs: SnapshotPairs,
+        held_out: SnapshotPairs,
+        dampings: Sequence[float],
+    ) -> None:
+        """f over the units, and with the damping, that suit held-out pairs best, and how uncertain it is."""
+        velocity, observed = ((each.xh - each.x0) / each.h[:, None] for each in (pairs, held_out))
+        noisy, self.field_error = len(dampings) > 1, np.inf
+
+        def corrected(
+            basis: UnitBasis, problem: _LeastSquares, coefficients: np.ndarray, damping: float
+        ) -> np.ndarray:
+            """Coefficients after deferred corrections of what the integrator is off by."""
+            for _ in range(CORRECTIONS):
+                rest = velocity - _mean_velocity(basis, coefficients, pairs.x0, pairs.h)
+                coefficients = coefficients + problem.solve(rest, damping)
+            return coefficients
+
+        for basis in bases:
+            problem = _LeastSquares(basis.design(pairs.x0))
+            for damping in dampings:
+                coefficients = problem.solve(velocity, damping)
+                if noisy:  # what the integrator is off by is the same for all, and small beside the noise
+                    rest = observed - basis.design(held_out.x0) @ coefficients
+                else:
+                    coefficients = corrected(basis, problem, coefficients, damping)
+                    rest = observed - _mean_velocity(basis, coefficients, held_out.x0, held_out.h)
+                error = float(np.sqrt((rest**2).sum() / (observed**2).sum()))
+                logger.info("damped by %g: held-out error of f %.2e", damping, error)
+                if error < self.field_error:
+                    self.field_error, self.basis, self.coefficients = error, basis, coefficients
+                    best, unexplained = (problem, damping), rest
+        if noisy:
+            self.coefficients = corrected(self.basis, best[0], self.coefficients, best[1])
+        # The standard error of f at the points, of independent errors in the velocities, as a share of f.
+        design = self.basis.design(self.points)
+        spread = (best[0].spread(design, best[1]) ** 2).sum(axis=1).mean()
+        share = (
+            spread * (unexplained**2).mean(axis=0).sum() / (self.drift(self.points) ** 2).sum(axis=1).mean()
+        )
+        self.uncertainty = float(np.sqrt(share))
+        logger.info("f is uncertain by %.1e of itself", self.uncertainty)
 
     def drift(self, x: np.ndarray) -> np.ndarray:
         """f at points ``(n, d)``, shape ``(n, d)``."""
@@ -156,13 +242,13 @@ class OutputWeights:
         """Why no networks can lead to a solution, in words; None where they can."""
         if not self.field_error < 1:
             return (
-                "f over random units is as far from the held-out pairs as no f at all;"
-                " record with less noise, or leave out training.output_weights"
+                "f over random units is as far from the held-out pairs as no f at all; record with less"
+                " noise, or write 'training: {check: null}'"
             )
         if not self._attractors:
             return (
                 "f over random units comes to rest nowhere within the recorded states, so that the branch of"
-                " V cannot be tested; leave out training.output_weights"
+                " V cannot be tested; write 'training: {check: null}'"
             )
         return None
 
@@ -170,50 +256,154 @@ class OutputWeights:
         """Networks with the output weights solved for; None where they lead to a false branch, or cannot."""
         if self.hopeless() is not None:
             return None
-        basis, equation = self.basis, self._equation
-        n, d, m = equation.gradients.shape
-        # V over the units as the networks have it, by its gradient; |y|² keeps the weight that it has there.
-        flat = equation.gradients.reshape(n * d, m)
         _, circulatory, vector_field = networks.evaluate(self.points)
         slopes = (circulatory - vector_field) @ self.diffusion.precision
-        steepness = float(networks.potential_scale[0, 0])
-        units, rest = flat[:, :-1], slopes.ravel() - steepness * flat[:, -1]
-        start = np.linalg.solve(units.T @ units + RIDGE * n * np.eye(m - 1), units.T @ rest)
-        weights = equation.robust_fit(
-            np.append(start, steepness), np.arange(m) < m - 1,
-            rounds=1, finest=np.inf, steps=STEPS, orthonormal=True,
-        )  # fmt: skip
-        unweighted = replace(equation, weight=1 / np.sqrt(self.squared_speed))
-        residual = float(np.median(unweighted.relative_residuals(weights)))
-        logger.info("output weights: median Hamilton–Jacobi residual %.1e", residual)
-        if not (residual < MAX_RESIDUAL and self._right_branch(weights)):
+        if not np.isfinite(slopes).all():  # of a training that was lost
             return None
-        circulatory = equation.flow + self.diffusion.push(self.points, equation.slopes(weights))
-        of_g = _LeastSquares(basis.design(self.points)[:, :m]).solve(circulatory)
+        steepness = float(networks.potential_scale[0, 0])
+        for basis in self._bases:
+            # V over the units as the networks have it, by its gradient; |y|² keeps the weight that it has.
+            equation = self._equation(basis)
+            n, d, m = equation.gradients.shape
+            flat = equation.gradients.reshape(n * d, m)
+            units, rest = flat[:, :-1], slopes.ravel() - steepness * flat[:, -1]
+            start = np.linalg.solve(units.T @ units + RIDGE * n * np.eye(m - 1), units.T @ rest)
+            weights = equation.robust_fit(
+                np.append(start, steepness), np.arange(m) < m - 1,
+                rounds=1, finest=np.inf, steps=STEPS, orthonormal=True,
+            )  # fmt: skip
+            unweighted = replace(equation, weight=1 / np.sqrt(self.squared_speed))
+            residual = float(np.median(unweighted.relative_residuals(weights)))
+            logger.info("output weights: median Hamilton–Jacobi residual %.1e", residual)
+            if not residual < MAX_START_RESIDUAL:
+                return None
+            if residual < max(MAX_RESIDUAL, self.uncertainty):
+                leaving = all(self._leaves(one, basis, weights) for one in self._attractors)
+                return self._networks(basis, weights, self.points) if leaving else None
+        return None
+
+    def _equation(self, basis: UnitBasis) -> HamiltonJacobi:
+        # Where f vanishes so does what is divided by its speed; about fixed points everything counts alike.
+        weight = 1 / (self.squared_speed + np.quantile(self.squared_speed, SLOW_SHARE))
+        gradients = basis.gradients(self.points)
+        return HamiltonJacobi(self.points, gradients, self._flow, self.diffusion, weight, self.diffusion)
+
+    def by_wells(self) -> NetworksByWell | None:
+        """Networks about each attractor of the identified f; None where some well has no solution."""
+        if self.found is None or self.hopeless() is not None:
+            return None
+        states = self.points[evenly_spread(self.points, generator=self.generator)]
+        portrait = phase_portrait(self.found.dynamics, states)
+        count = len(portrait.attractors)
+        if portrait.fault() is not None or not count:
+            return None
+        wells, barriers = list[Well](), np.full((count, count), np.inf)
+        for index in range(count):
+            try:
+                well = self._well(portrait, index)
+            except NumericalFailure as failure:
+                logger.info("%s", failure)
+                return None
+            attractor, saddles = portrait.attractors[index].position, portrait.saddles[index]
+            x = well.inside(LEVEL_SHARE)
+            residual = float(np.median(well.residual_at(x))) if len(x) else np.inf
+            logger.info("about %s: V up to %.4g, residual %.1e", attractor, well.level, residual)
+            if not (
+                residual < max(MAX_WELL_RESIDUAL, self.uncertainty)
+                and self._leaves(attractor, cast(UnitBasis, well.basis), well.coefficients)
+            ):
+                return None
+            wells.append(well)
+            for other in range(count):
+                tops = [
+                    one.position for one in saddles if any(one is each for each in portrait.saddles[other])
+                ]
+                if other != index and tops:
+                    barriers[index, other] = well.values(np.array(tops)).min()
+        parts = [
+            self._networks(cast(UnitBasis, well.basis), well.coefficients, well.points) for well in wells
+        ]
+        try:
+            heights = heights_of_attractors(barriers)
+        except NumericalFailure:  # wells that no saddle connects stand side by side
+            heights = np.zeros(count)
+        inside = [one.points(np.arange(len(one.chosen))) for one in portrait.basins]
+        known = [
+            np.where(well.reaches(x), index, NetworksByWell.NOWHERE)
+            for index, (well, x) in enumerate(zip(wells, inside, strict=True))
+        ]
+        return NetworksByWell(tuple(parts), heights, np.concatenate(inside), np.concatenate(known))
+
+    def _well(self, portrait: PhasePortrait, index: int) -> Well:
+        """V about an attractor over units of its own, grown from the square ``|y|²`` of offsets from it."""
+        attractor, basin = portrait.attractors[index].position, portrait.basins[index]
+        saddles, width = portrait.saddles[index], np.ptp(portrait.box, axis=1)
+        flat, shape = basin.states.reshape(-1, len(attractor)), basin.states.shape[:2]
+        tops = [one.position for one in saddles]
+        places = np.array(tops) if tops else basin.states[:, 0]
+        distance = np.linalg.norm((places - attractor) / width, axis=1)
+        scale = WELL_SCALE * (distance.min() if tops else np.median(distance)) * width
+        units = min(self.units, len(basin.chosen) // STATES_PER_UNIT)
+        basis = UnitBasis(
+            WELL_SPREAD * self.generator.normal(size=(len(attractor), units)),
+            WELL_SPREAD * self.generator.uniform(-2, 2, units),
+            attractor,
+            scale,
+        )
+        coefficients = np.zeros(basis.size)
+        slope = self.jacobian(attractor[None])[0]
+        square = 2 * self.diffusion.matrix @ np.diag(2 / scale**2)
+        approach = -np.linalg.eigvals(slope).real.max()
+        coefficients[-1] = approach / np.linalg.eigvals(square).real.max()
+        while np.linalg.eigvals(slope + coefficients[-1] * square).real.min() < approach:
+            coefficients[-1] *= STEEPER
+        values = (basis.values(flat) @ coefficients).reshape(shape)
+        heights = np.sort(basin.highest(values)[tuple(basin.chosen.T)])
+        free = np.arange(basis.size) < basis.size - 1
+        # What a well is grown with has the methods that these types are asked for.
+        field, functions = cast(Dynamics, self), cast(PowerBasis, basis)
+        well = grown(
+            field, basin, saddles, functions, coefficients,
+            free=free, metric=np.diag(2 * coefficients[-1] / scale**2),
+            level=float(heights[min(3 * basis.size, len(heights) - 1)]),
+            fitted=np.zeros(0, dtype=int), generator=self.generator, damping=WELL_DAMPING,
+        )  # fmt: skip
+        # About its saddle V is hardly smooth; in the well this counts for less.
+        equation = HamiltonJacobi.at(functions, well.points, field, attractor=attractor)
+        coefficients = equation.robust_fit(well.coefficients, free, damping=WELL_DAMPING, **WELL_FIT)
+        level = well.level
+        if well.saddle is not None:
+            level = float(basis.values(well.saddle[None])[0] @ coefficients)
+        return replace(well, coefficients=coefficients, level=level, reach=WELL_REACH * level)
+
+    def _networks(self, basis: UnitBasis, weights: np.ndarray, points: np.ndarray) -> TrainedNetworks:
+        """V over units as a network, with one for g of the same units, fitted at points."""
+        steepness, flow = float(weights[-1]), self.drift(points)
+        circulatory = flow + self.diffusion.push(points, basis.gradients(points) @ weights)
+        functions = np.column_stack([basis.hidden(points), np.ones(len(points))])
+        of_g = _LeastSquares(functions).solve(circulatory)
         layers = (basis.weights, basis.biases[None])
+        lowest = -(np.tanh(basis.biases) @ weights[:-1]) / steepness  # V is zero at μ
         return TrainedNetworks(
-            potential=(layers, (weights[:-1, None] / steepness, np.zeros((1, 1)))),
+            potential=(layers, (weights[:-1, None] / steepness, np.full((1, 1), lowest))),
             circulatory=(layers, (of_g[:-1], of_g[-1:])),
-            mean=basis.mean[None],
+            mean=basis.center[None],
             scale=basis.scale[None],
             potential_scale=np.array([[steepness]]),
             circulatory_scale=np.ones((1, 1)),
             diffusion=self.diffusion.matrix,
         )
 
-    def _right_branch(self, weights: np.ndarray) -> bool:
-        """Whether paths of least action leave every fixed point at which f comes to rest."""
-        for attractor in self._attractors:
-            slope = self.jacobian(attractor[None])[0]
-            curvature = self.basis.hessians(attractor[None])[0] @ weights
-            leaving = np.linalg.eigvals(slope + 2 * self.diffusion.matrix @ curvature).real.min()
-            approach = -np.linalg.eigvals(slope).real.max()
-            logger.info(
-                "about %s paths leave at rates of %.2g, f approaches at %.2g", attractor, leaving, approach
-            )
-            if leaving < ESCAPE_SHARE * approach:
-                return False
-        return True
+    def _leaves(self, attractor: np.ndarray, basis: UnitBasis, weights: np.ndarray) -> bool:
+        """Whether paths of least action leave an attractor at which f comes to rest."""
+        slope = self.jacobian(attractor[None])[0]
+        curvature = basis.hessians(attractor[None])[0] @ weights
+        leaving = float(np.linalg.eigvals(slope + 2 * self.diffusion.matrix @ curvature).real.min())
+        approach = -float(np.linalg.eigvals(slope).real.max())
+        logger.info(
+            "about %s paths leave at rates of %.2g, f approaches at %.2g", attractor, leaving, approach
+        )
+        return leaving >= ESCAPE_SHARE * approach
 
     @cached_property
     def _attractors(self) -> list[np.ndarray]:
@@ -224,30 +414,50 @@ class OutputWeights:
         return [one.position for one in found if one.kind == "attractor"]
 
 
+def formulas_by_well(networks: NetworksByWell, dynamics: Dynamics, *, degree: int) -> tuple[Well, ...]:
+    """V of networks in powers about each attractor, up to a degree, by least squares.
+
+    Nothing is refined: the formulas are as good as the networks. `dynamics` has the symbols, and the f and D
+    of which a residual would be.
+    """
+    wells = []
+    for index, (part, rows) in enumerate(
+        zip(networks.parts, networks.of_wells(networks.states), strict=True)
+    ):
+        x, attractor = networks.states[rows], part.mean[0]
+        values = part.potential_at(x)
+        scale = np.abs(x - attractor).max(axis=0)
+        basis = PowerBasis.up_to(degree, dynamics.symbols, attractor, scale)
+        coefficients = np.linalg.lstsq(basis.values(x), values, rcond=None)[0]
+        level = float(values.max()) / WELL_REACH
+        misfit = float(np.linalg.norm(basis.values(x) @ coefficients - values) / np.linalg.norm(values))
+        logger.info("well %d: powers up to %d miss the networks by %.1e", index, degree, misfit)
+        wells.append(Well(basis, coefficients, dynamics, attractor, level, None, misfit, x))
+    return tuple(wells)
+
+
 class _LeastSquares:
     """Least squares with one matrix ``(n, m)`` and many right-hand sides, damped where it is singular."""
 
     def __init__(self, matrix: np.ndarray) -> None:
-        self.rows, columns = matrix.shape
-        damping = SINGULAR_RATIO * np.linalg.norm(matrix)
-        self.q, self.r = np.linalg.qr(np.vstack([matrix, damping * np.eye(columns)]))
+        self.q, upper = np.linalg.qr(matrix)
+        self.left, self.sizes, self.right = np.linalg.svd(upper, full_matrices=False)
 
-    def solve(self, right: np.ndarray) -> np.ndarray:
-        """Coefficients ``(m, s)`` of right-hand sides ``(n, s)``."""
-        return np.asarray(scipy.linalg.solve_triangular(self.r, self.q[: self.rows].T @ right))
+    def solve(self, right: np.ndarray, damping: float = SINGULAR_RATIO) -> np.ndarray:
+        """Coefficients ``(m, s)`` of right-hand sides ``(n, s)``; damping is a share of the largest size."""
+        return self._inverse(damping) @ (self.q.T @ right)
 
+    def spread(self, rows: np.ndarray, damping: float) -> np.ndarray:
+        """``rows @ B``, where B turns independent errors of variance one in the data into coefficients."""
+        return rows @ self._inverse(damping)
 
-def _field_coefficients(basis: UnitBasis, pairs: SnapshotPairs) -> np.ndarray:
-    """C of ``f = design(x) C``, from mean velocities of pairs; then from what the integrator is off by."""
-    problem = _LeastSquares(basis.design(pairs.x0))
-    velocity = (pairs.xh - pairs.x0) / pairs.h[:, None]
-    coefficients = problem.solve(velocity)
-    for _ in range(CORRECTIONS):
-        rest = velocity - _mean_velocity(basis, coefficients, pairs.x0, pairs.h)
-        coefficients = coefficients + problem.solve(rest)
-    return coefficients
+    def _inverse(self, damping: float) -> np.ndarray:
+        factors = self.sizes / (self.sizes**2 + (damping * self.sizes[0]) ** 2)
+        return np.asarray((self.right.T * factors) @ self.left.T)
 
 
 def _mean_velocity(basis: UnitBasis, coefficients: np.ndarray, x0: np.ndarray, h: np.ndarray) -> np.ndarray:
     """(Φ_h(x0) - x0)/h by one step of the classical Runge–Kutta rule, shape ``(n, d)``."""
-    return (runge_kutta_step(lambda x: (basis.design(x.T) @ coefficients).T, x0.T, h).T - x0) / h[:, None]
+    with np.errstate(all="ignore"):  # f that was fitted to noise, undamped, may lead anywhere
+        reached = runge_kutta_step(lambda x: (basis.design(x.T) @ coefficients).T, x0.T, h).T
+    return (reached - x0) / h[:, None]

@@ -1,22 +1,16 @@
-"""Refinement: V by both routes, from the identified f and the recorded states, with its certificate.
+"""Refinement: V from the identified f and the recorded states, with its certificate.
 
-Two routes lead to V. They share f, the recorded points and Gauss–Newton; and by `training_check` networks are
-trained until they agree with the local route, so that their agreement is no evidence from elsewhere. The
-*network route* starts from the networks and seeks one formula for the whole recorded region; where no single
-formula can hold, since V has a kink between its wells, it takes each well for itself. The *local route* grows
-V from each attractor, and needs no network. Whether to believe either is decided by
-`siq.quasipotential.certificate`, and a control says what the same refinement makes of a network with its
-weights in random order.
-
-The check of a training does in small what will be done in earnest afterwards: V_θ is written in powers,
-refined on the Hamilton–Jacobi equation of the identified f, and compared with the local route. Whatever
-passes was thereby selected for agreement: that of a certificate is a test of consistency alone.
+V is grown from each attractor of the identified f, and one formula is sought for the whole recorded region.
+Networks take no part: where there are some, they are a second route to V, which shares with this one the
+recordings and nothing else. The certificate compares their own V with the refined one, within the errors of
+both (`siq.quasipotential.certificate`). A control says what becomes of that comparison when the weights of
+the networks are put in random order.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, Any, Literal
@@ -27,18 +21,18 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import FieldEstimate, Verdict
+from siq.inference.field_estimate import FieldEstimate
 from siq.inference.kalman_identification import filtered_recordings
 from siq.inference.library import CandidateLibrary, joint_library
 from siq.inference.regression import coarse_pairs
-from siq.networks.decomposition import CheckOptions, TrainedNetworks, shuffled
+from siq.networks.decomposition import AnyNetworks, shuffled
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.certificate import (
-    MIN_DIFFERENCE,
     Certificate,
     Evidence,
     caustics_below,
     certify,
+    check_agreement,
     references_about,
     uncertified,
 )
@@ -46,30 +40,23 @@ from siq.quasipotential.certificate_tests import (
     MAX_PAIRS,
     MIN_POINTS,
     CertificateOptions,
-    Function,
-    Reference,
-    check_agreement,
 )
 from siq.quasipotential.formulas import (
     SymbolicDecomposition,
     decomposition_from_coefficients,
-    term_coefficients,
 )
 from siq.quasipotential.global_formula import GlobalFormula, fit_values, refine_globally, with_circulation
-from siq.quasipotential.hamilton_jacobi import LibraryBasis, affordable_degree
+from siq.quasipotential.hamilton_jacobi import affordable_degree
 from siq.quasipotential.occupancy import OccupancyCheck, check_occupancy
 from siq.quasipotential.rates import NoiseStrength
-from siq.quasipotential.wells import MIN_OUTLIER_RESIDUAL, RESIDUAL_TOLERANCE, Well, fit_well, local_well
-from siq.remarks import Remark, sentence
+from siq.quasipotential.wells import MIN_OUTLIER_RESIDUAL, RESIDUAL_TOLERANCE, Well, local_well
+from siq.remarks import Remark
 from siq.systems.phase_portrait import PhasePortrait, RecordedRegion, evenly_spread, phase_portrait
 
 logger = logging.getLogger(__name__)
 
 Route = Literal["network", "local"]
 Degree = Annotated[int, Field(ge=2, le=16)]
-
-LOWER_PARTS = (0.7, 0.5, 0.3)  # of the points, by V
-NETWORK_DEGREE = 8  # highest power of a well by the network route, whose start knows no more
 
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -87,8 +74,8 @@ class RefinementOptions:
     tolerance
         Largest relative Hamilton–Jacobi residual at a point where a formula is believed.
     routes
-        ``network``, ``local``, or both, which are then compared with each other. By default both where
-        networks are asked for, and otherwise the local one; see `with_routes`.
+        V always comes from the ``local`` one. With ``network`` that of the networks has to agree with it, or
+        no formula is certified; so it is by default where networks are asked for, see `with_routes`.
     formula_degree
         Highest power of one formula for the whole region; by default what the identified f allows: one
         more than that of f, and at least four.
@@ -121,11 +108,10 @@ class RefinementOptions:
 
 @dataclass(frozen=True)
 class Refined:
-    """The V of both routes."""
+    """V about the attractors and over the region."""
 
-    found: FieldEstimate  #: over the functions of a formula for the region, those of f and of V
-    wells: tuple[Well, ...]  #: by the local route, one for each attractor
-    network_wells: tuple[Well, ...] = ()  #: by the network route, where it found no formula for the region
+    found: FieldEstimate  #: over the functions of a formula for the region: those of f and of V together
+    wells: tuple[Well, ...]  #: one for each attractor
     remarks: tuple[Remark, ...] = ()  #: what could not be done
     formula: GlobalFormula | None = None  #: V and g where one formula holds over the whole region
 
@@ -147,59 +133,27 @@ def refine(
     found: FieldEstimate,
     portrait: PhasePortrait,
     *,
-    formula: np.ndarray | None,
-    network: Function | None,
     points: np.ndarray,
     options: RefinementOptions,
     seed: int = 0,
 ) -> Refined:
-    """Follow the routes that the options name.
+    """V about each attractor, and one formula over the recorded states ``(n, d)`` where one holds.
 
-    The network route starts from `formula`, the regression's coefficients of V over the library of the
-    formula, shape ``(q,)``, and where that leads nowhere from `network`, V_θ at points. One formula is sought
-    over the recorded states `points`, shape ``(n, d)``. The seed decides which points are used where there
-    are too many.
+    The seed decides which points are used where there are too many.
     """
-    routes = options.with_routes(networks=network is not None).routes or ()
     library = _formula_library(found, options)
     found = _over_library(found, library)
-    wells, remarks = (
-        local_wells(found, portrait, options=options, seed=seed) if "local" in routes else ((), [])
-    )
-    network_wells: list[Well] = []
+    wells, remarks = _local_wells(found, portrait, options=options, seed=seed)
     # The errors of f make some of the residual with which one formula is believed to hold.
     errors = np.abs(np.sqrt(np.diag(found.covariance)) / found.values)
     noise = 0.0 if found.noise_free else 3 * float(np.sqrt((errors**2).mean()))
 
     def starts() -> Iterator[np.ndarray]:
         """Where one formula may begin; none is asked for once a formula is good enough."""
-        group: Sequence[Well] = wells
-        if "network" in routes:
-            group = network_wells
-            if formula is not None:
-                yield formula
-            if network is not None:
-                values = network(points)
-                yield fit_values(library, [points], [values])
-                # Networks are worst where recordings are few, far out, and Gauss–Newton may follow them to a
-                # false solution; further starts are refined on lower and lower parts of V first.
-                for part in (values <= np.quantile(values, share) for share in LOWER_PARTS):
-                    if part.sum() > 2 * library.size:
-                        start = fit_values(library, [points[part]], [values[part]])
-                        yield refine_globally(start, found, points[part], sparse=False).potential
-                # In powers no higher than the local route took.
-                degree = max((well.degree for well in wells), default=NETWORK_DEGREE)
-                degree = affordable_degree(library.dimension, min(degree, NETWORK_DEGREE))
-                made, failures = _about_attractors(
-                    "network", portrait,
-                    lambda at: fit_well(found.dynamics, portrait, at, network, degree=degree, seed=seed),
-                )  # fmt: skip
-                network_wells.extend(made)
-                remarks.extend(failures)
         if found.diffusion.constant and found.diffusion.regular:
-            # Refined one by one, the wells may turn out to share one formula. All of them together make the
-            # start: one alone does not tell an odd power from an even one, and goes on wrongly in the others.
-            for some in (group, *([well] for well in group if len(group) > 1)) if group else ():
+            # Solved for one by one, the wells may turn out to share one formula. All of them together make
+            # the start: one alone does not tell an odd power from an even one, and goes on wrongly elsewhere.
+            for some in (wells, *([well] for well in wells if len(wells) > 1)) if wells else ():
                 inside = [well.inside() for well in some]
                 heights = [well.values(x) for well, x in zip(some, inside, strict=True)]
                 yield fit_values(library, inside, heights)
@@ -222,9 +176,9 @@ def refine(
             if whole is not None:
                 if not (whole.joint or found.noise_free):
                     remarks.append(Remark("quasipotential.not_orthogonal"))
-                return Refined(found, wells, (), tuple(remarks), whole)
+                return Refined(found, wells, tuple(remarks), whole)
         remarks.append(Remark("quasipotential.no_single_formula"))
-    return Refined(found, wells, tuple(network_wells), tuple(remarks))
+    return Refined(found, wells, tuple(remarks))
 
 
 def _over_library(found: FieldEstimate, library: CandidateLibrary) -> FieldEstimate:
@@ -246,25 +200,16 @@ def _over_library(found: FieldEstimate, library: CandidateLibrary) -> FieldEstim
     return replace(found, library=library, coefficients=coefficients, support=support, alternatives=average)
 
 
-def local_wells(
+def _local_wells(
     found: FieldEstimate, portrait: PhasePortrait, *, options: RefinementOptions, seed: int = 0
 ) -> tuple[tuple[Well, ...], list[Remark]]:
-    """The local route: V about each attractor, and where that was not possible."""
-    return _about_attractors(
-        "local", portrait, lambda at: local_well(found.dynamics, portrait, at, options=options, seed=seed)
-    )
-
-
-def _about_attractors(
-    route: Route, portrait: PhasePortrait, solve: Callable[[int], Well]
-) -> tuple[tuple[Well, ...], list[Remark]]:
+    """V about each attractor, and where that was not possible."""
     wells, remarks = [], []
     for index in range(len(portrait.attractors)):
         try:
-            wells.append(solve(index))
+            wells.append(local_well(found.dynamics, portrait, index, options=options, seed=seed))
         except NumericalFailure as error:
-            values = {"route": route, "reason": str(error)}
-            remarks.append(Remark("quasipotential.route_failed", values))
+            remarks.append(Remark("quasipotential.route_failed", {"route": "local", "reason": str(error)}))
     return tuple(wells), remarks
 
 
@@ -275,8 +220,7 @@ def _refined_decomposition(refined: Refined, points: np.ndarray) -> SymbolicDeco
     one attractor only, its well's formula stands for the whole where no other was found.
     """
     found, formula = refined.found, refined.formula
-    library = found.library
-    wells = refined.wells or refined.network_wells
+    library, wells = found.library, refined.wells
 
     def named(errors: np.ndarray) -> dict[str, float]:
         return {name: float(one) for name, one in zip(library.names, errors, strict=True) if one > 0}
@@ -321,7 +265,7 @@ class RefinementContext:
         self,
         recordings: Recordings,
         found: FieldEstimate,
-        networks: TrainedNetworks | None,
+        networks: AnyNetworks | None,
         *,
         number: int,
         seed: int,
@@ -357,16 +301,10 @@ class RefinementContext:
             self.found, self.portrait, self.held_out, self.pairs, references, self.limits, self.number
         )
 
-    def refine_and_certify(self, regressed: SymbolicDecomposition | None) -> Refinement:
-        """Refined formulas of the run with their certificate, from those of a regression, if any."""
-        formula = None
-        if regressed is not None and regressed.potential is not None:
-            named = term_coefficients(regressed.potential)
-            library = _formula_library(self.found, self.options)
-            formula = np.array([named.get(name, 0.0) for name in library.names])
-        network = None if self.networks is None else self.networks.potential_at
-        refined, formulas, certificate = self._by_routes(self.options, network, formula)
-        wells, found = refined.wells or refined.network_wells, self.found
+    def refine_and_certify(self) -> Refinement:
+        """Refined formulas of the run with their certificate."""
+        refined, formulas, certificate = self._certified()
+        wells, found = refined.wells, self.found
         caustics = caustics_below(found.dynamics, wells, self.portrait, certificate.error, seed=self.number)
         # Hops and histogram of the record, compared with those that f predicts.
         strength, variance = found.noise_strength, found.sensor_variance
@@ -385,66 +323,46 @@ class RefinementContext:
             certificate = replace(certificate, tests={**certificate.tests, "record": verdict}, reason=reason)
         return Refinement(formulas, certificate, record, (*refined.remarks, *caustics))
 
-    def control(
-        self, refined: SymbolicDecomposition | None, certificate: Certificate | None
-    ) -> dict[str, Any]:
-        """Refine networks with their weights in random order, and test the result as the real one is.
+    def control(self, refined: SymbolicDecomposition | None) -> dict[str, Any]:
+        """What the comparison with the refined V says of networks with their weights in random order.
 
-        Gauss–Newton from a random start ends nowhere, at a false solution that is as exact as the true one,
-        or at the true one. The tests have to refuse the first two. Among those of the certificate, as it
-        stands in `model.json`, `same_as_refined` has the largest relative difference from the refined V in
-        any well; it takes no part in whether it is certified.
+        It stands in `model.json` as a certificate with one test, which has to refuse them.
         """
         assert self.networks is not None
         draw = generator(self.seed, self.number, Purpose.SHUFFLE)
-        randomised = shuffled(self.networks, generator=draw).potential_at
-        options = replace(self.options, routes=("network",))
-        try:
-            _, formulas, made = self._by_routes(options, randomised, None)
-        except (NumericalFailure, np.linalg.LinAlgError) as error:
-            reason = f"refinement from random weights led to no V: {error}"
-            nothing = Verdict.refused(reason, self.limits.hamilton_jacobi)
-            return uncertified(reason) | {"tests": {"hamilton_jacobi": nothing.as_data()}}
-        data = made.as_data()
-        if refined is None or certificate is None:
-            return data
-        difference = _difference(formulas, refined, self.evidence.references)
-        explained = MIN_DIFFERENCE + sum(one.error for one in (made, certificate) if np.isfinite(one.error))
-        verdict = Verdict.of(difference, explained, "it is another V than the refined one")
-        if made.certified:
-            data["reason"] = (
-                "refinement from random weights led to the same V" if verdict.passed else
-                "a V from random weights was certified that is not the refined one: one of the two is false"
-            )  # fmt: skip
-        data["tests"]["same_as_refined"] = verdict.as_data()
-        return data
+        randomised = shuffled(self.networks, generator=draw)
+        if refined is None or not (refined.wells or refined.potential is not None):
+            return uncertified("there is no refined V to compare with")
+        formulas = refined if refined.potential is not None else refined.wells
+        verdict = check_agreement(randomised, formulas, self.evidence)
+        reason = (
+            "networks with their weights in random order agree with the refined V: agreement is no evidence"
+        )
+        reason = reason if verdict.passed else verdict.reason
+        return uncertified(reason) | {"tests": {"agreement": verdict.as_data()}}
 
-    def _by_routes(
-        self, options: RefinementOptions, network: Function | None, formula: np.ndarray | None
-    ) -> tuple[Refined, SymbolicDecomposition, Certificate]:
-        """V as the routes make it of their starts, with its certificate."""
+    def _certified(self) -> tuple[Refined, SymbolicDecomposition, Certificate]:
+        """V about the attractors and over the region, with the certificate of what is to stand."""
         refined = refine(
-            self.found, self.portrait, formula=formula, network=network, points=self.points,
-            options=options, seed=self.number,
-        )  # fmt: skip
+            self.found, self.portrait, points=self.points, options=self.options, seed=self.number
+        )
         formulas, whole = _refined_decomposition(refined, self.points), refined.formula
-        wells = refined.wells or refined.network_wells
-        compared = len(options.routes or ()) == 2
-        others = refined.network_wells if refined.wells else ()
-        error = 0.0
+        told: dict[str, Any] = {
+            "networks": self.networks,
+            "compared": "network" in (self.options.routes or ()),
+        }
         if formulas.potential is None:
-            return refined, formulas, certify(wells, self.evidence, others=others, compared=compared)
+            return refined, formulas, certify(refined.wells, self.evidence, **told)
+        error = 0.0
         if whole is not None and not self.found.noise_free:
             error = whole.relative_error(refined.found.library.evaluate(self.points))
-        certificate = certify(
-            formulas, self.evidence, others=refined.wells, compared=compared, relative_error=error
-        )
+        certificate = certify(formulas, self.evidence, relative_error=error, **told)
         if certificate.certified or not refined.wells:
             return refined, formulas, certificate
         # One formula for all wells is an extra. What refuses it is no word against the wells.
         refused = Remark("quasipotential.single_formula_refused", {"reason": certificate.reason})
         alone = replace(refined, formula=None, remarks=(*refined.remarks, refused))
-        of_wells = certify(wells, self.evidence, others=others, compared=compared)
+        of_wells = certify(refined.wells, self.evidence, **told)
         if not of_wells.certified:
             return refined, formulas, certificate
         return alone, _refined_decomposition(alone, self.points), of_wells
@@ -473,83 +391,3 @@ class Refinement:
     certificate: Certificate  #: whether to believe them
     record: OccupancyCheck  #: f against hops and histogram of the recordings
     remarks: tuple[Remark, ...] = ()  #: what could not be done, and caustics
-
-
-def _difference(
-    one: SymbolicDecomposition, two: SymbolicDecomposition, references: Sequence[Reference]
-) -> float:
-    """Largest relative L2 difference of two V about any attractor; infinite where one has none there."""
-    worst = 0.0 if references else np.inf
-    for reference in references:
-        x, at = reference.points, reference.attractor
-        potentials = [
-            potential.values(x) - potential.values(at[None])
-            for formulas in (one, two)
-            for potential in (formulas.wells if formulas.potential is None else [formulas])
-            if not isinstance(potential, Well) or np.array_equal(potential.attractor, at)
-        ]
-        if len(potentials) < 2 or not len(x):
-            return np.inf
-        mine, theirs = potentials
-        worst = max(worst, float(np.linalg.norm(mine - theirs) / np.linalg.norm(theirs)))
-    return worst
-
-
-CHECK_STEPS = 15  # of Gauss–Newton: what does not converge quickly is not ready
-CHECK_DEGREES = (4, 6, 8)  # of the wells with which networks are compared, to some per cent
-CHECK_SHARE = 0.75  # of the recorded points, the lowest in V, on which one formula is tried
-
-
-class TrainingCheck:
-    """Whether refinement will succeed from networks of a run, given its f and recorded states ``(n, d)``."""
-
-    def __init__(self, found: FieldEstimate, x: np.ndarray, *, options: CheckOptions, seed: int) -> None:
-        points = x[evenly_spread(x, generator=np.random.default_rng(seed))]
-        self.options, self.portrait = options, phase_portrait(found.dynamics, points, seed=seed)
-        refinement = RefinementOptions(degrees=CHECK_DEGREES)
-        self.wells, _ = local_wells(found, self.portrait, options=refinement, seed=seed)
-        self.library = joint_library(found.library, degree=options.degree, potential_degree=options.degree)
-        self.found = _over_library(found, self.library)
-
-    def hopeless(self) -> str | None:
-        """Why no training can pass, in words; None where one can."""
-        if (fault := self.portrait.fault()) is not None:
-            return sentence(fault)
-        if len(self.wells) < len(self.portrait.attractors):
-            return "the local route found no formula about some attractor"
-        return None
-
-    def accepted(self, networks: TrainedNetworks) -> TrainedNetworks | None:
-        """The networks of one run where refinement will succeed from them."""
-        if self.hopeless() is not None:
-            return None
-        potential = networks.potential_at
-        return networks if self._single_formula(potential) or self._by_wells(potential) else None
-
-    def _single_formula(self, potential: Function) -> bool:
-        points = self.portrait.points
-        values = potential(points)
-        below = values <= np.quantile(values, CHECK_SHARE)
-        start = fit_values(self.library, [points[below]], [values[below]])
-        result = refine_globally(start, self.found, points[below], sparse=False)
-        basis = LibraryBasis.of_potential(self.library)
-        own = result.potential[basis.chosen]
-        worst = check_agreement(lambda x: basis.values(x) @ own, self.wells, limit=0.0).value
-        logger.info("check of one formula: residual %.1e, difference %.1e", result.residual, worst)
-        return result.residual < self.options.residual / 10 and worst < self.options.difference
-
-    def _by_wells(self, potential: Function) -> bool:
-        for index, local in enumerate(self.wells):
-            try:
-                well = fit_well(
-                    self.found.dynamics, self.portrait, index, potential, degree=local.degree,
-                    steps=CHECK_STEPS,
-                )  # fmt: skip
-            except NumericalFailure:
-                return False
-            difference = check_agreement(well.values, [local], limit=0.0).value
-            logger.info("check of a well: residual %.1e, difference %.1e", well.residual, difference)
-            allowed = self.options.difference + 2 * (local.residual + well.residual)
-            if well.residual > self.options.residual or difference > allowed:
-                return False
-        return True

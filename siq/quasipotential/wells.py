@@ -6,8 +6,9 @@ where the formula does not solve the Hamilton–Jacobi equation, nothing is clai
 
 At the attractor the Hessian of V is M, which follows from the Jacobian of f, and it is kept. The higher
 powers are found by Gauss–Newton on the Hamilton–Jacobi equation, in a sublevel set that grows from a small
-ellipsoid (`_grow_well`); the network route grows from values of V_θ instead, with all powers free
-(`fit_well`). From its saddle a formula is taken on to a higher level by robust fits (`_extend_well`).
+ellipsoid (`_grow_well`). From its saddle a formula is taken on to a higher level by robust fits
+(`_extend_well`). Random units grow in the same way, from a paraboloid and without M
+(`siq.quasipotential.output_weights`).
 
 For given equations the path of least action to the lowest saddle comes first, so that the depth of the well
 is known. V is grown once, in the lowest powers that follow it up there. From there every higher degree starts
@@ -17,7 +18,7 @@ at each level, which of high powers is bad. `local_well` chooses the degree.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -232,10 +233,7 @@ REPEAT_TOLERANCE = 1e-4  # of a level: one that was tried before, from which the
 SADDLE_TOLERANCE = 0.05  # of a level: by so much V of the saddle that set it may change with the next fit
 MAX_ROUNDS = 80  # of growing
 COARSE_TOLERANCE = 1e-6  # relative change of coefficients with which Gauss–Newton ends on the way
-START_SHARES = (0.5, 0.25, 1.0)  # of the networks' level: where the network route starts, one after the other
-START_DEGREE = 4  # powers up to this one are fitted to a network's V, and those above begin at zero
 MAX_RESIDUAL = 0.2  # relative residual from which on a start has led nowhere
-MIN_CURVATURE = 1e-6  # of the largest curvature at an attractor: V with a smaller one has no minimum there
 SADDLE_DISTANCE = 0.1  # of the recorded box: a saddle so close to the points of the fit has been reached
 ROBUST_GROWTH = 1.06  # of the level, from one robust fit to the next
 MIN_OUTLIER_RESIDUAL = 1e-5  # residual below which nothing is an outlier
@@ -363,13 +361,13 @@ def _grow_well(
     level = float(reached[min(4 * basis.size, len(reached) - 1)])
     if depth is not None:
         level = min(level, FIRST_LEVEL_SHARE * depth)
-    return _grown(
+    return grown(
         dynamics, basin, saddles, basis, coefficients, free=free, metric=hessian, level=level,
         fitted=np.zeros(0, dtype=int), generator=generator, depth=depth,
     )  # fmt: skip
 
 
-def _grown(
+def grown(
     dynamics: Dynamics,
     basin: Basin,
     saddles: Sequence[Equilibrium | Cycle],
@@ -382,11 +380,12 @@ def _grown(
     fitted: np.ndarray,
     generator: np.random.Generator,
     depth: float | None = None,
+    damping: float = 0.0,
 ) -> Well:
     """V grown from a start, level by level, to its lowest saddle or to the end of the recorded region.
 
-    `metric` is M, in which distances are measured; `fitted` has the rows of ``basin.chosen`` on which the
-    start was fitted.
+    `metric` is the curvature of V at the attractor, in which distances are measured; `fitted` has the rows of
+    ``basin.chosen`` on which the start was fitted. The damping is that of Gauss–Newton.
     """
     attractor = basis.center
     place = f"the attractor near {attractor.round(4)}"
@@ -428,7 +427,7 @@ def _grown(
         equation = HamiltonJacobi.at(basis, points, dynamics, attractor=attractor)
         steps, tolerance = (40, 1e-13) if last else (8, COARSE_TOLERANCE)
         coefficients, residual = equation.gauss_newton(
-            coefficients, free=free, steps=steps, tolerance=tolerance
+            coefficients, free=free, steps=steps, tolerance=tolerance, damping=damping
         )
         values = along(coefficients)
         recorded = _recorded(basin.starts(values), len(attractor))
@@ -457,8 +456,7 @@ def _grown(
     # A V that vanishes is a solution too, and the end of what starts far from any other.
     short = saddle is None and level < (1 - LEVEL_TOLERANCE) * recorded
     if short or not (np.isfinite(residual) and level > 0):
-        degree = int(basis.exponents.sum(axis=1).max())
-        raise NumericalFailure(f"powers of degree {degree} do not follow V from {place} up to a saddle")
+        raise NumericalFailure(f"{basis.title} do not follow V from {place} up to a saddle")
     return Well(basis, coefficients, dynamics, attractor, level, saddle, residual, points)
 
 
@@ -466,78 +464,6 @@ def _recorded(starts: np.ndarray, dimension: int) -> float:
     """The level that recordings reach, of V at the starts of descents, shape ``(n,)``."""
     # Of one state whatever lies below its highest start lies on the way down from it.
     return float(np.quantile(starts, RECORDED_QUANTILE if dimension > 1 else 1.0))
-
-
-def fit_well(
-    dynamics: Dynamics,
-    portrait: PhasePortrait,
-    index: int,
-    potential: Callable[[np.ndarray], np.ndarray],
-    *,
-    degree: int,
-    seed: int = 0,
-    steps: int = 60,
-) -> Well:
-    """V about an attractor by the network route: from values V_θ, up to a constant, refined without M.
-
-    It starts on the states where the network says that V is low, since networks are worst far out. From there
-    V grows by itself, as in the local route, but with all powers free. The other arguments are those of the
-    local route; `steps` are the most of Gauss–Newton at the start. Fails with `NumericalFailure` when the
-    networks leave too few states for a start, or no start grows to a well.
-    """
-    attractor, basin = portrait.attractors[index], portrait.basins[index]
-    saddles, generator = portrait.saddles[index], np.random.default_rng(seed)
-    lowest = float(potential(attractor.position[None])[0])
-    flat = basin.states.reshape(-1, basin.states.shape[2])
-    along = (potential(flat) - lowest).reshape(basin.states.shape[:2])
-    tops = np.array([one.position for one in saddles]).reshape(-1, flat.shape[1])
-    highest = _recorded(basin.starts(along), flat.shape[1])
-    level = min(float((potential(tops) - lowest).min(initial=np.inf)), highest)
-    failure: NumericalFailure | None = None
-    for share in START_SHARES:
-        rows = basin.below(along, share * level)
-        if len(rows) > MAX_POINTS:
-            rows = np.sort(generator.choice(rows, MAX_POINTS, replace=False))
-        points = basin.points(rows)
-        scale = positive(np.abs(points - attractor.position).max(axis=0, initial=0.0))
-        basis = PowerBasis.up_to(degree, dynamics.symbols, attractor.position, scale)
-        if len(points) < 2 * basis.size:
-            failure = failure or NumericalFailure(
-                f"the networks leave only {len(points)} recorded states below the saddle of the attractor"
-                f" near {attractor.position.round(4)}"
-            )
-            continue
-        # The low powers first: what points on slow manifolds leave open of the high ones would run away.
-        low = basis.exponents.sum(axis=1) <= START_DEGREE
-        start = np.zeros(basis.size)
-        start[low] = np.linalg.lstsq(basis.values(points)[:, low], potential(points) - lowest, rcond=1e-10)[0]
-        equation = HamiltonJacobi.at(basis, points, dynamics)
-        start, _ = equation.gauss_newton(start, free=low, steps=steps)
-        start, residual = equation.gauss_newton(start, steps=steps)
-        metric = basis.hessians(attractor.position[None])[0] @ start
-        curvature = np.linalg.eigvalsh(metric * np.outer(basis.scale, basis.scale))
-        # Up to half of these states, but no fewer than the coefficients need: a start that just has enough of
-        # them would otherwise be refused for want of states.
-        ways = basin.highest((basis.values(flat) @ start).reshape(along.shape))
-        heights = np.sort(ways[tuple(basin.chosen[rows].T)])
-        enough = max(len(heights) // 2, 2 * basis.size)
-        first = float(heights[min(enough, len(heights) - 1)]) * (1 + COARSE_TOLERANCE)
-        # V = 0 is a solution too, and what tends to it has a residual as large as itself.
-        if not residual < MAX_RESIDUAL or curvature[0] <= MIN_CURVATURE * curvature[-1] or first <= 0:
-            failure = NumericalFailure(
-                f"the networks' V leads to none with a minimum at the attractor near"
-                f" {attractor.position.round(4)}"
-            )
-            continue
-        try:
-            return _grown(
-                dynamics, basin, saddles, basis, start, free=np.ones(basis.size, dtype=bool), metric=metric,
-                level=first, fitted=rows, generator=generator,
-            )  # fmt: skip
-        except NumericalFailure as error:
-            failure = error
-    assert failure is not None  # there is at least one start
-    raise failure
 
 
 def _extend_well(

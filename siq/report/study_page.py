@@ -182,7 +182,8 @@ def study_page(
         published_runs=_method_tables(results.tables, (str(Method.REGRESSION),))
         if several and other
         else None,
-        routes=study.refinement.with_routes(networks=study.training is not None).routes or (),
+        networks="network"
+        in (study.refinement.with_routes(networks=study.training is not None).routes or ()),
         steps=results.tables["outcomes"].drop(columns=[] if several else "run"),
         machine=f"{named}; {machine}, {os.cpu_count()} cores",
         printed=_printed(study, given=given is not None),
@@ -513,21 +514,13 @@ def _tests_table(certificates: pd.DataFrame, run: int, method: Method) -> pd.Dat
 
 
 def _control_counts(certificates: pd.DataFrame) -> dict[str, int] | None:
-    """What became of the control, a network with its weights in random order; None where there is none.
+    """In how many ``runs`` the control was ``refused``; None where there is none.
 
-    In how many ``runs`` it was ``refused``, refined to the ``same`` U, or certified with another: a
-    ``false`` one. `same_as_refined` is no test of the control but a comparison.
+    The control is networks with their weights in random order, compared with the refined U.
     """
     mine = certificates[certificates["method"] == Method.CONTROL]
-    if not len(mine):
-        return None
-    compared = mine["test"] == "same_as_refined"
-    certified = mine[~compared].groupby("run")["passed"].all()
-    same = mine[compared].set_index("run")["passed"].reindex(certified.index, fill_value=False).astype(bool)
-    return {
-        "runs": len(certified), "refused": int((~certified).sum()), "same": int((certified & same).sum()),
-        "false": int((certified & ~same).sum()),
-    }  # fmt: skip
+    passed = mine.groupby("run")["passed"].all()
+    return {"runs": len(passed), "refused": int((~passed).sum())} if len(mine) else None
 
 
 def _counted_over_runs(table: pd.DataFrame, by: str | list[str], **columns: tuple[str, str]) -> pd.DataFrame:

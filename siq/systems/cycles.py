@@ -180,7 +180,7 @@ def hessians_along(dynamics: Dynamics, cycle: Cycle, *, reaching: bool = False) 
     return np.asarray(rows.transpose(0, 2, 1) @ np.linalg.inv(covariances) @ rows) / np.outer(scale, scale)
 
 
-def unstable_direction(dynamics: Dynamics, cycle: Cycle, place: int = 0, *, scale: np.ndarray) -> np.ndarray:
+def _unstable_direction(dynamics: Dynamics, cycle: Cycle, place: int = 0, *, scale: np.ndarray) -> np.ndarray:
     """At one of the points of an unstable cycle, a displacement that grows: shape ``(d,)``, of one scale."""
     _, flows, _ = _parts(dynamics, cycle.points, cycle.period / len(cycle.points), scale)
     rows = _across(dynamics.drift(cycle.points) / scale)
@@ -195,7 +195,7 @@ def states_beside(
     Shape ``(2k, d)``; they are off by `SEPARATRIX_OFFSET` of the widths.
     """
     if isinstance(over, Cycle):
-        position, unstable = over.points[place], unstable_direction(dynamics, over, place, scale=width)[None]
+        position, unstable = over.points[place], _unstable_direction(dynamics, over, place, scale=width)[None]
     else:
         values, vectors = np.linalg.eig(dynamics.jacobian(over[None])[0])
         position, unstable = over, vectors[:, values.real > 0].real.T

@@ -334,7 +334,11 @@ def reference_table(*, points: int = 100) -> pd.DataFrame:
                 for x, value in zip(at, values, strict=True)
             ]
         for barrier in each.barriers:
-            way = {"at": list(barrier.start), "by": list(barrier.saddle), "to": list(barrier.end)}
+            way: dict[str, Any] = {
+                "at": list(barrier.start),
+                "by": list(barrier.saddle),
+                "to": list(barrier.end),
+            }
             way["how"] = barrier.how
             rows.append(own | way | {"quantity": "barrier", "value": barrier.value, "error": barrier.error})
             if np.isfinite(barrier.prefactor):

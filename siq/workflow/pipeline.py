@@ -1,8 +1,8 @@
 """All that a run of recordings gives, step by step: f, networks, V with its certificate, landscape.
 
 Each step gives what it found, None where it failed, and an outcome that says why. The formulas of the
-regression are certified beside the refined ones, and so is a control: what the same refinement makes of a
-network with its weights in random order. `analyse` chains the steps in memory; the tasks of the workflow
+regression are certified beside the refined ones. As a control, the networks with their weights in random
+order are compared with the refined V. `analyse` chains the steps in memory; the tasks of the workflow
 call the same functions, and add files.
 """
 
@@ -25,14 +25,16 @@ from siq.inference.field_estimate import FieldEstimate
 from siq.inference.identify import identify
 from siq.inference.kalman_identification import of_all_states
 from siq.inference.library import candidate_library
-from siq.networks.decomposition import TrainedNetworks
+from siq.networks.decomposition import AnyNetworks, NetworksByWell
 from siq.networks.regression import RegressionResult, points_below, sparse_decomposition
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.certificate import Certificate, certify, uncertified
 from siq.quasipotential.formulas import SymbolicDecomposition, decomposition_from_coefficients
+from siq.quasipotential.hamilton_jacobi import affordable_degree
 from siq.quasipotential.landscape import Landscape, NoLandscape
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.occupancy import OccupancyCheck, VisitTest
+from siq.quasipotential.output_weights import formulas_by_well
 from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.refinement import Refinement, RefinementContext
 from siq.quasipotential.wells import Well
@@ -96,7 +98,7 @@ def identify_run(
 
 
 def regress_run(
-    settings: PipelineSettings, recordings: Recordings | None, trained: StepResult[TrainedNetworks]
+    settings: PipelineSettings, recordings: Recordings | None, trained: StepResult[AnyNetworks]
 ) -> StepResult[SymbolicDecomposition]:
     """Formulas of the networks of one run."""
     number = trained.outcome.run
@@ -124,7 +126,7 @@ def _no_networks(outcome: Outcome) -> str:
 
 
 def _regressed(
-    settings: PipelineSettings, recordings: Recordings, networks: TrainedNetworks
+    settings: PipelineSettings, recordings: Recordings, networks: AnyNetworks
 ) -> tuple[SymbolicDecomposition, RegressionResult]:
     options = settings.regression
     points = snapshot_pairs(recordings, pair_step=settings.sampling.pair_step).x0
@@ -142,6 +144,12 @@ def _regressed(
         library, potential=result.potential, circulatory=result.circulatory,
         vector_field=result.vector_field, points=points[below],
     )  # fmt: skip
+    if isinstance(networks, NetworksByWell):
+        dynamics = Dynamics.of(
+            formulas.symbols, formulas.vector_field, diffusion=Diffusion(networks.diffusion)
+        )
+        degree = affordable_degree(len(formulas.symbols), options.well_degree)
+        formulas = replace(formulas, wells=formulas_by_well(networks, dynamics, degree=degree))
     return formulas, result
 
 
@@ -180,13 +188,13 @@ def refine_run(
     settings: PipelineSettings,
     recordings: Recordings | None,
     identified: StepResult[FieldEstimate],
-    trained: StepResult[TrainedNetworks],
+    trained: StepResult[AnyNetworks],
     regressed: SymbolicDecomposition | None = None,
 ) -> RefinedRun:
     """V about every attractor of the identified f, or over the region, with its certificate.
 
-    It follows from trajectories, f and networks of the run; `regressed` are the formulas of the networks,
-    which are certified beside the refined ones.
+    It follows from trajectories and f of the run alone; the networks are a second route, which has to agree.
+    `regressed` are the formulas of the networks, which are certified beside the refined ones.
     """
     number, networks = identified.outcome.run, trained.result
     formulas = {} if regressed is None else {Method.REGRESSION: regressed}
@@ -194,14 +202,11 @@ def refine_run(
     context: RefinementContext | None = None
     refinement: Refinement | None = None
     # Networks that were asked for and are not there are the first cause of whatever follows.
-    routes = settings.refinement.routes or ()
-    asked = trained.outcome.status == Status.FAILED or "network" in routes
+    asked = trained.outcome.status == Status.FAILED or "network" in (settings.refinement.routes or ())
     lost = [_no_networks(trained.outcome)] if networks is None and asked else []
     if identified.result is None or recordings is None:
         missing = f"no vector field was identified ({identified.outcome.reason})"
         outcome = Outcome(number, Step.REFINE, Status.SKIPPED, missing)
-    elif networks is None and routes == ("network",):
-        outcome = Outcome(number, Step.REFINE, Status.SKIPPED, _no_networks(trained.outcome))
     else:
         try:
             context = RefinementContext(
@@ -211,7 +216,7 @@ def refine_run(
             )  # fmt: skip
             if regressed is not None:
                 certificates[Method.REGRESSION] = certify(regressed, context.evidence).as_data()
-            refinement = context.refine_and_certify(regressed)
+            refinement = context.refine_and_certify()
             certificate = refinement.certificate
             formulas[Method.REFINED] = refinement.formulas
             certificates[Method.REFINED] = certificate.as_data() | {
@@ -224,8 +229,7 @@ def refine_run(
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             outcome = Outcome(number, Step.REFINE, Status.FAILED, "; ".join([*lost, str(error)]))
     if context is not None and networks is not None:
-        theirs = (None, None) if refinement is None else (refinement.formulas, refinement.certificate)
-        certificates[Method.CONTROL] = context.control(*theirs)
+        certificates[Method.CONTROL] = context.control(formulas.get(Method.REFINED))
     for method in formulas.keys() - certificates.keys():
         certificates[method] = uncertified(f"no test was made: {outcome.reason}")
     portrait = None if context is None else context.portrait
@@ -295,7 +299,7 @@ class Analysis:
     """What the steps found; each has its outcome, and says why where it has no result."""
 
     identified: StepResult[FieldEstimate]  #: f, and the test of its predictions
-    trained: StepResult[TrainedNetworks]  #: the networks
+    trained: StepResult[AnyNetworks]  #: the networks
     regressed: StepResult[SymbolicDecomposition] | None  #: the published method's formulas, where asked for
     refined: RefinedRun  #: formulas by method, with their certificates
     landscape: StepResult[Landscape] | None  #: wells, barriers, ways; None where not asked for

@@ -36,8 +36,7 @@ class Method(StrEnum):
     """Whose formulas they are.
 
     ``regression`` is the published method, ``refined`` ours. ``randomised network`` is no method but the
-    control, a network with its weights in random order, refined as the real one is: no other V than the
-    refined one may come of it with a certificate.
+    control, networks with their weights in random order, whose V must not agree with the refined one.
     """
 
     REGRESSION = "regression"

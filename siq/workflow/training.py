@@ -17,11 +17,10 @@ import pandas as pd
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
-from siq.networks.decomposition import TrainedNetworks
+from siq.networks.decomposition import AnyNetworks
 from siq.networks.training import Block, Check, TrainingData, choose_device, prepare_data
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.output_weights import OutputWeights
-from siq.quasipotential.refinement import TrainingCheck
 from siq.systems.diffusion import Diffusion
 from siq.workflow.study import PipelineSettings
 from siq.workflow.tables import Outcome, Status, Step, StepResult, as_table
@@ -30,7 +29,7 @@ POSITION = "position"
 """In the details of an outcome: where the run stands among the networks of its block."""
 
 
-def not_trained(number: int) -> StepResult[TrainedNetworks]:
+def not_trained(number: int) -> StepResult[AnyNetworks]:
     """A run for which no networks were asked."""
     return StepResult(None, Outcome(number, Step.TRAIN, Status.SKIPPED, "no networks were asked for"))
 
@@ -44,7 +43,7 @@ Runs = Mapping[int, tuple[Recordings | None, FieldEstimate | None]]
 
 def train_block(
     settings: PipelineSettings, runs: Runs, *, folder: Path | None = None, device: str = "auto"
-) -> tuple[dict[int, StepResult[TrainedNetworks]], list[TrainedNetworks], pd.DataFrame]:
+) -> tuple[dict[int, StepResult[AnyNetworks]], list[AnyNetworks], pd.DataFrame]:
     """Train the networks of a block of runs, on the device ``auto``, ``cpu`` or ``cuda``.
 
     In the folder a killed training leaves what it goes on from; see `clean`. Given are the results of every
@@ -101,10 +100,10 @@ def _diffusion(settings: PipelineSettings, runs: Runs, data: Mapping[int, Traini
 
 def _training_data(
     settings: PipelineSettings, runs: Runs
-) -> tuple[dict[int, TrainingData], dict[int, StepResult[TrainedNetworks]]]:
+) -> tuple[dict[int, TrainingData], dict[int, StepResult[AnyNetworks]]]:
     """The data of every run of the block that has some, and the results of those that have none."""
     assert settings.training is not None
-    data, failed = {}, dict[int, StepResult[TrainedNetworks]]()
+    data, failed = {}, dict[int, StepResult[AnyNetworks]]()
     for number, (recordings, _) in runs.items():
         if recordings is None:
             reason = "the run has no trajectories"
@@ -125,15 +124,13 @@ def _checks(
     """When the training of each run may end; of those that have no check, why not."""
     assert settings.training is not None
     ready, faults = dict[int, Check](), {}
-    options, units = settings.training.check, settings.training.output_weights
-    for number, part in data.items():
-        record = runs[number][1]
+    for number, part in data.items() if settings.training.check is not None else ():
+        draw = generator(settings.seed, number, Purpose.UNITS)
         try:
-            if options is not None and units is not None:
-                draw = generator(settings.seed, number, Purpose.UNITS)
-                ready[number] = OutputWeights(part, diffusion=diffusion, units=units, generator=draw)
-            elif options is not None and record is not None:
-                ready[number] = TrainingCheck(record, part.training.x0, options=options, seed=number)
+            ready[number] = OutputWeights(
+                part, diffusion=diffusion, units=settings.training.output_weights, generator=draw,
+                found=runs[number][1],
+            )  # fmt: skip
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             faults[number] = f"the check of the training could not be prepared: {error}"
     return ready, faults

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from known_settings import PAPER
-from pydantic import ValidationError
 
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.errors import InputError, NumericalFailure
@@ -434,8 +433,3 @@ def test_the_slowest_part_leaves_out_the_fastest_points_in_any_units() -> None:
     scaled = dataclasses.replace(whole.training, x0=whole.training.x0 * units, xh=whole.training.xh * units)
     again = _slowest_part(dataclasses.replace(whole, training=scaled), 0.5)
     np.testing.assert_array_equal(again.representative_rows, kept)
-
-
-def test_output_weights_need_a_check() -> None:
-    with pytest.raises(ValidationError, match="never is"):
-        TrainingOptions(check=None, output_weights=400)

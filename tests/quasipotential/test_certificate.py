@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from known_systems import (
     maier_stein,
     polynomial_system,
     portrait_of,
+    potential_gradient,
     potential_values,
     uniform_points,
 )
@@ -34,7 +36,7 @@ from siq.data.recordings import Recordings, SnapshotPairs
 from siq.inference.checks import PredictionLimits, check_prediction, prediction_errors
 from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.inference.library import candidate_library, monomial_exponents
-from siq.networks.decomposition import shuffled
+from siq.networks.decomposition import AnyNetworks, shuffled
 from siq.networks.networks import Networks, at_rest, initial_layers
 from siq.numerics.randomness import representative_subset
 from siq.quasipotential.certificate import (
@@ -43,6 +45,7 @@ from siq.quasipotential.certificate import (
     _candidate_in_well,
     _follow_well,
     certify,
+    check_agreement,
     references_about,
 )
 from siq.quasipotential.certificate_tests import (
@@ -52,7 +55,6 @@ from siq.quasipotential.certificate_tests import (
     Reference,
     _check_branch,
     _check_characteristics,
-    check_agreement,
 )
 from siq.quasipotential.characteristics import Fan, adapted_fan
 from siq.quasipotential.formulas import exact_decomposition
@@ -79,7 +81,7 @@ def certified(
     potential: sympy.Expr,
     *,
     found: FieldEstimate | None = None,
-    wells: tuple[Well, ...] = (),
+    networks: AnyNetworks | None = None,
     prediction: Verdict = PASSED,
     circulatory: tuple[sympy.Expr, ...] | None = None,
     share: float = 0.6,
@@ -91,7 +93,16 @@ def certified(
     if circulatory is not None:
         formulas = replace(formulas, circulatory=circulatory)
     evidence = evidence_of(known, found, prediction=prediction, share=share)
-    return certify(formulas, evidence, others=wells, relative_error=relative_error)
+    return certify(
+        formulas, evidence, networks=networks, compared=networks is not None, relative_error=relative_error
+    )
+
+
+def networks_of(known: KnownSystem) -> AnyNetworks:
+    """Stand-ins of networks whose V is that of a known system."""
+    return SimpleNamespace(  # type: ignore[return-value]
+        potential_at=lambda x: potential_values(known, x), gradients_at=lambda x: potential_gradient(known, x)
+    )
 
 
 def evidence_of(
@@ -183,14 +194,14 @@ def test_the_true_solution_is_certified(name: str) -> None:
 @pytest.mark.parametrize("name", ["gradient system", "archetype in 3 dimensions", "Maier-Stein"])
 def test_the_true_solution_agrees_with_the_local_route(name: str) -> None:
     known = TRUE[name]
-    certificate = certified(known, known.potential, wells=wells_of(known))
+    certificate = certified(known, known.potential, networks=networks_of(known))
     assert certificate.certified, certificate.reason
     assert certificate.tests["agreement"].value < 1e-8
 
 
 def test_a_constant_in_v_means_nothing() -> None:
     known = TRUE["archetype in 3 dimensions"]
-    certificate = certified(known, known.potential + 17, wells=wells_of(known))
+    certificate = certified(known, known.potential + 17, networks=networks_of(known))
     assert certificate.certified, certificate.reason
 
 
@@ -316,7 +327,7 @@ def test_those_that_only_the_branch_sees_are_exact(name: str) -> None:
 def test_a_false_solution_disagrees_with_the_local_route(name: str) -> None:
     known = {"gradient system": separable(), "Maier-Stein": maier_stein(1)}[name]
     flat = (x**2 - 1) ** 2 / 4
-    certificate = certified(known, flat, wells=wells_of(known))
+    certificate = certified(known, flat, networks=networks_of(known))
     assert {"branch", "agreement"} <= refusals(certificate)
 
 
@@ -517,24 +528,44 @@ def test_the_identity_sees_every_state_whatever_its_unit() -> None:
     assert two.error == pytest.approx(one.error, rel=0.05)
 
 
-def test_a_well_of_another_system_is_refused_by_the_agreement_alone() -> None:
+def test_the_v_of_another_system_is_refused_by_the_agreement_alone() -> None:
     known, other = archetype(2), maier_stein(1)
-    certificate = certified(known, known.potential, wells=wells_of(other))
+    certificate = certified(known, known.potential, networks=networks_of(other))
     assert refusals(certificate) == {"agreement"}
-    assert "the two routes disagree most at" in certificate.reason
+
+
+def test_a_v_that_is_flat_along_a_state_is_refused_though_it_solves_the_equation() -> None:
+    known = archetype(2)
+    flat = known._replace(potential=known.potential.subs(known.dynamics.symbols[0], 1))
+    residual = potential_gradient(flat, uniform_points(known, 50))
+    assert np.abs(residual[:, 0]).max() == 0
+    assert refusals(certified(known, known.potential, networks=networks_of(flat))) == {"agreement"}
 
 
 def test_agreement_is_relative_and_up_to_a_constant() -> None:
     known = archetype(2)
-    wells = wells_of(known)
-
-    def scaled(at: np.ndarray) -> np.ndarray:
-        return 1.01 * potential_values(known, at) + 5
-
-    verdict = check_agreement(scaled, wells, limit=0.02)
+    scaled = known._replace(potential=sympy.Rational(101, 100) * known.potential + 5)
+    formulas, evidence = exact_decomposition(known.dynamics, 2 * known.potential), evidence_of(known)
+    verdict = check_agreement(networks_of(scaled), formulas, evidence)
     assert verdict.passed
     assert verdict.value == pytest.approx(0.01, rel=1e-6)
-    assert not check_agreement(scaled, wells, limit=0.009).passed
+    # What its own residual leaves open is twice the truth, for safety.
+    assert verdict.limit == pytest.approx(0.02, rel=0.1)
+    assert check_agreement(networks_of(known), formulas, evidence).value < 1e-9
+
+
+def test_networks_whose_residual_explains_any_difference_are_no_second_route() -> None:
+    known = archetype(2)
+    twice = known._replace(potential=sympy.Rational(3, 2) * known.potential)
+    certificate = certified(known, known.potential, networks=networks_of(twice))
+    assert refusals(certificate) == {"agreement"}
+    assert "no second route" in certificate.reason
+
+
+def test_networks_that_are_missing_are_no_second_route() -> None:
+    known = archetype(2)
+    certificate = certify(wells_of(known), evidence_of(known), compared=True)
+    assert refusals(certificate) == {"agreement"}
 
 
 def held_out(known: KnownSystem) -> Recordings:
@@ -602,13 +633,12 @@ def test_a_well_that_is_missing_is_refused() -> None:
     assert "1 of 2 attractors have no formula" in certificate.reason
 
 
-def test_wells_by_both_routes_must_agree() -> None:
+def test_networks_must_agree_with_every_well() -> None:
     known = archetype(2)
-    wells, other = wells_of(known), wells_of(maier_stein(1))
-    foreign = tuple(replace(two, attractor=one.attractor) for one, two in zip(wells, other, strict=True))
-    same = certify(wells, evidence_of(known), others=wells, compared=True)
+    same = certify(wells_of(known), evidence_of(known), networks=networks_of(known), compared=True)
     assert same.certified, same.reason
-    different = certify(wells, evidence_of(known), others=foreign, compared=True)
+    foreign = networks_of(maier_stein(1))
+    different = certify(wells_of(known), evidence_of(known), networks=foreign, compared=True)
     assert refusals(different) == {"agreement"}
 
 

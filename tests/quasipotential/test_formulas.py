@@ -14,10 +14,10 @@ from siq.errors import InputError, NumericalFailure
 from siq.inference.library import candidate_library
 from siq.quasipotential.formulas import (
     SymbolicDecomposition,
+    _decomposition_data,
     _expression_from_data,
     _expression_to_data,
     _minimum,
-    decomposition_data,
     decomposition_from_coefficients,
     exact_decomposition,
     read_model,
@@ -203,7 +203,7 @@ def test_wells_come_back_with_all_that_was_found_of_them(tmp_path: Path) -> None
 def test_coefficients_of_polynomials_are_kept_exactly(tmp_path: Path) -> None:
     coefficients = [float(number()) for _ in range(6)] + [5e-324, 1.7e308, 0.1]
     one = decomposition(sympy.Add(*(sympy.Float(c, 17) * x**k for k, c in enumerate(coefficients))))
-    data = decomposition_data(one)["V"]
+    data = _decomposition_data(one)["V"]
     assert {e[0]: c for e, c in zip(data["exponents"], data["coefficients"], strict=True)} == dict(
         enumerate(coefficients)
     )

@@ -50,7 +50,7 @@ def test_the_wells_of_both_files_are_the_same(tmp_path: Path) -> None:
     known = maier_stein(3)
     found, points = exact_field(known, 3), uniform_points(known, 300)
     refined = refine(
-        found, portrait_of(known), formula=None, network=None, points=points,
+        found, portrait_of(known), points=points,
         options=RefinementOptions(routes=("local",), degrees=(4, 6)),
     )  # fmt: skip
     model = tmp_path / "model.json"

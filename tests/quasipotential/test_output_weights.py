@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,8 +11,10 @@ import sympy
 from known_systems import (
     KnownSystem,
     archetype,
+    exact_field,
     limit_cycle,
     linear_system,
+    maier_stein,
     potential_gradient,
     potential_values,
 )
@@ -20,15 +23,17 @@ from siq.data.recordings import SnapshotPairs
 from siq.networks.decomposition import TrainedNetworks, TrainingOptions
 from siq.networks.training import TrainingData, prepare_data
 from siq.numerics.integration import runge_kutta_step
-from siq.quasipotential.output_weights import OutputWeights, UnitBasis
+from siq.quasipotential.output_weights import OutputWeights, UnitBasis, formulas_by_well
+from siq.quasipotential.refinement import RefinementOptions, _local_wells
+from siq.systems.phase_portrait import evenly_spread, phase_portrait
 
 STEP = 0.01
 STEEPNESS = 1.5  # η_v of the stand-ins, which V keeps
 
 
-def pairs_of(known: KnownSystem, *, seed: int = 0) -> TrainingData:
-    """Pairs that start anywhere in the domain, as 50 recordings."""
-    x0 = np.random.default_rng(seed).uniform(*known.domain.T, (3000, len(known.domain)))
+def pairs_of(known: KnownSystem, *, seed: int = 0, count: int = 3000) -> TrainingData:
+    """Pairs that start anywhere in the domain, 60 in a recording."""
+    x0 = np.random.default_rng(seed).uniform(*known.domain.T, (count, len(known.domain)))
     xh = runge_kutta_step(lambda x: known.dynamics.drift(x.T).T, x0.T, STEP).T
     pairs = SnapshotPairs(x0, xh, np.full(len(x0), STEP), np.arange(len(x0)) // 60)
     return prepare_data(pairs, options=TrainingOptions(), generator=np.random.default_rng(seed))
@@ -69,6 +74,52 @@ def test_a_rough_potential_leads_to_the_exact_one(known: KnownSystem) -> None:
     assert circulatory == pytest.approx(known.dynamics.drift(x) + slope @ known.diffusion, rel=1e-2, abs=1e-2)
 
 
+def test_noise_in_the_pairs_is_seen_and_f_known_as_well_as_stated() -> None:
+    known, draw = archetype(2), np.random.default_rng(2)
+    data = pairs_of(known, count=60_000)
+    noisy = data.training, data.held_out
+    noisy = tuple(replace(one, xh=one.xh + 0.014 * draw.normal(size=one.xh.shape)) for one in noisy)
+    data = replace(data, training=noisy[0], held_out=noisy[1])
+    solved = OutputWeights(data, diffusion=known.dynamics.diffusion, units=100, generator=draw)
+    exact = known.dynamics.drift(solved.points)
+    error = np.linalg.norm(solved.drift(solved.points) - exact) / np.linalg.norm(exact)
+    assert 0.3 * solved.uncertainty < error < 2 * solved.uncertainty
+    networks = solved.accepted(rough_networks(known, np.ones(2)))
+    assert networks is not None
+    assert solved.uncertainty < 0.01 and error_of(networks, known) < 0.05
+
+
+def test_a_kink_between_wells_is_met_by_networks_about_each_attractor() -> None:
+    known = maier_stein(3)
+    exact = exact_field(known, 3)
+    data = pairs_of(known)
+    solved = OutputWeights(
+        data, diffusion=known.dynamics.diffusion, units=200, generator=np.random.default_rng(1), found=exact
+    )
+    networks = solved.by_wells()
+    assert networks is not None and len(networks.parts) == 2
+    x = data.training.x0
+    portrait = phase_portrait(known.dynamics, x[evenly_spread(x, generator=np.random.default_rng(0))])
+    wells, _ = _local_wells(exact, portrait, options=RefinementOptions())
+    for well in wells:
+        places = well.inside(0.9)
+        mine = networks.potential_at(places) - networks.potential_at(well.attractor[None])
+        assert np.linalg.norm(mine - well.values(places)) < 0.01 * np.linalg.norm(well.values(places))
+    # Both wells are as deep, and where no well is nothing is claimed.
+    assert networks.heights == pytest.approx(0, abs=1e-2 * wells[0].level)
+    assert np.isnan(networks.potential_at(np.array([[np.nan, 0.0]]))).all()
+    by_well = formulas_by_well(networks, known.dynamics, degree=8)
+    for formula, well in zip(by_well, wells, strict=True):
+        places = well.inside(0.9)
+        assert np.linalg.norm(formula.values(places) - well.values(places)) < 0.02 * np.linalg.norm(
+            well.values(places)
+        )
+
+
+def test_without_an_identified_f_wells_are_not_told_apart() -> None:
+    assert solver(maier_stein(3)).by_wells() is None
+
+
 @pytest.mark.parametrize("flat", [0, 1])
 def test_a_potential_that_is_flat_along_a_direction_is_refused(flat: int) -> None:
     known = archetype(2)
@@ -80,7 +131,7 @@ def test_a_potential_that_is_flat_along_a_direction_is_refused(flat: int) -> Non
 def test_where_f_comes_to_rest_nowhere_the_branch_is_not_taken_on_trust() -> None:
     known = limit_cycle()
     solved = solver(known)
-    assert "leave out training.output_weights" in (solved.hopeless() or "")
+    assert "comes to rest nowhere" in (solved.hopeless() or "")
     assert solved.accepted(rough_networks(known, np.ones(2))) is None
 
 
@@ -101,7 +152,7 @@ def test_derivatives_of_units_are_those_of_their_formula() -> None:
     )
     coefficients, point = draw.normal(size=5), np.array([[0.7, -0.4]])
     states = sympy.symbols("x1 x2")
-    y = [(x - m) / s for x, m, s in zip(states, basis.mean, basis.scale, strict=True)]
+    y = [(x - m) / s for x, m, s in zip(states, basis.center, basis.scale, strict=True)]
     units = [
         sympy.tanh(y[0] * w0 + y[1] * w1 + b) for w0, w1, b in zip(*basis.weights, basis.biases, strict=True)
     ]

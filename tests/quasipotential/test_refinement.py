@@ -1,4 +1,4 @@
-"""Both routes together: which certificate counts, what is held out, and the check that ends a training."""
+"""Which certificate counts, what is held out, and the control of networks."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy
-from known_systems import KnownSystem, archetype, exact_field, limit_cycle, linear_system, potential_values
 
 from siq.data.recordings import SnapshotPairs
 from siq.inference.field_estimate import Verdict
-from siq.networks.decomposition import CheckOptions
 from siq.quasipotential import refinement
 from siq.quasipotential.certificate import Certificate
 from siq.quasipotential.global_formula import GlobalFormula
@@ -20,50 +18,11 @@ from siq.quasipotential.refinement import (
     Refined,
     RefinementContext,
     RefinementOptions,
-    TrainingCheck,
     _every_well_held_out,
 )
 from siq.remarks import has_code
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import phase_portrait
-
-
-def check_of(known: KnownSystem, degree: int = 3) -> TrainingCheck:
-    x = np.random.default_rng(0).uniform(*known.domain.T, (1500, len(known.domain)))
-    return TrainingCheck(exact_field(known, degree), x, options=CheckOptions(), seed=0)
-
-
-def verdict(checked: TrainingCheck, potential) -> bool:
-    """Whether the check passes for networks whose V is a given function."""
-    networks = SimpleNamespace(potential_at=potential)
-    return checked.accepted(networks) is not None  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("known", [linear_system(2), linear_system(3), archetype(2)])
-def test_networks_that_are_a_tenth_off_are_ready(known: KnownSystem) -> None:
-    def rough(x: np.ndarray) -> np.ndarray:
-        exact = potential_values(known, x)
-        return exact + 0.1 * exact.std() * np.sin(x.sum(axis=1))
-
-    assert verdict(check_of(known), rough)
-
-
-def test_networks_that_are_flat_along_a_state_are_not() -> None:
-    checked = check_of(archetype(2))
-    assert not verdict(checked, lambda x: 0.5 * x[:, 1] ** 2)
-
-
-def test_networks_that_know_nothing_are_not() -> None:
-    checked = check_of(archetype(2))
-    assert not verdict(checked, lambda x: np.sin(5 * x[:, 0]) * np.cos(4 * x[:, 1]))
-
-
-def test_a_limit_cycle_is_hopeless_and_said_to_be() -> None:
-    known = limit_cycle()
-    checked = check_of(known)
-    assert "limit cycle" in (checked.hopeless() or "")
-    assert not verdict(checked, lambda x: potential_values(known, x))
-
 
 PASSED, REFUSED = Verdict(0.0, 1.0, True), Verdict(2.0, 1.0, False, "it is no solution")
 
@@ -96,8 +55,11 @@ def test_the_wells_carry_the_certificate_where_one_formula_is_refused(
         return certificate(wells, "wells") if one == (well,) else certificate(formula, "region")
 
     monkeypatch.setattr(refinement, "certify", certified)
-    context: Any = SimpleNamespace(found=found.found, portrait=None, points=None, number=0, evidence=None)
-    refined, formulas, made = RefinementContext._by_routes(context, RefinementOptions(), None, None)
+    context: Any = SimpleNamespace(
+        found=found.found, portrait=None, points=None, number=0, evidence=None, networks=None,
+        options=RefinementOptions(),
+    )  # fmt: skip
+    refined, formulas, made = RefinementContext._certified(context)
     assert made.scope == scope
     assert (formulas.potential is not None) == whole
     assert made.certified == (PASSED in (formula, wells))

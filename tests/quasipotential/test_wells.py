@@ -35,7 +35,6 @@ from siq.quasipotential.wells import (
     _extend_well,
     _grow_well,
     best_trial,
-    fit_well,
     local_well,
 )
 from siq.systems.basins import Basin, Descents, basin_of, follow
@@ -222,89 +221,6 @@ def test_starts_near_the_attractor_stay_in_the_recorded_box() -> None:
     assert ((starts >= box[:, 0]) & (starts <= box[:, 1])).all()
 
 
-@pytest.mark.parametrize("known", [archetype(3), maier_stein(1)], ids=["archetype", "Maier-Stein"])
-def test_the_network_route_refines_values_that_are_off_by_a_tenth(known: KnownSystem) -> None:
-    found = portrait_of(known, share=0.8)
-
-    def rough(x: np.ndarray) -> np.ndarray:
-        waves = np.sin(2 * x).sum(axis=1) * np.cos(x[:, 0])
-        return 3 + potential_values(known, x) * 1.05 + 0.01 * waves
-
-    for index in range(2):
-        well = fit_well(known.dynamics, found, index, rough, degree=4)
-        assert_exact(known, replace(well, level=0.9 * well.level), 1e-9)
-
-
-def test_the_network_route_needs_recorded_states_below_the_saddle() -> None:
-    known = archetype(2)
-    found = portrait_of(known)
-
-    def inverted(x: np.ndarray) -> np.ndarray:
-        return -potential_values(known, x)
-
-    with pytest.raises(NumericalFailure, match="the networks leave only"):
-        fit_well(known.dynamics, found, 0, inverted, degree=4)
-
-
-def test_a_start_with_just_enough_states_is_not_halved() -> None:
-    # A network that is far too low at the saddle leaves between two and four states for each coefficient.
-    known = archetype(2)
-    found = portrait_of(known)
-    lowest = potential_values(known, found.attractors[0].position[None])
-    top = found.saddles[0][0].position
-
-    def dipped(x: np.ndarray) -> np.ndarray:
-        away = ((x - top) ** 2).sum(axis=1)
-        return potential_values(known, x) - lowest - 0.4996 * np.exp(-20 * away)
-
-    well = fit_well(known.dynamics, found, 0, dipped, degree=8)
-    assert well.level == pytest.approx(0.5, rel=1e-9)
-    assert_exact(known, replace(well, level=0.9 * well.level), 1e-9)
-
-
-def test_the_network_route_does_not_follow_networks_in_how_far_a_well_reaches() -> None:
-    # Steep along one state and flat along the other: where the network's V is low, V is not, and conversely.
-    known = maier_stein(3)
-    found = portrait_of(known)
-    local = grown(known, found, 0, degree=10)
-
-    def distorted(x: np.ndarray) -> np.ndarray:
-        offset = x - local.attractor
-        stretch = np.array([[3.0, 0.8], [0.8, 0.5]])
-        return np.einsum("ni,ij,nj->n", offset, local.hessians(local.attractor[None])[0] * stretch, offset)
-
-    x = local.points[local.values(local.points) < 0.9 * local.level]
-    assert np.linalg.norm(distorted(x) - local.values(x)) > 0.4 * np.linalg.norm(local.values(x))
-    well = fit_well(known.dynamics, found, 0, distorted, degree=10)
-    assert well.level == pytest.approx(local.level, rel=0.02)
-    assert np.linalg.norm(well.values(x) - local.values(x)) < 5e-3 * np.linalg.norm(local.values(x))
-
-
-@pytest.mark.parametrize("factor", [0.1, 10.0])
-def test_the_network_route_is_not_drawn_to_a_v_that_vanishes(factor: float) -> None:
-    known = archetype(2)
-    found = portrait_of(known)
-
-    def off(x: np.ndarray) -> np.ndarray:
-        return factor * potential_values(known, x)
-
-    well = fit_well(known.dynamics, found, 0, off, degree=4)
-    at = found.attractors[0].position[None]
-    true = potential_values(known, well.points) - potential_values(known, at)
-    np.testing.assert_allclose(well.values(well.points), true, atol=1e-6 * true.max())
-
-
-def test_the_network_route_refuses_a_v_without_a_minimum() -> None:
-    known = archetype(2)
-    found = portrait_of(known)
-
-    def saddle(x: np.ndarray) -> np.ndarray:
-        return (x[:, 0] + 1) ** 2 - x[:, 1] ** 2  # low on either side of the attractor
-
-    with pytest.raises(NumericalFailure, match="none with a minimum"):
-        fit_well(known.dynamics, found, 0, saddle, degree=4)
-
-
 def test_the_formula_of_a_well_has_its_values() -> None:
     known = maier_stein(3)
     well = grown(known, portrait_of(known), 0, degree=6)
@@ -318,8 +234,7 @@ def test_refinement_keeps_the_best_degree_of_a_well() -> None:
     known = maier_stein(3)
     found = exact_field(known, 3)
     refined = refine(
-        found, portrait_of(known), formula=None, network=None,
-        points=uniform_points(known, 300),
+        found, portrait_of(known), points=uniform_points(known, 300),
         options=RefinementOptions(routes=("local",), degrees=(4, 6, 8)),
     )  # fmt: skip
     assert refined.formula is None
@@ -327,8 +242,7 @@ def test_refinement_keeps_the_best_degree_of_a_well() -> None:
         assert [trial.degree for trial in well.trials] == [4, 6, 8]
         assert well.trials[best_trial(well.trials)].degree == well.degree
     with_one = refine(
-        found, portrait_of(known), formula=None, network=None,
-        points=uniform_points(known, 300),
+        found, portrait_of(known), points=uniform_points(known, 300),
         options=RefinementOptions(routes=("local",), degrees=(6,)),
     )  # fmt: skip
     assert [well.degree for well in with_one.wells] == [6, 6]

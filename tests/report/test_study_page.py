@@ -9,8 +9,10 @@ from typing import Any
 import pandas as pd
 import pytest
 import sympy
+from known_systems import double_well, exact_field
 from told_landscapes import NOISE, landscape, record_row, told, unseen_row
 
+from siq.inference.field_estimate import FieldEstimate
 from siq.quasipotential.formulas import SymbolicDecomposition, exact_decomposition, write_model
 from siq.report.formatting import texts
 from siq.report.page import ReportContent, ReportSection, render_report
@@ -57,6 +59,8 @@ def page_of(
     reason: str = "",
     record: list[dict[str, object]] | None = None,
     inspection: list[str] | None = None,
+    control: tuple[bool, ...] = (),
+    identified: FieldEstimate | None = None,
     **study: Any,
 ) -> ReportContent:
     """The page of a study with these results; where there is a reason for it, without formulas."""
@@ -81,6 +85,10 @@ def page_of(
         outcomes.append({"run": run, "step": "identify", "status": "ok", "reason": ""})
         if reason:
             outcomes.append({"run": run, "step": "refine", "status": "failed", "reason": reason})
+    tests += [
+        {"run": run, "method": Method.CONTROL, "test": "agreement", "passed": agrees, "reason": ""}
+        for run, agrees in enumerate(control)
+    ]
     tables = {name: as_table(name, []) for name in COLUMNS}
     tables |= {
         "rrmse": as_table("rrmse", rrmse), "certificates": as_table("certificates", tests),
@@ -97,7 +105,7 @@ def page_of(
     asked = Study.model_validate({"name": "mine", "runs": runs, "recordings": {"file": "mine.csv"}} | study)
     results = StudyResults(
         tables, Path("results/mine/tables"), images=dict.fromkeys(images, PNG), vectors={}, models=models,
-        shown=models.representative(tables["rrmse"]), exact=exact,
+        shown=models.representative(tables["rrmse"]), exact=exact, record=identified,
         landscape=None if overview is None else summarise(told(overview)), inspection=inspection,
     )  # fmt: skip
     return study_page(asked, results, command="siq run mine.yaml", versions={"siq": "1"})
@@ -157,6 +165,37 @@ def test_every_figure_that_makes_sense_is_shown_once(tmp_path: Path, runs: int, 
     texts = CAPTIONS | {"quasipotential": OF_ONE_STATE}
     expected = [text for name, text in texts.items() if name not in absent]
     assert sorted(shown) == sorted([*expected, "Of tomorrow."])
+
+
+@pytest.mark.parametrize(
+    ("study", "compared"),
+    [
+        ({"training": {}}, True),
+        ({"training": {}, "refinement": {"routes": ["local"]}}, False),
+        ({}, False),
+    ],
+)
+def test_networks_are_told_to_be_a_second_route_where_they_are_compared(
+    tmp_path: Path, study: dict[str, Any], compared: bool
+) -> None:
+    content = page_of(tmp_path, identified=exact_field(double_well(2), 3), **study)
+    text = " ".join(section_of(content, "The recordings and the workings").text)
+    assert "The formulas follow from this f alone" in text
+    assert ("The networks are a second route to U" in text) == compared
+
+
+@pytest.mark.parametrize(
+    ("control", "count", "alarm"),
+    [((False, False), "2 of 2 runs.", False), ((False, True), "1 of 2 runs;", True)],
+)
+def test_a_control_that_agrees_with_the_refined_u_is_told(
+    tmp_path: Path, control: tuple[bool, ...], count: str, alarm: bool
+) -> None:
+    content = page_of(tmp_path, runs=2, control=control)
+    text = " ".join(section_of(content, "How far it can be trusted").text)
+    assert f"They were refused in {count}" in text
+    assert ("agreement is no evidence here" in text) == alarm
+    assert "As a control" not in render_report(page_of(tmp_path))
 
 
 def test_a_figure_that_was_not_drawn_leaves_no_trace(tmp_path: Path) -> None:

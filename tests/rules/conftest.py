@@ -24,7 +24,8 @@ training:
   widths: [12, 12]
   steps: {steps}
   batch_size: 64
-  check: null
+  check: {{first: 120, attempts: 1}}
+  output_weights: 200
   decay_steps: 1000
   orthogonality_weight: 10
   representative_share: 0

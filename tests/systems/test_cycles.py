@@ -7,7 +7,7 @@ import pytest
 import sympy
 
 from siq.errors import NumericalFailure
-from siq.systems.cycles import Cycle, closed_orbit, hessians_along, unstable_direction
+from siq.systems.cycles import Cycle, _unstable_direction, closed_orbit, hessians_along
 from siq.systems.dynamics import Dynamics
 
 pytestmark = pytest.mark.portable
@@ -104,7 +104,7 @@ def test_van_der_pol_has_the_period_known_to_ten_digits() -> None:
 
 def test_what_grows_leads_away_from_a_cycle() -> None:
     cycle = around(INNER, axis=True)
-    direction = unstable_direction(rings(axis=True), cycle, scale=np.ones(3))
+    direction = _unstable_direction(rings(axis=True), cycle, scale=np.ones(3))
     assert abs(direction @ cycle.points[0]) / INNER == pytest.approx(1, rel=1e-5)
 
 

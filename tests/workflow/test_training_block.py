@@ -11,10 +11,10 @@ import torch
 from known_settings import PAPER
 
 from siq.data.recordings import SnapshotPairs
-from siq.networks.decomposition import CheckOptions, TrainedNetworks, pack
+from siq.networks.decomposition import CheckOptions, NetworksByWell, TrainedNetworks, TrainingOptions, pack
 from siq.networks.training import Block, prepare_data
 from siq.systems.diffusion import Diffusion
-from siq.workflow.tables import Status
+from siq.workflow.tables import Outcome, Status, Step
 from siq.workflow.training import _outcome_of, clean
 
 TRAINING = replace(
@@ -34,10 +34,21 @@ def data(run: int):
 
 
 class Check:
-    """Passes at its n-th call, or for the networks given, and may be told to die at a call."""
+    """Passes at its n-th call, or for the networks given, and may be told to die at a call.
 
-    def __init__(self, passes_at: int = -1, *, like: TrainedNetworks | None = None, dies_at: int = -1):
+    Where it never passes there may be something `instead`.
+    """
+
+    def __init__(
+        self,
+        passes_at: int = -1,
+        *,
+        like: TrainedNetworks | None = None,
+        dies_at: int = -1,
+        instead: NetworksByWell | None = None,
+    ):
         self.calls, self.passes_at, self.like, self.dies_at = 0, passes_at, like, dies_at
+        self.instead = instead
 
     def hopeless(self) -> None:
         return None
@@ -50,15 +61,20 @@ class Check:
             return networks if same(networks, self.like) else None
         return networks if self.calls == self.passes_at else None
 
+    def by_wells(self) -> NetworksByWell | None:
+        return self.instead
+
 
 def same(left: TrainedNetworks, right: TrainedNetworks) -> bool:
     one, other = pack([left]), pack([right])
     return all(np.array_equal(one[name], other[name]) for name in one)
 
 
-def block(folder: Path | None, checks: dict[int, Check], **further) -> Block:
+def block(
+    folder: Path | None, checks: dict[int, Check], *, options: TrainingOptions = TRAINING, **further
+) -> Block:
     return Block(
-        {run: data(run) for run in (0, 1)}, checks, options=TRAINING, diffusion=Diffusion.identity(2), seed=3,
+        {run: data(run) for run in (0, 1)}, checks, options=options, diffusion=Diffusion.identity(2), seed=3,
         folder=folder, mark="m" * 20, device=torch.device("cpu"), **further,
     )  # type: ignore[arg-type]  # fmt: skip
 
@@ -81,6 +97,17 @@ def test_a_run_whose_check_never_passes_is_shown_as_such(tmp_path: Path) -> None
     one.train()
     said = _outcome_of(one, 1)
     assert said.status == Status.WARNING and "passed in none of 2 trainings" in said.reason
+
+
+@pytest.mark.parametrize("options", [TRAINING, replace(TRAINING, learning_rate=1e30)], ids=["", "lost"])
+def test_networks_by_well_serve_where_no_training_has_passed(options: TrainingOptions) -> None:
+    by_well = NetworksByWell((), np.zeros(0), np.zeros((0, 2)), np.zeros(0, dtype=int))
+    checks = {0: Check(1, instead=by_well), 1: Check(99, instead=by_well)}
+    one = block(None, checks, options=options)
+    one.train()
+    assert isinstance(one.last[0], TrainedNetworks) and one.last[1] is by_well
+    assert checks[1].calls == 2 * 3  # every step of both trainings at which it was asked came first
+    assert _outcome_of(one, 1) == Outcome(1, Step.TRAIN, Status.OK, "", {"position": 1})
 
 
 def test_why_a_run_has_no_check_is_said() -> None:

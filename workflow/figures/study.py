@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.inference.checks import predict
-from siq.networks.decomposition import TrainedNetworks
+from siq.networks.decomposition import AnyNetworks
 from siq.networks.regression import highest_used, points_below
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.formulas import SymbolicDecomposition
@@ -110,7 +110,7 @@ def landscape_figures(
     escape: pd.DataFrame,
     landscape: Landscape | None = None,
     reference: ReferenceLandscape | None = None,
-    networks: TrainedNetworks | None = None,
+    networks: AnyNetworks | None = None,
     formulas: Mapping[str, SymbolicDecomposition] | None = None,
     published: Mapping[str, PublishedFigure] | None = None,
     mesh: Potential | None = None,
@@ -227,7 +227,7 @@ class RepresentativeRun:
     landscape: GlobalQuasipotential | None
     dynamics: Dynamics | None
     recordings: Recordings | None = None
-    networks: TrainedNetworks | None = None
+    networks: AnyNetworks | None = None
     exact: SymbolicDecomposition | None = None
 
 
@@ -392,7 +392,7 @@ def _prediction_figure(
 def _dataset(
     settings: PipelineSettings,
     recordings: Recordings,
-    networks: TrainedNetworks | None,
+    networks: AnyNetworks | None,
     system: Dynamics | None,
 ) -> Dataset:
     """The recorded states of a run, and those that its regression sees."""
