@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,6 @@ from siq.quasipotential.landscape_comparison import (
 )
 from siq.quasipotential.landscape_files import landscape_from_data, read_landscape
 from siq.quasipotential.transitions import Transition
-from siq.quasipotential.wells import Well
 from siq.remarks import sentence
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
@@ -137,7 +137,8 @@ def run_landscape_errors(
             sources["networks"] = _twice(networks.potential_at)
         regressed = formulas.get(Method.REGRESSION)
         if isinstance(networks, NetworksByWell) and regressed is not None and regressed.wells:
-            sources["regression, by well"] = _twice(_of_assigned_wells(networks, regressed.wells))
+            lifted = partial(networks.lifted, potentials=[one.values for one in regressed.wells])
+            sources["regression, by well"] = _twice(lifted)
         for source, potential in sources.items():
             tables.append(_rows(number, source, compare_estimate(reference, potential, below=below)))
     if np.isfinite(reference.mesh).any():
@@ -162,18 +163,6 @@ def run_landscape_errors(
 
 def _rows(number: int, source: str, comparisons: Sequence[Mapping[str, object]]) -> pd.DataFrame:
     return as_table(TABLE, [{"run": number, "source": source, **one} for one in comparisons])
-
-
-def _of_assigned_wells(networks: NetworksByWell, wells: Sequence[Well]) -> Potential:
-    """V by formulas about the attractors, each in the well that networks assign points to."""
-
-    def values(x: np.ndarray) -> np.ndarray:
-        potential = np.full(len(x), np.nan)
-        for well, height, rows in zip(wells, networks.heights, networks.of_wells(x), strict=True):
-            potential[rows] = well.values(x[rows]) + height
-        return potential
-
-    return values
 
 
 def _twice(potential: Potential) -> Potential:

@@ -47,9 +47,16 @@ def read_pairs(
     pair_step: float | None,
     hidden_velocities: bool = False,
 ) -> tuple[Recordings, SnapshotPairs]:
-    """Read recordings that something is to be learned from, and their pairs, see `snapshot_pairs`.
+    """Read recordings that something is to be learned from, and their pairs.
 
-    With hidden velocities they are positions: smooth, however strong the process noise on velocities is.
+    Parameters
+    ----------
+    path, states, units
+        See `read_recordings`.
+    pair_step
+        See `snapshot_pairs`.
+    hidden_velocities
+        Whether they are positions: these are smooth, however strong the process noise on velocities is.
 
     Raises
     ------

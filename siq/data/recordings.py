@@ -205,8 +205,11 @@ class Recordings:
     def select(self, indices: Sequence[int] | np.ndarray) -> Recordings:
         """Whole recordings, in the order given.
 
-        The indices are those of `labels`, not of rows. One that stands twice gives copies, told apart by
-        their labels: ``r07``, ``r07#2``.
+        Parameters
+        ----------
+        indices
+            Indices into `labels`, not of rows. One that stands twice gives copies, told apart by their
+            labels: ``r07``, ``r07#2``.
 
         Raises
         ------
@@ -323,8 +326,19 @@ def read_recordings(
 def write_recordings(path: str | Path, recordings: Recordings) -> None:
     """Write recordings as Parquet; `read_recordings` gives them back to the last bit.
 
-    The file appears complete or not at all, and the same recordings give the same bytes. One that exists is
-    replaced. Raises ValueError when its suffix is not ``.parquet``.
+    The file appears complete or not at all, and the same recordings give the same bytes.
+
+    Parameters
+    ----------
+    path
+        A file named ``.parquet``; one that exists is replaced.
+    recordings
+        What to write.
+
+    Raises
+    ------
+    ValueError
+        When the path has another suffix.
     """
     import pyarrow as pa
     from pyarrow import parquet
@@ -354,10 +368,20 @@ def write_recordings(path: str | Path, recordings: Recordings) -> None:
 
 
 def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) -> SnapshotPairs:
-    """Pair every sample with the next one of the same recording; raises ValueError when no pair results.
+    """Pair every sample with the next one of the same recording.
 
-    The pair step is the longest gap that still makes a pair, in the unit of `t`; by default `LONGEST_STEP`
-    median steps. It is a limit, not the step h of the pairs, of which each has its own.
+    Parameters
+    ----------
+    recordings
+        The trajectories.
+    pair_step
+        The longest gap that still makes a pair, in the unit of `t`; by default `LONGEST_STEP` median steps.
+        This is a limit, not the step h of the pairs, of which each has its own.
+
+    Raises
+    ------
+    ValueError
+        When no pair results.
     """
     if pair_step is not None and not pair_step > 0:
         raise ValueError(f"pair_step is {pair_step}, but it must be positive")

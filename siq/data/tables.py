@@ -381,10 +381,23 @@ def _once(rows: np.ndarray, numbers: np.ndarray) -> np.ndarray:
 def check_times(
     file: str, t: np.ndarray, recording: np.ndarray, labels: tuple[str, ...], rows: np.ndarray
 ) -> None:
-    """Refuse times that do not increase within every recording, and recordings of one row each.
+    """Refuse times that do not increase within every recording.
 
-    Time and recording have the shape ``(n,)``; the rows of a recording stand together. `rows` says where each
-    stands in the file, counted from 0: the first row at fault is named.
+    Parameters
+    ----------
+    file
+        The file, for messages.
+    t, recording
+        Shape ``(n,)``: the time and the recording of each row; the rows of a recording stand together.
+    labels
+        The label of each recording.
+    rows
+        Shape ``(n,)``: where each row stands in the file, counted from 0.
+
+    Raises
+    ------
+    InputError
+        For the first row of the file whose time is repeated or earlier, or when no recording has two rows.
     """
     same = recording[1:] == recording[:-1]
     if not same.any():

@@ -172,12 +172,17 @@ def probability_by_chance(
 ) -> float:
     """Probability of a mechanism by chance, where errors of a recording are autocorrelated.
 
-    Of recordings fewer than half of `blocks`, a covariance cannot be known; how long errors are correlated is
-    known all the same (`_correlated_probability`). Else it is a Wald test with the covariance of the scores
-    of whole recordings in the place of that of white errors. The residuals are those with the mechanism, so
-    that a real effect does not inflate its own error. Few recordings in which there is process noise, or of
-    which there is no fit without the mechanism, are cut into at least `blocks`, of several correlation times
-    each.
+    Among many recordings each counts as one (`_clustered_probability`). Of a few, blocks are too few to know
+    a covariance from them; how long errors are correlated is known all the same (`_correlated_probability`).
+
+    Parameters
+    ----------
+    fit, before
+        With the mechanism and without it; None where there is no such fit.
+    data, candidate
+        The recordings, and the mechanism.
+    blocks
+        Where there are fewer recordings than half of it, they are few.
     """
     few = len(data.labels) < blocks // 2
     if few and not (before is None or fit.has_process_noise or before.has_process_noise):
@@ -294,9 +299,18 @@ def evidences_by_size(
 def evidence_of_function(
     columns: np.ndarray, target: np.ndarray, knots: np.ndarray, *, freedom: float
 ) -> float:
-    """Log-likelihood of a smooth function, averaged over its values, size and smoothness, to that of none.
+    """Log-likelihood of a smooth function, averaged over its values, size and smoothness, to that of nothing.
 
-    The columns ``(n, k)`` are what its value at each knot does to the target, innovations in units of noise.
+    Parameters
+    ----------
+    columns
+        What its value at each knot does to the innovations, in units of noise, shape ``(n, k)``.
+    target
+        The innovations, shape ``(n,)``.
+    knots
+        Shape ``(k,)``.
+    freedom
+        Degrees of freedom of the target.
     """
     total = float(target @ target)
     values = []

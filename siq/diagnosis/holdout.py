@@ -42,7 +42,14 @@ MIN_STRETCH_SAMPLES = 16  # of a stretch that an initial state and an error can 
 def simulated(fit: Fit, data: Measurements, *, noise: Noise, substeps: int) -> np.ndarray:
     """A fit's free run of recordings, told how they begin and where it usually is.
 
-    The noise is that of `siq.inference.trajectories.free_run`; a fit that needed more substeps has its own.
+    Parameters
+    ----------
+    fit, data
+        Of the simulation, and the recordings.
+    noise
+        See `siq.inference.trajectories.free_run`.
+    substeps
+        Runge–Kutta steps between samples at least; a fit that needed more is run with its own.
     """
     finer = max(substeps, fit.substeps)
     return free_run(fit.model, data, noise=noise, substeps=finer, usual=fit.x)

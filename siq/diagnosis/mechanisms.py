@@ -609,8 +609,16 @@ def generic_candidates(
 ) -> list[MechanismCandidate]:
     """Monomials of the states up to a degree in every equation that says more than a definition.
 
-    Those that the simulation's own parameters can do are left out, and so are those of candidates with a
-    name.
+    Those that the simulation's own parameters can do are left out, and so are those that have a name.
+
+    Parameters
+    ----------
+    model, roles
+        The simulation.
+    degree
+        Highest degree.
+    named
+        Candidates of the dictionary.
     """
     states = [symbol(name) for name in model.states]
     found = []

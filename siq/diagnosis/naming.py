@@ -374,8 +374,16 @@ def decide_naming(
 ) -> Investigation:
     """Decide about the names of a search that found something, and fit models of the rest.
 
-    It is given what is left with the first mechanism, the first two, and so on, and draws effects without a
-    name.
+    Parameters
+    ----------
+    whole
+        The search.
+    left
+        What is left with the first mechanism, the first two, and so on.
+    context
+        What models are made from, and what could be named.
+    generator
+        Draws effects without a name.
     """
     least = context.study.search.least_log_odds
     decision = _judge_mechanisms(whole, left, context, generator=generator)

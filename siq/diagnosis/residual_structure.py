@@ -149,7 +149,17 @@ class Remainder:
 
     @classmethod
     def of(cls, data: Measurements, recalibrated: Fit, final: Fit, roles: Roles) -> Remainder:
-        """Of the fits of the simulation alone and with mechanisms, and the roles of its states."""
+        """Structure before and after mechanisms were added, and the share of the excess that they explain.
+
+        Parameters
+        ----------
+        data
+            The recordings.
+        recalibrated, final
+            The fit of the simulation, and that with mechanisms.
+        roles
+            Of the simulation's states.
+        """
         after = _structure_of(data, final, roles)
         # Process noise that stands for missing physics takes measurement noise with it: take the final one.
         still = Noise(final.noise.measurement, np.zeros(recalibrated.model.dimension))

@@ -87,7 +87,15 @@ class Probe:
     def all_of(
         cls, candidate: MechanismCandidate, data: Measurements, model: Dynamics, x: np.ndarray
     ) -> list[Probe]:
-        """A candidate with its shapes at all places where they are looked for along a simulation."""
+        """A candidate with its shapes at all places where they are looked for.
+
+        Parameters
+        ----------
+        candidate
+            The mechanism.
+        data, model, x
+            The recordings, and the simulation along them: sizes of motion are taken from there.
+        """
         choices: list[tuple[tuple[str, float], ...]] = [()]
         for name, search in zip(candidate.shapes, candidate.searches, strict=True):
             found = places_of(search, data, model, x)

@@ -84,8 +84,16 @@ class Bumps:
     ) -> Bumps:
         """A smooth function with its bumps where the recordings have been.
 
-        Its lengths are shares of the ranges of the courses ``(c, n)``. Of more bumps than so many, those
-        nearest to others are left out.
+        Parameters
+        ----------
+        coordinates, courses
+            What it is a function of, and their values along the recordings, shape ``(c, n)``.
+        shares
+            Its lengths, as shares of the coordinates' ranges.
+        deviation, weight
+            See above.
+        most
+            So many bumps at most; those left out are nearest to others.
         """
         lengths = np.array(shares) * np.ptp(courses, axis=1)
         limits = np.stack([courses.min(axis=1), courses.max(axis=1)])

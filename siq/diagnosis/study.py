@@ -242,8 +242,16 @@ def comparison_of(
 ) -> Comparison:
     """Check a simulation, recordings and settings against each other.
 
-    Recordings have a column for each output and each input. A state needs no domain; the recordings tell
-    where it lies. Messages about the settings call them `file`.
+    Parameters
+    ----------
+    system
+        The simulation. A state needs no domain; the recordings tell where it lies.
+    recordings
+        With a column for each output and each input.
+    settings
+        What is held out, what is known of the noise, and what counts as found.
+    file
+        What messages about the settings call them.
 
     Raises
     ------

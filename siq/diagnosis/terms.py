@@ -185,9 +185,17 @@ def places_in(
 ) -> tuple[Place, ...]:
     """Functions of one coordinate, in every equation that says more than a definition, and in every output.
 
-    In a rotating frame they are also those of amplitude and time, along the state and across it. Knots are
-    quantiles along the states ``(n, d)``. Piecewise linear ones have few knots and are forces: in equations
-    only, and in a rotating frame of the amplitude only, of which they have the direction and not the size.
+    In a rotating frame they are also those of amplitude and time, along the state and across it.
+
+    Parameters
+    ----------
+    model, roles
+        The simulation, and the roles of its states.
+    data, x
+        The recordings and the states along them, shape ``(n, d)``: knots are quantiles of these.
+    linear
+        Whether they are piecewise linear, of few knots, and forces: in equations only, and in a rotating
+        frame of the amplitude only, of which they have the direction and not the size.
     """
     found: list[Place] = []
     coordinates = coordinates_of(model)

@@ -462,7 +462,16 @@ def fit_models_of_remainder(
     """Models of what mechanisms with a name leave, the likeliest first; none where none is likelier.
 
     They are what was found on top of the names, not certain enough for one itself, and functions on top of
-    all that was found. Functions on top of the names alone may be fitted already.
+    all that was found.
+
+    Parameters
+    ----------
+    named, whole
+        The search with what is named, and with all that was found.
+    context
+        What models are made from.
+    functions
+        Those on top of the names alone, where they are fitted already.
     """
     base, data = named.fit, context.data
 

@@ -234,9 +234,17 @@ def unexplained_probability(
 ) -> float:
     """Probability of residuals having no part left that columns explain: tiny where f misses a term.
 
-    An F test of the regression of white residuals ``(n, r)`` on columns ``(n, q)``, or a χ² test where their
-    variances ``(r,)`` are known. The smallest probability of the r counts, corrected for their number. The
-    residuals have n degrees of freedom, unless these are given.
+    An F test of the regression of the residuals on the columns, or a χ² test where their variance is known.
+
+    Parameters
+    ----------
+    columns, rest
+        Shapes ``(n, q)`` and ``(n, r)``, of white residuals; the smallest probability of the r counts,
+        corrected for their number.
+    freedom
+        Degrees of freedom of the residuals, n by default.
+    variance
+        Of each of the r residuals, shape ``(r,)``, where it is known.
     """
     basis = np.linalg.qr(columns / positive(np.linalg.norm(columns, axis=0)))[0]
     explained, count = ((basis.T @ rest) ** 2).sum(axis=0), columns.shape[1]

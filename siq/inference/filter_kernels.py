@@ -27,11 +27,20 @@ def carry_linearly(
     transition: np.ndarray,
     response: np.ndarray,
 ) -> None:
-    """Carry derivatives of the state over one substep, in place: ``S' = J S + F`` by the Runge–Kutta rule.
+    """Carry deviations of the state over one substep, in place: ``S' = J S + F`` by the Runge–Kutta rule.
 
-    They are those by the state at the begin of the interval, `transition` ``(n, d, d)``, and by parameters,
-    `response` ``(n, d, p)``. Substeps are ``(n,)``; J and F, at the begin, middle and end of each,
-    ``(3, n, d, d)`` and ``(3, n, d, p)``.
+    Parameters
+    ----------
+    step
+        Lengths of the substeps, shape ``(n,)``.
+    jacobians
+        J at the begin, the middle and the end of each, shape ``(3, n, d, d)``.
+    forcings
+        F at the same places, shape ``(3, n, d, p)``: the derivatives by parameters.
+    transition
+        Shape ``(n, d, d)``: derivative of the state by the state at the begin of the interval.
+    response
+        Shape ``(n, d, p)``: derivative of the state by the parameters.
     """
     intervals, dimension, columns = forcings.shape[1:]
     slope = np.empty(dimension)

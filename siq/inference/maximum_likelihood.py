@@ -312,9 +312,18 @@ class Fit:
 def fit_of_states(
     model: Dynamics, data: Measurements, *, x: np.ndarray, noise: Noise, substeps: int, converged: bool
 ) -> Fit:
-    """A fit that was made otherwise, with states ``(n, d)`` that follow the equations of the fitted model.
+    """A fit that was made otherwise: without process noise, its states follow the equations.
 
-    The measurement noise is estimated, beginning with that of the noise.
+    Parameters
+    ----------
+    model
+        With the estimates.
+    data, substeps, converged
+        Of the fit.
+    x
+        The fitted states, shape ``(n, d)``.
+    noise
+        To begin with; the measurement noise is estimated.
     """
     along = linearise(model, Grid(data, substeps), model.values, x)
 

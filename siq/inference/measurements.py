@@ -103,12 +103,20 @@ class Measurements:
         delays: Sequence[tuple[int, float]],
         width: np.ndarray | float = 0.0,
     ) -> Signals:
-        """Inputs at instants ``(n,)``, each in its recording, whose places never decrease.
+        """Inputs at instants, each in its recording.
 
-        Delayed inputs are wanted by the place of the input, and by how much time it lags. What was before a
-        recording is taken to be as it began. Where they are held between samples they are averaged over a
-        width of time about each instant: a jump within a step of an integration then acts as it should, and
-        the lag has a derivative.
+        Parameters
+        ----------
+        t
+            Instants, shape ``(n,)``.
+        recording
+            The place of the recording of each; it never decreases.
+        delays
+            Delayed inputs wanted: the place of the input, and by how much time it lags. What was before a
+            recording is taken to be as it began.
+        width
+            Of time about each instant, over which a delayed input that is held between samples is averaged:
+            a jump within a step of an integration then acts as it should, and the lag has a derivative.
         """
         wide = np.broadcast_to(width, t.shape)
         count = len(self.courses[0]) if self.courses else 0

@@ -140,8 +140,23 @@ def fit_with_and_without_process_noise(
 ) -> tuple[Fit | None, Fit]:
     """Fit with process noise estimated, where that was begun with, and without.
 
-    Both begin with the states and noise of a fit, its process noise times the `level`; or with states `x`,
-    where the model has more of them. Where the fit is `settled` it is itself the one with process noise.
+    Parameters
+    ----------
+    model, data
+        With the parameters' values to begin with.
+    begin
+        A fit whose states and noise are begun with.
+    level
+        Factor on its process noise.
+    x
+        States, where the model has more of them.
+    settled
+        Whether `begin` is itself the fit of the model with process noise, and need not be made again.
+
+    Raises
+    ------
+    BudgetSpent
+        When nothing is left of what is allowed.
     """
     if budget is not None:
         budget.charge(COMPILATION)

@@ -202,12 +202,32 @@ def fit_trajectories(
     substeps: int,
     budget: Budget | None = None,
 ) -> Fit:
-    """Fit free parameters and initial states ``(recordings, d)``, without process noise, by damped steps.
+    """Fit free parameters and initial states, without process noise, by damped steps.
 
     Slower by far than `siq.inference.maximum_likelihood.fit_by_multiple_shooting`, for it simulates
     sample after sample, and lost where the motion is chaotic; to be used where that one does not settle.
-    The measurement noise weighs the outputs. The fit is not converged where the simulation runs away at the
-    begin, or where more simulations would be needed than are allowed.
+
+    Parameters
+    ----------
+    model, data
+        Its parameters' values are where the fit begins.
+    begin
+        Initial states to begin with, shape ``(recordings, d)``.
+    noise
+        Of which only the measurement noise is used, for the weights of the outputs.
+    substeps, budget
+        Runge–Kutta steps between samples; charged for every evaluation.
+
+    Returns
+    -------
+    Fit
+        Not converged where the simulation runs away at the begin, or where more simulations would be needed
+        than are allowed.
+
+    Raises
+    ------
+    BudgetSpent
+        When nothing is left of what is allowed.
     """
     work, free = substeps * evaluation(model, data), np.array(model.free, dtype=int)
     count = int(np.isfinite(data.outputs).sum())

@@ -7,7 +7,7 @@ torch, which takes longer to import than such an evaluation does to run. Network
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -256,10 +256,7 @@ class NetworksByWell:
 
     def potential_at(self, x: np.ndarray) -> np.ndarray:
         """V alone, shape ``(n,)``, NaN in no well."""
-        potential = np.full(len(x), np.nan)
-        for index, rows in enumerate(self.of_wells(x)):
-            potential[rows] = self.parts[index].potential_at(x[rows]) + self.heights[index]
-        return potential
+        return self.lifted(x, [one.potential_at for one in self.parts])
 
     def gradients_at(self, x: np.ndarray) -> np.ndarray:
         """∇V alone, shape ``(n, d)``, NaN in no well."""
@@ -267,6 +264,13 @@ class NetworksByWell:
         for index, rows in enumerate(self.of_wells(x)):
             gradients[rows] = self.parts[index].gradients_at(x[rows])
         return gradients
+
+    def lifted(self, x: np.ndarray, potentials: Sequence[Callable[[np.ndarray], np.ndarray]]) -> np.ndarray:
+        """V by functions for the wells, each zero at its attractor, so that they meet: shape ``(n,)``."""
+        potential = np.full(len(x), np.nan)
+        for values, height, rows in zip(potentials, self.heights, self.of_wells(x), strict=True):
+            potential[rows] = values(x[rows]) + height
+        return potential
 
     def of_wells(self, x: np.ndarray) -> list[np.ndarray]:
         """Rows of points ``(n, d)`` by the well that they lie in."""

@@ -468,10 +468,19 @@ def adapted_fan(
 ) -> Fan:
     """A fan whose curves end close together, as far as a number of curves allows.
 
-    There are `count` curves at first, and `most` at most, which are put in between in so many `rounds`, up to
-    seven into every gap that is wider than `gap`; the level is at about 1. Where a saddle or a caustic parts
-    neighbours, a gap stays however many curves are put into it. The generator draws the first directions
-    where there are more than two states; all else is as for `characteristics`.
+    Parameters
+    ----------
+    dynamics, attractor, level, box, **options
+        As for `characteristics`.
+    generator
+        Draws the first directions where there are more than two states.
+    count, most
+        Number of curves at first, and at most: in four and more dimensions that is what limits the spread.
+    rounds
+        How often curves are put in between, up to seven into every gap.
+    gap
+        Distance between the ends of neighbours that is close enough; the level is at about 1. Where a saddle
+        or a caustic parts neighbours, a gap stays however many curves are put into it.
     """
     directions = _even_directions(dynamics.dimension, count, generator=generator)
 
@@ -540,12 +549,23 @@ def ascending_integrals(
     fastest: float,
     fewest_steps: int = MIN_PATH_STEPS,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Integrals over time along the paths ``dx/dt = f + 2D∇V`` that end at x, ``(n, d)``, by Heun's rule.
+    """Integrals over time along the paths ``dx/dt = f + 2D∇V`` that end at points, by Heun's rule.
 
-    The `integrand` is a function of points, ∇V, f and D∇V there, to ``(n, k)``. A path that leaves the box of
-    the states, of `middle` and `width`, by `RUNAWAY_WIDTHS` has run away. Rates, and a number of steps, set
-    how long, and how finely, paths are followed back. Returned are the integrals, ``(n, k)``, where the paths
-    begin, ``(n, d)``, and a mask of those that have run away.
+    Parameters
+    ----------
+    gradient, dynamics, x
+        ∇V, points ``(n, d)`` to ``(n, d)``; f and D; and where the paths end, shape ``(n, d)``.
+    integrand
+        Of points, ∇V, f and D∇V there: to ``(n, k)``.
+    middle, width
+        Of the box of the states, shape ``(d,)``: a path that leaves it by `RUNAWAY_WIDTHS` has run away.
+    slowest, fastest, fewest_steps
+        Rates, and a number of steps, that set how long, and how finely, the paths are followed back.
+
+    Returns
+    -------
+    integrals, beginnings, lost
+        Shapes ``(n, k)``, ``(n, d)`` and ``(n,)``: the last is a mask of the paths that run away.
     """
     steps = int(np.clip(RELAXATIONS / slowest * fastest / HEUN_STEP, fewest_steps, MAX_PATH_STEPS))
     step = RELAXATIONS / slowest / steps

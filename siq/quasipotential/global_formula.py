@@ -91,11 +91,18 @@ def refine_globally(
     precision: float = 1e-7,
     sparse: bool = True,
 ) -> GlobalFormula:
-    """Refine V from a start, coefficients ``(q,)`` over the library of f; keep the terms that data support.
+    """Refine V from a start, and keep only the terms that the data support.
 
-    The equation is asked for at points ``(n, d)``. `false_terms` is the probability that the uncertainty of f
-    alone brings any false term into V. Terms that contribute less than the share `precision` of V are dropped
-    in any case; none at all if not `sparse`.
+    Parameters
+    ----------
+    start
+        Coefficients of V over the library of f, shape ``(q,)``.
+    found, points
+        The identified f with its uncertainty, and where the equation is asked for, shape ``(n, d)``.
+    false_terms
+        Probability that the uncertainty of f alone brings any false term into V.
+    precision
+        Terms that contribute less than this share of V are dropped in any case; none at all if not `sparse`.
     """
     library = found.library
     basis = LibraryBasis.of_potential(library)

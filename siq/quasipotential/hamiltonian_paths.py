@@ -208,12 +208,22 @@ def hamiltonian_paths(
     tolerance: float = 1e-5,
     curves: Sequence[np.ndarray] = (),
 ) -> list[MinimumActionPath]:
-    """Solutions from an attractor to a state, mostly a saddle, by rising action, those that are minima first.
+    """Solutions from an attractor to a state, by rising action, those that are minima first.
 
-    `beside` is a trajectory of f from the saddle to the attractor, shape ``(k, d)``: it tells from where the
-    saddle is approached, and is itself a curve for the end to move along, as are further `curves` from the
-    attractor to the end. The `tolerance` is that of the action, relative. NumericalFailure is raised when the
-    start is no attractor, or no curve leads to a solution.
+    Parameters
+    ----------
+    dynamics, attractor, end
+        f and D, twice differentiable; and two states, shape ``(d,)``, the end mostly a saddle.
+    beside, curves
+        A trajectory of f from the saddle to the attractor, shape ``(k, d)``: tells from where the saddle is
+        approached, and is itself a curve for the end to move along; and further curves from attractor to end.
+    tolerance
+        Of the action, relative.
+
+    Raises
+    ------
+    NumericalFailure
+        When the start is no attractor, or no curve leads to a solution.
     """
     if classify(dynamics, attractor).kind != "attractor":
         raise NumericalFailure(

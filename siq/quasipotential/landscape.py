@@ -338,8 +338,11 @@ class Landscape:
     def quasipotential_errors(self, points: np.ndarray) -> np.ndarray:
         """Standard errors of U at points ``(n, d)``, above the attractor of the well that each lies in.
 
-        They come from the uncertainty of f, shape ``(n,)``: zero where recordings carry no noise, NaN where U
-        is not known, or f was not identified.
+        Returns
+        -------
+        numpy.ndarray
+            Shape ``(n,)``, from the uncertainty of f; zero where recordings carry no noise, NaN where U is
+            not known, or f was not identified.
         """
         x = np.asarray(points, dtype=float)
         errors, whole = np.full(len(x), np.nan), self.global_quasipotential
@@ -365,23 +368,38 @@ class Landscape:
         return found
 
     def barriers(self) -> pd.DataFrame:
-        """ΔU on every way out of every well, one row each: columns ``start end barrier standard_error``.
+        """ΔU on every way out of every well, one row each.
 
-        Attractors are given by their place in `attractors`, the end missing where the way leads out of the
-        recorded region; ΔU is in the unit of ε, with its standard error from the uncertainty of f, NaN where
-        it is not known.
+        Returns
+        -------
+        pandas.DataFrame
+            Columns ``start end barrier standard_error``: attractors by their place in `attractors`, the end
+            missing where the way leads out of the recorded region; ΔU in the unit of ε with its standard
+            error from the uncertainty of f, NaN where it is not known.
         """
         types: dict[str, Any] = {"start": int, "end": "Int64", "barrier": float, "standard_error": float}
         rows = [[getattr(way, name) for name in types] for way in self.transitions]
         return pd.DataFrame(rows, columns=list(types)).astype(types)
 
     def dwell_times(self, *, noise: float | None = None) -> pd.DataFrame:
-        """Mean residence times, one row for every attractor: ``attractor mean_time data_error law_error``.
+        """Mean residence times, one row for every attractor.
 
-        The noise ε is in the unit of U, by default as the recordings show it; where none is known, it is a
-        `ValueError`. The time is NaN where it is not known. It has a relative standard error from the
-        uncertainty of f and of the noise, and a relative error of the law itself
-        (`siq.quasipotential.rates`).
+        Parameters
+        ----------
+        noise
+            ε, in the unit of U; by default as the recordings show it.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns ``attractor mean_time data_error law_error``: the time, NaN where it is not known, its
+            relative standard error from the uncertainty of f and of the noise, and the relative error of the
+            law itself (`siq.quasipotential.rates`).
+
+        Raises
+        ------
+        ValueError
+            When no noise is known.
         """
         strength = self.noise if noise is None else NoiseStrength(noise)
         if strength is None:
@@ -400,9 +418,16 @@ class Landscape:
     def escape_times(self, *, noise: float) -> pd.DataFrame:
         """Mean times until noise has led from each attractor to the next, one row for every way out.
 
-        The noise is ε of ``dx = f dt + √ε σ dW``, in the unit of U. Columns are ``start end mean_time note``:
-        the mean time by the law of Eyring and Kramers with its prefactor (`siq.quasipotential.rates`), NaN
-        with a note that says why where the law does not hold.
+        Parameters
+        ----------
+        noise
+            ε of ``dx = f dt + √ε σ dW``, in the unit of U.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns ``start end mean_time note``: the mean time by the law of Eyring and Kramers with its
+            prefactor (`siq.quasipotential.rates`), NaN with a note that says why where the law does not hold.
 
         Raises
         ------
@@ -464,7 +489,13 @@ class Landscape:
         return landscape_html(self)
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw U with its wells, passes and paths, by default on new axes; see `siq.plot_quasipotential`."""
+        """Draw U with its wells, passes and paths; see `siq.plot_quasipotential`, which this calls.
+
+        Parameters
+        ----------
+        ax
+            Where; by default new axes.
+        """
         from siq.report.plots.quasipotential import plot_quasipotential
 
         return plot_quasipotential(self, ax=ax)

@@ -75,11 +75,19 @@ def find_landscape(
     noise: NoiseStrength | None = None,
     seed: int = 0,
 ) -> Landscape:
-    """Find the landscape of an identified vector field, from its attractors, saddles and basins.
+    """Find the landscape of an identified vector field.
 
-    V about the attractors is as refinement found it, with its certificate; by default the local route finds V
-    here, by the options, and the seed decides which points are used where there are too many. `noise` is that
-    which drives the system, where it is known.
+    Parameters
+    ----------
+    found, portrait
+        The identified f with its uncertainty, and its attractors, saddles and basins.
+    wells, certificate
+        V about the attractors as refinement found it, and its certificate; by default the local route finds V
+        here, by the options.
+    noise
+        That drives the system, where it is known.
+    seed
+        Decides which points are used where there are too many.
     """
     fault, kept = portrait.fault(), list[Well | None]()
     remarks = [] if fault is None else [fault]

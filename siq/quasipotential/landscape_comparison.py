@@ -123,13 +123,24 @@ def reference_landscape(
     generator: np.random.Generator,
     mesh: Callable[[np.ndarray, float], Potential | None] | None = None,
 ) -> ReferenceLandscape:
-    """Compute the references of the exact f in a box ``(d, 2)``.
+    """Compute the references.
 
-    Curves are followed up to a level, `reach`, as a share of each well's lowest barrier; the generator draws
-    first directions, and points in more than two dimensions. Of two states `mesh` gives V (not U) about an
-    attractor up to a level by a method that shares no code with the others
-    (`siq.validation.mesh.mesh_potential`). Without an attractor, or without any saddle, this fails with
-    `NumericalFailure`.
+    Parameters
+    ----------
+    dynamics, portrait, box
+        The exact f, its attractors and saddles, and the region of interest, shape ``(d, 2)``.
+    reach
+        Level up to which curves are followed, as a share of each well's lowest barrier.
+    generator
+        Draws first directions and points in more than two dimensions.
+    mesh
+        Of two states, V (not U) about an attractor up to a level by a method that shares no code with the
+        others (`siq.validation.mesh.mesh_potential`).
+
+    Raises
+    ------
+    NumericalFailure
+        When there is no attractor, or an attractor has no saddle to compare a barrier at.
     """
     attractors = np.array([one.position for one in portrait.attractors])
     if not len(attractors):

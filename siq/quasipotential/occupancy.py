@@ -434,9 +434,16 @@ def check_occupancy(
 ) -> OccupancyCheck:
     """Hold what was identified against the record's own hops and histogram.
 
-    It is made of f with its uncertainty, what follows from it, and ε, None where the recordings show none.
-    `held_out` masks the labels of recordings that no fit saw. `sensor` is the standard deviation of each
-    state's measurement noise, shape ``(d,)``. The seed decides the draws of f.
+    Parameters
+    ----------
+    found, portrait, noise
+        f with its uncertainty, what follows from it, and ε, None where the recordings show none.
+    recordings, held_out
+        All of them, and a mask over their labels: those that no fit saw.
+    sensor
+        Standard deviation of each state's sensor noise, shape ``(d,)``; None where there is none.
+    seed
+        Decides the draws of f.
     """
     if found.noise_free:
         return OccupancyCheck(missing=Remark("quasipotential.record_without_noise"))

@@ -259,12 +259,22 @@ def local_well(
     saddle: Equilibrium | Cycle | None = None,
     path: MinimumActionPath | None = None,
 ) -> Well:
-    """V about attractor `index` of a portrait, of the lowest degree that no other betters by much.
+    """V about one attractor, of the lowest degree that no other betters by much.
 
-    The options have degrees, reach and tolerance; the seed decides which points are used where there are too
-    many. The lowest saddle, or bounding cycle, and the path of least action to it are given where that has
-    told V there before, as it does for given equations. When no degree gives a formula, this fails with
-    `NumericalFailure`.
+    Parameters
+    ----------
+    dynamics, portrait, index
+        f and D, their attractors, saddles and basins, and which attractor.
+    options, seed
+        Degrees, reach and tolerance; and what decides which points are used where there are too many.
+    saddle, path
+        The lowest saddle, or bounding cycle, and the path of least action to it, where that has told V there
+        before, as it does for given equations.
+
+    Raises
+    ------
+    NumericalFailure
+        When no degree gives a formula.
     """
     attractor, basin = portrait.attractors[index], portrait.basins[index]
     saddles = portrait.saddles[index] if saddle is None else [saddle]

@@ -238,7 +238,19 @@ def edge_saddle(
     box: np.ndarray,
     generator: np.random.Generator,
 ) -> Equilibrium | None:
-    """A saddle on the boundary of basin `one`, towards `two`; None where tracking comes to none."""
+    """A saddle on the boundary of a basin, between two attractors; None where tracking comes to none.
+
+    Parameters
+    ----------
+    dynamics
+        f.
+    one, two, attractors
+        Which of the attractors; the boundary is that of the basin of `one`.
+    box
+        Shape ``(d, 2)``: the domain.
+    generator
+        Bends the first way.
+    """
     edge = tracked_edge(dynamics, one, two, attractors, box=box, generator=generator)
     for _, _, state in itertools.islice(edge, MAX_TRACKING_ROUNDS):
         if (found := _saddle_near(dynamics, state, box)) is not None:
@@ -340,10 +352,22 @@ def basin_of(
     generator: np.random.Generator,
     near: tuple[int, float] | None = None,
 ) -> Basin:
-    """The points from which f leads to an attractor, by descents from points of the recorded box ``(d, 2)``.
+    """The points from which f leads to an attractor.
 
-    Further starts are drawn close to the attractor: `near` says how many, and up to which level of
-    ``½ (x - A)·M (x - A)``; by default as recordings need it.
+    Parameters
+    ----------
+    dynamics
+        f and D.
+    descents
+        From recorded points.
+    index, attractors
+        Which of the attractors.
+    box
+        Shape ``(d, 2)``: the recorded region.
+    generator
+        Draws further starts close to the attractor.
+    near
+        How many of these, and up to which level of ``½ (x - A)·M (x - A)``; by default as recordings need it.
     """
     center, width, d = attractors[index].position, np.ptp(box, axis=1), len(box)
     recorded = descents.paths[descents.ends == index]

@@ -166,10 +166,16 @@ class Diffusion:
         return self.derivatives(x, 0)
 
     def contract(self, x: np.ndarray, momenta: np.ndarray, order: int = 0) -> np.ndarray:
-        """``p·D(x) p``, or its first or second derivatives by x, at points and momenta ``(n, d)``.
+        """``p·D(x) p``, or its first or second derivatives by x.
 
-        For order 0 there may be several momenta at a point, ``(n, ..., d)``. The result has the shape
-        ``(n, ...)``, ``(n, d)`` or ``(n, d, d)``.
+        Parameters
+        ----------
+        x
+            Points, shape ``(n, d)``.
+        momenta
+            p, shape ``(n, d)``; for order 0 there may be several at a point, ``(n, ..., d)``.
+        order
+            Of the derivative: the result has the shape ``(n, ...)``, ``(n, d)`` or ``(n, d, d)``.
         """
         if order == 0:
             return np.asarray((momenta * self.push(x, momenta)).sum(axis=-1))

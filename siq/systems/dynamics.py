@@ -352,10 +352,20 @@ class Dynamics:
         domain: Sequence[Sequence[float]] | np.ndarray | None = None,
         parameters: Mapping[sympy.Symbol, float] | None = None,
     ) -> Dynamics:
-        """Dynamics of formulas alone, in real symbols for d states; parameters come with their values.
+        """Dynamics of formulas alone, with D = 1 unless another is given.
 
-        D is 1 unless it is given, as `Diffusion`, as a matrix ``(d, d)``, or as rows of formulas; the domain
-        has two limits a state.
+        Parameters
+        ----------
+        symbols
+            The d states, real symbols.
+        equations
+            The components of f.
+        diffusion
+            D, as `Diffusion`, as a matrix ``(d, d)``, or as rows of formulas.
+        domain
+            Two limits a state, where somebody says them.
+        parameters
+            Real symbols of f that may take other values, with the values that they have.
         """
         if diffusion is None:
             diffusion = Diffusion.identity(len(symbols))

@@ -104,11 +104,25 @@ def distinct_roots(
     margin: float,
     known: Sequence[np.ndarray] = (),
 ) -> list[np.ndarray]:
-    """Where f vanishes, as far as Newton's method comes there from starts ``(n, d)``; each root once.
+    """Where f vanishes, as far as Newton's method comes there from some starts; each root once.
 
-    A root may lie outside the box ``(d, 2)`` by a share of it, the `margin`. Those that are `known` are
-    deflated, and not given again: f is multiplied by ``Π (1 + 1/∣x - r∣²)``, which keeps Newton's method away
-    from them.
+    Parameters
+    ----------
+    dynamics
+        f.
+    starts
+        Shape ``(n, d)``.
+    box
+        Shape ``(d, 2)``: the region of interest.
+    margin
+        Share of the box by which a root may lie outside.
+    known
+        Roots that are deflated: f is multiplied by ``Π (1 + 1/∣x - r∣²)``, so that Newton's method is kept
+        away from them and comes to others. They are not given again.
+
+    References
+    ----------
+    P. E. Farrell, Á. Birkisson, S. W. Funke, SIAM J. Sci. Comput. 37 (2015) A2026: deflation.
     """
     low, high = box.T
     width = positive(high - low)

@@ -354,7 +354,16 @@ class Formula:
     ) -> Formula:
         """``Σ_k c_k Π_i ((x_i - center_i)/scale_i)^e_ki``, written in the units of the states.
 
-        Center and scale have the shape ``(d,)``, exponents ``(m, d)``, coefficients ``(m,)``.
+        Parameters
+        ----------
+        name, symbols, units, title
+            As of the class.
+        center, scale
+            Shape ``(d,)``.
+        exponents
+            Shape ``(m, d)``.
+        coefficients
+            Shape ``(m,)``.
         """
         plain = coefficients / np.prod(scale.astype(float) ** exponents, axis=1)
         terms = (
@@ -388,7 +397,10 @@ class Formula:
     def to_latex(self, *, digits: int = DIGITS) -> str:
         r"""The function as LaTeX, in an ``aligned`` environment where offsets are defined as well.
 
-        Its numbers have so many significant digits: a page has no room for 17.
+        Parameters
+        ----------
+        digits
+            Significant digits of its numbers, for a page that has no room for 17.
         """
 
         def latex(expression: sympy.Expr) -> str:

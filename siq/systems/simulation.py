@@ -123,11 +123,23 @@ def noise_source(
 def simulate_snapshots(
     dynamics: Dynamics, *, options: SimulationOptions, generator: np.random.Generator
 ) -> Recordings:
-    """Simulate trajectories from initial states, uniform over the domain Ω, and keep their snapshot pairs.
+    """Simulate trajectories from random initial states and keep their snapshot pairs.
 
-    Every trajectory is one recording of 2·M samples at t_j and t_j + h (paper, Appendix B). Consecutive
-    samples no further apart than h are the pairs (X0, Xh); see `siq.data.recordings.snapshot_pairs`. The
-    generator draws the initial states, and then the noise: they are the same with and without it.
+    Parameters
+    ----------
+    dynamics
+        What is simulated; its domain Ω is where the initial states are drawn, uniformly.
+    options
+        Sampling (paper, Appendix B).
+    generator
+        Source of the initial states, and then of the noise; a run passes its own. The initial states are
+        the same with and without noise.
+
+    Returns
+    -------
+    Recordings
+        Every trajectory as one recording of 2·M samples at t_j and t_j + h. Consecutive samples no
+        further apart than h are the pairs (X0, Xh); see `siq.data.recordings.snapshot_pairs`.
 
     Raises
     ------

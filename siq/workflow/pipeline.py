@@ -193,8 +193,16 @@ def refine_run(
 ) -> RefinedRun:
     """V about every attractor of the identified f, or over the region, with its certificate.
 
-    It follows from trajectories and f of the run alone; the networks are a second route, which has to agree.
-    `regressed` are the formulas of the networks, which are certified beside the refined ones.
+    It follows from trajectories and f alone; networks are a second route, which has to agree.
+
+    Parameters
+    ----------
+    settings
+        Routes, degrees, and the limits of the certificate.
+    recordings, identified, trained
+        Trajectories, f and networks of the run.
+    regressed
+        The formulas of the networks, which are certified beside the refined ones; None where there are none.
     """
     number, networks = identified.outcome.run, trained.result
     formulas = {} if regressed is None else {Method.REGRESSION: regressed}

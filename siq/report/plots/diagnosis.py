@@ -65,9 +65,24 @@ def plot_before_after(
 ) -> Figure | None:
     """Draw the held-out recording that differs most, with the simulation before and after.
 
-    The course stands above, simulation minus recording below. `after` is the simulation that the verdict ends
-    with: ``"augmented"``, ``"recalibrated"``, or ``"before"`` where nothing is to be changed; `noise` the
-    variance of the sensor's noise by output, for a band of ± 2 standard deviations.
+    Parameters
+    ----------
+    table
+        Columns ``recording t output measured before recalibrated augmented scored``.
+    after
+        The simulation that the verdict ends with: ``"augmented"``, ``"recalibrated"``, or ``"before"`` where
+        nothing is to be changed.
+    noise
+        Variance of the sensor's noise by output, for a band of ± 2 standard deviations.
+    units
+        Units of the outputs.
+    time_unit
+        Of ``t``.
+
+    Returns
+    -------
+    matplotlib.figure.Figure or None
+        The course above, simulation minus recording below; None where no recording was held out.
     """
     largest = largest_difference(table, after=after)
     if largest is None:
@@ -512,10 +527,25 @@ def plot_missing(
     time_unit: str = "1",
     source: str = "",
 ) -> Figure | None:
-    """Draw the missing part of up to two equations over the plane of two states, `names`.
+    """Draw the missing part of equations over a plane of the state space.
 
-    At states ``(n, 2)`` something must be added to each equation, shape ``(n,)`` each, of which means over
-    cells are drawn. `source` says in words where the numbers are from.
+    Parameters
+    ----------
+    points
+        States in the plane, shape ``(n, 2)``.
+    missing
+        What must be added to each equation there, shape ``(n,)`` each; means over cells are drawn.
+    names
+        Names of the two states.
+    units, time_unit
+        Units of states and time.
+    source
+        Where the numbers are from, in words.
+
+    Returns
+    -------
+    matplotlib.figure.Figure or None
+        A panel for each of up to two equations, below each other; None where nothing is missing anywhere.
     """
     shown = {name: values for name, values in missing.items() if np.isfinite(values).any()}
     shown = dict(sorted(shown.items(), key=lambda each: -float(np.nanstd(each[1])))[:2])
