@@ -279,9 +279,8 @@ def check_agreement(
             continue
         x, _ = one.below(potential.level if isinstance(potential, Well) else np.inf)
         # Networks by well end little above its saddle, and one formula for all wells does not.
-        known = np.isfinite(networks.potential_at(x))
-        x = x[known]
-        if len(x) < MIN_POINTS or known.mean() <= MIN_CLAIMED_SHARE:
+        x = x[np.isfinite(networks.potential_at(x))]
+        if len(x) < MIN_POINTS:
             verdicts.append(Verdict.refused("too few points are known at which two routes could be compared"))
             continue
         about = [each for each in evidence.portrait.attractors if np.array_equal(each.position, attractor)]
