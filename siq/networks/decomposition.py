@@ -272,6 +272,11 @@ class NetworksByWell:
             potential[rows] = values(x[rows]) + height
         return potential
 
+    def states_about(self, attractor: np.ndarray) -> np.ndarray:
+        """States in the well about an attractor ``(d,)``, shape ``(m, d)``."""
+        distances = [float(np.linalg.norm(one.mean[0] - attractor)) for one in self.parts]
+        return self.states[self.attractor_of == int(np.argmin(distances))]
+
     def of_wells(self, x: np.ndarray) -> list[np.ndarray]:
         """Rows of points ``(n, d)`` by the well that they lie in."""
         label, finite = np.full(len(x), self.NOWHERE), np.isfinite(x).all(axis=1)

@@ -23,7 +23,7 @@ import numpy as np
 from siq.data.recordings import SnapshotPairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import AnyField, Verdict
-from siq.networks.decomposition import AnyNetworks
+from siq.networks.decomposition import AnyNetworks, NetworksByWell
 from siq.numerics.randomness import representative_subset
 from siq.numerics.text import place_text
 from siq.quasipotential.certificate_tests import (
@@ -280,6 +280,10 @@ def check_agreement(
         x, _ = one.below(potential.level if isinstance(potential, Well) else np.inf)
         # Networks by well end little above its saddle, and one formula for all wells does not.
         x = x[np.isfinite(networks.potential_at(x))]
+        if len(x) < MIN_POINTS and isinstance(networks, NetworksByWell):
+            x = networks.states_about(attractor)
+            heights = potential.values(x) - potential.values(attractor[None])
+            x = x[heights < LEVEL_SHARE * (potential.level if isinstance(potential, Well) else np.inf)]
         if len(x) < MIN_POINTS:
             verdicts.append(Verdict.refused("too few points are known at which two routes could be compared"))
             continue
