@@ -202,18 +202,28 @@ class TrainedNetworks:
 
     def gradients_at(self, x: np.ndarray) -> np.ndarray:
         """∇V alone, shape ``(n, d)``, at half the cost of `evaluate`."""
-        return self._value_and_gradient(x)[2].astype(float)
-
-    def _value_and_gradient(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Normalised points, V ``(n, 1)`` and ∇V ``(n, d)``."""
         y = (x.astype(self.mean.dtype) - self.mean) / self.scale
-        value, gradient = _value_and_gradient(self.potential, y)
-        potential = self.potential_scale * (value + (y * y).sum(axis=1, keepdims=True))
-        return y, potential, self.potential_scale / self.scale * (gradient + 2 * y)
+        gradient = _gradient(self.potential, _hidden(self.potential, y))
+        return (self.potential_scale / self.scale * (gradient + 2 * y)).astype(float)
+
+    @cached_property
+    def _shared(self) -> bool:
+        """Whether both networks have the same hidden layers, as those with solved output weights do."""
+        pairs = zip(self.potential[:-1], self.circulatory[:-1], strict=False)
+        same = all(np.array_equal(one, two) for layers in pairs for one, two in zip(*layers, strict=True))
+        return same and len(self.potential) == len(self.circulatory)
 
     def _evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        y, potential, gradient = self._value_and_gradient(x)
-        circulatory = self.circulatory_scale * _hidden(self.circulatory, y)[-1]
+        y = (x.astype(self.mean.dtype) - self.mean) / self.scale
+        hidden = _hidden(self.potential, y)
+        potential = self.potential_scale * (hidden[-1] + (y * y).sum(axis=1, keepdims=True))
+        gradient = self.potential_scale / self.scale * (_gradient(self.potential, hidden) + 2 * y)
+        if self._shared:
+            weights, biases = self.circulatory[-1]
+            circulatory = hidden[-2] @ weights + biases
+        else:
+            circulatory = _hidden(self.circulatory, y)[-1]
+        circulatory = self.circulatory_scale * circulatory
         values = (potential[:, 0], circulatory, circulatory - gradient @ self.diffusion)
         return tuple(np.asarray(array, dtype=float) for array in values)  # type: ignore[return-value]
 
@@ -323,13 +333,12 @@ def _hidden(layers: tuple[Layer, ...], y: np.ndarray) -> list[np.ndarray]:
     return [*found, y @ weights + biases]
 
 
-def _value_and_gradient(layers: tuple[Layer, ...], y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Value of a scalar tanh network and its gradient, backwards through the layers."""
-    *hidden, value = _hidden(layers, y)
+def _gradient(layers: tuple[Layer, ...], hidden: list[np.ndarray]) -> np.ndarray:
+    """Gradient of a scalar tanh network, backwards through its activations and its output."""
     delta = layers[-1][0].T
-    for (weights, _), activation in zip(reversed(layers[:-1]), reversed(hidden), strict=True):
+    for (weights, _), activation in zip(reversed(layers[:-1]), reversed(hidden[:-1]), strict=True):
         delta = (delta * (1 - activation * activation)) @ weights.T
-    return value, delta
+    return delta
 
 
 def save_networks(path: str | Path, runs: Sequence[AnyNetworks]) -> None:
