@@ -337,9 +337,9 @@ class OutputWeights:
         return NetworksByWell(tuple(parts), heights, np.concatenate(inside), np.concatenate(known))
 
     def _reaching_well(self, portrait: PhasePortrait, index: int) -> Well:
-        """V about an attractor, of the first draw of units that takes it to a saddle."""
+        """V about an attractor, of the first draw of units that takes it to a saddle, else of the first."""
         width, tops = np.ptp(portrait.box, axis=1), [one.position for one in portrait.saddles[index]]
-        failure = NumericalFailure("units do not take V about an attractor to its saddle")
+        made, failure = list[Well](), NumericalFailure("no units were drawn")
         for _ in range(WELL_DRAWS):
             try:
                 well = self._well(portrait, index)
@@ -351,7 +351,10 @@ class OutputWeights:
             logger.info("a well comes as close to a saddle as %.2g of the box", away)
             if away < REACHED_DISTANCE:
                 return well
-        raise failure
+            made.append(well)
+        if not made:
+            raise failure
+        return made[0]
 
     def _well(self, portrait: PhasePortrait, index: int) -> Well:
         """V about an attractor over units of its own, grown from the square ``|y|²`` of offsets from it."""
