@@ -68,8 +68,6 @@ ESCAPE_SHARE = 0.5
 
 
 WELL_SPREAD = 1.0  # of the units of a well, on states divided by `WELL_SCALE`
-REACHED_DISTANCE = 0.05  # of the recorded box: about as far as evenly spread states lie apart
-WELL_DRAWS = 4  # of units, until a well reaches its saddle
 WELL_SCALE = 0.6  # of the distance of the nearest saddle
 WELL_FIT: dict[str, Any] = {"rounds": 4, "finest": 1e-5, "steps": 8}
 WELL_DAMPING = 1e-7  # of Gauss–Newton: keeps V from running away outside the points of a fit
@@ -302,7 +300,7 @@ class OutputWeights:
         wells, barriers = list[Well](), np.full((count, count), np.inf)
         for index in range(count):
             try:
-                well = self._reaching_well(portrait, index)
+                well = self._well(portrait, index)
             except NumericalFailure as failure:
                 logger.info("%s", failure)
                 return None
@@ -335,26 +333,6 @@ class OutputWeights:
             for index, (well, x) in enumerate(zip(wells, inside, strict=True))
         ]
         return NetworksByWell(tuple(parts), heights, np.concatenate(inside), np.concatenate(known))
-
-    def _reaching_well(self, portrait: PhasePortrait, index: int) -> Well:
-        """V about an attractor, of the first draw of units that takes it to a saddle, else of the first."""
-        width, tops = np.ptp(portrait.box, axis=1), [one.position for one in portrait.saddles[index]]
-        made, failure = list[Well](), NumericalFailure("no units were drawn")
-        for _ in range(WELL_DRAWS):
-            try:
-                well = self._well(portrait, index)
-            except NumericalFailure as error:
-                failure = error
-                continue
-            # Extrapolated, V may seem to be as low at a saddle as where the well has come to.
-            away = min((np.abs((well.points - top) / width).max(axis=1).min() for top in tops), default=0.0)
-            logger.info("a well comes as close to a saddle as %.2g of the box", away)
-            if away < REACHED_DISTANCE:
-                return well
-            made.append(well)
-        if not made:
-            raise failure
-        return made[0]
 
     def _well(self, portrait: PhasePortrait, index: int) -> Well:
         """V about an attractor over units of its own, grown from the square ``|y|²`` of offsets from it."""
