@@ -256,7 +256,7 @@ class NetworksByWell:
         return self.parts[0].diffusion
 
     def evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """V ``(n,)``, g and f ``(n, d)`` at points ``(n, d)``, NaN in no well, in the units of the states."""
+        """V ``(n,)``, g and f ``(n, d)`` at points ``(n, d)`` of the states, NaN outside the wells."""
         potential = np.full(len(x), np.nan)
         circulatory, vector_field = np.full(x.shape, np.nan), np.full(x.shape, np.nan)
         for index, rows in enumerate(self.of_wells(x)):
@@ -265,11 +265,11 @@ class NetworksByWell:
         return potential, circulatory, vector_field
 
     def potential_at(self, x: np.ndarray) -> np.ndarray:
-        """V alone, shape ``(n,)``, NaN in no well."""
+        """V alone, shape ``(n,)``, NaN outside the wells."""
         return self.lifted(x, [one.potential_at for one in self.parts])
 
     def gradients_at(self, x: np.ndarray) -> np.ndarray:
-        """∇V alone, shape ``(n, d)``, NaN in no well."""
+        """∇V alone, shape ``(n, d)``, NaN outside the wells."""
         gradients = np.full(x.shape, np.nan)
         for index, rows in enumerate(self.of_wells(x)):
             gradients[rows] = self.parts[index].gradients_at(x[rows])
@@ -295,7 +295,6 @@ class NetworksByWell:
 
     @cached_property
     def _width(self) -> np.ndarray:
-        """In which distances between states are measured, shape ``(d,)``."""
         return np.ptp(self.states, axis=0)
 
     @cached_property

@@ -627,7 +627,8 @@ class Block:
         """Why the check of a run has not passed."""
         if run in self.checks:
             return self.checks[run].hopeless() or (
-                f"the check passed in none of {self.attempts} trainings of {self.options.steps} steps"
+                f"the check passed in none of {self.attempts} trainings of {self.options.steps} steps; raise"
+                " training.steps or training.output_weights"
             )
         return self.faults.get(run, "no vector field was identified, so that nothing could be checked")
 

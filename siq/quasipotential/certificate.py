@@ -14,6 +14,7 @@ the level at which the first characteristic leaves these.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -48,7 +49,8 @@ from siq.systems.formulas import compile_formulas
 from siq.systems.phase_portrait import PhasePortrait, RecordedRegion
 
 INDEPENDENT = ("characteristics",)  # tests of V that share nothing with a fit of V but f and D
-ALONE = "only one of the two routes that the study names led to V"
+GO_WITHOUT = "or do without them: 'refinement: {routes: [local]}'"
+ALONE = f"only one of the two routes that the study names led to V; train other networks, {GO_WITHOUT}"
 COMPARED_POINTS = 100  # on which the error of networks is known to a tenth, and that is enough
 MIN_DIFFERENCE = 1e-6  # a difference of the routes that no error needs to explain
 MIN_CLAIMED_SHARE = 0.5  # of the states in a well: a formula that holds at fewer is none of it (a choice)
@@ -192,6 +194,7 @@ def certify(
         if compared and networks is None:
             tests["agreement"] = Verdict.refused(ALONE)
         elif compared and networks is not None:
+            # Beyond the standard errors that are stated: the networks' f has errors of its own.
             tests["agreement"] = check_agreement(
                 networks, formulas, evidence, error=error + 3 * relative_error
             )
@@ -261,40 +264,41 @@ def check_agreement(
 ) -> Verdict:
     """Whether the networks' own V is that of formulas about every attractor, up to a constant.
 
-    Formulas come from the identified f, networks from pairs of samples: all that they share are the
-    recordings. The figure is the largest relative L2 difference about any attractor, and its limit what the
-    error of the formulas and that of the networks explain, which their own residual leaves open. Networks of
-    which that is more than a certificate may state tell nothing, and are refused.
+    Formulas come from the identified f, networks from pairs of samples. They share the recordings; and where
+    networks come by well, also which states lead to which attractor, and how a well grows. The figure is the
+    largest relative L2 difference about any attractor. Its limit is what the error of the formulas explains,
+    and that of the networks, which their own residual leaves open. Networks of which that is more than a
+    certificate may state tell nothing, and are refused.
     """
     found, options = evidence.found, evidence.options
     verdicts = []
-    for one in evidence.references:
+    potentials: Sequence[SymbolicDecomposition | Well] = (
+        [formulas] if isinstance(formulas, SymbolicDecomposition) else formulas
+    )
+    for one, potential in itertools.product(evidence.references, potentials):
         attractor = one.attractor
-        potential: SymbolicDecomposition | Well | None
-        if isinstance(formulas, SymbolicDecomposition):
-            potential = formulas
-        else:
-            potential = next((each for each in formulas if np.array_equal(each.attractor, attractor)), None)
-        if potential is None:
+        if isinstance(potential, Well) and not np.array_equal(potential.attractor, attractor):
             continue
-        x, _ = one.below(potential.level if isinstance(potential, Well) else np.inf)
+        level = potential.level if isinstance(potential, Well) else np.inf
         # Networks by well end little above its saddle, and one formula for all wells does not.
+        x = one.below(level)[0]
         x = x[np.isfinite(networks.potential_at(x))]
         if len(x) < MIN_POINTS and isinstance(networks, NetworksByWell):
             x = networks.states_about(attractor)
-            heights = potential.values(x) - potential.values(attractor[None])
-            x = x[heights < LEVEL_SHARE * (potential.level if isinstance(potential, Well) else np.inf)]
+            x = x[potential.values(x) - potential.values(attractor[None]) < LEVEL_SHARE * level]
         if len(x) < MIN_POINTS:
-            verdicts.append(Verdict.refused("too few points are known at which two routes could be compared"))
+            few = f"the networks' V is known at {len(x)} points about {_position_text(attractor)}, too few to"
+            verdicts.append(Verdict.refused(f"{few} compare two routes: record more there, {GO_WITHOUT}"))
             continue
         about = [each for each in evidence.portrait.attractors if np.array_equal(each.position, attractor)]
         some, slopes = x[:: max(len(x) // COMPARED_POINTS, 1)], networks.gradients_at
+        # No Hessian is asked for where only an error is to be stated.
         theirs = Candidate(networks.potential_at, slopes, slopes, None, some, about)
         its = theirs.stated_error(found, seed=evidence.seed)
         if not its <= options.error:
             size = f"{its:.0%}" if np.isfinite(its) else "any size"
-            reason = f"the networks' V is no second route: its own residual leaves an error of {size} open"
-            return Verdict.refused(reason, options.error)
+            reason = f"the networks' V is no second route: its own residual leaves an error of {size} open;"
+            return Verdict.refused(f"{reason} raise training.output_weights, {GO_WITHOUT}", options.error)
         mine, other = (
             values(x) - values(attractor[None]) for values in (potential.values, networks.potential_at)
         )

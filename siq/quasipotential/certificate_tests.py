@@ -13,8 +13,8 @@ without it.
 `error`            the error that V's own residual leaves is small, and that from f small enough to be known
 `existence`        stable states and saddles stay where f is changed within its uncertainty
 `characteristics`  V is that which characteristics carry, within that error
-`agreement`        the networks' own V is the same within the errors of both: two routes that share the
-                   recordings and nothing else
+`agreement`        the networks' own V is the same within the errors of both: two routes from the same
+                   recordings, see `siq.quasipotential.certificate.check_agreement`
 `prediction`       f predicts held-out recordings, and its residuals are white
 `record`           held-out recordings hop, and are spread, as f and D say (`occupancy`). Only
                    where they show process noise and two states, and where they hop or should

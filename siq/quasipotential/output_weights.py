@@ -49,9 +49,10 @@ if TYPE_CHECKING:  # needs torch, which the mathematics does without
 logger = logging.getLogger(__name__)
 
 SPREADS = (0.1, 0.2, 0.4, 0.8)  # of the units' weights on normalised states; the held-out pairs choose
-CORRECTIONS = 3  # of f for the integrator's error; each gains about two digits
+CORRECTIONS = 3  # of f, for the integrator's error; each gains about two digits
 SINGULAR_RATIO = 1e-12  # damping of least squares: combinations of units that the points leave open
-# With noise in the pairs, which the error on held-out pairs shows, all of them take part, and damping counts.
+# With noise in the pairs, which the error on held-out pairs shows, all of them take part, and held-out pairs
+# choose the damping. Tried on the paper's noisy system, with 50 to 400 units.
 NOISY_ERROR = 0.01  # held-out error of f, relative to the mean velocities
 DAMPINGS = (1e-5, 1e-4, 1e-3)
 SLOW_SHARE = 0.04  # of the points, by their speed: below it residuals are not divided by the speed alone
@@ -65,16 +66,13 @@ MAX_START_RESIDUAL = 0.1  # the same, above which no other units would help: the
 # Of the slowest rate of approach, how fast paths of least action leave: 1 on the right branch, -1 where V is
 # flat along that direction, and in between a choice.
 ESCAPE_SHARE = 0.5
-
-
+# Chosen on the paper's resonator, and used as they are for the systems of the tests.
 WELL_SPREAD = 1.0  # of the units of a well, on states divided by `WELL_SCALE`
 WELL_SCALE = 0.6  # of the distance of the nearest saddle
 WELL_FIT: dict[str, Any] = {"rounds": 4, "finest": 1e-5, "steps": 8}
 WELL_DAMPING = 1e-7  # of Gauss–Newton: keeps V from running away outside the points of a fit
 WELL_REACH = 1.1  # of the level of a well: V beyond its saddle counts up to there
-MAX_WELL_RESIDUAL = (
-    0.01  # the same of a well below `LEVEL_SHARE` of its level: caustics begin near its saddle
-)
+MAX_WELL_RESIDUAL = 0.01  # as `MAX_RESIDUAL`, below `LEVEL_SHARE` of the level: V is less smooth near saddles
 STATES_PER_UNIT = 5  # in a well, at least: with fewer there are fewer units
 STEEPER = 1.2  # a paraboloid, until all paths leave the attractor
 
@@ -174,10 +172,10 @@ class OutputWeights:
         biases = generator.uniform(-2, 2, units)
         mean, width = self.points.mean(axis=0), self.points.std(axis=0)
         bases = [UnitBasis(one * weights, one * biases, mean, width) for one in SPREADS]
-        # Pairs without noise take the integrator at its word, and those of even points are enough.
-        self._fit_field(bases, pairs, others, (SINGULAR_RATIO,))
+        # Without noise the evenly spread pairs are enough.
+        self._fit_field(bases, pairs, others, noisy=False)
         if self.field_error > NOISY_ERROR:
-            self._fit_field(bases, data.training, data.held_out, DAMPINGS)
+            self._fit_field(bases, data.training, data.held_out, noisy=True)
         # V is sought over the units that suit f; if they follow it badly, over those of another spread.
         self._bases = [self.basis, *(one for one in bases if one is not self.basis)]
         self._flow = self.drift(self.points)
@@ -188,11 +186,12 @@ class OutputWeights:
         bases: Sequence[UnitBasis],
         pairs: SnapshotPairs,
         held_out: SnapshotPairs,
-        dampings: Sequence[float],
+        *,
+        noisy: bool,
     ) -> None:
         """f over the units, and with the damping, that suit held-out pairs best, and how uncertain it is."""
         velocity, observed = ((each.xh - each.x0) / each.h[:, None] for each in (pairs, held_out))
-        noisy, self.field_error = len(dampings) > 1, np.inf
+        self.field_error = np.inf
 
         def corrected(
             basis: UnitBasis, problem: _LeastSquares, coefficients: np.ndarray, damping: float
@@ -205,10 +204,11 @@ class OutputWeights:
 
         for basis in bases:
             problem = _LeastSquares(basis.design(pairs.x0))
-            for damping in dampings:
+            at_held_out = basis.design(held_out.x0) if noisy else None
+            for damping in DAMPINGS if noisy else (SINGULAR_RATIO,):
                 coefficients = problem.solve(velocity, damping)
-                if noisy:  # what the integrator is off by is the same for all, and small beside the noise
-                    rest = observed - basis.design(held_out.x0) @ coefficients
+                if at_held_out is not None:  # the integrator's error is the same for all, and below the noise
+                    rest = observed - at_held_out @ coefficients
                 else:
                     coefficients = corrected(basis, problem, coefficients, damping)
                     rest = observed - _mean_velocity(basis, coefficients, held_out.x0, held_out.h)
@@ -222,10 +222,8 @@ class OutputWeights:
         # The standard error of f at the points, of independent errors in the velocities, as a share of f.
         design = self.basis.design(self.points)
         spread = (best[0].spread(design, best[1]) ** 2).sum(axis=1).mean()
-        share = (
-            spread * (unexplained**2).mean(axis=0).sum() / (self.drift(self.points) ** 2).sum(axis=1).mean()
-        )
-        self.uncertainty = float(np.sqrt(share))
+        size = (self.drift(self.points) ** 2).sum(axis=1).mean()
+        self.uncertainty = float(np.sqrt(spread * (unexplained**2).mean(axis=0).sum() / size))
         logger.info("f is uncertain by %.1e of itself", self.uncertainty)
 
     def drift(self, x: np.ndarray) -> np.ndarray:
@@ -258,7 +256,7 @@ class OutputWeights:
             return None
         _, circulatory, vector_field = networks.evaluate(self.points)
         slopes = (circulatory - vector_field) @ self.diffusion.precision
-        if not np.isfinite(slopes).all():  # of a training that was lost
+        if not np.isfinite(slopes).all():  # of a training whose loss was lost
             return None
         steepness = float(networks.potential_scale[0, 0])
         for basis in self._bases:
@@ -368,7 +366,7 @@ class OutputWeights:
             level=float(heights[min(3 * basis.size, len(heights) - 1)]),
             fitted=np.zeros(0, dtype=int), generator=self.generator, damping=WELL_DAMPING,
         )  # fmt: skip
-        # About its saddle V is hardly smooth; in the well this counts for less.
+        # About its saddle V is hardly smooth. The last fit gives these points less weight.
         equation = HamiltonJacobi.at(functions, well.points, field, attractor=attractor)
         coefficients = equation.robust_fit(well.coefficients, free, damping=WELL_DAMPING, **WELL_FIT)
         level = well.level
@@ -421,17 +419,15 @@ def formulas_by_well(networks: NetworksByWell, dynamics: Dynamics, *, degree: in
     of which a residual would be.
     """
     wells = []
-    for index, (part, rows) in enumerate(
-        zip(networks.parts, networks.of_wells(networks.states), strict=True)
-    ):
+    for part, rows in zip(networks.parts, networks.of_wells(networks.states), strict=True):
         x, attractor = networks.states[rows], part.mean[0]
         values = part.potential_at(x)
-        scale = np.abs(x - attractor).max(axis=0)
-        basis = PowerBasis.up_to(degree, dynamics.symbols, attractor, scale)
-        coefficients = np.linalg.lstsq(basis.values(x), values, rcond=None)[0]
+        basis = PowerBasis.up_to(degree, dynamics.symbols, attractor, np.abs(x - attractor).max(axis=0))
+        functions = basis.values(x)
+        coefficients = np.linalg.lstsq(functions, values, rcond=None)[0]
         level = float(values.max()) / WELL_REACH
-        misfit = float(np.linalg.norm(basis.values(x) @ coefficients - values) / np.linalg.norm(values))
-        logger.info("well %d: powers up to %d miss the networks by %.1e", index, degree, misfit)
+        misfit = float(np.linalg.norm(functions @ coefficients - values) / np.linalg.norm(values))
+        logger.info("about %s powers up to %d miss the networks by %.1e", attractor, degree, misfit)
         wells.append(Well(basis, coefficients, dynamics, attractor, level, None, misfit, x))
     return tuple(wells)
 

@@ -1,10 +1,10 @@
 """Refinement: V from the identified f and the recorded states, with its certificate.
 
 V is grown from each attractor of the identified f, and one formula is sought for the whole recorded region.
-Networks take no part: where there are some, they are a second route to V, which shares with this one the
-recordings and nothing else. The certificate compares their own V with the refined one, within the errors of
-both (`siq.quasipotential.certificate`). A control says what becomes of that comparison when the weights of
-the networks are put in random order.
+Networks take no part: where there are some, they are a second route to V from the same recordings. The
+certificate compares their own V with the refined one, within the errors of both
+(`siq.quasipotential.certificate.check_agreement`). As a control it also compares networks whose weights were
+put in random order.
 """
 
 from __future__ import annotations
