@@ -6,6 +6,8 @@ CORES ?= 2
 # Where torch comes from on Linux, whose usual build brings 3 GB for graphics cards along. `make TORCH_INDEX=`
 # takes that one.
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+# Bytecode is written when a module is first imported: that of all 15,000 would take longer than to unpack them.
+INSTALL := $(BIN)/python -m pip install --quiet --no-compile
 
 .PHONY: statistics examples test test-portable full untuned noise wheel test-pages newcomer laboratories coverage supports discrepancies \
         golden official docs docs-full lint format environment clean
@@ -117,10 +119,10 @@ $(VENV)/installed: pyproject.toml requirements/pinned.txt
 	  || { echo "siq needs Python 3.11 or newer; name one with 'make PYTHON=python3.12 ...'." >&2; exit 1; }
 	@echo "Installing siq with all of its tools below $(VENV): about 2.4 GB, 1 GB of it for networks (CPU only)."
 	$(PYTHON) -m venv $(VENV)
-	@test -z "$(TORCH_INDEX)" || test "$$(uname)" != Linux || $(BIN)/python -m pip install --quiet --no-deps \
+	@test -z "$(TORCH_INDEX)" || test "$$(uname)" != Linux || $(INSTALL) --no-deps \
 	  --retries 0 --timeout 15 --index-url $(TORCH_INDEX) --constraint requirements/pinned.txt torch 2> /dev/null \
 	  || echo "$(TORCH_INDEX) does not answer; torch comes from the usual index."
-	$(BIN)/python -m pip install --quiet --constraint requirements/pinned.txt --editable '.[dev]'
+	$(INSTALL) --constraint requirements/pinned.txt --editable '.[dev]'
 	touch $@
 
 clean:
