@@ -27,6 +27,7 @@ WITHOUT_AVX512 := NPY_DISABLE_CPU_FEATURES="X86_V4 AVX512_ICL AVX512_SPR" OPENBL
                   ATEN_CPU_CAPABILITY=avx2 NUMBA_CPU_NAME=haswell
 test-portable: environment
 	test "$$(uname -m)" != x86_64 || $(WITHOUT_AVX512) $(BIN)/pytest -m "portable and not slow" \
+	  $$(grep --recursive --files-with-matches --include='*.py' mark.portable tests) \
 	  --numprocesses logical --dist loadgroup --no-loadscope-reorder
 
 # Everything: the tests of `make test` and the full-size checks, minutes each.
