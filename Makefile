@@ -9,7 +9,7 @@ TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 # Bytecode is written when a module is first imported: that of all 15,000 would take longer than to unpack them.
 INSTALL := $(BIN)/python -m pip install --quiet --no-compile
 
-.PHONY: statistics examples test test-portable full untuned noise wheel test-pages newcomer laboratories coverage supports discrepancies \
+.PHONY: statistics examples test suite test-portable full untuned noise wheel test-pages newcomer laboratories coverage supports discrepancies \
         golden official docs docs-full lint format environment clean
 
 statistics: environment
@@ -18,7 +18,9 @@ statistics: environment
 examples: environment
 	$(BIN)/snakemake --cores $(CORES) examples
 
-test: environment lint
+test: lint suite
+
+suite: environment
 	$(BIN)/pytest --numprocesses logical --dist loadgroup --no-loadscope-reorder
 
 # Quick numerical tests as on a processor without AVX-512: sums are rounded otherwise there, and no answer may hang on
