@@ -177,9 +177,7 @@ def _course_of_input(t: np.ndarray, u: np.ndarray, interpolation: str) -> scipy.
     right = 2 * u[-1] - u[-2 : -padding - 2 : -1]
     longer = np.concatenate([left, u, right])
     line = np.linspace(longer[0], longer[-1], len(longer))
-    from scipy.signal import resample  # `scipy.stats` comes with it: see `siq.systems.equilibria`
-
-    dense = resample(longer - line, OVERSAMPLING * len(longer))
+    dense = scipy.signal.resample(longer - line, OVERSAMPLING * len(longer))
     dense_t = t[0] + step.mean() * (np.arange(len(dense)) / OVERSAMPLING - padding)
     slope = (longer[-1] - longer[0]) / (len(longer) - 1) / step.mean()
     dense += longer[0] + slope * (dense_t - dense_t[0])

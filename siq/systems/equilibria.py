@@ -303,9 +303,8 @@ BOUNDARY_DISTANCE = 1e-3  # of the domain: so close to the boundary a root leave
 
 def spread_evenly(box: np.ndarray, count: int, *, generator: np.random.Generator) -> np.ndarray:
     """Points of a scrambled Sobol sequence in a box ``(d, 2)``: shape ``(n, d)``, n not below `count`."""
-    from scipy.stats import qmc  # which takes a second to import, and a plan of a workflow needs none
-
-    sequence = qmc.Sobol(len(box), scramble=True, seed=generator)
+    # scipy imports this when it is first named: plans of workflows do without.
+    sequence = scipy.stats.qmc.Sobol(len(box), scramble=True, seed=generator)
     share = sequence.random_base2(max(int(np.ceil(np.log2(count))), 1))
     return np.asarray(box[:, 0] + share * (box[:, 1] - box[:, 0]))
 
