@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from siq.errors import InputError
 from siq.numerics.files import whole_file
 
-CHUNK = 4096  # points evaluated together: few enough for their activations to stay in the processor's cache
+CHUNK = 81_920  # activations of a layer worked out together: few enough to stay in the processor's cache
 MatchingRule = Literal["explicit", "symmetric"]
 Order = Literal[2, 4]
 
@@ -187,15 +187,15 @@ class TrainedNetworks:
 
     def evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """V ``(n,)``, g and f ``(n, d)`` at points ``(n, d)`` in the units of the states."""
-        pieces = [self._evaluate(x[begin : begin + CHUNK]) for begin in range(0, len(x), CHUNK)]
+        pieces = [self._evaluate(x[part]) for part in self._parts(x)]
         potential, circulatory, vector_field = zip(*pieces or [self._evaluate(x)], strict=True)
         return np.concatenate(potential), np.concatenate(circulatory), np.concatenate(vector_field)
 
     def potential_at(self, x: np.ndarray) -> np.ndarray:
         """V alone, shape ``(n,)``, at a third of the cost of `evaluate`."""
         values = [np.zeros(0)]
-        for begin in range(0, len(x), CHUNK):
-            y = (x[begin : begin + CHUNK].astype(self.mean.dtype) - self.mean) / self.scale
+        for part in self._parts(x):
+            y = (x[part].astype(self.mean.dtype) - self.mean) / self.scale
             square = (y * y).sum(axis=1, keepdims=True)
             values.append((self.potential_scale * (_hidden(self.potential, y)[-1] + square))[:, 0])
         return np.concatenate(values).astype(float)
@@ -205,6 +205,12 @@ class TrainedNetworks:
         y = (x.astype(self.mean.dtype) - self.mean) / self.scale
         gradient = _gradient(self.potential, _hidden(self.potential, y))
         return (self.potential_scale / self.scale * (gradient + 2 * y)).astype(float)
+
+    def _parts(self, x: np.ndarray) -> list[slice]:
+        """Parts of points that are evaluated one after the other."""
+        widest = max(biases.size for _, biases in (*self.potential, *self.circulatory))
+        rows = max(CHUNK // widest, 1)
+        return [slice(begin, begin + rows) for begin in range(0, len(x), rows)]
 
     @cached_property
     def _shared(self) -> bool:
@@ -326,8 +332,9 @@ def _hidden(layers: tuple[Layer, ...], y: np.ndarray) -> list[np.ndarray]:
     """Activations of the hidden layers, and the output behind them."""
     found = []
     for weights, biases in layers[:-1]:
-        y = np.tanh(y @ weights + biases)
-        found.append(y)
+        y = y @ weights
+        y += biases
+        found.append(np.tanh(y, out=y))
     weights, biases = layers[-1]
     return [*found, y @ weights + biases]
 
@@ -336,7 +343,10 @@ def _gradient(layers: tuple[Layer, ...], hidden: list[np.ndarray]) -> np.ndarray
     """Gradient of a scalar tanh network, backwards through its activations and its output."""
     delta = layers[-1][0].T
     for (weights, _), activation in zip(reversed(layers[:-1]), reversed(hidden[:-1]), strict=True):
-        delta = (delta * (1 - activation * activation)) @ weights.T
+        slopes = activation * activation
+        np.subtract(1, slopes, out=slopes)
+        slopes *= delta
+        delta = slopes @ weights.T
     return delta
 
 
