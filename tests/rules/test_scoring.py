@@ -135,7 +135,8 @@ def test_v_on_a_grid_is_that_of_networks_at_its_points() -> None:
     draw = np.random.default_rng(0)
     hidden, outer = (draw.normal(size=(2, 30)), draw.normal(size=(1, 30))), draw.normal(size=(30, 1))
     one = TrainedNetworks(
-        potential=(hidden, (outer, np.array([[0.3]]))), circulatory=(hidden, (outer @ np.ones((1, 2)), np.ones((1, 2)))),
+        potential=(hidden, (outer, np.array([[0.3]]))),
+        circulatory=(hidden, (outer @ np.ones((1, 2)), np.ones((1, 2)))),
         mean=np.array([[0.5, -1.0]]), scale=np.array([[0.7, 2.0]]), potential_scale=np.array([[1.5]]),
         circulatory_scale=np.ones((1, 1)), diffusion=np.eye(2),
     )  # fmt: skip
