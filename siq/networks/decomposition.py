@@ -187,30 +187,28 @@ class TrainedNetworks:
 
     def evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """V ``(n,)``, g and f ``(n, d)`` at points ``(n, d)`` in the units of the states."""
-        pieces = [self._evaluate(x[part]) for part in self._parts(x)]
-        potential, circulatory, vector_field = zip(*pieces or [self._evaluate(x)], strict=True)
-        return np.concatenate(potential), np.concatenate(circulatory), np.concatenate(vector_field)
+        pieces = zip(*map(self._evaluate, self._parts(x)), strict=True)
+        potential, circulatory, vector_field = map(np.concatenate, pieces)
+        return potential, circulatory, vector_field
 
     def potential_at(self, x: np.ndarray) -> np.ndarray:
         """V alone, shape ``(n,)``, at a third of the cost of `evaluate`."""
-        values = [np.zeros(0)]
-        for part in self._parts(x):
-            y = (x[part].astype(self.mean.dtype) - self.mean) / self.scale
-            square = (y * y).sum(axis=1, keepdims=True)
-            values.append((self.potential_scale * (_hidden(self.potential, y)[-1] + square))[:, 0])
-        return np.concatenate(values).astype(float)
+        values = [
+            (self.potential_scale * (_hidden(self.potential, y)[-1] + (y * y).sum(axis=1, keepdims=True)))
+            for y in self._parts(x)
+        ]
+        return np.concatenate(values)[:, 0].astype(float)
 
     def gradients_at(self, x: np.ndarray) -> np.ndarray:
         """∇V alone, shape ``(n, d)``, at half the cost of `evaluate`."""
-        y = (x.astype(self.mean.dtype) - self.mean) / self.scale
-        gradient = _gradient(self.potential, _hidden(self.potential, y))
-        return (self.potential_scale / self.scale * (gradient + 2 * y)).astype(float)
+        gradients = [_gradient(self.potential, _hidden(self.potential, y)) + 2 * y for y in self._parts(x)]
+        return (self.potential_scale / self.scale * np.concatenate(gradients)).astype(float)
 
-    def _parts(self, x: np.ndarray) -> list[slice]:
-        """Parts of points that are evaluated one after the other."""
-        widest = max(biases.size for _, biases in (*self.potential, *self.circulatory))
-        rows = max(CHUNK // widest, 1)
-        return [slice(begin, begin + rows) for begin in range(0, len(x), rows)]
+    def _parts(self, x: np.ndarray) -> list[np.ndarray]:
+        """Normalised points y, in parts that are evaluated one after the other."""
+        y = (x.astype(self.mean.dtype) - self.mean) / self.scale
+        rows = max(CHUNK // max(biases.size for _, biases in (*self.potential, *self.circulatory)), 1)
+        return [y[begin : begin + rows] for begin in range(0, max(len(y), 1), rows)]
 
     @cached_property
     def _shared(self) -> bool:
@@ -219,8 +217,7 @@ class TrainedNetworks:
         same = all(np.array_equal(one, two) for layers in pairs for one, two in zip(*layers, strict=True))
         return same and len(self.potential) == len(self.circulatory)
 
-    def _evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        y = (x.astype(self.mean.dtype) - self.mean) / self.scale
+    def _evaluate(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         hidden = _hidden(self.potential, y)
         potential = self.potential_scale * (hidden[-1] + (y * y).sum(axis=1, keepdims=True))
         gradient = self.potential_scale / self.scale * (_gradient(self.potential, hidden) + 2 * y)
