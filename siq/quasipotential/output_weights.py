@@ -77,6 +77,7 @@ ESCAPE_SHARE = 0.5
 # Chosen on the paper's resonator, and used as they are for the systems of the tests.
 WELL_SPREAD = 1.0  # of the units of a well, on states divided by `WELL_SCALE`
 WELL_SCALE = 0.6  # of the distance of the nearest saddle
+FINER = 0.25  # of the spread, where V leaves too much of a residual: in many states units are to be smooth
 WELL_DRAWS = 4  # of units, until some take V to the saddle
 NEAREST_STATES = 10  # recorded ones: to the saddle has come what has one of those that lie nearest to it
 GROWTH_STEPS = 8  # of Gauss–Newton on each level; the last fit comes afterwards
@@ -337,13 +338,7 @@ class OutputWeights:
                 logger.info("%s", failure)
                 return None
             attractor = portrait.attractors[index].position
-            x = well.inside(LEVEL_SHARE)
-            residual = float(np.median(well.residual_at(x))) if len(x) else np.inf
-            logger.info("about %s: V up to %.4g, residual %.1e", attractor, well.level, residual)
-            if not (
-                residual < max(MAX_WELL_RESIDUAL, self.uncertainty)
-                and self._leaves(attractor, cast(UnitBasis, well.basis), well.coefficients)
-            ):
+            if not self._leaves(attractor, cast(UnitBasis, well.basis), well.coefficients):
                 return None
             wells.append(well)
             for other in range(count):
@@ -371,15 +366,11 @@ class OutputWeights:
         """What leads to an attractor, with more states about it where few lie in its well."""
         assert self.found is not None
         attractor, basin = portrait.attractors[index].position, portrait.basins[index]
-        hessian = hessian_at(self.found.dynamics, attractor)
-
-        def heights(x: np.ndarray) -> np.ndarray:
-            return np.asarray(0.5 * np.einsum("ni,ij,nj->n", x - attractor, hessian, x - attractor))
-
-        tops = [one.position for one in portrait.saddles[index]]
-        level = LEVEL_BEYOND_SADDLE * heights(np.array(tops)).min() if tops else np.inf
-        count = int((heights(basin.points(np.arange(len(basin.chosen)))) < level).sum())
-        if not tops or count >= STATES_PER_UNIT * self.units:
+        x = np.array([one.position for one in portrait.saddles[index]]).reshape(-1, len(attractor))
+        offsets = np.concatenate([x, basin.points(np.arange(len(basin.chosen)))]) - attractor
+        heights = np.einsum("ni,ij,nj->n", offsets, hessian_at(self.found.dynamics, attractor), offsets) / 2
+        level = LEVEL_BEYOND_SADDLE * float(heights[: len(x)].min(initial=np.inf))
+        if not len(x) or (heights[len(x) :] < level).sum() >= STATES_PER_UNIT * self.units:
             return basin
         return basin_of(
             self.found.dynamics, portrait.descents, index, portrait.attractors,
@@ -404,11 +395,18 @@ class OutputWeights:
             return np.sort(np.abs((x - places) / width).max(axis=2), axis=1)
 
         near = distances(basin.points(np.arange(len(basin.chosen))))[:, :NEAREST_STATES][:, -1]
+        spread = WELL_SPREAD
         for _ in range(WELL_DRAWS):
             try:
-                well = self._well_of_draw(portrait, index, generator)
+                well = self._well_of_draw(portrait, index, generator, spread)
             except NumericalFailure as error:
-                failure = error
+                failure, spread = error, FINER * spread
+                continue
+            x = well.inside(LEVEL_SHARE)
+            residual = float(np.median(well.residual_at(x))) if len(x) else np.inf
+            logger.info("about %s: V up to %.4g, residual %.1e", well.attractor, well.level, residual)
+            if not residual < max(MAX_WELL_RESIDUAL, self.uncertainty):
+                failure, spread = NumericalFailure(f"V leaves a residual of {residual:.1g}"), FINER * spread
                 continue
             away = distances(well.points)[:, 0]
             reached = [one for one, close in zip(saddles, away <= near, strict=True) if close]
@@ -424,7 +422,9 @@ class OutputWeights:
             raise failure
         return min(made, key=lambda one: one[0])[1:]
 
-    def _well_of_draw(self, portrait: PhasePortrait, index: int, generator: np.random.Generator) -> Well:
+    def _well_of_draw(
+        self, portrait: PhasePortrait, index: int, generator: np.random.Generator, spread: float
+    ) -> Well:
         """V about an attractor over units of its own, grown from the square ``|y|²`` of offsets from it."""
         attractor, basin = portrait.attractors[index].position, portrait.basins[index]
         saddles, width = portrait.saddles[index], np.ptp(portrait.box, axis=1)
@@ -434,8 +434,8 @@ class OutputWeights:
         distance = np.linalg.norm((places - attractor) / width, axis=1)
         scale = WELL_SCALE * (distance.min() if tops else np.median(distance)) * width
         units = min(self.units, len(basin.chosen) // STATES_PER_UNIT)
-        weights = WELL_SPREAD * generator.normal(size=(len(attractor), units))
-        biases = WELL_SPREAD * generator.uniform(-2, 2, units)
+        weights = spread * generator.normal(size=(len(attractor), units))
+        biases = spread * generator.uniform(-2, 2, units)
         # Those whose slopes span all directions best come first.
         order = scipy.linalg.qr(weights * (1 - np.tanh(biases) ** 2), mode="r", pivoting=True)[1]
         basis = UnitBasis(weights[:, order], biases[order], attractor, scale, flat=True)
