@@ -240,7 +240,10 @@ class NetworksByWell:
     parts
         Networks that hold in the well of each attractor; V of each is zero there.
     heights
-        What is added to V of each, shape ``(k,)``.
+        What is added to V of each, shape ``(k,)``; zeros where it is not known, as wells end before saddles.
+    levels
+        V of each at its lowest saddle, or where recordings end before it, shape ``(k,)``. Close to there, and
+        beyond, V is less exact than elsewhere.
     states, attractor_of
         States ``(n, d)``, and in the well of which attractor each lies, shape ``(n,)``, or `NOWHERE` where
         none of the networks holds. A point belongs to the well of the nearest of them.
@@ -250,6 +253,7 @@ class NetworksByWell:
 
     parts: tuple[TrainedNetworks, ...]
     heights: np.ndarray
+    levels: np.ndarray
     states: np.ndarray
     attractor_of: np.ndarray
 
@@ -285,10 +289,15 @@ class NetworksByWell:
             potential[rows] = values(x[rows]) + height
         return potential
 
-    def states_about(self, attractor: np.ndarray) -> np.ndarray:
-        """States in the well about an attractor ``(d,)``, shape ``(m, d)``."""
-        distances = [float(np.linalg.norm(one.mean[0] - attractor)) for one in self.parts]
-        return self.states[self.attractor_of == int(np.argmin(distances))]
+    def below(self, share: float, attractor: np.ndarray, x: np.ndarray | None = None) -> np.ndarray:
+        """Points ``(n, d)`` in the well about an attractor ``(d,)``, below a share of its level: ``(m, d)``.
+
+        By default they are taken from the states.
+        """
+        x = self.states if x is None else x
+        index = int(np.argmin([float(np.linalg.norm(one.mean[0] - attractor)) for one in self.parts]))
+        x = x[self.of_wells(x)[index]]
+        return np.asarray(x[self.parts[index].potential_at(x) < share * self.levels[index]])
 
     def of_wells(self, x: np.ndarray) -> list[np.ndarray]:
         """Rows of points ``(n, d)`` by the well that they lie in."""
@@ -358,7 +367,7 @@ def save_networks(path: str | Path, runs: Sequence[AnyNetworks]) -> None:
     write_archive(path, arrays)
 
 
-_OF_WELLS = ("heights", "states", "attractor_of")
+_OF_WELLS = ("heights", "levels", "states", "attractor_of")
 
 
 def load_networks(path: str | Path, *, run: int = 0) -> AnyNetworks:

@@ -391,11 +391,13 @@ def grown(
     generator: np.random.Generator,
     depth: float | None = None,
     damping: float = 0.0,
+    steps: int = 40,
 ) -> Well:
     """V grown from a start, level by level, to its lowest saddle or to the end of the recorded region.
 
     `metric` is the curvature of V at the attractor, in which distances are measured; `fitted` has the rows of
-    ``basin.chosen`` on which the start was fitted. The damping is that of Gauss–Newton.
+    ``basin.chosen`` on which the start was fitted. The damping is that of Gauss–Newton, and `steps` how many
+    it takes at most where the well ends.
     """
     attractor = basis.center
     place = f"the attractor near {attractor.round(4)}"
@@ -435,9 +437,9 @@ def grown(
                 f" needs {2 * basis.size}"
             )
         equation = HamiltonJacobi.at(basis, points, dynamics, attractor=attractor)
-        steps, tolerance = (40, 1e-13) if last else (8, COARSE_TOLERANCE)
+        most, tolerance = (steps, 1e-13) if last else (8, COARSE_TOLERANCE)
         coefficients, residual = equation.gauss_newton(
-            coefficients, free=free, steps=steps, tolerance=tolerance, damping=damping
+            coefficients, free=free, steps=most, tolerance=tolerance, damping=damping
         )
         values = along(coefficients)
         recorded = _recorded(basin.starts(values), len(attractor))
