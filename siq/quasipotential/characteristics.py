@@ -161,7 +161,7 @@ class HamiltonianFlow(ScaledSystem):
 
 
 MAX_STEPS = 20_000  # numerical, a guard: a curve that takes more is stiff, or circles
-HALVINGS = 20  # of the last step, to find where a curve ends: to a millionth of it
+HALVINGS = 24  # of the last step, to find where a curve ends
 MAX_RELAXATION_TIMES = 60.0  # in units of the slowest relaxation time of the attractor
 REST_RATIO = 1e-3  # p to x - A, in units in which both are equal near A
 SHEET_DISTANCE = 0.06  # of neighbours, the level being at about 1: more than the gaps of a fan
