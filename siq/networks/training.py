@@ -585,7 +585,7 @@ class Block:
         data = [_slowest_part(self.data[run], options.slowest_share) for run in runs]
         file = self._checkpoint(f"attempt{attempt}")
         state = None if file is None else _load_checkpoint(file, fingerprint=self.mark)
-        if state is None:
+        if state is None or state.step > options.steps:  # of a training that was given more steps
             state = start(data, options=options, diffusion=self.diffusion, seeds=seeds)
         kept = {run: self._checkpoint(f"attempt{attempt}-run{run}") for run in runs}
         # Networks that had passed the check before the job was killed.

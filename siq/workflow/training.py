@@ -2,6 +2,7 @@
 
 A training ends as soon as its networks are good enough, or when its steps are spent. A killed one is resumed
 where it stopped: from its checkpoint, and with the networks of the runs that had already passed the check.
+One without a check keeps its checkpoint at the end, and goes on from there when it is given more steps.
 """
 
 from __future__ import annotations
@@ -42,13 +43,19 @@ Runs = Mapping[int, tuple[Recordings | None, FieldEstimate | None]]
 
 
 def train_block(
-    settings: PipelineSettings, runs: Runs, *, folder: Path | None = None, device: str = "auto"
+    settings: PipelineSettings,
+    runs: Runs,
+    *,
+    folder: Path | None = None,
+    device: str = "auto",
+    version: int = 0,
 ) -> tuple[dict[int, StepResult[AnyNetworks]], list[AnyNetworks], pd.DataFrame]:
     """Train the networks of a block of runs, on the device ``auto``, ``cpu`` or ``cuda``.
 
-    In the folder a killed training leaves what it goes on from; see `clean`. Given are the results of every
-    run; the networks of those that have data, by their positions, be they good for anything or not; and the
-    loss, the table `training`.
+    In the folder a killed training leaves what it goes on from, and one without a check what a training of
+    more steps goes on from; see `clean`. Neither goes on from another version of the code. Given are the
+    results of every run; the networks of those that have data, by their positions, be they good for anything
+    or not; and the loss, the table `training`.
     """
     assert settings.training is not None  # networks are asked for
     data, results = _training_data(settings, runs)
@@ -58,7 +65,7 @@ def train_block(
     ready, faults = _checks(settings, runs, data, diffusion)
     block = Block(
         data, ready, options=settings.training, diffusion=diffusion, seed=settings.seed, folder=folder,
-        mark=_fingerprint(settings, runs, data), device=choose_device(device), faults=faults,
+        mark=_fingerprint(settings, runs, data, version), device=choose_device(device), faults=faults,
     )  # fmt: skip
     block.train()
     for number in data:
@@ -136,10 +143,14 @@ def _checks(
     return ready, faults
 
 
-def _fingerprint(settings: PipelineSettings, runs: Runs, data: Mapping[int, TrainingData]) -> str:
+def _fingerprint(
+    settings: PipelineSettings, runs: Runs, data: Mapping[int, TrainingData], version: int
+) -> str:
     """What everything kept by a killed training must share with the one that goes on from it."""
     told = settings.parts(("seed", "space", "sampling", "training"))
-    digest = hashlib.sha256(json.dumps([list(data), told], sort_keys=True).encode())
+    if told["training"]["check"] is None:
+        del told["training"]["steps"]  # which say when it ends, and change no step before
+    digest = hashlib.sha256(json.dumps([list(data), told, version], sort_keys=True).encode())
     for number, part in data.items():
         record = runs[number][1]
         arrays = [part.training.x0, part.training.xh, part.training.h]
@@ -151,7 +162,8 @@ def _fingerprint(settings: PipelineSettings, runs: Runs, data: Mapping[int, Trai
     return digest.hexdigest()
 
 
-def clean(folder: Path) -> None:
-    """Remove what only a killed training would need."""
-    for path in folder.glob("kept-*.npz"):
+def clean(folder: Path, *, but_last: bool = False) -> None:
+    """Remove what only a killed training would need; `but_last` leaves what was kept last."""
+    kept = sorted(folder.glob("kept-*.npz"), key=lambda path: path.stat().st_mtime_ns)
+    for path in kept[: len(kept) - but_last]:
         path.unlink()
