@@ -3,34 +3,34 @@
     .venv/bin/python -m benchmarks.ablations
     .venv/bin/python -m benchmarks.ablations --table
 
-The paper's system in three dimensions, runs 0 to 9 of the study ``archetype3d``. Every training is a cold
-start of its own. Its row goes into ``results/ablations.csv`` as soon as it has ended; a row that is there is
-not made again. ``--table`` writes the table of ``docs/how-the-method-works.md`` from what there is.
+The paper's system in three dimensions, runs 0 to 9 of the study ``archetype3d``; every training is a cold
+start. A row goes into ``results/ablations.csv`` as soon as it has ended, and one that is there is not made
+again. ``--table`` prints the table of ``docs/how-the-method-works.md`` from what there is.
 
-Asked is what output weights say at the first check: that V is right, that it is on a false branch, or that
-the start led nowhere. Then the training goes on as in a study, with further checks and fresh networks. What
-it ends with is compared with the exact U, which no training sees, and with the refined V, as every
-certificate does. Where it is wrong, its published regression is put to the certificate, too.
+Asked is what output weights say at the first check: that V is right, on a false branch, or nowhere. Then the
+training goes on as in a study. What it ends with is compared with the exact U, which no training sees, and
+with the refined V. Where it is wrong, its published regression is put to the certificate.
 """
 
 import os
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
-import argparse
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any
+from itertools import product
+from typing import Any, Literal
 
 import pandas as pd
 import torch
 
-from benchmarks.learning_curves import ROOT, RUNS, Run
-from siq.networks.decomposition import TrainedNetworks, TrainingOptions
+from benchmarks.learning_curves import CPU, ROOT, RUNS, Run
+from siq.networks.decomposition import TrainedNetworks
 from siq.networks.networks import at_rest
-from siq.networks.training import Block, start, train
+from siq.networks.training import Block, Check, start, train
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.certificate import certify, check_agreement
 from siq.quasipotential.output_weights import OutputWeights
@@ -40,87 +40,78 @@ from siq.workflow.tables import Outcome, Step, StepResult
 
 TABLE = ROOT / "results" / "ablations.csv"
 WRONG = 0.05  # relative error of U above which V is wrong, whatever anything says of it
-NO_STEPS, AS_LONG = "no steps", "as long"
 
 
 @dataclass(frozen=True)
 class Ablation:
-    """What is put back, in the words of the table: options of the training, or another way to train."""
+    """What is put back, in the words of the table."""
 
     name: str
     options: dict[str, Any] = field(default_factory=dict)
-    way: str = ""
+    way: Literal["", "no steps", "as long"] = ""
     steepness: float = 1.0
 
 
 AS_USUAL = Ablation("as in the study")
+PAPERS_START = {"normalise_on": "pairs", "potential_gain": 1}
+SINGLE: tuple[tuple[str, Any], ...] = (
+    *PAPERS_START.items(), ("representative_share", 0), ("orthogonality_weight", 1), ("matching", "explicit"),
+    ("precision", "float64"), ("batch_size", 100), ("decay_rate", 1), ("widths", [50, 50, 50]),
+    ("output_weights", 100), ("output_weights", 200), ("output_weights", 800),
+)  # fmt: skip
 ABLATIONS = (
     AS_USUAL,
-    Ablation("no steps: V = η_v∣y∣²", way=NO_STEPS),
-    Ablation("no steps, a tenth as steep", way=NO_STEPS, steepness=0.1),
-    Ablation("no steps, ten times as steep", way=NO_STEPS, steepness=10.0),
-    Ablation("published training for as many CPU seconds", way=AS_LONG),
+    Ablation("no steps: V = η_v∣y∣²", way="no steps"),
+    Ablation("no steps, a tenth as steep", way="no steps", steepness=0.1),
+    Ablation("no steps, ten times as steep", way="no steps", steepness=10.0),
+    Ablation("published training for as many CPU seconds", way="as long"),
     Ablation("no output weights: 900 steps of Adam", {"check": None}),
-    Ablation("`potential_gain: 1`", {"potential_gain": 1.0}),
-    Ablation("`normalise_on: pairs`", {"normalise_on": "pairs"}),
-    Ablation("both", {"normalise_on": "pairs", "potential_gain": 1.0}),
-    Ablation("`representative_share: 0`", {"representative_share": 0.0}),
-    Ablation("`orthogonality_weight: 1`", {"orthogonality_weight": 1.0}),
-    Ablation("`matching: explicit`", {"matching": "explicit"}),
-    Ablation("`precision: float64`", {"precision": "float64"}),
-    Ablation("`batch_size: 100`", {"batch_size": 100}),
-    Ablation("`decay_rate: 1`", {"decay_rate": 1.0}),
-    Ablation("`widths: [50, 50, 50]`", {"widths": (50, 50, 50)}),
-    Ablation("`output_weights: 100`", {"output_weights": 100}),
-    Ablation("`output_weights: 200`", {"output_weights": 200}),
-    Ablation("`output_weights: 800`", {"output_weights": 800}),
+    *(Ablation(f"`{name}: {value}`", {name: value}) for name, value in SINGLE),
+    Ablation("both", PAPERS_START),
 )
+FIRST = 6  # ablations that are made on all seeds before the others begin
 
 
 class Watched(OutputWeights):
     """Output weights that keep what they said at every check."""
 
     said: tuple[str, ...] = ()
-    false = False
 
     def accepted(self, networks: TrainedNetworks) -> TrainedNetworks | None:
         """As always."""
-        self.false = False
+        self.last = "nowhere"
         found = super().accepted(networks)
-        self.said += ("right" if found is not None else "false" if self.false else "nowhere",)
+        self.said += (self.last if found is None else "right",)
         return found
 
     def _leaves(self, *of: Any) -> bool:  # asked only of a V that solves the equation
         leaves = super()._leaves(*of)
-        self.false = self.false or not leaves
+        self.last = self.last if leaves else "false"
         return leaves
 
 
-class Judge:
-    """The refined V of a run, which no networks change, and what it says of networks."""
+@cache
+def judge(number: int) -> tuple[Run, Callable[[TrainedNetworks, bool], dict[str, Any]]]:
+    """A run, and what its refined V, which no networks change, says of right and wrong networks."""
+    run = Run("archetype3d", number)
+    its, found = run.settings, identify_run(run.settings, run.recordings, number=run.number).result
+    assert found is not None
+    context = RefinementContext(
+        run.recordings, found, None, number=run.number, seed=its.seed,
+        pair_step=its.sampling.pair_step, refinement=its.refinement, limits=its.certificate,
+    )  # fmt: skip
+    refined = context.refine_and_certify()
 
-    def __init__(self, run: Run) -> None:
-        self.run = run
-        self.identified = identify_run(run.settings, run.recordings, number=run.number)
-        assert self.identified.result is not None
-        self.context = RefinementContext(
-            run.recordings, self.identified.result, None, number=run.number, seed=run.settings.seed,
-            pair_step=run.settings.sampling.pair_step, refinement=run.settings.refinement,
-            limits=run.settings.certificate,
-        )  # fmt: skip
-        self.refined = self.context.refine_and_certify()
-
-    def __call__(self, networks: TrainedNetworks, *, wrong: bool) -> dict[str, Any]:
-        """Whether both routes agree; of networks that are wrong, whether their regression is certified."""
-        evidence, formulas = self.context.evidence, self.refined.formulas
-        assert formulas.potential is not None
-        agreement = check_agreement(networks, formulas, evidence, error=self.refined.certificate.error)
-        told = {"agrees": agreement.passed, "reason": agreement.reason, "certified": False}
+    def judged(networks: TrainedNetworks, wrong: bool) -> dict[str, Any]:
+        said = check_agreement(networks, refined.formulas, context.evidence, error=refined.certificate.error)
+        told = {"agrees": said.passed, "reason": said.reason, "certified": False}
         if wrong:
-            trained = StepResult[Any](networks, Outcome(self.run.number, Step.TRAIN))
-            regressed = regress_run(self.run.settings, self.run.recordings, trained).result
-            told["certified"] = regressed is not None and certify(regressed, evidence).certified
+            trained = StepResult[Any](networks, Outcome(run.number, Step.TRAIN))
+            regressed = regress_run(its, run.recordings, trained).result
+            told["certified"] = regressed is not None and certify(regressed, context.evidence).certified
         return told
+
+    return run, judged
 
 
 @cache
@@ -131,61 +122,41 @@ def prepared(run: Run, units: int) -> tuple[Watched, float]:
     return check, time.process_time() - began
 
 
-def networks_of(
-    ablation: Ablation, run: Run, *, seconds: float
-) -> tuple[TrainedNetworks, tuple[str, ...], float]:
+def networks_of(ablation: Ablation, run: Run, *, seconds: float) -> tuple[Any, tuple[str, ...], float]:
     """What a training ends with, what was said at its checks, and the CPU seconds of all of it."""
-    options: TrainingOptions = replace(run.options, **ablation.options)
+    options = Run.published() if ablation.way == "as long" else replace(run.options, **ablation.options)
     check, spent = (None, 0.0) if options.check is None else prepared(run, options.output_weights)
-    began, seeds = time.process_time(), [run.seed(0)]
-    if ablation.way == AS_LONG:
-        options, check, spent = Run.published(), None, 0.0
-        state = start([run.data], options=options, diffusion=run.system.diffusion, seeds=seeds)
-        while time.process_time() - began < seconds:
-            further = replace(options, steps=state.step + 5)
-            state = train(state, [run.data], options=further, seeds=seeds, log_every=10**9)
-        networks: Any = at_rest(state.networks, 0)
-    elif ablation.way == NO_STEPS:
-        assert check is not None
-        state = start([run.data], options=options, diffusion=run.system.diffusion, seeds=seeds)
-        first = at_rest(state.networks, 0)
-        weights, biases = first.potential[-1]
-        first = replace(
-            first,
-            potential=(*first.potential[:-1], (0 * weights, 0 * biases)),
-            potential_scale=ablation.steepness * first.potential_scale,
-        )
-        check.said = ()
-        networks = check.accepted(first) or first
-    else:
-        if check is not None:
-            check.said = ()
+    before = 0 if check is None else len(check.said)
+    checks: dict[int, Check] = {} if check is None else {run.number: check}
+    began, seeds, data = time.process_time(), [run.seed(0)], [run.data]
+    if not ablation.way:
         block = Block(
-            {run.number: run.data}, {} if check is None else {run.number: check}, options=options,
-            diffusion=run.system.diffusion, seed=run.settings.seed, folder=None, mark="",
-            device=torch.device("cpu"),
+            {run.number: run.data}, checks, options=options, diffusion=run.system.diffusion,
+            seed=run.settings.seed, folder=None, mark="", device=CPU,
         )  # fmt: skip
         block.train()
         networks = block.last[run.number]
-    said = () if check is None else check.said
-    return networks, said, spent + time.process_time() - began
+    else:
+        state = start(data, options=options, diffusion=run.system.diffusion, seeds=seeds)
+        while ablation.way == "as long" and time.process_time() - began < seconds:
+            more = replace(options, steps=state.step + 5)
+            state = train(state, data, options=more, seeds=seeds, log_every=10**9)
+        networks = first = at_rest(state.networks, 0)
+        if check is not None:
+            steep, last = ablation.steepness * first.potential_scale, first.potential[-1]
+            layers = (*first.potential[:-1], (0 * last[0], 0 * last[1]))
+            first = replace(first, potential=layers, potential_scale=steep)
+            networks = check.accepted(first) or first
+    return networks, () if check is None else check.said[before:], spent + time.process_time() - began
 
 
-def rows(number: int, done: dict[str, float]) -> Iterator[dict[str, Any]]:
-    """What is measured of one run, but for what is done, with its CPU seconds."""
-    if len(done) == len(ABLATIONS):
-        return
-    run = Run("archetype3d", number)
-    judge = Judge(run)
-    networks_of(AS_USUAL, run, seconds=0)  # what a first training imports is not to count
-    for ablation in ABLATIONS:
-        if ablation.name in done:
-            continue
-        networks, said, seconds = networks_of(ablation, run, seconds=done.get(AS_USUAL.name, 0.0))
-        done[ablation.name] = seconds
-        told = {"ablation": ablation.name, "run": number, "first_check": said[0] if said else ""}
-        told |= {"checks": len(said), "cpu_seconds": seconds, **run.measured(networks)}
-        yield told | judge(networks, wrong=told["error"] > WRONG)
+def row(ablation: Ablation, number: int, *, seconds: float) -> dict[str, Any]:
+    """What is measured of one training; some take as many CPU seconds as they are told."""
+    run, judged = judge(number)
+    networks, said, spent = networks_of(ablation, run, seconds=seconds)
+    told: dict[str, Any] = {"ablation": ablation.name, "run": number, "first_check": said[0] if said else ""}
+    told |= {"checks": len(said), "cpu_seconds": spent, **run.measured(networks)}
+    return told | judged(networks, told["error"] > WRONG)
 
 
 def table() -> str:
@@ -193,18 +164,17 @@ def table() -> str:
     made = pd.read_csv(TABLE, keep_default_na=False)
     lines = [
         "| put back | seeds | first check: right, false, nowhere | error of U, median | worst | CPU s |"
-        " agrees | wrong | of these agree, certified |",
-        "|---|---|---|---|---|---|---|---|---|",
+        " agrees | wrong | of these agree | certified |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for ablation in ABLATIONS:
         of = made[made["ablation"] == ablation.name]
-        first = [(of["first_check"] == one).sum() for one in ("right", "false", "nowhere")]
-        said = ", ".join(map(str, first)) if sum(first) else "–"
-        wrong = of["error"] > WRONG
+        first, wrong = of["first_check"].value_counts(), of["error"] > WRONG
+        counts = [str(first.get(one, 0)) for one in ("right", "false", "nowhere")]
         figures = [
-            ablation.name, len(of), said, f"{of['error'].median():.1e}", f"{of['error'].max():.1e}",
-            f"{of['cpu_seconds'].median():.1f}", of["agrees"].sum(), wrong.sum(),
-            f"{(of['agrees'] & wrong).sum()}, {(of['certified'] & wrong).sum()}",
+            ablation.name, len(of), "–" if "" in first else ", ".join(counts),
+            f"{of['error'].median():.1e}", f"{of['error'].max():.1e}", f"{of['cpu_seconds'].median():.1f}",
+            of["agrees"].sum(), wrong.sum(), (of["agrees"] & wrong).sum(), (of["certified"] & wrong).sum(),
         ]  # fmt: skip
         lines.append(f"| {' | '.join(map(str, figures))} |")
     return "\n".join(lines)
@@ -212,18 +182,17 @@ def table() -> str:
 
 def main() -> None:
     """Measure what is not there yet, or print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--table", action="store_true", help="print the table")
-    if parser.parse_args().table:
+    if "--table" in sys.argv:
         print(table())
         return
     torch.set_num_threads(1)
-    TABLE.parent.mkdir(exist_ok=True)
-    made = pd.read_csv(TABLE, keep_default_na=False).to_dict("records") if TABLE.exists() else []
-    for number in range(RUNS):
-        done = {one["ablation"]: one["cpu_seconds"] for one in made if one["run"] == number}
-        for row in rows(number, done):
-            made.append(row)
+    made: list[Any] = pd.read_csv(TABLE, keep_default_na=False).to_dict("records") if TABLE.exists() else []
+    done = {(one["ablation"], one["run"]): one["cpu_seconds"] for one in made}
+    networks_of(AS_USUAL, judge(0)[0], seconds=0)  # what a first training imports is not to count
+    for number, ablation in [*product(range(RUNS), ABLATIONS[:FIRST]), *product(range(RUNS), ABLATIONS)]:
+        if (ablation.name, number) not in done:
+            made.append(row(ablation, number, seconds=done.get((AS_USUAL.name, number), 0.0)))
+            done[ablation.name, number] = made[-1]["cpu_seconds"]
             pd.DataFrame(made).to_csv(TABLE, index=False)
 
 
