@@ -51,10 +51,13 @@ with needs_extra("networks"):
     import torch
     from torch import Tensor
 
+logger = logging.getLogger(__name__)
+
 CHUNK = 100  # steps whose batches are drawn together; part of what a seed means
 STANDARD_THINNING = 0.1  # distance of representative points, in standard deviations of the states
 FEWEST_REPRESENTATIVE = 10  # below this, orthogonality is asked for almost nowhere
 HELD_OUT_PAIRS = 4096  # pairs on which the held-out loss is measured
+HISTORY = ("run", "step", "training_loss", "held_out_loss", "dynamics", "orthogonality", "learning_rate")
 
 
 @dataclass(frozen=True)
@@ -255,11 +258,6 @@ def _initial_networks(
         potential_scale=options.potential_gain * torch.tensor(potential_scales, dtype=dtype)[:, None, None],
         circulatory_scale=torch.tensor(circulatory_scales, dtype=dtype)[:, None, None],
     )
-
-
-logger = logging.getLogger(__name__)
-
-HISTORY = ("run", "step", "training_loss", "held_out_loss", "dynamics", "orthogonality", "learning_rate")
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import pandas as pd
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
-from siq.networks.decomposition import AnyNetworks
+from siq.networks.decomposition import AnyNetworks, TrainingOptions
 from siq.networks.training import Block, Check, TrainingData, choose_device, prepare_data
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.output_weights import OutputWeights
@@ -28,6 +28,9 @@ from siq.workflow.tables import Outcome, Status, Step, StepResult, as_table
 
 POSITION = "position"
 """In the details of an outcome: where the run stands among the networks of its block."""
+MOST_POINTS = 10_000  # over which a D that depends on the state is averaged
+Runs = Mapping[int, tuple[Recordings | None, FieldEstimate | None]]
+"""What runs bring to their training, by number: trajectories and f, None where a step before failed."""
 
 
 def not_trained(number: int) -> StepResult[AnyNetworks]:
@@ -35,21 +38,10 @@ def not_trained(number: int) -> StepResult[AnyNetworks]:
     return StepResult(None, Outcome(number, Step.TRAIN, Status.SKIPPED, "no networks were asked for"))
 
 
-MOST_POINTS = 10_000  # over which a D that depends on the state is averaged
-
-
-Runs = Mapping[int, tuple[Recordings | None, FieldEstimate | None]]
-"""What runs bring to their training, by number: trajectories and f, None where a step before failed."""
-
-
 def train_block(
-    settings: PipelineSettings,
-    runs: Runs,
-    *,
-    folder: Path | None = None,
-    device: str = "auto",
+    settings: PipelineSettings, runs: Runs, *, folder: Path | None = None, device: str = "auto",
     version: int = 0,
-) -> tuple[dict[int, StepResult[AnyNetworks]], list[AnyNetworks], pd.DataFrame]:
+) -> tuple[dict[int, StepResult[AnyNetworks]], list[AnyNetworks], pd.DataFrame]:  # fmt: skip
     """Train the networks of a block of runs, on the device ``auto``, ``cpu`` or ``cuda``.
 
     In the folder a killed training leaves what it goes on from, and one without a check what a training of
@@ -65,7 +57,7 @@ def train_block(
     ready, faults = _checks(settings, runs, data, diffusion)
     block = Block(
         data, ready, options=settings.training, diffusion=diffusion, seed=settings.seed, folder=folder,
-        mark=_fingerprint(settings, runs, data, version), device=choose_device(device), faults=faults,
+        mark=f"{_fingerprint(settings, runs, data)} {version}", device=choose_device(device), faults=faults,
     )  # fmt: skip
     block.train()
     for number in data:
@@ -143,14 +135,12 @@ def _checks(
     return ready, faults
 
 
-def _fingerprint(
-    settings: PipelineSettings, runs: Runs, data: Mapping[int, TrainingData], version: int
-) -> str:
+def _fingerprint(settings: PipelineSettings, runs: Runs, data: Mapping[int, TrainingData]) -> str:
     """What everything kept by a killed training must share with the one that goes on from it."""
     told = settings.parts(("seed", "space", "sampling", "training"))
     if told["training"]["check"] is None:
         del told["training"]["steps"]  # which say when it ends, and change no step before
-    digest = hashlib.sha256(json.dumps([list(data), told, version], sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps([list(data), told], sort_keys=True).encode())
     for number, part in data.items():
         record = runs[number][1]
         arrays = [part.training.x0, part.training.xh, part.training.h]
@@ -162,8 +152,8 @@ def _fingerprint(
     return digest.hexdigest()
 
 
-def clean(folder: Path, *, but_last: bool = False) -> None:
-    """Remove what only a killed training would need; `but_last` leaves what was kept last."""
+def clean(folder: Path, options: TrainingOptions | None = None) -> None:
+    """Remove what only a killed training would need; what was kept last stays of one without a check."""
     kept = sorted(folder.glob("kept-*.npz"), key=lambda path: path.stat().st_mtime_ns)
-    for path in kept[: len(kept) - but_last]:
+    for path in kept[: len(kept) - (options is not None and options.check is None)]:
         path.unlink()

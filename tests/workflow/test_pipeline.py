@@ -212,7 +212,7 @@ def test_a_training_without_a_check_goes_on_when_it_is_given_more_steps(
         _, found, history = training.train_block(
             settings, {0: (recordings, None)}, folder=tmp_path / folder, device="cpu", version=version
         )
-        training.clean(tmp_path / folder, but_last=True)
+        training.clean(tmp_path / folder, settings.training)
         assert isinstance(found[0], TrainedNetworks)
         return found[0], history["step"].tolist()
 
