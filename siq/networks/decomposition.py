@@ -287,7 +287,7 @@ class NetworksByWell:
         return potential
 
     def below(self, share: float, attractor: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Points ``(n, d)`` in the well about an attractor ``(d,)`` below a share of its level: ``(m, d)``."""
+        """Points ``(n, d)`` in the well of an attractor ``(d,)``, below a share of its level: ``(m, d)``."""
         index = int(np.argmin([float(np.linalg.norm(one.mean[0] - attractor)) for one in self.parts]))
         x = x[self.of_wells(x)[index]]
         return np.asarray(x[self.parts[index].potential_at(x) < share * self.levels[index]])
