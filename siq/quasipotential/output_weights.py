@@ -71,7 +71,7 @@ ESCAPE_SHARE = 0.5
 # Chosen on the paper's resonator, and used as they are for the systems of the tests.
 WELL_SPREAD = 1.0  # of the units of a well, on states divided by `WELL_SCALE`
 WELL_SCALE = 0.6  # of the distance of the nearest saddle
-FINER = 0.25  # of the spread, where V leaves too much of a residual: in many states units are to be smooth
+FINER = 0.1  # of the spread, where V leaves too much of a residual: in many states units are to be smooth
 WELL_DRAWS = 4  # of units, until some take V to the saddle
 NEAREST_STATES = 10  # recorded ones: to the saddle has come what has one of those that lie nearest to it
 GROWTH_STEPS = 8  # of Gauss–Newton on each level; the last fit comes afterwards
