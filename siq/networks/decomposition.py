@@ -289,12 +289,8 @@ class NetworksByWell:
             potential[rows] = values(x[rows]) + height
         return potential
 
-    def below(self, share: float, attractor: np.ndarray, x: np.ndarray | None = None) -> np.ndarray:
-        """Points ``(n, d)`` in the well about an attractor ``(d,)``, below a share of its level: ``(m, d)``.
-
-        By default they are taken from the states.
-        """
-        x = self.states if x is None else x
+    def below(self, share: float, attractor: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Points ``(n, d)`` in the well of an attractor ``(d,)``, below a share of its level: ``(m, d)``."""
         index = int(np.argmin([float(np.linalg.norm(one.mean[0] - attractor)) for one in self.parts]))
         x = x[self.of_wells(x)[index]]
         return np.asarray(x[self.parts[index].potential_at(x) < share * self.levels[index]])

@@ -286,7 +286,7 @@ def check_agreement(
             # They end near their saddle, which one formula for all wells does not.
             x = networks.below(LEVEL_SHARE, attractor, x)
             if len(x) < MIN_POINTS:
-                x = networks.below(LEVEL_SHARE, attractor)
+                x = networks.below(LEVEL_SHARE, attractor, networks.states)
                 x = x[potential.values(x) - potential.values(attractor[None]) < LEVEL_SHARE * level]
         if len(x) < MIN_POINTS:
             few = f"the networks' V is known at {len(x)} points about {_position_text(attractor)}, too few to"

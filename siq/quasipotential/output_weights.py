@@ -39,17 +39,11 @@ from siq.quasipotential.certificate_tests import LEVEL_SHARE
 from siq.quasipotential.hamilton_jacobi import HamiltonJacobi, PowerBasis
 from siq.quasipotential.landscape import heights_of_attractors
 from siq.quasipotential.wells import Well, grown
-from siq.systems.basins import Basin, basin_of
+from siq.systems.basins import STARTS_NEAR_ATTRACTOR, Basin, basin_of
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
-from siq.systems.equilibria import Equilibrium, find_equilibria, hessian_at
-from siq.systems.phase_portrait import (
-    LEVEL_BEYOND_SADDLE,
-    STARTS_NEAR_ATTRACTOR,
-    PhasePortrait,
-    evenly_spread,
-    phase_portrait,
-)
+from siq.systems.equilibria import find_equilibria, hessian_at
+from siq.systems.phase_portrait import LEVEL_BEYOND_SADDLE, PhasePortrait, evenly_spread, phase_portrait
 
 if TYPE_CHECKING:  # needs torch, which the mathematics does without
     from siq.networks.training import TrainingData
@@ -77,7 +71,7 @@ ESCAPE_SHARE = 0.5
 # Chosen on the paper's resonator, and used as they are for the systems of the tests.
 WELL_SPREAD = 1.0  # of the units of a well, on states divided by `WELL_SCALE`
 WELL_SCALE = 0.6  # of the distance of the nearest saddle
-FINER = 0.25  # of the spread, where V leaves too much of a residual: in many states units are to be smooth
+FINER = 0.1  # of the spread, where V leaves too much of a residual: in many states units are to be smooth
 WELL_DRAWS = 4  # of units, until some take V to the saddle
 NEAREST_STATES = 10  # recorded ones: to the saddle has come what has one of those that lie nearest to it
 GROWTH_STEPS = 8  # of Gauss–Newton on each level; the last fit comes afterwards
@@ -254,7 +248,7 @@ class OutputWeights:
             self.coefficients = corrected(self.basis, best[0], self.coefficients, best[1])
         # The standard error of f at the points, of independent errors in the velocities, as a share of f.
         design = self.basis.design(self.points)
-        spread = (best[0].spread(design, best[1]) ** 2).sum(axis=1).mean()
+        spread = ((design @ best[0].inverse(best[1])) ** 2).sum(axis=1).mean()
         size = (self.drift(self.points) ** 2).sum(axis=1).mean()
         self.uncertainty = float(np.sqrt(spread * (unexplained**2).mean(axis=0).sum() / size))
         logger.info("f is uncertain by %.1e of itself", self.uncertainty)
@@ -328,39 +322,32 @@ class OutputWeights:
         count = len(portrait.attractors)
         if portrait.fault() is not None or not count:
             return None
-        basins = tuple(self._basin(portrait, index) for index in range(count))
-        portrait = replace(portrait, basins=basins)
-        wells, barriers = list[Well](), np.full((count, count), np.inf)
+        portrait = replace(portrait, basins=tuple(self._basin(portrait, one) for one in range(count)))
+        barriers, levels, parts, places, known = np.full((count, count), np.inf), [], [], [], []
         for index, generator in enumerate(self.generator.spawn(count)):
             try:
-                well, reached = self._well(portrait, index, generator)
+                well = self._well(portrait, index, generator)
             except NumericalFailure as failure:
                 logger.info("%s", failure)
                 return None
-            attractor = portrait.attractors[index].position
-            if not self._leaves(attractor, cast(UnitBasis, well.basis), well.coefficients):
+            basis, basin = cast(UnitBasis, well.basis), portrait.basins[index]
+            if not self._leaves(well.attractor, basis, well.coefficients):
                 return None
-            wells.append(well)
-            for other in range(count):
-                tops = [
-                    one.position for one in reached if any(one is each for each in portrait.saddles[other])
-                ]
-                if other != index and tops:
-                    barriers[index, other] = well.values(np.array(tops)).min()
-        parts = [
-            self._networks(cast(UnitBasis, well.basis), well.coefficients, well.points) for well in wells
-        ]
+            for other in range(count) if well.saddle is not None else ():
+                if any(np.array_equal(well.saddle, one.position) for one in portrait.saddles[other]):
+                    barriers[index, other] = well.level
+            x = basin.points(np.arange(len(basin.chosen)))
+            parts.append(self._networks(basis, well.coefficients, well.points))
+            levels.append(well.level)
+            places.append(x)
+            known.append(np.where(well.reaches(x), index, NetworksByWell.NOWHERE))
+        np.fill_diagonal(barriers, np.inf)
         try:
             heights = heights_of_attractors(barriers)
-        except NumericalFailure:  # wells that no saddle connects, to which they have come, stand side by side
+        except NumericalFailure:  # wells that their lowest saddles do not connect stand side by side
             heights = np.zeros(count)
-        inside = [one.points(np.arange(len(one.chosen))) for one in portrait.basins]
-        known = [
-            np.where(well.reaches(x), index, NetworksByWell.NOWHERE)
-            for index, (well, x) in enumerate(zip(wells, inside, strict=True))
-        ]
-        levels = np.array([well.level for well in wells])
-        return NetworksByWell(tuple(parts), heights, levels, np.concatenate(inside), np.concatenate(known))
+        joined = np.concatenate(places), np.concatenate(known)
+        return NetworksByWell(tuple(parts), heights, np.array(levels), *joined)
 
     def _basin(self, portrait: PhasePortrait, index: int) -> Basin:
         """What leads to an attractor, with more states about it where few lie in its well."""
@@ -377,17 +364,11 @@ class OutputWeights:
             box=portrait.box, generator=self.generator, near=(STARTS_NEAR_ATTRACTOR, level),
         )  # fmt: skip
 
-    def _well(
-        self, portrait: PhasePortrait, index: int, generator: np.random.Generator
-    ) -> tuple[Well, list[Equilibrium]]:
-        """V about an attractor, of the first units that take it to a saddle, and the saddles it comes to.
-
-        Extrapolated, V may seem to be as low at a saddle as where the well ends, far from it. Where no units
-        come to a saddle, those that end closest to one are kept.
-        """
+    def _well(self, portrait: PhasePortrait, index: int, generator: np.random.Generator) -> Well:
+        """V about an attractor, of the first units that take it to a saddle, or that end closest to one."""
         basin, saddles = portrait.basins[index], portrait.saddles[index]
-        width, made = np.ptp(portrait.box, axis=1), list[tuple[float, Well, list[Equilibrium]]]()
-        failure = NumericalFailure("no units were drawn")
+        made: dict[float, Well] = {}
+        failure, spread, width = NumericalFailure("no units were drawn"), WELL_SPREAD, portrait.box @ [-1, 1]
 
         def distances(x: np.ndarray) -> np.ndarray:
             """How far states lie from each saddle, in order: shape ``(saddles, n)``."""
@@ -395,32 +376,28 @@ class OutputWeights:
             return np.sort(np.abs((x - places) / width).max(axis=2), axis=1)
 
         near = distances(basin.points(np.arange(len(basin.chosen))))[:, :NEAREST_STATES][:, -1]
-        spread = WELL_SPREAD
         for _ in range(WELL_DRAWS):
             try:
                 well = self._well_of_draw(portrait, index, generator, spread)
+                x = well.inside(LEVEL_SHARE)
+                residual = float(np.median(well.residual_at(x))) if len(x) else np.inf
+                logger.info("about %s: V up to %.4g, residual %.1e", well.attractor, well.level, residual)
+                if not residual < max(MAX_WELL_RESIDUAL, self.uncertainty):
+                    raise NumericalFailure(f"V leaves a residual of {residual:.1g}")
             except NumericalFailure as error:
                 failure, spread = error, FINER * spread
                 continue
-            x = well.inside(LEVEL_SHARE)
-            residual = float(np.median(well.residual_at(x))) if len(x) else np.inf
-            logger.info("about %s: V up to %.4g, residual %.1e", well.attractor, well.level, residual)
-            if not residual < max(MAX_WELL_RESIDUAL, self.uncertainty):
-                failure, spread = NumericalFailure(f"V leaves a residual of {residual:.1g}"), FINER * spread
-                continue
+            # Extrapolated, V may seem to be as low at a saddle as where the well ends, far from it. Two draws
+            # that end at the same state end where recordings do.
             away = distances(well.points)[:, 0]
-            reached = [one for one, close in zip(saddles, away <= near, strict=True) if close]
-            low = [one for one in reached if well.values(one.position[None])[0] <= well.reach]
-            closest = float(away.min(initial=np.inf))
-            logger.info("a well comes as close to a saddle as %.2g of the box", closest)
-            # Two draws that end at the same state end where recordings do.
-            done = reached or not saddles or closest in [one[0] for one in made]
-            made.append((closest, well, low))
+            closest, reached = float(away.min(initial=np.inf)), bool((away <= near).any())
+            done = reached or closest in made or not saddles
+            made.setdefault(closest, well if reached else replace(well, saddle=None))
             if done:
                 break
         if not made:
             raise failure
-        return min(made, key=lambda one: one[0])[1:]
+        return made[min(made)]
 
     def _well_of_draw(
         self, portrait: PhasePortrait, index: int, generator: np.random.Generator, spread: float
@@ -532,13 +509,10 @@ class _LeastSquares:
 
     def solve(self, right: np.ndarray, damping: float = SINGULAR_RATIO) -> np.ndarray:
         """Coefficients ``(m, s)`` of right-hand sides ``(n, s)``; damping is a share of the largest size."""
-        return self._inverse(damping) @ (self.q.T @ right)
+        return self.inverse(damping) @ (self.q.T @ right)
 
-    def spread(self, rows: np.ndarray, damping: float) -> np.ndarray:
-        """``rows @ B``, where B turns independent errors of variance one in the data into coefficients."""
-        return rows @ self._inverse(damping)
-
-    def _inverse(self, damping: float) -> np.ndarray:
+    def inverse(self, damping: float) -> np.ndarray:
+        """What turns independent errors of variance one in the data into coefficients."""
         factors = self.sizes / (self.sizes**2 + (damping * self.sizes[0]) ** 2)
         return np.asarray((self.right.T * factors) @ self.left.T)
 

@@ -442,7 +442,8 @@ def grown(
             coefficients, free=free, steps=most, tolerance=tolerance, damping=damping
         )
         values = along(coefficients)
-        recorded = _recorded(basin.starts(values), len(attractor))
+        # Of one state whatever lies below its highest start lies on the way down from it.
+        recorded = float(np.quantile(basin.starts(values), RECORDED_QUANTILE if len(attractor) > 1 else 1.0))
         # Far from the points of the fit V is an extrapolation: a saddle that seems to lie lower than points
         # already reached does not count, unless they are close to it.
         heights = at_tops @ coefficients
@@ -470,12 +471,6 @@ def grown(
     if short or not (np.isfinite(residual) and level > 0):
         raise NumericalFailure(f"{basis.title} do not follow V from {place} up to a saddle")
     return Well(basis, coefficients, dynamics, attractor, level, saddle, residual, points)
-
-
-def _recorded(starts: np.ndarray, dimension: int) -> float:
-    """The level that recordings reach, of V at the starts of descents, shape ``(n,)``."""
-    # Of one state whatever lies below its highest start lies on the way down from it.
-    return float(np.quantile(starts, RECORDED_QUANTILE if dimension > 1 else 1.0))
 
 
 def _extend_well(

@@ -68,7 +68,7 @@ def test_what_lies_low_in_a_well_is_told_apart(by_well: NetworksByWell) -> None:
         one = replace(by_well, levels=np.full(2, level))
         low = states[values < 0.9 * level]
         assert 0 < len(low) < len(states)
-        np.testing.assert_array_equal(one.below(0.9, part.mean[0]), low)
+        np.testing.assert_array_equal(one.below(0.9, part.mean[0], by_well.states), low)
         some = one.below(0.9, part.mean[0], by_well.states[:500])
         np.testing.assert_array_equal(some, low[: len(some)])
 
