@@ -202,6 +202,8 @@ class Mechanism(_Part):
         One for each kind of system in which it shows.
     generalises
         Mechanisms that are special cases of it.
+    family
+        The kind of physics that it is a member of, by default itself: what recordings tell first.
     look_alikes
         Mechanisms that are easily taken for it.
     reference
@@ -212,6 +214,7 @@ class Mechanism(_Part):
     sentence: str
     forms: Annotated[tuple[Form, ...], Field(min_length=1)]
     generalises: tuple[str, ...] = ()
+    family: str = ""
     look_alikes: tuple[str, ...] = ()
     reference: str = ""
 

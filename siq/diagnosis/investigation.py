@@ -17,7 +17,7 @@ from siq.diagnosis.holdout import (
     simulated,
 )
 from siq.diagnosis.mechanisms import candidates_of, generic_candidates
-from siq.diagnosis.naming import Investigation, decide_naming
+from siq.diagnosis.naming import Investigation, decide_naming, named_by_forecasts
 from siq.diagnosis.residual_structure import (
     RANDOM_RESIDUALS,
     STRUCTURED,
@@ -80,7 +80,7 @@ def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigat
             break
     tried = bool(found.found)
     if tried:
-        result = decide_naming(found, by_each, context, generator=np.random.default_rng(0))
+        result = decide_naming(found, by_each, context)
         result = replace(result, least_squares=least_squares)
     else:
         left = Remainder.of(data, recalibrated, recalibrated, roles)
@@ -103,7 +103,9 @@ def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigat
         result = replace(result, verdict=result.quiet_verdict)
     elif not tried:
         result = replace(result, verdict=MismatchVerdict.UNEXPLAINED)
-    if not tried and rounded is None and found.fit.has_process_noise:
+    if not tried and rounded is None and doubtful:
+        result = named_by_forecasts(result, context)
+    if not (tried or result.verdict.names) and rounded is None and found.fit.has_process_noise:
         # Process noise explains any recordings. It is named where nothing else is likelier, neither a
         # function instead of it nor one on top of it: noise does not know where a system is, so that no
         # function of the states takes a part of it over.
@@ -199,9 +201,11 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     card = replace(search.recalibrated, model=investigation.context.model)
     # What fits best with process noise admitted need not be what runs best without.
     recalibrated = search.recalibrated
-    if recalibrated.has_process_noise and np.isfinite(investigation.least_squares.sum_of_squares):
-        recalibrated = best_of(investigation.least_squares, recalibrated, card)
-    plain = best_of(investigation.exact, search.fit)
+    if recalibrated.has_process_noise:
+        recalibrated = best_of(
+            investigation.least_squares, recalibrated, *investigation.recalibrations, card
+        )
+    plain = best_of(investigation.exact, search.fit, *investigation.finals)
     choices = [(model, best_of(model.fit, model.exact)) for model in investigation.models]
     named = investigation.verdict.names
     judges = [place for place, label in enumerate(data.labels) if label not in study.tests]

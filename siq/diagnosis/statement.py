@@ -157,9 +157,6 @@ class Description:
         Whether the fit needed process noise.
     too_faint
         Whether the mechanisms explain enough, and a function without a name is nearly as likely.
-    p_alike
-        Probability that as many mechanisms explain as much of an effect that has no name; None where nothing
-        is left.
     misleading
         Whether the mechanisms are not named since recordings held out are predicted worse with them.
     """
@@ -169,7 +166,6 @@ class Description:
     p_residuals_random: float
     random_forces_admitted: bool
     too_faint: bool = False
-    p_alike: float | None = None
     misleading: bool = False
 
 

@@ -80,7 +80,6 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
             p_residuals_random=investigation.remainder.after.p_value,
             random_forces_admitted=search.fit.has_process_noise,
             too_faint=investigation.too_faint,
-            p_alike=investigation.p_alike,
             misleading=investigation.withdrawn,
         )
         if verdict is MismatchVerdict.UNEXPLAINED
