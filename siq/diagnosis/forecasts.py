@@ -55,7 +55,7 @@ SAMPLES_PER_PARAMETER = 10  # at a horizon, at least, beside the initial states
 FOLDS = 8  # parts of the recordings that are left out in turn: a choice
 ALONE, IN_PLACE = (0.1, 1.0), (1.0, 10.0)  # levels of process noise, relative to that of the fits
 PROMISING, SHAPES = 32, 3  # explanations, and shapes of each, that are asked at all horizons: a choice
-LEADERS, ATTEMPTS = 4, 8  # explanations that are fitted in earnest before none is said to lead: a choice
+LEADERS, ATTEMPTS = 6, 12  # explanations that are fitted in earnest before none is said to lead: a choice
 RIDGE = 1e-10  # numerical: of normal equations whose columns have unit length
 NEARLY_ALL = 0.9  # of an effect, or of what is gained
 PLAUSIBLE = 0.05  # of the probability of a family, from which on a member is not ruled out
@@ -246,15 +246,9 @@ def _sites(candidates: Sequence[MechanismCandidate], along: Fit, context: FitCon
     """
     data, unnamed = context.data, context.study.search.unnamed
     model, x = along.model, along.x
-    families = {each.family for each in candidates}
-    where = Counter(family for family, _ in {(each.family, each.equations) for each in candidates})
-    members = Counter(kind[:2] for kind in {(each.family, each.equations, each.name) for each in candidates})
-    alike = Counter((each.family, each.equations, each.name) for each in candidates)
+    priors = _log_priors(candidates, unnamed)
     found = []
-    for each in candidates:
-        kind = each.family, each.equations
-        count = len(families) * where[each.family] * members[kind] * alike[(*kind, each.name)]
-        prior = np.log1p(-unnamed) - np.log(count)
+    for each, prior in zip(candidates, priors, strict=True):
         try:
             spread = replace(
                 each, model=spread_edges(each.model, data, x, substeps=max(along.substeps, EDGE_SUBSTEPS))
@@ -264,7 +258,7 @@ def _sites(candidates: Sequence[MechanismCandidate], along: Fit, context: FitCon
             LOGGER.info("%s: %s", each.label, error)
             continue
         if probes:
-            found.append(_Site(tuple(probes), float(prior), kind, each))
+            found.append(_Site(tuple(probes), prior, (each.family, each.equations), each))
     single = places_in(model, context.roles, data, x)
     places = (*single, *products_in([each for each in single if each.equations], model, data, x))
     for place in places:
@@ -279,10 +273,32 @@ def _sites(candidates: Sequence[MechanismCandidate], along: Fit, context: FitCon
     return found
 
 
+def _log_priors(candidates: Sequence[MechanismCandidate], unnamed: float) -> list[float]:
+    """Logarithms of the probabilities of mechanisms: of families by weight, of members by weight, then alike."""
+    families: dict[str, float] = {}
+    members: dict[tuple[str, str], float] = {}
+    for each in candidates:
+        families[each.family] = max(families.get(each.family, 0.0), each.weight)
+        members[each.family, each.name] = each.weight
+    of_family: Counter[str] = Counter()
+    for (family, _), weight in members.items():
+        of_family[family] += weight  # type: ignore[assignment]
+    places = Counter((each.family, each.name) for each in candidates)
+    whole = sum(families.values())
+    return [
+        float(
+            np.log1p(-unnamed)
+            + np.log(families[each.family] / whole * each.weight / of_family[each.family])
+            - np.log(places[each.family, each.name])
+        )
+        for each in candidates
+    ]
+
+
 def _gained(
     horizon: Horizon, terms: Sequence[Probe | Place], leading: MechanismCandidate | None, budget: Budget
 ) -> np.ndarray:
-    """What terms gain over nothing at a horizon, in the place of a leading mechanism, shape ``(terms,)``."""
+    """What terms gain at a horizon over nothing, or over a leading mechanism in its place, ``(terms,)``."""
     fit, data = horizon.fit, horizon.data
     fold, nothing = _fold_of(data), -np.inf
     best, at = np.full(len(terms), -np.inf), 0
@@ -298,7 +314,8 @@ def _gained(
                 continue
             further = white.columns[:, len(fit.model.free) :]
             constant = -0.5 * white.log_determinant
-            nothing = max(nothing, float(problem.log_density(further[:, :0]).sum()) + constant)
+            known = white.columns[:, _places_of(leading, fit, linear=True)]
+            nothing = max(nothing, float(problem.log_density(known).sum()) + constant)
             for place, (term, group) in enumerate(zip(some, groups, strict=True), start=at):
                 columns = further[:, group]
                 if np.isfinite(columns).all() and columns.any():
@@ -344,19 +361,18 @@ def _in_place_of(
     leading: MechanismCandidate | None, fit: Fit, white: Whitened, fold: np.ndarray
 ) -> _Foreseen:
     """The problem of what is missing without a mechanism, along the trajectories of the fit with it."""
-    count = len(fit.model.free)
-    own = white.columns[:, :count]
-    names = [fit.model.parameters[place].name for place in fit.model.free]
-    tested = [] if leading is None else [names.index(name) for name in leading.new if name in names]
-    linear = (
-        []
-        if leading is None
-        else [names.index(name) for name in (leading.amplitudes or leading.shapes) if name in names]
-    )
-    change = white.solve()[0][:count] if white.columns.shape[1] == count else _solved(own, white.innovations)
-    values = fit.model.values[list(fit.model.free)] + change
+    own = white.columns[:, : len(fit.model.free)]
+    tested, linear = (_places_of(leading, fit, linear=each) for each in (False, True))
+    values = fit.model.values[list(fit.model.free)] + _solved(own, white.innovations)
     target = white.innovations + own[:, linear] @ values[linear]
     return _Foreseen(white, target, np.delete(own, tested, axis=1), fold)
+
+
+def _places_of(leading: MechanismCandidate | None, fit: Fit, *, linear: bool) -> list[int]:
+    """Where the parameters of a mechanism stand among the free ones of a fit, all or the linear ones."""
+    names = [fit.model.parameters[place].name for place in fit.model.free]
+    chosen = () if leading is None else (leading.amplitudes or leading.shapes) if linear else leading.new
+    return [names.index(name) for name in chosen if name in names]
 
 
 def _containing(horizon: Horizon, sites: Sequence[_Site], leading: MechanismCandidate) -> np.ndarray:
@@ -492,26 +508,40 @@ def next_rung(
         if not gains[place] > 0 or len(tried) == LEADERS:
             break
         fitted = _fitted_at(horizons, sites[place], budget)
-        if fitted is not None:
+        if fitted is not None and fitted[1] > 0:
             tried[sites[place].label] = fitted
     if not tried:
         return None
     by_label = {site.label: site for site in sites if site.candidate is not None}
-    leader = max(tried, key=lambda label: tried[label][1] + by_label[label].prior)
-    leading, (along, gain) = by_label[leader], tried[leader]
-    candidate = leading.candidate
-    assert candidate is not None
-    if candidate.model.dimension == base.model.dimension:
-        rebased = [each.rebased(base.model, along[0].fit.model) for each in candidates]
-        sites, gains = _gains(along, _sites(rebased, along[0].fit, context), candidate, budget)
-    # What was fitted in earnest counts as it was fitted, where that is more.
+    weighed = {label: fitted[1] + by_label[label].prior for label, fitted in tried.items()}
+    plausible = [label for label, each in weighed.items() if each > max(weighed.values()) + np.log(PLAUSIBLE)]
+    leader = min(plausible, key=lambda label: (len(_candidate(by_label[label]).new), -weighed[label]))
+    # All others are compared in the place of one that brings no states of its own.
+    d = base.model.dimension
+    steady = [label for label in tried if _candidate(by_label[label]).model.dimension == d]
     real = {label: fitted[1] for label, fitted in tried.items()}
-    gains = np.array(
-        [max(real.get(site.label, -np.inf), gain) for site, gain in zip(sites, gains, strict=True)]
-    )
+    patched: set[str] = set()  # explanations that are outdone by two others together
+    if steady:
+        ground = leader if leader in steady else max(steady, key=lambda label: weighed[label])
+        there, place = tried[ground][0], _candidate(by_label[ground])
+        rebased = [each.rebased(base.model, there[0].fit.model) for each in candidates]
+        remaining = _sites(rebased, there[0].fit, context)
+        if leader != ground:
+            # A state that follows the motion may be a simple mechanism and something else at a time.
+            above, further = _gains(there, remaining, None, budget)
+            both = max(gain + site.prior for site, gain in zip(above, further, strict=True))
+            if weighed[ground] + max(both, 0.0) > weighed[leader]:
+                patched, leader = {leader}, ground
+        sites, gains = _gains(there, remaining, place, budget)
+        gains = gains + real[ground]
+    leading, (along, gain) = by_label[leader], tried[leader]
+    candidate = _candidate(leading)
+    # What was fitted in earnest counts as it was fitted.
+    gains = np.array([real.get(site.label, gain) for site, gain in zip(sites, gains, strict=True)])
     _told(leader, sites, gains)
     weights = np.append(gains + np.array([site.prior for site in sites]), 0.0)  # nothing, last
-    if candidate.model.dimension == base.model.dimension:
+    if leader in steady:
+        weights[:-1][[site.label in patched for site in sites]] = -np.inf
         more = _containing(along[0], sites, candidate) & (gain >= NEARLY_ALL * gains)
         weights[:-1][more] = -np.inf
     family = np.array([site.family == leading.family for site in sites] + [False])
@@ -545,6 +575,11 @@ def next_rung(
         log_odds,
         gain,
     )
+
+
+def _candidate(site: _Site) -> MechanismCandidate:
+    assert site.candidate is not None
+    return site.candidate
 
 
 def _told(what: str, sites: Sequence[_Site], gains: np.ndarray) -> None:

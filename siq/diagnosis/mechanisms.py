@@ -148,8 +148,9 @@ class MechanismCandidate:
 
     Attributes
     ----------
-    name, label, variant, family
-        Of the mechanism; the same, told apart from its other forms and places; of its form; and of its kind.
+    name, label, variant, family, weight
+        Of the mechanism; the same, told apart from its other forms and places; of its form; of its kind; and
+        how likely it is beforehand.
     model
         The simulation with it built in; amplitudes are zero, shapes not yet set.
     amplitudes, shapes, searches
@@ -190,6 +191,7 @@ class MechanismCandidate:
     generalises: tuple[str, ...] = ()
     variant: str = ""
     family: str = ""
+    weight: float = 1.0
     kind: Kind = MECHANISM
     log_cost: float = 0.0
     place: Place | None = None
@@ -363,6 +365,7 @@ def build_candidate(
         generalises=mechanism.generalises,
         variant=form.variant,
         family=mechanism.family or mechanism.name,
+        weight=mechanism.weight,
     )
     return _labelled(candidate, model)
 

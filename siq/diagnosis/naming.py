@@ -43,6 +43,7 @@ from siq.diagnosis.unnamed_models import (
 from siq.inference.budget import UNLIMITED, Account
 from siq.inference.kalman_filter import Whitened, solve, whiten
 from siq.inference.maximum_likelihood import Fit
+from siq.inference.recalibration import fit_with_process_noise_as_needed
 from siq.remarks import Remark
 
 LOGGER = logging.getLogger(__name__)
@@ -247,13 +248,14 @@ def decide_naming(whole: Search, left: Sequence[Remainder], context: FitContext)
         What models are made from, and what could be named.
     """
     decision = _judge_mechanisms(whole, left, context)
-    if not decision.verdict.names:
-        decision = named_by_forecasts(decision, context)
+    return _with_models(decision, whole, context)
+
+
+def _with_models(decision: Investigation, whole: Search, context: FitContext) -> Investigation:
+    """With models of what has no name, be it all that is missing, or what names leave of a whole search."""
     search = decision.search
     if not decision.verdict.names:
         return replace(decision, models=fit_unnamed_models(search, context))
-    if decision.finals:
-        whole = search
     if len(whole.found) > len(search.found) or decision.remainder.doubtful or search.fit.has_process_noise:
         models = fit_models_of_remainder(search, whole, context)
         decision = replace(decision, models=models)
@@ -265,21 +267,29 @@ def decide_naming(whole: Search, left: Sequence[Remainder], context: FitContext)
     return decision
 
 
-def named_by_forecasts(decision: Investigation, context: FitContext) -> Investigation:
-    """Names by what they foresee, where something is left that process noise, or nothing, stands in for."""
-    alone, rungs = climb(decision.search.recalibrated, context)
-    decision = replace(decision, recalibrations=tuple(each.fit for each in alone))
+def named_by_forecasts(
+    recalibrated: Fit, least_squares: Fit, context: FitContext
+) -> tuple[Investigation | None, tuple[Fit, ...]]:
+    """What is missing by what foresees recordings best, where the recalibrated fit needs forces at random.
+
+    Returned are also the fits of the simulation alone at each horizon; None where nothing has a name.
+    """
+    alone, rungs = climb(recalibrated, context)
+    recalibrations = tuple(each.fit for each in alone)
     if not rungs:
-        return decision
-    recalibrated = alone[0].fit
+        return None, recalibrations
     fit = rungs[-1].accepted.best.fit
-    search = replace(decision.search, found=tuple(each.accepted for each in rungs), fit=fit)
-    left = Remainder.of(context.data, recalibrated, fit, context.roles)
-    return replace(
-        decision, search=search, remainder=left, verdict=MismatchVerdict.MISSING_PHYSICS,
-        log_odds=tuple(each.log_odds for each in rungs), convincing=True,
-        remarks=(_remainder_remark(left, unnamed=True),), finals=tuple(each.fit for each in rungs[-1].horizons),
+    with context.budget.exempt():  # without forces, where they are not needed any more
+        fit = fit_with_process_noise_as_needed(fit.model, context.data, fit, budget=context.budget)
+    left = Remainder.of(context.data, alone[0].fit, fit, context.roles)
+    search = Search(recalibrated, tuple(each.accepted for each in rungs), fit, ())
+    decision = Investigation(
+        context, search, left, MismatchVerdict.MISSING_PHYSICS, least_squares, convincing=True,
+        log_odds=tuple(each.log_odds for each in rungs), recalibrations=recalibrations,
+        remarks=(_remainder_remark(left, unnamed=True),) if left.doubtful or fit.has_process_noise else (),
+        finals=tuple(each.fit for each in rungs[-1].horizons),
     )  # fmt: skip
+    return _with_models(decision, search, context), recalibrations
 
 
 def _log_odds(search: Search, number: int, chosen: Sequence[int], context: FitContext) -> float:
