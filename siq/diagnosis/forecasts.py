@@ -542,7 +542,8 @@ def next_rung(
     weights = np.append(gains + np.array([site.prior for site in sites]), 0.0)  # nothing, last
     if leader in steady:
         weights[:-1][[site.label in patched for site in sites]] = -np.inf
-        more = _containing(along[0], sites, candidate) & (gain >= NEARLY_ALL * gains)
+        # The mechanism and hardly more is no rival; but what is clearly better says that it is another thing.
+        more = _containing(along[0], sites, candidate) & (gains < gain + options.least_log_odds)
         weights[:-1][more] = -np.inf
     family = np.array([site.family == leading.family for site in sites] + [False])
     ours, theirs = scipy.special.logsumexp(weights[family]), scipy.special.logsumexp(weights[~family])
@@ -553,7 +554,9 @@ def next_rung(
         if site.family == leading.family and site.candidate is not None
     }
     LOGGER.info("%s: log-odds of %s %.1f", leader, leading.family[0], log_odds)
-    if log_odds < options.least_log_odds:
+    # The general form of a family may do more than any member of it: another physics then, of the same kind.
+    general = gains[[site.family == leading.family and site.candidate is None for site in sites]]
+    if log_odds < options.least_log_odds or gain < NEARLY_ALL * general.max(initial=0.0):
         return None
     best = FittedCandidate.of(along[0].fit, base, horizons[0].data, candidate, blocks=options.blocks)
     same = []
