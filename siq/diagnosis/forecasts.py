@@ -39,7 +39,7 @@ from siq.diagnosis.evidence import (
 )
 from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.diagnosis.screening import PROBE_SUBSTEPS, Probe, linearised_with, portions
-from siq.diagnosis.search import AcceptedMechanism, FitContext
+from siq.diagnosis.search import AcceptedMechanism, FitContext, Standing
 from siq.diagnosis.terms import Place, places_in, products_in
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent, evaluation
@@ -448,6 +448,26 @@ class Rung:
     gain: float
 
 
+@dataclass(frozen=True, eq=False)
+class _Leader:
+    """A mechanism that was fitted at every horizon, and what it gains over the fits without it."""
+
+    site: _Site
+    horizons: list[Horizon]
+    gain: float
+
+    @property
+    def candidate(self) -> MechanismCandidate:
+        """The mechanism."""
+        assert self.site.candidate is not None
+        return self.site.candidate
+
+    @property
+    def weight(self) -> float:
+        """Logarithm of its probability, up to a constant."""
+        return self.gain + self.site.prior
+
+
 def _fitted_at(
     horizons: Sequence[Horizon], site: _Site, budget: Budget
 ) -> tuple[list[Horizon], float] | None:
@@ -493,101 +513,97 @@ def _begun(site: _Site, horizon: Horizon, before: Fit | None) -> tuple[Fit, np.n
     )
 
 
-def next_rung(
-    horizons: Sequence[Horizon], candidates: Sequence[MechanismCandidate], context: FitContext
-) -> Rung | None:
-    """The mechanism that stands first on top of fits; None where none is likelier than all that has no name."""
-    options, base, budget = context.study.search, horizons[0].fit, context.budget
-    budget.says("comparing forecasts of what was left out")
-    sites, gains = _gains(horizons, _sites(candidates, base, context), None, budget)
+def _fitted_in_earnest(
+    horizons: Sequence[Horizon], sites: Sequence[_Site], gains: np.ndarray, budget: Budget
+) -> dict[str, _Leader]:
+    """The mechanisms that promise most, fitted at every horizon; those that foresee better than nothing."""
+    found: dict[str, _Leader] = {}
     weights = gains + np.array([site.prior for site in sites])
-    _told("alone", sites, gains)
-    tried: dict[str, tuple[list[Horizon], float]] = {}
     order = [place for place in np.argsort(-weights) if sites[place].candidate is not None]
     for place in order[:ATTEMPTS]:
-        if not gains[place] > 0 or len(tried) == LEADERS:
+        if not gains[place] > 0 or len(found) == LEADERS:
             break
         fitted = _fitted_at(horizons, sites[place], budget)
         if fitted is not None and fitted[1] > 0:
-            tried[sites[place].label] = fitted
-    if not tried:
+            found[sites[place].label] = _Leader(sites[place], *fitted)
+    return found
+
+
+def next_rung(
+    horizons: Sequence[Horizon], candidates: Sequence[MechanismCandidate], context: FitContext
+) -> Rung | None:
+    """The mechanism that stands first on top of fits; None where none is likelier than what has no name."""
+    options, base, budget = context.study.search, horizons[0].fit, context.budget
+    budget.says("comparing forecasts of what was left out")
+    sites, gains = _gains(horizons, _sites(candidates, base, context), None, budget)
+    fitted = _fitted_in_earnest(horizons, sites, gains, budget)
+    if not fitted:
         return None
-    by_label = {site.label: site for site in sites if site.candidate is not None}
-    weighed = {label: fitted[1] + by_label[label].prior for label, fitted in tried.items()}
-    plausible = [label for label, each in weighed.items() if each > max(weighed.values()) + np.log(PLAUSIBLE)]
-    leader = min(plausible, key=lambda label: (len(_candidate(by_label[label]).new), -weighed[label]))
+    alone = {site.label: site for site in sites if site.candidate is not None}
+    # Of those that are not told apart, the one with the fewest parameters.
+    heaviest = max(each.weight for each in fitted.values())
+    plausible = [each for each in fitted.values() if each.weight > heaviest + np.log(PLAUSIBLE)]
+    leader = min(plausible, key=lambda each: (len(each.candidate.new), -each.weight))
     # All others are compared in the place of one that brings no states of its own.
-    d = base.model.dimension
-    steady = [label for label in tried if _candidate(by_label[label]).model.dimension == d]
-    real = {label: fitted[1] for label, fitted in tried.items()}
-    patched: set[str] = set()  # explanations that are outdone by two others together
+    d, outdone = base.model.dimension, set[str]()
+    steady = [each for each in fitted.values() if each.candidate.model.dimension == d]
     if steady:
-        ground = leader if leader in steady else max(steady, key=lambda label: weighed[label])
-        there, place = tried[ground][0], _candidate(by_label[ground])
-        rebased = [each.rebased(base.model, there[0].fit.model) for each in candidates]
-        remaining = _sites(rebased, there[0].fit, context)
-        if leader != ground:
+        ground = leader if leader in steady else max(steady, key=lambda each: each.weight)
+        there = ground.horizons[0].fit
+        rebased = [each.rebased(base.model, there.model) for each in candidates]
+        remaining = _sites(rebased, there, context)
+        if leader is not ground:
             # A state that follows the motion may be a simple mechanism and something else at a time.
-            above, further = _gains(there, remaining, None, budget)
+            above, further = _gains(ground.horizons, remaining, None, budget)
             both = max(gain + site.prior for site, gain in zip(above, further, strict=True))
-            if weighed[ground] + max(both, 0.0) > weighed[leader]:
-                patched, leader = {leader}, ground
-        sites, gains = _gains(there, remaining, place, budget)
-        gains = gains + real[ground]
-    leading, (along, gain) = by_label[leader], tried[leader]
-    candidate = _candidate(leading)
+            if ground.weight + max(both, 0.0) > leader.weight:
+                outdone, leader = {leader.site.label}, ground
+        sites, gains = _gains(ground.horizons, remaining, ground.candidate, budget)
+        gains = gains + ground.gain
     # What was fitted in earnest counts as it was fitted.
-    gains = np.array([real.get(site.label, gain) for site, gain in zip(sites, gains, strict=True)])
-    _told(leader, sites, gains)
-    weights = np.append(gains + np.array([site.prior for site in sites]), 0.0)  # nothing, last
+    kept = [place for place, site in enumerate(sites) if site.label not in fitted]
+    sites = [*(sites[place] for place in kept), *(each.site for each in fitted.values())]
+    gains = np.append(gains[kept], [each.gain for each in fitted.values()])
+    weights = gains + np.array([site.prior for site in sites])
+    weights[[site.label in outdone for site in sites]] = -np.inf
     if leader in steady:
-        weights[:-1][[site.label in patched for site in sites]] = -np.inf
         # The mechanism and hardly more is no rival; but what is clearly better says that it is another thing.
-        more = _containing(along[0], sites, candidate) & (gains < gain + options.least_log_odds)
-        weights[:-1][more] = -np.inf
-    family = np.array([site.family == leading.family for site in sites] + [False])
-    ours, theirs = scipy.special.logsumexp(weights[family]), scipy.special.logsumexp(weights[~family])
-    log_odds = float(ours - theirs)
-    members = {
-        site.label: weight
-        for site, weight in zip(sites, weights[:-1], strict=True)
-        if site.family == leading.family and site.candidate is not None
-    }
-    LOGGER.info("%s: log-odds of %s %.1f", leader, leading.family[0], log_odds)
+        more = _containing(leader.horizons[0], sites, leader.candidate)
+        weights[more & (gains < leader.gain + options.least_log_odds)] = -np.inf
+    family = np.array([site.family == leader.site.family for site in sites])
+    rivals = np.append(weights[~family], 0.0)  # and nothing at all
+    log_odds = float(scipy.special.logsumexp(weights[family]) - scipy.special.logsumexp(rivals))
+    _told(sites, gains)
+    LOGGER.info("%s: log-odds of %s %.1f", leader.site.label, leader.site.family[0], log_odds)
     # The general form of a family may do more than any member of it: another physics then, of the same kind.
-    general = gains[[site.family == leading.family and site.candidate is None for site in sites]]
-    if log_odds < options.least_log_odds or gain < NEARLY_ALL * general.max(initial=0.0):
+    general = max((gains[k] for k in np.flatnonzero(family) if sites[k].candidate is None), default=0.0)
+    if log_odds < options.least_log_odds or leader.gain < NEARLY_ALL * general:
         return None
-    best = FittedCandidate.of(along[0].fit, base, horizons[0].data, candidate, blocks=options.blocks)
-    same = []
-    top = max(members.values())
-    for label, weight in members.items():
-        if label != leader and weight > top + np.log(PLAUSIBLE):
-            fitted = tried.get(label) or (
-                _fitted_at(horizons, by_label[label], budget) if label in by_label else None
-            )
-            if fitted is not None:
-                other = by_label[label].candidate
-                assert other is not None
-                same.append(
-                    FittedCandidate.of(fitted[0][0].fit, base, horizons[0].data, other, blocks=options.blocks)
-                )
-    return Rung(
-        AcceptedMechanism(best, {"same": tuple(same), "needless": (), "less": ()}),
-        tuple(along),
-        log_odds,
-        gain,
-    )
+    members = {sites[k].label: weights[k] for k in np.flatnonzero(family) if sites[k].candidate is not None}
+    alike = {label for label, weight in members.items() if weight > leader.weight + np.log(PLAUSIBLE)}
+    for label in alike.intersection(alone) - fitted.keys():
+        another = _fitted_at(horizons, alone[label], budget)
+        if another is not None:
+            fitted[label] = _Leader(alone[label], *another)
+    known = {
+        label: FittedCandidate.of(
+            each.horizons[0].fit, base, horizons[0].data, each.candidate, blocks=options.blocks
+        )
+        for label, each in fitted.items()
+    }
+    best = known.pop(leader.site.label)
+    others: dict[Standing, tuple[FittedCandidate, ...]] = {
+        "same": tuple(each for label, each in known.items() if label in alike),
+        "needless": (),
+        "less": tuple(each for label, each in known.items() if label not in alike),
+    }
+    return Rung(AcceptedMechanism(best, others), tuple(leader.horizons), log_odds, leader.gain)
 
 
-def _candidate(site: _Site) -> MechanismCandidate:
-    assert site.candidate is not None
-    return site.candidate
-
-
-def _told(what: str, sites: Sequence[_Site], gains: np.ndarray) -> None:
-    for place in np.argsort(-gains)[:12]:
-        LOGGER.info("  (%s) %s: %.1f", what, sites[place].label, gains[place])
+def _told(sites: Sequence[_Site], gains: np.ndarray) -> None:
+    """Log what gains most."""
+    for place in np.argsort(-gains)[:LEADERS]:
+        LOGGER.info("%s: gains %.1f", sites[place].label, gains[place])
 
 
 def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[Rung]]:

@@ -643,7 +643,7 @@ def generic_candidates(
                 added(
                     model, {name: symbol(new) * monomial}, {}, [Parameter(new, 0.0, unit)],
                     name=GENERIC, label=f"{GENERIC} {monomial} in {name}", coordinate=among or "constant",
-                    family=str(monomial),
+                    family=GENERIC,
                 )
             )  # fmt: skip
     have_names = {_added_square(each) for each in named} - {None}

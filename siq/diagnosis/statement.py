@@ -95,8 +95,8 @@ class StatedTerm:
 
     Attributes
     ----------
-    name, label
-        Of the dictionary, and told apart from its other forms and places.
+    name, label, family
+        Of the dictionary; told apart from its other forms and places; and the kind of physics that it is.
     kind
         ``mechanism``: one of the dictionary. ``formula``: a sum of a few powers. ``curve``, ``surface``: a
         smooth function of one coordinate, or of two, as a sum of Gaussian bumps.
@@ -119,6 +119,7 @@ class StatedTerm:
 
     name: str
     label: str
+    family: str = ""
     kind: Kind = MECHANISM
     terms: Mapping[str, str]
     parameters: Mapping[str, Estimate]

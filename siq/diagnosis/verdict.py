@@ -207,6 +207,7 @@ def _stated(trial: FittedCandidate, fit: Fit, *, log_odds: float | None = None, 
     return StatedTerm(
         name=candidate.name,
         label=candidate.label,
+        family=candidate.family,
         terms={name: str(formula) for name, formula in candidate.changes},
         parameters={
             name: Estimate(known[name].value, errors.get(name), known[name].unit)
