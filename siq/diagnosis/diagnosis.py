@@ -67,7 +67,6 @@ def _withdrawn(found: Investigation) -> Investigation:
             verdict=found.quiet_verdict,
             search=replace(found.search, found=(), fit=recalibrated),
             log_odds=(),
-            p_alike=None,
             convincing=False,
             remarks=(*found.remarks, Remark("diagnosis.refuted", {"names": " and ".join(names)})),
             account=budget.account(),

@@ -282,6 +282,14 @@ def linearised_with(
         coarse = linearise(fit.model, grid, fit.model.values, fit.linearised_at, columns=columns)
     known, parameters = fit.linearisation, len(fit.model.free)
     further, measured = coarse.response[:, :, parameters:], coarse.measured_response[:, :, parameters:]
+    if fit.has_process_noise:
+        # What a filter knows at a sample it knows from that sample. A fault of a sensor acts on what was
+        # foreseen; taken at what is known it would explain the innovations by themselves.
+        foreseen = fit.linearised_at.copy()
+        foreseen[data.begins + 1] += known.gap[data.begins]
+        with np.errstate(all="ignore"):
+            at_foreseen = columns.outputs(np.ascontiguousarray(foreseen.T), fit.model.values)
+        measured = np.moveaxis(at_foreseen, 2, 0)
     return replace(
         known,
         response=np.concatenate([known.response, further], axis=2),

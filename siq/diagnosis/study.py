@@ -69,15 +69,6 @@ class SearchOptions(BaseModel):
         """Logarithm of the odds that a name takes."""
         return math.log((1 - self.wrong_names) / self.wrong_names)
 
-    @property
-    def most_alike(self) -> float:
-        """Most probability that an effect without a name is explained as well, if a name is to stand.
-
-        By Bayes' rule: where something is left, either the name is right and something without a name is
-        missing as well, (1 - unnamed) unnamed, or there is only the latter, and looks alike.
-        """
-        return math.exp(-self.least_log_odds) * (1 - self.unnamed)
-
 
 class MismatchVerdict(StrEnum):
     """What a diagnosis ends with, as files have it."""

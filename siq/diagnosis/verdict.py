@@ -80,7 +80,6 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
             p_residuals_random=investigation.remainder.after.p_value,
             random_forces_admitted=search.fit.has_process_noise,
             too_faint=investigation.too_faint,
-            p_alike=investigation.p_alike,
             misleading=investigation.withdrawn,
         )
         if verdict is MismatchVerdict.UNEXPLAINED
@@ -208,6 +207,7 @@ def _stated(trial: FittedCandidate, fit: Fit, *, log_odds: float | None = None, 
     return StatedTerm(
         name=candidate.name,
         label=candidate.label,
+        family=candidate.family,
         terms={name: str(formula) for name, formula in candidate.changes},
         parameters={
             name: Estimate(known[name].value, errors.get(name), known[name].unit)
