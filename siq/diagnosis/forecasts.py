@@ -211,7 +211,8 @@ def _fitted(
     fit = fit_by_multiple_shooting(
         model, data, x=states, noise=noise, estimate_process=True, substeps=substeps, budget=budget
     )
-    if not fit.converged:
+    # Where f jumps its derivatives are never exact, and steps may go to and fro about the best fit.
+    if fit.fault or not (fit.converged or fit.model.edges):
         raise NumericalFailure(fit.fault or "its fit does not settle")
     return fit
 
@@ -258,19 +259,28 @@ def _sites(candidates: Sequence[MechanismCandidate], along: Fit, context: FitCon
             LOGGER.info("%s: %s", each.label, error)
             continue
         if probes:
-            found.append(_Site(tuple(probes), prior, (each.family, each.equations), each))
+            found.append(_Site(tuple(probes), prior, _kind_of(each, model), each))
     single = places_in(model, context.roles, data, x)
     places = (*single, *products_in([each for each in single if each.equations], model, data, x))
     for place in places:
-        acting = [
-            each
+        acting = {
+            (_kind_of(each, model), each.name)
             for each in candidates
             if each.equations == place.targets and each.coordinate == ", ".join(place.words)
-        ]
-        shared = Counter(family for family, _ in {(each.family, each.name) for each in acting})
-        family = next((name for name, count in shared.most_common(1) if count > 1), "")
-        found.append(_Site((place,), float(np.log(unnamed) - np.log(len(places))), (family, place.targets)))
+        }
+        shared = Counter(kind for kind, _ in acting)
+        kind = next((one for one, count in shared.most_common(1) if count > 1), ("", place.targets))
+        found.append(_Site((place,), float(np.log(unnamed) - np.log(len(places))), kind))
     return found
+
+
+def _kind_of(candidate: MechanismCandidate, model: Dynamics) -> tuple[str, tuple[str, ...]]:
+    """The family of a mechanism, and where it acts: along a state, wherever that acts back, or in equations.
+
+    In a machine of several joints, friction in one of them acts on all.
+    """
+    along = candidate.coordinate
+    return candidate.family, (along,) if along in model.states else (along, *candidate.equations)
 
 
 def _log_priors(candidates: Sequence[MechanismCandidate], unnamed: float) -> list[float]:
