@@ -1,14 +1,14 @@
-"""Forecasts of parts left out: how they are counted, and what they name where forces at random act as well."""
+"""Forecasts of parts left out: how they are counted, and what they name where forces at random act, too."""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
-import scipy.special
 from homes_of_mechanisms import model_of, numbers, states
 
 from siq.data.recordings import Recordings
@@ -27,15 +27,17 @@ from siq.diagnosis.forecasts import (
     next_rung,
 )
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
-from siq.diagnosis.screening import Probe, linearised_with
+from siq.diagnosis.screening import Probe, Term, linearised_with
 from siq.diagnosis.search import FitContext
 from siq.inference.budget import Budget
-from siq.inference.kalman_filter import Whitened
+from siq.inference.kalman_filter import Linearisation, Whitened
+from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, measurements
 from siq.inference.recalibration import recalibrate
 from siq.systems.dynamics import Dynamics
+from tests.diagnosis.decays import DECAY
 
-SAMPLES, FINE, DURATION, SIZE = 120, 10, 8.0, 0.001
+SAMPLES, FINE, DURATION, LASTING, NOISE = 120, 10, 8.0, 0.5, 0.001
 CLOSE = ("linear damping", "quadratic drag", "cubic stiffness", "constant bias")  # near the truth, or far off
 
 
@@ -51,14 +53,12 @@ def pendulum(scale: float = 1.0) -> Dynamics:
     return model_of(card)
 
 
-def recorded(
-    damping: float, force: float, *, scale: float = 1.0, correlated: float = 0.5, count: int = 6, seed: int = 3
-) -> Measurements:
-    """Pendulums of another swing each, by Heun's rule, with forces at random that last for so long."""
-    draw = np.random.default_rng(seed)
+def recorded(damping: float, force: float, *, scale: float = 1.0, count: int = 6) -> Measurements:
+    """Pendulums of another swing each, by Heun's rule, with forces at random that last for a while."""
+    draw = np.random.default_rng(3)
     h = DURATION / (SAMPLES - 1) / FINE
     state = np.stack([np.linspace(0.6, 2.2, count), draw.normal(size=count)])
-    push, memory = draw.normal(size=count), np.exp(-h / correlated) if correlated else 0.0
+    push, memory = draw.normal(size=count), np.exp(-h / LASTING)
     seen = np.empty((count, SAMPLES))
 
     def rate(y: np.ndarray) -> np.ndarray:
@@ -70,7 +70,7 @@ def recorded(
             first = rate(state)
             state = state + h / 2 * (first + rate(state + h * first))
             push = memory * push + np.sqrt(1 - memory**2) * draw.normal(size=count)
-    seen = scale * (seen + SIZE * draw.normal(size=seen.shape))
+    seen = scale * (seen + NOISE * draw.normal(size=seen.shape))
     return laid_out(seen, pendulum(scale))
 
 
@@ -218,7 +218,7 @@ def test_damping_is_named_beside_forces_that_last() -> None:
     best = found.accepted.best
     assert (best.candidate.name, best.candidate.family) == ("linear damping", "resistance to motion")
     assert found.log_odds >= context.study.search.least_log_odds and found.gain > 0
-    assert len(alone) == len(found.horizons) == 3
+    assert len(alone) == len(found.horizons) >= 2
     c = next(each for each in best.fit.model.parameters if each.name in best.candidate.amplitudes)
     assert c.value == pytest.approx(0.15, rel=0.3)
 
@@ -243,26 +243,39 @@ def test_units_of_the_state_say_nothing() -> None:
 def same_as_before(found: Rung | None) -> None:
     assert found is not None
     assert found.accepted.best.candidate.label == damped().accepted.best.candidate.label
-    assert found.gain == pytest.approx(damped().gain, rel=0.01)
-    assert found.log_odds == pytest.approx(damped().log_odds, rel=0.02)
+    assert found.log_odds == pytest.approx(damped().log_odds, rel=1e-3)
+    # Over fits of the simulation alone, which settle up to a tolerance.
+    assert found.gain == pytest.approx(damped().gain, rel=0.05)
+
+
+def kicked_decays(count: int = 4, samples: int = 60) -> Measurements:
+    """Decays as their card has them, kicked at random about as far as they go."""
+    draw = np.random.default_rng(4)
+    step = DURATION / (samples - 1)
+    (rate,) = DECAY.values
+    left = np.exp(-rate * step)
+    x = draw.normal(size=(count, samples))
+    for before, now in itertools.pairwise(x.T):
+        now[:] = left * before + np.sqrt(1 - left**2) * now
+    return laid_out(x + 0.01 * draw.normal(size=x.shape), DECAY)
 
 
 def test_a_sensor_gains_nothing_from_what_a_filter_learned_from_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Taken at filtered states, a fault of a sensor explains innovations that forces at random made."""
-    data, model = recorded(0.0, 1.0, correlated=0.0), pendulum()
-    context = context_of(model, data, ("sensor gain or offset",))
-    fit, _ = recalibrate(model, data)
-    horizon = horizons_of(fit, context)[0]
-    terms = [
-        term for each in context.candidates for term in Probe.all_of(each, data, model, horizon.fit.x)
-    ]
-    assert terms and horizon.fit.has_process_noise
-    gained = _gained(horizon, terms, None, Budget()).max()
+    data = kicked_decays()
+    context = context_of(DECAY, data, ("sensor gain or offset",))
+    horizons = horizons_of(recalibrate(DECAY, data)[0], context)
+    x = horizons[0].fit.x
+    # Each form that has a gain; a constant offset was never mistaken for innovations.
+    faults = [each for each in context.candidates if any(name.startswith("g") for name in each.amplitudes)]
+    terms = [term for each in faults for term in Probe.all_of(each, data, DECAY, x)]
+    assert len(terms) == 2 and len(horizons) == 2
+    assert all((_gained(each, terms, None, Budget()) < 0).all() for each in horizons)
 
-    def at_filtered(fit, data, terms):
-        return linearised_with(replace(fit, noise=fit.noise.without_process()), data, terms)
+    def at_filtered(fit: Fit, data: Measurements, some: Sequence[Term]) -> tuple[Linearisation, list[slice]]:
+        # Where a fit has no process noise nothing is foreseen other than what is known.
+        return linearised_with(replace(fit, noise=fit.noise.without_process()), data, some)
 
+    # At the states that the filter knows a gain explains the kicks, and this test would fail.
     monkeypatch.setattr(forecasts, "linearised_with", at_filtered)
-    leaked = _gained(horizon, terms, None, Budget()).max()
-    least = context.study.search.least_log_odds
-    assert gained < least < 10 * least < leaked
+    assert all((_gained(each, terms, None, Budget()) > 9).all() for each in horizons)
+    assert (_gained(horizons[0], terms, None, Budget()) > 500).all()
