@@ -148,13 +148,19 @@ def made(number: int, seed: int) -> tuple[dict[str, Any], pd.DataFrame, dict[str
         def f(time_: float, x: np.ndarray) -> np.ndarray:
             u = 0.0 if course is None else float(course(time_))
             rates = np.array(system.rates(x, u))
-            strange = [np.sin(7 * x[place] * rate), np.cos(5 * x[0] * rate), abs(np.sin(3 * x[0] * rate)) - 0.5]
+            strange = [
+                np.sin(7 * x[place] * rate),
+                np.cos(5 * x[0] * rate),
+                abs(np.sin(3 * x[0] * rate)) - 0.5,
+            ]
             rates[place] += error * size * (strange[kind] if odd else force(time_))
             if effect != "none":
                 rates[place] += system.effects[effect](x, u)
             return rates
 
-        run = scipy.integrate.solve_ivp(f, (0, system.duration), begin, t_eval=t, rtol=1e-8, atol=1e-10, max_step=last)
+        run = scipy.integrate.solve_ivp(
+            f, (0, system.duration), begin, t_eval=t, rtol=1e-8, atol=1e-10, max_step=last
+        )
         frame = pd.DataFrame({"recording": f"r{recording}", "t": t})
         frame[next(iter(system.card["outputs"]))] = run.y[system.measured]
         if course is not None:
@@ -167,7 +173,13 @@ def made(number: int, seed: int) -> tuple[dict[str, Any], pd.DataFrame, dict[str
     card = yaml.safe_load(yaml.safe_dump(system.card))
     for parameter in card["parameters"].values():
         parameter["value"] = float(parameter["value"] * np.exp(generator.uniform(-0.1, 0.1)))
-    key = {"system": name, "effect": effect, "family": families.get(effect, ""), "error": error, "noise": noise}
+    key = {
+        "system": name,
+        "effect": effect,
+        "family": families.get(effect, ""),
+        "error": error,
+        "noise": noise,
+    }
     return card, table, key
 
 
@@ -195,7 +207,9 @@ def judged(number: int, seed: int) -> dict[str, Any]:
 
 def main() -> None:
     """Judge cases and print the counts."""
-    parser = argparse.ArgumentParser(prog="benchmarks.model_error", description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="benchmarks.model_error", description=(__doc__ or "").splitlines()[0]
+    )
     parser.add_argument("cases", nargs="?", type=int, default=60)
     parser.add_argument("--seed", type=int, default=20261125)
     parser.add_argument("--table", type=Path, default=Path("model_error.csv"))
@@ -215,12 +229,19 @@ def main() -> None:
             if fresh:
                 writer.writeheader()
             writer.writerow(row)
-        print({name: row.get(name) for name in ("case", "system", "effect", "error", "verdict", "named", "seconds")},
-              flush=True)
+        print(
+            {
+                name: row.get(name)
+                for name in ("case", "system", "effect", "error", "verdict", "named", "seconds")
+            },
+            flush=True,
+        )
     table = pd.read_csv(chosen.table)
     effect, none = table[table["effect"] != "none"], table[table["effect"] == "none"]
-    print(f"{len(effect)} effects: family right {effect['right_family'].mean():.0%}, member right or in the set"
-          f" {effect['right_member'].mean():.0%}, a wrong family {effect['wrong_family'].mean():.0%}")
+    print(
+        f"{len(effect)} effects: family right {effect['right_family'].mean():.0%}, member right or in the set"
+        f" {effect['right_member'].mean():.0%}, a wrong family {effect['wrong_family'].mean():.0%}"
+    )
     print(f"{len(none)} without: named {none['wrong_family'].mean():.0%}")
 
 

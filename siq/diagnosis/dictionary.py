@@ -205,8 +205,8 @@ class Mechanism(_Part):
     family
         The kind of physics that it is a member of, by default itself: what recordings tell first.
     weight
-        How likely it is beforehand, beside one of weight 1. What nearly every system of its kind has weighs 5,
-        what few have weighs 0.2. A family weighs as much as its likeliest member.
+        How likely it is beforehand, beside one of weight 1. What nearly every system of its kind has
+        weighs 5, what few have weighs 0.2. A family weighs as much as its likeliest member.
     look_alikes
         Mechanisms that are easily taken for it.
     reference

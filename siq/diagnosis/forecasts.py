@@ -1,15 +1,16 @@
 """Forecasts: explanations judged by how well they foresee recordings that they were not fitted to.
 
-No machine follows a formula down to its encoder. Between an explanation and the recordings stands a
-discrepancy (Kennedy and O'Hagan 2001, J. R. Stat. Soc. B 63; Brynjarsdóttir and O'Hagan 2014, Inverse Problems
-30): forces at random, whose size every fit estimates anew, alike for all explanations. What an explanation is
-worth is the logarithm of the probability with which it foresees parts of the recordings that were left out of
-its fit.
+No machine follows a formula down to its encoder. Between an explanation and the recordings stands an error of
+the model (Kennedy and O'Hagan 2001, J. R. Stat. Soc. B 63; Brynjarsdóttir and O'Hagan 2014, Inverse Problems
+30): process noise, whose size every fit estimates anew, alike for all explanations. An explanation is worth
+the logarithm of the probability with which it foresees parts of the recordings that were left out of its fit.
 
-One sample ahead it is the fine structure of the discrepancy that is foreseen, and not the motion. So the filter
-is also shown every fourth sample only, every sixteenth, and so on, as long as there are enough: it then has to
-foresee the motion over as much time. Every horizon counts alike. What a discrepancy leaves at neighbouring
-samples is alike; so many errors count as are independent.
+One sample ahead a filter foresees the fine structure of this error, and not the motion. So it is also shown
+every fourth sample only, every sixteenth, and so on, as long as there are enough: it then has to foresee the
+motion over as much time. Every horizon counts alike. With the log-density ``l`` of the parts left out and the
+correlation time ``tau`` of the errors in samples, an explanation gains over nothing
+
+    G = mean over horizons of (l - l_nothing) / tau.
 
 Explanations are mechanisms of the dictionary, one by one within their family, and functions without a name.
 Along the trajectories of a fit with the leading mechanism everything is linear, and all of them are compared
@@ -100,9 +101,10 @@ class _Foreseen:
         )
 
     def log_density(self, columns: np.ndarray, precision: np.ndarray | None = None) -> np.ndarray:
-        """Logarithms of the probabilities of the parts, up to a constant, each from the others, ``(folds,)``.
+        """Log-densities of the parts, up to a constant, each foreseen from the others, shape ``(folds,)``.
 
-        With columns ``(n, k)``, whose coefficients have the prior precision ``(k, k)``, in units of the noise.
+        With columns ``(n, k)``, whose coefficients have the prior precision ``(k, k)`` in units of the
+        noise.
         """
         squares, overlap, gram, count = self._base
         parts, p, k = (
@@ -211,7 +213,8 @@ def _fitted(
     fit = fit_by_multiple_shooting(
         model, data, x=states, noise=noise, estimate_process=True, substeps=substeps, budget=budget
     )
-    if not fit.converged:
+    # Where f jumps its derivatives are never exact, and steps may go to and fro about the best fit.
+    if fit.fault or not (fit.converged or fit.model.edges):
         raise NumericalFailure(fit.fault or "its fit does not settle")
     return fit
 
@@ -258,23 +261,32 @@ def _sites(candidates: Sequence[MechanismCandidate], along: Fit, context: FitCon
             LOGGER.info("%s: %s", each.label, error)
             continue
         if probes:
-            found.append(_Site(tuple(probes), prior, (each.family, each.equations), each))
+            found.append(_Site(tuple(probes), prior, _kind_of(each, model), each))
     single = places_in(model, context.roles, data, x)
     places = (*single, *products_in([each for each in single if each.equations], model, data, x))
     for place in places:
-        acting = [
-            each
+        acting = {
+            (_kind_of(each, model), each.name)
             for each in candidates
             if each.equations == place.targets and each.coordinate == ", ".join(place.words)
-        ]
-        shared = Counter(family for family, _ in {(each.family, each.name) for each in acting})
-        family = next((name for name, count in shared.most_common(1) if count > 1), "")
-        found.append(_Site((place,), float(np.log(unnamed) - np.log(len(places))), (family, place.targets)))
+        }
+        shared = Counter(kind for kind, _ in acting)
+        kind = next((one for one, count in shared.most_common(1) if count > 1), ("", place.targets))
+        found.append(_Site((place,), float(np.log(unnamed) - np.log(len(places))), kind))
     return found
 
 
+def _kind_of(candidate: MechanismCandidate, model: Dynamics) -> tuple[str, tuple[str, ...]]:
+    """The family of a mechanism, and where it acts: along a state, wherever that acts back, or in equations.
+
+    In a machine of several joints, friction in one of them acts on all.
+    """
+    along = candidate.coordinate
+    return candidate.family, (along,) if along in model.states else (along, *candidate.equations)
+
+
 def _log_priors(candidates: Sequence[MechanismCandidate], unnamed: float) -> list[float]:
-    """Logarithms of the probabilities of mechanisms: of families by weight, of members by weight, then alike."""
+    """Logarithms of prior probabilities: by weight of families, and of their members; alike over places."""
     families: dict[str, float] = {}
     members: dict[tuple[str, str], float] = {}
     for each in candidates:
@@ -329,7 +341,8 @@ def _gains(
 ) -> tuple[list[_Site], np.ndarray]:
     """The sites that may matter, and what they gain: means over horizons, ``(sites,)``.
 
-    One sample ahead all are asked. Of those that promise most there, each with its best shapes, the others are.
+    All are asked one sample ahead, and those that promise most there, with their best shapes, at the
+    other horizons.
     """
     asked = _gained(horizons[0], [term for site in sites for term in site.terms], leading, budget)
     ends = np.cumsum([len(site.terms) for site in sites])
@@ -471,7 +484,7 @@ class _Leader:
 def _fitted_at(
     horizons: Sequence[Horizon], site: _Site, budget: Budget
 ) -> tuple[list[Horizon], float] | None:
-    """A mechanism fitted at every horizon, and what it gains; None where it cannot be, or has no such sign."""
+    """A mechanism fitted at every horizon, and what it gains; None where that fails, or its sign is wrong."""
     candidate = site.candidate
     assert candidate is not None
     found: list[Horizon] = []

@@ -300,6 +300,8 @@ def test_what_a_name_leaves_is_described_and_no_sample_of_a_test_chooses_it(
             context, first, left[0], named, whole.recalibrated, log_odds=(9.0,), convincing=True
         )
 
+    # Forecasts would name both.
+    monkeypatch.setattr(investigation, "named_by_forecasts", lambda *_: (None, ()))
     monkeypatch.setattr("siq.diagnosis.naming._judge_mechanisms", the_first_alone)
     table = recordings_of(lambda x, v, t: -2.0 * x**3 - 0.1 * v * np.abs(v), count=6)
     study = {"held_out": ["r2", "r4"], "tests": ["r2", "r4"], "search": {"mechanisms": 2}}
