@@ -199,7 +199,8 @@ def judged(number: int, seed: int) -> dict[str, Any]:
     return {
         **key, "case": number, "verdict": str(found.verdict), "named": "; ".join(names),
         "families": "; ".join(sorted(said)), "right_family": key["family"] in said,
-        "right_member": key["effect"] in members, "wrong_family": bool(said - {key["family"], "process noise"}),
+        "right_member": key["effect"] in members,
+        "wrong_family": bool(said - {key["family"], "process noise"}),
         "before": errors.before, "recalibrated": errors.recalibrated, "augmented": errors.augmented,
         "seconds": time.process_time() - began,
     }  # fmt: skip

@@ -16,7 +16,7 @@ import pandas as pd
 
 from siq.inference.checks import prediction_errors
 from siq.inference.library import candidate_library
-from siq.networks.decomposition import AnyNetworks, TrainedNetworks, shuffled
+from siq.networks.decomposition import AnyNetworks, potential_on_grid, shuffled
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.formulas import SymbolicDecomposition, exact_decomposition, term_coefficients
 from siq.systems.cards import load_exact, load_system
@@ -28,7 +28,6 @@ from siq.workflow.tables import METHODS, Method, Outcome, Status, Step, as_table
 from workflow.published import PublishedFigure
 from workflow.rows import certificate_rows, concatenate
 
-LARGEST_EXPONENT = 700  # of e, in double precision
 GRID_POINTS = 1_000_000  # the paper's grid has 100 points along each of three axes
 
 
@@ -108,32 +107,6 @@ def _domain_grid(domain: np.ndarray, *, points: int) -> tuple[list[np.ndarray], 
     along = max(round(points ** (1 / len(domain))), 2)
     axes = [np.linspace(lower, upper, along) for lower, upper in domain]
     return axes, np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")])
-
-
-def potential_on_grid(networks: AnyNetworks, axes: Sequence[np.ndarray], grid: np.ndarray) -> np.ndarray:
-    """V of networks on the grid ``(d, n)`` of some axes, shape ``(n,)``.
-
-    With one hidden layer ``V^NN = Σ_k v_k tanh z_k`` and ``tanh z = 1 - 2/(1 + e^{2z})``. As z is a sum over
-    states, ``e^{2z}`` is a product of what is worked out along each axis alone.
-    """
-    if not isinstance(networks, TrainedNetworks) or len(networks.potential) != 2:
-        return networks.potential_at(grid.T)
-    (weights, biases), (outer, shift) = networks.potential
-    scaled = (grid.T - networks.mean) / networks.scale
-    most = LARGEST_EXPONENT / (len(axes) + 1)
-    *others, last = [
-        np.exp(np.clip(2 * (axis[:, None] - mean) / scale * row, -most, most))
-        for axis, mean, scale, row in zip(axes, networks.mean[0], networks.scale[0], weights, strict=True)
-    ]
-    rows, values, terms = np.exp(2 * biases), [], np.empty_like(last)
-    for factor in others:
-        rows = (rows[:, None] * factor).reshape(-1, factor.shape[1])
-    for row in rows:
-        np.multiply(last, row, out=terms)
-        terms += 1
-        values.append(np.reciprocal(terms, out=terms) @ outer[:, 0])
-    potential = outer.sum() + shift[0, 0] - 2 * np.concatenate(values) + (scaled**2).sum(axis=1)
-    return np.asarray(networks.potential_scale[0, 0] * potential, dtype=float)
 
 
 def relative_error(estimate: np.ndarray, exact: np.ndarray) -> float:

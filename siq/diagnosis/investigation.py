@@ -51,7 +51,6 @@ def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigat
         When not even the recalibrated simulation with process noise can be fitted.
     """
     study, data, dictionary = case.settings, case.learn, case.dictionary
-    options = study.search
     model = with_expectations(case.system)
     roles = roles_of(model)
     candidates = candidates_of(model, roles, dictionary)

@@ -22,6 +22,7 @@ from siq.errors import InputError
 from siq.numerics.files import whole_file
 
 CHUNK = 81_920  # activations of a layer worked out together: few enough to stay in the processor's cache
+LARGEST_EXPONENT = 700  # numerical: of e, in double precision
 MatchingRule = Literal["explicit", "symmetric"]
 Order = Literal[2, 4]
 
@@ -350,6 +351,32 @@ def _gradient(layers: tuple[Layer, ...], hidden: list[np.ndarray]) -> np.ndarray
         slopes *= delta
         delta = slopes @ weights.T
     return delta
+
+
+def potential_on_grid(networks: AnyNetworks, axes: Sequence[np.ndarray], grid: np.ndarray) -> np.ndarray:
+    """V of networks on the grid ``(d, n)`` of some axes, shape ``(n,)``.
+
+    With one hidden layer ``V^NN = Σ_k v_k tanh z_k`` and ``tanh z = 1 - 2/(1 + e^{2z})``. As z is a sum over
+    states, ``e^{2z}`` is a product of what is worked out along each axis alone.
+    """
+    if not isinstance(networks, TrainedNetworks) or len(networks.potential) != 2:
+        return networks.potential_at(grid.T)
+    (weights, biases), (outer, shift) = networks.potential
+    scaled = (grid.T - networks.mean) / networks.scale
+    most = LARGEST_EXPONENT / (len(axes) + 1)
+    *others, last = [
+        np.exp(np.clip(2 * (axis[:, None] - mean) / scale * row, -most, most))
+        for axis, mean, scale, row in zip(axes, networks.mean[0], networks.scale[0], weights, strict=True)
+    ]
+    rows, values, terms = np.exp(2 * biases), [], np.empty_like(last)
+    for factor in others:
+        rows = (rows[:, None] * factor).reshape(-1, factor.shape[1])
+    for row in rows:
+        np.multiply(last, row, out=terms)
+        terms += 1
+        values.append(np.reciprocal(terms, out=terms) @ outer[:, 0])
+    potential = outer.sum() + shift[0, 0] - 2 * np.concatenate(values) + (scaled**2).sum(axis=1)
+    return np.asarray(networks.potential_scale[0, 0] * potential, dtype=float)
 
 
 def save_networks(path: str | Path, runs: Sequence[AnyNetworks]) -> None:

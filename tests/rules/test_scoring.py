@@ -10,7 +10,7 @@ import sympy
 from known_systems import exact_archetype
 
 from siq.inference.library import candidate_library
-from siq.networks.decomposition import TrainedNetworks
+from siq.networks.decomposition import TrainedNetworks, potential_on_grid
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.systems.dynamics import Dynamics
 from siq.workflow.tables import as_table
@@ -24,7 +24,6 @@ from workflow.scoring import (
     _relative_root_mean_square_error,
     _support_is_correct,
     exact_answer,
-    potential_on_grid,
     relative_error,
     summary_table,
 )
