@@ -2,11 +2,11 @@
 
     .venv/bin/python -m benchmarks.model_error [CASES] [--seed SEED] [--table FILE]
 
-Cases of six systems: one effect that their card lacks, or none, and beside it an error of the model that no card
-mentions: a coloured force of its own in every recording, or a small term of an odd shape. It makes 0.3 to 10 % of
-the motion. The table has a row for each case, written as soon as it is known; begun again, it goes on. Counted
-are right families, right members (or such as are not told apart), wrong families, and names where nothing
-but the error of the model is there.
+Cases of six systems: one effect that their card lacks, or none, and beside it an error of the model that
+no card mentions: a coloured force of its own in every recording, or a small term of an odd shape. It
+makes 0.3 to 10 % of the motion. The table has a row for each case, written as soon as it is known; begun
+again, it goes on. Counted are right families, right members (or such as are not told apart), wrong
+families, and names where nothing but the error of the model is there.
 """
 
 from __future__ import annotations
@@ -108,7 +108,10 @@ SYSTEMS = {
     "population": System(
         _card("population", {"n": "g"}, {"r": 0.6}, equations={"n": "r*n"}, outputs={"m": "n"}),
         lambda x, u: [0.6 * x[0]], (0, 1.0), ((0.1, 3.0),), 10.0,
-        {"self-limitation": lambda x, u: -0.15 * x[0] ** 2, "harvest": lambda x, u: -0.5 * x[0] / (0.5 + x[0])},
+        {
+            "self-limitation": lambda x, u: -0.15 * x[0] ** 2,
+            "harvest": lambda x, u: -0.5 * x[0] / (0.5 + x[0]),
+        },
     ),
     "heated room": System(
         _card("room", {"T": "K"}, {"c": 0.4}, inputs={"u": {"unit": "K/s"}}, equations={"T": "c*u"},
@@ -145,7 +148,7 @@ def made(number: int, seed: int) -> tuple[dict[str, Any], pd.DataFrame, dict[str
             steps[k] = np.exp(-1 / tau) * steps[k - 1] + np.sqrt(1 - np.exp(-2 / tau)) * steps[k]
         force = scipy.interpolate.CubicSpline(knots * last, steps)
 
-        def f(time_: float, x: np.ndarray) -> np.ndarray:
+        def f(time_: float, x: np.ndarray, course: Any = course, force: Any = force) -> np.ndarray:
             u = 0.0 if course is None else float(course(time_))
             rates = np.array(system.rates(x, u))
             strange = [

@@ -31,8 +31,10 @@ import scipy.special
 
 from siq.diagnosis.evidence import (
     NUMERICAL_ERRORS,
+    OVERFLOWS,
     SMOOTH_LENGTHS,
     FittedCandidate,
+    NotFitted,
     correlation_time_of,
     orthonormal,
     sizes_of_effects,
@@ -241,7 +243,12 @@ class _Site:
         return f"a function of {' and '.join(place.words)} in {', '.join(place.targets)}"
 
 
-def _sites(candidates: Sequence[MechanismCandidate], along: Fit, context: FitContext) -> list[_Site]:
+def _sites(
+    candidates: Sequence[MechanismCandidate],
+    along: Fit,
+    context: FitContext,
+    untried: dict[str, NotFitted],
+) -> list[_Site]:
     """All explanations on top of a fit, with their priors.
 
     A family counts once, and its members alike. A function of a coordinate along which several members of a
@@ -259,6 +266,7 @@ def _sites(candidates: Sequence[MechanismCandidate], along: Fit, context: FitCon
             probes = Probe.all_of(spread, data, model, x)
         except NUMERICAL_ERRORS as error:
             LOGGER.info("%s: %s", each.label, error)
+            untried[each.label] = NotFitted.of(each, error)
             continue
         if probes:
             found.append(_Site(tuple(probes), prior, _kind_of(each, model), each))
@@ -330,14 +338,20 @@ def _gained(
             nothing = max(nothing, float(problem.log_density(known).sum()) + constant)
             for place, (term, group) in enumerate(zip(some, groups, strict=True), start=at):
                 columns = further[:, group]
-                if np.isfinite(columns).all() and columns.any():
+                if not np.isfinite(columns).all():
+                    best[place] = np.nan
+                elif columns.any():
                     best[place] = max(best[place], _density(problem, term, columns) + constant)
         at += len(some)
-    return np.where(np.isfinite(best), best - nothing, -np.inf) / horizon.correlated
+    return (best - nothing) / horizon.correlated
 
 
 def _gains(
-    horizons: Sequence[Horizon], sites: Sequence[_Site], leading: MechanismCandidate | None, budget: Budget
+    horizons: Sequence[Horizon],
+    sites: Sequence[_Site],
+    leading: MechanismCandidate | None,
+    budget: Budget,
+    untried: dict[str, NotFitted],
 ) -> tuple[list[_Site], np.ndarray]:
     """The sites that may matter, and what they gain: means over horizons, ``(sites,)``.
 
@@ -347,6 +361,10 @@ def _gains(
     asked = _gained(horizons[0], [term for site in sites for term in site.terms], leading, budget)
     ends = np.cumsum([len(site.terms) for site in sites])
     promised = [asked[end - len(site.terms) : end] for site, end in zip(sites, ends, strict=True)]
+    for site, one in zip(sites, promised, strict=True):
+        if site.candidate is not None and np.isnan(one).all():
+            untried[site.label] = NotFitted.of(site.candidate, OVERFLOWS)
+    promised = [np.where(np.isnan(one), -np.inf, one) for one in promised]
     order = sorted(range(len(sites)), key=lambda place: -promised[place].max())[:PROMISING]
     kept, total = list[_Site](), list[np.ndarray]()
     for place in order:
@@ -356,7 +374,7 @@ def _gains(
     gained = np.concatenate(total)
     for each in horizons[1:]:
         gained = gained + _gained(each, [term for site in kept for term in site.terms], leading, budget)
-    gained = gained / len(horizons)
+    gained = np.where(np.isnan(gained), -np.inf, gained) / len(horizons)
     ends = np.cumsum([len(site.terms) for site in kept])
     # The prior of a mechanism is spread over all shapes at which it was looked for.
     found = [
@@ -482,7 +500,7 @@ class _Leader:
 
 
 def _fitted_at(
-    horizons: Sequence[Horizon], site: _Site, budget: Budget
+    horizons: Sequence[Horizon], site: _Site, budget: Budget, untried: dict[str, NotFitted]
 ) -> tuple[list[Horizon], float] | None:
     """A mechanism fitted at every horizon, and what it gains; None where that fails, or its sign is wrong."""
     candidate = site.candidate
@@ -499,7 +517,9 @@ def _fitted_at(
             begin = fit
         except NUMERICAL_ERRORS as error:
             LOGGER.info("%s at a horizon: %s", candidate.label, error)
+            untried[candidate.label] = NotFitted.of(candidate, error)
             return None
+    untried.pop(candidate.label, None)
     gain = np.mean(
         [
             (one.log_density - other.log_density) / min(one.correlated, other.correlated)
@@ -527,29 +547,37 @@ def _begun(site: _Site, horizon: Horizon, before: Fit | None) -> tuple[Fit, np.n
 
 
 def _fitted_in_earnest(
-    horizons: Sequence[Horizon], sites: Sequence[_Site], gains: np.ndarray, budget: Budget
+    horizons: Sequence[Horizon],
+    sites: Sequence[_Site],
+    gains: np.ndarray,
+    budget: Budget,
+    untried: dict[str, NotFitted],
 ) -> dict[str, _Leader]:
     """The mechanisms that promise most, fitted at every horizon; those that foresee better than nothing."""
     found: dict[str, _Leader] = {}
     weights = gains + np.array([site.prior for site in sites])
     order = [place for place in np.argsort(-weights) if sites[place].candidate is not None]
-    for place in order[:ATTEMPTS]:
+    for number, place in enumerate(order[:ATTEMPTS], start=1):
         if not gains[place] > 0 or len(found) == LEADERS:
             break
-        fitted = _fitted_at(horizons, sites[place], budget)
+        budget.says(f"candidate {number} of at most {min(ATTEMPTS, len(order))}: {sites[place].label}")
+        fitted = _fitted_at(horizons, sites[place], budget, untried)
         if fitted is not None and fitted[1] > 0:
             found[sites[place].label] = _Leader(sites[place], *fitted)
     return found
 
 
 def next_rung(
-    horizons: Sequence[Horizon], candidates: Sequence[MechanismCandidate], context: FitContext
+    horizons: Sequence[Horizon],
+    candidates: Sequence[MechanismCandidate],
+    context: FitContext,
+    untried: dict[str, NotFitted],
 ) -> Rung | None:
     """The mechanism that stands first on top of fits; None where none is likelier than what has no name."""
     options, base, budget = context.study.search, horizons[0].fit, context.budget
     budget.says("comparing forecasts of what was left out")
-    sites, gains = _gains(horizons, _sites(candidates, base, context), None, budget)
-    fitted = _fitted_in_earnest(horizons, sites, gains, budget)
+    sites, gains = _gains(horizons, _sites(candidates, base, context, untried), None, budget, untried)
+    fitted = _fitted_in_earnest(horizons, sites, gains, budget, untried)
     if not fitted:
         return None
     alone = {site.label: site for site in sites if site.candidate is not None}
@@ -564,14 +592,14 @@ def next_rung(
         ground = leader if leader in steady else max(steady, key=lambda each: each.weight)
         there = ground.horizons[0].fit
         rebased = [each.rebased(base.model, there.model) for each in candidates]
-        remaining = _sites(rebased, there, context)
+        remaining = _sites(rebased, there, context, untried)
         if leader is not ground:
             # A state that follows the motion may be a simple mechanism and something else at a time.
-            above, further = _gains(ground.horizons, remaining, None, budget)
+            above, further = _gains(ground.horizons, remaining, None, budget, untried)
             both = max(gain + site.prior for site, gain in zip(above, further, strict=True))
             if ground.weight + max(both, 0.0) > leader.weight:
                 outdone, leader = {leader.site.label}, ground
-        sites, gains = _gains(ground.horizons, remaining, ground.candidate, budget)
+        sites, gains = _gains(ground.horizons, remaining, ground.candidate, budget, untried)
         gains = gains + ground.gain
     # What was fitted in earnest counts as it was fitted.
     kept = [place for place, site in enumerate(sites) if site.label not in fitted]
@@ -595,7 +623,7 @@ def next_rung(
     members = {sites[k].label: weights[k] for k in np.flatnonzero(family) if sites[k].candidate is not None}
     alike = {label for label, weight in members.items() if weight > leader.weight + np.log(PLAUSIBLE)}
     for label in alike.intersection(alone) - fitted.keys():
-        another = _fitted_at(horizons, alone[label], budget)
+        another = _fitted_at(horizons, alone[label], budget, untried)
         if another is not None:
             fitted[label] = _Leader(alone[label], *another)
     known = {
@@ -619,12 +647,13 @@ def _told(sites: Sequence[_Site], gains: np.ndarray) -> None:
         LOGGER.info("%s: gains %.1f", sites[place].label, gains[place])
 
 
-def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[Rung]]:
+def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[Rung], tuple[NotFitted, ...]]:
     """Mechanisms one on top of the other, as long as the next is likelier than what has no name.
 
-    Returned are also the fits of the simulation alone; all are empty where it cannot be fitted.
+    Returned are also the fits of the simulation alone, empty where it cannot be fitted, and what could not be
+    judged.
     """
-    model, found = context.model, list[Rung]()
+    model, found, untried = context.model, list[Rung](), dict[str, NotFitted]()
     alone: list[Horizon] = []
     try:
         horizons = alone = horizons_of(fit, context)
@@ -637,7 +666,7 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[Rung]]:
                 for each in context.candidates
                 if not any(each.repeats(other.accepted.best.candidate) for other in found)
             ]
-            rung = next_rung(horizons, remaining, context)
+            rung = next_rung(horizons, remaining, context, untried)
             if rung is None:
                 break
             LOGGER.info("found %s by forecasts", rung.accepted.best.candidate.label)
@@ -645,4 +674,4 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[Rung]]:
             horizons = list(rung.horizons)
     except (*NUMERICAL_ERRORS, BudgetSpent) as error:
         LOGGER.info("forecasts end: %s", error)
-    return alone, found
+    return alone, found, tuple(untried.values())

@@ -44,9 +44,11 @@ from siq.inference.budget import UNLIMITED, Account
 from siq.inference.kalman_filter import Whitened, solve, whiten
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.recalibration import fit_with_process_noise_as_needed
+from siq.inference.trajectories import sharpened
 from siq.remarks import Remark
 
 LOGGER = logging.getLogger(__name__)
+FORECASTS_SHARE = 0.5  # of the budget, so that the tests have something left where nothing is named: a choice
 
 
 class _MissingEffect:
@@ -274,15 +276,18 @@ def named_by_forecasts(
 
     Returned are also the fits of the simulation alone at each horizon; None where nothing has a name.
     """
-    alone, rungs = climb(recalibrated, context)
+    with context.budget.part(FORECASTS_SHARE):
+        alone, rungs, untried = climb(recalibrated, context)
     recalibrations = tuple(each.fit for each in alone)
     if not rungs:
         return None, recalibrations
     fit = rungs[-1].accepted.best.fit
     with context.budget.exempt():  # without forces, where they are not needed any more
         fit = fit_with_process_noise_as_needed(fit.model, context.data, fit, budget=context.budget)
+        if fit.model.edges:
+            fit = sharpened(fit, context.data, budget=context.budget)
     left = Remainder.of(context.data, alone[0].fit, fit, context.roles)
-    search = Search(recalibrated, tuple(each.accepted for each in rungs), fit, ())
+    search = Search(recalibrated, tuple(each.accepted for each in rungs), fit, (), untried=untried)
     decision = Investigation(
         context, search, left, MismatchVerdict.MISSING_PHYSICS, least_squares, convincing=True,
         log_odds=tuple(each.log_odds for each in rungs), recalibrations=recalibrations,

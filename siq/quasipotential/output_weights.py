@@ -333,8 +333,11 @@ class OutputWeights:
             basis, basin = cast(UnitBasis, well.basis), portrait.basins[index]
             if not self._leaves(well.attractor, basis, well.coefficients):
                 return None
-            for other in range(count) if well.saddle is not None else ():
-                if any(np.array_equal(well.saddle, one.position) for one in portrait.saddles[other]):
+            saddle = well.saddle
+            for other in range(count) if saddle is not None else ():
+                if any(
+                    np.array_equal(cast(np.ndarray, saddle), one.position) for one in portrait.saddles[other]
+                ):
                     barriers[index, other] = well.level
             x = basin.points(np.arange(len(basin.chosen)))
             parts.append(self._networks(basis, well.coefficients, well.points))
