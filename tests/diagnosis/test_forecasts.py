@@ -92,7 +92,7 @@ def context_of(model: Dynamics, data: Measurements, among: tuple[str, ...] = ())
 def first_rung(context: FitContext) -> Rung | None:
     fit, _ = recalibrate(context.model, context.data)
     assert fit.has_process_noise
-    return next_rung(horizons_of(fit, context), context.candidates, context)
+    return next_rung(horizons_of(fit, context), context.candidates, context, {})
 
 
 @cache
