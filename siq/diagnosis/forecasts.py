@@ -92,9 +92,14 @@ class _Foreseen:
     fold: np.ndarray
 
     @cached_property
+    def _parts(self) -> list[np.ndarray]:
+        """The rows of each part."""
+        return [np.flatnonzero(self.fold == each) for each in np.unique(self.fold)]
+
+    @cached_property
     def _base(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """By fold: squares of the target, its overlap with the parameters, their Gram matrix, the count."""
-        parts = [self.fold == each for each in np.unique(self.fold)]
+        """By part: squares of the target, its overlap with the parameters, their Gram matrix, the count."""
+        parts = self._parts
         return (
             np.array([self.target[rows] @ self.target[rows] for rows in parts]),
             np.stack([self.own[rows].T @ self.target[rows] for rows in parts]),
@@ -102,27 +107,42 @@ class _Foreseen:
             np.array([self.white.known[rows].sum() for rows in parts], dtype=float),
         )
 
+    def sums(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Normal equations of parameters and columns ``(n, k)``: ``(f, p + k, p + k)``, ``(f, p + k)`` by part."""
+        _, overlap, gram, _ = self._base
+        p, size = self.own.shape[1], self.own.shape[1] + columns.shape[1]
+        whole, right = np.zeros((len(gram), size, size)), np.zeros((len(gram), size))
+        whole[:, :p, :p], right[:, :p] = gram, overlap
+        for place, rows in enumerate(self._parts):
+            some = columns[rows]
+            whole[place, :p, p:] = self.own[rows].T @ some
+            whole[place, p:, :p] = whole[place, :p, p:].T
+            whole[place, p:, p:] = some.T @ some
+            right[place, p:] = some.T @ self.target[rows]
+        return whole, right
+
+    def signs(self, sums: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        """Signs of the coefficients of columns, fitted to all parts, shape ``(k,)``."""
+        whole, right = (each.sum(axis=0) for each in sums)
+        scale = np.sqrt(np.diag(whole))
+        scale = np.where(scale > 0, scale, 1.0)
+        damped = whole / np.outer(scale, scale) + RIDGE * np.eye(len(scale))
+        return np.asarray(np.sign(np.linalg.solve(damped, right / scale))[self.own.shape[1] :])
+
     def log_density(self, columns: np.ndarray, precision: np.ndarray | None = None) -> np.ndarray:
         """Log-densities of the parts, up to a constant, each foreseen from the others, shape ``(folds,)``.
 
         With columns ``(n, k)``, whose coefficients have the prior precision ``(k, k)`` in units of the
         noise.
         """
-        squares, overlap, gram, count = self._base
-        parts, p, k = (
-            [self.fold == each for each in np.unique(self.fold)],
-            self.own.shape[1],
-            columns.shape[1],
-        )
-        whole = np.zeros((len(parts), p + k, p + k))
-        right = np.zeros((len(parts), p + k))
-        whole[:, :p, :p], right[:, :p] = gram, overlap
-        for place, rows in enumerate(parts):
-            some = columns[rows]
-            whole[place, :p, p:] = self.own[rows].T @ some
-            whole[place, p:, :p] = whole[place, :p, p:].T
-            whole[place, p:, p:] = some.T @ some
-            right[place, p:] = some.T @ self.target[rows]
+        return self.log_density_of(self.sums(columns), precision)
+
+    def log_density_of(
+        self, sums: tuple[np.ndarray, np.ndarray], precision: np.ndarray | None = None
+    ) -> np.ndarray:
+        """The same by the normal equations of columns, see `sums`."""
+        (squares, _, _, count), (whole, right), p = self._base, sums, self.own.shape[1]
+        k = whole.shape[1] - p
         scale = np.sqrt(np.einsum("fii->i", whole))
         scale = np.where(scale > 0, scale, 1.0)
         whole, right = whole / np.outer(scale, scale), right / scale
@@ -436,24 +456,25 @@ def _solved(columns: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def _density(problem: _Foreseen, term: Probe | Place, columns: np.ndarray) -> float:
     """With a term, averaged over what is expected of it; signs are those that it may have."""
+    sums = problem.sums(columns)
     if isinstance(term, Probe):
         positive = term.positive
-        while True:
-            found = _solved(np.concatenate([problem.own, columns], axis=1), problem.target)
-            wrong = (found[problem.own.shape[1] :] < 0) & positive
-            if not wrong.any():
-                return float(problem.log_density(columns).sum())
+        while (wrong := (problem.signs(sums) < 0) & positive).any():
             columns, positive = columns[:, ~wrong], positive[~wrong]
             if not columns.shape[1]:
                 return -np.inf
+            sums = problem.sums(columns)
+        return float(problem.log_density_of(sums).sum())
     values = []
-    total = float(problem.target @ problem.target)
-    sizes = sizes_of_effects(total)[:: max(len(sizes_of_effects(total)) // 4, 1)]
+    sizes = sizes_of_effects(float(problem.target @ problem.target))
+    gram = sums[0].sum(axis=0)[problem.own.shape[1] :, problem.own.shape[1] :]
     for length in SMOOTH_LENGTHS:
         prior = smooth_prior(term.knots, length)
-        told = float(np.einsum("nk,kl,nl->", columns, prior, columns))
-        inverse = np.linalg.inv(prior)
-        values += [problem.log_density(columns, inverse * (told / size)).sum() for size in sizes]
+        told, inverse = float((prior * gram).sum()), np.linalg.inv(prior)
+        values += [
+            problem.log_density_of(sums, inverse * (told / size)).sum()
+            for size in sizes[:: max(len(sizes) // 4, 1)]
+        ]
     return float(scipy.special.logsumexp(values) - np.log(len(values)))
 
 
