@@ -108,7 +108,7 @@ class _Foreseen:
         )
 
     def sums(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Normal equations of parameters and columns ``(n, k)``: ``(f, p + k, p + k)``, ``(f, p + k)`` by part."""
+        """Normal equations of parameters and columns ``(n, k)``, one for each part, and right-hand sides."""
         _, overlap, gram, _ = self._base
         p, size = self.own.shape[1], self.own.shape[1] + columns.shape[1]
         whole, right = np.zeros((len(gram), size, size)), np.zeros((len(gram), size))
