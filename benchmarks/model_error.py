@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -189,14 +190,14 @@ def made(number: int, seed: int) -> tuple[dict[str, Any], pd.DataFrame, dict[str
 def judged(number: int, seed: int) -> dict[str, Any]:
     """The row of a case."""
     card, table, key = made(number, seed)
-    families = {each.name: each.family or each.name for each in standard_dictionary()}
-    path = Path("/tmp") / f"model_error_{seed}_{number}.yaml"
-    path.write_text(yaml.safe_dump(card), encoding="utf-8")
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "system.yaml"
+        path.write_text(yaml.safe_dump(card), encoding="utf-8")
+        system = siq.load_system(path)
     began = time.process_time()
-    found = siq.diagnose(siq.load_system(path), table)
-    path.unlink()
+    found = siq.diagnose(system, table)
     names = [each.name for each in found.mechanisms]
-    said = {families.get(each, each) for each in names}
+    said = {each.family or each.name for each in found.mechanisms}
     members = {*names, *(one for each in found.mechanisms for one in each.indistinguishable_from or ())}
     errors = found.statement.errors
     return {

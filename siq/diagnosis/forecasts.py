@@ -54,13 +54,17 @@ from siq.systems.dynamics import Dynamics
 
 LOGGER = logging.getLogger(__name__)
 THINNING = 4  # from one horizon to the next: a choice
-SAMPLES_PER_PARAMETER = 10  # at a horizon, at least, beside the initial states
+# At a horizon, at least, beside the initial states: a choice. With three a parameter, most explanations of a
+# motor's recordings foresaw parts left out far worse than none did.
+SAMPLES_PER_PARAMETER = 10
 FOLDS = 8  # parts of the recordings that are left out in turn: a choice
 ALONE, IN_PLACE = (0.1, 1.0), (1.0, 10.0)  # levels of process noise, relative to that of the fits
 PROMISING, SHAPES = 32, 3  # explanations, and shapes of each, that are asked at all horizons: a choice
 LEADERS, ATTEMPTS = 6, 12  # explanations that are fitted in earnest before none is said to lead: a choice
 RIDGE = 1e-10  # numerical: of normal equations whose columns have unit length
-NEARLY_ALL = 0.9  # of an effect, or of what is gained
+# Of an effect, or of what is gained: a choice, made when two cases had been seen, 0.93 for the linear damping
+# of a pendulum arm, and 0.46 for a preload in the place of a bump.
+NEARLY_ALL = 0.9
 PLAUSIBLE = 0.05  # of the probability of a family, from which on a member is not ruled out
 
 
@@ -280,10 +284,7 @@ def _sites(
     found = []
     for each, prior in zip(candidates, priors, strict=True):
         try:
-            spread = replace(
-                each, model=spread_edges(each.model, data, x, substeps=max(along.substeps, EDGE_SUBSTEPS))
-            )
-            probes = Probe.all_of(spread, data, model, x)
+            probes = Probe.along(each, along, data)
         except NUMERICAL_ERRORS as error:
             LOGGER.info("%s: %s", each.label, error)
             untried[each.label] = NotFitted.of(each, error)
@@ -437,10 +438,7 @@ def _containing(horizon: Horizon, sites: Sequence[_Site], leading: MechanismCand
     response, groups = linearised_with(fit, data, [sites[place].terms[0] for place in chosen])
     white = whiten(response, data, fit.noise)
     problem = _in_place_of(leading, fit, white, _fold_of(data))
-    basis = orthonormal(problem.own)
-    alone = _in_place_of(None, fit, white, _fold_of(data))
-    left = alone.target - alone.own @ _solved(alone.own, alone.target)
-    effect = problem.target - left
+    basis, effect = orthonormal(problem.own), problem.target - white.innovations
     effect = effect - basis @ (basis.T @ effect)
     for place, group in zip(chosen, groups, strict=True):
         columns = white.columns[:, len(fit.model.free) :][:, group]

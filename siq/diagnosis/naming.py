@@ -5,8 +5,8 @@ missing, by their marginal likelihoods (`siq.diagnosis.evidence`): along the tra
 mechanism everything is linear, and amplitudes, shapes and functions have normal priors whose size is drawn
 evenly on a logarithmic scale. A name takes the odds that keep wrong names as rare as is asked for.
 
-**Where something is left** by mechanisms, or process noise stands in for it, forecasts decide
-(`siq.diagnosis.forecasts`).
+**Where process noise stands in** for what is missing, forecasts are asked first (`siq.diagnosis.forecasts`),
+and tests with these odds only where they name nothing.
 """
 
 from __future__ import annotations
@@ -274,7 +274,7 @@ def named_by_forecasts(
 ) -> tuple[Investigation | None, tuple[Fit, ...]]:
     """What is missing by what foresees recordings best, where the recalibrated fit needs forces at random.
 
-    Returned are also the fits of the simulation alone at each horizon; None where nothing has a name.
+    Returned are what is named, None where nothing is, and the fits of the simulation alone at each horizon.
     """
     with context.budget.part(FORECASTS_SHARE):
         alone, rungs, untried = climb(recalibrated, context)

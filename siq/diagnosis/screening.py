@@ -102,6 +102,13 @@ class Probe:
             choices = [(*before, (name, float(place))) for before in choices for place in found]
         return [cls(candidate, shapes) for shapes in choices]
 
+    @classmethod
+    def along(cls, candidate: MechanismCandidate, fit: Fit, data: Measurements) -> list[Probe]:
+        """The same along the trajectories of a fit, with jumps of f spread as its integration asks for."""
+        substeps = max(fit.substeps, EDGE_SUBSTEPS)
+        spread = replace(candidate, model=spread_edges(candidate.model, data, fit.x, substeps=substeps))
+        return cls.all_of(spread, data, fit.model, fit.x)
+
     @property
     def recorded(self) -> bool:
         """Whether the recordings themselves show its shape.
@@ -523,9 +530,7 @@ def screen_all(
     budget.says(f"screening {len(candidates)} candidates")
     for candidate in candidates:
         try:
-            sharp = max(current.substeps, EDGE_SUBSTEPS)
-            spread = replace(candidate, model=spread_edges(candidate.model, data, current.x, substeps=sharp))
-            probes += Probe.all_of(spread, data, current.model, current.x)
+            probes += Probe.along(candidate, current, data)
         except NUMERICAL_ERRORS as error:
             untried[candidate.label] = NotFitted.of(candidate, error)
     ranked, failed = rank(current, data, probes, judge=by_likelihood, budget=budget)
