@@ -10,10 +10,12 @@ import scipy.stats
 
 from siq.diagnosis.dictionary import Mechanism, roles_of
 from siq.diagnosis.evidence import NotFitted
+from siq.diagnosis.forecasts import Horizon
 from siq.diagnosis.holdout import (
     HeldOutErrors,
     errors_left_out,
     first_better,
+    preferred_recalibration,
     simplest_of,
     simulated,
 )
@@ -62,7 +64,7 @@ def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigat
     budget.says("fitting the simulation's own parameters")
     with budget.exempt():
         recalibrated, least_squares = recalibrate(model, data, budget=budget)
-    named, recalibrations = None, tuple[Fit, ...]()
+    named, recalibrations = None, tuple[Horizon, ...]()
     # The steps of a sensor look like forces, too, and so like physics that explains them.
     if recalibrated.has_process_noise and (
         explained_by_quantisation(data, least_squares, roles, budget=budget) is None
@@ -171,6 +173,8 @@ class HeldOutRuns:
     ----------
     before, recalibrated, augmented
         Outputs ``(n, m)`` of the simulation as it is, with its parameters refitted, and with what was found.
+    recalibration
+        Of the recalibrated simulation: where no refit foresees parts left out better, that of the card.
     fit
         Of the augmented simulation that was run.
     errors
@@ -184,6 +188,7 @@ class HeldOutRuns:
     before: np.ndarray
     recalibrated: np.ndarray
     augmented: np.ndarray
+    recalibration: Fit
     fit: Fit
     errors: HeldOutErrors
     independent: bool = True
@@ -222,8 +227,12 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     # What fits best with process noise admitted need not be what runs best without.
     recalibrated = search.recalibrated
     if recalibrated.has_process_noise:
-        recalibrated = best_of(investigation.least_squares, recalibrated, *investigation.recalibrations, card)
-    plain = best_of(investigation.exact, search.fit, *investigation.finals)
+        refits = [(investigation.least_squares, learned)]
+        refits += [(each.fit, each.data) for each in investigation.recalibrations] or [
+            (recalibrated, learned)
+        ]
+        recalibrated = preferred_recalibration(card, refits, learned, noise=noise)
+    plain = best_of(investigation.exact, search.fit, *(each.fit for each in investigation.finals))
     choices = [(model, best_of(model.fit, model.exact)) for model in investigation.models]
     named = investigation.verdict.names
     judges = [place for place, label in enumerate(data.labels) if label not in study.tests]
@@ -279,6 +288,7 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         before=before,
         recalibrated=refitted,
         augmented=augmented,
+        recalibration=recalibrated,
         fit=fit,
         errors=HeldOutErrors.of(squares, noise_floor=floor),
         independent=not set(learned.labels) & set(data.labels),
