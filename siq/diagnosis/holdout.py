@@ -252,7 +252,7 @@ def errors_left_out(
 
 
 def _typically_better(before: tuple[float, ...], after: tuple[float, ...]) -> bool:
-    """Whether errors of blocks fall, not only in the one where a motion near a saddle point multiplies them."""
+    """Whether errors of blocks fall, and not only in one in which a saddle point multiplies them."""
     falls = np.log(np.maximum(before, np.finfo(float).tiny) / np.maximum(after, np.finfo(float).tiny))
     return bool(scipy.stats.ttest_1samp(falls, 0.0, alternative="greater").pvalue < CHANGE_BY_CHANCE) and (
         change_between(before, after) != "worse"

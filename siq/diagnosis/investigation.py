@@ -59,6 +59,8 @@ def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigat
     if study.generic if study.generic is not None else not roles.physical:
         monomials = generic_candidates(model, roles, degree=study.degree, named=candidates)
         candidates += [each for each in monomials if each.coordinate != "constant"]
+    if study.search.prior == "flat":
+        candidates = [replace(each, weight=1.0) for each in candidates]
     budget = budget or Budget()
     context = FitContext(model, data, roles, tuple(candidates), study, budget)
     budget.says("fitting the simulation's own parameters")

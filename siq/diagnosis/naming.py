@@ -286,11 +286,20 @@ def named_by_forecasts(
             fit = sharpened(fit, context.data, budget=context.budget)
     left = Remainder.of(context.data, alone[0].fit, fit, context.roles)
     search = Search(recalibrated, tuple(each.accepted for each in rungs), fit, (), untried=untried)
+    remarks = [
+        Remark(
+            "diagnosis.by_prior",
+            {"name": each.accepted.best.candidate.name, "odds": np.exp(each.flat_log_odds)},
+        )
+        for each in rungs
+        if each.flat_log_odds < context.study.search.least_log_odds
+    ]
+    if left.doubtful or fit.has_process_noise:
+        remarks.append(_remainder_remark(left, unnamed=True))
     decision = Investigation(
         context, search, left, MismatchVerdict.MISSING_PHYSICS, least_squares, convincing=True,
-        log_odds=tuple(each.log_odds for each in rungs), recalibrations=recalibrations,
-        remarks=(_remainder_remark(left, unnamed=True),) if left.doubtful or fit.has_process_noise else (),
-        finals=rungs[-1].horizons,
+        log_odds=tuple(each.log_odds for each in rungs), remarks=tuple(remarks),
+        recalibrations=recalibrations, finals=rungs[-1].horizons,
     )  # fmt: skip
     return _with_models(decision, search, context), recalibrations
 

@@ -233,6 +233,18 @@ def test_damping_is_named_beside_forces_that_last() -> None:
     assert c.value == pytest.approx(0.15, rel=0.3)
 
 
+def test_odds_with_a_flat_prior_are_those_of_mechanisms_that_are_alike() -> None:
+    context = context_of(pendulum(), recorded(0.15, 0.2), CLOSE)
+    alike = tuple(replace(each, weight=1.0) for each in context.candidates)
+    options = context.study.search.model_copy(update={"unnamed": 0.5})
+    study = context.study.model_copy(update={"search": options})
+    flat = first_rung(replace(context, candidates=alike, study=study))
+    assert flat is not None
+    assert flat.log_odds == pytest.approx(flat.flat_log_odds)
+    assert damped().flat_log_odds == pytest.approx(flat.log_odds, abs=0.05)
+    assert damped().log_odds > damped().flat_log_odds  # nearly everything that moves is damped
+
+
 def test_forces_that_last_have_no_name_in_the_dictionary() -> None:
     model, data = pendulum(), recorded(0.0, 0.2)
     alone, rungs, _ = climb(recalibrate(model, data)[0], context_of(model, data))
