@@ -254,6 +254,12 @@ class MechanismCandidate:
         pairs = zip(free, fit.standard_errors, strict=True)
         return not any(each.value < -2 * error for each, error in pairs if each.name in self.positive)
 
+    def idle(self, fit: Fit) -> bool:
+        """Whether an amplitude of a fit is zero within errors, so that this is a special case of itself."""
+        free = (fit.model.parameters[place] for place in fit.model.free)
+        pairs = zip(free, fit.standard_errors, strict=True)
+        return any(abs(each.value) < 2 * error for each, error in pairs if each.name in self.amplitudes)
+
     def repeats(self, found: MechanismCandidate) -> bool:
         """Whether it is what was found already: the same, or in another form at the same place.
 

@@ -123,7 +123,8 @@ def fit_with_process_noise_as_needed(
         model, data, begin, budget=budget, hopeless=MISSED, **options
     )
     chosen = _simpler_fit(loose, strict)
-    if chosen is loose and strict.converged and strict.model.edges:
+    far = chosen is loose and loose is not None and _missed_without(loose, data) > MISSED
+    if chosen is loose and not far and strict.converged and strict.model.edges:
         chosen = _simpler_fit(loose, sharpened(strict, data, budget=budget))
     return chosen
 
@@ -199,10 +200,11 @@ def fit_with_and_without_process_noise(
             model if of is None else of.model, data, begin=at[data.first[:-1]], noise=still, **same
         )
 
+    far = loose is not None and _missed_without(loose, data) > hopeless
     # Where f jumps, steps of all samples at once go to and fro.
-    ways = (as_trajectories, at_all_samples) if jumps else (at_all_samples, as_trajectories)
+    ways = (as_trajectories, at_all_samples) if jumps and not far else (at_all_samples, as_trajectories)
     strict = ways[0]()
-    if not (strict.converged or (loose is not None and _missed_without(loose, data) > hopeless)):
+    if not (strict.converged or far):
         strict = preferred_fit(strict, ways[1]())
     return loose, _with_insignificant_dropped(loose, strict, data)
 
