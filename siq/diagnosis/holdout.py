@@ -16,18 +16,21 @@ import itertools
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import scipy.stats
 
+from siq.diagnosis.dictionary import Roles
+from siq.diagnosis.evidence import correlation_time_of, residuals
 from siq.diagnosis.mechanisms import MechanismCandidate
+from siq.diagnosis.residual_structure import Remainder
 from siq.errors import NumericalFailure
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import fit_with_process_noise_as_needed
-from siq.inference.trajectories import free_run, squared_errors
+from siq.inference.trajectories import free_run, scored_rows, squared_errors
 
 LOGGER = logging.getLogger(__name__)
 Change = Literal["better", "same", "worse", "unknown"]
@@ -71,6 +74,12 @@ class HeldOutErrors:
         With what has a name only, where something without a name describes the rest.
     squares
         Mean squared errors of blocks of samples, by simulation: what changes are told by.
+    rungs
+        With the first mechanism that is named, with the first two, and so on.
+    floor
+        What measurement noise and the error of the model amount to in a free run (`spread_of_free_runs`).
+    spread, unit
+        Of a single output: what errors of 1 amount to; None where there are several, or it has no unit.
     """
 
     before: float | None = None
@@ -80,9 +89,15 @@ class HeldOutErrors:
     values: int = 0
     named: float | None = None
     squares: Mapping[str, tuple[float, ...]] = field(default_factory=dict, repr=False)
+    rungs: tuple[float | None, ...] = ()
+    floor: float | None = None
+    spread: float | None = None
+    unit: str = "1"
 
     @classmethod
-    def of(cls, runs: Mapping[str, np.ndarray | None], *, noise_floor: float | None = None) -> HeldOutErrors:
+    def of(
+        cls, runs: Mapping[str, np.ndarray | None], *, noise_floor: float | None = None, **further: Any
+    ) -> HeldOutErrors:
         """From normalised squared errors of the same values, shape ``(values,)``, by the names above.
 
         They are None where the simulation ran away (`siq.inference.trajectories.squared_errors`).
@@ -93,6 +108,7 @@ class HeldOutErrors:
             noise_floor=noise_floor,
             values=max(map(len, known.values()), default=0),
             squares={name: in_blocks(each) for name, each in known.items()},
+            **further,
         )
 
     @property
@@ -114,6 +130,19 @@ class HeldOutErrors:
         names = (self.better_without if each == "without" else each for each in (first, second))
         return change_between(*map(self.squares.get, names))
 
+    @property
+    def share_gained(self) -> float:
+        """What was found gains, as a share of what could be gained down to the floor.
+
+        A simulation that is off by more than the spread is no better than the recordings' mean.
+        """
+        floor = self.noise_floor if self.floor is None else self.floor
+        if self.augmented is None or floor is None:
+            return 0.0
+        without = self.error("without")
+        before = 1.0 if without is None else min(without, 1.0)
+        return (before - self.augmented) / max(before - floor, 1e-300)
+
     def at_noise(self, run: Run) -> bool:
         """Whether an error is that of measurement noise alone.
 
@@ -124,6 +153,28 @@ class HeldOutErrors:
             return False
         tolerance = CONFIDENCE_95 / float(np.sqrt(2 * self.values)) if self.values else 0.0
         return error * (1 - tolerance) <= self.noise_floor
+
+
+def spread_of_free_runs(fit: Fit, learned: Measurements, roles: Roles) -> np.ndarray:
+    """Variance of what free runs of a fit are off by, as the noises of the fit foresee it, shape ``(m,)``.
+
+    The error of the model acts as a random force whose intensity over long times is that from one sample to
+    the next, times its correlation time τ in samples. What a function of a coordinate finds in it is no
+    random force, and not counted.
+    """
+    white, _, left = residuals(fit, learned)
+    correlated = correlation_time_of(left, white.recording, outputs=len(fit.model.outputs))
+    random = 1 - Remainder.of(learned, fit, fit, roles).after.share
+    scored = scored_rows(learned)
+    unseen = np.where(scored[:, None], np.nan, fit.linearisation.residual)
+    run = replace(fit.linearisation, residual=unseen).filtered(
+        learned.first, learned.step, fit.noise.scaled(correlated * random),
+        begin_covariance=np.diag(np.ptp(fit.x, axis=0) ** 2), kept=True,
+    )  # fmt: skip
+    measured = fit.linearisation.measured
+    return np.asarray(
+        np.einsum("nmi,nij,nmj->nm", measured, run[7], measured)[scored].mean(axis=0) + fit.noise.measurement
+    )
 
 
 def change_between(first: tuple[float, ...] | None, second: tuple[float, ...] | None) -> Change:

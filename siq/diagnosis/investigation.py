@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.stats
 
-from siq.diagnosis.dictionary import Mechanism, roles_of
+from siq.diagnosis.dictionary import Mechanism, roles_of, units_of
 from siq.diagnosis.evidence import NotFitted
 from siq.diagnosis.holdout import (
     HeldOutErrors,
@@ -16,6 +16,7 @@ from siq.diagnosis.holdout import (
     first_better,
     simplest_of,
     simulated,
+    spread_of_free_runs,
 )
 from siq.diagnosis.mechanisms import candidates_of, generic_candidates
 from siq.diagnosis.naming import Investigation, decide_naming, named_by_forecasts
@@ -35,6 +36,7 @@ from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, with_expectations
 from siq.inference.recalibration import covariance_with_unknown_process_noise, recalibrate
 from siq.inference.trajectories import scored_rows, squared_errors
+from siq.numerics.randomness import positive
 from siq.remarks import Remark
 from siq.systems.dynamics import Dynamics
 
@@ -271,16 +273,30 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         "augmented": squared_errors(augmented, data),
         "named": errors_of(plain, data) if named and adopted is not None else None,
     }
-    # What a fit leaves may be more than noise; the one that leaves least is nearest to it.
-    spread = np.nanvar(data.outputs[scored_rows(data)], axis=0)
-    least = np.minimum(search.fit.noise.measurement, fit.noise.measurement)
-    floor = float(np.sqrt(np.mean(least / np.where(spread > 0, spread, 1.0))))
+    # What a fit leaves may be more than noise; the one that leaves least is nearest to it. Process noise takes
+    # a part of the sensor's noise over.
+    spread = positive(np.nanvar(data.outputs[scored_rows(data)], axis=0))
+    fits = [search.fit, fit]
+    still = [each for each in fits if not each.has_process_noise] or fits
+    least = np.min([learned.roughness, *(each.noise.measurement for each in still)], axis=0)
+    noise_floor, floor = float(np.sqrt(np.mean(least / spread))), None
+    if described is not None and fit.has_process_noise:
+        whole = spread_of_free_runs(fit, learned, investigation.context.roles)
+        floor = float(np.sqrt(np.mean(whole / spread)))
+    unit = units_of(fit.model).get(str(fit.model.outputs[0][1]), "1")
+    rungs = [errors_of(each.best.fit, data) for each in search.found[:-1]] if named else []
     return HeldOutRuns(
         before=before,
         recalibrated=refitted,
         augmented=augmented,
         fit=fit,
-        errors=HeldOutErrors.of(squares, noise_floor=floor),
+        errors=HeldOutErrors.of(
+            squares,
+            noise_floor=noise_floor,
+            floor=floor,
+            rungs=tuple(None if each is None else float(np.sqrt(each.mean())) for each in rungs),
+            **({"spread": float(np.sqrt(spread[0])), "unit": unit} if len(spread) == 1 and unit != "1" else {}),
+        ),
         independent=not set(learned.labels) & set(data.labels),
         described=described,
     )

@@ -14,16 +14,23 @@ is linear in the other, so that they are worked out in turn.
 Along the trajectories of a fit everything is linear. The likelihood of a smooth function, averaged over
 everything that it could be, tells its lengths and its size: one that is too rough could have been too much
 else, and one that is too smooth explains too little (MacKay, Neural Computation 4, 415 (1992)).
+
+**Shapes.** A function that is in proportion to its coordinate, saturates or repeats has a name for that: the
+simplest formula that the recordings allow in its place, by least squares in what they tell of its values.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
+import scipy.optimize
+import scipy.stats
 import sympy
 from scipy.spatial.distance import cdist
 
@@ -405,17 +412,41 @@ class Smoothness:
                 place.coordinates, self.courses, shares, deviation=self.deviation, weight=weight
             )
             return SmoothFunction(place, (bumps,), np.zeros(bumps.width))
-        by_value = self.fine.heights_of(self.fine.heights_of(self.gram).T)
+        gram, overlap = self._by_value
         return _product_of(
             place,
             self.courses,
             tuple(times * share for share in LENGTH_SCALES),
             points=self.fine.centres,
-            gram=(by_value + by_value.T) / (2 * self.noise),
-            overlap=self.fine.heights_of(self.overlap) / self.noise,
+            gram=gram,
+            overlap=overlap,
             deviation=self.deviation,
             weight=weight,
         )
+
+
+    @property
+    def _by_value(self) -> tuple[np.ndarray, np.ndarray]:
+        """Gram matrix and overlap of values at the finest bumps, in units of noise."""
+        gram = self.fine.heights_of(self.fine.heights_of(self.gram).T)
+        return (gram + gram.T) / (2 * self.noise), self.fine.heights_of(self.overlap) / self.noise
+
+    @property
+    def told(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+        """Places of the finest bumps, and what is told of values there; see `fitting_forms`.
+
+        The normal equations of values f are ``G f = b``. With the covariance ``K = L Lᵀ`` that is expected of
+        the function, and the eigenvalues λ and eigenvectors U of ``Lᵀ G L``, the weights are ``(1 + λ)^-½ Uᵀ
+        Lᵀ G``, and the degrees of freedom ``Σ λ/(1 + λ)``: a difference counts as far as such a function
+        could be it.
+        """
+        (gram, overlap), (shares, ranges) = self._by_value, (self.shares, np.ptp(self.courses, axis=1))
+        root = self.deviation * _triangle_of(self.fine.centres, np.array(shares) * ranges)
+        seen, vectors = np.linalg.eigh(root.T @ gram @ root)
+        seen = np.maximum(seen, 0.0)
+        turned = (vectors / np.sqrt(1 + seen)).T @ root.T
+        freedom = float((seen / (1 + seen)).sum())
+        return self.fine.centres[:, 0], turned @ gram, turned @ overlap, freedom
 
 
 def _without(white: Whitened, fit: Fit, known: FittedCandidate | None) -> tuple[Whitened, int]:
@@ -429,3 +460,113 @@ def _without(white: Whitened, fit: Fit, known: FittedCandidate | None) -> tuple[
     others = np.delete(white.columns, mine, axis=1)
     innovations = white.innovations + white.columns[:, linear] @ values
     return replace(white, innovations=innovations, columns=others), len(names) - len(mine)
+
+
+class _Form(NamedTuple):
+    """A formula of one coordinate z, linear in all of its coefficients but at most one, c.
+
+    `formula` has the names of the coefficients and of z in braces; `columns` are what units of the linear
+    ones are along z, for a value of c. The unit of the first is divided by a `power` of that of z. Values of
+    c that are tried are multiples of the range, or places within it.
+    """
+
+    name: str
+    formula: str
+    columns: Callable[[np.ndarray, float], list[np.ndarray]]
+    power: int = 0
+    tried: tuple[float, ...] = ()
+    within: bool = False
+    positive: tuple[int, ...] = ()  #: columns whose coefficients may not be negative
+
+
+def _forms() -> Iterator[_Form]:
+    """The shapes that have names, each alone and above a constant."""
+    inside, scales = tuple(np.linspace(0, 1, 26)[1:-1]), tuple(np.geomspace(1 / 16, 2, 21))
+    periods = tuple(1 / np.linspace(1, 8, 57))  # a whole one at least has to be seen
+    alone = (
+        _Form("constant", "{a}", lambda z, c: [np.ones_like(z)]),
+        _Form("proportional", "{a}*{z}", lambda z, c: [z], 1),
+        _Form("square", "{a}*{z}**2", lambda z, c: [z**2], 2),
+        _Form("signed square", "{a}*{z}*abs({z})", lambda z, c: [z * np.abs(z)], 2),
+        _Form("cube", "{a}*{z}**3", lambda z, c: [z**3], 3),
+        _Form("fourth power", "{a}*{z}**4", lambda z, c: [z**4], 4),
+        _Form("exponential", "{a}*exp({z}/{c})", lambda z, c: [np.exp(z / c)], 0, scales),
+        _Form("exponential", "{a}*exp(-{z}/{c})", lambda z, c: [np.exp(-z / c)], 0, scales),
+        _Form("saturating", "{a}*{z}/({c} + abs({z}))", lambda z, c: [z / (c + np.abs(z))], 0, scales),
+        _Form("saturating", "{a}*tanh({z}/{c})", lambda z, c: [np.tanh(z / c)], 0, scales),
+        _Form("threshold", "{a}*max({z} - {c}, 0)", lambda z, c: [np.maximum(z - c, 0)], 1, inside, True),
+        _Form("threshold", "{a}*max({c} - {z}, 0)", lambda z, c: [np.maximum(c - z, 0)], 1, inside, True),
+        _Form(
+            "periodic", "{a}*sin(2*pi*{z}/{c}) + {b}*cos(2*pi*{z}/{c})",
+            lambda z, c: [np.sin(2 * np.pi * z / c), np.cos(2 * np.pi * z / c)], 0, periods,
+        ),
+    )  # fmt: skip
+    yield from alone
+    for each in alone[1:]:
+        raised = lambda z, c, own=each.columns: [*own(z, c), np.ones_like(z)]  # noqa: E731
+        name = "straight line" if each.name == "proportional" else each.name
+        yield each._replace(name=name, formula="{d} + " + each.formula, columns=raised)
+
+
+FORMS = tuple(_forms())
+FITS = 0.05  # p-value from which on a formula is all that the recordings tell of a function
+
+
+def fitting_forms(
+    at: np.ndarray, weights: np.ndarray, goal: np.ndarray, freedom: float, forms: Sequence[_Form] = FORMS
+) -> list[tuple[_Form, np.ndarray, np.ndarray]]:
+    """The simplest formulas that a function may be, the nearest first.
+
+    A formula with values f may be the function where ``|goal - weights @ f|²`` is as large as chance makes
+    it: χ² of so many degrees of freedom, less its coefficients.
+
+    Parameters
+    ----------
+    at
+        Places, shape ``(k,)``.
+    weights, goal, freedom
+        What is told of values there (`Smoothness.told`), such as ``C^-½`` and ``C^-½ v`` of values v with the
+        covariance C; shapes ``(r, k)`` and ``(r,)``.
+    forms
+        Those that are asked.
+
+    Returns
+    -------
+    list of (form, numpy.ndarray, numpy.ndarray)
+        Of those that fit with as few coefficients as any; with these, the linear ones first and then c, and
+        their covariance. Empty where none fits.
+    """
+    width = float(np.ptp(at))
+
+    def solved(form: _Form, c: float) -> tuple[float, np.ndarray, np.ndarray]:
+        """χ² at its best, linear coefficients, and the form, weighted."""
+        with np.errstate(all="ignore"):
+            columns = weights @ np.stack(form.columns(at, c), axis=1)
+        if not np.isfinite(columns).all():
+            return np.inf, np.zeros(columns.shape[1]), columns
+        scale = np.sqrt((columns**2).sum(axis=0))
+        scale = np.where(scale > 0, scale, 1.0)
+        found = np.linalg.lstsq(columns / scale, goal, rcond=1e-12)[0] / scale
+        return float(((goal - columns @ found) ** 2).sum()), found, columns
+
+    fitting: list[tuple[int, float, _Form, np.ndarray, np.ndarray]] = []
+    for form in forms:
+        places, c = (at.min() if form.within else 0.0) + width * np.array(form.tried), np.nan
+        if len(places):
+            best = int(np.argmin([solved(form, one)[0] for one in places]))
+            near = np.sort(places[max(best - 1, 0) : best + 2])
+            c = scipy.optimize.minimize_scalar(
+                lambda one, form=form: solved(form, one)[0], bounds=(near[0], near[-1]), method="bounded"
+            ).x
+        total, found, columns = solved(form, c)
+        if (found[list(form.positive)] < 0).any():
+            continue
+        if len(places):
+            step = 1e-4 * width
+            bent = (solved(form, c + step)[2] - solved(form, c - step)[2]) / (2 * step) @ found
+            columns, found = np.column_stack([columns, bent]), np.append(found, c)
+        if scipy.stats.chi2.sf(total, max(freedom - len(found), 1.0)) >= FITS:
+            fitting.append((len(found), total, form, found, np.linalg.pinv(columns.T @ columns)))
+    fewest = min((count for count, *_ in fitting), default=0)
+    ranked = sorted((each for each in fitting if each[0] == fewest), key=lambda each: each[1])
+    return [(form, found, errors) for _, _, form, found, errors in ranked]

@@ -13,11 +13,13 @@ import numpy as np
 import sympy
 
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
-from siq.diagnosis.evidence import BUDGET_SPENT, FittedCandidate, log_evidences, residuals
+from siq.diagnosis.evidence import BUDGET_SPENT, NUMERICAL_ERRORS, FittedCandidate, log_evidences, residuals
 from siq.diagnosis.investigation import HeldOutRuns
-from siq.diagnosis.mechanisms import PROCESS_NOISE, SURFACE
+from siq.diagnosis.mechanisms import PROCESS_NOISE, SURFACE, fresh_names, places_of
 from siq.diagnosis.naming import Investigation
 from siq.diagnosis.residual_structure import Structure
+from siq.diagnosis.search import FitContext
+from siq.diagnosis.smooth_functions import FORMS, Smoothness, fitting_forms
 from siq.diagnosis.statement import (
     Alternative,
     DescribedCurve,
@@ -32,6 +34,7 @@ from siq.diagnosis.statement import (
     UpperBound,
 )
 from siq.diagnosis.study import MismatchVerdict
+from siq.diagnosis.terms import Place
 from siq.diagnosis.unnamed_models import AugmentedModel
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
@@ -56,15 +59,27 @@ def statement_of_failure(reason: str) -> Statement:
 
 def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
     """What follows from an investigation, and from the runs of recordings held out."""
-    search, verdict = investigation.search, investigation.verdict
-    described = shown.described
+    search, verdict, described = investigation.search, investigation.verdict, shown.described
     final = investigation.final if described is None else shown.fit
-    found = _found_mechanisms(investigation, final if verdict.names else search.fit)
-    names = tuple(each.best.candidate.label for each in search.found) if verdict.names else ()
+    named = verdict.names
+    found = _found_mechanisms(investigation, final if named else search.fit)
+    names = tuple(each.best.candidate.label for each in search.found) if named else ()
     parts = () if described is None else described.parts
     labels = [each.candidate.label for each in parts]
     errors = _standard_errors(final)
-    remarks = list(investigation.remarks)
+    remarks, errors_seen = list(investigation.remarks), shown.errors
+    if verdict is MismatchVerdict.UNEXPLAINED and described is not None:
+        # A model that leaves hardly more than noise is an explanation, though it has no name.
+        if errors_seen.change("without", "augmented") == "better" and errors_seen.share_gained >= NEARLY_ALL:
+            verdict = MismatchVerdict.MISSING_PHYSICS
+    elif (
+        verdict is MismatchVerdict.PARAMETER_SHIFT
+        and errors_seen.change("before", "recalibrated") != "better"
+    ):
+        # Recordings held out say that other parameters mend nothing, be it that there is nothing to be seen.
+        seen = not errors_seen.at_noise("before")
+        verdict = MismatchVerdict.UNEXPLAINED if seen else MismatchVerdict.NO_MISMATCH
+        remarks.append(Remark("diagnosis.shift_mends_nothing", {"seen": seen}))
     if investigation.account.partial:
         untried = sum(each.remark == BUDGET_SPENT for each in search.untried)
         stopped_by = investigation.account.stopped_by
@@ -73,7 +88,7 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
         remarks.append(Remark("diagnosis.one_recording"))
     return Statement(
         verdict=verdict,
-        mechanisms=found if verdict.names else (),
+        mechanisms=found if investigation.verdict.names else (),
         description=Description(
             share_described=investigation.remainder.share if found else 0.0,
             by=found,
@@ -82,12 +97,13 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
             too_faint=investigation.too_faint,
             misleading=investigation.withdrawn,
         )
-        if verdict is MismatchVerdict.UNEXPLAINED
+        if verdict.mismatch and not investigation.verdict.names
         else None,
         described=tuple(
-            _stated_function(part, final, (*names, *labels[:place])) for place, part in enumerate(parts)
+            _stated_function(part, final, (*names, *labels[:place]), investigation.context)
+            for place, part in enumerate(parts)
         ),
-        location=_locate(investigation, described) if verdict.mismatch else None,
+        location=_locate(investigation, described) if investigation.verdict.mismatch else None,
         recalibration={
             entry.name: Recalibrated(
                 entry.value, float(final.model.values[place]), errors[entry.name], entry.unit
@@ -95,7 +111,7 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
             for place, entry in enumerate(investigation.context.model.parameters)
             if entry.name in errors
         },
-        errors=shown.errors,
+        errors=errors_seen,
         excluded={} if verdict.mismatch else _excluded(investigation),
         explanations=_explanations(investigation, names),
         remarks=tuple(remarks),
@@ -220,13 +236,17 @@ def _stated(trial: FittedCandidate, fit: Fit, *, log_odds: float | None = None, 
     )
 
 
-def _stated_function(part: FittedCandidate, fit: Fit, beside: tuple[str, ...]) -> StatedTerm:
+def _stated_function(
+    part: FittedCandidate, fit: Fit, beside: tuple[str, ...], context: FitContext
+) -> StatedTerm:
     """A part of the model of what has no name, with its curve or surface and their standard errors."""
     candidate = part.candidate
     place, smooth = candidate.place, candidate.smooth
     known = {entry.name: entry.value for entry in fit.model.parameters}
+    errors = _standard_errors(fit)
     amplitudes = np.array([known[name] for name in candidate.amplitudes])
     curve = surface = None
+    shape: dict[str, Any] = {}
     at: list[np.ndarray] = []
     if smooth is not None:
         at = [np.linspace(lower, upper, GRID_POINTS) for lower, upper in smooth.limits.T]
@@ -242,10 +262,10 @@ def _stated_function(part: FittedCandidate, fit: Fit, beside: tuple[str, ...]) -
         weights = np.stack([np.broadcast_to(each, at[0].shape) for each in columns], axis=1).astype(float)
         values = weights @ amplitudes
     if place is not None and at:
-        rows = [list(_standard_errors(fit)).index(name) for name in candidate.amplitudes]
+        rows = [list(errors).index(name) for name in candidate.amplitudes]
         variances = np.einsum("kc,cd,kd->k", weights, fit.covariance[np.ix_(rows, rows)], weights)
-        shape, deviations = [len(each) for each in at], np.sqrt(np.maximum(variances, 0.0))
-        shaped = [each.reshape(shape).tolist() for each in (values, deviations)]
+        sides, deviations = [len(each) for each in at], np.sqrt(np.maximum(variances, 0.0))
+        shaped = [each.reshape(sides).tolist() for each in (values, deviations)]
         if candidate.kind == SURFACE:
             grid = (tuple(at[0].tolist()), tuple(at[1].tolist()))
             surface = DescribedSurface(
@@ -253,6 +273,11 @@ def _stated_function(part: FittedCandidate, fit: Fit, beside: tuple[str, ...]) -
             )
         else:
             curve = DescribedCurve(place.words[0], tuple(at[0].tolist()), *map(tuple, shaped))
+            shape = _shape_of(part, place, fit, context) or _course_of(values, deviations)
+    elif candidate.begins:  # a hidden state
+        name = candidate.shapes[0]
+        time = Estimate(known[name], errors.get(name), fit.model.time_unit)
+        shape = {"shape": "late" if len(candidate.shapes) == 1 else "ringing", "sizes": {name: time}}
     measured = [name for name, _ in candidate.changes if name in fit.model.output_names]
     return _stated(
         part,
@@ -263,7 +288,79 @@ def _stated_function(part: FittedCandidate, fit: Fit, beside: tuple[str, ...]) -
         curve=curve,
         surface=surface,
         beside=beside,
+        **shape,
     )
+
+
+def _course_of(values: np.ndarray, deviations: np.ndarray) -> dict[str, Any]:
+    """Whether a curve rises or falls all the way, as far as its errors tell."""
+    ahead = np.subtract.outer(values, values)[np.tril_indices(len(values), -1)]
+    errors = np.hypot.outer(deviations, deviations)[np.tril_indices(len(values), -1)]
+    sure = np.sign(ahead[np.abs(ahead) > VISIBLE_ERRORS * errors])
+    same = len(sure) and (sure == sure[0]).all()
+    return {"shape": ("rising" if sure[0] > 0 else "falling") if same else ""}
+
+
+def _shape_of(part: FittedCandidate, place: Place, fit: Fit, context: FitContext) -> dict[str, Any]:
+    """The simplest formula that a curve may be, and the mechanism that is such a function."""
+    try:
+        asked = Smoothness.of(fit, context.data, place, known=part)
+    except NUMERICAL_ERRORS:
+        asked = None
+    fits = [] if asked is None else fitting_forms(*asked.told)
+    if asked is None or not fits:
+        return {}
+    form, found, covariances = fits[0]
+    word, extra = place.words[0], len(place.words) - 1
+    letters = [letter for letter in "abdc" if f"{{{letter}}}" in form.formula]
+    names = dict(zip(letters, fresh_names("s", len(letters), fit.model.names), strict=True))
+    whole, along = place.unit(fit.model, 0, extra), units_of(fit.model).get(word, "1")
+    units = {"a": place.unit(fit.model, form.power, extra), "c": along}
+    sizes = {
+        names[letter]: Estimate(float(value), float(np.sqrt(variance)), units.get(letter, whole))
+        for letter, value, variance in zip(letters, found, np.diag(covariances), strict=True)
+    }
+    known = fitting_forms(*asked.told, _known_forms(place, fit, context))
+    return {
+        "shape": form.name,
+        "formula": form.formula.format(z=word, **names),
+        "sizes": sizes,
+        "like": known[0][0].name if known else "",
+    }
+
+
+def _known_forms(place: Place, fit: Fit, context: FitContext) -> list[Any]:
+    """Mechanisms that are functions of a place's coordinate in its equations, as forms."""
+    found, model = [], context.model
+    values = {symbol(each.name): sympy.Float(each.value, 17) for each in fit.model.parameters}
+    for each in context.candidates:
+        searches = each.searches
+        if len(each.shapes) > 1 or each.begins or each.changes[0][0] not in dict(place.equations):
+            continue
+        (name, factor), *further = place.equations
+        if further or each.model.dimension > model.dimension or each.model.outputs != model.outputs:
+            continue
+        changes = [new - old for new, old in zip(each.model.equations, model.equations, strict=True)]
+        change = changes.pop(model.states.index(name))
+        own = [symbol(one) for one in each.new]
+        term = _in_coordinate(sympy.simplify(change / factor), place.coordinates[0])
+        term = term.xreplace({key: value for key, value in values.items() if key not in own})
+        if any(one != 0 for one in changes) or not term.free_symbols <= {COORDINATE, *own}:
+            continue
+        slopes = [term.diff(symbol(one)) for one in each.amplitudes]
+        compiled = compile_values(slopes, [COORDINATE, *map(symbol, each.shapes)], common=False)
+        tried = places_of(searches[0], context.data, model, fit.x) if searches else ()
+        found.append(
+            FORMS[0]._replace(
+                name=each.name,
+                columns=lambda z, c, compiled=compiled, shapes=len(each.shapes): [
+                    np.broadcast_to(one, z.shape) for one in compiled(z, *[c] * shapes)
+                ],
+                tried=tuple(np.asarray(tried) / np.ptp(place.knots)) if searches else (),
+                positive=tuple(k for k, one in enumerate(each.amplitudes) if one in each.positive),
+            )
+        )
+    return found
 
 
 def _in_coordinate(term: sympy.Expr, coordinate: sympy.Expr) -> sympy.Expr:
