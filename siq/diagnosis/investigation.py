@@ -273,8 +273,8 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         "augmented": squared_errors(augmented, data),
         "named": errors_of(plain, data) if named and adopted is not None else None,
     }
-    # What a fit leaves may be more than noise; the one that leaves least is nearest to it. Process noise takes
-    # a part of the sensor's noise over.
+    # What a fit leaves may be more than noise; the one that leaves least is nearest to it. Where there is
+    # process noise, that takes a part of the sensor's noise over.
     spread = positive(np.nanvar(data.outputs[scored_rows(data)], axis=0))
     fits = [search.fit, fit]
     still = [each for each in fits if not each.has_process_noise] or fits
@@ -283,7 +283,7 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     if described is not None and fit.has_process_noise:
         whole = spread_of_free_runs(fit, learned, investigation.context.roles)
         floor = float(np.sqrt(np.mean(whole / spread)))
-    unit = units_of(fit.model).get(str(fit.model.outputs[0][1]), "1")
+    unit = units_of(fit.model).get(str(fit.model.outputs[0][1]), "1") if len(spread) == 1 else "1"
     rungs = [errors_of(each.best.fit, data) for each in search.found[:-1]] if named else []
     return HeldOutRuns(
         before=before,
@@ -295,7 +295,8 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
             noise_floor=noise_floor,
             floor=floor,
             rungs=tuple(None if each is None else float(np.sqrt(each.mean())) for each in rungs),
-            **({"spread": float(np.sqrt(spread[0])), "unit": unit} if len(spread) == 1 and unit != "1" else {}),
+            spread=None if unit == "1" else float(np.sqrt(spread[0])),
+            unit=unit,
         ),
         independent=not set(learned.labels) & set(data.labels),
         described=described,

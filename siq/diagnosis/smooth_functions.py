@@ -424,7 +424,6 @@ class Smoothness:
             weight=weight,
         )
 
-
     @property
     def _by_value(self) -> tuple[np.ndarray, np.ndarray]:
         """Gram matrix and overlap of values at the finest bumps, in units of noise."""

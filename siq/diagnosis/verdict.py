@@ -353,8 +353,8 @@ def _known_forms(place: Place, fit: Fit, context: FitContext) -> list[Any]:
         found.append(
             FORMS[0]._replace(
                 name=each.name,
-                columns=lambda z, c, compiled=compiled, shapes=len(each.shapes): [
-                    np.broadcast_to(one, z.shape) for one in compiled(z, *[c] * shapes)
+                columns=lambda z, c, compiled=compiled, shapes=each.shapes: [
+                    np.broadcast_to(one, z.shape) for one in compiled(z, *[c for _ in shapes])
                 ],
                 tried=tuple(np.asarray(tried) / np.ptp(place.knots)) if searches else (),
                 positive=tuple(k for k, one in enumerate(each.amplitudes) if one in each.positive),
