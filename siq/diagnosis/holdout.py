@@ -103,8 +103,8 @@ class HeldOutErrors:
         They are None where the simulation ran away (`siq.inference.trajectories.squared_errors`).
         """
         known = {name: each for name, each in runs.items() if each is not None}
+        further |= {name: float(np.sqrt(each.mean())) for name, each in known.items()}
         return cls(
-            **{name: float(np.sqrt(each.mean())) for name, each in known.items()},
             noise_floor=noise_floor,
             values=max(map(len, known.values()), default=0),
             squares={name: in_blocks(each) for name, each in known.items()},

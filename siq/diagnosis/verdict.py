@@ -349,13 +349,17 @@ def _known_forms(place: Place, fit: Fit, context: FitContext) -> list[Any]:
             continue
         slopes = [term.diff(symbol(one)) for one in each.amplitudes]
         compiled = compile_values(slopes, [COORDINATE, *map(symbol, each.shapes)], common=False)
+
+        def columns(
+            z: np.ndarray, c: float, of: Any = compiled, shapes: Any = each.shapes
+        ) -> list[np.ndarray]:
+            return [np.broadcast_to(one, z.shape) for one in of(z, *[c for _ in shapes])]
+
         tried = places_of(searches[0], context.data, model, fit.x) if searches else ()
         found.append(
             FORMS[0]._replace(
                 name=each.name,
-                columns=lambda z, c, compiled=compiled, shapes=each.shapes: [
-                    np.broadcast_to(one, z.shape) for one in compiled(z, *[c for _ in shapes])
-                ],
+                columns=columns,
                 tried=tuple(np.asarray(tried) / np.ptp(place.knots)) if searches else (),
                 positive=tuple(k for k, one in enumerate(each.amplitudes) if one in each.positive),
             )

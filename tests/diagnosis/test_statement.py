@@ -240,7 +240,8 @@ def test_a_model_without_a_name_is_said_with_its_gain_or_that_nothing_was_gained
     ("shape", "words"),
     [
         ("proportional", "in proportion"), ("straight line", "along a straight line"),
-        ("square", "like its square"), ("cube", "like its cube"), ("saturating", "saturating over 2.00 ± 0.10 m"),
+        ("square", "like its square"), ("cube", "like its cube"),
+        ("saturating", "saturating over 2.00 ± 0.10 m"),
         ("threshold", "with a threshold at 2.00 ± 0.10 m"), ("periodic", "periodic over 2.00 ± 0.10 m"),
         ("exponential", "exponential over 2.00 ± 0.10 m"), ("rising", "rising"), ("falling", "falling"),
         ("late", "which is late by 2.00 ± 0.10 m"), ("constant", "the same everywhere"),

@@ -153,7 +153,7 @@ def test_page_says_what_where_how_sure_and_what_else(models):
     page = page_of(models)
     for part in (
         "missing physics",
-        "Cubic stiffness is missing in the equation of v",
+        "Cubic stiffness (or quintic stiffness, which explains the recordings as well) is missing in the",
         "0.250 ± 0.010\u00a01/(mm²·s²)",
         "Duffing",
         "cannot tell cubic stiffness from quintic stiffness",
