@@ -407,8 +407,8 @@ def test_a_model_at_the_floor_is_missing_physics_with_its_formula(models):
     shown = findings(models, verdict=said)
     sentence = shown.statement.sentence.replace("\u00a0", " ")
     assert sentence.startswith(
-        "An effect of x is missing in the equation of v, exponential over 0.500 ± 0.010 mm, as of cubic"
-        " stiffness. With it, the error"
+        "An effect of x is missing in the equation of v, exponential over 0.500 ± 0.010 mm, as cubic"
+        " stiffness would have. With it, the error"
     )
     assert "As a formula: s_1*exp(x/s_2), s_1 = 2.00 ± 0.10 mm/s²" in sentence
     page = mismatch_page(shown, title="t", commands=())
