@@ -22,10 +22,10 @@ simplest formula that the recordings allow in its place, by least squares in wha
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -42,7 +42,9 @@ from siq.errors import NumericalFailure
 from siq.inference.kalman_filter import Whitened
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
+from siq.numerics.randomness import positive
 from siq.systems.dynamics import Dynamics, JointExpectation, symbol
+from siq.systems.formulas import compile_values
 
 LENGTH_SCALES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # of the range; beyond, a function is a parabola
 LARGEST_LINEARISATION = 40_000_000  # numbers held at a time, which is a third of a gigabyte
@@ -461,60 +463,52 @@ def _without(white: Whitened, fit: Fit, known: FittedCandidate | None) -> tuple[
     return replace(white, innovations=innovations, columns=others), len(names) - len(mine)
 
 
-class _Form(NamedTuple):
-    """A formula of one coordinate z, linear in all of its coefficients but at most one, c.
+Z, A, B, D, C = sympy.symbols("z a b d c", real=True)
+THRESHOLD = "threshold"  # whose c is a place, and no length
+FITS = 0.05  # p-value from which on a formula is all that the recordings tell of a function
 
-    `formula` has the names of the coefficients and of z in braces; `columns` are what units of the linear
-    ones are along z, for a value of c. The unit of the first is divided by a `power` of that of z. Values of
-    c that are tried are multiples of the range, or places within it.
+
+class _Form(NamedTuple):
+    """A formula of a coordinate z, linear in a, b and d. Values of c are tried, as shares of the range of z.
+
+    The unit of a is divided by a power of that of z.
     """
 
     name: str
-    formula: str
-    columns: Callable[[np.ndarray, float], list[np.ndarray]]
+    formula: sympy.Expr
     power: int = 0
     tried: tuple[float, ...] = ()
-    within: bool = False
-    positive: tuple[int, ...] = ()  #: columns whose coefficients may not be negative
+    positive: tuple[sympy.Symbol, ...] = ()  #: coefficients that may not be negative
 
 
 def _forms() -> Iterator[_Form]:
     """The shapes that have names, each alone and above a constant."""
     inside, scales = tuple(np.linspace(0, 1, 26)[1:-1]), tuple(np.geomspace(1 / 16, 2, 21))
-    periods = tuple(1 / np.linspace(1, 8, 57))  # a whole one at least has to be seen
+    turn = 2 * sympy.pi * Z / C  # a whole one at least has to be seen
     alone = (
-        _Form("constant", "{a}", lambda z, c: [np.ones_like(z)]),
-        _Form("proportional", "{a}*{z}", lambda z, c: [z], 1),
-        _Form("square", "{a}*{z}**2", lambda z, c: [z**2], 2),
-        _Form("signed square", "{a}*{z}*abs({z})", lambda z, c: [z * np.abs(z)], 2),
-        _Form("cube", "{a}*{z}**3", lambda z, c: [z**3], 3),
-        _Form("fourth power", "{a}*{z}**4", lambda z, c: [z**4], 4),
-        _Form("exponential", "{a}*exp({z}/{c})", lambda z, c: [np.exp(z / c)], 0, scales),
-        _Form("exponential", "{a}*exp(-{z}/{c})", lambda z, c: [np.exp(-z / c)], 0, scales),
-        _Form("saturating", "{a}*{z}/({c} + abs({z}))", lambda z, c: [z / (c + np.abs(z))], 0, scales),
-        _Form("saturating", "{a}*tanh({z}/{c})", lambda z, c: [np.tanh(z / c)], 0, scales),
-        _Form("threshold", "{a}*max({z} - {c}, 0)", lambda z, c: [np.maximum(z - c, 0)], 1, inside, True),
-        _Form("threshold", "{a}*max({c} - {z}, 0)", lambda z, c: [np.maximum(c - z, 0)], 1, inside, True),
-        _Form(
-            "periodic", "{a}*sin(2*pi*{z}/{c}) + {b}*cos(2*pi*{z}/{c})",
-            lambda z, c: [np.sin(2 * np.pi * z / c), np.cos(2 * np.pi * z / c)], 0, periods,
-        ),
+        _Form("constant", A), _Form("proportional", A * Z, 1), _Form("square", A * Z**2, 2),
+        _Form("signed square", A * Z * sympy.Abs(Z), 2), _Form("cube", A * Z**3, 3),
+        _Form("fourth power", A * Z**4, 4), _Form("exponential", A * sympy.exp(Z / C), 0, scales),
+        _Form("exponential", A * sympy.exp(-Z / C), 0, scales),
+        _Form("saturating", A * Z / (C + sympy.Abs(Z)), 0, scales),
+        _Form("saturating", A * sympy.tanh(Z / C), 0, scales),
+        _Form(THRESHOLD, A * sympy.Max(Z - C, 0), 1, inside),
+        _Form(THRESHOLD, A * sympy.Max(C - Z, 0), 1, inside),
+        _Form("periodic", A * sympy.sin(turn) + B * sympy.cos(turn), 0, tuple(1 / np.linspace(1, 8, 57))),
     )  # fmt: skip
     yield from alone
     for each in alone[1:]:
-        raised = lambda z, c, own=each.columns: [*own(z, c), np.ones_like(z)]  # noqa: E731
         name = "straight line" if each.name == "proportional" else each.name
-        yield each._replace(name=name, formula="{d} + " + each.formula, columns=raised)
+        yield each._replace(name=name, formula=each.formula + D)
 
 
 FORMS = tuple(_forms())
-FITS = 0.05  # p-value from which on a formula is all that the recordings tell of a function
 
 
 def fitting_forms(
     at: np.ndarray, weights: np.ndarray, goal: np.ndarray, freedom: float, forms: Sequence[_Form] = FORMS
-) -> list[tuple[_Form, np.ndarray, np.ndarray]]:
-    """The simplest formulas that a function may be, the nearest first.
+) -> list[tuple[_Form, dict[sympy.Symbol, tuple[float, float]]]]:
+    """The simplest formulas that a function may be, the nearest first, with coefficients and their errors.
 
     A formula with values f may be the function where ``|goal - weights @ f|²`` is as large as chance makes
     it: χ² of so many degrees of freedom, less its coefficients.
@@ -531,41 +525,44 @@ def fitting_forms(
 
     Returns
     -------
-    list of (form, numpy.ndarray, numpy.ndarray)
-        Of those that fit with as few coefficients as any; with these, the linear ones first and then c, and
-        their covariance. Empty where none fits.
+    list of (form, dict)
+        Of those that fit with as few coefficients as any. Empty where none fits.
     """
     width = float(np.ptp(at))
-
-    def solved(form: _Form, c: float) -> tuple[float, np.ndarray, np.ndarray]:
-        """χ² at its best, linear coefficients, and the form, weighted."""
-        with np.errstate(all="ignore"):
-            columns = weights @ np.stack(form.columns(at, c), axis=1)
-        if not np.isfinite(columns).all():
-            return np.inf, np.zeros(columns.shape[1]), columns
-        scale = np.sqrt((columns**2).sum(axis=0))
-        scale = np.where(scale > 0, scale, 1.0)
-        found = np.linalg.lstsq(columns / scale, goal, rcond=1e-12)[0] / scale
-        return float(((goal - columns @ found) ** 2).sum()), found, columns
-
-    fitting: list[tuple[int, float, _Form, np.ndarray, np.ndarray]] = []
+    fitting: list[tuple[int, float, _Form, dict[sympy.Symbol, tuple[float, float]]]] = []
     for form in forms:
-        places, c = (at.min() if form.within else 0.0) + width * np.array(form.tried), np.nan
+        linear = [each for each in (A, B, D) if each in form.formula.free_symbols]
+        slopes = compile_values([form.formula.diff(each) for each in linear], [Z, C], common=False)
+
+        def solved(c: float, slopes: Any = slopes) -> tuple[float, np.ndarray, np.ndarray]:
+            """χ² at its best, linear coefficients, and the form, weighted."""
+            with np.errstate(all="ignore"):
+                columns = weights @ np.stack(
+                    [np.broadcast_to(each, at.shape) for each in slopes(at, c)], axis=1
+                )
+            if not np.isfinite(columns).all():
+                return np.inf, np.zeros(columns.shape[1]), columns
+            scale = positive(np.sqrt((columns**2).sum(axis=0)))
+            found = np.linalg.lstsq(columns / scale, goal, rcond=1e-12)[0] / scale
+            return float(((goal - columns @ found) ** 2).sum()), found, columns
+
+        places, c = (at.min() if form.name == THRESHOLD else 0) + width * np.array(form.tried), np.nan
         if len(places):
-            best = int(np.argmin([solved(form, one)[0] for one in places]))
+            best = int(np.argmin([solved(one)[0] for one in places]))
             near = np.sort(places[max(best - 1, 0) : best + 2])
             c = scipy.optimize.minimize_scalar(
-                lambda one, form=form: solved(form, one)[0], bounds=(near[0], near[-1]), method="bounded"
+                lambda one, of=solved: of(one)[0], bounds=(near[0], near[-1]), method="bounded"
             ).x
-        total, found, columns = solved(form, c)
-        if (found[list(form.positive)] < 0).any():
-            continue
+        total, found, columns = solved(c)
         if len(places):
-            step = 1e-4 * width
-            bent = (solved(form, c + step)[2] - solved(form, c - step)[2]) / (2 * step) @ found
-            columns, found = np.column_stack([columns, bent]), np.append(found, c)
+            bent = solved(c + 1e-4 * width)[2] - solved(c - 1e-4 * width)[2]
+            columns, found = np.column_stack([columns, bent @ found / (2e-4 * width)]), np.append(found, c)
+        errors = np.sqrt(np.diag(np.linalg.pinv(columns.T @ columns)))
+        values = dict(zip([*linear, C], zip(found, errors, strict=True), strict=False))
+        if any(values[each][0] < 0 for each in form.positive):
+            continue
         if scipy.stats.chi2.sf(total, max(freedom - len(found), 1.0)) >= FITS:
-            fitting.append((len(found), total, form, found, np.linalg.pinv(columns.T @ columns)))
+            fitting.append((len(found), total, form, values))
     fewest = min((count for count, *_ in fitting), default=0)
     ranked = sorted((each for each in fitting if each[0] == fewest), key=lambda each: each[1])
-    return [(form, found, errors) for _, _, form, found, errors in ranked]
+    return [(form, values) for *_, form, values in ranked]

@@ -7,6 +7,7 @@ found.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from siq.diagnosis.mechanisms import PROCESS_NOISE, SURFACE, fresh_names, places
 from siq.diagnosis.naming import Investigation
 from siq.diagnosis.residual_structure import Structure
 from siq.diagnosis.search import FitContext
-from siq.diagnosis.smooth_functions import FORMS, Smoothness, fitting_forms
+from siq.diagnosis.smooth_functions import FORMS, A, B, C, Smoothness, Z, fitting_forms
 from siq.diagnosis.statement import (
     Alternative,
     DescribedCurve,
@@ -273,7 +274,7 @@ def _stated_function(
             )
         else:
             curve = DescribedCurve(place.words[0], tuple(at[0].tolist()), *map(tuple, shaped))
-            shape = _shape_of(part, place, fit, context) or _course_of(values, deviations)
+            shape = _shape_of(part, curve, place, fit, context)
     elif candidate.begins:  # a hidden state
         name = candidate.shapes[0]
         time = Estimate(known[name], errors.get(name), fit.model.time_unit)
@@ -292,78 +293,56 @@ def _stated_function(
     )
 
 
-def _course_of(values: np.ndarray, deviations: np.ndarray) -> dict[str, Any]:
-    """Whether a curve rises or falls all the way, as far as its errors tell."""
-    ahead = np.subtract.outer(values, values)[np.tril_indices(len(values), -1)]
-    errors = np.hypot.outer(deviations, deviations)[np.tril_indices(len(values), -1)]
-    sure = np.sign(ahead[np.abs(ahead) > VISIBLE_ERRORS * errors])
-    same = len(sure) and (sure == sure[0]).all()
-    return {"shape": ("rising" if sure[0] > 0 else "falling") if same else ""}
+def _shape_of(
+    part: FittedCandidate, curve: DescribedCurve, place: Place, fit: Fit, context: FitContext
+) -> dict[str, Any]:
+    """The simplest formula that a curve may be, and the mechanism that is such a function.
 
-
-def _shape_of(part: FittedCandidate, place: Place, fit: Fit, context: FitContext) -> dict[str, Any]:
-    """The simplest formula that a curve may be, and the mechanism that is such a function."""
-    try:
-        asked = Smoothness.of(fit, context.data, place, known=part)
-    except NUMERICAL_ERRORS:
-        asked = None
-    fits = [] if asked is None else fitting_forms(*asked.told)
+    Where there is no such formula, whether it rises or falls all the way, as far as its errors tell.
+    """
+    fits = []
+    with suppress(*NUMERICAL_ERRORS):
+        if (asked := Smoothness.of(fit, context.data, place, known=part)) is not None:
+            fits = fitting_forms(*asked.told)
     if asked is None or not fits:
-        return {}
-    form, found, covariances = fits[0]
-    word, extra = place.words[0], len(place.words) - 1
-    letters = [letter for letter in "abdc" if f"{{{letter}}}" in form.formula]
-    names = dict(zip(letters, fresh_names("s", len(letters), fit.model.names), strict=True))
-    whole, along = place.unit(fit.model, 0, extra), units_of(fit.model).get(word, "1")
-    units = {"a": place.unit(fit.model, form.power, extra), "c": along}
-    sizes = {
-        names[letter]: Estimate(float(value), float(np.sqrt(variance)), units.get(letter, whole))
-        for letter, value, variance in zip(letters, found, np.diag(covariances), strict=True)
-    }
+        value, error = np.array(curve.value), np.array(curve.standard_error)
+        apart = np.subtract.outer(value, value)
+        seen = np.tril(np.sign(apart) * (np.abs(apart) > VISIBLE_ERRORS * np.hypot.outer(error, error)))
+        sides = {(1.0, 0.0): "rising", (0.0, -1.0): "falling"}
+        return {"shape": sides.get((float(seen.max()), float(seen.min())), "")}
+    form, found = fits[0]
+    extra, power = len(place.words) - 1, form.power
+    names = dict(zip(found, fresh_names("s", len(found), fit.model.names), strict=True))
+    units = {each: place.unit(fit.model, power if each == A else 0, extra) for each in found}
+    units[C] = units_of(fit.model).get(place.words[0], "1")
+    written = {Z: symbol(place.words[0])} | {each: symbol(name) for each, name in names.items()}
     known = fitting_forms(*asked.told, _known_forms(place, fit, context))
     return {
         "shape": form.name,
-        "formula": form.formula.format(z=word, **names),
-        "sizes": sizes,
+        "formula": str(form.formula.xreplace(written)),
+        "sizes": {name: Estimate(*map(float, found[each]), units[each]) for each, name in names.items()},
         "like": known[0][0].name if known else "",
     }
 
 
 def _known_forms(place: Place, fit: Fit, context: FitContext) -> list[Any]:
-    """Mechanisms that are functions of a place's coordinate in its equations, as forms."""
+    """Mechanisms that are functions of a place's coordinate in its equation, as forms."""
     found, model = [], context.model
+    (name, factor), *further = (*place.equations, *place.outputs)
     values = {symbol(each.name): sympy.Float(each.value, 17) for each in fit.model.parameters}
-    for each in context.candidates:
-        searches = each.searches
-        if len(each.shapes) > 1 or each.begins or each.changes[0][0] not in dict(place.equations):
+    for each in context.candidates if name in model.states and not further else ():
+        own = [*map(symbol, (*each.amplitudes, *each.shapes))]
+        if each.equations != (name,) or each.begins or not each.amplitudes or len(own) > 2:
             continue
-        (name, factor), *further = place.equations
-        if further or each.model.dimension > model.dimension or each.model.outputs != model.outputs:
-            continue
-        changes = [new - old for new, old in zip(each.model.equations, model.equations, strict=True)]
-        change = changes.pop(model.states.index(name))
-        own = [symbol(one) for one in each.new]
-        term = _in_coordinate(sympy.simplify(change / factor), place.coordinates[0])
-        term = term.xreplace({key: value for key, value in values.items() if key not in own})
-        if any(one != 0 for one in changes) or not term.free_symbols <= {COORDINATE, *own}:
-            continue
-        slopes = [term.diff(symbol(one)) for one in each.amplitudes]
-        compiled = compile_values(slopes, [COORDINATE, *map(symbol, each.shapes)], common=False)
-
-        def columns(
-            z: np.ndarray, c: float, of: Any = compiled, shapes: Any = each.shapes
-        ) -> list[np.ndarray]:
-            return [np.broadcast_to(one, z.shape) for one in of(z, *[c for _ in shapes])]
-
-        tried = places_of(searches[0], context.data, model, fit.x) if searches else ()
-        found.append(
-            FORMS[0]._replace(
-                name=each.name,
-                columns=columns,
-                tried=tuple(np.asarray(tried) / np.ptp(place.knots)) if searches else (),
-                positive=tuple(k for k, one in enumerate(each.amplitudes) if one in each.positive),
-            )
-        )
+        row = model.states.index(name)
+        change = sympy.simplify((each.model.equations[row] - model.equations[row]) / factor)
+        letters = dict(zip(own, (A, B) if len(each.amplitudes) == 2 else (A, C), strict=False))
+        term = _in_coordinate(change, place.coordinates[0]).xreplace(values | letters | {COORDINATE: Z})
+        if term.free_symbols <= {Z, *letters.values()}:
+            tried = [c for one in each.searches for c in places_of(one, context.data, model, fit.x)]
+            shares = tuple(c / float(np.ptp(place.knots)) for c in tried)
+            signs = tuple(letters[symbol(one)] for one in each.positive & set(each.amplitudes))
+            found.append(FORMS[0]._replace(name=each.name, formula=term, tried=shares, positive=signs))
     return found
 
 
