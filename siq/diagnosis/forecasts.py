@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import scipy.special
+from scipy.special import logsumexp
 
 from siq.diagnosis.evidence import (
     NUMERICAL_ERRORS,
@@ -65,6 +65,9 @@ RIDGE = 1e-10  # numerical: of normal equations whose columns have unit length
 # Of an effect, or of what is gained: a choice, made when two cases had been seen, 0.93 for the linear damping
 # of a pendulum arm, and 0.46 for a preload in the place of a bump.
 NEARLY_ALL = 0.9
+# Of the budget, for the first name, so that tests have something left where forecasts name nothing: a choice.
+FIRST_NAME_SHARE = 0.5
+EVEN = 0.5  # probability of a cause without a name, where nothing is known beforehand
 PLAUSIBLE = 0.05  # of the probability of a family, from which on a member is not ruled out
 
 
@@ -77,13 +80,16 @@ def _thinned(data: Measurements, every: int) -> Measurements:
 
 
 def _fold_of(data: Measurements) -> np.ndarray:
-    """The part of each measured value, shape ``(n·m,)``: recordings, or stretches where these are few."""
+    """The part of each measured value, shape ``(n·m,)``: recordings, or stretches where these are few.
+
+    Of many recordings each part has several, by their labels, so that their order does not matter.
+    """
     count = len(data.labels)
     stretches = -(-FOLDS // count) if count < FOLDS // 2 else 1
-    fold = np.empty(len(data.t), dtype=int)
+    fold, rank = np.empty(len(data.t), dtype=int), np.argsort(np.argsort(data.labels))
     for place, (begin, end) in enumerate(itertools.pairwise(data.first)):
-        fold[begin:end] = place * stretches + (np.arange(end - begin) * stretches) // (end - begin)
-    return np.repeat(fold % max(FOLDS, stretches), data.outputs.shape[1])
+        fold[begin:end] = rank[place] * stretches + (np.arange(end - begin) * stretches) // (end - begin)
+    return np.repeat(fold if stretches > 1 else fold % FOLDS, data.outputs.shape[1])
 
 
 @dataclass(frozen=True)
@@ -249,11 +255,13 @@ def _fitted(
 class _Site:
     """An explanation at one place: a mechanism with all shapes at which it is looked for, or a function.
 
-    Its prior is the logarithm of a probability; its family has an equation in which it acts.
+    Its prior is the logarithm of a probability, and what that is if all mechanisms are as likely, with a name
+    or without; its family has an equation in which it acts.
     """
 
     terms: tuple[Probe | Place, ...]
     prior: float
+    flat: float
     family: tuple[str, tuple[str, ...]]
     candidate: MechanismCandidate | None = None
 
@@ -281,8 +289,9 @@ def _sites(
     data, unnamed = context.data, context.study.search.unnamed
     model, x = along.model, along.x
     priors = _log_priors(candidates, unnamed)
+    alike = _log_priors([replace(each, weight=1.0) for each in candidates], EVEN)
     found = []
-    for each, prior in zip(candidates, priors, strict=True):
+    for each, prior, flat in zip(candidates, priors, alike, strict=True):
         try:
             probes = Probe.along(each, along, data)
         except NUMERICAL_ERRORS as error:
@@ -290,7 +299,7 @@ def _sites(
             untried[each.label] = NotFitted.of(each, error)
             continue
         if probes:
-            found.append(_Site(tuple(probes), prior, _kind_of(each, model), each))
+            found.append(_Site(tuple(probes), prior, flat, _kind_of(each, model), each))
     single = places_in(model, context.roles, data, x)
     places = (*single, *products_in([each for each in single if each.equations], model, data, x))
     for place in places:
@@ -301,7 +310,8 @@ def _sites(
         }
         shared = Counter(kind for kind, _ in acting)
         kind = next((one for one, count in shared.most_common(1) if count > 1), ("", place.targets))
-        found.append(_Site((place,), float(np.log(unnamed) - np.log(len(places))), kind))
+        prior, flat = (float(np.log(share) - np.log(len(places))) for share in (unnamed, EVEN))
+        found.append(_Site((place,), prior, flat, kind))
     return found
 
 
@@ -399,7 +409,7 @@ def _gains(
     ends = np.cumsum([len(site.terms) for site in kept])
     # The prior of a mechanism is spread over all shapes at which it was looked for.
     found = [
-        scipy.special.logsumexp(gained[end - len(site.terms) : end]) - np.log(len(sites[place].terms))
+        logsumexp(gained[end - len(site.terms) : end]) - np.log(len(sites[place].terms))
         for place, site, end in zip(order, kept, ends, strict=True)
     ]
     best = [
@@ -473,7 +483,7 @@ def _density(problem: _Foreseen, term: Probe | Place, columns: np.ndarray) -> fl
             problem.log_density_of(sums, inverse * (told / size)).sum()
             for size in sizes[:: max(len(sizes) // 4, 1)]
         ]
-    return float(scipy.special.logsumexp(values) - np.log(len(values)))
+    return float(logsumexp(values) - np.log(len(values)))
 
 
 @dataclass(frozen=True)
@@ -488,6 +498,8 @@ class Rung:
         The fits with it.
     log_odds
         Of its family, against all other explanations together.
+    flat_log_odds
+        The same, if all mechanisms are as likely beforehand, with a name or without.
     gain
         Mean logarithm of the density gained by recordings left out.
     """
@@ -495,6 +507,7 @@ class Rung:
     accepted: AcceptedMechanism
     horizons: tuple[Horizon, ...]
     log_odds: float
+    flat_log_odds: float
     gain: float
 
 
@@ -624,15 +637,19 @@ def next_rung(
     kept = [place for place, site in enumerate(sites) if site.label not in fitted]
     sites = [*(sites[place] for place in kept), *(each.site for each in fitted.values())]
     gains = np.append(gains[kept], [each.gain for each in fitted.values()])
-    weights = gains + np.array([site.prior for site in sites])
-    weights[[site.label in outdone for site in sites]] = -np.inf
+    gains[[site.label in outdone for site in sites]] = -np.inf
+    rival = np.ones(len(sites), dtype=bool)
     if leader in steady:
         # The mechanism and hardly more is no rival; but what is clearly better says that it is another thing.
         more = _containing(leader.horizons[0], sites, leader.candidate)
-        weights[more & (gains < leader.gain + options.least_log_odds)] = -np.inf
+        rival = ~(more & (gains < leader.gain + options.least_log_odds))
+    weights = np.where(rival, gains + np.array([site.prior for site in sites]), -np.inf)
+    flat = np.where(rival, gains + np.array([site.flat for site in sites]), -np.inf)
     family = np.array([site.family == leader.site.family for site in sites])
-    rivals = np.append(weights[~family], 0.0)  # and nothing at all
-    log_odds = float(scipy.special.logsumexp(weights[family]) - scipy.special.logsumexp(rivals))
+    log_odds, flat_log_odds = (
+        float(logsumexp(each[family]) - logsumexp(np.append(each[~family], 0.0)))  # and nothing at all
+        for each in (weights, flat)
+    )
     _told(sites, gains)
     LOGGER.info("%s: log-odds of %s %.1f", leader.site.label, leader.site.family[0], log_odds)
     # The general form of a family may do more than any member of it: another physics then, of the same kind.
@@ -657,7 +674,7 @@ def next_rung(
         "needless": (),
         "less": tuple(each for label, each in known.items() if label not in alike),
     }
-    return Rung(AcceptedMechanism(best, others), tuple(leader.horizons), log_odds, leader.gain)
+    return Rung(AcceptedMechanism(best, others), tuple(leader.horizons), log_odds, flat_log_odds, leader.gain)
 
 
 def _told(sites: Sequence[_Site], gains: np.ndarray) -> None:
@@ -675,7 +692,8 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[Rung], tup
     model, found, untried = context.model, list[Rung](), dict[str, NotFitted]()
     alone: list[Horizon] = []
     try:
-        horizons = alone = horizons_of(fit, context)
+        with context.budget.part(FIRST_NAME_SHARE):
+            horizons = alone = horizons_of(fit, context)
         while len(found) < context.study.search.mechanisms:
             base = horizons[0].fit.model
             if base.dimension > model.dimension:
@@ -685,7 +703,8 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[Rung], tup
                 for each in context.candidates
                 if not any(each.repeats(other.accepted.best.candidate) for other in found)
             ]
-            rung = next_rung(horizons, remaining, context, untried)
+            with context.budget.part(1.0 if found else FIRST_NAME_SHARE):
+                rung = next_rung(horizons, remaining, context, untried)
             if rung is None:
                 break
             LOGGER.info("found %s by forecasts", rung.accepted.best.candidate.label)

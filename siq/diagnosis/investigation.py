@@ -10,10 +10,12 @@ import scipy.stats
 
 from siq.diagnosis.dictionary import Mechanism, roles_of, units_of
 from siq.diagnosis.evidence import NotFitted
+from siq.diagnosis.forecasts import Horizon
 from siq.diagnosis.holdout import (
     HeldOutErrors,
     errors_left_out,
     first_better,
+    preferred_recalibration,
     simplest_of,
     simulated,
     spread_of_free_runs,
@@ -59,12 +61,14 @@ def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigat
     if study.generic if study.generic is not None else not roles.physical:
         monomials = generic_candidates(model, roles, degree=study.degree, named=candidates)
         candidates += [each for each in monomials if each.coordinate != "constant"]
+    if study.search.prior == "flat":
+        candidates = [replace(each, weight=1.0) for each in candidates]
     budget = budget or Budget()
     context = FitContext(model, data, roles, tuple(candidates), study, budget)
     budget.says("fitting the simulation's own parameters")
     with budget.exempt():
         recalibrated, least_squares = recalibrate(model, data, budget=budget)
-    named, recalibrations = None, tuple[Fit, ...]()
+    named, recalibrations = None, tuple[Horizon, ...]()
     # The steps of a sensor look like forces, too, and so like physics that explains them.
     if recalibrated.has_process_noise and (
         explained_by_quantisation(data, least_squares, roles, budget=budget) is None
@@ -173,6 +177,8 @@ class HeldOutRuns:
     ----------
     before, recalibrated, augmented
         Outputs ``(n, m)`` of the simulation as it is, with its parameters refitted, and with what was found.
+    recalibration
+        Of the recalibrated simulation: where no refit foresees parts left out better, that of the card.
     fit
         Of the augmented simulation that was run.
     errors
@@ -186,6 +192,7 @@ class HeldOutRuns:
     before: np.ndarray
     recalibrated: np.ndarray
     augmented: np.ndarray
+    recalibration: Fit
     fit: Fit
     errors: HeldOutErrors
     independent: bool = True
@@ -224,8 +231,12 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     # What fits best with process noise admitted need not be what runs best without.
     recalibrated = search.recalibrated
     if recalibrated.has_process_noise:
-        recalibrated = best_of(investigation.least_squares, recalibrated, *investigation.recalibrations, card)
-    plain = best_of(investigation.exact, search.fit, *investigation.finals)
+        refits = [(investigation.least_squares, learned)]
+        refits += [(each.fit, each.data) for each in investigation.recalibrations] or [
+            (recalibrated, learned)
+        ]
+        recalibrated = preferred_recalibration(card, refits, learned, noise=noise)
+    plain = best_of(investigation.exact, search.fit, *(each.fit for each in investigation.finals))
     choices = [(model, best_of(model.fit, model.exact)) for model in investigation.models]
     named = investigation.verdict.names
     judges = [place for place, label in enumerate(data.labels) if label not in study.tests]
@@ -276,19 +287,19 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     # What a fit leaves may be more than noise; the one that leaves least is nearest to it. Where there is
     # process noise, that takes a part of the sensor's noise over.
     spread = positive(np.nanvar(data.outputs[scored_rows(data)], axis=0))
-    fits = [search.fit, fit]
-    still = [each for each in fits if not each.has_process_noise] or fits
+    still = [each for each in (search.fit, fit) if not each.has_process_noise] or [search.fit, fit]
     least = np.min([learned.roughness, *(each.noise.measurement for each in still)], axis=0)
-    noise_floor, floor = float(np.sqrt(np.mean(least / spread))), None
+    floors = [learned.with_known_noise(least)]
     if described is not None and fit.has_process_noise:
-        whole = spread_of_free_runs(fit, learned, investigation.context.roles)
-        floor = float(np.sqrt(np.mean(whole / spread)))
+        floors.append(spread_of_free_runs(fit, learned, investigation.context.roles))
+    noise_floor, *_, floor = [float(np.sqrt(np.mean(each / spread))) for each in (*floors, floors[-1])]
     unit = units_of(fit.model).get(str(fit.model.outputs[0][1]), "1") if len(spread) == 1 else "1"
     rungs = [errors_of(each.best.fit, data) for each in search.found[:-1]] if named else []
     return HeldOutRuns(
         before=before,
         recalibrated=refitted,
         augmented=augmented,
+        recalibration=recalibrated,
         fit=fit,
         errors=HeldOutErrors.of(
             squares,

@@ -363,7 +363,7 @@ def build_candidate(
         coordinate=" ".join(assignment.get(word, word) for word in form.coordinate.split()),
         changes=(*changes, *further),
         generalises=mechanism.generalises,
-        variant=form.variant,
+        variant=form.variant.format_map(assignment),
         family=mechanism.family or mechanism.name,
         weight=mechanism.weight,
     )

@@ -27,7 +27,7 @@ from siq.diagnosis.evidence import (
     orthonormal,
     sizes_of_effects,
 )
-from siq.diagnosis.forecasts import climb
+from siq.diagnosis.forecasts import Horizon, climb
 from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.diagnosis.residual_structure import Remainder
 from siq.diagnosis.screening import linearised_with, portions
@@ -48,7 +48,6 @@ from siq.inference.trajectories import sharpened
 from siq.remarks import Remark
 
 LOGGER = logging.getLogger(__name__)
-FORECASTS_SHARE = 0.5  # of the budget, so that the tests have something left where nothing is named: a choice
 
 
 class _MissingEffect:
@@ -173,8 +172,8 @@ class Investigation:
     exact: Fit | None = None
     account: Account = UNLIMITED
     withdrawn: bool = False
-    recalibrations: tuple[Fit, ...] = ()
-    finals: tuple[Fit, ...] = ()
+    recalibrations: tuple[Horizon, ...] = ()
+    finals: tuple[Horizon, ...] = ()
 
     @property
     def process_noise(self) -> bool:
@@ -271,14 +270,13 @@ def _with_models(decision: Investigation, whole: Search, context: FitContext) ->
 
 def named_by_forecasts(
     recalibrated: Fit, least_squares: Fit, context: FitContext
-) -> tuple[Investigation | None, tuple[Fit, ...]]:
+) -> tuple[Investigation | None, tuple[Horizon, ...]]:
     """What is missing by what foresees recordings best, where the recalibrated fit needs forces at random.
 
     Returned are what is named, None where nothing is, and the fits of the simulation alone at each horizon.
     """
-    with context.budget.part(FORECASTS_SHARE):
-        alone, rungs, untried = climb(recalibrated, context)
-    recalibrations = tuple(each.fit for each in alone)
+    alone, rungs, untried = climb(recalibrated, context)
+    recalibrations = tuple(alone)
     if not rungs:
         return None, recalibrations
     fit = rungs[-1].accepted.best.fit
@@ -288,11 +286,20 @@ def named_by_forecasts(
             fit = sharpened(fit, context.data, budget=context.budget)
     left = Remainder.of(context.data, alone[0].fit, fit, context.roles)
     search = Search(recalibrated, tuple(each.accepted for each in rungs), fit, (), untried=untried)
+    remarks = [
+        Remark(
+            "diagnosis.by_prior",
+            {"name": each.accepted.best.candidate.name, "odds": np.exp(each.flat_log_odds)},
+        )
+        for each in rungs
+        if each.flat_log_odds < context.study.search.least_log_odds
+    ]
+    if left.doubtful or fit.has_process_noise:
+        remarks.append(_remainder_remark(left, unnamed=True))
     decision = Investigation(
         context, search, left, MismatchVerdict.MISSING_PHYSICS, least_squares, convincing=True,
-        log_odds=tuple(each.log_odds for each in rungs), recalibrations=recalibrations,
-        remarks=(_remainder_remark(left, unnamed=True),) if left.doubtful or fit.has_process_noise else (),
-        finals=tuple(each.fit for each in rungs[-1].horizons),
+        log_odds=tuple(each.log_odds for each in rungs), remarks=tuple(remarks),
+        recalibrations=recalibrations, finals=rungs[-1].horizons,
     )  # fmt: skip
     return _with_models(decision, search, context), recalibrations
 

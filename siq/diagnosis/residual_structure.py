@@ -66,12 +66,6 @@ class Structure:
         """Probability that nothing is left."""
         return min(1.0, 2 * min(self.p_curves, self.p_autocorrelation))
 
-    @property
-    def share(self) -> float:
-        """Share of the innovations' squares that a function of a coordinate explains, beyond chance."""
-        best = next((each.gain - 2 * each.term.width for each in self.curves[:1]), 0.0)
-        return float(np.clip(best / max(self.total, 1e-300), 0.0, 1.0))
-
 
 def _structure_of(data: Measurements, fit: Fit, roles: Roles, *, noise: Noise | None = None) -> Structure:
     """Describe what a fit leaves."""

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -46,6 +46,9 @@ class SearchOptions(BaseModel):
         Most mechanisms that are looked for.
     unnamed
         Probability beforehand that what a simulation lacks is not in the dictionary.
+    prior
+        By ``physics`` what nearly every system of a kind has is likelier than what few have, as the weights
+        of the dictionary say; ``flat`` makes all mechanisms alike.
     wrong_names
         Most probability of a name that is wrong, since something without a name looks alike. What is less
         certain is detected, and described.
@@ -61,6 +64,7 @@ class SearchOptions(BaseModel):
     fitted: Annotated[int, Field(ge=1)] = 6
     mechanisms: Annotated[int, Field(ge=1, le=5)] = 3
     unnamed: Annotated[float, Field(gt=0, lt=1)] = 0.1
+    prior: Literal["physics", "flat"] = "physics"
     wrong_names: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
     blocks: Annotated[int, Field(ge=4)] = 10
 

@@ -61,22 +61,23 @@ def statement_of_failure(reason: str) -> Statement:
 def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
     """What follows from an investigation, and from the runs of recordings held out."""
     search, verdict, described = investigation.search, investigation.verdict, shown.described
-    final = investigation.final if described is None else shown.fit
     named = verdict.names
+    final = investigation.final if named else shown.recalibration
+    kept = final.model is investigation.context.model  # the card's own values
+    if described is not None:
+        final, kept = shown.fit, False
     found = _found_mechanisms(investigation, final if named else search.fit)
     names = tuple(each.best.candidate.label for each in search.found) if named else ()
     parts = () if described is None else described.parts
     labels = [each.candidate.label for each in parts]
     errors = _standard_errors(final)
     remarks, errors_seen = list(investigation.remarks), shown.errors
-    if verdict is MismatchVerdict.UNEXPLAINED and described is not None:
+    shifted = verdict is MismatchVerdict.PARAMETER_SHIFT
+    better = described is not None and errors_seen.change("without", "augmented") == "better"
+    if verdict is MismatchVerdict.UNEXPLAINED and better and errors_seen.share_gained >= NEARLY_ALL:
         # A model that leaves hardly more than noise is an explanation, though it has no name.
-        if errors_seen.change("without", "augmented") == "better" and errors_seen.share_gained >= NEARLY_ALL:
-            verdict = MismatchVerdict.MISSING_PHYSICS
-    elif (
-        verdict is MismatchVerdict.PARAMETER_SHIFT
-        and errors_seen.change("before", "recalibrated") != "better"
-    ):
+        verdict = MismatchVerdict.MISSING_PHYSICS
+    elif shifted and errors_seen.change("before", "recalibrated") != "better":
         # Recordings held out say that other parameters mend nothing, be it that there is nothing to be seen.
         seen = not errors_seen.at_noise("before")
         verdict = MismatchVerdict.UNEXPLAINED if seen else MismatchVerdict.NO_MISMATCH
@@ -85,6 +86,8 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
         untried = sum(each.remark == BUDGET_SPENT for each in search.untried)
         stopped_by = investigation.account.stopped_by
         remarks.append(Remark("diagnosis.partial", {"untried": untried, "stopped_by": stopped_by}))
+    if kept and errors:
+        remarks.append(Remark("diagnosis.values_stay"))
     if not shown.independent:
         remarks.append(Remark("diagnosis.one_recording"))
     return Statement(
@@ -110,7 +113,7 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
                 entry.value, float(final.model.values[place]), errors[entry.name], entry.unit
             )
             for place, entry in enumerate(investigation.context.model.parameters)
-            if entry.name in errors
+            if entry.name in errors and not kept
         },
         errors=errors_seen,
         excluded={} if verdict.mismatch else _excluded(investigation),
@@ -320,7 +323,10 @@ def _shape_of(
     return {
         "shape": form.name,
         "formula": str(form.formula.xreplace(written)),
-        "sizes": {name: Estimate(*map(float, found[each]), units[each]) for each, name in names.items()},
+        "sizes": {
+            name: Estimate(float(found[each][0]), float(found[each][1]), units[each])
+            for each, name in names.items()
+        },
         "like": known[0][0].name if known else "",
     }
 

@@ -26,6 +26,7 @@ from siq.diagnosis.forecasts import (
     horizons_of,
     next_rung,
 )
+from siq.diagnosis.holdout import preferred_recalibration
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
 from siq.diagnosis.screening import Probe, Term, linearised_with
 from siq.diagnosis.search import FitContext
@@ -53,9 +54,11 @@ def pendulum(scale: float = 1.0) -> Dynamics:
     return model_of(card)
 
 
-def recorded(damping: float, force: float, *, scale: float = 1.0, count: int = 6) -> Measurements:
+def recorded(
+    damping: float, force: float, *, scale: float = 1.0, count: int = 6, seed: int = 3
+) -> Measurements:
     """Pendulums of another swing each, by Heun's rule, with forces at random that last for a while."""
-    draw = np.random.default_rng(3)
+    draw = np.random.default_rng(seed)
     h = DURATION / (SAMPLES - 1) / FINE
     state = np.stack([np.linspace(0.6, 2.2, count), draw.normal(size=count)])
     push, memory = draw.normal(size=count), np.exp(-h / LASTING)
@@ -146,16 +149,23 @@ def test_a_thinned_recording_has_every_so_manieth_sample_from_its_first() -> Non
     assert np.isfinite(data.outputs).all()
 
 
-@pytest.mark.parametrize(("count", "parts"), [(1, 8), (2, 8), (3, 8), (4, 4), (8, 8), (11, 8)])
+@pytest.mark.parametrize(("count", "parts"), [(1, 8), (2, 8), (3, 9), (4, 4), (8, 8), (11, 8)])
 def test_parts_are_whole_stretches_and_each_row_is_in_one(count: int, parts: int) -> None:
     data = laid_out(np.zeros((count, 40)), pendulum())
     fold = _fold_of(data)
-    assert len(fold) == data.outputs.size and set(fold) == set(range(parts)) and parts <= FOLDS
+    assert len(fold) == data.outputs.size and set(fold) == set(range(parts)) and parts < FOLDS + count
     for begin, end in itertools.pairwise(data.first):
         part = fold[begin:end]
         # A stretch begins where another ends; where there are enough recordings nobody divides one.
         stretches = 1 + int((np.diff(part) != 0).sum())
         assert stretches == len(set(part)) and (stretches == 1 or count < FOLDS // 2)
+
+
+def test_parts_do_not_depend_on_the_order_of_recordings() -> None:
+    data = laid_out(np.zeros((11, 40)), pendulum())
+    other = replace(data, labels=data.labels[::-1])
+    pairs = [sorted(zip(each.labels, _fold_of(each)[::40], strict=True)) for each in (data, other)]
+    assert pairs[0] == pairs[1]
 
 
 def test_horizons_end_where_too_few_samples_tell_of_the_parameters() -> None:
@@ -223,6 +233,18 @@ def test_damping_is_named_beside_forces_that_last() -> None:
     assert c.value == pytest.approx(0.15, rel=0.3)
 
 
+def test_odds_with_a_flat_prior_are_those_of_mechanisms_that_are_alike() -> None:
+    context = context_of(pendulum(), recorded(0.15, 0.2), CLOSE)
+    alike = tuple(replace(each, weight=1.0) for each in context.candidates)
+    options = context.study.search.model_copy(update={"unnamed": 0.5})
+    study = context.study.model_copy(update={"search": options})
+    flat = first_rung(replace(context, candidates=alike, study=study))
+    assert flat is not None
+    assert flat.log_odds == pytest.approx(flat.flat_log_odds)
+    assert damped().flat_log_odds == pytest.approx(flat.log_odds, abs=0.05)
+    assert damped().log_odds > damped().flat_log_odds  # nearly everything that moves is damped
+
+
 def test_forces_that_last_have_no_name_in_the_dictionary() -> None:
     model, data = pendulum(), recorded(0.0, 0.2)
     alone, rungs, _ = climb(recalibrate(model, data)[0], context_of(model, data))
@@ -279,3 +301,22 @@ def test_a_sensor_gains_nothing_from_what_a_filter_learned_from_it(monkeypatch: 
     monkeypatch.setattr(forecasts, "linearised_with", at_filtered)
     assert all((_gained(each, terms, None, Budget()) > 9).all() for each in horizons)
     assert (_gained(horizons[0], terms, None, Budget()) > 500).all()
+
+
+def refitted(start: float, *, force: float, seed: int) -> bool:
+    """Whether a pendulum's frequency is refitted, where it begins at a value and 9 is right."""
+    data = recorded(0.0, force, seed=seed, count=4)
+    model = pendulum().with_values(np.array([start]))
+    loose, strict = recalibrate(model, data)
+    card = replace(loose, model=model)
+    refits = [(strict, data), (loose, data)]
+    return preferred_recalibration(card, refits, data, noise=loose.noise) is not card
+
+
+def test_values_of_the_card_stay_where_a_refit_follows_nothing_but_forces_at_random() -> None:
+    kept = [not refitted(9.0, force=0.3, seed=seed) for seed in range(12)]
+    assert sum(kept) >= 10  # each is another with a probability of 5 % at the most, so three with 2 %
+
+
+def test_values_of_the_card_are_refitted_where_they_are_wrong() -> None:
+    assert all(refitted(8.0, force=0.3, seed=seed) for seed in range(4))

@@ -114,8 +114,8 @@ def test_what_is_left_out_is_foreseen_up_to_noise_and_parameters_are_fitted_to_t
     assert squares is not None and len(squares) > 150
     right = np.sqrt(squares.mean())
     # A fifth of each tells where it begins.
-    spread = np.array([out.outputs[12:].std() for out, _, _ in _cross_validation_folds(data)])
-    assert right == pytest.approx(np.sqrt(np.mean((0.01 / spread) ** 2)), rel=0.3)
+    spread = np.concatenate([data.outputs[a + 12 : b] for a, b in itertools.pairwise(data.first)]).std()
+    assert right == pytest.approx(0.01 / spread, rel=0.3)
     # From wrong parameters it ends the same, since they are fitted again, but where they may not be.
     off = replace(fit, model=fit.model.with_values(np.array([1.3])))
     again = errors_left_out(off, data, noise=fit.noise)

@@ -164,7 +164,7 @@ def plot_ladder(statement: Statement) -> Figure | None:
         said = "runs away" if error is None else value_text(at, unit=unit, digits=3)
         axes.text(1.08 * scale * errors.noise_floor, place - 0.15, f"{label}: {said}", va="bottom")
     axes.axvline(scale * errors.noise_floor, color=BLACK, linestyle=":", label="noise of the sensor")
-    if errors.floor is not None:
+    if errors.floor not in (None, errors.noise_floor):
         axes.axvline(scale * errors.floor, color=GREEN, linestyle="--", label="and random forces")
     axes.set_xlim(lowest, highest)
     axes.set_ylim(len(steps) - 0.6, -0.8)
