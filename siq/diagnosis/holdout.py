@@ -143,16 +143,16 @@ class HeldOutErrors:
         before = 1.0 if without is None else min(without, 1.0)
         return (before - self.augmented) / max(before - self.floor, 1e-300)
 
-    def at_noise(self, run: Run) -> bool:
-        """Whether an error is that of measurement noise alone.
+    def at_noise(self, run: Run, *, random: bool = False) -> bool:
+        """Whether an error is that of measurement noise alone, or with the error of the model at random.
 
         The root mean square of n independent values has the relative standard error 1/√(2n).
         """
-        error = self.error(run)
-        if error is None or self.noise_floor is None:
+        error, floor = self.error(run), self.floor if random else self.noise_floor
+        if error is None or floor is None:
             return False
         tolerance = CONFIDENCE_95 / float(np.sqrt(2 * self.values)) if self.values else 0.0
-        return error * (1 - tolerance) <= self.noise_floor
+        return error * (1 - tolerance) <= floor
 
 
 def spread_of_free_runs(fit: Fit, learned: Measurements, roles: Roles) -> np.ndarray:
@@ -160,7 +160,7 @@ def spread_of_free_runs(fit: Fit, learned: Measurements, roles: Roles) -> np.nda
 
     The error of the model acts as a random force whose intensity over long times is that from one sample to
     the next, times its correlation time τ in samples. What a function of a coordinate finds in it is no
-    random force, and not counted.
+    random force, and not counted. Where τ is not short beside the times of the system, this is too much.
     """
     white, _, left = residuals(fit, learned)
     correlated = correlation_time_of(left, white.recording, outputs=len(fit.model.outputs))

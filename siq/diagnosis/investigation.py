@@ -290,8 +290,8 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     still = [each for each in (search.fit, fit) if not each.has_process_noise] or [search.fit, fit]
     least = np.min([learned.roughness, *(each.noise.measurement for each in still)], axis=0)
     floors = [learned.with_known_noise(least)]
-    if described is not None and fit.has_process_noise:
-        floors.append(spread_of_free_runs(fit, learned, investigation.context.roles))
+    if described is not None and described.fit.has_process_noise:
+        floors.append(spread_of_free_runs(described.fit, learned, investigation.context.roles))
     noise_floor, *_, floor = [float(np.sqrt(np.mean(each / spread))) for each in (*floors, floors[-1])]
     unit = units_of(fit.model).get(str(fit.model.outputs[0][1]), "1") if len(spread) == 1 else "1"
     rungs = [errors_of(each.best.fit, data) for each in search.found[:-1]] if named else []

@@ -18,7 +18,7 @@ from siq.diagnosis.evidence import BUDGET_SPENT, NUMERICAL_ERRORS, FittedCandida
 from siq.diagnosis.investigation import HeldOutRuns
 from siq.diagnosis.mechanisms import PROCESS_NOISE, SURFACE, fresh_names, places_of
 from siq.diagnosis.naming import Investigation
-from siq.diagnosis.residual_structure import Structure
+from siq.diagnosis.residual_structure import Remainder, Structure
 from siq.diagnosis.search import FitContext
 from siq.diagnosis.smooth_functions import FORMS, A, B, C, Smoothness, Z, fitting_forms
 from siq.diagnosis.statement import (
@@ -73,10 +73,14 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
     errors = _standard_errors(final)
     remarks, errors_seen = list(investigation.remarks), shown.errors
     shifted = verdict is MismatchVerdict.PARAMETER_SHIFT
-    better = described is not None and errors_seen.change("without", "augmented") == "better"
-    if verdict is MismatchVerdict.UNEXPLAINED and better and errors_seen.share_gained >= NEARLY_ALL:
-        # A model that leaves hardly more than noise is an explanation, though it has no name.
-        verdict = MismatchVerdict.MISSING_PHYSICS
+    left, context = investigation.remainder.after, investigation.context
+    if verdict is MismatchVerdict.UNEXPLAINED and described is not None:
+        # A model that leaves no more than sensor and randomness do is an explanation, though it has no name.
+        rest = Remainder.of(context.data, described.fit, described.fit, context.roles)
+        gained = errors_seen.change("without", "augmented") == "better"
+        nearly = gained and errors_seen.share_gained >= NEARLY_ALL
+        if nearly and (errors_seen.at_noise("augmented", random=True) or not rest.doubtful):
+            verdict, left = MismatchVerdict.MISSING_PHYSICS, rest.after
     elif shifted and errors_seen.change("before", "recalibrated") != "better":
         # Recordings held out say that other parameters mend nothing, be it that there is nothing to be seen.
         seen = not errors_seen.at_noise("before")
@@ -96,15 +100,15 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
         description=Description(
             share_described=investigation.remainder.share if found else 0.0,
             by=found,
-            p_residuals_random=investigation.remainder.after.p_value,
-            random_forces_admitted=search.fit.has_process_noise,
+            p_residuals_random=left.p_value,
+            random_forces_admitted=(search.fit if described is None else described.fit).has_process_noise,
             too_faint=investigation.too_faint,
             misleading=investigation.withdrawn,
         )
         if verdict.mismatch and not investigation.verdict.names
         else None,
         described=tuple(
-            _stated_function(part, final, (*names, *labels[:place]), investigation.context)
+            _stated_function(part, final, (*names, *labels[:place]), context)
             for place, part in enumerate(parts)
         ),
         location=_locate(investigation, described) if investigation.verdict.mismatch else None,
