@@ -21,10 +21,7 @@ from typing import Any, Literal
 import numpy as np
 import scipy.stats
 
-from siq.diagnosis.dictionary import Roles
-from siq.diagnosis.evidence import correlation_time_of, residuals
 from siq.diagnosis.mechanisms import MechanismCandidate
-from siq.diagnosis.residual_structure import Remainder
 from siq.errors import NumericalFailure
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
@@ -78,7 +75,7 @@ class HeldOutErrors:
     rungs
         With the first mechanism that is named, with the first two, and so on.
     floor
-        The same with the error of the model that described the rest (`spread_of_free_runs`).
+        The same with the error of the model that described the rest (`siq.diagnosis.investigation`).
     spread, unit
         Of a single output: what errors of 1 amount to; None where there are several, or it has no unit.
     """
@@ -153,30 +150,6 @@ class HeldOutErrors:
             return False
         tolerance = CONFIDENCE_95 / float(np.sqrt(2 * self.values)) if self.values else 0.0
         return error * (1 - tolerance) <= floor
-
-
-def spread_of_free_runs(fit: Fit, learned: Measurements, roles: Roles) -> np.ndarray:
-    """Variance of what free runs of a fit are off by, as the noises of the fit foresee it, shape ``(m,)``.
-
-    The error of the model acts as a random force whose intensity over long times is that from one sample to
-    the next, times its correlation time τ in samples. What a function of a coordinate finds in it is no
-    random force, and not counted. Where τ is not short beside the times of the system, this is too much.
-    """
-    white, _, left = residuals(fit, learned)
-    correlated = correlation_time_of(left, white.recording, outputs=len(fit.model.outputs))
-    after = Remainder.of(learned, fit, fit, roles).after
-    found = max((each.gain - 2 * each.term.width for each in after.curves), default=0.0)
-    random = 1 - np.clip(found / after.total, 0.0, 1.0)
-    scored = scored_rows(learned)
-    unseen = np.where(scored[:, None], np.nan, fit.linearisation.residual)
-    run = replace(fit.linearisation, residual=unseen).filtered(
-        learned.first, learned.step, fit.noise.scaled(correlated * random),
-        begin_covariance=np.diag(np.ptp(fit.x, axis=0) ** 2), kept=True,
-    )  # fmt: skip
-    measured = fit.linearisation.measured
-    return np.asarray(
-        np.einsum("nmi,nij,nmj->nm", measured, run[7], measured)[scored].mean(axis=0) + fit.noise.measurement
-    )
 
 
 def change_between(first: tuple[float, ...] | None, second: tuple[float, ...] | None) -> Change:

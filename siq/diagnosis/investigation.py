@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.stats
 
-from siq.diagnosis.dictionary import Mechanism, roles_of, units_of
-from siq.diagnosis.evidence import NotFitted
+from siq.diagnosis.dictionary import Mechanism, Roles, roles_of, units_of
+from siq.diagnosis.evidence import NotFitted, correlation_time_of, residuals
 from siq.diagnosis.forecasts import Horizon
 from siq.diagnosis.holdout import (
     HeldOutErrors,
@@ -18,7 +18,6 @@ from siq.diagnosis.holdout import (
     preferred_recalibration,
     simplest_of,
     simulated,
-    spread_of_free_runs,
 )
 from siq.diagnosis.mechanisms import candidates_of, generic_candidates
 from siq.diagnosis.naming import Investigation, decide_naming, named_by_forecasts
@@ -291,7 +290,7 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     least = np.min([learned.roughness, *(each.noise.measurement for each in still)], axis=0)
     floors = [learned.with_known_noise(least)]
     if described is not None and described.fit.has_process_noise:
-        floors.append(spread_of_free_runs(described.fit, learned, investigation.context.roles))
+        floors.append(_spread_of_free_runs(described.fit, learned, investigation.context.roles))
     noise_floor, *_, floor = [float(np.sqrt(np.mean(each / spread))) for each in (*floors, floors[-1])]
     unit = units_of(fit.model).get(str(fit.model.outputs[0][1]), "1") if len(spread) == 1 else "1"
     rungs = [errors_of(each.best.fit, data) for each in search.found[:-1]] if named else []
@@ -311,4 +310,28 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         ),
         independent=not set(learned.labels) & set(data.labels),
         described=described,
+    )
+
+
+def _spread_of_free_runs(fit: Fit, learned: Measurements, roles: Roles) -> np.ndarray:
+    """Variance of what free runs of a fit are off by, as the noises of the fit foresee it, shape ``(m,)``.
+
+    The error of the model acts as a random force whose intensity over long times is that from one sample to
+    the next, times its correlation time τ in samples. What a function of a coordinate finds in it is no
+    random force, and not counted. Where τ is not short beside the times of the system, this is too much.
+    """
+    white, _, left = residuals(fit, learned)
+    correlated = correlation_time_of(left, white.recording, outputs=len(fit.model.outputs))
+    after = Remainder.of(learned, fit, fit, roles).after
+    found = max((each.gain - 2 * each.term.width for each in after.curves), default=0.0)
+    random = 1 - np.clip(found / after.total, 0.0, 1.0)
+    scored = scored_rows(learned)
+    unseen = np.where(scored[:, None], np.nan, fit.linearisation.residual)
+    run = replace(fit.linearisation, residual=unseen).filtered(
+        learned.first, learned.step, fit.noise.scaled(correlated * random),
+        begin_covariance=np.diag(np.ptp(fit.x, axis=0) ** 2), kept=True,
+    )  # fmt: skip
+    measured = fit.linearisation.measured
+    return np.asarray(
+        np.einsum("nmi,nij,nmj->nm", measured, run[7], measured)[scored].mean(axis=0) + fit.noise.measurement
     )

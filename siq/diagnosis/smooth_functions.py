@@ -432,22 +432,29 @@ class Smoothness:
         gram = self.fine.heights_of(self.fine.heights_of(self.gram).T)
         return (gram + gram.T) / (2 * self.noise), self.fine.heights_of(self.overlap) / self.noise
 
-    @property
-    def told(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        """Places of the finest bumps, and what is told of values there; see `fitting_forms`.
+    def fitting_forms(
+        self, forms: Sequence[_Form] | None = None
+    ) -> list[tuple[_Form, dict[sympy.Symbol, tuple[float, float]]]]:
+        """The simplest formulas that the function may be, by default of all that have names (`FORMS`).
 
-        The normal equations of values f are ``G f = b``. With the covariance ``K = L Lᵀ`` that is expected of
-        the function, and the eigenvalues λ and eigenvectors U of ``Lᵀ G L``, the weights are ``(1 + λ)^-½ Uᵀ
-        Lᵀ G``, and the degrees of freedom ``Σ λ/(1 + λ)``: a difference counts as far as such a function
-        could be it.
+        What recordings tell of its values f at the finest bumps are normal equations ``G f = b``. With the
+        covariance ``K = L Lᵀ`` that is expected of the function, λ and U the eigenvalues and eigenvectors of
+        ``Lᵀ G L``, a formula is the function as far as ``(1 + λ)^-½ Uᵀ Lᵀ (b - G f)`` is noise, with ``Σ λ/(1
+        + λ)`` degrees of freedom: a difference counts as far as such a function could be it.
+
+        Returns
+        -------
+        list of (form, dict)
+            Of those that fit with as few coefficients as any, the nearest first, with these and their errors.
+            Empty where none fits.
         """
-        (gram, overlap), (shares, ranges) = self._by_value, (self.shares, np.ptp(self.courses, axis=1))
-        root = self.deviation * _triangle_of(self.fine.centres, np.array(shares) * ranges)
+        (gram, overlap), ranges = self._by_value, np.ptp(self.courses, axis=1)
+        root = self.deviation * _triangle_of(self.fine.centres, np.array(self.shares) * ranges)
         seen, vectors = np.linalg.eigh(root.T @ gram @ root)
         seen = np.maximum(seen, 0.0)
-        turned = (vectors / np.sqrt(1 + seen)).T @ root.T
-        freedom = float((seen / (1 + seen)).sum())
-        return self.fine.centres[:, 0], turned @ gram, turned @ overlap, freedom
+        turned, freedom = (vectors / np.sqrt(1 + seen)).T @ root.T, float((seen / (1 + seen)).sum())
+        asked = FORMS if forms is None else forms
+        return _fitting(self.fine.centres[:, 0], turned @ gram, turned @ overlap, freedom, asked)
 
 
 def _without(white: Whitened, fit: Fit, known: FittedCandidate | None) -> tuple[Whitened, int]:
@@ -505,28 +512,13 @@ def _forms() -> Iterator[_Form]:
 FORMS = tuple(_forms())
 
 
-def fitting_forms(
-    at: np.ndarray, weights: np.ndarray, goal: np.ndarray, freedom: float, forms: Sequence[_Form] = FORMS
+def _fitting(
+    at: np.ndarray, weights: np.ndarray, goal: np.ndarray, freedom: float, forms: Sequence[_Form]
 ) -> list[tuple[_Form, dict[sympy.Symbol, tuple[float, float]]]]:
-    """The simplest formulas that a function may be, the nearest first, with coefficients and their errors.
+    """The simplest formulas that a function may be, with coefficients and their errors, the nearest first.
 
-    A formula with values f may be the function where ``|goal - weights @ f|²`` is as large as chance makes
-    it: χ² of so many degrees of freedom, less its coefficients.
-
-    Parameters
-    ----------
-    at
-        Places, shape ``(k,)``.
-    weights, goal, freedom
-        What is told of values there (`Smoothness.told`), such as ``C^-½`` and ``C^-½ v`` of values v with the
-        covariance C; shapes ``(r, k)`` and ``(r,)``.
-    forms
-        Those that are asked.
-
-    Returns
-    -------
-    list of (form, dict)
-        Of those that fit with as few coefficients as any. Empty where none fits.
+    A formula with values f at places ``(k,)`` may be the function where ``|goal - weights @ f|²`` is as large
+    as chance makes it: χ² of so many degrees of freedom, less its coefficients. Weights are ``(r, k)``.
     """
     width = float(np.ptp(at))
     fitting: list[tuple[int, float, _Form, dict[sympy.Symbol, tuple[float, float]]]] = []

@@ -20,7 +20,7 @@ from siq.diagnosis.mechanisms import PROCESS_NOISE, SURFACE, fresh_names, places
 from siq.diagnosis.naming import Investigation
 from siq.diagnosis.residual_structure import Remainder, Structure
 from siq.diagnosis.search import FitContext
-from siq.diagnosis.smooth_functions import FORMS, A, B, C, Smoothness, Z, fitting_forms
+from siq.diagnosis.smooth_functions import FORMS, A, B, C, Smoothness, Z
 from siq.diagnosis.statement import (
     Alternative,
     DescribedCurve,
@@ -310,7 +310,7 @@ def _shape_of(
     fits = []
     with suppress(*NUMERICAL_ERRORS):
         if (asked := Smoothness.of(fit, context.data, place, known=part)) is not None:
-            fits = fitting_forms(*asked.told)
+            fits = asked.fitting_forms()
     if asked is None or not fits:
         value, error = np.array(curve.value), np.array(curve.standard_error)
         apart = np.subtract.outer(value, value)
@@ -323,7 +323,7 @@ def _shape_of(
     units = {each: place.unit(fit.model, power if each == A else 0, extra) for each in found}
     units[C] = units_of(fit.model).get(place.words[0], "1")
     written = {Z: symbol(place.words[0])} | {each: symbol(name) for each, name in names.items()}
-    known = fitting_forms(*asked.told, _known_forms(place, fit, context))
+    known = asked.fitting_forms(_known_forms(place, fit, context))
     return {
         "shape": form.name,
         "formula": str(form.formula.xreplace(written)),

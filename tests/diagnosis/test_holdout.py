@@ -12,8 +12,8 @@ from siq.diagnosis.holdout import (
     change_between,
     in_blocks,
     simulated,
-    spread_of_free_runs,
 )
+from siq.diagnosis.investigation import _spread_of_free_runs
 from siq.diagnosis.study import _measurements_of
 from siq.inference.measurements import with_expectations
 from siq.inference.recalibration import recalibrate
@@ -138,7 +138,7 @@ def test_noises_of_a_fit_foresee_how_far_free_runs_are_off(tau: float) -> None:
     fit, _ = recalibrate(with_expectations(model), data)
     assert fit.has_process_noise
     off = (simulated(fit, data, noise=fit.noise, substeps=fit.substeps) - data.outputs)[scored_rows(data)]
-    foreseen = spread_of_free_runs(fit, data, roles_of(fit.model))
+    foreseen = _spread_of_free_runs(fit, data, roles_of(fit.model))
     # A correlation over half of the time in which the force is forgotten makes it too much.
     low, high = (0.7, 1.4) if tau == 0 else (1.0, 2.5)
     assert low < foreseen[0] / np.mean(off**2) < high

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from siq.diagnosis.smooth_functions import FORMS, A, fitting_forms
+from siq.diagnosis.smooth_functions import FORMS, A, _fitting
 
 Z = np.linspace(-0.2, 1.0, 25)
 SHAPES = {
@@ -38,7 +38,7 @@ def known_to(error: float, draw: np.random.Generator) -> tuple[np.ndarray, np.nd
 
 
 def fits_of(values: np.ndarray, weights: np.ndarray, forms=FORMS):
-    return fitting_forms(Z, weights, weights @ values, len(Z), forms)
+    return _fitting(Z, weights, weights @ values, len(Z), forms)
 
 
 @pytest.mark.parametrize("name", SHAPES)

@@ -14,6 +14,7 @@ from siq.diagnosis.holdout import HeldOutErrors
 from siq.diagnosis.mechanisms import PROCESS_NOISE
 from siq.diagnosis.statement import (
     Alternative,
+    DescribedCurve,
     Description,
     Estimate,
     Evidence,
@@ -259,6 +260,26 @@ def test_a_shape_is_said_in_words(shape, words):
         "falls from 5.00 m (3.00 m with its own parameters refitted) to 0.500 m (noise alone: 0.400 m)"
         in text
     )
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        ("", "in proportion to u"), ("constant", "in proportion to u alone"),
+        ("saturating", "in proportion to u and, along x, saturating over 2.00 ± 0.10 m"),
+    ],
+)  # fmt: skip
+def test_a_coefficient_is_said_in_words(shape, words):
+    part = curve_in_v(
+        shape=shape, formula="s_1*x", sizes={"s_1": Estimate(2.0, 0.1, "m")},
+        curve=DescribedCurve("x", (0.0, 1.0), (0.0, 1.0), (0.1, 0.1)),
+    )  # fmt: skip
+    part = replace(part, coordinates=("x", "u"))
+    errors = errors_with({"before": 0.5, "recalibrated": 0.3, "augmented": 0.05}, 0.04)
+    statement = Statement(MismatchVerdict.MISSING_PHYSICS, described=(part,), errors=errors)
+    text = statement.sentence.replace("\u00a0", " ")
+    assert text.startswith(f"An effect of x and u is missing in the equation of v, {words}. With it")
+    assert "As a formula: s_1*x times u, s_1 = 2.00 ± 0.10 m." in text
 
 
 def test_what_describes_a_rest_is_told_from_what_has_a_name():
