@@ -72,7 +72,6 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
     labels = [each.candidate.label for each in parts]
     errors = _standard_errors(final)
     remarks, errors_seen = list(investigation.remarks), shown.errors
-    shifted = verdict is MismatchVerdict.PARAMETER_SHIFT
     left, context = investigation.remainder.after, investigation.context
     if verdict is MismatchVerdict.UNEXPLAINED and described is not None:
         # A model that leaves no more than sensor and randomness do is an explanation, though it has no name.
@@ -81,11 +80,13 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
         nearly = gained and errors_seen.share_gained >= NEARLY_ALL
         if nearly and (errors_seen.at_noise("augmented", random=True) or not rest.doubtful):
             verdict, left = MismatchVerdict.MISSING_PHYSICS, rest.after
-    elif shifted and errors_seen.change("before", "recalibrated") != "better":
-        # Recordings held out say that other parameters mend nothing, be it that there is nothing to be seen.
-        seen = not errors_seen.at_noise("before")
-        verdict = MismatchVerdict.UNEXPLAINED if seen else MismatchVerdict.NO_MISMATCH
-        remarks.append(Remark("diagnosis.shift_mends_nothing", {"seen": seen}))
+    elif verdict is MismatchVerdict.PARAMETER_SHIFT:
+        # Other parameters have to mend it, by more than chance or down to the noise.
+        seen, change = not errors_seen.at_noise("before"), errors_seen.change("before", "recalibrated")
+        to_noise = seen and change == "same" and errors_seen.at_noise("recalibrated")
+        if not (change == "better" or to_noise):
+            verdict = MismatchVerdict.UNEXPLAINED if seen else MismatchVerdict.NO_MISMATCH
+            remarks.append(Remark("diagnosis.shift_mends_nothing", {"seen": seen}))
     if investigation.account.partial:
         untried = sum(each.remark == BUDGET_SPENT for each in search.untried)
         stopped_by = investigation.account.stopped_by

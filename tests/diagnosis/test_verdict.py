@@ -41,6 +41,7 @@ def test_a_formula_of_a_state_is_written_in_it() -> None:
         (0.5, 0.5, 0.1, MismatchVerdict.UNEXPLAINED),
         (0.1, 0.1, 0.1, MismatchVerdict.NO_MISMATCH),
         (0.5, 0.9, 0.1, MismatchVerdict.UNEXPLAINED),
+        (0.12, 0.1, 0.1, MismatchVerdict.PARAMETER_SHIFT),  # to the noise, where chance is not ruled out
     ],
 )
 def test_parameters_have_shifted_only_where_that_mends_the_simulation(
@@ -58,12 +59,14 @@ def test_parameters_have_shifted_only_where_that_mends_the_simulation(
         MismatchVerdict.PARAMETER_SHIFT, fit,
     )  # fmt: skip
     alike = draw.chisquare(1, 600)
-    errors = HeldOutErrors.of(
-        {name: error**2 * alike / alike.mean() for name, error in
-         (("before", before), ("recalibrated", recalibrated), ("augmented", recalibrated))},
-        noise_floor=floor,
-    )  # fmt: skip
+    off = {"before": before, "recalibrated": recalibrated, "augmented": recalibrated}
+    squares = {name: error**2 * alike / alike.mean() for name, error in off.items()}
+    if before == 0.12:  # all of the difference in one stretch
+        squares["before"] = squares["recalibrated"].copy()
+        squares["before"][:50] *= (before / recalibrated) ** 2 * 12 - 11
+    errors = HeldOutErrors.of(squares, noise_floor=floor)
     runs = HeldOutRuns(data.outputs, data.outputs, data.outputs, fit, fit, errors)
+    assert (errors.change("before", "recalibrated") == "better") == (before == 0.5 and recalibrated == 0.1)
     statement = statement_of(found, runs)
     assert statement.verdict is verdict
     assert ("diagnosis.shift_mends_nothing" in [each.code for each in statement.remarks]) == (
