@@ -11,8 +11,9 @@ what it found must be tested by what does not know of this equation (`siq.quasip
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -99,12 +100,17 @@ class LibraryBasis:
 
 @dataclass(frozen=True)
 class PowerBasis:
-    """Products of powers of ``(x - center)/scale``, with exponents of the shape ``(m, d)``."""
+    """Products of powers of ``y = (x - center)/scale``, with exponents ``(p, d)``, and units, if any.
+
+    A unit ``tanh(w·y + b)`` is a row ``(w, b)`` of `units`, shape ``(m - p, d + 1)``. Its Taylor polynomial
+    of degree 2 at the center is taken away, so that value, slope and curvature there are those of the powers.
+    """
 
     symbols: tuple[sympy.Symbol, ...]
     center: np.ndarray
     scale: np.ndarray
     exponents: np.ndarray
+    units: np.ndarray | None = None
 
     @classmethod
     def up_to(
@@ -117,35 +123,45 @@ class PowerBasis:
     @classmethod
     def from_data(cls, data: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...]) -> PowerBasis:
         """The powers that `Well.powers` wrote."""
-        return cls(symbols, *(np.array(data[name]) for name in ("center", "scale", "exponents")))
+        names = ("center", "scale", "exponents", *(["units"] if "units" in data else []))
+        return cls(symbols, *(np.array(data[name]) for name in names))
 
     @property
     def size(self) -> int:
         """Number of functions, m."""
-        return len(self.exponents)
+        return len(self.free)
+
+    @property
+    def free(self) -> np.ndarray:
+        """Mask of the functions that a fit may change, ``(m,)``: all but the quadratic ones, which are M."""
+        return np.append(self.exponents.sum(axis=1) > 2, np.full(len(self._rows), True))
 
     @property
     def title(self) -> str:
         """The functions in words."""
-        return f"powers of degree {self.exponents.sum(axis=1).max()}"
+        words = f"powers of degree {self.exponents.sum(axis=1).max()}"
+        return words if self.units is None else f"{words} and {len(self.units)} random units"
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """Points ``(n, d)`` to values ``(n, m)``."""
-        return self._product(self._powers(x), ())
+        return np.concatenate([self._product(self._powers(x), ()), self._along_units(x, 0)], axis=1)
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
         """Points ``(n, d)`` to gradients ``(n, d, m)``."""
         powers = self._powers(x)
-        d = len(self.symbols)
-        return np.stack([self._product(powers, (i,)) for i in range(d)], axis=1)
+        slopes = self._rows[:, :-1].T / self.scale[:, None]
+        of_powers = np.stack([self._product(powers, (i,)) for i in range(len(slopes))], axis=1)
+        return np.concatenate([of_powers, self._along_units(x, 1)[:, None] * slopes], axis=2)
 
     def hessians(self, x: np.ndarray) -> np.ndarray:
         """Points ``(n, d)`` to Hessians ``(n, d, d, m)``."""
         powers, d = self._powers(x), len(self.symbols)
-        values = np.empty((len(x), d, d, self.size))
+        values, slopes = np.empty((len(x), d, d, self.size)), self._rows[:, :-1].T / self.scale[:, None]
+        bends, p = self._along_units(x, 2), len(self.exponents)
         for i in range(d):
             for j in range(i + 1):
-                values[:, i, j] = values[:, j, i] = self._product(powers, (i, j))
+                values[:, i, j, :p] = values[:, j, i, :p] = self._product(powers, (i, j))
+                values[:, i, j, p:] = values[:, j, i, p:] = bends * slopes[i] * slopes[j]
         return values
 
     def expression(self, coefficients: np.ndarray) -> sympy.Expr:
@@ -155,7 +171,33 @@ class PowerBasis:
             for symbol, c, s in zip(self.symbols, self.center, self.scale, strict=True)
         ]
         powers = ([base ** int(e) for base, e in zip(scaled, row, strict=True)] for row in self.exponents)
-        return _weighted_sum(coefficients, (sympy.Mul(*factors) for factors in powers))
+        terms = itertools.chain((sympy.Mul(*factors) for factors in powers), self.unit_terms(scaled))
+        return _weighted_sum(coefficients, terms)
+
+    def unit_terms(self, scaled: Sequence[sympy.Expr]) -> Iterator[sympy.Expr]:
+        """The units as formulas of y."""
+        for *weights, bias in self._rows.tolist():
+            along = _weighted_sum(np.array(weights), scaled)
+            here = float(np.tanh(bias))
+            slope, bend = 1 - here**2, -here * (1 - here**2)
+            taylor = (sympy.Float(one, 17) * along**k for k, one in enumerate((here, slope, bend)))
+            yield sympy.tanh(along + sympy.Float(bias, 17)) - sympy.Add(*taylor)
+
+    @property
+    def _rows(self) -> np.ndarray:
+        return np.zeros((0, len(self.center) + 1)) if self.units is None else self.units
+
+    def _along_units(self, x: np.ndarray, order: int) -> np.ndarray:
+        """The units' derivative of an order up to 2 by ``w·y``, shape ``(n, m - p)``."""
+        weights, biases = self._rows[:, :-1], self._rows[:, -1]
+        along = ((x - self.center) / self.scale) @ weights.T
+        here, at_center = np.tanh(along + biases), np.tanh(biases)
+        slope = 1 - at_center**2
+        if order == 0:
+            return here - at_center - slope * along + slope * at_center * along**2
+        if order == 1:
+            return 1 - here**2 - slope + 2 * slope * at_center * along
+        return -2 * here * (1 - here**2) + 2 * at_center * slope
 
     def _powers(self, x: np.ndarray) -> np.ndarray:
         """Powers of every scaled state, shape ``(highest + 1, d, n)``."""
@@ -281,7 +323,10 @@ class HamiltonJacobi:
         if orthonormal:
             equation, turned = _orthonormalised(self, free)
             moving = np.arange(turned.shape[1]) < turned.shape[1] - int((~free).sum())
-            theta = np.linalg.lstsq(turned[free], start[free], rcond=None)[0]
+            # The same function over the points, of which the coefficients may be far from unique.
+            now, root = self.slopes(np.where(free, start, 0.0)), self.measure.root_at(self.points)
+            along = np.einsum("nij,nim,nkj,nk->m", root, equation.gradients, root, now, optimize=True)
+            theta = along / len(now)
             theta[~moving] = start[~free]
         for _ in range(rounds):
             rest = equation.relative_residuals(theta)

@@ -30,6 +30,7 @@ from scipy.spatial import cKDTree
 from siq.errors import NumericalFailure
 from siq.numerics.randomness import positive
 from siq.quasipotential.hamilton_jacobi import (
+    MAX_POWERS,
     SINGULAR_RATIO,
     Expansion,
     HamiltonJacobi,
@@ -108,8 +109,9 @@ class Well(Expansion):
 
     @property
     def powers(self) -> dict[str, Any]:
-        """Center, scale, exponents and coefficients as plain data."""
-        parts = {name: getattr(self.basis, name).tolist() for name in ("center", "scale", "exponents")}
+        """Center, scale, exponents, units and coefficients as plain data."""
+        names = ("center", "scale", "exponents", *(["units"] if self.basis.units is not None else []))
+        parts = {name: getattr(self.basis, name).tolist() for name in names}
         return parts | {"coefficients": self.coefficients.tolist()}
 
     @property
@@ -178,14 +180,22 @@ class Well(Expansion):
 
     @property
     def formula(self) -> Formula:
-        """V in powers of the offsets from the attractor, in the units of the states, without rounding."""
-        size, basis = np.abs(self.coefficients), self.basis
-        return Formula.of_powers(
+        """V in powers of the offsets from the attractor, in the units of the states, without rounding.
+
+        Where V has random units, their sum is added.
+        """
+        basis, (of_powers, of_units) = self.basis, np.split(self.coefficients, [len(self.basis.exponents)])
+        size = np.abs(of_powers)
+        formula = Formula.of_powers(
             "V", basis.symbols, scale=basis.scale, exponents=basis.exponents,
             center=np.where(np.abs(basis.center) > NEGLIGIBLE_COEFFICIENT * basis.scale, basis.center, 0.0),
-            coefficients=np.where(size > NEGLIGIBLE_COEFFICIENT * size.max(), self.coefficients, 0.0),
+            coefficients=np.where(size > NEGLIGIBLE_COEFFICIENT * size.max(), of_powers, 0.0),
             units=self.dynamics.units, title=f"U = 2V is the quasipotential, known up to V = {self.reach!r}",
         )  # fmt: skip
+        pairs = zip(basis.symbols, basis.scale.tolist(), strict=True)
+        units = basis.unit_terms([one / sympy.Float(width, DIGITS) for one, width in pairs])
+        terms = [sympy.Float(one, DIGITS) * unit for one, unit in zip(of_units, units, strict=True)]
+        return replace(formula, expression=sympy.Add(formula.expression, *terms))
 
     def to_text(self) -> str:
         """The formula as text, a line for each definition."""
@@ -246,6 +256,9 @@ MAX_POINTS_TO_KNOWN_DEPTH = 5000  # of one fit
 RUNAWAY_LEVEL = 1.5  # of a level: where the lower degree's formula is higher, a lower V is an extrapolation
 RUNAWAY_RATIO = 3.0  # times the residual of the degree below: a higher one so much worse has run away
 MAX_IDLE_DEGREES = 2  # higher degrees in a row that do not improve: there is nothing more to be had
+POINTS_PER_UNIT = 4  # at least, where units begin; with fewer points there are fewer units
+UNIT_WIDTHS = 2.0  # of random units: so many times more or less than the distance of the level
+COVERAGE_TOLERANCE = 0.005  # share of the states by which two formulas hold at as many
 HELD_OUT_STRIDE = 4  # every so manieth point is kept for choosing the degree
 
 
@@ -335,10 +348,61 @@ def local_well(
     return replace(wells[best_trial(trials)], trials=tuple(trials))
 
 
+def over_units(
+    well: Well,
+    portrait: PhasePortrait,
+    index: int,
+    *,
+    seed: int = 0,
+    path: MinimumActionPath | None = None,
+) -> Well:
+    """V about an attractor over random tanh units, from a formula in powers that does not follow it.
+
+    ``½ (x - A)·M (x - A)`` stays, and units add nothing to the curvature at the attractor. They begin
+    with ∇V of the formula at that half of its points where it solves the Hamilton–Jacobi equation best, and
+    are taken on from there as powers are. Directions are drawn alike in the metric of M. The parameters are
+    as of `local_well`.
+
+    Raises
+    ------
+    NumericalFailure
+        When too few states lead to the attractor, or the units do not follow V.
+    """
+    basin, draw, d = portrait.basins[index], np.random.default_rng(seed), len(well.attractor)
+    rows = np.arange(len(basin.chosen))
+    residual = well.residual_at(well.points)
+    x = well.points[residual <= np.median(residual)]
+    count = min(MAX_POWERS, len(x) // POINTS_PER_UNIT)
+    metric = np.linalg.cholesky(hessian_at(well.dynamics, well.attractor)) / np.sqrt(2 * well.level)
+    widths = UNIT_WIDTHS ** draw.uniform(-1, 1, count)
+    directions = draw.normal(size=(count, d)) / np.sqrt(d) / widths[:, None] @ metric.T
+    middles = well.points[draw.choice(len(well.points), count)] - well.attractor
+    units = np.column_stack([directions * well.basis.scale, -(directions * middles).sum(axis=1)])
+    basis = replace(PowerBasis.up_to(2, well.basis.symbols, well.attractor, well.basis.scale), units=units)
+    free, coefficients = basis.free, np.zeros(basis.size)
+    coefficients[~free] = well.coefficients[: int((~free).sum())]  # the quadratic powers come first
+    equation = HamiltonJacobi.at(basis, x, well.dynamics, attractor=well.attractor)
+    slopes, roots = well.gradients(equation.points), equation.measure.root_at(equation.points)
+    weight = np.sqrt(equation.measure.contract(equation.points, slopes))
+    roots = roots / np.maximum(weight, np.median(weight))[:, None, None]
+    matrix = np.einsum("nij,nim->njm", roots, equation.gradients[:, :, free], optimize=True)
+    rest = np.einsum("nij,ni->nj", roots, slopes - equation.slopes(coefficients))
+    flat = matrix.reshape(-1, count)
+    scale = positive(np.linalg.norm(flat, axis=0))
+    coefficients[free] = np.linalg.lstsq(flat / scale, rest.ravel(), rcond=SINGULAR_RATIO)[0] / scale
+    found = _extend_well(
+        replace(well, basis=basis, coefficients=coefficients), basin, goal=well.reach, path=path,
+        rows=rows[rows % HELD_OUT_STRIDE != 0], generator=draw, first=float(np.median(well.values(x))),
+    )  # fmt: skip
+    if not found.residual < MAX_RESIDUAL:
+        raise NumericalFailure(f"{basis.title} do not follow V from the attractor near {well.attractor}")
+    return found
+
+
 def best_trial(trials: Sequence[DegreeTrial]) -> int:
     """Index of the first trial whose coverage and residual no other betters by much."""
     coverage = max(trial.covered for trial in trials)
-    good = [index for index, trial in enumerate(trials) if trial.covered >= coverage - 0.005]
+    good = [index for index, trial in enumerate(trials) if trial.covered >= coverage - COVERAGE_TOLERANCE]
     finest = min(trials[index].residual for index in good)
     return next(index for index in good if trials[index].residual <= max(2 * finest, MIN_OUTLIER_RESIDUAL))
 
@@ -361,7 +425,7 @@ def _grow_well(
     quadratic = 0.5 * np.einsum("ni,ij,nj->n", offsets, hessian, offsets).reshape(basin.states.shape[:2])
     size = np.quantile(quadratic[:, 0], 0.5) if depth is None else depth
     basis = PowerBasis.up_to(degree, dynamics.symbols, attractor.position, extent * np.sqrt(2 * size))
-    free = basis.exponents.sum(axis=1) > 2
+    free = basis.free
     coefficients = np.zeros(basis.size)
     i, j = np.array([np.repeat(np.arange(len(extent)), row) for row in basis.exponents[~free]]).T
     coefficients[~free] = np.where(i == j, 0.5, 1.0) * hessian[i, j] * basis.scale[i] * basis.scale[j]
@@ -485,18 +549,20 @@ def _extend_well(
     path: MinimumActionPath | None = None,
     generator: np.random.Generator | None = None,
     by_path: bool = True,
+    first: float | None = None,
 ) -> Well:
     """Take a formula on, from its well to a higher level `goal`, by robust fits of the equation.
 
     Only states that lead to the attractor are asked: across the ridge another well begins. Where the path to
     the saddle is known the formula may be one of lower powers in a basis of higher ones, and begins with ∇V
-    along it.
+    along it. `first` is the level of the first fit, by default a little below that of the well.
     """
     allowed = np.arange(len(basin.chosen)) if rows is None else rows
     functions = well.basis.values(basin.states.reshape(-1, basin.states.shape[2]))
-    shape, free = basin.states.shape[:2], well.basis.exponents.sum(axis=1) > 2
-    coefficients, level = well.coefficients, min(0.9 * well.level, goal)
-    options, rounds = (ROBUST_FIT, 4) if path is None else (FIT_TO_KNOWN_DEPTH, 3)
+    shape, free = basin.states.shape[:2], well.basis.free
+    coefficients, level = well.coefficients, min(0.9 * well.level if first is None else first, goal)
+    with_units = well.basis.units is not None
+    options, rounds = (FIT_TO_KNOWN_DEPTH, 3) if with_units or path is not None else (ROBUST_FIT, 4)
     if path is not None:
         metric = np.linalg.cholesky(hessian_at(well.dynamics, well.attractor))
         places = basin.points(np.arange(len(basin.chosen))) @ metric
