@@ -222,8 +222,8 @@ def better_wells(
     """Wells with V over random units where powers leave an error of more than `MIN_EXPLAINED_ERROR`.
 
     A V over units takes the place of powers if it passes tests that these do not pass, or has a smaller
-    error, and claims to hold at as many states. The error is what its residual leaves open, or its difference from
-    characteristics, if this is more. With ``units`` these stand wherever they lead to a V.
+    error, and claims to hold at as many states. The error is what its residual leaves open, or its difference
+    from characteristics, if this is more. With ``units`` these stand wherever they lead to a V.
 
     `paths` are those of least action to the lowest saddles, one for each attractor, where they are known.
     """

@@ -30,7 +30,6 @@ from scipy.spatial import cKDTree
 from siq.errors import NumericalFailure
 from siq.numerics.randomness import positive
 from siq.quasipotential.hamilton_jacobi import (
-    MAX_POWERS,
     SINGULAR_RATIO,
     Expansion,
     HamiltonJacobi,
@@ -256,6 +255,8 @@ MAX_POINTS_TO_KNOWN_DEPTH = 5000  # of one fit
 RUNAWAY_LEVEL = 1.5  # of a level: where the lower degree's formula is higher, a lower V is an extrapolation
 RUNAWAY_RATIO = 3.0  # times the residual of the degree below: a higher one so much worse has run away
 MAX_IDLE_DEGREES = 2  # higher degrees in a row that do not improve: there is nothing more to be had
+FIT_POINTS_PER_UNIT = 12  # at most, in a fit on the way and at its end
+MAX_UNITS = 200  # of a well; more are slower and hardly closer
 POINTS_PER_UNIT = 4  # at least, where units begin; with fewer points there are fewer units
 UNIT_WIDTHS = 2.0  # of random units: so many times more or less than the distance of the level
 COVERAGE_TOLERANCE = 0.005  # share of the states by which two formulas hold at as many
@@ -372,7 +373,7 @@ def over_units(
     rows = np.arange(len(basin.chosen))
     residual = well.residual_at(well.points)
     x = well.points[residual <= np.median(residual)]
-    count = min(MAX_POWERS, len(x) // POINTS_PER_UNIT)
+    count = min(MAX_UNITS, len(x) // POINTS_PER_UNIT)
     metric = np.linalg.cholesky(hessian_at(well.dynamics, well.attractor)) / np.sqrt(2 * well.level)
     widths = UNIT_WIDTHS ** draw.uniform(-1, 1, count)
     directions = draw.normal(size=(count, d)) / np.sqrt(d) / widths[:, None] @ metric.T
@@ -583,9 +584,9 @@ def _extend_well(
                 chosen = chosen[away < POINT_REACH * np.sqrt(2 * level)]
             fitted = chosen = np.union1d(chosen, np.flatnonzero(beside < level))
         chosen = used = np.intersect1d(chosen, allowed)
-        if path is not None and len(used) > MAX_POINTS_TO_KNOWN_DEPTH:
-            assert generator is not None
-            used = np.sort(generator.choice(used, MAX_POINTS_TO_KNOWN_DEPTH, replace=False))
+        most = FIT_POINTS_PER_UNIT * well.basis.size if with_units else MAX_POINTS_TO_KNOWN_DEPTH
+        if generator is not None and len(used) > most:
+            used = np.sort(generator.choice(used, most, replace=False))
         if path is not None and len(used) < 2 * well.basis.size:
             raise NumericalFailure(
                 f"V about the attractor near {well.attractor.round(4)} is told by {len(used)} states alone"
@@ -596,7 +597,7 @@ def _extend_well(
         coefficients = equation.robust_fit(coefficients, free, rounds=rounds if last else 1, **options)
         if last:
             break
-        level = min(goal, ROBUST_GROWTH * level)
+        level = min(goal, (ROBUST_GROWTH**2 if with_units else ROBUST_GROWTH) * level)
     residual = float(np.median(equation.relative_residuals(coefficients)))
     if path is not None and not np.isfinite(residual):
         raise NumericalFailure(f"powers of degree {well.degree} do not follow V to its saddle")
