@@ -6,8 +6,10 @@ CORES ?= 2
 # Where torch comes from on Linux, whose usual build brings 3 GB for graphics cards along. `make TORCH_INDEX=`
 # takes that one.
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+# Bytecode is written when a module is first imported: that of all 15,000 would take longer than to unpack them.
+INSTALL := $(BIN)/python -m pip install --quiet --no-compile
 
-.PHONY: statistics examples test test-portable full untuned noise wheel test-pages newcomer laboratories coverage supports discrepancies \
+.PHONY: statistics examples test suite test-portable full untuned noise wheel test-pages newcomer laboratories coverage supports discrepancies \
         golden official docs docs-full lint format environment clean
 
 statistics: environment
@@ -16,7 +18,9 @@ statistics: environment
 examples: environment
 	$(BIN)/snakemake --cores $(CORES) examples
 
-test: environment lint
+test: lint suite
+
+suite: environment
 	$(BIN)/pytest --numprocesses logical --dist loadgroup --no-loadscope-reorder
 
 # Quick numerical tests as on a processor without AVX-512: sums are rounded otherwise there, and no answer may hang on
@@ -25,6 +29,7 @@ WITHOUT_AVX512 := NPY_DISABLE_CPU_FEATURES="X86_V4 AVX512_ICL AVX512_SPR" OPENBL
                   ATEN_CPU_CAPABILITY=avx2 NUMBA_CPU_NAME=haswell
 test-portable: environment
 	test "$$(uname -m)" != x86_64 || $(WITHOUT_AVX512) $(BIN)/pytest -m "portable and not slow" \
+	  $$(grep --recursive --files-with-matches --include='*.py' mark.portable tests) \
 	  --numprocesses logical --dist loadgroup --no-loadscope-reorder
 
 # Everything: the tests of `make test` and the full-size checks, minutes each.
@@ -117,10 +122,10 @@ $(VENV)/installed: pyproject.toml requirements/pinned.txt
 	  || { echo "siq needs Python 3.11 or newer; name one with 'make PYTHON=python3.12 ...'." >&2; exit 1; }
 	@echo "Installing siq with all of its tools below $(VENV): about 2.4 GB, 1 GB of it for networks (CPU only)."
 	$(PYTHON) -m venv $(VENV)
-	@test -z "$(TORCH_INDEX)" || test "$$(uname)" != Linux || $(BIN)/python -m pip install --quiet --no-deps \
+	@test -z "$(TORCH_INDEX)" || test "$$(uname)" != Linux || $(INSTALL) --no-deps \
 	  --retries 0 --timeout 15 --index-url $(TORCH_INDEX) --constraint requirements/pinned.txt torch 2> /dev/null \
 	  || echo "$(TORCH_INDEX) does not answer; torch comes from the usual index."
-	$(BIN)/python -m pip install --quiet --constraint requirements/pinned.txt --editable '.[dev]'
+	$(INSTALL) --constraint requirements/pinned.txt --editable '.[dev]'
 	touch $@
 
 clean:

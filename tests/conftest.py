@@ -17,11 +17,18 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.hookimpl(tryfirst=True)  # before the scheduler reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Workflows first, for they take longest; those that look at the same one in the same process."""
-    items.sort(key=lambda item: "workflow" not in item.path.parts)
+    """Folders that take longest first; the tests of a file in one process, which makes what they share once.
+
+    Those that look at the same finished workflow are a group of their own. Inference is one, too: its first
+    test has the filter's machine code made, which takes longer than all of its tests beside.
+    """
+    items.sort(
+        key=lambda item: not {"inference", "quasipotential", "rules", "workflow"} & set(item.path.parts)
+    )
     for item in items:
-        if "finished" in getattr(item, "fixturenames", ()):
-            item.add_marker(pytest.mark.xdist_group("finished"))
+        alike = item.path.parent if "inference" in item.path.parts else item.path
+        shared = "finished" in getattr(item, "fixturenames", ())
+        item.add_marker(pytest.mark.xdist_group("finished" if shared else str(alike)))
 
 
 @pytest.fixture

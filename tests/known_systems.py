@@ -70,6 +70,7 @@ def _compiled(potential: sympy.Expr, symbols: tuple[sympy.Symbol, ...]) -> tuple
     return compile_formulas([potential], symbols), compile_formulas(gradient, symbols)
 
 
+@functools.cache
 def linear_system(dimension: int, *, seed: int = 0, rotation: float = 6.0) -> KnownSystem:
     """``f = -(D - Q) M x`` with random M, D and antisymmetric Q of size `rotation`; V = ½ xᵀMx."""
     draw = np.random.default_rng([seed, dimension])
@@ -81,6 +82,7 @@ def linear_system(dimension: int, *, seed: int = 0, rotation: float = 6.0) -> Kn
     return _known(symbols, potential, diffusion, turning, np.zeros((1, dimension)), [[-2, 2]] * dimension)
 
 
+@functools.cache
 def maier_stein(beta: float) -> KnownSystem:
     """``(x - x³ - βxy², -(1 + x²)y)``; V is known for β = 1 alone, where the noise-free flow is -∇V + g."""
     x, y = symbols = _symbols(2)
@@ -94,6 +96,7 @@ def maier_stein(beta: float) -> KnownSystem:
     )
 
 
+@functools.cache
 def archetype(dimension: int) -> KnownSystem:
     """The paper's system in d states: ``x`` quartic, every other state coupled to it in the same way."""
     symbols = _symbols(dimension)
@@ -108,6 +111,7 @@ def archetype(dimension: int) -> KnownSystem:
     return _known(symbols, potential, sympy.eye(dimension), turning, attractors, domain)
 
 
+@functools.cache
 def double_well(dimension: int) -> KnownSystem:
     """``f = -D∇V`` with g = 0 and D a multiple of no unit matrix; two wells of different depth."""
     symbols = _symbols(dimension)
@@ -123,6 +127,7 @@ def double_well(dimension: int) -> KnownSystem:
     )
 
 
+@functools.cache
 def limit_cycle(*, rotation: float = 2.0) -> KnownSystem:
     """Hopf's normal form, V = (x² + y² - 1)²/4: the attractor is the unit circle, and no equilibrium."""
     x, y = symbols = _symbols(2)
@@ -138,6 +143,7 @@ def limit_cycle(*, rotation: float = 2.0) -> KnownSystem:
     )
 
 
+@functools.cache
 def polynomial_system(
     dimension: int, *, seed: int = 0, rotation: float = 1.0, linear_rotation: bool = True
 ) -> KnownSystem:

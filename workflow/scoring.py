@@ -16,7 +16,7 @@ import pandas as pd
 
 from siq.inference.checks import prediction_errors
 from siq.inference.library import candidate_library
-from siq.networks.decomposition import AnyNetworks, shuffled
+from siq.networks.decomposition import AnyNetworks, potential_on_grid, shuffled
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.formulas import SymbolicDecomposition, exact_decomposition, term_coefficients
 from siq.systems.cards import load_exact, load_system
@@ -102,11 +102,11 @@ def _support_is_correct(coefficients: pd.DataFrame) -> bool | None:
     return bool(((quasipotential["estimate"] != 0) == (quasipotential["exact"] != 0)).all())
 
 
-def _domain_grid(domain: np.ndarray, *, points: int = GRID_POINTS) -> np.ndarray:
-    """A regular grid over the domain Ω, as components ``(d, n)`` with n about `points`."""
+def _domain_grid(domain: np.ndarray, *, points: int) -> tuple[list[np.ndarray], np.ndarray]:
+    """Axes of a regular grid over the domain Ω, and its points as ``(d, n)`` with n about `points`."""
     along = max(round(points ** (1 / len(domain))), 2)
     axes = [np.linspace(lower, upper, along) for lower, upper in domain]
-    return np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")])
+    return axes, np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")])
 
 
 def relative_error(estimate: np.ndarray, exact: np.ndarray) -> float:
@@ -248,13 +248,13 @@ def _network_errors(
     """
     randomised = shuffled(trained, generator=draw)
 
-    def error_of(networks: AnyNetworks, grid: np.ndarray) -> float:
-        values = 2 * networks.potential_at(grid.T)
+    def error_of(networks: AnyNetworks, points: int) -> float:
+        axes, grid = _domain_grid(box, points=points)
+        values = 2 * potential_on_grid(networks, axes, grid)
         known = np.isfinite(values)
         return relative_error(values[known], _exact_values(exact, grid[:, known]))
 
-    error = error_of(trained, _domain_grid(box))
-    chance = error_of(randomised, _domain_grid(box, points=COARSE))
+    error, chance = error_of(trained, GRID_POINTS), error_of(randomised, COARSE)
     return dict.fromkeys(map(str, METHODS), error) | {str(Method.CONTROL): chance}
 
 

@@ -88,11 +88,11 @@ def train(given: Given, settings: PipelineSettings) -> Any:
 
     torch.set_num_threads(given.threads)
     runs = dict(enumerate(zip(given.recordings, given.field, strict=True), start=given.number))
-    folder = Path(given.outputs["networks"]).parent
-    given.afterwards.append(partial(training.clean, folder))
-    results, networks, history = training.train_block(settings, runs, folder=folder, device=given.device)
-    outcomes = [one.outcome for one in results.values()]
-    return {"networks": networks or None, "history": history, "train_outcome": outcomes}
+    folder, version = Path(given.outputs["networks"]).parent, given.options["version"]
+    given.afterwards.append(partial(training.clean, folder, settings.training))
+    found = training.train_block(settings, runs, folder=folder, device=given.device, version=version)
+    outcomes = [one.outcome for one in found[0].values()]
+    return {"networks": found[1] or None, "history": found[2], "train_outcome": outcomes}
 
 
 UNCERTIFIED = {

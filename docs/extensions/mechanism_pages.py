@@ -41,7 +41,7 @@ def entry(mechanism: Mechanism) -> Iterator[str]:
         yield from ("", "| parameter | unit | sign | where it is looked for |", "|---|---|---|---|")
     for name, unit, sign, where in parameters:
         yield f"| `{name}` | `{unit}` | {sign} | {where} |"
-    yield ""
+    yield from ("", f"Family: {mechanism.family or mechanism.name}, weight {mechanism.weight:g}.", "")
     for words, names in (
         ("Special cases of it", mechanism.generalises),
         ("Easily taken for it", mechanism.look_alikes),

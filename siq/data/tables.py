@@ -303,6 +303,8 @@ def _complete(
     measured value is missing, where they are the few. Where most are, the columns were hardly meant to be one
     state, and they are refused, as is whatever else is missing.
     """
+    if not np.isnan(numbers[:, rows.order]).any():
+        return rows
     whole = pd.Series(~np.isnan(numbers[:, rows.order]).any(axis=0))
     after = whole.groupby(rows.recording).cummax()
     before = whole[::-1].groupby(rows.recording[::-1]).cummax()

@@ -29,7 +29,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from siq.data.correlation import markov_lag
 from siq.data.recordings import Recordings
@@ -186,8 +186,8 @@ class DwellCount:
         The number of hops in a given time is Poisson's, so that ``2T/τ`` lies between quantiles of χ².
         """
         tail = (1 - CONFIDENCE) / 2
-        upper = stats.chi2.ppf(1 - tail, 2 * self.visits + 2)
-        lower = stats.chi2.ppf(tail, 2 * self.visits) if self.visits else 0.0
+        upper = 2 * special.gammaincinv(self.visits + 1, 1 - tail)
+        lower = 2 * special.gammaincinv(self.visits, tail) if self.visits else 0.0
         return float(2 * self.time / upper), float(2 * self.time / lower) if lower > 0 else float("inf")
 
 
@@ -264,7 +264,7 @@ def _pushed_apart(values: np.ndarray, runs: list[slice], relaxation: float) -> t
     contrasts = at_places[second] - at_places[first]
     errors = np.sqrt(np.einsum("ij,jk,ik->i", contrasts, covariance, contrasts))
     largest = float(np.max(contrasts @ coefficients / errors))
-    return largest, float(stats.f.sf(max(largest, 0.0) ** 2 / DEGREE, DEGREE, freedom))
+    return largest, float(special.fdtrc(DEGREE, freedom, max(largest, 0.0) ** 2 / DEGREE))
 
 
 def _valley_between(

@@ -67,7 +67,6 @@ def _withdrawn(found: Investigation) -> Investigation:
             verdict=found.quiet_verdict,
             search=replace(found.search, found=(), fit=recalibrated),
             log_odds=(),
-            p_alike=None,
             convincing=False,
             remarks=(*found.remarks, Remark("diagnosis.refuted", {"names": " and ".join(names)})),
             account=budget.account(),
@@ -250,13 +249,13 @@ def solve_case(
         raise
     except NUMERICAL_ERRORS as error:
         raise NumericalFailure(f"the simulation cannot be fitted to the recordings: {error}") from error
-    final, model = found.final, found.final.model
+    recalibrated = shown.recalibration
+    final, model = found.final, shown.fit.model
     if shown.described is not None:
-        final, model = shown.fit, shown.fit.model
-    elif found.verdict.names:
-        model = shown.fit.model
+        final = shown.fit
+    elif not found.verdict.names:
+        final, model = recalibrated, recalibrated.model
     process = final.noise.process if found.process_noise else None
-    recalibrated = found.search.recalibrated
     return Diagnosis(
         statement=statement,
         augmented=_completed(model, final.x, process=process),

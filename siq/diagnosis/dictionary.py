@@ -202,6 +202,11 @@ class Mechanism(_Part):
         One for each kind of system in which it shows.
     generalises
         Mechanisms that are special cases of it.
+    family
+        The kind of physics that it is a member of, by default itself: what recordings tell first.
+    weight
+        How likely it is beforehand, beside one of weight 1. What nearly every system of its kind has
+        weighs 5, what few have weighs 0.2. A family weighs as much as its likeliest member.
     look_alikes
         Mechanisms that are easily taken for it.
     reference
@@ -212,6 +217,8 @@ class Mechanism(_Part):
     sentence: str
     forms: Annotated[tuple[Form, ...], Field(min_length=1)]
     generalises: tuple[str, ...] = ()
+    family: str = ""
+    weight: Annotated[float, Field(gt=0)] = 1.0
     look_alikes: tuple[str, ...] = ()
     reference: str = ""
 

@@ -27,7 +27,8 @@ from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import fit_with_process_noise_as_needed
-from siq.inference.trajectories import free_run, squared_errors
+from siq.inference.trajectories import free_run, scored_rows, squared_errors
+from siq.numerics.randomness import positive
 
 LOGGER = logging.getLogger(__name__)
 Change = Literal["better", "same", "worse", "unknown"]
@@ -196,6 +197,42 @@ def _cross_validation_folds(
         yield stretches(out, [owner[place] for place in group])[0], *rest
 
 
+def _refits_left_out(
+    fit: Fit,
+    learned: Measurements,
+    *,
+    noise: Noise,
+    candidates: Iterable[MechanismCandidate] = (),
+    shown: Measurements | None = None,
+) -> list[tuple[Fit, np.ndarray]] | None:
+    """Fits without each part in turn, and their errors on it, see `errors_left_out`."""
+    signed = {name for each in candidates for name in each.positive.intersection(each.amplitudes)}
+    spread, found = np.nanvar(learned.outputs[scored_rows(learned)], axis=0), []
+    for out, rest, rows in _cross_validation_folds(learned):
+        model, wrong = fit.model, {""}
+        rest = rest if shown is None else replace(rest, outputs=shown.outputs[rows])
+        try:
+            while wrong:
+                again = fit_with_process_noise_as_needed(model, rest, replace(fit, x=fit.x[rows]))
+                wrong = {p.name for p in again.model.parameters if p.name in signed and p.value < 0}
+                if wrong:
+                    LOGGER.info("without rows of one part, %s would be negative", ", ".join(sorted(wrong)))
+                    absent = (
+                        replace(each, value=0.0, fixed=True) if each.name in wrong else each
+                        for each in model.parameters
+                    )
+                    model = replace(model, parameters=tuple(absent))
+            run = simulated(again, out, noise=noise, substeps=fit.substeps)
+            own = squared_errors(run, out, spread)
+        except NumericalFailure:
+            return None
+        # One that does not quite settle, as where a reading is cut off, is judged by what it predicts.
+        if own is None or again.fault:
+            return None
+        found.append((again, own))
+    return found
+
+
 def errors_left_out(
     fit: Fit, learned: Measurements, *, noise: Noise, candidates: Iterable[MechanismCandidate] = ()
 ) -> np.ndarray | None:
@@ -210,30 +247,69 @@ def errors_left_out(
     numpy.ndarray or None
         None where a fit has no result, or a simulation runs away.
     """
-    positive = {name for each in candidates for name in each.positive.intersection(each.amplitudes)}
-    squares = []
-    for out, rest, rows in _cross_validation_folds(learned):
-        model, wrong = fit.model, {""}
-        try:
-            while wrong:
-                again = fit_with_process_noise_as_needed(model, rest, replace(fit, x=fit.x[rows]))
-                wrong = {p.name for p in again.model.parameters if p.name in positive and p.value < 0}
-                if wrong:
-                    LOGGER.info("without rows of one part, %s would be negative", ", ".join(sorted(wrong)))
-                    absent = (
-                        replace(each, value=0.0, fixed=True) if each.name in wrong else each
-                        for each in model.parameters
-                    )
-                    model = replace(model, parameters=tuple(absent))
-            run = simulated(again, out, noise=noise, substeps=fit.substeps)
-            own = squared_errors(run, out)
-        except NumericalFailure:
-            return None
-        # One that does not quite settle, as where a reading is cut off, is judged by what it predicts.
-        if own is None or again.fault:
-            return None
-        squares.append(own)
-    return np.concatenate(squares)
+    refits = _refits_left_out(fit, learned, noise=noise, candidates=candidates)
+    return None if refits is None else np.concatenate([squares for _, squares in refits])
+
+
+def _typically_better(before: tuple[float, ...], after: tuple[float, ...]) -> bool:
+    """Whether errors of blocks fall, and not only in one in which a saddle point multiplies them."""
+    falls = np.log(np.maximum(before, np.finfo(float).tiny) / np.maximum(after, np.finfo(float).tiny))
+    return bool(scipy.stats.ttest_1samp(falls, 0.0, alternative="greater").pvalue < CHANGE_BY_CHANCE) and (
+        change_between(before, after) != "worse"
+    )
+
+
+def preferred_recalibration(
+    card: Fit, refits: Sequence[tuple[Fit, Measurements]], learned: Measurements, *, noise: Noise
+) -> Fit:
+    """The fit whose free runs of parts left out are the best by more than appears by chance.
+
+    Where the model is wrong a refit bends its parameters to the parts that it learned from, and may be far
+    off elsewhere. So the simulation as it is stays, unless the parameters θ of a refit are farther from those
+    of the card, θ₀, than they are from each other without one of the n parts (delete-one jackknife; Efron and
+    Stein 1981, Ann. Stat. 9), and it foresees parts left out no worse. With the covariance C of p parameters
+    the ratio
+
+        (θ − θ₀)ᵀC⁻¹(θ − θ₀) / ((n − 1)/n · Σ (θᵢ − θ̄)ᵀC⁻¹(θᵢ − θ̄))
+
+    has Fisher's distribution with p and, at the least, n − 1 degrees of freedom if nothing but the model's
+    error moved them.
+
+    Parameters
+    ----------
+    card
+        With the parameters of the simulation as it is.
+    refits
+        Each with the recordings that it was shown, of which some samples may be missing; of those that are
+        as good the first is preferred.
+    learned, noise
+        What is left out in turn, and how much is trusted in where free runs begin.
+    """
+    parameters = tuple(replace(each, fixed=True) for each in card.model.parameters)
+    still = replace(card, model=replace(card.model, parameters=parameters), noise=noise.without_process())
+    alone = errors_left_out(still, learned, noise=noise)
+    chosen, least = card, None if alone is None else in_blocks(alone)
+    for fit, shown in refits:
+        known = _refits_left_out(fit, learned, noise=noise, shown=shown)
+        free = list(fit.model.free)
+        if known is None or not np.isfinite(fit.covariance).all():
+            continue
+        values = np.array([again.model.values[free] for again, _ in known])
+        scale = positive(np.sqrt(np.diag(fit.covariance)))
+        inverse = np.linalg.pinv(fit.covariance / np.outer(scale, scale), rcond=1e-9, hermitian=True)
+        apart, among = (
+            float(np.einsum("kp,pq,kq->", each / scale, inverse, each / scale))
+            for each in ((fit.model.values - card.model.values)[None, free], values - values.mean(axis=0))
+        )
+        count = len(known)
+        ratio = apart / max((count - 1) / count * among, np.finfo(float).tiny)
+        squares = np.concatenate([each for _, each in known])
+        moved = scipy.stats.f.sf(ratio, len(free), count - 1) < CHANGE_BY_CHANCE / len(refits)
+        after = in_blocks(squares)
+        LOGGER.info("a refit: error of parts left out %.3g, ratio of shifts %.3g", squares.mean(), ratio)
+        if moved and (least is None or _typically_better(least, after)):
+            chosen, least = fit, after
+    return chosen
 
 
 def simplest_of(errors: Sequence[float], coordinates: Sequence[int], likeliest: int) -> int:

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.stats
 
-from siq.diagnosis.dictionary import roles_of
+from siq.diagnosis.dictionary import Mechanism, roles_of
 from siq.diagnosis.evidence import NotFitted
+from siq.diagnosis.forecasts import Horizon
 from siq.diagnosis.holdout import (
     HeldOutErrors,
     errors_left_out,
     first_better,
+    preferred_recalibration,
     simplest_of,
     simulated,
 )
 from siq.diagnosis.mechanisms import candidates_of, generic_candidates
-from siq.diagnosis.naming import Investigation, decide_naming
+from siq.diagnosis.naming import Investigation, decide_naming, named_by_forecasts
 from siq.diagnosis.residual_structure import (
     RANDOM_RESIDUALS,
     STRUCTURED,
@@ -50,18 +53,45 @@ def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigat
         When not even the recalibrated simulation with process noise can be fitted.
     """
     study, data, dictionary = case.settings, case.learn, case.dictionary
-    options = study.search
     model = with_expectations(case.system)
     roles = roles_of(model)
     candidates = candidates_of(model, roles, dictionary)
     if study.generic if study.generic is not None else not roles.physical:
         monomials = generic_candidates(model, roles, degree=study.degree, named=candidates)
         candidates += [each for each in monomials if each.coordinate != "constant"]
+    if study.search.prior == "flat":
+        candidates = [replace(each, weight=1.0) for each in candidates]
     budget = budget or Budget()
     context = FitContext(model, data, roles, tuple(candidates), study, budget)
     budget.says("fitting the simulation's own parameters")
     with budget.exempt():
         recalibrated, least_squares = recalibrate(model, data, budget=budget)
+    named, recalibrations = None, tuple[Horizon, ...]()
+    # The steps of a sensor look like forces, too, and so like physics that explains them.
+    if recalibrated.has_process_noise and (
+        explained_by_quantisation(data, least_squares, roles, budget=budget) is None
+    ):
+        with budget.keeping(BUDGET_FOR_FUNCTIONS):
+            named, recalibrations = named_by_forecasts(recalibrated, least_squares, context)
+    if named is None:
+        result = replace(
+            _by_tests(recalibrated, least_squares, context, dictionary), recalibrations=recalibrations
+        )
+    else:
+        result = replace(named, p_shift=_shift_probability(model, recalibrated))
+    budget.says("working out how well parameters are known")
+    with budget.exempt():
+        covariance = covariance_with_unknown_process_noise(result.search.fit, data, budget=budget)
+    search = replace(result.search, fit=replace(result.search.fit, covariance=covariance))
+    return replace(result, search=search, account=budget.account())
+
+
+def _by_tests(
+    recalibrated: Fit, least_squares: Fit, context: FitContext, dictionary: Sequence[Mechanism]
+) -> Investigation:
+    """What is missing by tests that suppose that with it nothing is left but noise."""
+    model, data, roles, budget = context.model, context.data, context.roles, context.budget
+    options = context.study.search
     with budget.keeping(BUDGET_FOR_FUNCTIONS):
         found = search_mechanisms(Search(recalibrated, (), recalibrated, ()), context)
     recalibrated = found.recalibrated  # from where a mechanism led it, if that is better
@@ -80,7 +110,7 @@ def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigat
             break
     tried = bool(found.found)
     if tried:
-        result = decide_naming(found, by_each, context, generator=np.random.default_rng(0))
+        result = decide_naming(found, by_each, context)
         result = replace(result, least_squares=least_squares)
     else:
         left = Remainder.of(data, recalibrated, recalibrated, roles)
@@ -119,11 +149,7 @@ def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigat
                 result = replace(result, models=models)
     if result.verdict is MismatchVerdict.UNEXPLAINED and not (result.models or result.search.found):
         result = replace(result, models=fit_unnamed_models(result.search, context))
-    budget.says("working out how well parameters are known")
-    with budget.exempt():
-        covariance = covariance_with_unknown_process_noise(result.search.fit, data, budget=budget)
-    search = replace(result.search, fit=replace(result.search.fit, covariance=covariance))
-    return replace(result, search=search, account=budget.account())
+    return result
 
 
 def _shift_probability(model: Dynamics, recalibrated: Fit) -> float:
@@ -149,6 +175,8 @@ class HeldOutRuns:
     ----------
     before, recalibrated, augmented
         Outputs ``(n, m)`` of the simulation as it is, with its parameters refitted, and with what was found.
+    recalibration
+        Of the recalibrated simulation: where no refit foresees parts left out better, that of the card.
     fit
         Of the augmented simulation that was run.
     errors
@@ -162,6 +190,7 @@ class HeldOutRuns:
     before: np.ndarray
     recalibrated: np.ndarray
     augmented: np.ndarray
+    recalibration: Fit
     fit: Fit
     errors: HeldOutErrors
     independent: bool = True
@@ -199,9 +228,13 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     card = replace(search.recalibrated, model=investigation.context.model)
     # What fits best with process noise admitted need not be what runs best without.
     recalibrated = search.recalibrated
-    if recalibrated.has_process_noise and np.isfinite(investigation.least_squares.sum_of_squares):
-        recalibrated = best_of(investigation.least_squares, recalibrated, card)
-    plain = best_of(investigation.exact, search.fit)
+    if recalibrated.has_process_noise:
+        refits = [(investigation.least_squares, learned)]
+        refits += [(each.fit, each.data) for each in investigation.recalibrations] or [
+            (recalibrated, learned)
+        ]
+        recalibrated = preferred_recalibration(card, refits, learned, noise=noise)
+    plain = best_of(investigation.exact, search.fit, *(each.fit for each in investigation.finals))
     choices = [(model, best_of(model.fit, model.exact)) for model in investigation.models]
     named = investigation.verdict.names
     judges = [place for place, label in enumerate(data.labels) if label not in study.tests]
@@ -257,6 +290,7 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         before=before,
         recalibrated=refitted,
         augmented=augmented,
+        recalibration=recalibrated,
         fit=fit,
         errors=HeldOutErrors.of(squares, noise_floor=floor),
         independent=not set(learned.labels) & set(data.labels),

@@ -148,8 +148,9 @@ class MechanismCandidate:
 
     Attributes
     ----------
-    name, label, variant
-        Of the mechanism; the same, told apart from its other forms and places; and of its form.
+    name, label, variant, family, weight
+        Of the mechanism; the same, told apart from its other forms and places; of its form; of its kind; and
+        how likely it is beforehand.
     model
         The simulation with it built in; amplitudes are zero, shapes not yet set.
     amplitudes, shapes, searches
@@ -189,6 +190,8 @@ class MechanismCandidate:
     begins: tuple[sympy.Expr, ...] = ()
     generalises: tuple[str, ...] = ()
     variant: str = ""
+    family: str = ""
+    weight: float = 1.0
     kind: Kind = MECHANISM
     log_cost: float = 0.0
     place: Place | None = None
@@ -361,6 +364,8 @@ def build_candidate(
         changes=(*changes, *further),
         generalises=mechanism.generalises,
         variant=form.variant,
+        family=mechanism.family or mechanism.name,
+        weight=mechanism.weight,
     )
     return _labelled(candidate, model)
 
@@ -638,6 +643,7 @@ def generic_candidates(
                 added(
                     model, {name: symbol(new) * monomial}, {}, [Parameter(new, 0.0, unit)],
                     name=GENERIC, label=f"{GENERIC} {monomial} in {name}", coordinate=among or "constant",
+                    family=GENERIC,
                 )
             )  # fmt: skip
     have_names = {_added_square(each) for each in named} - {None}

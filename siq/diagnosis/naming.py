@@ -5,14 +5,8 @@ missing, by their marginal likelihoods (`siq.diagnosis.evidence`): along the tra
 mechanism everything is linear, and amplitudes, shapes and functions have normal priors whose size is drawn
 evenly on a logarithmic scale. A name takes the odds that keep wrong names as rare as is asked for.
 
-**Matches by chance.** A mechanism that leaves something may be right and not alone, or wrong and alike.
-Effects without a name are drawn as smooth functions at all sites; least squares says how much of each the
-best mechanisms would explain. A name has to explain more than that.
-
-**Where something is left.** Where it does not, the first mechanism may still be likelier than a function in
-its place, whatever else is missing being a function for both. The errors that both leave are autocorrelated
-and count as so many as are independent. Where the odds decide nothing, cross-validation does. Where process
-noise still has to stand in for something, the rest has no model, and nobody can say.
+**Where process noise stands in** for what is missing, forecasts are asked first (`siq.diagnosis.forecasts`),
+and tests with these odds only where they name nothing.
 """
 
 from __future__ import annotations
@@ -27,20 +21,16 @@ import scipy.special
 
 from siq.diagnosis.evidence import (
     NUMERICAL_ERRORS,
-    SMOOTH_LENGTHS,
-    FittedCandidate,
     averaged_evidence,
     correlation_time_of,
     evidence_of_function,
-    log_evidences,
     orthonormal,
     sizes_of_effects,
-    smooth_prior,
 )
-from siq.diagnosis.holdout import change_between, errors_left_out, in_blocks
+from siq.diagnosis.forecasts import Horizon, climb
 from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.diagnosis.residual_structure import Remainder
-from siq.diagnosis.screening import Probe, linearised_with, portions
+from siq.diagnosis.screening import linearised_with, portions
 from siq.diagnosis.search import FitContext, Search
 from siq.diagnosis.study import MismatchVerdict
 from siq.diagnosis.terms import places_in, products_in
@@ -49,18 +39,15 @@ from siq.diagnosis.unnamed_models import (
     exact_fit,
     fit_models_of_remainder,
     fit_unnamed_models,
-    runs_freely,
-    with_function,
 )
-from siq.errors import NumericalFailure
 from siq.inference.budget import UNLIMITED, Account
-from siq.inference.kalman_filter import Noise, Whitened, solve, whiten
+from siq.inference.kalman_filter import Whitened, solve, whiten
 from siq.inference.maximum_likelihood import Fit
+from siq.inference.recalibration import fit_with_process_noise_as_needed
+from siq.inference.trajectories import sharpened
 from siq.remarks import Remark
 
 LOGGER = logging.getLogger(__name__)
-FUNCTIONS_EXTENDED = 2  # functions in the place of the mechanism that get another on top of them: a choice
-EFFECTS_DRAWN = 300  # effects without a name, which tell a probability of 5 % to 1 %
 
 
 class _MissingEffect:
@@ -134,113 +121,6 @@ def _log_odds_of_a_name(fit: Fit, candidates: Sequence[MechanismCandidate], cont
     return float(named - nameless)
 
 
-def _false_match_rate(
-    whole: Search, context: FitContext, *, share: float, mechanisms: int, generator: np.random.Generator
-) -> float:
-    """Probability that so many mechanisms explain as large a share of an effect that has no name."""
-    recalibrated, data = whole.recalibrated, context.data
-    model, count = recalibrated.model, len(recalibrated.model.free)
-    probes = [
-        probe
-        for each in context.candidates
-        for probe in Probe.all_of(each, data, context.model, recalibrated.x)
-    ]
-    noise = Noise(whole.fit.noise.measurement, np.zeros(model.dimension))
-    # Effects of smooth functions at places drawn at random on the innovations.
-    places = places_in(model, context.roles, data, recalibrated.x)
-    counts = iter(generator.multinomial(EFFECTS_DRAWN, np.full(len(places), 1 / max(len(places), 1))))
-    drawn = []
-    for some in portions(recalibrated, data, places):
-        response, slices = linearised_with(recalibrated, data, some)
-        further = whiten(response, data, noise).columns[:, count:]
-        for place, group in zip(some, slices, strict=True):
-            draws, columns = next(counts), further[:, group]
-            if np.isfinite(columns).all():
-                for _ in range(draws):
-                    root = np.linalg.cholesky(smooth_prior(place.knots, generator.choice(SMOOTH_LENGTHS)))
-                    drawn.append(columns @ (root @ generator.normal(size=place.width)))
-    if not drawn:
-        raise NumericalFailure("no effect can be drawn")
-    effects = np.stack(drawn, axis=1)
-    response, slices = linearised_with(recalibrated, data, probes)
-    white = whiten(response, data, noise)
-    own = orthonormal(white.columns[:, :count])
-    effects = effects - own @ (own.T @ effects)
-    effects = effects[:, (effects**2).sum(axis=0) > 0]
-    if not effects.shape[1]:
-        raise NumericalFailure("no effect can be seen in the recordings")
-    groups = [white.columns[:, count:][:, each] for each in slices]
-    groups = [orthonormal(each - own @ (own.T @ each)) for each in groups if np.isfinite(each).all()]
-    best = _best_shares(effects, groups, mechanisms)
-    return float((np.sum(best >= share) + 1) / (len(best) + 1))
-
-
-def _best_shares(effects: np.ndarray, groups: Sequence[np.ndarray], most: int) -> np.ndarray:
-    """Share of effects ``(n, e)`` that so many groups of columns explain, chosen one by one."""
-    size = (effects**2).sum(axis=0)
-    left = effects.copy()
-    chosen: list[list[np.ndarray]] = [[] for _ in size]
-    for _ in range(most):
-        explained = np.stack([((group.T @ left) ** 2).sum(axis=0) for group in groups])
-        for place, best in enumerate(explained.argmax(axis=0)):
-            chosen[place].append(groups[best])
-            basis = orthonormal(np.concatenate(chosen[place], axis=1))
-            left[:, place] = effects[:, place] - basis @ (basis.T @ effects[:, place])
-    return 1 - (left**2).sum(axis=0) / size
-
-
-def _residual_model_comparison(
-    trial: FittedCandidate, recalibrated: Fit, context: FitContext
-) -> tuple[float, bool, tuple[AugmentedModel, ...], tuple[AugmentedModel, ...]] | None:
-    """Hold a mechanism against functions in its place, whatever else is missing being a function for both.
-
-    Returned are the log-odds that it is the mechanism; whether, where these decide nothing, an explanation
-    with it predicts parts left out better than every one without it, by more than appears by chance;
-    functions on top of it; and functions in its place, alone and with another on top.
-    """
-    if trial.fit.has_process_noise or trial.fit.model.dimension > recalibrated.model.dimension:
-        return None
-    data, options = context.data, context.study.search
-    unnamed = options.unnamed
-    on_top = [
-        each
-        for each in with_function((), trial.fit, context)
-        if not each.fit.has_process_noise
-        and trial.candidate.admits(each.fit)
-        and runs_freely(each.fit, trial.fit, data)
-    ]
-    instead = with_function((), recalibrated, context)
-    for one in instead[:FUNCTIONS_EXTENDED]:
-        instead = instead + with_function(one.parts, one.fit, context)
-    ours = [AugmentedModel((), trial.fit), *on_top]
-    theirs = [AugmentedModel((), recalibrated), *instead]
-    # That something without a name is missing, too, has its own probability.
-    evidences = [
-        evidence - each.cost + len(each.parts) * np.log(unnamed)
-        for each, evidence in zip(
-            (*ours, *theirs), log_evidences([each.fit for each in (*ours, *theirs)], data), strict=True
-        )
-    ]
-    best, best_without = max(evidences[: len(ours)]), max(evidences[len(ours) :])
-    forms = Counter(each.name for each in context.candidates)
-    chosen = np.log(max(len(forms) * forms[trial.candidate.name], 1))
-    log_odds = float(best + np.log1p(-unnamed) - chosen - best_without)
-    LOGGER.info("%s with a function on top of it: log-odds %.1f", trial.candidate.label, log_odds)
-    predicts_better = False
-    if abs(log_odds) < options.least_log_odds:
-        blocks = []
-        for models, candidates in ((theirs, ()), (ours, (trial.candidate,))):
-            errors = (
-                errors_left_out(each.fit, data, noise=recalibrated.noise, candidates=candidates)
-                for each in models
-            )
-            least_error = min((each for each in errors if each is not None), key=np.mean, default=None)
-            blocks.append(None if least_error is None else in_blocks(least_error))
-        predicts_better = None not in blocks and change_between(*blocks) == "better"
-        LOGGER.info("parts left out are predicted better with it: %s", predicts_better)
-    return log_odds, predicts_better, tuple(on_top), tuple(instead)
-
-
 @dataclass(frozen=True)
 class Investigation:
     """What was found out about a simulation and recordings of the system, with all fits that it rests on.
@@ -262,11 +142,9 @@ class Investigation:
         p-value of the test that the parameters of the card are the true ones.
     log_odds
         For each mechanism, that it is this rather than a function without a name, as a logarithm.
-    p_alike
-        Probability that as many mechanisms explain as much of an effect that has no name; None where nothing
-        is left.
     convincing
-        Whether the mechanisms explain enough; the odds have to be for them as well before they are named.
+        Whether the mechanisms leave nothing, or foresee recordings better than all else; where they leave
+        nothing the odds have to be for them as well before they are named.
     remarks
         Reservations.
     models
@@ -277,6 +155,8 @@ class Investigation:
         The work that it took, and whether something was left undone.
     withdrawn
         Whether a name was given, and mislead on recordings held out (`siq.diagnosis.diagnosis`).
+    recalibrations, finals
+        The simulation alone, and with what is named, fitted at each horizon (`siq.diagnosis.forecasts`).
     """
 
     context: FitContext
@@ -286,13 +166,14 @@ class Investigation:
     least_squares: Fit
     p_shift: float = float("nan")
     log_odds: tuple[float, ...] = ()
-    p_alike: float | None = None
     convincing: bool = False
     remarks: tuple[Remark, ...] = ()
     models: tuple[AugmentedModel, ...] = ()
     exact: Fit | None = None
     account: Account = UNLIMITED
     withdrawn: bool = False
+    recalibrations: tuple[Horizon, ...] = ()
+    finals: tuple[Horizon, ...] = ()
 
     @property
     def process_noise(self) -> bool:
@@ -316,28 +197,16 @@ class Investigation:
         return MismatchVerdict.PARAMETER_SHIFT if shifted else MismatchVerdict.NO_MISMATCH
 
 
-def _judge_mechanisms(
-    whole: Search, left: Sequence[Remainder], context: FitContext, *, generator: np.random.Generator
-) -> Investigation:
+def _judge_mechanisms(whole: Search, left: Sequence[Remainder], context: FitContext) -> Investigation:
     """Judge the mechanisms of a search, as far as they explain by themselves what is missing."""
     options = context.study.search
 
-    def convincing(number: int, left: Remainder) -> tuple[bool, float | None]:
-        """Whether the first so many mechanisms leave nothing, or explain more than by chance."""
-        if not (left.doubtful or whole.found[number - 1].best.fit.has_process_noise):
-            return True, None
-        try:
-            p_alike = _false_match_rate(
-                whole, context, share=left.share, mechanisms=number, generator=generator
-            )
-        except NUMERICAL_ERRORS as error:
-            LOGGER.info("matches by chance are not known: %s", error)
-            return False, None
-        LOGGER.info("%d mechanisms explain %.4f; by chance: p %.3f", number, left.share, p_alike)
-        return p_alike <= options.most_alike, p_alike
+    def convincing(number: int, left: Remainder) -> bool:
+        """Whether the first so many mechanisms leave nothing."""
+        return not (left.doubtful or whole.found[number - 1].best.fit.has_process_noise)
 
     search = whole
-    if len(whole.found) > 1 and convincing(1, left[0])[0]:
+    if len(whole.found) > 1 and convincing(1, left[0]):
         # Those after the first stay as long as each is likely and leaves less; others are patches of them.
         kept = 1
         while (
@@ -348,14 +217,12 @@ def _judge_mechanisms(
             kept += 1
         search = replace(whole, found=whole.found[:kept], fit=whole.found[kept - 1].best.fit)
         left = left[:kept]
-    convinces, p_alike = convincing(len(search.found), left[-1])
+    convinces = convincing(len(search.found), left[-1])
     every = range(len(search.found))
     odds = tuple(_log_odds(whole, len(every), [place], context) for place in every)
     together = odds[0] if len(odds) == 1 else _log_odds(whole, len(every), every, context)
     least = min(*odds, together)
     remarks = []
-    if convinces and p_alike is not None and (left[-1].doubtful or left[-1].share < 1):
-        remarks.append(_remainder_remark(left[-1]))
     if convinces and not least >= options.least_log_odds:
         names = " and ".join(each.best.candidate.name for each in search.found)
         needed = float(np.exp(options.least_log_odds))
@@ -365,13 +232,11 @@ def _judge_mechanisms(
     verdict = MismatchVerdict.MISSING_PHYSICS if named else MismatchVerdict.UNEXPLAINED
     return Investigation(
         context, search, left[-1], verdict, whole.recalibrated,
-        log_odds=odds, p_alike=p_alike, convincing=convinces, remarks=tuple(remarks),
+        log_odds=odds, convincing=convinces, remarks=tuple(remarks),
     )  # fmt: skip
 
 
-def decide_naming(
-    whole: Search, left: Sequence[Remainder], context: FitContext, *, generator: np.random.Generator
-) -> Investigation:
+def decide_naming(whole: Search, left: Sequence[Remainder], context: FitContext) -> Investigation:
     """Decide about the names of a search that found something, and fit models of the rest.
 
     Parameters
@@ -382,28 +247,18 @@ def decide_naming(
         What is left with the first mechanism, the first two, and so on.
     context
         What models are made from, and what could be named.
-    generator
-        Draws effects without a name.
     """
-    least = context.study.search.least_log_odds
-    decision = _judge_mechanisms(whole, left, context, generator=generator)
-    compared = None
-    # Only few functions are fitted; along the trajectories of a fit all are compared. Where these speak
-    # against the name as clearly as something would have to speak for it, the few prove nothing.
-    if not decision.convincing and _log_odds(whole, 1, [0], context) > -least:
-        compared = _residual_model_comparison(whole.found[0].best, whole.recalibrated, context)
-    odds, predicts_better, on_top, instead = compared or (-np.inf, False, None, None)
-    if odds >= least or predicts_better:
-        first = replace(whole, found=whole.found[:1], fit=whole.found[0].best.fit)
-        decision = replace(
-            decision, search=first, remainder=left[0], log_odds=(odds,), convincing=True,
-            verdict=MismatchVerdict.MISSING_PHYSICS, remarks=(_remainder_remark(left[0], unnamed=True),),
-        )  # fmt: skip
+    decision = _judge_mechanisms(whole, left, context)
+    return _with_models(decision, whole, context)
+
+
+def _with_models(decision: Investigation, whole: Search, context: FitContext) -> Investigation:
+    """With models of what has no name, be it all that is missing, or what names leave of a whole search."""
     search = decision.search
     if not decision.verdict.names:
-        return replace(decision, models=fit_unnamed_models(search, context, functions=instead))
+        return replace(decision, models=fit_unnamed_models(search, context))
     if len(whole.found) > len(search.found) or decision.remainder.doubtful or search.fit.has_process_noise:
-        models = fit_models_of_remainder(search, whole, context, functions=on_top)
+        models = fit_models_of_remainder(search, whole, context)
         decision = replace(decision, models=models)
     with context.budget.exempt():
         exact = exact_fit(search.fit, context.data, context.budget)
@@ -411,6 +266,42 @@ def decide_naming(
         remarks = (*decision.remarks, Remark("diagnosis.least_squares"))
         decision = replace(decision, exact=exact, remarks=remarks)
     return decision
+
+
+def named_by_forecasts(
+    recalibrated: Fit, least_squares: Fit, context: FitContext
+) -> tuple[Investigation | None, tuple[Horizon, ...]]:
+    """What is missing by what foresees recordings best, where the recalibrated fit needs forces at random.
+
+    Returned are what is named, None where nothing is, and the fits of the simulation alone at each horizon.
+    """
+    alone, rungs, untried = climb(recalibrated, context)
+    recalibrations = tuple(alone)
+    if not rungs:
+        return None, recalibrations
+    fit = rungs[-1].accepted.best.fit
+    with context.budget.exempt():  # without forces, where they are not needed any more
+        fit = fit_with_process_noise_as_needed(fit.model, context.data, fit, budget=context.budget)
+        if fit.model.edges:
+            fit = sharpened(fit, context.data, budget=context.budget)
+    left = Remainder.of(context.data, alone[0].fit, fit, context.roles)
+    search = Search(recalibrated, tuple(each.accepted for each in rungs), fit, (), untried=untried)
+    remarks = [
+        Remark(
+            "diagnosis.by_prior",
+            {"name": each.accepted.best.candidate.name, "odds": np.exp(each.flat_log_odds)},
+        )
+        for each in rungs
+        if each.flat_log_odds < context.study.search.least_log_odds
+    ]
+    if left.doubtful or fit.has_process_noise:
+        remarks.append(_remainder_remark(left, unnamed=True))
+    decision = Investigation(
+        context, search, left, MismatchVerdict.MISSING_PHYSICS, least_squares, convincing=True,
+        log_odds=tuple(each.log_odds for each in rungs), remarks=tuple(remarks),
+        recalibrations=recalibrations, finals=rungs[-1].horizons,
+    )  # fmt: skip
+    return _with_models(decision, search, context), recalibrations
 
 
 def _log_odds(search: Search, number: int, chosen: Sequence[int], context: FitContext) -> float:

@@ -102,6 +102,13 @@ class Probe:
             choices = [(*before, (name, float(place))) for before in choices for place in found]
         return [cls(candidate, shapes) for shapes in choices]
 
+    @classmethod
+    def along(cls, candidate: MechanismCandidate, fit: Fit, data: Measurements) -> list[Probe]:
+        """The same along the trajectories of a fit, with jumps of f spread as its integration asks for."""
+        substeps = max(fit.substeps, EDGE_SUBSTEPS)
+        spread = replace(candidate, model=spread_edges(candidate.model, data, fit.x, substeps=substeps))
+        return cls.all_of(spread, data, fit.model, fit.x)
+
     @property
     def recorded(self) -> bool:
         """Whether the recordings themselves show its shape.
@@ -282,6 +289,14 @@ def linearised_with(
         coarse = linearise(fit.model, grid, fit.model.values, fit.linearised_at, columns=columns)
     known, parameters = fit.linearisation, len(fit.model.free)
     further, measured = coarse.response[:, :, parameters:], coarse.measured_response[:, :, parameters:]
+    if fit.has_process_noise:
+        # What a filter knows at a sample it knows from that sample. A fault of a sensor acts on what was
+        # foreseen; taken at what is known it would explain the innovations by themselves.
+        foreseen = fit.linearised_at.copy()
+        foreseen[data.begins + 1] += known.gap[data.begins]
+        with np.errstate(all="ignore"):
+            at_foreseen = columns.outputs(np.ascontiguousarray(foreseen.T), fit.model.values)
+        measured = np.moveaxis(at_foreseen, 2, 0)
     return replace(
         known,
         response=np.concatenate([known.response, further], axis=2),
@@ -515,9 +530,7 @@ def screen_all(
     budget.says(f"screening {len(candidates)} candidates")
     for candidate in candidates:
         try:
-            sharp = max(current.substeps, EDGE_SUBSTEPS)
-            spread = replace(candidate, model=spread_edges(candidate.model, data, current.x, substeps=sharp))
-            probes += Probe.all_of(spread, data, current.model, current.x)
+            probes += Probe.along(candidate, current, data)
         except NUMERICAL_ERRORS as error:
             untried[candidate.label] = NotFitted.of(candidate, error)
     ranked, failed = rank(current, data, probes, judge=by_likelihood, budget=budget)

@@ -95,8 +95,8 @@ class StatedTerm:
 
     Attributes
     ----------
-    name, label
-        Of the dictionary, and told apart from its other forms and places.
+    name, label, family
+        Of the dictionary; told apart from its other forms and places; and the kind of physics that it is.
     kind
         ``mechanism``: one of the dictionary. ``formula``: a sum of a few powers. ``curve``, ``surface``: a
         smooth function of one coordinate, or of two, as a sum of Gaussian bumps.
@@ -119,6 +119,7 @@ class StatedTerm:
 
     name: str
     label: str
+    family: str = ""
     kind: Kind = MECHANISM
     terms: Mapping[str, str]
     parameters: Mapping[str, Estimate]
@@ -157,9 +158,6 @@ class Description:
         Whether the fit needed process noise.
     too_faint
         Whether the mechanisms explain enough, and a function without a name is nearly as likely.
-    p_alike
-        Probability that as many mechanisms explain as much of an effect that has no name; None where nothing
-        is left.
     misleading
         Whether the mechanisms are not named since recordings held out are predicted worse with them.
     """
@@ -169,7 +167,6 @@ class Description:
     p_residuals_random: float
     random_forces_admitted: bool
     too_faint: bool = False
-    p_alike: float | None = None
     misleading: bool = False
 
 

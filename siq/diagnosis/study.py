@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -46,6 +46,9 @@ class SearchOptions(BaseModel):
         Most mechanisms that are looked for.
     unnamed
         Probability beforehand that what a simulation lacks is not in the dictionary.
+    prior
+        By ``physics`` what nearly every system of a kind has is likelier than what few have, as the weights
+        of the dictionary say; ``flat`` makes all mechanisms alike.
     wrong_names
         Most probability of a name that is wrong, since something without a name looks alike. What is less
         certain is detected, and described.
@@ -61,6 +64,7 @@ class SearchOptions(BaseModel):
     fitted: Annotated[int, Field(ge=1)] = 6
     mechanisms: Annotated[int, Field(ge=1, le=5)] = 3
     unnamed: Annotated[float, Field(gt=0, lt=1)] = 0.1
+    prior: Literal["physics", "flat"] = "physics"
     wrong_names: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
     blocks: Annotated[int, Field(ge=4)] = 10
 
@@ -68,15 +72,6 @@ class SearchOptions(BaseModel):
     def least_log_odds(self) -> float:
         """Logarithm of the odds that a name takes."""
         return math.log((1 - self.wrong_names) / self.wrong_names)
-
-    @property
-    def most_alike(self) -> float:
-        """Most probability that an effect without a name is explained as well, if a name is to stand.
-
-        By Bayes' rule: where something is left, either the name is right and something without a name is
-        missing as well, (1 - unnamed) unnamed, or there is only the latter, and looks alike.
-        """
-        return math.exp(-self.least_log_odds) * (1 - self.unnamed)
 
 
 class MismatchVerdict(StrEnum):

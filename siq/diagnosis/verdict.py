@@ -58,7 +58,10 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
     """What follows from an investigation, and from the runs of recordings held out."""
     search, verdict = investigation.search, investigation.verdict
     described = shown.described
-    final = investigation.final if described is None else shown.fit
+    final = investigation.final if verdict.names else shown.recalibration
+    kept = final.model is investigation.context.model  # the card's own values
+    if described is not None:
+        final, kept = shown.fit, False
     found = _found_mechanisms(investigation, final if verdict.names else search.fit)
     names = tuple(each.best.candidate.label for each in search.found) if verdict.names else ()
     parts = () if described is None else described.parts
@@ -69,6 +72,8 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
         untried = sum(each.remark == BUDGET_SPENT for each in search.untried)
         stopped_by = investigation.account.stopped_by
         remarks.append(Remark("diagnosis.partial", {"untried": untried, "stopped_by": stopped_by}))
+    if kept and errors:
+        remarks.append(Remark("diagnosis.values_stay"))
     if not shown.independent:
         remarks.append(Remark("diagnosis.one_recording"))
     return Statement(
@@ -80,7 +85,6 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
             p_residuals_random=investigation.remainder.after.p_value,
             random_forces_admitted=search.fit.has_process_noise,
             too_faint=investigation.too_faint,
-            p_alike=investigation.p_alike,
             misleading=investigation.withdrawn,
         )
         if verdict is MismatchVerdict.UNEXPLAINED
@@ -94,7 +98,7 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
                 entry.value, float(final.model.values[place]), errors[entry.name], entry.unit
             )
             for place, entry in enumerate(investigation.context.model.parameters)
-            if entry.name in errors
+            if entry.name in errors and not kept
         },
         errors=shown.errors,
         excluded={} if verdict.mismatch else _excluded(investigation),
@@ -208,6 +212,7 @@ def _stated(trial: FittedCandidate, fit: Fit, *, log_odds: float | None = None, 
     return StatedTerm(
         name=candidate.name,
         label=candidate.label,
+        family=candidate.family,
         terms={name: str(formula) for name, formula in candidate.changes},
         parameters={
             name: Estimate(known[name].value, errors.get(name), known[name].unit)

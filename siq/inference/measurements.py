@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import scipy.interpolate
-import scipy.signal
 import sympy
 
 from siq.data.recordings import Recordings

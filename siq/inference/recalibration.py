@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import scipy.stats
+import scipy.special
 
 from siq.errors import NumericalFailure
 from siq.inference.budget import COMPILATION, Budget, evaluation
@@ -235,7 +235,7 @@ def process_noise_needed(loose: Fit, strict: Fit) -> bool:
 def least_to_believe(noise: Noise) -> float:
     """Twice the increase of the log-likelihood from which on process noise is believed."""
     driven = int((noise.process > 0).sum())
-    return float(scipy.stats.chi2.isf(2 * THRESHOLD, driven)) if driven else np.inf
+    return float(scipy.special.chdtri(driven, 2 * THRESHOLD)) if driven else np.inf
 
 
 def recalibrate(model: Dynamics, data: Measurements, *, budget: Budget | None = None) -> tuple[Fit, Fit]:

@@ -350,17 +350,21 @@ def scored_rows(data: Measurements, told: int | None = None) -> np.ndarray:
     return np.asarray(within >= _prefixes(data, told)[data.recording])
 
 
-def squared_errors(run: np.ndarray, data: Measurements) -> np.ndarray | None:
+def squared_errors(
+    run: np.ndarray, data: Measurements, spread: np.ndarray | None = None
+) -> np.ndarray | None:
     """Squared errors of all scored values of a free run over the variance of each measured output.
 
-    Shape ``(values,)``, sample by sample; what was not measured is left out. None where it ran away.
+    Shape ``(values,)``, sample by sample; what was not measured is left out. None where it ran away. The
+    spread, ``(m,)``, is another variance: that of all recordings, where the data are a part of them.
     """
     scored = scored_rows(data)
     measured = data.outputs[scored]
     error, known = run[scored] - measured, np.isfinite(measured)
     if not np.isfinite(error[known]).all():
         return None
-    return np.asarray((error**2 / positive(np.nanvar(measured, axis=0)))[known])
+    spread = np.nanvar(measured, axis=0) if spread is None else spread
+    return np.asarray((error**2 / positive(spread))[known])
 
 
 def normalised_rms(run: np.ndarray, data: Measurements) -> float | None:

@@ -21,7 +21,8 @@ from scipy.spatial import cKDTree
 from siq.errors import InputError
 from siq.numerics.files import whole_file
 
-CHUNK = 4096  # points evaluated together: few enough for their activations to stay in the processor's cache
+CHUNK = 81_920  # activations of a layer worked out together: few enough to stay in the processor's cache
+LARGEST_EXPONENT = 700  # numerical: of e, in double precision
 MatchingRule = Literal["explicit", "symmetric"]
 Order = Literal[2, 4]
 
@@ -187,24 +188,28 @@ class TrainedNetworks:
 
     def evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """V ``(n,)``, g and f ``(n, d)`` at points ``(n, d)`` in the units of the states."""
-        pieces = [self._evaluate(x[begin : begin + CHUNK]) for begin in range(0, len(x), CHUNK)]
-        potential, circulatory, vector_field = zip(*pieces or [self._evaluate(x)], strict=True)
-        return np.concatenate(potential), np.concatenate(circulatory), np.concatenate(vector_field)
+        pieces = zip(*map(self._evaluate, self._parts(x)), strict=True)
+        potential, circulatory, vector_field = map(np.concatenate, pieces)
+        return potential, circulatory, vector_field
 
     def potential_at(self, x: np.ndarray) -> np.ndarray:
         """V alone, shape ``(n,)``, at a third of the cost of `evaluate`."""
-        values = [np.zeros(0)]
-        for begin in range(0, len(x), CHUNK):
-            y = (x[begin : begin + CHUNK].astype(self.mean.dtype) - self.mean) / self.scale
-            square = (y * y).sum(axis=1, keepdims=True)
-            values.append((self.potential_scale * (_hidden(self.potential, y)[-1] + square))[:, 0])
-        return np.concatenate(values).astype(float)
+        values = [
+            (self.potential_scale * (_hidden(self.potential, y)[-1] + (y * y).sum(axis=1, keepdims=True)))
+            for y in self._parts(x)
+        ]
+        return np.concatenate(values)[:, 0].astype(float)
 
     def gradients_at(self, x: np.ndarray) -> np.ndarray:
         """∇V alone, shape ``(n, d)``, at half the cost of `evaluate`."""
+        gradients = [_gradient(self.potential, _hidden(self.potential, y)) + 2 * y for y in self._parts(x)]
+        return (self.potential_scale / self.scale * np.concatenate(gradients)).astype(float)
+
+    def _parts(self, x: np.ndarray) -> list[np.ndarray]:
+        """Normalised points y, in parts that are evaluated one after the other."""
         y = (x.astype(self.mean.dtype) - self.mean) / self.scale
-        gradient = _gradient(self.potential, _hidden(self.potential, y))
-        return (self.potential_scale / self.scale * (gradient + 2 * y)).astype(float)
+        rows = max(CHUNK // max(biases.size for _, biases in (*self.potential, *self.circulatory)), 1)
+        return [y[begin : begin + rows] for begin in range(0, max(len(y), 1), rows)]
 
     @cached_property
     def _shared(self) -> bool:
@@ -213,8 +218,7 @@ class TrainedNetworks:
         same = all(np.array_equal(one, two) for layers in pairs for one, two in zip(*layers, strict=True))
         return same and len(self.potential) == len(self.circulatory)
 
-    def _evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        y = (x.astype(self.mean.dtype) - self.mean) / self.scale
+    def _evaluate(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         hidden = _hidden(self.potential, y)
         potential = self.potential_scale * (hidden[-1] + (y * y).sum(axis=1, keepdims=True))
         gradient = self.potential_scale / self.scale * (_gradient(self.potential, hidden) + 2 * y)
@@ -237,7 +241,10 @@ class NetworksByWell:
     parts
         Networks that hold in the well of each attractor; V of each is zero there.
     heights
-        What is added to V of each, shape ``(k,)``.
+        What is added to V of each, shape ``(k,)``; zeros where it is not known, as wells end before saddles.
+    levels
+        V of each at its lowest saddle, or where recordings end before it, shape ``(k,)``. Close to there, and
+        beyond, V is less exact than elsewhere.
     states, attractor_of
         States ``(n, d)``, and in the well of which attractor each lies, shape ``(n,)``, or `NOWHERE` where
         none of the networks holds. A point belongs to the well of the nearest of them.
@@ -247,6 +254,7 @@ class NetworksByWell:
 
     parts: tuple[TrainedNetworks, ...]
     heights: np.ndarray
+    levels: np.ndarray
     states: np.ndarray
     attractor_of: np.ndarray
 
@@ -282,10 +290,11 @@ class NetworksByWell:
             potential[rows] = values(x[rows]) + height
         return potential
 
-    def states_about(self, attractor: np.ndarray) -> np.ndarray:
-        """States in the well about an attractor ``(d,)``, shape ``(m, d)``."""
-        distances = [float(np.linalg.norm(one.mean[0] - attractor)) for one in self.parts]
-        return self.states[self.attractor_of == int(np.argmin(distances))]
+    def below(self, share: float, attractor: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Points ``(n, d)`` in the well of an attractor ``(d,)``, below a share of its level: ``(m, d)``."""
+        index = int(np.argmin([float(np.linalg.norm(one.mean[0] - attractor)) for one in self.parts]))
+        x = x[self.of_wells(x)[index]]
+        return np.asarray(x[self.parts[index].potential_at(x) < share * self.levels[index]])
 
     def of_wells(self, x: np.ndarray) -> list[np.ndarray]:
         """Rows of points ``(n, d)`` by the well that they lie in."""
@@ -326,8 +335,9 @@ def _hidden(layers: tuple[Layer, ...], y: np.ndarray) -> list[np.ndarray]:
     """Activations of the hidden layers, and the output behind them."""
     found = []
     for weights, biases in layers[:-1]:
-        y = np.tanh(y @ weights + biases)
-        found.append(y)
+        y = y @ weights
+        y += biases
+        found.append(np.tanh(y, out=y))
     weights, biases = layers[-1]
     return [*found, y @ weights + biases]
 
@@ -336,8 +346,37 @@ def _gradient(layers: tuple[Layer, ...], hidden: list[np.ndarray]) -> np.ndarray
     """Gradient of a scalar tanh network, backwards through its activations and its output."""
     delta = layers[-1][0].T
     for (weights, _), activation in zip(reversed(layers[:-1]), reversed(hidden[:-1]), strict=True):
-        delta = (delta * (1 - activation * activation)) @ weights.T
+        slopes = activation * activation
+        np.subtract(1, slopes, out=slopes)
+        slopes *= delta
+        delta = slopes @ weights.T
     return delta
+
+
+def potential_on_grid(networks: AnyNetworks, axes: Sequence[np.ndarray], grid: np.ndarray) -> np.ndarray:
+    """V of networks on the grid ``(d, n)`` of some axes, shape ``(n,)``.
+
+    With one hidden layer ``V^NN = Σ_k v_k tanh z_k`` and ``tanh z = 1 - 2/(1 + e^{2z})``. As z is a sum over
+    states, ``e^{2z}`` is a product of what is worked out along each axis alone.
+    """
+    if not isinstance(networks, TrainedNetworks) or len(networks.potential) != 2:
+        return networks.potential_at(grid.T)
+    (weights, biases), (outer, shift) = networks.potential
+    scaled = (grid.T - networks.mean) / networks.scale
+    most = LARGEST_EXPONENT / (len(axes) + 1)
+    *others, last = [
+        np.exp(np.clip(2 * (axis[:, None] - mean) / scale * row, -most, most))
+        for axis, mean, scale, row in zip(axes, networks.mean[0], networks.scale[0], weights, strict=True)
+    ]
+    rows, values, terms = np.exp(2 * biases), [], np.empty_like(last)
+    for factor in others:
+        rows = (rows[:, None] * factor).reshape(-1, factor.shape[1])
+    for row in rows:
+        np.multiply(last, row, out=terms)
+        terms += 1
+        values.append(np.reciprocal(terms, out=terms) @ outer[:, 0])
+    potential = outer.sum() + shift[0, 0] - 2 * np.concatenate(values) + (scaled**2).sum(axis=1)
+    return np.asarray(networks.potential_scale[0, 0] * potential, dtype=float)
 
 
 def save_networks(path: str | Path, runs: Sequence[AnyNetworks]) -> None:
@@ -351,7 +390,7 @@ def save_networks(path: str | Path, runs: Sequence[AnyNetworks]) -> None:
     write_archive(path, arrays)
 
 
-_OF_WELLS = ("heights", "states", "attractor_of")
+_OF_WELLS = ("heights", "levels", "states", "attractor_of")
 
 
 def load_networks(path: str | Path, *, run: int = 0) -> AnyNetworks:

@@ -24,6 +24,7 @@ from siq.errors import Fault, NumericalFailure, needs_extra
 from siq.inference.library import CandidateLibrary
 from siq.systems.diffusion import Diffusion
 
+CHUNK = 1024  # points whose functions are made triangular together, in the processor's cache
 LOWER_SHARE = 0.75
 """Of the points by V_θ, where no level is given, a choice: the highest are few, and networks worst there."""
 
@@ -174,8 +175,11 @@ def sparse_decomposition(
         )
     term_scale, target_scale = _scales(library, values, targets, options)
     # The problem depends on the points through a small triangular matrix only.
-    stacked = np.column_stack([values / term_scale, targets / target_scale])
-    triangle = np.asarray(np.linalg.qr(stacked, mode="r"))
+    triangle = np.zeros((0, values.shape[1] + targets.shape[1]))
+    for begin in range(0, len(x), CHUNK):
+        part = slice(begin, begin + CHUNK)
+        rows = np.column_stack([values[part] / term_scale, targets[part] / target_scale])
+        triangle = np.asarray(np.linalg.qr(np.concatenate([triangle, rows]), mode="r"))
     if options.scaling == "columns":
         triangle = triangle / np.sqrt(len(x))
     q = library.size

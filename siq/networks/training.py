@@ -51,10 +51,13 @@ with needs_extra("networks"):
     import torch
     from torch import Tensor
 
+logger = logging.getLogger(__name__)
+
 CHUNK = 100  # steps whose batches are drawn together; part of what a seed means
 STANDARD_THINNING = 0.1  # distance of representative points, in standard deviations of the states
 FEWEST_REPRESENTATIVE = 10  # below this, orthogonality is asked for almost nowhere
 HELD_OUT_PAIRS = 4096  # pairs on which the held-out loss is measured
+HISTORY = ("run", "step", "training_loss", "held_out_loss", "dynamics", "orthogonality", "learning_rate")
 
 
 @dataclass(frozen=True)
@@ -255,11 +258,6 @@ def _initial_networks(
         potential_scale=options.potential_gain * torch.tensor(potential_scales, dtype=dtype)[:, None, None],
         circulatory_scale=torch.tensor(circulatory_scales, dtype=dtype)[:, None, None],
     )
-
-
-logger = logging.getLogger(__name__)
-
-HISTORY = ("run", "step", "training_loss", "held_out_loss", "dynamics", "orthogonality", "learning_rate")
 
 
 @dataclass(frozen=True)
@@ -585,7 +583,7 @@ class Block:
         data = [_slowest_part(self.data[run], options.slowest_share) for run in runs]
         file = self._checkpoint(f"attempt{attempt}")
         state = None if file is None else _load_checkpoint(file, fingerprint=self.mark)
-        if state is None:
+        if state is None or state.step > options.steps:  # of a training that was given more steps
             state = start(data, options=options, diffusion=self.diffusion, seeds=seeds)
         kept = {run: self._checkpoint(f"attempt{attempt}-run{run}") for run in runs}
         # Networks that had passed the check before the job was killed.

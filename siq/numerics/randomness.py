@@ -83,7 +83,7 @@ def representative_subset(
         raise ValueError(f"the thinning distance is {distance}; give a positive number")
     remaining = generator.permutation(len(points))
     kept: list[np.ndarray] = []
-    batch = 2048
+    batch = 256  # at first, when points still crowd
     while len(remaining):
         # The first batch in the random order decides alone about itself: all kept points have already
         # removed their neighbours from it.
@@ -94,7 +94,7 @@ def representative_subset(
         if len(rest):
             nearest, _ = cKDTree(points[chosen]).query(points[rest], distance_upper_bound=distance)
             rest = rest[~(nearest < distance)]
-        remaining = rest
+        remaining, batch = rest, 2 * batch
     return np.sort(np.concatenate(kept))
 
 

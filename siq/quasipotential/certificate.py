@@ -314,7 +314,8 @@ def check_agreement(
     networks come by well, also which states lead to which attractor, and how a well grows. The figure is the
     largest relative L2 difference about any attractor. Its limit is what the error of the formulas explains,
     and that of the networks, which their own residual leaves open. Networks of which that is more than a
-    certificate may state tell nothing, and are refused.
+    certificate may state tell nothing, and are refused. Nothing is said of networks by well above
+    `LEVEL_SHARE` of their level, nor of how high one well stands above another.
     """
     found, options = evidence.found, evidence.options
     verdicts = []
@@ -326,12 +327,13 @@ def check_agreement(
         if isinstance(potential, Well) and not np.array_equal(potential.attractor, attractor):
             continue
         level = potential.level if isinstance(potential, Well) else np.inf
-        # Networks by well end little above its saddle, and one formula for all wells does not.
         x = one.below(level)[0]
-        x = x[np.isfinite(networks.potential_at(x))]
-        if len(x) < MIN_POINTS and isinstance(networks, NetworksByWell):
-            x = networks.states_about(attractor)
-            x = x[potential.values(x) - potential.values(attractor[None]) < LEVEL_SHARE * level]
+        if isinstance(networks, NetworksByWell):
+            # They end near their saddle, which one formula for all wells does not.
+            x = networks.below(LEVEL_SHARE, attractor, x)
+            if len(x) < MIN_POINTS:
+                x = networks.below(LEVEL_SHARE, attractor, networks.states)
+                x = x[potential.values(x) - potential.values(attractor[None]) < LEVEL_SHARE * level]
         if len(x) < MIN_POINTS:
             few = f"the networks' V is known at {len(x)} points about {_position_text(attractor)}, too few to"
             verdicts.append(Verdict.refused(f"{few} compare two routes: record more there, {GO_WITHOUT}"))

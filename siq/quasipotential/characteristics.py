@@ -161,7 +161,7 @@ class HamiltonianFlow(ScaledSystem):
 
 
 MAX_STEPS = 20_000  # numerical, a guard: a curve that takes more is stiff, or circles
-HALVINGS = 26  # of the last step, to find where a curve ends
+HALVINGS = 24  # of the last step, to find where a curve ends
 MAX_RELAXATION_TIMES = 60.0  # in units of the slowest relaxation time of the attractor
 REST_RATIO = 1e-3  # p to x - A, in units in which both are equal near A
 SHEET_DISTANCE = 0.06  # of neighbours, the level being at about 1: more than the gaps of a fan
@@ -577,20 +577,25 @@ def ascending_integrals(
         push = dynamics.diffusion.push(points, slope)
         return -(flow + 2 * push), (points, slope, flow, push)
 
-    lost = np.zeros(len(x), dtype=bool)
+    beginnings, running, lost = x.copy(), np.arange(len(x)), np.zeros(len(x), dtype=bool)
     with np.errstate(over="ignore", invalid="ignore"):
         velocity, parts = terms(x)
         before = integrand(*parts)
         total = np.zeros_like(before)
         for _ in range(steps):
-            moved = x + step / 2 * (velocity + terms(x + step * velocity)[0])
-            lost |= ~(np.abs(moved - middle) < far).all(axis=1)
-            x = np.where(lost[:, None], x, moved)
+            x = x + step / 2 * (velocity + terms(x + step * velocity)[0])
+            inside = (np.abs(x - middle) < far).all(axis=1)
+            if not inside.all():
+                lost[running[~inside]] = True
+                running, x, before = running[inside], x[inside], before[inside]
+            if not len(running):
+                break
             velocity, parts = terms(x)
             after = integrand(*parts)
-            total += step / 2 * (before + after)
+            total[running] += step / 2 * (before + after)
             before = after
-    return total, x, lost
+    beginnings[running] = x
+    return total, beginnings, lost
 
 
 def _potential_slopes(

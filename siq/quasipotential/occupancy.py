@@ -37,7 +37,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise, product
 
 import numpy as np
-from scipy import sparse, special, stats
+from scipy import sparse, special
 from scipy.sparse.linalg import splu
 
 from siq.data.preparation import joined
@@ -180,7 +180,7 @@ class _CellProcess:
             mass, edges = np.histogram(at, bins=MOST_PLACES, weights=mass)
             at = (edges[1:] + edges[:-1]) / 2
         spread = np.hypot(blur, float(np.median(np.diff(at))) / np.sqrt(12))  # a cell is no point
-        return np.asarray(stats.norm.cdf((places[:, None] - at) / spread) @ (mass / mass.sum()))
+        return np.asarray(special.ndtr((places[:, None] - at) / spread) @ (mass / mass.sum()))
 
 
 def _rates(
@@ -503,7 +503,7 @@ def check_occupancy(
             share = np.diff(processes[0].distribution(well, state, edges, blur))
             width = edges[1] - edges[0]
             counts = np.histogram(x, bins=edges)[0] / (len(x) * width)
-            probability = float(stats.kstwobign.sf(distance * np.sqrt(effective)))
+            probability = float(special.kolmogorov(distance * np.sqrt(effective)))
             densities.append(
                 DensityTest(
                     well, state, distance, float(independent), probability, edges, counts, share / width
@@ -519,6 +519,6 @@ def _probability_of(count: DwellCount, mean: float, error: float) -> float:
     nodes, weights = np.polynomial.hermite_e.hermegauss(HERMITE_NODES)
     expected = count.time / mean * np.exp(np.clip(error * nodes, -50, 50))
     weights = weights / weights.sum()
-    fewer = float(weights @ stats.poisson.cdf(count.visits, expected))
-    more = float(weights @ stats.poisson.sf(count.visits - 1, expected))
+    fewer = float(weights @ special.pdtr(count.visits, expected))
+    more = float(weights @ special.gammainc(count.visits, expected))
     return min(2 * min(fewer, more), 1.0)

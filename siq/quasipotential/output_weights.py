@@ -28,6 +28,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+import scipy.linalg
 
 from siq.data.recordings import SnapshotPairs
 from siq.errors import NumericalFailure
@@ -38,10 +39,11 @@ from siq.quasipotential.certificate_tests import LEVEL_SHARE
 from siq.quasipotential.hamilton_jacobi import HamiltonJacobi, PowerBasis
 from siq.quasipotential.landscape import heights_of_attractors
 from siq.quasipotential.wells import Well, grown
+from siq.systems.basins import STARTS_NEAR_ATTRACTOR, Basin, basin_of
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
-from siq.systems.equilibria import find_equilibria
-from siq.systems.phase_portrait import PhasePortrait, evenly_spread, phase_portrait
+from siq.systems.equilibria import find_equilibria, hessian_at
+from siq.systems.phase_portrait import LEVEL_BEYOND_SADDLE, PhasePortrait, evenly_spread, phase_portrait
 
 if TYPE_CHECKING:  # needs torch, which the mathematics does without
     from siq.networks.training import TrainingData
@@ -69,6 +71,10 @@ ESCAPE_SHARE = 0.5
 # Chosen on the paper's resonator, and used as they are for the systems of the tests.
 WELL_SPREAD = 1.0  # of the units of a well, on states divided by `WELL_SCALE`
 WELL_SCALE = 0.6  # of the distance of the nearest saddle
+FINER = 0.1  # of the spread, where V leaves too much of a residual: in many states units are to be smooth
+WELL_DRAWS = 4  # of units, until some take V to the saddle
+NEAREST_STATES = 10  # recorded ones: to the saddle has come what has one of those that lie nearest to it
+GROWTH_STEPS = 8  # of Gauss–Newton on each level; the last fit comes afterwards
 WELL_FIT: dict[str, Any] = {"rounds": 4, "finest": 1e-5, "steps": 8}
 WELL_DAMPING = 1e-7  # of Gauss–Newton: keeps V from running away outside the points of a fit
 WELL_REACH = 1.1  # of the level of a well: V beyond its saddle counts up to there
@@ -87,12 +93,16 @@ class UnitBasis:
         W and b, shapes ``(d, units)`` and ``(units,)``.
     center, scale
         μ and σ, shape ``(d,)``.
+    flat
+        Whether each function has no slope at μ either, as V has none at an attractor. Then the first d units
+        take up that of each other one, and are no functions of their own.
     """
 
     weights: np.ndarray
     biases: np.ndarray
     center: np.ndarray
     scale: np.ndarray
+    flat: bool = False
 
     def hidden(self, x: np.ndarray) -> np.ndarray:
         """The units alone, shape ``(n, units)``."""
@@ -101,7 +111,7 @@ class UnitBasis:
     @property
     def size(self) -> int:
         """Number of functions, the units and the square."""
-        return len(self.biases) + 1
+        return len(self.biases) + 1 - len(self._taken)
 
     @property
     def title(self) -> str:
@@ -111,23 +121,40 @@ class UnitBasis:
     def values(self, x: np.ndarray) -> np.ndarray:
         """Points ``(n, d)`` to functions ``(n, m)``, each of which is zero at μ."""
         square = (self._normalised(x) ** 2).sum(axis=1)
-        return np.column_stack([self.hidden(x) - np.tanh(self.biases), square])
+        return np.column_stack([self._functions(self.hidden(x) - np.tanh(self.biases)), square])
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
         """Points ``(n, d)`` to gradients ``(n, d, m)``."""
         of_units = (1 - self.hidden(x) ** 2)[:, None] * (self.weights / self.scale[:, None])
-        return np.concatenate([of_units, (2 * self._normalised(x) / self.scale)[:, :, None]], axis=2)
+        square = (2 * self._normalised(x) / self.scale)[:, :, None]
+        return np.concatenate([self._functions(of_units), square], axis=2)
 
     def hessians(self, x: np.ndarray) -> np.ndarray:
         """Points ``(n, d)`` to Hessians ``(n, d, d, m)``."""
         hidden, slopes = self.hidden(x), self.weights / self.scale[:, None]
         of_units = (-2 * hidden * (1 - hidden**2))[:, None, None] * slopes[:, None] * slopes
         square = np.broadcast_to(np.diag(2 / self.scale**2)[:, :, None], (*of_units.shape[:3], 1))
-        return np.concatenate([of_units, square], axis=3)
+        return np.concatenate([self._functions(of_units), square], axis=3)
 
     def design(self, x: np.ndarray) -> np.ndarray:
         """Functions for f, ``[tanh(y W + b), 1, y]``: points ``(n, d)`` to ``(n, units + 1 + d)``."""
         return np.column_stack([self.hidden(x), np.ones(len(x)), self._normalised(x)])
+
+    def of_units(self, coefficients: np.ndarray) -> np.ndarray:
+        """The weights of the units, shape ``(units,)``, in a sum of the functions."""
+        return np.concatenate([-self._taken @ coefficients[:-1], coefficients[:-1]])
+
+    def _functions(self, of_units: np.ndarray) -> np.ndarray:
+        """Functions ``(..., m - 1)`` of units ``(..., units)``."""
+        first = len(self._taken)
+        return of_units[..., first:] - of_units[..., :first] @ self._taken if first else of_units
+
+    @cached_property
+    def _taken(self) -> np.ndarray:
+        """How much of each other unit the first ones take up, shape ``(d, units - d)``; ``(0, units)``."""
+        d = len(self.weights) if self.flat else 0
+        slopes = self.weights * (1 - np.tanh(self.biases) ** 2)
+        return np.linalg.solve(slopes[:d, :d], slopes[:d, d:])
 
     def _normalised(self, x: np.ndarray) -> np.ndarray:
         return (x - self.center) / self.scale
@@ -221,7 +248,7 @@ class OutputWeights:
             self.coefficients = corrected(self.basis, best[0], self.coefficients, best[1])
         # The standard error of f at the points, of independent errors in the velocities, as a share of f.
         design = self.basis.design(self.points)
-        spread = (best[0].spread(design, best[1]) ** 2).sum(axis=1).mean()
+        spread = ((design @ best[0].inverse(best[1])) ** 2).sum(axis=1).mean()
         size = (self.drift(self.points) ** 2).sum(axis=1).mean()
         self.uncertainty = float(np.sqrt(spread * (unexplained**2).mean(axis=0).sum() / size))
         logger.info("f is uncertain by %.1e of itself", self.uncertainty)
@@ -295,44 +322,89 @@ class OutputWeights:
         count = len(portrait.attractors)
         if portrait.fault() is not None or not count:
             return None
-        wells, barriers = list[Well](), np.full((count, count), np.inf)
-        for index in range(count):
+        portrait = replace(portrait, basins=tuple(self._basin(portrait, one) for one in range(count)))
+        barriers, levels, parts, places, known = np.full((count, count), np.inf), [], [], [], []
+        for index, generator in enumerate(self.generator.spawn(count)):
             try:
-                well = self._well(portrait, index)
+                well = self._well(portrait, index, generator)
             except NumericalFailure as failure:
                 logger.info("%s", failure)
                 return None
-            attractor, saddles = portrait.attractors[index].position, portrait.saddles[index]
-            x = well.inside(LEVEL_SHARE)
-            residual = float(np.median(well.residual_at(x))) if len(x) else np.inf
-            logger.info("about %s: V up to %.4g, residual %.1e", attractor, well.level, residual)
-            if not (
-                residual < max(MAX_WELL_RESIDUAL, self.uncertainty)
-                and self._leaves(attractor, cast(UnitBasis, well.basis), well.coefficients)
-            ):
+            basis, basin = cast(UnitBasis, well.basis), portrait.basins[index]
+            if not self._leaves(well.attractor, basis, well.coefficients):
                 return None
-            wells.append(well)
-            for other in range(count):
-                tops = [
-                    one.position for one in saddles if any(one is each for each in portrait.saddles[other])
-                ]
-                if other != index and tops:
-                    barriers[index, other] = well.values(np.array(tops)).min()
-        parts = [
-            self._networks(cast(UnitBasis, well.basis), well.coefficients, well.points) for well in wells
-        ]
+            saddle = well.saddle
+            for other in range(count) if saddle is not None else ():
+                if any(
+                    np.array_equal(cast(np.ndarray, saddle), one.position) for one in portrait.saddles[other]
+                ):
+                    barriers[index, other] = well.level
+            x = basin.points(np.arange(len(basin.chosen)))
+            parts.append(self._networks(basis, well.coefficients, well.points))
+            levels.append(well.level)
+            places.append(x)
+            known.append(np.where(well.reaches(x), index, NetworksByWell.NOWHERE))
+        np.fill_diagonal(barriers, np.inf)
         try:
             heights = heights_of_attractors(barriers)
-        except NumericalFailure:  # wells that no saddle connects stand side by side
+        except NumericalFailure:  # wells that their lowest saddles do not connect stand side by side
             heights = np.zeros(count)
-        inside = [one.points(np.arange(len(one.chosen))) for one in portrait.basins]
-        known = [
-            np.where(well.reaches(x), index, NetworksByWell.NOWHERE)
-            for index, (well, x) in enumerate(zip(wells, inside, strict=True))
-        ]
-        return NetworksByWell(tuple(parts), heights, np.concatenate(inside), np.concatenate(known))
+        joined = np.concatenate(places), np.concatenate(known)
+        return NetworksByWell(tuple(parts), heights, np.array(levels), *joined)
 
-    def _well(self, portrait: PhasePortrait, index: int) -> Well:
+    def _basin(self, portrait: PhasePortrait, index: int) -> Basin:
+        """What leads to an attractor, with more states about it where few lie in its well."""
+        assert self.found is not None
+        attractor, basin = portrait.attractors[index].position, portrait.basins[index]
+        x = np.array([one.position for one in portrait.saddles[index]]).reshape(-1, len(attractor))
+        offsets = np.concatenate([x, basin.points(np.arange(len(basin.chosen)))]) - attractor
+        heights = np.einsum("ni,ij,nj->n", offsets, hessian_at(self.found.dynamics, attractor), offsets) / 2
+        level = LEVEL_BEYOND_SADDLE * float(heights[: len(x)].min(initial=np.inf))
+        if not len(x) or (heights[len(x) :] < level).sum() >= STATES_PER_UNIT * self.units:
+            return basin
+        return basin_of(
+            self.found.dynamics, portrait.descents, index, portrait.attractors,
+            box=portrait.box, generator=self.generator, near=(STARTS_NEAR_ATTRACTOR, level),
+        )  # fmt: skip
+
+    def _well(self, portrait: PhasePortrait, index: int, generator: np.random.Generator) -> Well:
+        """V about an attractor, of the first units that take it to a saddle, or that end closest to one."""
+        basin, saddles = portrait.basins[index], portrait.saddles[index]
+        made: dict[float, Well] = {}
+        failure, spread, width = NumericalFailure("no units were drawn"), WELL_SPREAD, portrait.box @ [-1, 1]
+
+        def distances(x: np.ndarray) -> np.ndarray:
+            """How far states lie from each saddle, in order: shape ``(saddles, n)``."""
+            places = np.array([one.position for one in saddles]).reshape(-1, 1, x.shape[1])
+            return np.sort(np.abs((x - places) / width).max(axis=2), axis=1)
+
+        near = distances(basin.points(np.arange(len(basin.chosen))))[:, :NEAREST_STATES][:, -1]
+        for _ in range(WELL_DRAWS):
+            try:
+                well = self._well_of_draw(portrait, index, generator, spread)
+                x = well.inside(LEVEL_SHARE)
+                residual = float(np.median(well.residual_at(x))) if len(x) else np.inf
+                logger.info("about %s: V up to %.4g, residual %.1e", well.attractor, well.level, residual)
+                if not residual < max(MAX_WELL_RESIDUAL, self.uncertainty):
+                    raise NumericalFailure(f"V leaves a residual of {residual:.1g}")
+            except NumericalFailure as error:
+                failure, spread = error, FINER * spread
+                continue
+            # Extrapolated, V may seem to be as low at a saddle as where the well ends, far from it. Two draws
+            # that end at the same state end where recordings do.
+            away = distances(well.points)[:, 0]
+            closest, reached = float(away.min(initial=np.inf)), bool((away <= near).any())
+            done = reached or closest in made or not saddles
+            made.setdefault(closest, well if reached else replace(well, saddle=None))
+            if done:
+                break
+        if not made:
+            raise failure
+        return made[min(made)]
+
+    def _well_of_draw(
+        self, portrait: PhasePortrait, index: int, generator: np.random.Generator, spread: float
+    ) -> Well:
         """V about an attractor over units of its own, grown from the square ``|y|²`` of offsets from it."""
         attractor, basin = portrait.attractors[index].position, portrait.basins[index]
         saddles, width = portrait.saddles[index], np.ptp(portrait.box, axis=1)
@@ -342,12 +414,11 @@ class OutputWeights:
         distance = np.linalg.norm((places - attractor) / width, axis=1)
         scale = WELL_SCALE * (distance.min() if tops else np.median(distance)) * width
         units = min(self.units, len(basin.chosen) // STATES_PER_UNIT)
-        basis = UnitBasis(
-            WELL_SPREAD * self.generator.normal(size=(len(attractor), units)),
-            WELL_SPREAD * self.generator.uniform(-2, 2, units),
-            attractor,
-            scale,
-        )
+        weights = spread * generator.normal(size=(len(attractor), units))
+        biases = spread * generator.uniform(-2, 2, units)
+        # Those whose slopes span all directions best come first.
+        order = scipy.linalg.qr(weights * (1 - np.tanh(biases) ** 2), mode="r", pivoting=True)[1]
+        basis = UnitBasis(weights[:, order], biases[order], attractor, scale, flat=True)
         coefficients = np.zeros(basis.size)
         slope = self.jacobian(attractor[None])[0]
         square = 2 * self.diffusion.matrix @ np.diag(2 / scale**2)
@@ -355,7 +426,7 @@ class OutputWeights:
         coefficients[-1] = approach / np.linalg.eigvals(square).real.max()
         while np.linalg.eigvals(slope + coefficients[-1] * square).real.min() < approach:
             coefficients[-1] *= STEEPER
-        values = (basis.values(flat) @ coefficients).reshape(shape)
+        values = (coefficients[-1] * (((flat - attractor) / scale) ** 2).sum(axis=1)).reshape(shape)
         heights = np.sort(basin.highest(values)[tuple(basin.chosen.T)])
         free = np.arange(basis.size) < basis.size - 1
         # What a well is grown with has the methods that these types are asked for.
@@ -364,7 +435,7 @@ class OutputWeights:
             field, basin, saddles, functions, coefficients,
             free=free, metric=np.diag(2 * coefficients[-1] / scale**2),
             level=float(heights[min(3 * basis.size, len(heights) - 1)]),
-            fitted=np.zeros(0, dtype=int), generator=self.generator, damping=WELL_DAMPING,
+            fitted=np.zeros(0, dtype=int), generator=generator, damping=WELL_DAMPING, steps=GROWTH_STEPS,
         )  # fmt: skip
         # About its saddle V is hardly smooth. The last fit gives these points less weight.
         equation = HamiltonJacobi.at(functions, well.points, field, attractor=attractor)
@@ -376,14 +447,14 @@ class OutputWeights:
 
     def _networks(self, basis: UnitBasis, weights: np.ndarray, points: np.ndarray) -> TrainedNetworks:
         """V over units as a network, with one for g of the same units, fitted at points."""
-        steepness, flow = float(weights[-1]), self.drift(points)
+        steepness, flow, of_units = float(weights[-1]), self.drift(points), basis.of_units(weights)
         circulatory = flow + self.diffusion.push(points, basis.gradients(points) @ weights)
         functions = np.column_stack([basis.hidden(points), np.ones(len(points))])
         of_g = _LeastSquares(functions).solve(circulatory)
         layers = (basis.weights, basis.biases[None])
-        lowest = -(np.tanh(basis.biases) @ weights[:-1]) / steepness  # V is zero at μ
+        lowest = -(np.tanh(basis.biases) @ of_units) / steepness  # V is zero at μ
         return TrainedNetworks(
-            potential=(layers, (weights[:-1, None] / steepness, np.full((1, 1), lowest))),
+            potential=(layers, (of_units[:, None] / steepness, np.full((1, 1), lowest))),
             circulatory=(layers, (of_g[:-1], of_g[-1:])),
             mean=basis.center[None],
             scale=basis.scale[None],
@@ -441,13 +512,10 @@ class _LeastSquares:
 
     def solve(self, right: np.ndarray, damping: float = SINGULAR_RATIO) -> np.ndarray:
         """Coefficients ``(m, s)`` of right-hand sides ``(n, s)``; damping is a share of the largest size."""
-        return self._inverse(damping) @ (self.q.T @ right)
+        return self.inverse(damping) @ (self.q.T @ right)
 
-    def spread(self, rows: np.ndarray, damping: float) -> np.ndarray:
-        """``rows @ B``, where B turns independent errors of variance one in the data into coefficients."""
-        return rows @ self._inverse(damping)
-
-    def _inverse(self, damping: float) -> np.ndarray:
+    def inverse(self, damping: float) -> np.ndarray:
+        """What turns independent errors of variance one in the data into coefficients."""
         factors = self.sizes / (self.sizes**2 + (damping * self.sizes[0]) ** 2)
         return np.asarray((self.right.T * factors) @ self.left.T)
 

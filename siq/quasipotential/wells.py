@@ -456,11 +456,13 @@ def grown(
     generator: np.random.Generator,
     depth: float | None = None,
     damping: float = 0.0,
+    steps: int = 40,
 ) -> Well:
     """V grown from a start, level by level, to its lowest saddle or to the end of the recorded region.
 
     `metric` is the curvature of V at the attractor, in which distances are measured; `fitted` has the rows of
-    ``basin.chosen`` on which the start was fitted. The damping is that of Gauss–Newton.
+    ``basin.chosen`` on which the start was fitted. The damping is that of Gauss–Newton, and `steps` how many
+    it takes at most where the well ends.
     """
     attractor = basis.center
     place = f"the attractor near {attractor.round(4)}"
@@ -500,12 +502,13 @@ def grown(
                 f" needs {2 * basis.size}"
             )
         equation = HamiltonJacobi.at(basis, points, dynamics, attractor=attractor)
-        steps, tolerance = (40, 1e-13) if last else (8, COARSE_TOLERANCE)
+        most, tolerance = (steps, 1e-13) if last else (8, COARSE_TOLERANCE)
         coefficients, residual = equation.gauss_newton(
-            coefficients, free=free, steps=steps, tolerance=tolerance, damping=damping
+            coefficients, free=free, steps=most, tolerance=tolerance, damping=damping
         )
         values = along(coefficients)
-        recorded = _recorded(basin.starts(values), len(attractor))
+        # Of one state whatever lies below its highest start lies on the way down from it.
+        recorded = float(np.quantile(basin.starts(values), RECORDED_QUANTILE if len(attractor) > 1 else 1.0))
         # Far from the points of the fit V is an extrapolation: a saddle that seems to lie lower than points
         # already reached does not count, unless they are close to it.
         heights = at_tops @ coefficients
@@ -533,12 +536,6 @@ def grown(
     if short or not (np.isfinite(residual) and level > 0):
         raise NumericalFailure(f"{basis.title} do not follow V from {place} up to a saddle")
     return Well(basis, coefficients, dynamics, attractor, level, saddle, residual, points)
-
-
-def _recorded(starts: np.ndarray, dimension: int) -> float:
-    """The level that recordings reach, of V at the starts of descents, shape ``(n,)``."""
-    # Of one state whatever lies below its highest start lies on the way down from it.
-    return float(np.quantile(starts, RECORDED_QUANTILE if dimension > 1 else 1.0))
 
 
 def _extend_well(

@@ -29,7 +29,6 @@ from typing import Literal, Protocol
 
 import numpy as np
 import scipy.linalg
-from scipy.stats import qmc
 
 from siq.errors import NumericalFailure
 from siq.numerics.randomness import positive
@@ -304,7 +303,8 @@ BOUNDARY_DISTANCE = 1e-3  # of the domain: so close to the boundary a root leave
 
 def spread_evenly(box: np.ndarray, count: int, *, generator: np.random.Generator) -> np.ndarray:
     """Points of a scrambled Sobol sequence in a box ``(d, 2)``: shape ``(n, d)``, n not below `count`."""
-    sequence = qmc.Sobol(len(box), scramble=True, seed=generator)
+    # scipy imports this when it is first named: plans of workflows do without.
+    sequence = scipy.stats.qmc.Sobol(len(box), scramble=True, seed=generator)
     share = sequence.random_base2(max(int(np.ceil(np.log2(count))), 1))
     return np.asarray(box[:, 0] + share * (box[:, 1] - box[:, 0]))
 

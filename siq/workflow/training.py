@@ -2,6 +2,7 @@
 
 A training ends as soon as its networks are good enough, or when its steps are spent. A killed one is resumed
 where it stopped: from its checkpoint, and with the networks of the runs that had already passed the check.
+One without a check keeps its checkpoint at the end, and goes on from there when it is given more steps.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import pandas as pd
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
-from siq.networks.decomposition import AnyNetworks
+from siq.networks.decomposition import AnyNetworks, TrainingOptions
 from siq.networks.training import Block, Check, TrainingData, choose_device, prepare_data
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.output_weights import OutputWeights
@@ -27,6 +28,9 @@ from siq.workflow.tables import Outcome, Status, Step, StepResult, as_table
 
 POSITION = "position"
 """In the details of an outcome: where the run stands among the networks of its block."""
+MOST_POINTS = 10_000  # over which a D that depends on the state is averaged
+Runs = Mapping[int, tuple[Recordings | None, FieldEstimate | None]]
+"""What runs bring to their training, by number: trajectories and f, None where a step before failed."""
 
 
 def not_trained(number: int) -> StepResult[AnyNetworks]:
@@ -34,21 +38,16 @@ def not_trained(number: int) -> StepResult[AnyNetworks]:
     return StepResult(None, Outcome(number, Step.TRAIN, Status.SKIPPED, "no networks were asked for"))
 
 
-MOST_POINTS = 10_000  # over which a D that depends on the state is averaged
-
-
-Runs = Mapping[int, tuple[Recordings | None, FieldEstimate | None]]
-"""What runs bring to their training, by number: trajectories and f, None where a step before failed."""
-
-
 def train_block(
-    settings: PipelineSettings, runs: Runs, *, folder: Path | None = None, device: str = "auto"
-) -> tuple[dict[int, StepResult[AnyNetworks]], list[AnyNetworks], pd.DataFrame]:
+    settings: PipelineSettings, runs: Runs, *, folder: Path | None = None, device: str = "auto",
+    version: int = 0,
+) -> tuple[dict[int, StepResult[AnyNetworks]], list[AnyNetworks], pd.DataFrame]:  # fmt: skip
     """Train the networks of a block of runs, on the device ``auto``, ``cpu`` or ``cuda``.
 
-    In the folder a killed training leaves what it goes on from; see `clean`. Given are the results of every
-    run; the networks of those that have data, by their positions, be they good for anything or not; and the
-    loss, the table `training`.
+    In the folder a killed training leaves what it goes on from, and one without a check what a training of
+    more steps goes on from; see `clean`. Neither goes on from another version of the code. Given are the
+    results of every run; the networks of those that have data, by their positions, be they good for anything
+    or not; and the loss, the table `training`.
     """
     assert settings.training is not None  # networks are asked for
     data, results = _training_data(settings, runs)
@@ -58,7 +57,7 @@ def train_block(
     ready, faults = _checks(settings, runs, data, diffusion)
     block = Block(
         data, ready, options=settings.training, diffusion=diffusion, seed=settings.seed, folder=folder,
-        mark=_fingerprint(settings, runs, data), device=choose_device(device), faults=faults,
+        mark=f"{_fingerprint(settings, runs, data)} {version}", device=choose_device(device), faults=faults,
     )  # fmt: skip
     block.train()
     for number in data:
@@ -139,6 +138,8 @@ def _checks(
 def _fingerprint(settings: PipelineSettings, runs: Runs, data: Mapping[int, TrainingData]) -> str:
     """What everything kept by a killed training must share with the one that goes on from it."""
     told = settings.parts(("seed", "space", "sampling", "training"))
+    if told["training"]["check"] is None:
+        del told["training"]["steps"]  # which say when it ends, and change no step before
     digest = hashlib.sha256(json.dumps([list(data), told], sort_keys=True).encode())
     for number, part in data.items():
         record = runs[number][1]
@@ -151,7 +152,8 @@ def _fingerprint(settings: PipelineSettings, runs: Runs, data: Mapping[int, Trai
     return digest.hexdigest()
 
 
-def clean(folder: Path) -> None:
-    """Remove what only a killed training would need."""
-    for path in folder.glob("kept-*.npz"):
+def clean(folder: Path, options: TrainingOptions | None = None) -> None:
+    """Remove what only a killed training would need; what was kept last stays of one without a check."""
+    kept = sorted(folder.glob("kept-*.npz"), key=lambda path: path.stat().st_mtime_ns)
+    for path in kept[: len(kept) - (options is not None and options.check is None)]:
         path.unlink()

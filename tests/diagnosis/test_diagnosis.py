@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 import yaml
 
-from siq.diagnosis import investigation, search
+from siq.diagnosis import forecasts, investigation, search
 from siq.diagnosis.diagnosis import Diagnosis, _withdrawn, solve_case
 from siq.diagnosis.dictionary import standard_dictionary
 from siq.diagnosis.evidence import FittedCandidate
@@ -300,6 +300,8 @@ def test_what_a_name_leaves_is_described_and_no_sample_of_a_test_chooses_it(
             context, first, left[0], named, whole.recalibrated, log_odds=(9.0,), convincing=True
         )
 
+    # Forecasts would name both.
+    monkeypatch.setattr(investigation, "named_by_forecasts", lambda *_: (None, ()))
     monkeypatch.setattr("siq.diagnosis.naming._judge_mechanisms", the_first_alone)
     table = recordings_of(lambda x, v, t: -2.0 * x**3 - 0.1 * v * np.abs(v), count=6)
     study = {"held_out": ["r2", "r4"], "tests": ["r2", "r4"], "search": {"mechanisms": 2}}
@@ -408,14 +410,22 @@ def test_a_mechanism_that_overflows_ends_itself_and_not_the_diagnosis(tmp_path: 
 def test_a_candidate_whose_fit_fails_unforeseen_is_recorded_with_the_reason(
     error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    begun = forecasts._begun
+
+    def failing(site: Any, *further: Any) -> Any:
+        if site.candidate.name == "cubic stiffness":
+            raise error
+        return begun(site, *further)
+
     right = search._with_start
 
-    def failing(promised: Ranked[Probe], *further: Any) -> Dynamics:
+    def failing_in_tests(promised: Ranked[Probe], *further: Any) -> Dynamics:
         if promised.term.candidate.name == "cubic stiffness":
             raise error
         return right(promised, *further)
 
-    monkeypatch.setattr(search, "_with_start", failing)
+    monkeypatch.setattr(forecasts, "_begun", failing)
+    monkeypatch.setattr(search, "_with_start", failing_in_tests)
     kept = {"cubic stiffness", "quintic stiffness"}
     without = [each.name for each in standard_dictionary() if each.name not in kept]
     study = {"held_out": ["r2"], "without": without}

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.diagnosis.evidence import averaged_evidence, evidence_of_function, orthonormal, smooth_prior
+from siq.diagnosis.evidence import averaged_evidence, evidence_of_function, smooth_prior
 from siq.diagnosis.mechanisms import fresh_names
-from siq.diagnosis.naming import _best_shares
 from siq.diagnosis.study import SearchOptions
 from siq.diagnosis.terms import Place, _powers, _simplest, _with_formula
 from siq.systems.diffusion import Diffusion
@@ -61,26 +60,9 @@ def test_smooth_functions_are_smooth() -> None:
     assert (np.diff(correlation) < 0).all() and np.linalg.eigvalsh(prior).min() > 0
 
 
-def test_the_best_mechanisms_of_each_effect_are_chosen_one_beside_the_other() -> None:
-    draw = np.random.default_rng(1)
-    groups = [orthonormal(draw.normal(size=(30, width))) for width in (1, 2, 1, 1)]
-    effects = draw.normal(size=(30, 5))
-    effects[:, 0] = groups[1] @ [1.0, -2.0] + 0.5 * groups[3][:, 0]
-    one, two = _best_shares(effects, groups, 1), _best_shares(effects, groups, 2)
-    alone = max(float(((g.T @ effects[:, 1]) ** 2).sum()) for g in groups) / float(
-        effects[:, 1] @ effects[:, 1]
-    )
-    assert one[1] == pytest.approx(alone)
-    assert two[0] == pytest.approx(1.0) and one[0] < 0.99
-    assert (two >= one - 1e-12).all()
-
-
 def test_odds_of_a_name_follow_from_how_many_may_be_wrong() -> None:
     options = SearchOptions(wrong_names=0.05, unnamed=0.2)
     assert np.exp(options.least_log_odds) == pytest.approx(19)
-    # A right name beside something without one, or only this, which is matched as well.
-    right, wrong = 0.8 * 0.2, 0.2 * options.most_alike
-    assert wrong / (wrong + right) == pytest.approx(0.05)
 
 
 def place(*words: str) -> Place:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from siq.diagnosis import screening
+from siq.diagnosis import forecasts, screening
 from siq.diagnosis.diagnosis import Diagnosis, solve_case, tables_of
 from siq.diagnosis.study import Allowance
 from siq.errors import NumericalFailure
@@ -141,6 +141,7 @@ def test_a_candidate_that_overflows_ends_itself_and_not_the_case(
         raise NumericalFailure("it runs away")
 
     monkeypatch.setattr(screening, "by_likelihood", overflow)
+    monkeypatch.setattr(forecasts, "_gains", overflow)
     found = answered(falling_ball(0.3), tmp_path)
     assert {each.reason for each in found.statement.not_fitted} == {"it runs away"}
     assert not found.statement.partial and np.isfinite(found.statement.errors.recalibrated or 0.0)

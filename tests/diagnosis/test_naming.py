@@ -1,4 +1,4 @@
-"""What is left beside a name: correlated errors, a function for both rivals, and parts that are left out."""
+"""What is left beside a name: correlated errors, and parts that are left out."""
 
 from __future__ import annotations
 
@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 
 from siq.data.recordings import Recordings
-from siq.diagnosis import naming
 from siq.diagnosis.evidence import correlation_time_of
 from siq.diagnosis.holdout import _cross_validation_folds, errors_left_out, first_better
-from siq.diagnosis.naming import _MissingEffect, _residual_model_comparison
-from siq.diagnosis.search import FitContext
-from siq.diagnosis.unnamed_models import AugmentedModel, runs_freely
+from siq.diagnosis.naming import _MissingEffect
+from siq.diagnosis.unnamed_models import runs_freely
 from siq.inference.kalman_filter import Whitened
 from siq.inference.measurements import Measurements, measurements
 from siq.inference.recalibration import recalibrate
@@ -79,76 +77,6 @@ def test_evidence_counts_errors_that_hang_together_as_one() -> None:
     assert repeated == pytest.approx(alone, rel=0.25)
 
 
-def trial_of(fit: SimpleNamespace) -> SimpleNamespace:
-    candidate = SimpleNamespace(name="overflow", label="overflow in h", admits=lambda _: True)
-    return SimpleNamespace(fit=fit, candidate=candidate)
-
-
-def fit_of(evidence: float, *, forces: bool = False, dimension: int = 1) -> SimpleNamespace:
-    model = SimpleNamespace(dimension=dimension, parameters=(), free=())
-    return SimpleNamespace(evidence=evidence, has_process_noise=forces, model=model, noise=None)
-
-
-@pytest.mark.parametrize(
-    ("on_top", "instead", "pairs", "given", "foreseen"),
-    [
-        (30.0, 10.0, 20.0, True, 0.5),
-        # Another function in its place does as well, and so does one alone.
-        (30.0, 10.0, 30.0, False, 0.5),
-        (30.0, 27.0, 20.0, False, 0.5),
-        # Nothing is likelier on top of it than nothing; alone it is not likely enough.
-        (0.0, 10.0, 15.0, False, 0.5),
-        # Where the odds decide nothing, parts left out do: foreseen with it better, worse, or not at all.
-        (30.0, 10.0, 30.0, False, 2.0),
-        (30.0, 10.0, 30.0, False, None),
-    ],
-)
-def test_a_name_stands_beside_a_rest_where_no_function_does_as_well_in_its_place(
-    on_top: float,
-    instead: float,
-    pairs: float,
-    given: bool,
-    foreseen: float | None,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    own, base = fit_of(12.0), fit_of(0.0)
-    draw = np.random.default_rng(2)
-    known = {id(own): None if foreseen is None else squares(draw, foreseen)}
-    without = squares(draw, 1.0)
-    monkeypatch.setattr(naming, "errors_left_out", lambda fit, *_, **__: known.get(id(fit), without))
-    part = SimpleNamespace(candidate=SimpleNamespace(log_cost=1.0))
-
-    def functions(parts: tuple, fit: SimpleNamespace, _: object) -> list[AugmentedModel]:
-        if fit is own:
-            return [AugmentedModel((part,), fit_of(on_top))] if on_top else []
-        return [AugmentedModel((*parts, part), fit_of(pairs if parts else instead))]
-
-    monkeypatch.setattr(naming, "with_function", functions)
-    monkeypatch.setattr(naming, "runs_freely", lambda *_: True)
-    monkeypatch.setattr(naming, "log_evidences", lambda fits, _: [fit.evidence for fit in fits])
-    candidates = tuple(SimpleNamespace(name=name) for name in ("overflow", "overflow", "leak"))
-    context = FitContext(DECAY, SimpleNamespace(), SimpleNamespace(), candidates)
-    assert context.study.search.unnamed == 0.1
-    found = _residual_model_comparison(trial_of(own), base, context)
-    # Each function costs what it was chosen among, and the probability that something has no name.
-    cost = 1.0 + np.log(10)
-    best = max(on_top - cost if on_top else 0.0, 12.0)
-    expected = best + np.log(0.9) - np.log(2 * 2) - max(instead - cost, pairs - 2 * cost)
-    assert found is not None
-    log_odds, predicts_better, *_ = found
-    assert log_odds == pytest.approx(expected)
-    assert bool(log_odds >= np.log(19)) is given
-    undecided = abs(log_odds) < context.study.search.least_log_odds
-    # Functions on top of the mechanism foresee as badly as those in its place here.
-    assert predicts_better is (undecided and foreseen == 0.5)
-
-
-def test_what_random_forces_stand_in_for_has_no_model_beside_which_a_name_could_stand() -> None:
-    context = FitContext(DECAY, SimpleNamespace(), SimpleNamespace())
-    for fit in (fit_of(50.0, forces=True), fit_of(50.0, dimension=2)):
-        assert _residual_model_comparison(trial_of(fit), fit_of(0.0), context) is None
-
-
 def decays(count: int, samples: int, *, rate: float = 1.0) -> Measurements:
     draw = np.random.default_rng(5)
     t = np.linspace(0, 2, samples)
@@ -186,8 +114,8 @@ def test_what_is_left_out_is_foreseen_up_to_noise_and_parameters_are_fitted_to_t
     assert squares is not None and len(squares) > 150
     right = np.sqrt(squares.mean())
     # A fifth of each tells where it begins.
-    spread = np.array([out.outputs[12:].std() for out, _, _ in _cross_validation_folds(data)])
-    assert right == pytest.approx(np.sqrt(np.mean((0.01 / spread) ** 2)), rel=0.3)
+    spread = np.concatenate([data.outputs[a + 12 : b] for a, b in itertools.pairwise(data.first)]).std()
+    assert right == pytest.approx(0.01 / spread, rel=0.3)
     # From wrong parameters it ends the same, since they are fitted again, but where they may not be.
     off = replace(fit, model=fit.model.with_values(np.array([1.3])))
     again = errors_left_out(off, data, noise=fit.noise)

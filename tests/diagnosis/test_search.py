@@ -209,18 +209,16 @@ def judged(
     left: list[Remainder],
     *,
     together: float = 20.0,
-    p_alike: float = 0.5,
 ) -> Investigation:
-    """A search of so many mechanisms, judged by odds and matches that are given."""
+    """A search of so many mechanisms, judged by odds that are given."""
 
     def of_a_name(_: object, candidates: list[SimpleNamespace], context: FitContext) -> float:
         return odds[candidates[0].number - 1] if len(candidates) == 1 else together
 
     monkeypatch.setattr(naming, "_log_odds_of_a_name", of_a_name)
-    monkeypatch.setattr(naming, "_false_match_rate", lambda *_, **__: p_alike)
     study = MismatchStudy(search=SearchOptions(wrong_names=0.05, unnamed=0.2))
     context = FitContext(SimpleNamespace(), SimpleNamespace(), MOTION, study=study)
-    return _judge_mechanisms(found_with(len(odds)), left, context, generator=np.random.default_rng(0))
+    return _judge_mechanisms(found_with(len(odds)), left, context)
 
 
 @pytest.mark.parametrize(
@@ -242,29 +240,27 @@ def test_further_mechanisms_stay_as_long_as_each_is_likely_and_leaves_less(
 
 
 @pytest.mark.parametrize(
-    ("odds", "together", "p_alike", "p_left", "verdict", "said"),
+    ("odds", "together", "p_left", "verdict", "said"),
     [
-        ((9.0,), 20.0, 0.5, 1.0, "missing physics", None),
-        ((2.5,), 20.0, 0.5, 1.0, "unexplained", "nearly as likely (odds of 12 to 1)"),
-        ((-1.0,), 20.0, 0.5, 1.0, "unexplained", "a function without a name is likelier"),
+        ((9.0,), 20.0, 1.0, "missing physics", None),
+        ((2.5,), 20.0, 1.0, "unexplained", "nearly as likely (odds of 12 to 1)"),
+        ((-1.0,), 20.0, 1.0, "unexplained", "a function without a name is likelier"),
         # Two that are a description of one function.
-        ((9.0, 9.0), 1.0, 0.5, 1.0, "unexplained", "mechanism 1 and mechanism 2"),
-        # Of what leaves something, the share has to be more than mechanisms reach by chance.
-        ((9.0,), 20.0, 0.5, 1e-9, "unexplained", None),
-        ((9.0,), 20.0, 0.01, 1e-9, "missing physics", None),
+        ((9.0, 9.0), 1.0, 1.0, "unexplained", "mechanism 1 and mechanism 2"),
+        # What leaves something is not named by odds that suppose that nothing is left.
+        ((9.0,), 20.0, 1e-9, "unexplained", None),
     ],
 )
 def test_a_name_has_to_be_likelier_than_none(
     odds: tuple[float, ...],
     together: float,
-    p_alike: float,
     p_left: float,
     verdict: str,
     said: str | None,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     left = [remainder(0.99 + 0.001 * place, p_left) for place in range(len(odds))]
-    found = judged(monkeypatch, odds, left, together=together, p_alike=p_alike)
+    found = judged(monkeypatch, odds, left, together=together)
     assert found.verdict.names == (verdict == "missing physics")
     assert said is None or said in sentence(found.remarks[-1])
 

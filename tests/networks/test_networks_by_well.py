@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from siq.networks.decomposition import (
 
 D = np.array([[2.0, 0.6], [0.6, 1.0]])
 HEIGHTS = np.array([0.0, 0.25])
+LEVELS = np.array([1.0, 0.5])
 
 
 def networks(seed: int, *, units: int) -> TrainedNetworks:
@@ -40,7 +42,7 @@ def by_well() -> NetworksByWell:
     """Wells left and right of x = 0, of different sizes; the networks hold nowhere above y = 1."""
     states = np.random.default_rng(0).uniform(-2, 2, size=(4000, 2))
     attractor_of = np.where(states[:, 1] > 1, NetworksByWell.NOWHERE, states[:, 0] > 0)
-    return NetworksByWell((networks(1, units=5), networks(2, units=7)), HEIGHTS, states, attractor_of)
+    return NetworksByWell((networks(1, units=5), networks(2, units=7)), HEIGHTS, LEVELS, states, attractor_of)
 
 
 def test_each_holds_in_its_own_well_and_none_elsewhere(by_well: NetworksByWell) -> None:
@@ -58,12 +60,25 @@ def test_each_holds_in_its_own_well_and_none_elsewhere(by_well: NetworksByWell) 
     np.testing.assert_array_equal(by_well.diffusion, D)
 
 
+def test_what_lies_low_in_a_well_is_told_apart(by_well: NetworksByWell) -> None:
+    for index, part in enumerate(by_well.parts):
+        states = by_well.states[by_well.attractor_of == index]
+        values = part.potential_at(states)
+        level = float(np.quantile(values, 0.7)) / 0.9
+        one = replace(by_well, levels=np.full(2, level))
+        low = states[values < 0.9 * level]
+        assert 0 < len(low) < len(states)
+        np.testing.assert_array_equal(one.below(0.9, part.mean[0], by_well.states), low)
+        some = one.below(0.9, part.mean[0], by_well.states[:500])
+        np.testing.assert_array_equal(some, low[: len(some)])
+
+
 def test_they_are_kept_beside_those_of_other_runs(by_well: NetworksByWell, tmp_path: Path) -> None:
     single = networks(3, units=9)
     save_networks(tmp_path / "n.npz", [single, by_well, single])
     first, again, last = (load_networks(tmp_path / "n.npz", run=run) for run in range(3))
     assert isinstance(again, NetworksByWell)
-    for name in ("heights", "states", "attractor_of"):
+    for name in ("heights", "levels", "states", "attractor_of"):
         np.testing.assert_array_equal(getattr(again, name), getattr(by_well, name))
     for one, other in (([first], [single]), ([last], [single]), (again.parts, by_well.parts)):
         assert all(isinstance(each, TrainedNetworks) for each in one)

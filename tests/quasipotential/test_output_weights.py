@@ -145,6 +145,22 @@ def test_the_draw_decides_the_units_and_nothing_else_does() -> None:
     assert not np.array_equal(one.potential_at(x), other.potential_at(x))
 
 
+def test_flat_functions_have_no_slope_at_their_center_and_are_sums_of_the_units() -> None:
+    draw = np.random.default_rng(4)
+    basis = UnitBasis(
+        draw.normal(size=(2, 9)), draw.normal(size=9), np.ones(2), np.array([2.0, 0.5]), flat=True
+    )
+    assert basis.size == 8
+    np.testing.assert_allclose(basis.gradients(basis.center[None]), 0, atol=1e-14)
+    x, coefficients = draw.normal(size=(20, 2)), draw.normal(size=8)
+    units = replace(basis, flat=False)
+    same = np.append(basis.of_units(coefficients), coefficients[-1])
+    for name in ("values", "gradients", "hessians"):
+        flat, plain = getattr(basis, name)(x) @ coefficients, getattr(units, name)(x) @ same
+        np.testing.assert_allclose(flat, plain, atol=1e-12)
+    np.testing.assert_array_equal(units.of_units(same), same[:-1])
+
+
 def test_derivatives_of_units_are_those_of_their_formula() -> None:
     draw = np.random.default_rng(3)
     basis = UnitBasis(

@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from forked import Snakemake
 
 ROOT = Path(__file__).resolve().parents[2]
 STUDY = """\
@@ -60,24 +61,20 @@ class Project:
         """The same with all that it has made, to be changed."""
         return Project(Path(shutil.copytree(self.folder, folder)))
 
-    def start(self, *arguments: str, study: str = "study.yaml") -> subprocess.Popen[str]:
+    def start(self, *arguments: str, study: str = "study.yaml") -> Snakemake:
         # The profile's longer span would only let each of these short workflows end later.
         span = ("--max-jobs-per-timespan", "100/1s")
-        command = [sys.executable, "-m", "snakemake", "--cores", "2", *span, *arguments]
-        command += ["--configfile", study]
-        return subprocess.Popen(
-            command,
-            cwd=self.folder,
-            env=os.environ | {"PYTHONPATH": f"{self.folder}{os.pathsep}{ROOT}"},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            start_new_session=True,
-        )
+        number, output = tempfile.mkstemp(suffix=".txt", dir=self.folder.parent)
+        os.close(number)
+        return Snakemake(
+            ["--cores", "2", *span, *arguments, "--configfile", study],
+            folder=self.folder, path=[ROOT], output=Path(output),
+        )  # fmt: skip
 
     def run(self, *arguments: str, study: str = "study.yaml") -> subprocess.CompletedProcess[str]:
         process = self.start(*arguments, study=study)
-        output, _ = process.communicate(timeout=600)
+        output = process.output(timeout=600)
+        assert process.returncode is not None
         return subprocess.CompletedProcess(process.args, process.returncode, output)
 
     def make(self, *arguments: str, study: str = "study.yaml") -> str:

@@ -77,7 +77,7 @@ def test_what_a_plan_says_a_run_does(finished, tmp_path):
 def wait_for(pattern, process, *, within, seconds=120):
     deadline = time.monotonic() + seconds
     while not any(within.glob(pattern)):
-        assert process.poll() is None and time.monotonic() < deadline, f"{pattern} never appeared"
+        assert process.returncode is None and time.monotonic() < deadline, f"{pattern} never appeared"
         time.sleep(0.02)
 
 
@@ -92,7 +92,7 @@ def test_an_interrupted_workflow_resumes_and_gives_the_same_tables(finished, tmp
     process = project.start("results/mini/tables/summary.parquet")
     wait_for("results/mini/training/000-000/kept-*.npz", process, within=project.folder)
     os.killpg(process.pid, how)
-    process.communicate(timeout=60)
+    process.output(timeout=60)
     assert process.returncode != 0
     project.make("results/mini/tables/summary.parquet")
     for name in ("coefficients", "rrmse", "outcomes", "training", "summary"):
@@ -115,5 +115,5 @@ def test_a_second_snakemake_waits_for_nobody_and_says_so(fresh_project):
     finally:
         process.send_signal(signal.SIGCONT)
     assert second.returncode != 0 and "Another snakemake is at work" in second.stdout
-    process.communicate(timeout=120)
+    process.output(timeout=120)
     assert process.returncode == 0

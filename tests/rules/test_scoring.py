@@ -10,12 +10,14 @@ import sympy
 from known_systems import exact_archetype
 
 from siq.inference.library import candidate_library
+from siq.networks.decomposition import TrainedNetworks, potential_on_grid
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.systems.dynamics import Dynamics
 from siq.workflow.tables import as_table
 from workflow.published import PublishedFigure
 from workflow.rows import concatenate
 from workflow.scoring import (
+    GRID_POINTS,
     _coefficient_table,
     _domain_grid,
     _exact_values,
@@ -120,12 +122,27 @@ def test_the_error_on_a_grid_does_not_depend_on_the_constant_of_u() -> None:
 
 
 def test_the_grid_covers_the_domain_evenly() -> None:
-    grid = _domain_grid(np.array([[-1.0, 1.0], [0.0, 3.0], [5.0, 6.0]]), points=1000)
+    _, grid = _domain_grid(np.array([[-1.0, 1.0], [0.0, 3.0], [5.0, 6.0]]), points=1000)
     assert grid.shape == (3, 1000)
     np.testing.assert_array_equal(grid.min(axis=1), [-1, 0, 5])
     np.testing.assert_array_equal(grid.max(axis=1), [1, 3, 6])
     assert [len(np.unique(axis)) for axis in grid] == [10, 10, 10]
-    assert _domain_grid(np.array([[0.0, 1.0]])).shape == (1, 1_000_000)
+    assert _domain_grid(np.array([[0.0, 1.0]]), points=GRID_POINTS)[1].shape == (1, 1_000_000)
+
+
+def test_v_on_a_grid_is_that_of_networks_at_its_points() -> None:
+    draw = np.random.default_rng(0)
+    hidden, outer = (draw.normal(size=(2, 30)), draw.normal(size=(1, 30))), draw.normal(size=(30, 1))
+    one = TrainedNetworks(
+        potential=(hidden, (outer, np.array([[0.3]]))),
+        circulatory=(hidden, (outer @ np.ones((1, 2)), np.ones((1, 2)))),
+        mean=np.array([[0.5, -1.0]]), scale=np.array([[0.7, 2.0]]), potential_scale=np.array([[1.5]]),
+        circulatory_scale=np.ones((1, 1)), diffusion=np.eye(2),
+    )  # fmt: skip
+    axes, grid = _domain_grid(np.array([[-3.0, 2.0], [0.0, 300.0]]), points=900)
+    np.testing.assert_allclose(
+        potential_on_grid(one, axes, grid), one.potential_at(grid.T), rtol=1e-12, atol=1e-11
+    )
 
 
 # Summaries

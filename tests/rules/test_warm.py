@@ -20,15 +20,16 @@ HEAD = "from workflow.warm import run_warm\nrun_warm('example_hopping')\nimport 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
 
 
-@pytest.fixture
-def interpreter(monkeypatch: pytest.MonkeyPatch) -> Iterator[subprocess.Popen[bytes]]:
-    """A warm interpreter that ends with the test."""
-    monkeypatch.setenv(warm.ADDRESS, "")
-    process = warm.start()
-    assert process is not None and process.stdin is not None
-    yield process
-    process.stdin.close()
-    process.wait(timeout=20)
+@pytest.fixture(scope="module")
+def interpreter() -> Iterator[subprocess.Popen[bytes]]:
+    """A warm interpreter that ends with the last of these tests."""
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv(warm.ADDRESS, "")
+        process = warm.start()
+        assert process is not None and process.stdin is not None
+        yield process
+        process.stdin.close()
+        process.wait(timeout=20)
 
 
 def start(path: Path, body: str, **environment: str) -> subprocess.Popen[str]:

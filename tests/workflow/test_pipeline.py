@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,10 @@ from known_systems import as_system, double_well, potential_gradient, potential_
 
 from siq.data.recordings import Recordings
 from siq.errors import NumericalFailure
-from siq.networks.decomposition import CheckOptions, NetworksByWell, TrainedNetworks, TrainingOptions
+from siq.networks import training as networks_training
+from siq.networks.decomposition import CheckOptions, NetworksByWell, TrainedNetworks, TrainingOptions, pack
 from siq.networks.regression import RegressionOptions
+from siq.networks.training import start
 from siq.quasipotential.certificate_tests import CertificateOptions
 from siq.quasipotential.formulas import _decomposition_data, exact_decomposition
 from siq.quasipotential.refinement import RefinementOptions
@@ -91,11 +94,12 @@ def test_v_and_its_barriers_are_right(analysis: Analysis) -> None:
         assert way.barrier == pytest.approx(2 * (top - low), rel=1e-4)
 
 
-def test_the_same_seed_gives_the_same_and_another_run_another_answer(recordings: Recordings) -> None:
-    settings = replace(SETTINGS, landscape=None)
-    one, same = analyse(recordings, settings), analyse(recordings, settings)
-    assert one.landscape is None
-    assert one.refined.certificates == same.refined.certificates
+def test_the_same_seed_gives_the_same_and_another_run_another_answer(
+    recordings: Recordings, analysis: Analysis
+) -> None:
+    same = analyse(recordings, replace(SETTINGS, landscape=None))
+    assert same.landscape is None
+    assert same.refined.certificates == analysis.refined.certificates
     first, second = drawn(number=0).result, drawn(number=1).result
     assert first is not None and second is not None and not np.array_equal(first.values, second.values)
 
@@ -191,6 +195,40 @@ def test_recordings_are_taken_whole_by_the_first_run_and_resampled_by_others(
     first, second = (pipeline.draw_run(settings, recordings, number=number) for number in (0, 1))
     assert first.result is recordings and second.result is not recordings
     assert first.outcome.step == second.outcome.step == Step.RESAMPLE
+
+
+def test_a_training_without_a_check_goes_on_when_it_is_given_more_steps(
+    recordings: Recordings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    starts = []
+
+    def counted(*arguments: Any, **named: Any) -> Any:
+        starts.append(named)
+        return start(*arguments, **named)
+
+    monkeypatch.setattr(networks_training, "start", counted)
+
+    def trained(steps: int, folder: str, *, version: int = 1) -> tuple[TrainedNetworks, list[int]]:
+        settings = replace(SETTINGS, training=replace(BRIEF, steps=steps))
+        _, found, history = training.train_block(
+            settings, {0: (recordings, None)}, folder=tmp_path / folder, device="cpu", version=version
+        )
+        training.clean(tmp_path / folder, settings.training)
+        assert isinstance(found[0], TrainedNetworks)
+        return found[0], history["step"].tolist()
+
+    whole, _ = trained(50, "whole")
+    trained(20, "parts")
+    more, steps = trained(50, "parts")
+    assert len(starts) == 2 and steps == list(range(1, 51))
+    for one, other in zip(pack([more]).values(), pack([whole]).values(), strict=True):
+        assert np.array_equal(one, other)
+    trained(20, "parts")  # fewer steps are no more of what there is
+    trained(20, "parts", version=2)
+    assert len(starts) == 4
+    assert len(list((tmp_path / "parts").iterdir())) == 1
+    training.clean(tmp_path / "parts")
+    assert not list((tmp_path / "parts").iterdir())
 
 
 def test_why_a_check_could_not_be_prepared_is_the_reason(

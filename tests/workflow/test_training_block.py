@@ -101,7 +101,7 @@ def test_a_run_whose_check_never_passes_is_shown_as_such(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("options", [TRAINING, replace(TRAINING, learning_rate=1e30)], ids=["", "lost"])
 def test_networks_by_well_serve_where_no_training_has_passed(options: TrainingOptions) -> None:
-    by_well = NetworksByWell((), np.zeros(0), np.zeros((0, 2)), np.zeros(0, dtype=int))
+    by_well = NetworksByWell((), np.zeros(0), np.zeros(0), np.zeros((0, 2)), np.zeros(0, dtype=int))
     checks = {0: Check(1, instead=by_well), 1: Check(99, instead=by_well)}
     one = block(None, checks, options=options)
     one.train()

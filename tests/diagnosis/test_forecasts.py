@@ -1,0 +1,322 @@
+"""Forecasts of parts left out: how they are counted, and what they name where forces at random act, too."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from homes_of_mechanisms import model_of, numbers, states
+
+from siq.data.recordings import Recordings
+from siq.diagnosis import forecasts
+from siq.diagnosis.dictionary import roles_of, standard_dictionary
+from siq.diagnosis.forecasts import (
+    FOLDS,
+    Rung,
+    _fold_of,
+    _Foreseen,
+    _gained,
+    _log_priors,
+    _thinned,
+    climb,
+    horizons_of,
+    next_rung,
+)
+from siq.diagnosis.holdout import preferred_recalibration
+from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
+from siq.diagnosis.screening import Probe, Term, linearised_with
+from siq.diagnosis.search import FitContext
+from siq.inference.budget import Budget
+from siq.inference.kalman_filter import Linearisation, Whitened
+from siq.inference.maximum_likelihood import Fit
+from siq.inference.measurements import Measurements, measurements
+from siq.inference.recalibration import recalibrate
+from siq.systems.dynamics import Dynamics
+from tests.diagnosis.decays import DECAY
+
+SAMPLES, FINE, DURATION, LASTING, NOISE = 120, 10, 8.0, 0.5, 0.001
+CLOSE = ("linear damping", "quadratic drag", "cubic stiffness", "constant bias")  # near the truth, or far off
+
+
+def pendulum(scale: float = 1.0) -> Dynamics:
+    """Without damping; angles are in units of so many per radian."""
+    card = {
+        "time_unit": "s",
+        "states": states(a="1", w="1/s"),
+        "parameters": numbers(k=8.5),
+        "equations": {"a": "w", "w": f"-k*{scale}*sin(a/{scale})"},
+        "outputs": {"q": "a"},
+    }
+    return model_of(card)
+
+
+def recorded(
+    damping: float, force: float, *, scale: float = 1.0, count: int = 6, seed: int = 3
+) -> Measurements:
+    """Pendulums of another swing each, by Heun's rule, with forces at random that last for a while."""
+    draw = np.random.default_rng(seed)
+    h = DURATION / (SAMPLES - 1) / FINE
+    state = np.stack([np.linspace(0.6, 2.2, count), draw.normal(size=count)])
+    push, memory = draw.normal(size=count), np.exp(-h / LASTING)
+    seen = np.empty((count, SAMPLES))
+
+    def rate(y: np.ndarray) -> np.ndarray:
+        return np.stack([y[1], -9.0 * np.sin(y[0]) - damping * y[1] + force * push])
+
+    for sample in range(SAMPLES):
+        seen[:, sample] = state[0]
+        for _ in range(FINE):
+            first = rate(state)
+            state = state + h / 2 * (first + rate(state + h * first))
+            push = memory * push + np.sqrt(1 - memory**2) * draw.normal(size=count)
+    seen = scale * (seen + NOISE * draw.normal(size=seen.shape))
+    return laid_out(seen, pendulum(scale))
+
+
+def laid_out(seen: np.ndarray, model: Dynamics) -> Measurements:
+    count, samples = seen.shape
+    table = Recordings(
+        ("q",), (None,), tuple(f"r{place}" for place in range(count)), np.repeat(np.arange(count), samples),
+        np.tile(np.linspace(0, DURATION, samples), count), seen.reshape(-1, 1),
+    )  # fmt: skip
+    return measurements(table, model)
+
+
+def context_of(model: Dynamics, data: Measurements, among: tuple[str, ...] = ()) -> FitContext:
+    roles = roles_of(model)
+    dictionary = [each for each in standard_dictionary() if not among or each.name in among]
+    return FitContext(model, data, roles, tuple(candidates_of(model, roles, dictionary)))
+
+
+def first_rung(context: FitContext) -> Rung | None:
+    fit, _ = recalibrate(context.model, context.data)
+    assert fit.has_process_noise
+    return next_rung(horizons_of(fit, context), context.candidates, context, {})
+
+
+@cache
+def damped() -> Rung:
+    """What is found first where linear damping is missing."""
+    found = first_rung(context_of(pendulum(), recorded(0.15, 0.2), CLOSE))
+    assert found is not None
+    return found
+
+
+# Priors
+
+
+def member(name: str, family: str, weight: float = 1.0) -> MechanismCandidate:
+    like = next(iter(candidates_of(pendulum(), roles_of(pendulum()), standard_dictionary())))
+    return replace(like, name=name, family=family, weight=weight)
+
+
+def test_names_share_what_is_left_to_them_and_a_family_counts_once() -> None:
+    crowd = [member(f"spring {place}", "stiffness") for place in range(5)]
+    given = [*crowd, member("drag", "resistance"), member("bias", "bias", 2.0), member("bias", "bias", 2.0)]
+    priors = np.exp(_log_priors(given, 0.1))
+    assert priors.sum() == pytest.approx(0.9)
+    # A family has the weight of its likeliest member, however many these are.
+    assert priors[:5].sum() == pytest.approx(priors[5])
+    # One that could act in two places is divided between them, and weighs twice as much together.
+    assert priors[6] == pytest.approx(priors[7]) and priors[6:].sum() == pytest.approx(2 * priors[5])
+
+
+def test_members_share_their_family_by_weight() -> None:
+    given = [member("drag", "resistance", 5.0), member("odd", "resistance", 0.2), member("bias", "bias")]
+    usual, odd, bias = np.exp(_log_priors(given, 0.1))
+    assert usual == pytest.approx(25 * odd)
+    assert usual + odd == pytest.approx(5 * bias)
+    assert usual + odd + bias == pytest.approx(0.9)
+
+
+def test_priors_of_the_dictionary_are_probabilities() -> None:
+    context = context_of(pendulum(), recorded(0.0, 0.2))
+    assert np.exp(_log_priors(context.candidates, 0.3)).sum() == pytest.approx(0.7)
+
+
+# Horizons and parts
+
+
+def test_a_thinned_recording_has_every_so_manieth_sample_from_its_first() -> None:
+    data = laid_out(np.random.default_rng(1).normal(size=(3, 30)), pendulum())
+    for every in (1, 4, 16):
+        known = np.isfinite(_thinned(data, every).outputs[:, 0]).reshape(3, 30)
+        np.testing.assert_array_equal(known, np.tile(np.arange(30) % every == 0, (3, 1)))
+    assert np.isfinite(data.outputs).all()
+
+
+@pytest.mark.parametrize(("count", "parts"), [(1, 8), (2, 8), (3, 9), (4, 4), (8, 8), (11, 8)])
+def test_parts_are_whole_stretches_and_each_row_is_in_one(count: int, parts: int) -> None:
+    data = laid_out(np.zeros((count, 40)), pendulum())
+    fold = _fold_of(data)
+    assert len(fold) == data.outputs.size and set(fold) == set(range(parts)) and parts < FOLDS + count
+    for begin, end in itertools.pairwise(data.first):
+        part = fold[begin:end]
+        # A stretch begins where another ends; where there are enough recordings nobody divides one.
+        stretches = 1 + int((np.diff(part) != 0).sum())
+        assert stretches == len(set(part)) and (stretches == 1 or count < FOLDS // 2)
+
+
+def test_parts_do_not_depend_on_the_order_of_recordings() -> None:
+    data = laid_out(np.zeros((11, 40)), pendulum())
+    other = replace(data, labels=data.labels[::-1])
+    pairs = [sorted(zip(each.labels, _fold_of(each)[::40], strict=True)) for each in (data, other)]
+    assert pairs[0] == pairs[1]
+
+
+def test_horizons_end_where_too_few_samples_tell_of_the_parameters() -> None:
+    context = context_of(pendulum(), recorded(0.0, 0.2), CLOSE)
+    horizons = horizons_of(recalibrate(context.model, context.data)[0], context)
+    known = [int(np.isfinite(each.data.outputs).sum()) for each in horizons]
+    assert known == [6 * -(-SAMPLES // every) for every in (1, 4, 16)]
+    assert all(each.fit.has_process_noise and each.correlated >= 1 for each in horizons)
+
+
+# Densities
+
+
+@pytest.mark.parametrize("width", [0, 3])
+@pytest.mark.parametrize("expected", [False, True])
+def test_the_density_of_each_part_is_that_of_a_fit_to_the_others(width: int, *, expected: bool) -> None:
+    draw = np.random.default_rng(6)
+    rows, fold = 90, np.repeat([0, 1, 2, 1, 0, 3], 15)
+    own, columns = draw.normal(size=(rows, 2)), draw.normal(size=(rows, width))
+    target = own @ [1.0, -2.0] + columns @ np.ones(width) + draw.normal(size=rows)
+    known = draw.random(rows) < 0.9
+    target[~known], own[~known], columns[~known] = 0.0, 0.0, 0.0
+    root = draw.normal(size=(width, width))
+    precision = root @ root.T + np.eye(width) if expected else None
+    white = Whitened(target, own, np.zeros(rows, dtype=int), known, int(known.sum()), 0.0)
+    found = _Foreseen(white, target, own, fold).log_density(columns, precision)
+    everything = np.concatenate([own, columns], axis=1)
+    for part in range(4):
+        out, rest = fold == part, fold != part
+        x, y = everything[rest], target[rest]
+        if precision is not None:
+            prior = np.concatenate([np.zeros((width, 2)), np.linalg.cholesky(precision).T], axis=1)
+            x, y = np.concatenate([x, prior]), np.concatenate([y, np.zeros(width)])
+        coefficients = np.linalg.lstsq(x, y, rcond=None)[0]
+        learned = ((y - x @ coefficients) ** 2).sum()
+        variance = learned / (known[rest].sum() - 2 - width)
+        missed = ((target - everything @ coefficients)[out] ** 2).sum()
+        direct = -0.5 * (missed / variance + known[out].sum() * np.log(variance))
+        assert found[part] == pytest.approx(direct, rel=1e-6)
+
+
+def test_the_density_does_not_depend_on_units_of_columns() -> None:
+    draw = np.random.default_rng(9)
+    own, columns, target = draw.normal(size=(60, 2)), draw.normal(size=(60, 2)), draw.normal(size=60)
+    white = Whitened(target, own, np.zeros(60, dtype=int), np.ones(60, dtype=bool), 60, 0.0)
+    fold = np.arange(60) // 15
+    one = _Foreseen(white, target, own, fold).log_density(columns, np.eye(2))
+    other = _Foreseen(white, target, own * [1e6, 1.0], fold).log_density(columns * 1e-5, 1e-10 * np.eye(2))
+    np.testing.assert_allclose(one, other, rtol=1e-8)
+
+
+# Names
+
+
+def test_damping_is_named_beside_forces_that_last() -> None:
+    model, data = pendulum(), recorded(0.15, 0.2)
+    context = context_of(model, data)
+    alone, rungs, _ = climb(recalibrate(model, data)[0], context)
+    (found,) = rungs
+    best = found.accepted.best
+    assert (best.candidate.name, best.candidate.family) == ("linear damping", "resistance to motion")
+    assert found.log_odds >= context.study.search.least_log_odds and found.gain > 0
+    assert len(alone) == len(found.horizons) >= 2
+    c = next(each for each in best.fit.model.parameters if each.name in best.candidate.amplitudes)
+    assert c.value == pytest.approx(0.15, rel=0.3)
+
+
+def test_odds_with_a_flat_prior_are_those_of_mechanisms_that_are_alike() -> None:
+    context = context_of(pendulum(), recorded(0.15, 0.2), CLOSE)
+    alike = tuple(replace(each, weight=1.0) for each in context.candidates)
+    options = context.study.search.model_copy(update={"unnamed": 0.5})
+    study = context.study.model_copy(update={"search": options})
+    flat = first_rung(replace(context, candidates=alike, study=study))
+    assert flat is not None
+    assert flat.log_odds == pytest.approx(flat.flat_log_odds)
+    assert damped().flat_log_odds == pytest.approx(flat.log_odds, abs=0.05)
+    assert damped().log_odds > damped().flat_log_odds  # nearly everything that moves is damped
+
+
+def test_forces_that_last_have_no_name_in_the_dictionary() -> None:
+    model, data = pendulum(), recorded(0.0, 0.2)
+    alone, rungs, _ = climb(recalibrate(model, data)[0], context_of(model, data))
+    assert len(alone) == 3 and rungs == []
+
+
+def test_the_order_of_recordings_says_nothing() -> None:
+    data, model = recorded(0.15, 0.2), pendulum()
+    turned = laid_out(data.outputs.reshape(-1, SAMPLES)[::-1], model)
+    same_as_before(first_rung(context_of(model, turned, CLOSE)))
+
+
+def test_units_of_the_state_say_nothing() -> None:
+    scale = 57.3
+    same_as_before(first_rung(context_of(pendulum(scale), recorded(0.15, 0.2, scale=scale), CLOSE)))
+
+
+def same_as_before(found: Rung | None) -> None:
+    assert found is not None
+    assert found.accepted.best.candidate.label == damped().accepted.best.candidate.label
+    assert found.log_odds == pytest.approx(damped().log_odds, rel=1e-3)
+    # Over fits of the simulation alone, which settle up to a tolerance.
+    assert found.gain == pytest.approx(damped().gain, rel=0.05)
+
+
+def kicked_decays(count: int = 4, samples: int = 60) -> Measurements:
+    """Decays as their card has them, kicked at random about as far as they go."""
+    draw = np.random.default_rng(4)
+    step = DURATION / (samples - 1)
+    (rate,) = DECAY.values
+    left = np.exp(-rate * step)
+    x = draw.normal(size=(count, samples))
+    for before, now in itertools.pairwise(x.T):
+        now[:] = left * before + np.sqrt(1 - left**2) * now
+    return laid_out(x + 0.01 * draw.normal(size=x.shape), DECAY)
+
+
+def test_a_sensor_gains_nothing_from_what_a_filter_learned_from_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = kicked_decays()
+    context = context_of(DECAY, data, ("sensor gain or offset",))
+    horizons = horizons_of(recalibrate(DECAY, data)[0], context)
+    x = horizons[0].fit.x
+    # Each form that has a gain; a constant offset was never mistaken for innovations.
+    faults = [each for each in context.candidates if any(name.startswith("g") for name in each.amplitudes)]
+    terms = [term for each in faults for term in Probe.all_of(each, data, DECAY, x)]
+    assert len(terms) == 2 and len(horizons) == 2
+    assert all((_gained(each, terms, None, Budget()) < 0).all() for each in horizons)
+
+    def at_filtered(fit: Fit, data: Measurements, some: Sequence[Term]) -> tuple[Linearisation, list[slice]]:
+        # Where a fit has no process noise nothing is foreseen other than what is known.
+        return linearised_with(replace(fit, noise=fit.noise.without_process()), data, some)
+
+    # At the states that the filter knows a gain explains the kicks, and this test would fail.
+    monkeypatch.setattr(forecasts, "linearised_with", at_filtered)
+    assert all((_gained(each, terms, None, Budget()) > 9).all() for each in horizons)
+    assert (_gained(horizons[0], terms, None, Budget()) > 500).all()
+
+
+def refitted(start: float, *, force: float, seed: int) -> bool:
+    """Whether a pendulum's frequency is refitted, where it begins at a value and 9 is right."""
+    data = recorded(0.0, force, seed=seed, count=4)
+    model = pendulum().with_values(np.array([start]))
+    loose, strict = recalibrate(model, data)
+    card = replace(loose, model=model)
+    refits = [(strict, data), (loose, data)]
+    return preferred_recalibration(card, refits, data, noise=loose.noise) is not card
+
+
+def test_values_of_the_card_stay_where_a_refit_follows_nothing_but_forces_at_random() -> None:
+    kept = [not refitted(9.0, force=0.3, seed=seed) for seed in range(12)]
+    assert sum(kept) >= 10  # each is another with a probability of 5 % at the most, so three with 2 %
+
+
+def test_values_of_the_card_are_refitted_where_they_are_wrong() -> None:
+    assert all(refitted(8.0, force=0.3, seed=seed) for seed in range(4))
