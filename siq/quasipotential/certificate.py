@@ -15,10 +15,9 @@ the level at which the first characteristic leaves these.
 from __future__ import annotations
 
 import itertools
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -42,15 +41,12 @@ from siq.quasipotential.certificate_tests import (
 from siq.quasipotential.characteristics import SHEET_MARGIN, End, Fan, adapted_fan
 from siq.quasipotential.characteristics import relative_error as field_error
 from siq.quasipotential.formulas import SymbolicDecomposition
-from siq.quasipotential.path_chains import MinimumActionPath
-from siq.quasipotential.wells import COVERAGE_TOLERANCE, Well, over_units
+from siq.quasipotential.wells import MIN_EXPLAINED_ERROR, Well
 from siq.remarks import Remark, sentence
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
 from siq.systems.formulas import compile_formulas
 from siq.systems.phase_portrait import PhasePortrait, RecordedRegion
-
-logger = logging.getLogger(__name__)
 
 INDEPENDENT = ("characteristics",)  # tests of V that share nothing with a fit of V but f and D
 GO_WITHOUT = "or do without them: 'refinement: {routes: [local]}'"
@@ -212,48 +208,6 @@ def certify(
     return Certificate(tests, error, "; ".join(dict.fromkeys(refused)), scope, tested_on)
 
 
-def better_wells(
-    wells: Sequence[Well],
-    evidence: Evidence,
-    *,
-    functions: Literal["auto", "powers", "units"],
-    paths: Sequence[MinimumActionPath | None] = (),
-) -> list[Well]:
-    """Wells with V over random units where powers leave an error of more than `MIN_EXPLAINED_ERROR`.
-
-    A V over units takes the place of powers if it passes tests that these do not pass, or has a smaller
-    error, and claims to hold at as many states. The error is what its residual leaves open, or its difference
-    from characteristics, if this is more. With ``units`` these stand wherever they lead to a V.
-
-    `paths` are those of least action to the lowest saddles, one for each attractor, where they are known.
-    """
-
-    def judged(well: Well) -> tuple[bool, float, float]:
-        candidate = _candidate_in_well(well, evidence)
-        if candidate.claimed < MIN_CLAIMED_SHARE:
-            return True, np.inf, candidate.claimed
-        made, error = candidate.check(evidence.found, evidence.options, seed=evidence.seed)
-        error = max(error, made["characteristics"].value)
-        return not all(one.passed for one in made.values()), error, candidate.claimed
-
-    chosen = []
-    for well in wells if functions != "powers" else ():
-        failed, error, claimed = judged(well) if functions == "auto" else (True, np.inf, 0.0)
-        if failed or error > MIN_EXPLAINED_ERROR:
-            portrait = evidence.portrait
-            index = [np.array_equal(one.position, well.attractor) for one in portrait.attractors].index(True)
-            try:
-                path = paths[index] if paths else None
-                other = over_units(well, portrait, index, seed=evidence.seed, path=path)
-                others = judged(other) if functions == "auto" else (False, 0.0, 1.0)
-                if others[:2] < (failed, error) and others[2] >= claimed - COVERAGE_TOLERANCE:
-                    well = other
-            except (NumericalFailure, np.linalg.LinAlgError) as failure:
-                logger.info("%s", failure)
-        chosen.append(well)
-    return chosen or list(wells)
-
-
 def _candidate_of_region(
     formulas: SymbolicDecomposition, evidence: Evidence, relative_error: float
 ) -> Candidate:
@@ -362,7 +316,6 @@ def _position_text(position: np.ndarray) -> str:
     return np.array2string(position, precision=4, suppress_small=True, separator=", ")
 
 
-MIN_EXPLAINED_ERROR = 1e-3  # a stated error above this is worth an explanation
 # Curves in search of a caustic; what is said of one has four digits.
 CAUSTIC_FAN: dict[str, Any] = {"most": 512, "tolerance": 1e-7, "spacing": 0.1}
 

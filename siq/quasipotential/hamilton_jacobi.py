@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -98,9 +98,16 @@ class LibraryBasis:
         return _weighted_sum(coefficients, (self.library.terms[k] for k in self.chosen))
 
 
+def _tanh_derivatives(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The hyperbolic tangent with its first and second derivative."""
+    here = np.tanh(x)
+    slope = 1 - here**2
+    return here, slope, -2 * here * slope
+
+
 @dataclass(frozen=True)
 class PowerBasis:
-    """Products of powers of ``y = (x - center)/scale``, with exponents ``(p, d)``, and units, if any.
+    """Products of powers of ``y = (x - center)/scale``, with exponents ``(p, d)``, and random units.
 
     A unit ``tanh(w·y + b)`` is a row ``(w, b)`` of `units`, shape ``(m - p, d + 1)``. Its Taylor polynomial
     of degree 2 at the center is taken away, so that value, slope and curvature there are those of the powers.
@@ -110,7 +117,7 @@ class PowerBasis:
     center: np.ndarray
     scale: np.ndarray
     exponents: np.ndarray
-    units: np.ndarray | None = None
+    units: np.ndarray
 
     @classmethod
     def up_to(
@@ -118,50 +125,48 @@ class PowerBasis:
     ) -> PowerBasis:
         """All powers of degree 2 up to `degree` about a center; the quadratic ones come first."""
         exponents = [row for row in monomial_exponents(len(symbols), degree) if sum(row) >= 2]
-        return cls(symbols, np.asarray(center, dtype=float), scale, np.array(exponents))
+        none = np.zeros((0, len(symbols) + 1))
+        return cls(symbols, np.asarray(center, dtype=float), scale, np.array(exponents), none)
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...]) -> PowerBasis:
-        """The powers that `Well.powers` wrote."""
-        names = ("center", "scale", "exponents", *(["units"] if "units" in data else []))
-        return cls(symbols, *(np.array(data[name]) for name in names))
+        """The powers, and units, that `Well.powers` wrote."""
+        parts = (np.array(data[name]) for name in ("center", "scale", "exponents"))
+        return cls(symbols, *parts, np.array(data.get("units", [])).reshape(-1, len(symbols) + 1))
 
     @property
     def size(self) -> int:
         """Number of functions, m."""
-        return len(self.free)
+        return len(self.exponents) + len(self.units)
 
     @property
     def free(self) -> np.ndarray:
         """Mask of the functions that a fit may change, ``(m,)``: all but the quadratic ones, which are M."""
-        return np.append(self.exponents.sum(axis=1) > 2, np.full(len(self._rows), True))
+        return np.append(self.exponents.sum(axis=1) > 2, np.full(len(self.units), True))
 
     @property
     def title(self) -> str:
         """The functions in words."""
         words = f"powers of degree {self.exponents.sum(axis=1).max()}"
-        return words if self.units is None else f"{words} and {len(self.units)} random units"
+        return f"{words} and {len(self.units)} random units" if len(self.units) else words
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """Points ``(n, d)`` to values ``(n, m)``."""
-        return np.concatenate([self._product(self._powers(x), ()), self._along_units(x, 0)], axis=1)
+        return np.concatenate([self._product(self._powers(x), ()), self._of_units(x, 0)], axis=1)
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
         """Points ``(n, d)`` to gradients ``(n, d, m)``."""
-        powers = self._powers(x)
-        slopes = self._rows[:, :-1].T / self.scale[:, None]
-        of_powers = np.stack([self._product(powers, (i,)) for i in range(len(slopes))], axis=1)
-        return np.concatenate([of_powers, self._along_units(x, 1)[:, None] * slopes], axis=2)
+        powers, of_units = self._powers(x), self._of_units(x, 1)
+        rows = [np.hstack([self._product(powers, (i,)), of_units * one]) for i, one in self._slopes]
+        return np.stack(rows, axis=1)
 
     def hessians(self, x: np.ndarray) -> np.ndarray:
         """Points ``(n, d)`` to Hessians ``(n, d, d, m)``."""
-        powers, d = self._powers(x), len(self.symbols)
-        values, slopes = np.empty((len(x), d, d, self.size)), self._rows[:, :-1].T / self.scale[:, None]
-        bends, p = self._along_units(x, 2), len(self.exponents)
-        for i in range(d):
-            for j in range(i + 1):
-                values[:, i, j, :p] = values[:, j, i, :p] = self._product(powers, (i, j))
-                values[:, i, j, p:] = values[:, j, i, p:] = bends * slopes[i] * slopes[j]
+        powers, of_units, d = self._powers(x), self._of_units(x, 2), len(self.symbols)
+        values = np.empty((len(x), d, d, self.size))
+        for (i, one), (j, other) in itertools.combinations_with_replacement(self._slopes, 2):
+            both = np.hstack([self._product(powers, (i, j)), of_units * one * other])
+            values[:, i, j] = values[:, j, i] = both
         return values
 
     def expression(self, coefficients: np.ndarray) -> sympy.Expr:
@@ -171,33 +176,30 @@ class PowerBasis:
             for symbol, c, s in zip(self.symbols, self.center, self.scale, strict=True)
         ]
         powers = ([base ** int(e) for base, e in zip(scaled, row, strict=True)] for row in self.exponents)
-        terms = itertools.chain((sympy.Mul(*factors) for factors in powers), self.unit_terms(scaled))
+        of_powers, of_units = np.split(coefficients, [len(self.exponents)])
+        products = (sympy.Mul(*factors) for factors in powers)
+        return _weighted_sum(of_powers, products) + self.sum_of_units(of_units, scaled)
+
+    def sum_of_units(self, coefficients: np.ndarray, scaled: Sequence[sympy.Expr]) -> sympy.Expr:
+        """A sum of the units as a formula of y."""
+        terms = []
+        for *weights, bias in self.units.tolist():
+            along, here = _weighted_sum(np.array(weights), scaled), sympy.Float(bias, 17)
+            value, slope, bend = (sympy.Float(float(one), 17) for one in _tanh_derivatives(bias))
+            terms.append(sympy.tanh(along + here) - value - slope * along - bend * along**2 / 2)
         return _weighted_sum(coefficients, terms)
 
-    def unit_terms(self, scaled: Sequence[sympy.Expr]) -> Iterator[sympy.Expr]:
-        """The units as formulas of y."""
-        for *weights, bias in self._rows.tolist():
-            along = _weighted_sum(np.array(weights), scaled)
-            here = float(np.tanh(bias))
-            slope, bend = 1 - here**2, -here * (1 - here**2)
-            taylor = (sympy.Float(one, 17) * along**k for k, one in enumerate((here, slope, bend)))
-            yield sympy.tanh(along + sympy.Float(bias, 17)) - sympy.Add(*taylor)
-
     @property
-    def _rows(self) -> np.ndarray:
-        return np.zeros((0, len(self.center) + 1)) if self.units is None else self.units
+    def _slopes(self) -> list[tuple[int, np.ndarray]]:
+        """The derivatives of ``w·y`` by every state."""
+        return list(enumerate(self.units[:, :-1].T / self.scale[:, None]))
 
-    def _along_units(self, x: np.ndarray, order: int) -> np.ndarray:
-        """The units' derivative of an order up to 2 by ``w·y``, shape ``(n, m - p)``."""
-        weights, biases = self._rows[:, :-1], self._rows[:, -1]
-        along = ((x - self.center) / self.scale) @ weights.T
-        here, at_center = np.tanh(along + biases), np.tanh(biases)
-        slope = 1 - at_center**2
-        if order == 0:
-            return here - at_center - slope * along + slope * at_center * along**2
-        if order == 1:
-            return 1 - here**2 - slope + 2 * slope * at_center * along
-        return -2 * here * (1 - here**2) + 2 * at_center * slope
+    def _of_units(self, x: np.ndarray, order: int) -> np.ndarray:
+        """Derivatives of the units by ``w·y``, of an order up to 2, shape ``(n, m - p)``."""
+        along, biases = ((x - self.center) / self.scale) @ self.units[:, :-1].T, self.units[:, -1]
+        _, slope, bend = at_center = _tanh_derivatives(biases)
+        taken = (at_center[0] + slope * along + bend * along**2 / 2, slope + bend * along, bend)
+        return np.asarray(_tanh_derivatives(along + biases)[order] - taken[order])
 
     def _powers(self, x: np.ndarray) -> np.ndarray:
         """Powers of every scaled state, shape ``(highest + 1, d, n)``."""

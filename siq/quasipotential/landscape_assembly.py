@@ -20,14 +20,7 @@ from pydantic.dataclasses import dataclass
 from siq.errors import InputError, NumericalFailure
 from siq.inference.field_estimate import AnyField, FieldEstimate, dynamics_of
 from siq.numerics.randomness import Purpose, generator
-from siq.quasipotential.certificate import (
-    Certificate,
-    Evidence,
-    better_wells,
-    caustics_below,
-    certify,
-    references_about,
-)
+from siq.quasipotential.certificate import Certificate, Evidence, caustics_below, certify, references_about
 from siq.quasipotential.certificate_tests import CertificateOptions
 from siq.quasipotential.landscape import Landscape, LandscapeOptions, NoLandscape, heights_of_attractors
 from siq.quasipotential.path_chains import evenly
@@ -167,10 +160,6 @@ def landscape_from_equations(
             system, portrait, np.concatenate(unseen), options=settings.certificate, seed=seed,
             references=references_about(system, portrait, depths=depths, seed=seed),
         )  # fmt: skip
-        paths = [None if way is None else way.path for way in lowest]
-        better = iter(better_wells(sought, evidence, functions=settings.refinement.about, paths=paths))
-        wells = [None if well is None else next(better) for well in wells]
-        sought = [well for well in wells if well is not None]
         certificate = certify(sought, evidence)
         remarks += caustics_below(system, sought, portrait, certificate.error, seed=seed)
     wells += [None] * len(portrait.cycles)

@@ -23,6 +23,7 @@ unknowns. Eigenvectors would do, too, but those of a long chain that turns are a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import scipy.linalg
@@ -138,7 +139,7 @@ def quasipotential_series(dynamics: Dynamics, attractor: np.ndarray, *, degree: 
         gradients[k] = basis.gradient(parts[k], k)
     exponents = np.concatenate([basis.exponents[k] for k in parts])
     return Expansion(
-        PowerBasis(dynamics.symbols, center, np.ones(len(center)), exponents),
+        replace(PowerBasis.up_to(2, dynamics.symbols, center, np.ones(d)), exponents=exponents),
         np.concatenate([part / basis.scales(k, scale) for k, part in parts.items()]),
     )
 

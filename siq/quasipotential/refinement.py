@@ -30,7 +30,6 @@ from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.certificate import (
     Certificate,
     Evidence,
-    better_wells,
     caustics_below,
     certify,
     check_agreement,
@@ -351,8 +350,6 @@ class RefinementContext:
         refined = refine(
             self.found, self.portrait, points=self.points, options=self.options, seed=self.number
         )
-        wells = better_wells(refined.wells, self.evidence, functions=self.options.about)
-        refined = replace(refined, wells=tuple(wells))
         formulas, whole = _refined_decomposition(refined, self.points), refined.formula
         told: dict[str, Any] = {
             "networks": self.networks,

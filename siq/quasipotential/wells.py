@@ -18,6 +18,7 @@ at each level, which of high powers is bad. `local_well` chooses the degree.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -29,6 +30,7 @@ from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
 from siq.numerics.randomness import positive
+from siq.quasipotential.certificate_tests import LEVEL_SHARE, MIN_POINTS, Candidate
 from siq.quasipotential.hamilton_jacobi import (
     SINGULAR_RATIO,
     Expansion,
@@ -47,6 +49,8 @@ from siq.systems.phase_portrait import PhasePortrait, RecordedRegion
 
 if TYPE_CHECKING:
     from siq.quasipotential.refinement import RefinementOptions
+
+logger = logging.getLogger(__name__)
 
 RESIDUAL_TOLERANCE = 0.05  # residual up to which a formula is believed: V is then off by some per cent
 ROUNDING_SHARE = 1e-16  # of what is usual: |∇V| |f| so close to the attractor says nothing
@@ -109,7 +113,7 @@ class Well(Expansion):
     @property
     def powers(self) -> dict[str, Any]:
         """Center, scale, exponents, units and coefficients as plain data."""
-        names = ("center", "scale", "exponents", *(["units"] if self.basis.units is not None else []))
+        names = ("center", "scale", "exponents", *["units"] * bool(len(self.basis.units)))
         parts = {name: getattr(self.basis, name).tolist() for name in names}
         return parts | {"coefficients": self.coefficients.tolist()}
 
@@ -179,10 +183,7 @@ class Well(Expansion):
 
     @property
     def formula(self) -> Formula:
-        """V in powers of the offsets from the attractor, in the units of the states, without rounding.
-
-        Where V has random units, their sum is added.
-        """
+        """V in offsets from the attractor, in powers and units, in those of the states, without rounding."""
         basis, (of_powers, of_units) = self.basis, np.split(self.coefficients, [len(self.basis.exponents)])
         size = np.abs(of_powers)
         formula = Formula.of_powers(
@@ -191,10 +192,8 @@ class Well(Expansion):
             coefficients=np.where(size > NEGLIGIBLE_COEFFICIENT * size.max(), of_powers, 0.0),
             units=self.dynamics.units, title=f"U = 2V is the quasipotential, known up to V = {self.reach!r}",
         )  # fmt: skip
-        pairs = zip(basis.symbols, basis.scale.tolist(), strict=True)
-        units = basis.unit_terms([one / sympy.Float(width, DIGITS) for one, width in pairs])
-        terms = [sympy.Float(one, DIGITS) * unit for one, unit in zip(of_units, units, strict=True)]
-        return replace(formula, expression=sympy.Add(formula.expression, *terms))
+        scaled = [one / sympy.Float(s, DIGITS) for one, s in zip(basis.symbols, basis.scale, strict=True)]
+        return replace(formula, expression=formula.expression + basis.sum_of_units(of_units, scaled))
 
     def to_text(self) -> str:
         """The formula as text, a line for each definition."""
@@ -260,6 +259,7 @@ MAX_UNITS = 200  # of a well; more are slower and hardly closer
 POINTS_PER_UNIT = 4  # at least, where units begin; with fewer points there are fewer units
 UNIT_WIDTHS = 2.0  # of random units: so many times more or less than the distance of the level
 COVERAGE_TOLERANCE = 0.005  # share of the states by which two formulas hold at as many
+MIN_EXPLAINED_ERROR = 1e-3  # a stated error above this is worth an explanation, and a search for a better V
 HELD_OUT_STRIDE = 4  # every so manieth point is kept for choosing the degree
 
 
@@ -346,32 +346,41 @@ def local_well(
         covered = int((residual <= well.tolerance).sum()) / max(most, 1)
         median = float(np.median(residual)) if len(residual) else np.inf
         trials.append(DegreeTrial(well.degree, well.basis.size, median, covered))
-    return replace(wells[best_trial(trials)], trials=tuple(trials))
+    well = replace(wells[best_trial(trials)], trials=tuple(trials))
+    if options.about == "powers" or (options.about == "auto" and well.residual < options.accuracy):
+        return well
+
+    def stated(well: Well) -> tuple[float, float]:
+        """The error that its residual leaves open below the saddle, and at which share it claims to hold."""
+        below = x[(well.values(x) < LEVEL_SHARE * well.level) & well.reaches(x)]
+        known = below[well.believed(below)]
+        if len(known) < MIN_POINTS:
+            return np.inf, 0.0
+        candidate = Candidate(well.values, well.gradients, well.hessians, None, known, [attractor])
+        return candidate.stated_error(dynamics, seed=seed), len(known) / len(below)
+
+    (error, claimed), wanted = stated(well), options.about == "units"
+    if wanted or error > MIN_EXPLAINED_ERROR:
+        try:
+            other = _over_units(well, basin, kept, path, np.random.default_rng(seed))
+            its, share = stated(other)
+            if wanted or (its < error and share >= claimed - COVERAGE_TOLERANCE):
+                return other
+        except (NumericalFailure, np.linalg.LinAlgError) as failure:
+            logger.info("%s", failure)
+    return well
 
 
-def over_units(
-    well: Well,
-    portrait: PhasePortrait,
-    index: int,
-    *,
-    seed: int = 0,
-    path: MinimumActionPath | None = None,
+def _over_units(
+    well: Well, basin: Basin, rows: np.ndarray, path: MinimumActionPath | None, draw: np.random.Generator
 ) -> Well:
     """V about an attractor over random tanh units, from a formula in powers that does not follow it.
 
-    ``½ (x - A)·M (x - A)`` stays, and units add nothing to the curvature at the attractor. They begin
-    with ∇V of the formula at that half of its points where it solves the Hamilton–Jacobi equation best, and
-    are taken on from there as powers are. Directions are drawn alike in the metric of M. The parameters are
-    as of `local_well`.
-
-    Raises
-    ------
-    NumericalFailure
-        When too few states lead to the attractor, or the units do not follow V.
+    ``½ (x - A)·M (x - A)`` stays. Units, whose directions are drawn alike in the metric of M, begin with ∇V
+    of the formula at that half of its points where it solves the Hamilton–Jacobi equation best, and are taken
+    on from there as powers are.
     """
-    basin, draw, d = portrait.basins[index], np.random.default_rng(seed), len(well.attractor)
-    rows = np.arange(len(basin.chosen))
-    residual = well.residual_at(well.points)
+    residual, d = well.residual_at(well.points), len(well.attractor)
     x = well.points[residual <= np.median(residual)]
     count = min(MAX_UNITS, len(x) // POINTS_PER_UNIT)
     metric = np.linalg.cholesky(hessian_at(well.dynamics, well.attractor)) / np.sqrt(2 * well.level)
@@ -380,20 +389,12 @@ def over_units(
     middles = well.points[draw.choice(len(well.points), count)] - well.attractor
     units = np.column_stack([directions * well.basis.scale, -(directions * middles).sum(axis=1)])
     basis = replace(PowerBasis.up_to(2, well.basis.symbols, well.attractor, well.basis.scale), units=units)
-    free, coefficients = basis.free, np.zeros(basis.size)
-    coefficients[~free] = well.coefficients[: int((~free).sum())]  # the quadratic powers come first
-    equation = HamiltonJacobi.at(basis, x, well.dynamics, attractor=well.attractor)
-    slopes, roots = well.gradients(equation.points), equation.measure.root_at(equation.points)
-    weight = np.sqrt(equation.measure.contract(equation.points, slopes))
-    roots = roots / np.maximum(weight, np.median(weight))[:, None, None]
-    matrix = np.einsum("nij,nim->njm", roots, equation.gradients[:, :, free], optimize=True)
-    rest = np.einsum("nij,ni->nj", roots, slopes - equation.slopes(coefficients))
-    flat = matrix.reshape(-1, count)
-    scale = positive(np.linalg.norm(flat, axis=0))
-    coefficients[free] = np.linalg.lstsq(flat / scale, rest.ravel(), rcond=SINGULAR_RATIO)[0] / scale
+    start = np.where(basis.free, 0.0, np.resize(well.coefficients, basis.size))  # quadratic powers come first
+    found = replace(well, basis=basis, coefficients=start)
+    coefficients = _with_slopes(found, x, well.gradients(x))
     found = _extend_well(
-        replace(well, basis=basis, coefficients=coefficients), basin, goal=well.reach, path=path,
-        rows=rows[rows % HELD_OUT_STRIDE != 0], generator=draw, first=float(np.median(well.values(x))),
+        replace(found, coefficients=coefficients), basin, goal=well.reach, path=path, rows=rows,
+        generator=draw, first=float(np.median(well.values(x))),
     )  # fmt: skip
     if not found.residual < MAX_RESIDUAL:
         raise NumericalFailure(f"{basis.title} do not follow V from the attractor near {well.attractor}")
@@ -559,7 +560,7 @@ def _extend_well(
     functions = well.basis.values(basin.states.reshape(-1, basin.states.shape[2]))
     shape, free = basin.states.shape[:2], well.basis.free
     coefficients, level = well.coefficients, min(0.9 * well.level if first is None else first, goal)
-    with_units = well.basis.units is not None
+    with_units = len(well.basis.units) > 0
     options, rounds = (FIT_TO_KNOWN_DEPTH, 3) if with_units or path is not None else (ROBUST_FIT, 4)
     if path is not None:
         metric = np.linalg.cholesky(hessian_at(well.dynamics, well.attractor))
@@ -571,7 +572,8 @@ def _extend_well(
         near = distance < PATH_DISTANCE * np.sqrt(path.values[-1])
         beside = np.where(near, path.values[nearest] / 2, np.inf)
         if by_path:
-            coefficients = _towards_path(well, basin.points(fitted), path, free)
+            x = basin.points(fitted)
+            coefficients = _with_slopes(well, x, well.gradients(x), path)
     while True:
         chosen = basin.below((functions @ coefficients).reshape(shape), level)
         if path is not None:
@@ -607,28 +609,30 @@ def _extend_well(
     )
 
 
-def _towards_path(well: Well, x: np.ndarray, path: MinimumActionPath, free: np.ndarray) -> np.ndarray:
-    """A start: the formula as it is at points, but for the path, whose ∇V is known."""
-    noise = measure_at(well.dynamics, well.attractor)
-    values = path.values / 2
-    rising = (values > PATH_FROM * values[-1]) & (values < PATH_TO * values[-1])
-    where, slopes = path.points[rising], path.momenta[rising]
-    if not len(where) or not len(x):
+def _with_slopes(
+    well: Well, x: np.ndarray, slopes: np.ndarray, path: MinimumActionPath | None = None
+) -> np.ndarray:
+    """Coefficients with ∇V ``(n, d)`` at points, and with that along a path, by least squares."""
+    if not len(x):
         return well.coefficients
-    old, along = well.basis.gradients(x), well.basis.gradients(where)
-    weight = np.sqrt(len(x) / len(where)) / np.sqrt(noise.contract(where, slopes))
-    rest = slopes - along @ well.coefficients
-    steep = np.sqrt(noise.contract(x, old @ well.coefficients))
-    steep = np.maximum(steep, np.median(steep))
-    root = noise.root_at(where)
-    rows = [
-        np.einsum("n,nij,nim->njm", weight, root, along[:, :, free], optimize=True),
-        np.einsum("n,nij,nim->njm", 1 / steep, noise.root_at(x), old[:, :, free], optimize=True),
-    ]
+    noise, free = measure_at(well.dynamics, well.attractor), well.basis.free
+    steep = np.sqrt(noise.contract(x, slopes))
+    parts = [(x, slopes, 1 / np.maximum(steep, np.median(steep)))]
+    if path is not None:
+        depth = path.values[-1]
+        rising = (path.values > PATH_FROM * depth) & (path.values < PATH_TO * depth)
+        where, momenta = path.points[rising], path.momenta[rising]
+        weight = np.sqrt(len(x) / max(len(where), 1)) / np.sqrt(noise.contract(where, momenta))
+        parts.insert(0, (where, momenta, weight))
+    rows, rest = [], []
+    for points, gradients, weight in parts:
+        root, along = noise.root_at(points), well.basis.gradients(points)
+        rows.append(np.einsum("n,nij,nim->njm", weight, root, along[:, :, free], optimize=True))
+        off = gradients - along @ well.coefficients
+        rest.append(np.einsum("n,nij,ni->nj", weight, root, off).ravel())
     matrix = np.concatenate([one.reshape(-1, one.shape[2]) for one in rows])
-    right = np.zeros(len(matrix))
-    right[: where.size] = np.einsum("n,nij,ni->nj", weight, root, rest).ravel()
     scale = positive(np.linalg.norm(matrix, axis=0))
     coefficients = well.coefficients.copy()
-    coefficients[free] += np.linalg.lstsq(matrix / scale, right, rcond=SINGULAR_RATIO)[0] / scale
+    solution = np.linalg.lstsq(matrix / scale, np.concatenate(rest), rcond=SINGULAR_RATIO)[0]
+    coefficients[free] += solution / scale
     return coefficients
