@@ -156,7 +156,7 @@ def degree_rows(run: int, found: Landscape | None) -> pd.DataFrame:
         {
             "run": run, "attractor": f"A{index + 1}", "degree": trial.degree, "terms": trial.terms,
             "residual": trial.residual, "covered": trial.covered,
-            "chosen": well.basis.units is None and number == best_trial(well.trials),
+            "chosen": not len(well.basis.units) and number == best_trial(well.trials),
         }
         for index, well in enumerate(() if found is None else found.wells)
         if well is not None

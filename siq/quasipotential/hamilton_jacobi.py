@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -125,8 +125,8 @@ class PowerBasis:
     ) -> PowerBasis:
         """All powers of degree 2 up to `degree` about a center; the quadratic ones come first."""
         exponents = [row for row in monomial_exponents(len(symbols), degree) if sum(row) >= 2]
-        none = np.zeros((0, len(symbols) + 1))
-        return cls(symbols, np.asarray(center, dtype=float), scale, np.array(exponents), none)
+        center, none = np.asarray(center, dtype=float), np.zeros((0, len(symbols) + 1))
+        return cls(symbols, center, scale, np.array(exponents), none)
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...]) -> PowerBasis:
@@ -156,17 +156,17 @@ class PowerBasis:
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
         """Points ``(n, d)`` to gradients ``(n, d, m)``."""
-        powers, of_units = self._powers(x), self._of_units(x, 1)
-        rows = [np.hstack([self._product(powers, (i,)), of_units * one]) for i, one in self._slopes]
-        return np.stack(rows, axis=1)
+        powers, of_units, slopes = self._powers(x), self._of_units(x, 1), self.units[:, :-1].T
+        each = enumerate(slopes / self.scale[:, None])
+        return np.stack([np.hstack([self._product(powers, (i,)), of_units * one]) for i, one in each], axis=1)
 
     def hessians(self, x: np.ndarray) -> np.ndarray:
         """Points ``(n, d)`` to Hessians ``(n, d, d, m)``."""
         powers, of_units, d = self._powers(x), self._of_units(x, 2), len(self.symbols)
-        values = np.empty((len(x), d, d, self.size))
-        for (i, one), (j, other) in itertools.combinations_with_replacement(self._slopes, 2):
-            both = np.hstack([self._product(powers, (i, j)), of_units * one * other])
-            values[:, i, j] = values[:, j, i] = both
+        values, slopes = np.empty((len(x), d, d, self.size)), self.units[:, :-1] / self.scale
+        for i, j in itertools.combinations_with_replacement(range(d), 2):
+            bends = of_units * slopes[:, i] * slopes[:, j]
+            values[:, i, j] = values[:, j, i] = np.hstack([self._product(powers, (i, j)), bends])
         return values
 
     def expression(self, coefficients: np.ndarray) -> sympy.Expr:
@@ -176,23 +176,14 @@ class PowerBasis:
             for symbol, c, s in zip(self.symbols, self.center, self.scale, strict=True)
         ]
         powers = ([base ** int(e) for base, e in zip(scaled, row, strict=True)] for row in self.exponents)
-        of_powers, of_units = np.split(coefficients, [len(self.exponents)])
-        products = (sympy.Mul(*factors) for factors in powers)
-        return _weighted_sum(of_powers, products) + self.sum_of_units(of_units, scaled)
+        return _weighted_sum(coefficients, itertools.chain(map(sympy.prod, powers), self.unit_terms(scaled)))
 
-    def sum_of_units(self, coefficients: np.ndarray, scaled: Sequence[sympy.Expr]) -> sympy.Expr:
-        """A sum of the units as a formula of y."""
-        terms = []
+    def unit_terms(self, scaled: Sequence[sympy.Expr]) -> Iterator[sympy.Expr]:
+        """The units as formulas of y."""
         for *weights, bias in self.units.tolist():
-            along, here = _weighted_sum(np.array(weights), scaled), sympy.Float(bias, 17)
-            value, slope, bend = (sympy.Float(float(one), 17) for one in _tanh_derivatives(bias))
-            terms.append(sympy.tanh(along + here) - value - slope * along - bend * along**2 / 2)
-        return _weighted_sum(coefficients, terms)
-
-    @property
-    def _slopes(self) -> list[tuple[int, np.ndarray]]:
-        """The derivatives of ``w·y`` by every state."""
-        return list(enumerate(self.units[:, :-1].T / self.scale[:, None]))
+            along, here = _weighted_sum(np.array(weights), scaled), sympy.Float(math.tanh(bias), 17)
+            slope = 1 - here**2
+            yield sympy.tanh(along + sympy.Float(bias, 17)) - here - slope * along + here * slope * along**2
 
     def _of_units(self, x: np.ndarray, order: int) -> np.ndarray:
         """Derivatives of the units by ``w·y``, of an order up to 2, shape ``(n, m - p)``."""
@@ -326,9 +317,8 @@ class HamiltonJacobi:
             equation, turned = _orthonormalised(self, free)
             moving = np.arange(turned.shape[1]) < turned.shape[1] - int((~free).sum())
             # The same function over the points, of which the coefficients may be far from unique.
-            now, root = self.slopes(np.where(free, start, 0.0)), self.measure.root_at(self.points)
-            along = np.einsum("nij,nim,nkj,nk->m", root, equation.gradients, root, now, optimize=True)
-            theta = along / len(now)
+            now = self.measure.push(self.points, self.slopes(np.where(free, start, 0.0)))
+            theta = np.einsum("nim,ni->m", equation.gradients, now) / len(now)
             theta[~moving] = start[~free]
         for _ in range(rounds):
             rest = equation.relative_residuals(theta)

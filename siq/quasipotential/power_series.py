@@ -23,7 +23,6 @@ unknowns. Eigenvectors would do, too, but those of a long chain that turns are a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 import scipy.linalg
@@ -139,7 +138,7 @@ def quasipotential_series(dynamics: Dynamics, attractor: np.ndarray, *, degree: 
         gradients[k] = basis.gradient(parts[k], k)
     exponents = np.concatenate([basis.exponents[k] for k in parts])
     return Expansion(
-        replace(PowerBasis.up_to(2, dynamics.symbols, center, np.ones(d)), exponents=exponents),
+        PowerBasis(dynamics.symbols, center, np.ones(d), exponents, np.zeros((0, d + 1))),
         np.concatenate([part / basis.scales(k, scale) for k, part in parts.items()]),
     )
 

@@ -13,12 +13,13 @@ ellipsoid (`_grow_well`). From its saddle a formula is taken on to a higher leve
 For given equations the path of least action to the lowest saddle comes first, so that the depth of the well
 is known. V is grown once, in the lowest powers that follow it up there. From there every higher degree starts
 on the whole sublevel set, from the formula of the degree below: grown by itself it would be an extrapolation
-at each level, which of high powers is bad. `local_well` chooses the degree.
+at each level, which of high powers is bad. `local_well` chooses the degree, or random units beside M where
+these leave less of an error.
 """
 
 from __future__ import annotations
 
-import logging
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -49,8 +50,6 @@ from siq.systems.phase_portrait import PhasePortrait, RecordedRegion
 
 if TYPE_CHECKING:
     from siq.quasipotential.refinement import RefinementOptions
-
-logger = logging.getLogger(__name__)
 
 RESIDUAL_TOLERANCE = 0.05  # residual up to which a formula is believed: V is then off by some per cent
 ROUNDING_SHARE = 1e-16  # of what is usual: |∇V| |f| so close to the attractor says nothing
@@ -193,7 +192,8 @@ class Well(Expansion):
             units=self.dynamics.units, title=f"U = 2V is the quasipotential, known up to V = {self.reach!r}",
         )  # fmt: skip
         scaled = [one / sympy.Float(s, DIGITS) for one, s in zip(basis.symbols, basis.scale, strict=True)]
-        return replace(formula, expression=formula.expression + basis.sum_of_units(of_units, scaled))
+        terms = [float(one) * unit for one, unit in zip(of_units, basis.unit_terms(scaled), strict=True)]
+        return replace(formula, expression=sympy.Add(formula.expression, *terms))
 
     def to_text(self) -> str:
         """The formula as text, a line for each definition."""
@@ -254,9 +254,8 @@ MAX_POINTS_TO_KNOWN_DEPTH = 5000  # of one fit
 RUNAWAY_LEVEL = 1.5  # of a level: where the lower degree's formula is higher, a lower V is an extrapolation
 RUNAWAY_RATIO = 3.0  # times the residual of the degree below: a higher one so much worse has run away
 MAX_IDLE_DEGREES = 2  # higher degrees in a row that do not improve: there is nothing more to be had
-FIT_POINTS_PER_UNIT = 12  # at most, in a fit on the way and at its end
 MAX_UNITS = 200  # of a well; more are slower and hardly closer
-POINTS_PER_UNIT = 4  # at least, where units begin; with fewer points there are fewer units
+FEWEST_PER_UNIT, MOST_PER_UNIT = 4, 12  # points: with fewer there are fewer units, and of more some are drawn
 UNIT_WIDTHS = 2.0  # of random units: so many times more or less than the distance of the level
 COVERAGE_TOLERANCE = 0.005  # share of the states by which two formulas hold at as many
 MIN_EXPLAINED_ERROR = 1e-3  # a stated error above this is worth an explanation, and a search for a better V
@@ -359,15 +358,13 @@ def local_well(
         candidate = Candidate(well.values, well.gradients, well.hessians, None, known, [attractor])
         return candidate.stated_error(dynamics, seed=seed), len(known) / len(below)
 
-    (error, claimed), wanted = stated(well), options.about == "units"
-    if wanted or error > MIN_EXPLAINED_ERROR:
-        try:
+    error, claimed = (np.inf, 0.0) if options.about == "units" else stated(well)
+    if error > MIN_EXPLAINED_ERROR:
+        with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):  # powers stay
             other = _over_units(well, basin, kept, path, np.random.default_rng(seed))
             its, share = stated(other)
-            if wanted or (its < error and share >= claimed - COVERAGE_TOLERANCE):
+            if its < error and share >= claimed - COVERAGE_TOLERANCE:
                 return other
-        except (NumericalFailure, np.linalg.LinAlgError) as failure:
-            logger.info("%s", failure)
     return well
 
 
@@ -382,7 +379,7 @@ def _over_units(
     """
     residual, d = well.residual_at(well.points), len(well.attractor)
     x = well.points[residual <= np.median(residual)]
-    count = min(MAX_UNITS, len(x) // POINTS_PER_UNIT)
+    count = min(MAX_UNITS, len(x) // FEWEST_PER_UNIT)
     metric = np.linalg.cholesky(hessian_at(well.dynamics, well.attractor)) / np.sqrt(2 * well.level)
     widths = UNIT_WIDTHS ** draw.uniform(-1, 1, count)
     directions = draw.normal(size=(count, d)) / np.sqrt(d) / widths[:, None] @ metric.T
@@ -391,14 +388,9 @@ def _over_units(
     basis = replace(PowerBasis.up_to(2, well.basis.symbols, well.attractor, well.basis.scale), units=units)
     start = np.where(basis.free, 0.0, np.resize(well.coefficients, basis.size))  # quadratic powers come first
     found = replace(well, basis=basis, coefficients=start)
-    coefficients = _with_slopes(found, x, well.gradients(x))
-    found = _extend_well(
-        replace(found, coefficients=coefficients), basin, goal=well.reach, path=path, rows=rows,
-        generator=draw, first=float(np.median(well.values(x))),
-    )  # fmt: skip
-    if not found.residual < MAX_RESIDUAL:
-        raise NumericalFailure(f"{basis.title} do not follow V from the attractor near {well.attractor}")
-    return found
+    found = replace(found, coefficients=_with_slopes(found, x, well))
+    first = float(np.median(well.values(x)))
+    return _extend_well(found, basin, goal=well.reach, rows=rows, path=path, generator=draw, first=first)
 
 
 def best_trial(trials: Sequence[DegreeTrial]) -> int:
@@ -572,8 +564,7 @@ def _extend_well(
         near = distance < PATH_DISTANCE * np.sqrt(path.values[-1])
         beside = np.where(near, path.values[nearest] / 2, np.inf)
         if by_path:
-            x = basin.points(fitted)
-            coefficients = _with_slopes(well, x, well.gradients(x), path)
+            coefficients = _with_slopes(well, basin.points(fitted), well, path)
     while True:
         chosen = basin.below((functions @ coefficients).reshape(shape), level)
         if path is not None:
@@ -583,7 +574,7 @@ def _extend_well(
                 chosen = chosen[away < POINT_REACH * np.sqrt(2 * level)]
             fitted = chosen = np.union1d(chosen, np.flatnonzero(beside < level))
         chosen = used = np.intersect1d(chosen, allowed)
-        most = FIT_POINTS_PER_UNIT * well.basis.size if with_units else MAX_POINTS_TO_KNOWN_DEPTH
+        most = MOST_PER_UNIT * well.basis.size if with_units else MAX_POINTS_TO_KNOWN_DEPTH
         if generator is not None and len(used) > most:
             used = np.sort(generator.choice(used, most, replace=False))
         if path is not None and len(used) < 2 * well.basis.size:
@@ -609,13 +600,11 @@ def _extend_well(
     )
 
 
-def _with_slopes(
-    well: Well, x: np.ndarray, slopes: np.ndarray, path: MinimumActionPath | None = None
-) -> np.ndarray:
-    """Coefficients with ∇V ``(n, d)`` at points, and with that along a path, by least squares."""
+def _with_slopes(well: Well, x: np.ndarray, other: Well, path: MinimumActionPath | None = None) -> np.ndarray:
+    """A start: coefficients with the ∇V of another formula at points, and with that along a path."""
     if not len(x):
         return well.coefficients
-    noise, free = measure_at(well.dynamics, well.attractor), well.basis.free
+    noise, free, slopes = measure_at(well.dynamics, well.attractor), well.basis.free, other.gradients(x)
     steep = np.sqrt(noise.contract(x, slopes))
     parts = [(x, slopes, 1 / np.maximum(steep, np.median(steep)))]
     if path is not None:

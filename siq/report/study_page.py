@@ -332,8 +332,7 @@ def _formula_rows(
 
 def _well_row(well: Well, places: Sequence[np.ndarray]) -> FormulaRow:
     """U about one attractor in offsets from it: the terms that count, and the whole formula."""
-    basis = well.basis
-    coefficients = well.coefficients[: len(basis.exponents)]  # units would fill pages
+    basis, coefficients = well.basis, well.coefficients[: len(well.basis.exponents)]  # units would fill pages
     label = "(" + ", ".join(value_text(value) for value in well.attractor) + ")"
     if len(places):
         away = [np.abs((np.asarray(place) - well.attractor) / basis.scale).max() for place in places]
