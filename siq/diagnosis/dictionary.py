@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import string
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import as_file, files
@@ -155,7 +156,8 @@ class Form(_Part):
     coordinate
         Along which role the mechanism acts.
     variant
-        What tells the form from others of the same roles, in words that follow the name: ``from above``.
+        What tells the form from others of the same roles, in words that follow the name: ``from above``;
+        roles in braces are what fills them.
     symmetric
         Whether exchanging the roles gives the same mechanism.
     one_unit
@@ -186,6 +188,9 @@ class Form(_Part):
         for name in changed:
             if name not in self.roles:
                 raise Fault(f"'{name}' has no role", f"add 'roles: {{{name}: state}}' or another role")
+        told = {role for _, role, *_ in string.Formatter().parse(self.variant) if role is not None}
+        for name in sorted(told.difference(self.roles)):
+            raise Fault(f"the variant names '{name}', which has no role", f"add 'roles: {{{name}: state}}'")
         return self
 
 

@@ -40,6 +40,7 @@ from siq.diagnosis.evidence import (
     sizes_of_effects,
     smooth_prior,
 )
+from siq.diagnosis.holdout import errors_left_out, in_blocks, typically_better
 from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.diagnosis.screening import PROBE_SUBSTEPS, Probe, linearised_with, portions
 from siq.diagnosis.search import AcceptedMechanism, FitContext, Standing
@@ -205,7 +206,7 @@ class Horizon:
         return cls(data, fit, float(density), correlated)
 
 
-def horizons_of(fit: Fit, context: FitContext) -> list[Horizon]:
+def _horizons_of(fit: Fit, context: FitContext) -> list[Horizon]:
     """A simulation fitted once for each horizon, with forces at random, from a fit that has them.
 
     Raises
@@ -545,6 +546,8 @@ def _fitted_at(
             fit = _fitted(fit.model, each.data, fit, x, budget=budget)
             if not candidate.admits(fit):
                 raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
+            if candidate.generalises and candidate.idle(fit):
+                raise NumericalFailure("it is no more than the special case of it")
             found.append(Horizon.of(fit, each.data))
             begin = fit
         except NUMERICAL_ERRORS as error:
@@ -599,7 +602,7 @@ def _fitted_in_earnest(
     return found
 
 
-def next_rung(
+def _next_rung(
     horizons: Sequence[Horizon],
     candidates: Sequence[MechanismCandidate],
     context: FitContext,
@@ -686,14 +689,18 @@ def _told(sites: Sequence[_Site], gains: np.ndarray) -> None:
 def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[Rung], tuple[NotFitted, ...]]:
     """Mechanisms one on top of the other, as long as the next is likelier than what has no name.
 
+    What stands on top of others may take over what these leave of an error of the model. So the last of
+    several also has to make free runs of parts left out typically better than without it, or it is taken
+    back, and then the one before it is the last.
+
     Returned are also the fits of the simulation alone, empty where it cannot be fitted, and what could not be
     judged.
     """
     model, found, untried = context.model, list[Rung](), dict[str, NotFitted]()
-    alone: list[Horizon] = []
+    alone, budget = list[Horizon](), context.budget
     try:
-        with context.budget.part(FIRST_NAME_SHARE):
-            horizons = alone = horizons_of(fit, context)
+        with budget.part(FIRST_NAME_SHARE):
+            horizons = alone = _horizons_of(fit, context)
         while len(found) < context.study.search.mechanisms:
             base = horizons[0].fit.model
             if base.dimension > model.dimension:
@@ -703,8 +710,8 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[Rung], tup
                 for each in context.candidates
                 if not any(each.repeats(other.accepted.best.candidate) for other in found)
             ]
-            with context.budget.part(1.0 if found else FIRST_NAME_SHARE):
-                rung = next_rung(horizons, remaining, context, untried)
+            with budget.part(1.0 if found else FIRST_NAME_SHARE):
+                rung = _next_rung(horizons, remaining, context, untried)
             if rung is None:
                 break
             LOGGER.info("found %s by forecasts", rung.accepted.best.candidate.label)
@@ -712,4 +719,22 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[Rung], tup
             horizons = list(rung.horizons)
     except (*NUMERICAL_ERRORS, BudgetSpent) as error:
         LOGGER.info("forecasts end: %s", error)
+
+    def errors(number: int) -> tuple[float, ...] | None:
+        """Of free runs of parts left out, with the first so many mechanisms, by blocks."""
+        best = [each.accepted.best for each in found[:number]]
+        squares = errors_left_out(
+            best[-1].fit, context.data, noise=alone[0].fit.noise,
+            candidates=[each.candidate for each in best], budget=budget,
+        )  # fmt: skip
+        return None if squares is None else in_blocks(squares)
+
+    with budget.exempt():
+        last = errors(len(found)) if len(found) > 1 else None
+        while len(found) > 1:
+            before = errors(len(found) - 1)
+            if last is not None and (before is None or typically_better(before, last)):
+                break
+            LOGGER.info("%s makes no free run better", found[-1].accepted.best.candidate.label)
+            found, last = found[:-1], before
     return alone, found, tuple(untried.values())

@@ -23,6 +23,7 @@ import scipy.stats
 
 from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.errors import NumericalFailure
+from siq.inference.budget import Budget
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
@@ -204,6 +205,7 @@ def _refits_left_out(
     noise: Noise,
     candidates: Iterable[MechanismCandidate] = (),
     shown: Measurements | None = None,
+    budget: Budget | None = None,
 ) -> list[tuple[Fit, np.ndarray]] | None:
     """Fits without each part in turn, and their errors on it, see `errors_left_out`."""
     signed = {name for each in candidates for name in each.positive.intersection(each.amplitudes)}
@@ -213,7 +215,8 @@ def _refits_left_out(
         rest = rest if shown is None else replace(rest, outputs=shown.outputs[rows])
         try:
             while wrong:
-                again = fit_with_process_noise_as_needed(model, rest, replace(fit, x=fit.x[rows]))
+                begin = replace(fit, x=fit.x[rows])
+                again = fit_with_process_noise_as_needed(model, rest, begin, budget=budget)
                 wrong = {p.name for p in again.model.parameters if p.name in signed and p.value < 0}
                 if wrong:
                     LOGGER.info("without rows of one part, %s would be negative", ", ".join(sorted(wrong)))
@@ -234,7 +237,12 @@ def _refits_left_out(
 
 
 def errors_left_out(
-    fit: Fit, learned: Measurements, *, noise: Noise, candidates: Iterable[MechanismCandidate] = ()
+    fit: Fit,
+    learned: Measurements,
+    *,
+    noise: Noise,
+    candidates: Iterable[MechanismCandidate] = (),
+    budget: Budget | None = None,
 ) -> np.ndarray | None:
     """Normalised squared errors of free runs of the parts left out, one behind the other, ``(values,)``.
 
@@ -247,12 +255,15 @@ def errors_left_out(
     numpy.ndarray or None
         None where a fit has no result, or a simulation runs away.
     """
-    refits = _refits_left_out(fit, learned, noise=noise, candidates=candidates)
+    refits = _refits_left_out(fit, learned, noise=noise, candidates=candidates, budget=budget)
     return None if refits is None else np.concatenate([squares for _, squares in refits])
 
 
-def _typically_better(before: tuple[float, ...], after: tuple[float, ...]) -> bool:
-    """Whether errors of blocks fall, and not only in one in which a saddle point multiplies them."""
+def typically_better(before: tuple[float, ...], after: tuple[float, ...]) -> bool:
+    """Whether errors of blocks fall, and not only in one in which a saddle point multiplies them.
+
+    Other than `change_between` this asks for the typical ratio of errors, not for that of their sums.
+    """
     falls = np.log(np.maximum(before, np.finfo(float).tiny) / np.maximum(after, np.finfo(float).tiny))
     return bool(scipy.stats.ttest_1samp(falls, 0.0, alternative="greater").pvalue < CHANGE_BY_CHANCE) and (
         change_between(before, after) != "worse"
@@ -307,7 +318,7 @@ def preferred_recalibration(
         moved = scipy.stats.f.sf(ratio, len(free), count - 1) < CHANGE_BY_CHANCE / len(refits)
         after = in_blocks(squares)
         LOGGER.info("a refit: error of parts left out %.3g, ratio of shifts %.3g", squares.mean(), ratio)
-        if moved and (least is None or _typically_better(least, after)):
+        if moved and (least is None or typically_better(least, after)):
             chosen, least = fit, after
     return chosen
 

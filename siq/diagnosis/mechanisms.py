@@ -254,6 +254,12 @@ class MechanismCandidate:
         pairs = zip(free, fit.standard_errors, strict=True)
         return not any(each.value < -2 * error for each, error in pairs if each.name in self.positive)
 
+    def idle(self, fit: Fit) -> bool:
+        """Whether an amplitude of a fit is zero within errors, so that this is a special case of itself."""
+        free = (fit.model.parameters[place] for place in fit.model.free)
+        pairs = zip(free, fit.standard_errors, strict=True)
+        return any(abs(each.value) < 2 * error for each, error in pairs if each.name in self.amplitudes)
+
     def repeats(self, found: MechanismCandidate) -> bool:
         """Whether it is what was found already: the same, or in another form at the same place.
 
@@ -363,7 +369,7 @@ def build_candidate(
         coordinate=" ".join(assignment.get(word, word) for word in form.coordinate.split()),
         changes=(*changes, *further),
         generalises=mechanism.generalises,
-        variant=form.variant,
+        variant=form.variant.format_map(assignment),
         family=mechanism.family or mechanism.name,
         weight=mechanism.weight,
     )

@@ -280,10 +280,13 @@ def named_by_forecasts(
     if not rungs:
         return None, recalibrations
     fit = rungs[-1].accepted.best.fit
-    with context.budget.exempt():  # without forces, where they are not needed any more
-        fit = fit_with_process_noise_as_needed(fit.model, context.data, fit, budget=context.budget)
-        if fit.model.edges:
-            fit = sharpened(fit, context.data, budget=context.budget)
+    try:
+        with context.budget.exempt():  # without forces, where they are not needed any more
+            fit = fit_with_process_noise_as_needed(fit.model, context.data, fit, budget=context.budget)
+            if fit.model.edges:
+                fit = sharpened(fit, context.data, budget=context.budget)
+    except NUMERICAL_ERRORS as error:
+        LOGGER.info("the fit at the shortest horizon stays: %s", error)
     left = Remainder.of(context.data, alone[0].fit, fit, context.roles)
     search = Search(recalibrated, tuple(each.accepted for each in rungs), fit, (), untried=untried)
     remarks = [

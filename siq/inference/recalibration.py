@@ -30,6 +30,9 @@ POINTS = 16  # of the average
 UNLIKELY = 8.0  # logarithm of a likelihood, relative to the largest, that adds nothing to an average
 THRESHOLD = 1e-4  # probability by chance, below which process noise is believed
 FAINT = 1e-4  # process noise, relative to the motion, from which a fit without any is loosened
+# Mean square of errors in units of the sensors' noise. Errors twice as large cost a log-likelihood of 0.7 for
+# each value, which nobody believes.
+MISSED = 4.0
 BETTER = 0.5  # of a log-likelihood: what half a parameter gains by chance, below which two fits are one
 
 
@@ -116,9 +119,12 @@ def fit_with_process_noise_as_needed(
     A jump that is spread too far leaves errors which process noise stands in for. Before that is believed the
     jumps of the fit without them are followed more finely.
     """
-    loose, strict = fit_with_and_without_process_noise(model, data, begin, budget=budget, **options)
+    loose, strict = fit_with_and_without_process_noise(
+        model, data, begin, budget=budget, hopeless=MISSED, **options
+    )
     chosen = _simpler_fit(loose, strict)
-    if chosen is loose and strict.converged and strict.model.edges:
+    far = chosen is loose and loose is not None and _missed_without(loose, data) > MISSED
+    if chosen is loose and not far and strict.converged and strict.model.edges:
         chosen = _simpler_fit(loose, sharpened(strict, data, budget=budget))
     return chosen
 
@@ -136,6 +142,7 @@ def fit_with_and_without_process_noise(
     level: float = 1.0,
     x: np.ndarray | None = None,
     settled: bool = False,
+    hopeless: float = np.inf,
     budget: Budget | None = None,
 ) -> tuple[Fit | None, Fit]:
     """Fit with process noise estimated, where that was begun with, and without.
@@ -152,6 +159,9 @@ def fit_with_and_without_process_noise(
         States, where the model has more of them.
     settled
         Whether `begin` is itself the fit of the model with process noise, and need not be made again.
+    hopeless
+        Mean square of errors, in units of the sensors' noise, beyond which trajectories are not followed step
+        by step to where they end: errors that linear equations along the fit with process noise foresee.
 
     Raises
     ------
@@ -190,12 +200,25 @@ def fit_with_and_without_process_noise(
             model if of is None else of.model, data, begin=at[data.first[:-1]], noise=still, **same
         )
 
+    far = loose is not None and _missed_without(loose, data) > hopeless
     # Where f jumps, steps of all samples at once go to and fro.
-    ways = (as_trajectories, at_all_samples) if jumps else (at_all_samples, as_trajectories)
+    ways = (as_trajectories, at_all_samples) if jumps and not far else (at_all_samples, as_trajectories)
     strict = ways[0]()
-    if not strict.converged:
+    if not (strict.converged or far):
         strict = preferred_fit(strict, ways[1]())
     return loose, _with_insignificant_dropped(loose, strict, data)
+
+
+def _missed_without(loose: Fit, data: Measurements) -> float:
+    """Mean square of the errors that a fit would have without its process noise, if all were linear."""
+    if not (loose.converged and loose.has_process_noise):
+        return 0.0
+    try:
+        white = whiten(loose.linearisation, data, loose.noise.without_process())
+        left = white.innovations - white.columns @ white.solve()[0]
+    except (NumericalFailure, np.linalg.LinAlgError):
+        return 0.0
+    return float(left @ left) / max(white.degrees_of_freedom - white.columns.shape[1], 1)
 
 
 def _with_insignificant_dropped(loose: Fit | None, strict: Fit, data: Measurements) -> Fit:

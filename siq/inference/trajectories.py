@@ -251,7 +251,10 @@ def fit_trajectories(
             if normal is None:
                 along = linearise(model, grid, values, states)
                 normal = _NormalEquations(along, data, noise.measurement, expectations(model, values))
-            change, moved, foreseen = normal.step(damping)
+            try:
+                change, moved, foreseen = normal.step(damping)
+            except np.linalg.LinAlgError:  # derivatives beyond all numbers
+                break
             new = values.copy()
             new[free] += change
             tried, then = followed(new, begin + moved)

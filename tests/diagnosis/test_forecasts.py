@@ -20,11 +20,11 @@ from siq.diagnosis.forecasts import (
     _fold_of,
     _Foreseen,
     _gained,
+    _horizons_of,
     _log_priors,
+    _next_rung,
     _thinned,
     climb,
-    horizons_of,
-    next_rung,
 )
 from siq.diagnosis.holdout import preferred_recalibration
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
@@ -95,7 +95,7 @@ def context_of(model: Dynamics, data: Measurements, among: tuple[str, ...] = ())
 def first_rung(context: FitContext) -> Rung | None:
     fit, _ = recalibrate(context.model, context.data)
     assert fit.has_process_noise
-    return next_rung(horizons_of(fit, context), context.candidates, context, {})
+    return _next_rung(_horizons_of(fit, context), context.candidates, context, {})
 
 
 @cache
@@ -170,7 +170,7 @@ def test_parts_do_not_depend_on_the_order_of_recordings() -> None:
 
 def test_horizons_end_where_too_few_samples_tell_of_the_parameters() -> None:
     context = context_of(pendulum(), recorded(0.0, 0.2), CLOSE)
-    horizons = horizons_of(recalibrate(context.model, context.data)[0], context)
+    horizons = _horizons_of(recalibrate(context.model, context.data)[0], context)
     known = [int(np.isfinite(each.data.outputs).sum()) for each in horizons]
     assert known == [6 * -(-SAMPLES // every) for every in (1, 4, 16)]
     assert all(each.fit.has_process_noise and each.correlated >= 1 for each in horizons)
@@ -233,6 +233,32 @@ def test_damping_is_named_beside_forces_that_last() -> None:
     assert c.value == pytest.approx(0.15, rel=0.3)
 
 
+def test_a_last_mechanism_that_makes_no_free_run_better_is_taken_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    context = context_of(pendulum(), recorded(0.15, 0.2), CLOSE)
+    rungs = iter([damped(), damped(), None])  # the second changes nothing
+    monkeypatch.setattr(forecasts, "_next_rung", lambda *_: next(rungs))
+    fit, _ = recalibrate(context.model, context.data)
+    assert climb(fit, context)[1] == [damped()]
+    # One that makes free runs better stays, with those that it stands on.
+    rungs = iter([damped(), damped(), None])
+    monkeypatch.setattr(forecasts, "typically_better", lambda *_: True)
+    assert climb(fit, context)[1] == [damped(), damped()]
+
+
+def test_a_general_form_whose_amplitude_is_zero_within_errors_is_its_special_case() -> None:
+    best = damped().accepted.best
+    fit, (amplitude,) = best.fit, best.candidate.amplitudes
+    assert not best.candidate.idle(fit)
+    names = [each.name for each in fit.model.parameters]
+    small = fit.model.values.copy()
+    small[names.index(amplitude)] = fit.standard_errors[
+        [names[place] for place in fit.model.free].index(amplitude)
+    ]
+    assert best.candidate.idle(replace(fit, model=fit.model.with_values(small)))
+
+
 def test_odds_with_a_flat_prior_are_those_of_mechanisms_that_are_alike() -> None:
     context = context_of(pendulum(), recorded(0.15, 0.2), CLOSE)
     alike = tuple(replace(each, weight=1.0) for each in context.candidates)
@@ -285,7 +311,7 @@ def kicked_decays(count: int = 4, samples: int = 60) -> Measurements:
 def test_a_sensor_gains_nothing_from_what_a_filter_learned_from_it(monkeypatch: pytest.MonkeyPatch) -> None:
     data = kicked_decays()
     context = context_of(DECAY, data, ("sensor gain or offset",))
-    horizons = horizons_of(recalibrate(DECAY, data)[0], context)
+    horizons = _horizons_of(recalibrate(DECAY, data)[0], context)
     x = horizons[0].fit.x
     # Each form that has a gain; a constant offset was never mistaken for innovations.
     faults = [each for each in context.candidates if any(name.startswith("g") for name in each.amplitudes)]

@@ -192,6 +192,8 @@ def test_entries_of_a_study_are_added_and_left_out() -> None:
          "changes nothing"),
         ("mechanisms: [{name: a, sentence: b, forms: [{roles: {v: speed}, terms: {v: '1'}, coordinate: v,"
          " parameters: {}}]}]", "speed"),
+        ("mechanisms: [{name: a, sentence: b, forms: [{roles: {v: velocity}, terms: {v: '1'}, coordinate: v,"
+         " variant: 'against w in {u}', parameters: {}}]}]", "the variant names 'u', which has no role"),
         ("mechanisms: [{name: a, sentense: b, forms: []}]", "perhaps you meant 'sentence'"),
     ],
 )  # fmt: skip

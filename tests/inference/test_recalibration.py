@@ -82,3 +82,36 @@ def test_a_fit_has_not_settled_while_it_foresees_more_than_it_has() -> None:
         stuck = fit_by_multiple_shooting(decay, data, x=x, noise=noise, estimate_process=False)
         settled = fit_by_multiple_shooting(fit.model, data, x=fit.x, noise=noise, estimate_process=False)
     assert not stuck.converged and settled.converged
+
+
+def test_trajectories_are_not_followed_where_no_simulation_comes_near_the_sensor(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Kicks a hundred times the sensor's noise: without process noise all is missed by as much."""
+    decay, calm = decays()
+    kicks = np.random.default_rng(5).normal(0, 0.3, len(calm.t)) * np.sqrt(0.1)
+    pushed = replace(calm, outputs=calm.outputs + np.cumsum(kicks)[:, None])
+    shooting, followed = recalibration.fit_by_multiple_shooting, recalibration.fit_trajectories
+    calls = []
+
+    def unsettled(model: Dynamics, *given: Any, **named: Any) -> Fit:
+        fit = shooting(model, *given, **named)
+        return fit if named["estimate_process"] else replace(fit, converged=False)
+
+    def counted(*given: Any, **named: Any) -> Fit:
+        calls.append(1)
+        return followed(*given, **named)
+
+    for data, expected in ((pushed, 0), (calm, 1)):
+        begin = shooting(
+            decay,
+            data,
+            x=data.outputs,
+            noise=Noise(np.array([1e-4]), np.array([1e-2])),
+            estimate_process=True,
+        )
+        with monkeypatch.context() as changed:
+            changed.setattr(recalibration, "fit_by_multiple_shooting", unsettled)
+            changed.setattr(recalibration, "fit_trajectories", counted)
+            fit = recalibration.fit_with_process_noise_as_needed(decay, data, begin)
+        assert sum(calls) == expected and fit.has_process_noise == (data is pushed)
