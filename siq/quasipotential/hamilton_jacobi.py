@@ -131,8 +131,8 @@ class PowerBasis:
     @classmethod
     def from_data(cls, data: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...]) -> PowerBasis:
         """The powers, and units, that `Well.powers` wrote."""
-        parts = (np.array(data[name]) for name in ("center", "scale", "exponents"))
-        return cls(symbols, *parts, np.array(data.get("units", [])).reshape(-1, len(symbols) + 1))
+        units = np.array(data.get("units", [])).reshape(-1, len(symbols) + 1)
+        return cls(symbols, *(np.array(data[name]) for name in ("center", "scale", "exponents")), units=units)
 
     @property
     def size(self) -> int:
