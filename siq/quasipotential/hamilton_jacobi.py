@@ -132,7 +132,8 @@ class PowerBasis:
     def from_data(cls, data: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...]) -> PowerBasis:
         """The powers, and units, that `Well.powers` wrote."""
         units = np.array(data.get("units", [])).reshape(-1, len(symbols) + 1)
-        return cls(symbols, *(np.array(data[name]) for name in ("center", "scale", "exponents")), units=units)
+        center, scale, exponents = (np.array(data[name]) for name in ("center", "scale", "exponents"))
+        return cls(symbols, center, scale, exponents, units)
 
     @property
     def size(self) -> int:

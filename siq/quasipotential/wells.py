@@ -358,12 +358,12 @@ def local_well(
         candidate = Candidate(well.values, well.gradients, well.hessians, None, known, [attractor])
         return candidate.stated_error(dynamics, seed=seed), len(known) / len(below)
 
-    error, claimed = (np.inf, 0.0) if options.about == "units" else stated(well)
-    if error > MIN_EXPLAINED_ERROR:
+    left, claimed = (np.inf, 0.0) if options.about == "units" else stated(well)
+    if left > MIN_EXPLAINED_ERROR:
         with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):  # powers stay
             other = _over_units(well, basin, kept, path, np.random.default_rng(seed))
             its, share = stated(other)
-            if its < error and share >= claimed - COVERAGE_TOLERANCE:
+            if its < left and share >= claimed - COVERAGE_TOLERANCE:
                 return other
     return well
 
@@ -387,9 +387,8 @@ def _over_units(
     units = np.column_stack([directions * well.basis.scale, -(directions * middles).sum(axis=1)])
     basis = replace(PowerBasis.up_to(2, well.basis.symbols, well.attractor, well.basis.scale), units=units)
     start = np.where(basis.free, 0.0, np.resize(well.coefficients, basis.size))  # quadratic powers come first
-    found = replace(well, basis=basis, coefficients=start)
+    found, first = replace(well, basis=basis, coefficients=start), float(np.median(well.values(x)))
     found = replace(found, coefficients=_with_slopes(found, x, well))
-    first = float(np.median(well.values(x)))
     return _extend_well(found, basin, goal=well.reach, rows=rows, path=path, generator=draw, first=first)
 
 
