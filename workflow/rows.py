@@ -155,7 +155,8 @@ def degree_rows(run: int, found: Landscape | None) -> pd.DataFrame:
     rows = [
         {
             "run": run, "attractor": f"A{index + 1}", "degree": trial.degree, "terms": trial.terms,
-            "residual": trial.residual, "covered": trial.covered, "chosen": number == best_trial(well.trials),
+            "residual": trial.residual, "covered": trial.covered,
+            "chosen": not len(well.basis.units) and number == best_trial(well.trials),
         }
         for index, well in enumerate(() if found is None else found.wells)
         if well is not None

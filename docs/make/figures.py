@@ -42,7 +42,7 @@ def power(value: float) -> str:
 
 
 def archetype3d(tables: Path) -> Found:
-    """The 50 runs of `make statistics`."""
+    """The 50 runs of `make statistics`, or of the same system with noise."""
     scores = pd.read_parquet(tables / "rrmse.parquet")
     errors = pd.read_parquet(tables / "prediction.parquet")
     coefficients = pd.read_parquet(tables / "coefficients.parquet")
@@ -122,6 +122,11 @@ def neuromorphic_chip(tables: Path) -> Found:
 
 SOURCES: dict[str, tuple[str, Callable[[Path], Found], str]] = {
     "archetype3d": ("archetype3d/tables", archetype3d, "make statistics"),
+    "archetype3d_noise": (
+        "archetype3d-noise/tables",
+        archetype3d,
+        "snakemake --cores 2 results/archetype3d-noise/report.html",
+    ),
     "greenland_ice": ("greenland-ice/tables", greenland_ice, "siq run greenland-ice"),
     "neuromorphic_chip": ("neuromorphic-chip/tables", neuromorphic_chip, "siq run neuromorphic-chip"),
     "proof": ("proof/proof/tables", proof, "snakemake --cores 2 proof"),

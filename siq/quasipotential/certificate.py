@@ -41,7 +41,7 @@ from siq.quasipotential.certificate_tests import (
 from siq.quasipotential.characteristics import SHEET_MARGIN, End, Fan, adapted_fan
 from siq.quasipotential.characteristics import relative_error as field_error
 from siq.quasipotential.formulas import SymbolicDecomposition
-from siq.quasipotential.wells import Well
+from siq.quasipotential.wells import MIN_EXPLAINED_ERROR, Well
 from siq.remarks import Remark, sentence
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
@@ -316,7 +316,6 @@ def _position_text(position: np.ndarray) -> str:
     return np.array2string(position, precision=4, suppress_small=True, separator=", ")
 
 
-MIN_EXPLAINED_ERROR = 1e-3  # a stated error above this is worth an explanation
 # Curves in search of a caustic; what is said of one has four digits.
 CAUSTIC_FAN: dict[str, Any] = {"most": 512, "tolerance": 1e-7, "spacing": 0.1}
 

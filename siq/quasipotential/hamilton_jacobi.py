@@ -11,8 +11,9 @@ what it found must be tested by what does not know of this equation (`siq.quasip
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -97,14 +98,26 @@ class LibraryBasis:
         return _weighted_sum(coefficients, (self.library.terms[k] for k in self.chosen))
 
 
+def _tanh_derivatives(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The hyperbolic tangent with its first and second derivative."""
+    here = np.tanh(x)
+    slope = 1 - here**2
+    return here, slope, -2 * here * slope
+
+
 @dataclass(frozen=True)
 class PowerBasis:
-    """Products of powers of ``(x - center)/scale``, with exponents of the shape ``(m, d)``."""
+    """Products of powers of ``y = (x - center)/scale``, with exponents ``(p, d)``, and random units.
+
+    A unit ``tanh(w·y + b)`` is a row ``(w, b)`` of `units`, shape ``(m - p, d + 1)``. Its Taylor polynomial
+    of degree 2 at the center is taken away, so that value, slope and curvature there are those of the powers.
+    """
 
     symbols: tuple[sympy.Symbol, ...]
     center: np.ndarray
     scale: np.ndarray
     exponents: np.ndarray
+    units: np.ndarray
 
     @classmethod
     def up_to(
@@ -112,40 +125,49 @@ class PowerBasis:
     ) -> PowerBasis:
         """All powers of degree 2 up to `degree` about a center; the quadratic ones come first."""
         exponents = [row for row in monomial_exponents(len(symbols), degree) if sum(row) >= 2]
-        return cls(symbols, np.asarray(center, dtype=float), scale, np.array(exponents))
+        center, none = np.asarray(center, dtype=float), np.zeros((0, len(symbols) + 1))
+        return cls(symbols, center, scale, np.array(exponents), none)
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...]) -> PowerBasis:
-        """The powers that `Well.powers` wrote."""
-        return cls(symbols, *(np.array(data[name]) for name in ("center", "scale", "exponents")))
+        """The powers, and units, that `Well.powers` wrote."""
+        units = np.array(data.get("units", [])).reshape(-1, len(symbols) + 1)
+        center, scale, exponents = (np.array(data[name]) for name in ("center", "scale", "exponents"))
+        return cls(symbols, center, scale, exponents, units)
 
     @property
     def size(self) -> int:
         """Number of functions, m."""
-        return len(self.exponents)
+        return len(self.exponents) + len(self.units)
+
+    @property
+    def free(self) -> np.ndarray:
+        """Mask of the functions that a fit may change, ``(m,)``: all but the quadratic ones, which are M."""
+        return np.append(self.exponents.sum(axis=1) > 2, np.full(len(self.units), True))
 
     @property
     def title(self) -> str:
         """The functions in words."""
-        return f"powers of degree {self.exponents.sum(axis=1).max()}"
+        words = f"powers of degree {self.exponents.sum(axis=1).max()}"
+        return f"{words} and {len(self.units)} random units" if len(self.units) else words
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """Points ``(n, d)`` to values ``(n, m)``."""
-        return self._product(self._powers(x), ())
+        return np.concatenate([self._product(self._powers(x), ()), self._of_units(x, 0)], axis=1)
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
         """Points ``(n, d)`` to gradients ``(n, d, m)``."""
-        powers = self._powers(x)
-        d = len(self.symbols)
-        return np.stack([self._product(powers, (i,)) for i in range(d)], axis=1)
+        powers, of_units, slopes = self._powers(x), self._of_units(x, 1), self.units[:, :-1].T
+        each = enumerate(slopes / self.scale[:, None])
+        return np.stack([np.hstack([self._product(powers, (i,)), of_units * one]) for i, one in each], axis=1)
 
     def hessians(self, x: np.ndarray) -> np.ndarray:
         """Points ``(n, d)`` to Hessians ``(n, d, d, m)``."""
-        powers, d = self._powers(x), len(self.symbols)
-        values = np.empty((len(x), d, d, self.size))
-        for i in range(d):
-            for j in range(i + 1):
-                values[:, i, j] = values[:, j, i] = self._product(powers, (i, j))
+        powers, of_units, d = self._powers(x), self._of_units(x, 2), len(self.symbols)
+        values, slopes = np.empty((len(x), d, d, self.size)), self.units[:, :-1] / self.scale
+        for i, j in itertools.combinations_with_replacement(range(d), 2):
+            bends = of_units * slopes[:, i] * slopes[:, j]
+            values[:, i, j] = values[:, j, i] = np.hstack([self._product(powers, (i, j)), bends])
         return values
 
     def expression(self, coefficients: np.ndarray) -> sympy.Expr:
@@ -155,7 +177,21 @@ class PowerBasis:
             for symbol, c, s in zip(self.symbols, self.center, self.scale, strict=True)
         ]
         powers = ([base ** int(e) for base, e in zip(scaled, row, strict=True)] for row in self.exponents)
-        return _weighted_sum(coefficients, (sympy.Mul(*factors) for factors in powers))
+        return _weighted_sum(coefficients, itertools.chain(map(sympy.prod, powers), self.unit_terms(scaled)))
+
+    def unit_terms(self, scaled: Sequence[sympy.Expr]) -> Iterator[sympy.Expr]:
+        """The units as formulas of y."""
+        for *weights, bias in self.units.tolist():
+            along, here = _weighted_sum(np.array(weights), scaled), sympy.Float(math.tanh(bias), 17)
+            slope = 1 - here**2
+            yield sympy.tanh(along + sympy.Float(bias, 17)) - here - slope * along + here * slope * along**2
+
+    def _of_units(self, x: np.ndarray, order: int) -> np.ndarray:
+        """Derivatives of the units by ``w·y``, of an order up to 2, shape ``(n, m - p)``."""
+        along, biases = ((x - self.center) / self.scale) @ self.units[:, :-1].T, self.units[:, -1]
+        _, slope, bend = at_center = _tanh_derivatives(biases)
+        taken = (at_center[0] + slope * along + bend * along**2 / 2, slope + bend * along, bend)
+        return np.asarray(_tanh_derivatives(along + biases)[order] - taken[order])
 
     def _powers(self, x: np.ndarray) -> np.ndarray:
         """Powers of every scaled state, shape ``(highest + 1, d, n)``."""
@@ -281,7 +317,9 @@ class HamiltonJacobi:
         if orthonormal:
             equation, turned = _orthonormalised(self, free)
             moving = np.arange(turned.shape[1]) < turned.shape[1] - int((~free).sum())
-            theta = np.linalg.lstsq(turned[free], start[free], rcond=None)[0]
+            # The same function over the points, of which the coefficients may be far from unique.
+            now = self.measure.push(self.points, self.slopes(np.where(free, start, 0.0)))
+            theta = np.einsum("nim,ni->m", equation.gradients, now) / len(now)
             theta[~moving] = start[~free]
         for _ in range(rounds):
             rest = equation.relative_residuals(theta)

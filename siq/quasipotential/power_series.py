@@ -138,7 +138,7 @@ def quasipotential_series(dynamics: Dynamics, attractor: np.ndarray, *, degree: 
         gradients[k] = basis.gradient(parts[k], k)
     exponents = np.concatenate([basis.exponents[k] for k in parts])
     return Expansion(
-        PowerBasis(dynamics.symbols, center, np.ones(len(center)), exponents),
+        PowerBasis(dynamics.symbols, center, np.ones(d), exponents, np.zeros((0, d + 1))),
         np.concatenate([part / basis.scales(k, scale) for k, part in parts.items()]),
     )
 

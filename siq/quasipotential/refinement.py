@@ -69,6 +69,9 @@ class RefinementOptions:
         Highest powers about an attractor that are tried, one after the other.
     accuracy
         Relative Hamilton–Jacobi residual below which no higher power is tried.
+    about
+        Functions of V about an attractor: ``powers``, random tanh ``units``, or ``auto``, units where powers
+        leave an error of more than 0.1 % and units a smaller one.
     reach
         Level up to which a formula is sought, as a share of V at the lowest saddle.
     tolerance
@@ -91,6 +94,7 @@ class RefinementOptions:
 
     degrees: Annotated[tuple[Degree, ...], Field(min_length=1)] = (4, 6, 8, 10, 12)
     accuracy: Annotated[float, Field(gt=0)] = MIN_OUTLIER_RESIDUAL
+    about: Literal["auto", "powers", "units"] = "auto"
     reach: Annotated[float, Field(gt=0, le=3)] = 1.2
     tolerance: Annotated[float, Field(gt=0, lt=1)] = RESIDUAL_TOLERANCE
     routes: Annotated[tuple[Route, ...], Field(min_length=1)] | None = None

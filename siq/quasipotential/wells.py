@@ -13,11 +13,13 @@ ellipsoid (`_grow_well`). From its saddle a formula is taken on to a higher leve
 For given equations the path of least action to the lowest saddle comes first, so that the depth of the well
 is known. V is grown once, in the lowest powers that follow it up there. From there every higher degree starts
 on the whole sublevel set, from the formula of the degree below: grown by itself it would be an extrapolation
-at each level, which of high powers is bad. `local_well` chooses the degree.
+at each level, which of high powers is bad. `local_well` chooses the degree, or random units beside M where
+these leave less of an error.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -29,6 +31,7 @@ from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
 from siq.numerics.randomness import positive
+from siq.quasipotential.certificate_tests import LEVEL_SHARE, MIN_POINTS, Candidate
 from siq.quasipotential.hamilton_jacobi import (
     SINGULAR_RATIO,
     Expansion,
@@ -108,8 +111,9 @@ class Well(Expansion):
 
     @property
     def powers(self) -> dict[str, Any]:
-        """Center, scale, exponents and coefficients as plain data."""
-        parts = {name: getattr(self.basis, name).tolist() for name in ("center", "scale", "exponents")}
+        """Center, scale, exponents, units and coefficients as plain data."""
+        names = ("center", "scale", "exponents", *["units"] * bool(len(self.basis.units)))
+        parts = {name: getattr(self.basis, name).tolist() for name in names}
         return parts | {"coefficients": self.coefficients.tolist()}
 
     @property
@@ -178,14 +182,18 @@ class Well(Expansion):
 
     @property
     def formula(self) -> Formula:
-        """V in powers of the offsets from the attractor, in the units of the states, without rounding."""
-        size, basis = np.abs(self.coefficients), self.basis
-        return Formula.of_powers(
+        """V in offsets from the attractor, in powers and units, in those of the states, without rounding."""
+        basis, (of_powers, of_units) = self.basis, np.split(self.coefficients, [len(self.basis.exponents)])
+        size = np.abs(of_powers)
+        formula = Formula.of_powers(
             "V", basis.symbols, scale=basis.scale, exponents=basis.exponents,
             center=np.where(np.abs(basis.center) > NEGLIGIBLE_COEFFICIENT * basis.scale, basis.center, 0.0),
-            coefficients=np.where(size > NEGLIGIBLE_COEFFICIENT * size.max(), self.coefficients, 0.0),
+            coefficients=np.where(size > NEGLIGIBLE_COEFFICIENT * size.max(), of_powers, 0.0),
             units=self.dynamics.units, title=f"U = 2V is the quasipotential, known up to V = {self.reach!r}",
         )  # fmt: skip
+        scaled = [one / sympy.Float(s, DIGITS) for one, s in zip(basis.symbols, basis.scale, strict=True)]
+        terms = [float(one) * unit for one, unit in zip(of_units, basis.unit_terms(scaled), strict=True)]
+        return replace(formula, expression=sympy.Add(formula.expression, *terms))
 
     def to_text(self) -> str:
         """The formula as text, a line for each definition."""
@@ -246,6 +254,11 @@ MAX_POINTS_TO_KNOWN_DEPTH = 5000  # of one fit
 RUNAWAY_LEVEL = 1.5  # of a level: where the lower degree's formula is higher, a lower V is an extrapolation
 RUNAWAY_RATIO = 3.0  # times the residual of the degree below: a higher one so much worse has run away
 MAX_IDLE_DEGREES = 2  # higher degrees in a row that do not improve: there is nothing more to be had
+MAX_UNITS = 200  # of a well; more are slower and hardly closer
+FEWEST_PER_UNIT, MOST_PER_UNIT = 4, 12  # points: with fewer there are fewer units, and of more some are drawn
+UNIT_WIDTHS = 2.0  # of random units: so many times more or less than the distance of the level
+COVERAGE_TOLERANCE = 0.005  # share of the states by which two formulas hold at as many
+MIN_EXPLAINED_ERROR = 1e-3  # a stated error above this is worth an explanation, and a search for a better V
 HELD_OUT_STRIDE = 4  # every so manieth point is kept for choosing the degree
 
 
@@ -332,13 +345,57 @@ def local_well(
         covered = int((residual <= well.tolerance).sum()) / max(most, 1)
         median = float(np.median(residual)) if len(residual) else np.inf
         trials.append(DegreeTrial(well.degree, well.basis.size, median, covered))
-    return replace(wells[best_trial(trials)], trials=tuple(trials))
+    well = replace(wells[best_trial(trials)], trials=tuple(trials))
+    if options.about == "powers" or (options.about == "auto" and well.residual < options.accuracy):
+        return well
+
+    def stated(well: Well) -> tuple[float, float]:
+        """The error that its residual leaves open below the saddle, and at which share it claims to hold."""
+        below = x[(well.values(x) < LEVEL_SHARE * well.level) & well.reaches(x)]
+        known = below[well.believed(below)]
+        if len(known) < MIN_POINTS:
+            return np.inf, 0.0
+        candidate = Candidate(well.values, well.gradients, well.hessians, None, known, [attractor])
+        return candidate.stated_error(dynamics, seed=seed), len(known) / len(below)
+
+    left, claimed = (np.inf, 0.0) if options.about == "units" else stated(well)
+    if left > MIN_EXPLAINED_ERROR:
+        with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):  # powers stay
+            other = _over_units(well, basin, kept, path, np.random.default_rng(seed))
+            its, share = stated(other)
+            if its < left and share >= claimed - COVERAGE_TOLERANCE:
+                return other
+    return well
+
+
+def _over_units(
+    well: Well, basin: Basin, rows: np.ndarray, path: MinimumActionPath | None, draw: np.random.Generator
+) -> Well:
+    """V about an attractor over random tanh units, from a formula in powers that does not follow it.
+
+    ``½ (x - A)·M (x - A)`` stays. Units, whose directions are drawn alike in the metric of M, begin with ∇V
+    of the formula at that half of its points where it solves the Hamilton–Jacobi equation best, and are taken
+    on from there as powers are.
+    """
+    residual, d = well.residual_at(well.points), len(well.attractor)
+    x = well.points[residual <= np.median(residual)]
+    count = min(MAX_UNITS, len(x) // FEWEST_PER_UNIT)
+    metric = np.linalg.cholesky(hessian_at(well.dynamics, well.attractor)) / np.sqrt(2 * well.level)
+    widths = UNIT_WIDTHS ** draw.uniform(-1, 1, count)
+    directions = draw.normal(size=(count, d)) / np.sqrt(d) / widths[:, None] @ metric.T
+    middles = well.points[draw.choice(len(well.points), count)] - well.attractor
+    units = np.column_stack([directions * well.basis.scale, -(directions * middles).sum(axis=1)])
+    basis = replace(PowerBasis.up_to(2, well.basis.symbols, well.attractor, well.basis.scale), units=units)
+    start = np.where(basis.free, 0.0, np.resize(well.coefficients, basis.size))  # quadratic powers come first
+    found, first = replace(well, basis=basis, coefficients=start), float(np.median(well.values(x)))
+    found = replace(found, coefficients=_with_slopes(found, x, well))
+    return _extend_well(found, basin, goal=well.reach, rows=rows, path=path, generator=draw, first=first)
 
 
 def best_trial(trials: Sequence[DegreeTrial]) -> int:
     """Index of the first trial whose coverage and residual no other betters by much."""
     coverage = max(trial.covered for trial in trials)
-    good = [index for index, trial in enumerate(trials) if trial.covered >= coverage - 0.005]
+    good = [index for index, trial in enumerate(trials) if trial.covered >= coverage - COVERAGE_TOLERANCE]
     finest = min(trials[index].residual for index in good)
     return next(index for index in good if trials[index].residual <= max(2 * finest, MIN_OUTLIER_RESIDUAL))
 
@@ -361,7 +418,7 @@ def _grow_well(
     quadratic = 0.5 * np.einsum("ni,ij,nj->n", offsets, hessian, offsets).reshape(basin.states.shape[:2])
     size = np.quantile(quadratic[:, 0], 0.5) if depth is None else depth
     basis = PowerBasis.up_to(degree, dynamics.symbols, attractor.position, extent * np.sqrt(2 * size))
-    free = basis.exponents.sum(axis=1) > 2
+    free = basis.free
     coefficients = np.zeros(basis.size)
     i, j = np.array([np.repeat(np.arange(len(extent)), row) for row in basis.exponents[~free]]).T
     coefficients[~free] = np.where(i == j, 0.5, 1.0) * hessian[i, j] * basis.scale[i] * basis.scale[j]
@@ -482,18 +539,20 @@ def _extend_well(
     path: MinimumActionPath | None = None,
     generator: np.random.Generator | None = None,
     by_path: bool = True,
+    first: float | None = None,
 ) -> Well:
     """Take a formula on, from its well to a higher level `goal`, by robust fits of the equation.
 
     Only states that lead to the attractor are asked: across the ridge another well begins. Where the path to
     the saddle is known the formula may be one of lower powers in a basis of higher ones, and begins with ∇V
-    along it.
+    along it. `first` is the level of the first fit, by default a little below that of the well.
     """
     allowed = np.arange(len(basin.chosen)) if rows is None else rows
     functions = well.basis.values(basin.states.reshape(-1, basin.states.shape[2]))
-    shape, free = basin.states.shape[:2], well.basis.exponents.sum(axis=1) > 2
-    coefficients, level = well.coefficients, min(0.9 * well.level, goal)
-    options, rounds = (ROBUST_FIT, 4) if path is None else (FIT_TO_KNOWN_DEPTH, 3)
+    shape, free = basin.states.shape[:2], well.basis.free
+    coefficients, level = well.coefficients, min(0.9 * well.level if first is None else first, goal)
+    with_units = len(well.basis.units) > 0
+    options, rounds = (FIT_TO_KNOWN_DEPTH, 3) if with_units or path is not None else (ROBUST_FIT, 4)
     if path is not None:
         metric = np.linalg.cholesky(hessian_at(well.dynamics, well.attractor))
         places = basin.points(np.arange(len(basin.chosen))) @ metric
@@ -504,7 +563,7 @@ def _extend_well(
         near = distance < PATH_DISTANCE * np.sqrt(path.values[-1])
         beside = np.where(near, path.values[nearest] / 2, np.inf)
         if by_path:
-            coefficients = _towards_path(well, basin.points(fitted), path, free)
+            coefficients = _with_slopes(well, basin.points(fitted), well, path)
     while True:
         chosen = basin.below((functions @ coefficients).reshape(shape), level)
         if path is not None:
@@ -514,9 +573,9 @@ def _extend_well(
                 chosen = chosen[away < POINT_REACH * np.sqrt(2 * level)]
             fitted = chosen = np.union1d(chosen, np.flatnonzero(beside < level))
         chosen = used = np.intersect1d(chosen, allowed)
-        if path is not None and len(used) > MAX_POINTS_TO_KNOWN_DEPTH:
-            assert generator is not None
-            used = np.sort(generator.choice(used, MAX_POINTS_TO_KNOWN_DEPTH, replace=False))
+        most = MOST_PER_UNIT * well.basis.size if with_units else MAX_POINTS_TO_KNOWN_DEPTH
+        if generator is not None and len(used) > most:
+            used = np.sort(generator.choice(used, most, replace=False))
         if path is not None and len(used) < 2 * well.basis.size:
             raise NumericalFailure(
                 f"V about the attractor near {well.attractor.round(4)} is told by {len(used)} states alone"
@@ -527,7 +586,7 @@ def _extend_well(
         coefficients = equation.robust_fit(coefficients, free, rounds=rounds if last else 1, **options)
         if last:
             break
-        level = min(goal, ROBUST_GROWTH * level)
+        level = min(goal, (ROBUST_GROWTH**2 if with_units else ROBUST_GROWTH) * level)
     residual = float(np.median(equation.relative_residuals(coefficients)))
     if path is not None and not np.isfinite(residual):
         raise NumericalFailure(f"powers of degree {well.degree} do not follow V to its saddle")
@@ -540,28 +599,28 @@ def _extend_well(
     )
 
 
-def _towards_path(well: Well, x: np.ndarray, path: MinimumActionPath, free: np.ndarray) -> np.ndarray:
-    """A start: the formula as it is at points, but for the path, whose ∇V is known."""
-    noise = measure_at(well.dynamics, well.attractor)
-    values = path.values / 2
-    rising = (values > PATH_FROM * values[-1]) & (values < PATH_TO * values[-1])
-    where, slopes = path.points[rising], path.momenta[rising]
-    if not len(where) or not len(x):
+def _with_slopes(well: Well, x: np.ndarray, other: Well, path: MinimumActionPath | None = None) -> np.ndarray:
+    """A start: coefficients with the ∇V of another formula at points, and with that along a path."""
+    if not len(x):
         return well.coefficients
-    old, along = well.basis.gradients(x), well.basis.gradients(where)
-    weight = np.sqrt(len(x) / len(where)) / np.sqrt(noise.contract(where, slopes))
-    rest = slopes - along @ well.coefficients
-    steep = np.sqrt(noise.contract(x, old @ well.coefficients))
-    steep = np.maximum(steep, np.median(steep))
-    root = noise.root_at(where)
-    rows = [
-        np.einsum("n,nij,nim->njm", weight, root, along[:, :, free], optimize=True),
-        np.einsum("n,nij,nim->njm", 1 / steep, noise.root_at(x), old[:, :, free], optimize=True),
-    ]
+    noise, free, slopes = measure_at(well.dynamics, well.attractor), well.basis.free, other.gradients(x)
+    steep = np.sqrt(noise.contract(x, slopes))
+    parts = [(x, slopes, 1 / np.maximum(steep, np.median(steep)))]
+    if path is not None:
+        depth = path.values[-1]
+        rising = (path.values > PATH_FROM * depth) & (path.values < PATH_TO * depth)
+        where, momenta = path.points[rising], path.momenta[rising]
+        weight = np.sqrt(len(x) / max(len(where), 1)) / np.sqrt(noise.contract(where, momenta))
+        parts.insert(0, (where, momenta, weight))
+    rows, rest = [], []
+    for points, gradients, weight in parts:
+        root, along = noise.root_at(points), well.basis.gradients(points)
+        rows.append(np.einsum("n,nij,nim->njm", weight, root, along[:, :, free], optimize=True))
+        off = gradients - along @ well.coefficients
+        rest.append(np.einsum("n,nij,ni->nj", weight, root, off).ravel())
     matrix = np.concatenate([one.reshape(-1, one.shape[2]) for one in rows])
-    right = np.zeros(len(matrix))
-    right[: where.size] = np.einsum("n,nij,ni->nj", weight, root, rest).ravel()
     scale = positive(np.linalg.norm(matrix, axis=0))
     coefficients = well.coefficients.copy()
-    coefficients[free] += np.linalg.lstsq(matrix / scale, right, rcond=SINGULAR_RATIO)[0] / scale
+    solution = np.linalg.lstsq(matrix / scale, np.concatenate(rest), rcond=SINGULAR_RATIO)[0]
+    coefficients[free] += solution / scale
     return coefficients

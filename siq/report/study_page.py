@@ -332,21 +332,21 @@ def _formula_rows(
 
 def _well_row(well: Well, places: Sequence[np.ndarray]) -> FormulaRow:
     """U about one attractor in offsets from it: the terms that count, and the whole formula."""
-    basis, coefficients = well.basis, well.coefficients
+    basis, coefficients = well.basis, well.coefficients[: len(well.basis.exponents)]  # units would fill pages
     label = "(" + ", ".join(value_text(value) for value in well.attractor) + ")"
     if len(places):
         away = [np.abs((np.asarray(place) - well.attractor) / basis.scale).max() for place in places]
         label = well_name(int(np.argmin(away)))
     size = np.abs(coefficients)
     if len(well.points):
-        size = size * np.abs(basis.values(well.points)).max(axis=0)
+        size = size * np.abs(basis.values(well.points)).max(axis=0)[: len(size)]
     kept = size > NEGLIGIBLE_TERM * well.level
     if kept.sum() == 0 or len(kept) <= SHORT_FORMULA:
         kept = coefficients != 0
     left_out = int(((coefficients != 0) & ~kept).sum())
     center = np.where(np.abs(basis.center) < 1e-12 * np.maximum(basis.scale, 1e-300), 0.0, basis.center)
     (note,) = paragraphs(
-        "well_formula.j2", level=well.level, label=label, left_out=left_out,
+        "well_formula.j2", level=well.level, label=label, left_out=left_out, units=basis.size - len(size),
         offsets=[(symbol.name, value) for symbol, value in zip(basis.symbols, center, strict=True)],
     )  # fmt: skip
     offsets = [sympy.Symbol(f"Δ{symbol}", real=True) for symbol in basis.symbols]
