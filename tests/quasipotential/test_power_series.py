@@ -124,9 +124,9 @@ def test_a_field_that_is_no_polynomial_is_expanded_by_its_derivatives() -> None:
 @pytest.mark.parametrize(("dimension", "degree"), [(3, 6), (4, 5)])
 def test_the_series_is_found_quickly(dimension: int, degree: int) -> None:
     known = archetype(dimension)
-    began = time.perf_counter()
+    began = time.process_time()
     series_of(known, degree)
-    assert time.perf_counter() - began < 2
+    assert time.process_time() - began < 2
 
 
 def test_a_saddle_has_no_series() -> None:
