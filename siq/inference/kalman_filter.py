@@ -122,8 +122,10 @@ class Grid:
             courses = np.vstack([found.inputs, found.delayed, found.slopes, found.t])
             by_node = np.moveaxis(courses.reshape(-1, len(self.rows), len(nodes)), 2, 0).copy()
             ends = np.cumsum([len(found.inputs), len(delays), len(delays)])
-            parts = [np.split(each, ends) for each in by_node]
-            self._known[delays] = [Signals(*each, t[0]) for *each, t in parts]
+            self._known[delays] = [
+                Signals(inputs, delayed, slopes, times[0])
+                for inputs, delayed, slopes, times in (np.split(each, ends) for each in by_node)
+            ]
         return self._known[delays][node]
 
     def at_samples(self, delays: tuple[tuple[int, float], ...]) -> Signals:
