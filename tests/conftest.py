@@ -15,6 +15,11 @@ from siq.systems.dynamics import Dynamics
 ROOT = Path(__file__).parents[1]
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Files of full-size checks alone: without `-m slow` each process would import them in vain."""
+    return True if collection_path.name == "slow" and config.option.markexpr.startswith("not slow") else None
+
+
 @pytest.hookimpl(tryfirst=True)  # before the scheduler reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Folders that take longest first; the tests of a file in one process, which makes what they share once.

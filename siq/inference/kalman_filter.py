@@ -113,13 +113,20 @@ class Grid:
         if self.whole is not None:
             known, at = self.whole.signals(node, delays), self.chosen
             return Signals(known.inputs[:, at], known.delayed[:, at], known.slopes[:, at], known.t[at])
-        if (node, delays) not in self._known:
-            part, place = divmod(node, 3)
-            fraction = part + (INSIDE, 0.5, 1.0 - INSIDE)[place]
-            t = self.data.t[self.rows] + fraction * self.step
-            recording = self.data.recording[self.rows]
-            self._known[node, delays] = self.data.signals(t, recording, delays=delays, width=self.step)
-        return self._known[node, delays]
+        if delays not in self._known:  # all nodes at once, since every integration passes each
+            nodes = (np.arange(self.substeps)[:, None] + np.array([INSIDE, 0.5, 1.0 - INSIDE])).ravel()
+            t = (self.data.t[self.rows, None] + nodes * self.step[:, None]).ravel()
+            recording = np.repeat(self.data.recording[self.rows], len(nodes))
+            width = np.repeat(self.step, len(nodes))
+            found = self.data.signals(t, recording, delays=delays, width=width)
+            courses = np.vstack([found.inputs, found.delayed, found.slopes, found.t])
+            by_node = np.moveaxis(courses.reshape(-1, len(self.rows), len(nodes)), 2, 0).copy()
+            ends = np.cumsum([len(found.inputs), len(delays), len(delays)])
+            self._known[delays] = [
+                Signals(inputs, delayed, slopes, times[0])
+                for inputs, delayed, slopes, times in (np.split(each, ends) for each in by_node)
+            ]
+        return self._known[delays][node]
 
     def at_samples(self, delays: tuple[tuple[int, float], ...]) -> Signals:
         """Inputs at the samples themselves."""
@@ -130,7 +137,7 @@ class Grid:
         return Grid(self.data, self.substeps, whole=self, chosen=chosen)
 
     @cached_property
-    def _known(self) -> dict[tuple[int, tuple[tuple[int, float], ...]], Signals]:
+    def _known(self) -> dict[tuple[tuple[int, float], ...], list[Signals]]:
         return {}
 
 
@@ -287,7 +294,7 @@ def _carried(
         by_state, by_parameter = drift.slopes(at, grid.signals(node, delays), values)
         if columns is not None:
             by_parameter = np.concatenate([by_parameter, columns.rates(at, values, node)], axis=1)
-        return np.moveaxis(by_state, 2, 0), np.moveaxis(by_parameter, 2, 0)
+        return by_state.transpose(2, 0, 1), by_parameter.transpose(2, 0, 1)
 
     for part in range(grid.substeps):
         with np.errstate(all="ignore"):  # what runs away is seen by `Linearisation.finite`

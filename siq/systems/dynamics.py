@@ -165,9 +165,8 @@ class ParametricFunctions:
         return self._parted(len(self._measured), self._evaluated("output_slopes", x, signals, values))
 
     def _parted(self, count: int, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        by_state, by_parameter = np.split(flat, [count * len(self._states)])
-        n = flat.shape[1]
-        return by_state.reshape(count, -1, n), by_parameter.reshape(count, len(self._free), n)
+        ends, n = count * len(self._states), flat.shape[1]
+        return flat[:ends].reshape(count, -1, n), flat[ends:].reshape(count, len(self._free), n)
 
     def _evaluated(self, what: str, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
         if what not in self._compiled:

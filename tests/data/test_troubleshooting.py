@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ PAGE = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
 GAP = "\0"  # where a message has a name or a number
 
 
+@cache
 def sentences() -> list[str]:
     """All text in the code and in the templates of remarks, what is filled in replaced by `GAP`."""
     found = []
@@ -28,7 +30,6 @@ def sentences() -> list[str]:
     return found
 
 
-SENTENCES = sentences()
 MESSAGES = re.findall(r"^\| `([^`]+)` \|", PAGE, flags=re.MULTILINE)
 
 
@@ -39,4 +40,4 @@ def test_the_page_has_messages() -> None:
 @pytest.mark.parametrize("message", MESSAGES)
 def test_a_message_on_the_page_is_one_that_the_code_says(message: str) -> None:
     pattern = re.compile(".*".join(re.escape(part) for part in message.split("…")), flags=re.DOTALL)
-    assert any(pattern.search(sentence) for sentence in SENTENCES)
+    assert any(pattern.search(sentence) for sentence in sentences())

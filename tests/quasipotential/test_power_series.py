@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
@@ -37,16 +39,17 @@ def around(center: np.ndarray, radius: float, count: int = 200) -> np.ndarray:
 
 
 EXACT = {
-    **{f"linear {d}": linear_system(d) for d in range(2, 7)},
-    **{f"archetype {d}": archetype(d) for d in (2, 3, 4)},
-    "Maier-Stein": maier_stein(1),
-    "polynomial 2": polynomial_system(2, seed=1),
-    "polynomial 3": polynomial_system(3, seed=1),
+    **{f"linear {d}": partial(linear_system, d) for d in range(2, 7)},
+    **{f"archetype {d}": partial(archetype, d) for d in (2, 3, 4)},
+    "Maier-Stein": partial(maier_stein, 1),
+    "polynomial 2": partial(polynomial_system, 2, seed=1),
+    "polynomial 3": partial(polynomial_system, 3, seed=1),
 }
 
 
-@pytest.mark.parametrize("known", EXACT.values(), ids=EXACT)
-def test_a_polynomial_quasipotential_is_found_exactly(known: KnownSystem) -> None:
+@pytest.mark.parametrize("make", EXACT.values(), ids=EXACT)
+def test_a_polynomial_quasipotential_is_found_exactly(make: Callable[[], KnownSystem]) -> None:
+    known = make()
     series = series_of(known, 5)
     points = around(series.basis.center, 1.0)
     at_attractor = potential_values(known, series.basis.center[None])
@@ -121,9 +124,9 @@ def test_a_field_that_is_no_polynomial_is_expanded_by_its_derivatives() -> None:
 @pytest.mark.parametrize(("dimension", "degree"), [(3, 6), (4, 5)])
 def test_the_series_is_found_quickly(dimension: int, degree: int) -> None:
     known = archetype(dimension)
-    began = time.perf_counter()
+    began = time.process_time()
     series_of(known, degree)
-    assert time.perf_counter() - began < 2
+    assert time.process_time() - began < 2
 
 
 def test_a_saddle_has_no_series() -> None:

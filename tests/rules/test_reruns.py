@@ -74,7 +74,7 @@ def test_what_a_plan_says_a_run_does(finished, tmp_path):
     assert [new != old for new, old in zip(after, before, strict=True)] == [False, False, True]
 
 
-def wait_for(pattern, process, *, within, seconds=120):
+def wait_for(pattern, process, *, within, seconds=600):
     deadline = time.monotonic() + seconds
     while not any(within.glob(pattern)):
         assert process.returncode is None and time.monotonic() < deadline, f"{pattern} never appeared"
