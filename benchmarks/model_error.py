@@ -201,7 +201,7 @@ def judged(number: int, seed: int) -> dict[str, Any]:
     members = {*names, *(one for each in found.mechanisms for one in each.indistinguishable_from or ())}
     errors = found.statement.errors
     return {
-        **key, "case": number, "verdict": str(found.verdict), "named": "; ".join(names),
+        **key, "case": number, "verdict": found.statement.outcome, "named": "; ".join(names),
         "families": "; ".join(sorted(said)), "right_family": key["family"] in said,
         "right_member": key["effect"] in members,
         "wrong_family": bool(said - {key["family"], "process noise"}),
@@ -216,7 +216,7 @@ def main() -> None:
         prog="benchmarks.model_error", description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument("cases", nargs="?", type=int, default=60)
-    parser.add_argument("--seed", type=int, default=20261126)
+    parser.add_argument("--seed", type=int, default=20261127)
     parser.add_argument("--table", type=Path, default=Path("model_error.csv"))
     chosen = parser.parse_args()
     logging.disable(logging.INFO)

@@ -82,14 +82,13 @@ def mismatch_figures(given: Given, settings: PipelineSettings) -> Any:
     units, time_unit = _units(before), before.time_unit
     sensors = noise[(noise["stage"] == "final") & (noise["kind"] == "measurement")]
     variances = dict(zip(sensors["name"], sensors["variance"], strict=True))
+    statement = Statement.from_data(verdict)
+    after = statement.final_simulation
     drawn = {
         "before_after": plots.plot_before_after(
-            given.held_out,
-            after=Statement.from_data(verdict).final_simulation,
-            noise=variances,
-            units=units,
-            time_unit=time_unit,
+            given.held_out, after=after, noise=variances, units=units, time_unit=time_unit
         ),
+        "ladder": plots.plot_ladder(statement),
         "held_out": plots.plot_held_out(given.held_out, units=units, time_unit=time_unit),
         "curves": None,
         "described": plots.plot_described(verdict["described"], units=units, time_unit=time_unit),

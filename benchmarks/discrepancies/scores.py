@@ -165,7 +165,8 @@ def judged(method: str, generator: str, case: Comparison, true: TrueCase, answer
     detected = answer.detected
     if method == OURS and answer.verdict is not None and generator == "foreign":
         # That a coarse sensor rounds is right where it does, and no discrepancy.
-        detected = bool(detected and (named["named"] or answer.verdict["verdict"] != "missing physics"))
+        nameless = answer.verdict["verdict"] != "missing physics" or not answer.verdict["mechanisms"]
+        detected = bool(detected and (named["named"] or nameless))
     concealing = key.kind in CONCEALING
     equation, coordinate = place_right(key, answer) if concealing and detected else (False, False)
     return {

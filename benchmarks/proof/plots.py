@@ -22,7 +22,7 @@ from siq.report.plots.style import (
     say,
 )
 
-VERDICTS = ("no mismatch", "parameter shift", "missing physics", "unexplained", FAILED)
+VERDICTS = ("no mismatch", "parameter shift", "missing physics", "modelled", "unexplained", FAILED)
 EDGES = np.array([-np.inf, 10.0, 30.0, 100.0, 300.0, 1000.0, 10_000.0, np.inf])
 MARKERS = {40.0: ("o", BLUE), 30.0: ("s", VERMILLION), 20.0: ("^", GREEN)}
 
@@ -66,8 +66,7 @@ def _verdicts(axes: Axes, scores: pd.DataFrame) -> None:
     axes.imshow(shares, cmap="Blues", vmin=0, vmax=1.6, aspect="auto")
     for (row, column), count in np.ndenumerate(counts):
         axes.text(column, row, str(count), ha="center", va="center", color="black" if count else GREY)
-    for row, kind in enumerate(kinds):
-        column = verdicts.index(EXPECTED[kind])
+    for row, column in ((kinds.index(k), verdicts.index(each)) for k in kinds for each in EXPECTED[k]):
         axes.plot(
             column + np.array([-0.46, 0.46, 0.46, -0.46, -0.46]),
             row + np.array([-0.44, -0.44, 0.44, 0.44, -0.44]),

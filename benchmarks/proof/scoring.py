@@ -24,12 +24,13 @@ from siq.systems.formulas import parse_formula
 NOISE = "process noise"
 NOTHING = ("no mismatch", "parameter shift")
 NOTHING_CONCEALED = ("null", "shift")
-EXPECTED = {
-    "null": "no mismatch",
-    "shift": "parameter shift",
-    "mechanism": "missing physics",
-    "process noise": "missing physics",
-    "withheld": "unexplained",
+NAMELESS = ("modelled", "unexplained")
+EXPECTED: Mapping[str, tuple[str, ...]] = {
+    "null": ("no mismatch",),
+    "shift": ("parameter shift",),
+    "mechanism": ("missing physics",),
+    "process noise": ("missing physics",),
+    "withheld": NAMELESS,
 }
 FAILED = "failed"
 INTERVAL = 1.96
@@ -162,7 +163,9 @@ def score_table(rows: list[dict[str, Any]], columns: Mapping[str, str] = COLUMNS
 
 def stated(key: CaseKey, answer: Answer, names: Sequence[str]) -> dict[str, Any]:
     """What of a key and a verdict stands in every table of scores; `names` are those that count."""
-    said = str((answer.verdict or {}).get("verdict", FAILED))
+    verdict = answer.verdict or {}
+    modelled = verdict.get("outcome") == "modelled"  # missing physics, too, and without a name
+    said = "modelled" if modelled else str(verdict.get("verdict", FAILED))
     nothing = said in NOTHING or (said == "missing physics" and not names)
     found = not nothing and said != FAILED
     return {
@@ -191,7 +194,7 @@ def judgement(key: CaseKey, answer: Answer) -> dict[str, Any]:
         "mechanism": key.mechanism or "",
         "reported_class": ", ".join(reported),
         "class_size": len(reported),
-        "right": row["verdict"] == EXPECTED[key.kind] and (key.kind != NOISE or names == [NOISE]),
+        "right": row["verdict"] in EXPECTED[key.kind] and (key.kind != NOISE or names == [NOISE]),
         "truth_in_class": key.mechanism in reported,
         "deterministic_under_noise": key.kind == NOISE and any(name != NOISE for name in names),
         "equation_right": bool(place) and set(key.equations) <= set(place.get("equations", {})),

@@ -641,11 +641,13 @@ def _next_rung(
     sites = [*(sites[place] for place in kept), *(each.site for each in fitted.values())]
     gains = np.append(gains[kept], [each.gain for each in fitted.values()])
     gains[[site.label in outdone for site in sites]] = -np.inf
-    rival = np.ones(len(sites), dtype=bool)
+    # The mechanism and hardly more is no rival, nor is what cannot be fitted; but what is clearly better says
+    # that it is another thing.
+    more = np.array([site.label in untried for site in sites])
     if leader in steady:
-        # The mechanism and hardly more is no rival; but what is clearly better says that it is another thing.
-        more = _containing(leader.horizons[0], sites, leader.candidate)
-        rival = ~(more & (gains < leader.gain + options.least_log_odds))
+        more |= _containing(leader.horizons[0], sites, leader.candidate)
+    clearly = (gains > leader.gain + options.least_log_odds) & (leader.gain < NEARLY_ALL * gains)
+    rival = ~more | clearly
     weights = np.where(rival, gains + np.array([site.prior for site in sites]), -np.inf)
     flat = np.where(rival, gains + np.array([site.flat for site in sites]), -np.inf)
     family = np.array([site.family == leader.site.family for site in sites])

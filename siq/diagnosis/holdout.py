@@ -16,7 +16,7 @@ import itertools
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import scipy.stats
@@ -73,6 +73,12 @@ class HeldOutErrors:
         With what has a name only, where something without a name describes the rest.
     squares
         Mean squared errors of blocks of samples, by simulation: what changes are told by.
+    rungs
+        With the first mechanism that is named, with the first two, and so on.
+    floor
+        The same with the error of the model that described the rest (`siq.diagnosis.investigation`).
+    spread, unit
+        Of a single output: what errors of 1 amount to; None where there are several, or it has no unit.
     """
 
     before: float | None = None
@@ -82,19 +88,26 @@ class HeldOutErrors:
     values: int = 0
     named: float | None = None
     squares: Mapping[str, tuple[float, ...]] = field(default_factory=dict, repr=False)
+    rungs: tuple[float | None, ...] = ()
+    floor: float | None = None
+    spread: float | None = None
+    unit: str = "1"
 
     @classmethod
-    def of(cls, runs: Mapping[str, np.ndarray | None], *, noise_floor: float | None = None) -> HeldOutErrors:
+    def of(
+        cls, runs: Mapping[str, np.ndarray | None], *, noise_floor: float | None = None, **further: Any
+    ) -> HeldOutErrors:
         """From normalised squared errors of the same values, shape ``(values,)``, by the names above.
 
         They are None where the simulation ran away (`siq.inference.trajectories.squared_errors`).
         """
         known = {name: each for name, each in runs.items() if each is not None}
+        further |= {name: float(np.sqrt(each.mean())) for name, each in known.items()}
         return cls(
-            **{name: float(np.sqrt(each.mean())) for name, each in known.items()},
             noise_floor=noise_floor,
             values=max(map(len, known.values()), default=0),
             squares={name: in_blocks(each) for name, each in known.items()},
+            **further,
         )
 
     @property
@@ -116,16 +129,28 @@ class HeldOutErrors:
         names = (self.better_without if each == "without" else each for each in (first, second))
         return change_between(*map(self.squares.get, names))
 
-    def at_noise(self, run: Run) -> bool:
-        """Whether an error is that of measurement noise alone.
+    @property
+    def share_gained(self) -> float:
+        """What was found gains, as a share of what could be gained down to the floor.
+
+        A simulation that is off by more than the spread is no better than the recordings' mean.
+        """
+        if self.augmented is None or self.floor is None:
+            return 0.0
+        without = self.error("without")
+        before = 1.0 if without is None else min(without, 1.0)
+        return (before - self.augmented) / max(before - self.floor, 1e-300)
+
+    def at_noise(self, run: Run, *, random: bool = False) -> bool:
+        """Whether an error is that of measurement noise alone, or with the error of the model at random.
 
         The root mean square of n independent values has the relative standard error 1/√(2n).
         """
-        error = self.error(run)
-        if error is None or self.noise_floor is None:
+        error, floor = self.error(run), self.floor if random else self.noise_floor
+        if error is None or floor is None:
             return False
         tolerance = CONFIDENCE_95 / float(np.sqrt(2 * self.values)) if self.values else 0.0
-        return error * (1 - tolerance) <= self.noise_floor
+        return error * (1 - tolerance) <= floor
 
 
 def change_between(first: tuple[float, ...] | None, second: tuple[float, ...] | None) -> Change:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.stats
 
-from siq.diagnosis.dictionary import Mechanism, roles_of
-from siq.diagnosis.evidence import NotFitted
+from siq.diagnosis.dictionary import Mechanism, Roles, roles_of, units_of
+from siq.diagnosis.evidence import NotFitted, correlation_time_of, residuals
 from siq.diagnosis.forecasts import Horizon
 from siq.diagnosis.holdout import (
     HeldOutErrors,
@@ -37,6 +37,7 @@ from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, with_expectations
 from siq.inference.recalibration import covariance_with_unknown_process_noise, recalibrate
 from siq.inference.trajectories import scored_rows, squared_errors
+from siq.numerics.randomness import positive
 from siq.remarks import Remark
 from siq.systems.dynamics import Dynamics
 
@@ -282,17 +283,55 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         "augmented": squared_errors(augmented, data),
         "named": errors_of(plain, data) if named and adopted is not None else None,
     }
-    # What a fit leaves may be more than noise; the one that leaves least is nearest to it.
-    spread = np.nanvar(data.outputs[scored_rows(data)], axis=0)
-    least = np.minimum(search.fit.noise.measurement, fit.noise.measurement)
-    floor = float(np.sqrt(np.mean(least / np.where(spread > 0, spread, 1.0))))
+    # What a fit leaves may be more than noise; the one that leaves least is nearest to it. Where there is
+    # process noise, that takes a part of the sensor's noise over.
+    spread = positive(np.nanvar(data.outputs[scored_rows(data)], axis=0))
+    still = [each for each in (search.fit, fit) if not each.has_process_noise] or [search.fit, fit]
+    least = np.min([learned.roughness, *(each.noise.measurement for each in still)], axis=0)
+    floors = [learned.with_known_noise(least)]
+    if described is not None and described.fit.has_process_noise:
+        floors.append(_spread_of_free_runs(described.fit, learned, investigation.context.roles))
+    noise_floor, *_, floor = [float(np.sqrt(np.mean(each / spread))) for each in (*floors, floors[-1])]
+    unit = units_of(fit.model).get(str(fit.model.outputs[0][1]), "1") if len(spread) == 1 else "1"
+    rungs = [errors_of(each.best.fit, data) for each in search.found[:-1]] if named else []
     return HeldOutRuns(
         before=before,
         recalibrated=refitted,
         augmented=augmented,
         recalibration=recalibrated,
         fit=fit,
-        errors=HeldOutErrors.of(squares, noise_floor=floor),
+        errors=HeldOutErrors.of(
+            squares,
+            noise_floor=noise_floor,
+            floor=floor,
+            rungs=tuple(None if each is None else float(np.sqrt(each.mean())) for each in rungs),
+            spread=None if unit == "1" else float(np.sqrt(spread[0])),
+            unit=unit,
+        ),
         independent=not set(learned.labels) & set(data.labels),
         described=described,
+    )
+
+
+def _spread_of_free_runs(fit: Fit, learned: Measurements, roles: Roles) -> np.ndarray:
+    """Variance of what free runs of a fit are off by, as the noises of the fit foresee it, shape ``(m,)``.
+
+    The error of the model acts as a random force whose intensity over long times is that from one sample to
+    the next, times its correlation time τ in samples. What a function of a coordinate finds in it is no
+    random force, and not counted. Where τ is not short beside the times of the system, this is too much.
+    """
+    white, _, left = residuals(fit, learned)
+    correlated = correlation_time_of(left, white.recording, outputs=len(fit.model.outputs))
+    after = Remainder.of(learned, fit, fit, roles).after
+    found = max((each.gain - 2 * each.term.width for each in after.curves), default=0.0)
+    random = 1 - np.clip(found / after.total, 0.0, 1.0)
+    scored = scored_rows(learned)
+    unseen = np.where(scored[:, None], np.nan, fit.linearisation.residual)
+    run = replace(fit.linearisation, residual=unseen).filtered(
+        learned.first, learned.step, fit.noise.scaled(correlated * random),
+        begin_covariance=np.diag(np.ptp(fit.x, axis=0) ** 2), kept=True,
+    )  # fmt: skip
+    measured = fit.linearisation.measured
+    return np.asarray(
+        np.einsum("nmi,nij,nmj->nm", measured, run[7], measured)[scored].mean(axis=0) + fit.noise.measurement
     )

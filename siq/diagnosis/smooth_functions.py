@@ -14,16 +14,23 @@ is linear in the other, so that they are worked out in turn.
 Along the trajectories of a fit everything is linear. The likelihood of a smooth function, averaged over
 everything that it could be, tells its lengths and its size: one that is too rough could have been too much
 else, and one that is too smooth explains too little (MacKay, Neural Computation 4, 415 (1992)).
+
+**Shapes.** A function that is in proportion to its coordinate, saturates or repeats has a name for that: the
+simplest formula that the recordings allow in its place, by least squares in what they tell of its values.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
+import scipy.optimize
+import scipy.stats
 import sympy
 from scipy.spatial.distance import cdist
 
@@ -35,7 +42,9 @@ from siq.errors import NumericalFailure
 from siq.inference.kalman_filter import Whitened
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
+from siq.numerics.randomness import positive
 from siq.systems.dynamics import Dynamics, JointExpectation, symbol
+from siq.systems.formulas import compile_values
 
 LENGTH_SCALES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # of the range; beyond, a function is a parabola
 LARGEST_LINEARISATION = 40_000_000  # numbers held at a time, which is a third of a gigabyte
@@ -405,17 +414,47 @@ class Smoothness:
                 place.coordinates, self.courses, shares, deviation=self.deviation, weight=weight
             )
             return SmoothFunction(place, (bumps,), np.zeros(bumps.width))
-        by_value = self.fine.heights_of(self.fine.heights_of(self.gram).T)
+        gram, overlap = self._by_value
         return _product_of(
             place,
             self.courses,
             tuple(times * share for share in LENGTH_SCALES),
             points=self.fine.centres,
-            gram=(by_value + by_value.T) / (2 * self.noise),
-            overlap=self.fine.heights_of(self.overlap) / self.noise,
+            gram=gram,
+            overlap=overlap,
             deviation=self.deviation,
             weight=weight,
         )
+
+    @property
+    def _by_value(self) -> tuple[np.ndarray, np.ndarray]:
+        """Gram matrix and overlap of values at the finest bumps, in units of noise."""
+        gram = self.fine.heights_of(self.fine.heights_of(self.gram).T)
+        return (gram + gram.T) / (2 * self.noise), self.fine.heights_of(self.overlap) / self.noise
+
+    def fitting_forms(
+        self, forms: Sequence[_Form] | None = None
+    ) -> list[tuple[_Form, dict[sympy.Symbol, tuple[float, float]]]]:
+        """The simplest formulas that the function may be, by default of all that have names (`FORMS`).
+
+        What recordings tell of its values f at the finest bumps are normal equations ``G f = b``. With the
+        covariance ``K = L Lᵀ`` that is expected of the function, λ and U the eigenvalues and eigenvectors of
+        ``Lᵀ G L``, a formula is the function as far as ``(1 + λ)^-½ Uᵀ Lᵀ (b - G f)`` is noise, with ``Σ λ/(1
+        + λ)`` degrees of freedom: a difference counts as far as such a function could be it.
+
+        Returns
+        -------
+        list of (form, dict)
+            Of those that fit with as few coefficients as any, the nearest first, with these and their errors.
+            Empty where none fits.
+        """
+        (gram, overlap), ranges = self._by_value, np.ptp(self.courses, axis=1)
+        root = self.deviation * _triangle_of(self.fine.centres, np.array(self.shares) * ranges)
+        seen, vectors = np.linalg.eigh(root.T @ gram @ root)
+        seen = np.maximum(seen, 0.0)
+        turned, freedom = (vectors / np.sqrt(1 + seen)).T @ root.T, float((seen / (1 + seen)).sum())
+        asked = FORMS if forms is None else forms
+        return _fitting(self.fine.centres[:, 0], turned @ gram, turned @ overlap, freedom, asked)
 
 
 def _without(white: Whitened, fit: Fit, known: FittedCandidate | None) -> tuple[Whitened, int]:
@@ -429,3 +468,93 @@ def _without(white: Whitened, fit: Fit, known: FittedCandidate | None) -> tuple[
     others = np.delete(white.columns, mine, axis=1)
     innovations = white.innovations + white.columns[:, linear] @ values
     return replace(white, innovations=innovations, columns=others), len(names) - len(mine)
+
+
+Z, A, B, D, C = sympy.symbols("z a b d c", real=True)
+THRESHOLD = "threshold"  # whose c is a place, and no length
+FITS = 0.05  # p-value from which on a formula is all that the recordings tell of a function
+
+
+class _Form(NamedTuple):
+    """A formula of a coordinate z, linear in a, b and d. Values of c are tried, as shares of the range of z.
+
+    The unit of a is divided by a power of that of z.
+    """
+
+    name: str
+    formula: sympy.Expr
+    power: int = 0
+    tried: tuple[float, ...] = ()
+    positive: tuple[sympy.Symbol, ...] = ()  #: coefficients that may not be negative
+
+
+def _forms() -> Iterator[_Form]:
+    """The shapes that have names, each alone and above a constant."""
+    inside, scales = tuple(np.linspace(0, 1, 26)[1:-1]), tuple(np.geomspace(1 / 16, 2, 21))
+    turn = 2 * sympy.pi * Z / C  # a whole one at least has to be seen
+    alone = (
+        _Form("constant", A), _Form("proportional", A * Z, 1), _Form("square", A * Z**2, 2),
+        _Form("signed square", A * Z * sympy.Abs(Z), 2), _Form("cube", A * Z**3, 3),
+        _Form("fourth power", A * Z**4, 4), _Form("exponential", A * sympy.exp(Z / C), 0, scales),
+        _Form("exponential", A * sympy.exp(-Z / C), 0, scales),
+        _Form("saturating", A * Z / (C + sympy.Abs(Z)), 0, scales),
+        _Form("saturating", A * sympy.tanh(Z / C), 0, scales),
+        _Form(THRESHOLD, A * sympy.Max(Z - C, 0), 1, inside),
+        _Form(THRESHOLD, A * sympy.Max(C - Z, 0), 1, inside),
+        _Form("periodic", A * sympy.sin(turn) + B * sympy.cos(turn), 0, tuple(1 / np.linspace(1, 8, 57))),
+    )  # fmt: skip
+    yield from alone
+    for each in alone[1:]:
+        name = "straight line" if each.name == "proportional" else each.name
+        yield each._replace(name=name, formula=each.formula + D)
+
+
+FORMS = tuple(_forms())
+
+
+def _fitting(
+    at: np.ndarray, weights: np.ndarray, goal: np.ndarray, freedom: float, forms: Sequence[_Form]
+) -> list[tuple[_Form, dict[sympy.Symbol, tuple[float, float]]]]:
+    """The simplest formulas that a function may be, with coefficients and their errors, the nearest first.
+
+    A formula with values f at places ``(k,)`` may be the function where ``|goal - weights @ f|²`` is as large
+    as chance makes it: χ² of so many degrees of freedom, less its coefficients. Weights are ``(r, k)``.
+    """
+    width = float(np.ptp(at))
+    fitting: list[tuple[int, float, _Form, dict[sympy.Symbol, tuple[float, float]]]] = []
+    for form in forms:
+        linear = [each for each in (A, B, D) if each in form.formula.free_symbols]
+        slopes = compile_values([form.formula.diff(each) for each in linear], [Z, C], common=False)
+
+        def solved(c: float, slopes: Any = slopes) -> tuple[float, np.ndarray, np.ndarray]:
+            """χ² at its best, linear coefficients, and the form, weighted."""
+            with np.errstate(all="ignore"):
+                columns = weights @ np.stack(
+                    [np.broadcast_to(each, at.shape) for each in slopes(at, c)], axis=1
+                )
+            if not np.isfinite(columns).all():
+                return np.inf, np.zeros(columns.shape[1]), columns
+            scale = positive(np.sqrt((columns**2).sum(axis=0)))
+            found = np.linalg.lstsq(columns / scale, goal, rcond=1e-12)[0] / scale
+            return float(((goal - columns @ found) ** 2).sum()), found, columns
+
+        places, c = (at.min() if form.name == THRESHOLD else 0) + width * np.array(form.tried), np.nan
+        if len(places):
+            best = int(np.argmin([solved(one)[0] for one in places]))
+            near = np.sort(places[max(best - 1, 0) : best + 2])
+            c = scipy.optimize.minimize_scalar(
+                lambda one, of=solved: of(one)[0], bounds=(near[0], near[-1]), method="bounded"
+            ).x
+        total, found, columns = solved(c)
+        if len(places):
+            bent = solved(c + 1e-4 * width)[2] - solved(c - 1e-4 * width)[2]
+            columns, found = np.column_stack([columns, bent @ found / (2e-4 * width)]), np.append(found, c)
+        errors = np.sqrt(np.diag(np.linalg.pinv(columns.T @ columns)))
+        values = dict(zip([*linear, C], zip(found, errors, strict=True), strict=False))
+        if any(values[each][0] < 0 for each in form.positive):
+            continue
+        if scipy.stats.chi2.sf(total, max(freedom - len(found), 1.0)) >= FITS:
+            fitting.append((len(found), total, form, values))
+    fewest = min((count for count, *_ in fitting), default=0)
+    ranked = sorted((each for each in fitting if each[0] == fewest), key=lambda each: each[1])
+    return [(form, values) for *_, form, values in ranked]

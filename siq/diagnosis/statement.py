@@ -23,6 +23,8 @@ from siq.inference.budget import UNLIMITED, Account
 from siq.remarks import Remark
 
 METRIC = "normalised rms, held-out recordings"
+SHAPE = ("shape", "formula", "sizes", "like")
+VERSION = 2  # of ``verdict.json``; since 2 missing physics may be modelled, see `Statement.outcome`
 # JSON has no number for what is not finite: it is null there.
 Number = Annotated[float, BeforeValidator(lambda value: float("nan") if value is None else value)]
 
@@ -115,6 +117,11 @@ class StatedTerm:
     coordinates, curve, surface
         Of a part of a model: what it depends on; and its values, where it is a function of one coordinate or
         a surface. A curve in two coordinates is the coefficient of the second.
+    shape, formula, sizes, like
+        Of a curve: the simplest formula within its errors (`siq.diagnosis.smooth_functions.FORMS`), its
+        coefficients in the order of the formula, and the mechanism of the dictionary that is such a function.
+        Where no formula is, the shape is ``rising`` or ``falling`` or nothing. Of a hidden state it is
+        ``late`` or ``ringing``, with the time of it.
     """
 
     name: str
@@ -131,6 +138,10 @@ class StatedTerm:
     coordinates: tuple[str, ...] = ()
     curve: DescribedCurve | None = None
     surface: DescribedSurface | None = None
+    shape: str = ""
+    formula: str = ""
+    sizes: Mapping[str, Estimate] = field(default_factory=dict)
+    like: str = ""
     beside: tuple[str, ...] = ()
     rivals: tuple[Alternative, ...] = ()
 
@@ -229,7 +240,7 @@ class Statement:
         One of four, and what is named.
     description, described
         Of a mismatch without a name; and the model of it that is part of the new card, empty where nothing
-        that was added helped.
+        that was added helped. A model that leaves nothing to be explained is missing physics, too.
     location
         Where the mismatch sits, if there is one.
     recalibration, errors
@@ -274,6 +285,13 @@ class Statement:
         return [each.name for each in self.mechanisms] == [PROCESS_NOISE]
 
     @property
+    def outcome(self) -> str:
+        """The verdict, but that missing physics is ``named``, ``modelled`` or ``process noise``."""
+        if self.verdict != MismatchVerdict.MISSING_PHYSICS:
+            return str(self.verdict)
+        return PROCESS_NOISE if self.random_forces else "named" if self.mechanisms else "modelled"
+
+    @property
     def final_simulation(self) -> str:
         """Which simulation the verdict ends with: ``before``, ``recalibrated`` or ``augmented``."""
         if self.verdict == MismatchVerdict.NO_MISMATCH:
@@ -297,7 +315,7 @@ class Statement:
         )
         by = (data["description"] or {}).get("by", ())
         for each in (*data["mechanisms"], *by):
-            for name in ("kind", "outputs", "coordinates", "curve", "surface"):
+            for name in ("kind", "outputs", "coordinates", "curve", "surface", *SHAPE):
                 del each[name]
         for each in data["described"]:
             for name in ("share_of_excess", "indistinguishable_from", "rivals"):
@@ -309,6 +327,7 @@ class Statement:
         ]
         for each, stated in zip(data["not_fitted"], self.not_fitted, strict=True):
             each["reason"] = stated.reason
+        data |= {"version": VERSION, "outcome": self.outcome}
         data["fit"] = {"metric": METRIC} | data.pop("errors")
         data |= {"partial": self.partial, "not_tried": list(self.not_tried), "budget": data.pop("account")}
         data["remark_codes"] = data.pop("remarks")

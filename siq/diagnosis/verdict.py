@@ -7,17 +7,20 @@ found.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 import sympy
 
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
-from siq.diagnosis.evidence import BUDGET_SPENT, FittedCandidate, log_evidences, residuals
+from siq.diagnosis.evidence import BUDGET_SPENT, NUMERICAL_ERRORS, FittedCandidate, log_evidences, residuals
 from siq.diagnosis.investigation import HeldOutRuns
-from siq.diagnosis.mechanisms import PROCESS_NOISE, SURFACE
+from siq.diagnosis.mechanisms import PROCESS_NOISE, SURFACE, fresh_names, places_of
 from siq.diagnosis.naming import Investigation
-from siq.diagnosis.residual_structure import Structure
+from siq.diagnosis.residual_structure import Remainder, Structure
+from siq.diagnosis.search import FitContext
+from siq.diagnosis.smooth_functions import FORMS, A, B, C, Smoothness, Z
 from siq.diagnosis.statement import (
     Alternative,
     DescribedCurve,
@@ -32,6 +35,7 @@ from siq.diagnosis.statement import (
     UpperBound,
 )
 from siq.diagnosis.study import MismatchVerdict
+from siq.diagnosis.terms import Place
 from siq.diagnosis.unnamed_models import AugmentedModel
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
@@ -56,18 +60,33 @@ def statement_of_failure(reason: str) -> Statement:
 
 def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
     """What follows from an investigation, and from the runs of recordings held out."""
-    search, verdict = investigation.search, investigation.verdict
-    described = shown.described
-    final = investigation.final if verdict.names else shown.recalibration
+    search, verdict, described = investigation.search, investigation.verdict, shown.described
+    named = verdict.names
+    final = investigation.final if named else shown.recalibration
     kept = final.model is investigation.context.model  # the card's own values
     if described is not None:
         final, kept = shown.fit, False
-    found = _found_mechanisms(investigation, final if verdict.names else search.fit)
-    names = tuple(each.best.candidate.label for each in search.found) if verdict.names else ()
+    found = _found_mechanisms(investigation, final if named else search.fit)
+    names = tuple(each.best.candidate.label for each in search.found) if named else ()
     parts = () if described is None else described.parts
     labels = [each.candidate.label for each in parts]
     errors = _standard_errors(final)
-    remarks = list(investigation.remarks)
+    remarks, errors_seen = list(investigation.remarks), shown.errors
+    left, context = investigation.remainder.after, investigation.context
+    if verdict is MismatchVerdict.UNEXPLAINED and described is not None:
+        # A model that leaves no more than sensor and randomness do is an explanation, though it has no name.
+        rest = Remainder.of(context.data, described.fit, described.fit, context.roles)
+        gained = errors_seen.change("without", "augmented") == "better"
+        nearly = gained and errors_seen.share_gained >= NEARLY_ALL
+        if nearly and (errors_seen.at_noise("augmented", random=True) or not rest.doubtful):
+            verdict, left = MismatchVerdict.MISSING_PHYSICS, rest.after
+    elif verdict is MismatchVerdict.PARAMETER_SHIFT:
+        # Other parameters have to mend it, by more than chance or down to the noise.
+        seen, change = not errors_seen.at_noise("before"), errors_seen.change("before", "recalibrated")
+        to_noise = seen and change == "same" and errors_seen.at_noise("recalibrated")
+        if not (change == "better" or to_noise):
+            verdict = MismatchVerdict.UNEXPLAINED if seen else MismatchVerdict.NO_MISMATCH
+            remarks.append(Remark("diagnosis.shift_mends_nothing", {"seen": seen}))
     if investigation.account.partial:
         untried = sum(each.remark == BUDGET_SPENT for each in search.untried)
         stopped_by = investigation.account.stopped_by
@@ -78,21 +97,22 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
         remarks.append(Remark("diagnosis.one_recording"))
     return Statement(
         verdict=verdict,
-        mechanisms=found if verdict.names else (),
+        mechanisms=found if investigation.verdict.names else (),
         description=Description(
             share_described=investigation.remainder.share if found else 0.0,
             by=found,
-            p_residuals_random=investigation.remainder.after.p_value,
-            random_forces_admitted=search.fit.has_process_noise,
+            p_residuals_random=left.p_value,
+            random_forces_admitted=(search.fit if described is None else described.fit).has_process_noise,
             too_faint=investigation.too_faint,
             misleading=investigation.withdrawn,
         )
-        if verdict is MismatchVerdict.UNEXPLAINED
+        if verdict.mismatch and not investigation.verdict.names
         else None,
         described=tuple(
-            _stated_function(part, final, (*names, *labels[:place])) for place, part in enumerate(parts)
+            _stated_function(part, final, (*names, *labels[:place]), context)
+            for place, part in enumerate(parts)
         ),
-        location=_locate(investigation, described) if verdict.mismatch else None,
+        location=_locate(investigation, described) if investigation.verdict.mismatch else None,
         recalibration={
             entry.name: Recalibrated(
                 entry.value, float(final.model.values[place]), errors[entry.name], entry.unit
@@ -100,7 +120,7 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
             for place, entry in enumerate(investigation.context.model.parameters)
             if entry.name in errors and not kept
         },
-        errors=shown.errors,
+        errors=errors_seen,
         excluded={} if verdict.mismatch else _excluded(investigation),
         explanations=_explanations(investigation, names),
         remarks=tuple(remarks),
@@ -225,13 +245,17 @@ def _stated(trial: FittedCandidate, fit: Fit, *, log_odds: float | None = None, 
     )
 
 
-def _stated_function(part: FittedCandidate, fit: Fit, beside: tuple[str, ...]) -> StatedTerm:
+def _stated_function(
+    part: FittedCandidate, fit: Fit, beside: tuple[str, ...], context: FitContext
+) -> StatedTerm:
     """A part of the model of what has no name, with its curve or surface and their standard errors."""
     candidate = part.candidate
     place, smooth = candidate.place, candidate.smooth
     known = {entry.name: entry.value for entry in fit.model.parameters}
+    errors = _standard_errors(fit)
     amplitudes = np.array([known[name] for name in candidate.amplitudes])
     curve = surface = None
+    shape: dict[str, Any] = {}
     at: list[np.ndarray] = []
     if smooth is not None:
         at = [np.linspace(lower, upper, GRID_POINTS) for lower, upper in smooth.limits.T]
@@ -247,10 +271,10 @@ def _stated_function(part: FittedCandidate, fit: Fit, beside: tuple[str, ...]) -
         weights = np.stack([np.broadcast_to(each, at[0].shape) for each in columns], axis=1).astype(float)
         values = weights @ amplitudes
     if place is not None and at:
-        rows = [list(_standard_errors(fit)).index(name) for name in candidate.amplitudes]
+        rows = [list(errors).index(name) for name in candidate.amplitudes]
         variances = np.einsum("kc,cd,kd->k", weights, fit.covariance[np.ix_(rows, rows)], weights)
-        shape, deviations = [len(each) for each in at], np.sqrt(np.maximum(variances, 0.0))
-        shaped = [each.reshape(shape).tolist() for each in (values, deviations)]
+        sides, deviations = [len(each) for each in at], np.sqrt(np.maximum(variances, 0.0))
+        shaped = [each.reshape(sides).tolist() for each in (values, deviations)]
         if candidate.kind == SURFACE:
             grid = (tuple(at[0].tolist()), tuple(at[1].tolist()))
             surface = DescribedSurface(
@@ -258,6 +282,11 @@ def _stated_function(part: FittedCandidate, fit: Fit, beside: tuple[str, ...]) -
             )
         else:
             curve = DescribedCurve(place.words[0], tuple(at[0].tolist()), *map(tuple, shaped))
+            shape = _shape_of(part, curve, place, fit, context)
+    elif candidate.begins:  # a hidden state
+        name = candidate.shapes[0]
+        time = Estimate(known[name], errors.get(name), fit.model.time_unit)
+        shape = {"shape": "late" if len(candidate.shapes) == 1 else "ringing", "sizes": {name: time}}
     measured = [name for name, _ in candidate.changes if name in fit.model.output_names]
     return _stated(
         part,
@@ -268,7 +297,64 @@ def _stated_function(part: FittedCandidate, fit: Fit, beside: tuple[str, ...]) -
         curve=curve,
         surface=surface,
         beside=beside,
+        **shape,
     )
+
+
+def _shape_of(
+    part: FittedCandidate, curve: DescribedCurve, place: Place, fit: Fit, context: FitContext
+) -> dict[str, Any]:
+    """The simplest formula that a curve may be, and the mechanism that is such a function.
+
+    Where there is no such formula, whether it rises or falls all the way, as far as its errors tell.
+    """
+    fits = []
+    with suppress(*NUMERICAL_ERRORS):
+        if (asked := Smoothness.of(fit, context.data, place, known=part)) is not None:
+            fits = asked.fitting_forms()
+    if asked is None or not fits:
+        value, error = np.array(curve.value), np.array(curve.standard_error)
+        apart = np.subtract.outer(value, value)
+        seen = np.tril(np.sign(apart) * (np.abs(apart) > VISIBLE_ERRORS * np.hypot.outer(error, error)))
+        sides = {(1.0, 0.0): "rising", (0.0, -1.0): "falling"}
+        return {"shape": sides.get((float(seen.max()), float(seen.min())), "")}
+    form, found = fits[0]
+    extra, power = len(place.words) - 1, form.power
+    names = dict(zip(found, fresh_names("s", len(found), fit.model.names), strict=True))
+    units = {each: place.unit(fit.model, power if each == A else 0, extra) for each in found}
+    units[C] = units_of(fit.model).get(place.words[0], "1")
+    written = {Z: symbol(place.words[0])} | {each: symbol(name) for each, name in names.items()}
+    known = asked.fitting_forms(_known_forms(place, fit, context))
+    return {
+        "shape": form.name,
+        "formula": str(form.formula.xreplace(written)),
+        "sizes": {
+            name: Estimate(float(found[each][0]), float(found[each][1]), units[each])
+            for each, name in names.items()
+        },
+        "like": known[0][0].name if known else "",
+    }
+
+
+def _known_forms(place: Place, fit: Fit, context: FitContext) -> list[Any]:
+    """Mechanisms that are functions of a place's coordinate in its equation, as forms."""
+    found, model = [], context.model
+    (name, factor), *further = (*place.equations, *place.outputs)
+    values = {symbol(each.name): sympy.Float(each.value, 17) for each in fit.model.parameters}
+    for each in context.candidates if name in model.states and not further else ():
+        own = [*map(symbol, (*each.amplitudes, *each.shapes))]
+        if each.equations != (name,) or each.begins or not each.amplitudes or len(own) > 2:
+            continue
+        row = model.states.index(name)
+        change = sympy.simplify((each.model.equations[row] - model.equations[row]) / factor)
+        letters = dict(zip(own, (A, B) if len(each.amplitudes) == 2 else (A, C), strict=False))
+        term = _in_coordinate(change, place.coordinates[0]).xreplace(values | letters | {COORDINATE: Z})
+        if term.free_symbols <= {Z, *letters.values()}:
+            tried = [c for one in each.searches for c in places_of(one, context.data, model, fit.x)]
+            shares = tuple(c / float(np.ptp(place.knots)) for c in tried)
+            signs = tuple(letters[symbol(one)] for one in each.positive & set(each.amplitudes))
+            found.append(FORMS[0]._replace(name=each.name, formula=term, tried=shares, positive=signs))
+    return found
 
 
 def _in_coordinate(term: sympy.Expr, coordinate: sympy.Expr) -> sympy.Expr:

@@ -56,11 +56,6 @@ class Findings:
     folder: str = "tables"  #: where the whole tables are
 
     @property
-    def kind(self) -> str:
-        """The verdict in two words, process noise being a kind of their own."""
-        return "process noise" if self.statement.random_forces else str(self.statement.verdict)
-
-    @property
     def named(self) -> list[StatedTerm]:
         """What was named, or what describes a mismatch that has no name."""
         description = self.statement.description
@@ -89,6 +84,7 @@ def mismatch_answer(statement: Statement, *, title: str) -> dict[str, Any]:
         "title": title,
         "sentence": statement.sentence,
         "verdict": str(statement.verdict),
+        "outcome": statement.outcome,
         "compared": errors.noise_floor is not None,
         "held_out_before": errors.before,
         "held_out_after": getattr(errors, statement.final_simulation),
@@ -140,7 +136,7 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str]) ->
         largest=largest,
         units=of_outputs,
         mechanism_sentences=[
-            (each.name, entry.sentence) for each, entry in named if findings.kind != "process noise"
+            (each.name, entry.sentence) for each, entry in named if not statement.random_forces
         ],
         errors=_errors_table(findings, of_outputs),
         formulas=_formulas(findings),
@@ -148,9 +144,13 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str]) ->
         references=list(
             dict.fromkeys((each.name, entry.reference) for each, entry in known if entry.reference)
         ),
-        described_formulas=[row for each in statement.described for row in _rows_of(each, findings)],
+        described_formulas=[
+            row
+            for each in statement.described
+            for row in (*_rows_of(each, findings), *_simplest_of(each, findings))
+        ],
         described_tables=[
-            (each, _curve(each) if each.curve is not None else _parameters_of([each]))
+            (each, _parameters_of([each]) if each.curve is None else _curve(each))
             for each in statement.described
         ],
         look_alikes=[(name, names) for name, names in alike if names],
@@ -213,7 +213,7 @@ def _errors_table(findings: Findings, units: Mapping[str, str]) -> pd.DataFrame 
     if floor is None:
         return None
     shown = ["before", "recalibrated", "augmented"]
-    if not (findings.named or statement.described) or findings.kind == "process noise":
+    if not (findings.named or statement.described) or statement.random_forces:
         shown.remove("augmented")
     if errors.before == errors.recalibrated:  # no parameter was free, or none changed
         shown.remove("recalibrated")
@@ -234,7 +234,7 @@ def _errors_table(findings: Findings, units: Mapping[str, str]) -> pd.DataFrame 
             text = value_text(float(np.sqrt(np.mean(off**2))), digits=3) if known else "ran away"
             own[with_unit(str(output), units.get(str(output), "1"))] = text
         said = name
-        if name == "augmented" and findings.kind == "unexplained":
+        if name == "augmented" and statement.outcome in ("unexplained", "modelled"):
             said = "described" if statement.described else "closest"
         if name == "augmented" and errors.named is not None:
             rows.append(row(words["named"], errors.named))
@@ -247,7 +247,7 @@ def _errors_table(findings: Findings, units: Mapping[str, str]) -> pd.DataFrame 
 def _formulas(findings: Findings) -> list[FormulaRow]:
     """Formulas of what was named or comes closest; with what is named, the whole new equations."""
     rows = [row for each in findings.named for row in _rows_of(each, findings)]
-    if rows and findings.kind == "missing physics":
+    if rows and findings.statement.outcome == "named":
         rows += [
             FormulaRow(_rate_of(name), _typeset(formula))
             for name, formula in zip(findings.after.states, findings.after.equations, strict=True)
@@ -269,6 +269,15 @@ def _rows_of(part: StatedTerm, findings: Findings) -> list[FormulaRow]:
             )
         )
     return rows
+
+
+def _simplest_of(part: StatedTerm, findings: Findings) -> list[FormulaRow]:
+    """The simplest formula that a function may be."""
+    if not part.formula:
+        return []
+    words = texts("tables")["formula_of"]["coefficient" if part.coordinates[1:] else "simplest"]
+    typeset = _typeset_text(part.formula, findings.after, part.sizes)
+    return [FormulaRow(part.shape, typeset, str(words).format(*part.coordinates))]
 
 
 def _meaning(name: str, entry: Mechanism | None, findings: Findings) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
+from siq.diagnosis.holdout import HeldOutErrors
 from siq.diagnosis.mechanisms import GENERIC, PROCESS_NOISE
 from siq.diagnosis.residual_structure import DOUBTFUL
 from siq.diagnosis.statement import Recalibrated, Statement
@@ -91,10 +92,12 @@ def _card_value(value: float) -> str:
     return number_text(value) if "e" in text else text.replace("-", "−")
 
 
-def _error_text(value: float | None) -> str:
-    """An error as a share of the recordings' spread."""
+def _error_text(value: float | None, errors: HeldOutErrors) -> str:
+    """An error in the unit of what is measured, or as a share of the recordings' spread."""
     if value is None:
         return "unknown"
+    if errors.spread is not None:
+        return value_text(value * errors.spread, unit=errors.unit, digits=3)
     share = 100 * value
     if share >= 1e3 or 0 < share < 1e-3:
         text = f"{share:.0f}" if 1e3 <= share < LARGEST_PLAIN_NUMBER else number_text(share, decimals=2)

@@ -162,7 +162,11 @@ def test_a_mechanism_that_is_not_certain_enough_is_described_but_not_named(tmp_p
     table = recordings_of(lambda x, v, t: -0.03 * x**3)
     study = {"held_out": ["r2", "r5"], "search": {"wrong_names": 1e-200}}
     diagnosis = solved(tmp_path, table, study=study)
-    assert said(diagnosis)["verdict"] == "unexplained" and names(diagnosis) == []
+    assert said(diagnosis)["outcome"] == "modelled" and names(diagnosis) == []
+    assert (
+        "in the equation of v, like its cube, as cubic stiffness would have. With it"
+        in said(diagnosis)["sentence"]
+    )
     assert said(diagnosis)["description"]["by"][0]["name"] == "cubic stiffness"
     assert "a name takes odds of" in said(diagnosis)["remarks"][-1]
     # It is in the new card all the same, since the card foresees more with it.
@@ -267,15 +271,20 @@ def test_a_function_of_a_sensor_is_located_in_what_is_measured(tmp_path: Path) -
     assert said(diagnosis)["described"][0]["outputs"] == ["x"]
 
 
-def test_what_the_dictionary_lacks_stays_unexplained(tmp_path: Path) -> None:
+def test_what_the_dictionary_lacks_is_modelled_without_a_name(tmp_path: Path) -> None:
     diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: 1.5 * np.exp(-(((x - 0.5) / 0.15) ** 2))))
-    assert said(diagnosis)["verdict"] == "unexplained" and said(diagnosis)["mechanisms"] == []
+    assert said(diagnosis)["verdict"] == "missing physics" and said(diagnosis)["mechanisms"] == []
+    assert said(diagnosis)["outcome"] == "modelled"
     assert said(diagnosis)["location"]["coordinate"] == "x"
     # And gets a model: its function of x, which foresees recordings that had no part in it.
     part = said(diagnosis)["described"][0]
     assert part["kind"] == "curve" and part["equations"] == ["v"] and part["coordinates"] == ["x"]
     assert said(diagnosis)["fit"]["augmented"] < 0.5 * said(diagnosis)["fit"]["recalibrated"]
-    assert " it. With it, the error on held-out recordings falls from" in said(diagnosis)["sentence"]
+    assert part["shape"] == part["formula"] == ""  # a bump is none of the simple formulas
+    assert said(diagnosis)["sentence"].startswith(
+        "An effect of x is missing in the equation of v. With it, the error on recordings that it did not see"
+        " falls from"
+    )
     path = tmp_path / "augmented.yaml"
     path.write_text(diagnosis.to_card(), encoding="utf-8")
     again = load_system(path)

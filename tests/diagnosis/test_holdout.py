@@ -3,9 +3,23 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from siq.diagnosis.holdout import HeldOutErrors, change_between, in_blocks
+from siq.diagnosis.dictionary import roles_of
+from siq.diagnosis.holdout import (
+    HeldOutErrors,
+    change_between,
+    in_blocks,
+    simulated,
+)
+from siq.diagnosis.investigation import _spread_of_free_runs
+from siq.diagnosis.study import _measurements_of
+from siq.inference.measurements import with_expectations
+from siq.inference.recalibration import recalibrate
+from siq.inference.trajectories import scored_rows
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics, Parameter, symbol
 
 
 def squares_of(noise: np.ndarray, *errors: float) -> list[tuple[float, ...]]:
@@ -85,3 +99,46 @@ def test_without_what_was_found_is_the_better_of_two() -> None:
     assert away.better_without == "recalibrated" and away.change("before", "recalibrated") == "better"
     nothing = HeldOutErrors.of({"before": None, "recalibrated": None, "augmented": None})
     assert nothing.change("without", "augmented") == "unknown" and not nothing.at_noise("before")
+
+
+@pytest.mark.parametrize(
+    ("before", "augmented", "floor", "share"),
+    [
+        (0.5, 0.1, 0.1, 1.0), (0.5, 0.14, 0.1, 0.9), (0.5, 0.05, 0.1, 1.125), (30.0, 0.19, 0.1, 0.9),
+        (None, 0.1, 0.1, 1.0), (0.5, None, 0.1, 0.0), (0.5, 0.1, None, 0.0), (0.5, 0.5, 0.1, 0.0),
+    ],
+)  # fmt: skip
+def test_what_is_gained_is_a_share_of_what_could_be(
+    before: float | None, augmented: float | None, floor: float | None, share: float
+) -> None:
+    """A simulation that is off by thirty times the spread is no better than their mean."""
+    errors = HeldOutErrors(before=before, recalibrated=before, augmented=augmented, floor=floor)
+    assert errors.share_gained == pytest.approx(share)
+
+
+@pytest.mark.parametrize("tau", [0.0, 1.0])
+def test_noises_of_a_fit_foresee_how_far_free_runs_are_off(tau: float) -> None:
+    """Of a decay that a force drives at random, white or with a correlation time."""
+    draw, step, rate = np.random.default_rng(5), 0.1, 0.5
+    t, frames = np.arange(0, 20, step), []
+    for place in range(16):
+        force = draw.normal(size=len(t)) / np.sqrt(step)
+        for k in range(1, len(t)):
+            if tau:
+                force[k] = force[k - 1] * np.exp(-step / tau) + force[k] * (1 - np.exp(-step / tau))
+        x = np.full(len(t), 2.0)
+        for k in range(1, len(t)):
+            x[k] = x[k - 1] * np.exp(-rate * step) + 0.3 * force[k] * step
+        frames.append(
+            pd.DataFrame({"recording": f"r{place}", "t": t, "x": x + 0.01 * draw.normal(size=len(t))})
+        )
+    k, x = symbol("k"), symbol("x")
+    model = Dynamics(("x",), (-k * x,), Diffusion.identity(1), parameters=(Parameter("k", rate, "1"),))
+    data = _measurements_of(pd.concat(frames, ignore_index=True), model)
+    fit, _ = recalibrate(with_expectations(model), data)
+    assert fit.has_process_noise
+    off = (simulated(fit, data, noise=fit.noise, substeps=fit.substeps) - data.outputs)[scored_rows(data)]
+    foreseen = _spread_of_free_runs(fit, data, roles_of(fit.model))
+    # A correlation over half of the time in which the force is forgotten makes it too much.
+    low, high = (0.7, 1.4) if tau == 0 else (1.0, 2.5)
+    assert low < foreseen[0] / np.mean(off**2) < high

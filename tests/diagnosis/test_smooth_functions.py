@@ -215,7 +215,7 @@ def test_what_depends_on_two_coordinates_gets_a_surface(tmp_path: Path) -> None:
     noisy = {name: each + 0.01 * rng.normal(size=each.shape) for name, each in (("x", x), ("y", y))}
     case = ForeignCase(CARD, table_of(t, noisy), {"generic": False}).read(tmp_path)
     verdict = solve_case(case).statement.as_data()
-    assert verdict["verdict"] == "unexplained"
+    assert verdict["outcome"] == "modelled"
     (part,) = verdict["described"]
     assert part["kind"] == "surface" and part["coordinates"] == ["x", "y"]
     assert verdict["location"]["coordinate"] == "x, y" and list(verdict["location"]["equations"]) == ["x"]

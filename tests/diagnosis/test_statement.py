@@ -14,6 +14,7 @@ from siq.diagnosis.holdout import HeldOutErrors
 from siq.diagnosis.mechanisms import PROCESS_NOISE
 from siq.diagnosis.statement import (
     Alternative,
+    DescribedCurve,
     Description,
     Estimate,
     Evidence,
@@ -212,10 +213,10 @@ def test_all_of_it_is_never_said_of_what_is_not_explained():
         assert ("looks like noise (p =" in text) == (description.p_residuals_random >= 2e-3)
 
 
-def curve_in_v() -> StatedTerm:
+def curve_in_v(**shape: Any) -> StatedTerm:
     return StatedTerm(
         name="a function of x", label="a function of x in v", kind="curve", terms={}, parameters={},
-        evidence=Evidence(90.0, -80.0, 0.0, 0.0), equations=("v",),
+        evidence=Evidence(90.0, -80.0, 0.0, 0.0), equations=("v",), coordinates=("x",), **shape,
     )  # fmt: skip
 
 
@@ -230,10 +231,55 @@ def test_a_model_without_a_name_is_said_with_its_gain_or_that_nothing_was_gained
         described=(part,) if described else (),
     ).sentence  # fmt: skip
     if described:
-        assert "A function of x in the equation of v describes it. With it, the error" in text
+        assert "An effect of x in the equation of v describes a part of it. With it, the error" in text
         assert percentages(text.split("falls from")[1])[:3] == [50.0, 30.0, 5.0]
     else:
         assert "the simulation stays as it was" in text and "falls from" not in text
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        ("proportional", "in proportion"), ("straight line", "along a straight line"),
+        ("square", "like its square"), ("cube", "like its cube"),
+        ("saturating", "saturating over 2.00 ± 0.10 m"),
+        ("threshold", "with a threshold at 2.00 ± 0.10 m"), ("periodic", "periodic over 2.00 ± 0.10 m"),
+        ("exponential", "exponential over 2.00 ± 0.10 m"), ("rising", "rising"), ("falling", "falling"),
+        ("late", "which is late by 2.00 ± 0.10 m"), ("constant", "the same everywhere"),
+    ],
+)  # fmt: skip
+def test_a_shape_is_said_in_words(shape, words):
+    part = curve_in_v(shape=shape, sizes={"s_1": Estimate(2.0, 0.1, "m")})
+    errors = errors_with({"before": 0.5, "recalibrated": 0.3, "augmented": 0.05}, 0.04)
+    errors = replace(errors, spread=10.0, unit="m")
+    statement = Statement(MismatchVerdict.MISSING_PHYSICS, described=(part,), errors=errors)
+    text = statement.sentence.replace("\u00a0", " ")
+    assert statement.outcome == "modelled"
+    assert text.startswith(f"An effect of x is missing in the equation of v, {words}. With it, the error on")
+    assert (
+        "falls from 5.00 m (3.00 m with its own parameters refitted) to 0.500 m (noise alone: 0.400 m)"
+        in text
+    )
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        ("", "in proportion to u"), ("constant", "in proportion to u alone"),
+        ("saturating", "in proportion to u and, along x, saturating over 2.00 ± 0.10 m"),
+    ],
+)  # fmt: skip
+def test_a_coefficient_is_said_in_words(shape, words):
+    part = curve_in_v(
+        shape=shape, formula="s_1*x", sizes={"s_1": Estimate(2.0, 0.1, "m")},
+        curve=DescribedCurve("x", (0.0, 1.0), (0.0, 1.0), (0.1, 0.1)),
+    )  # fmt: skip
+    part = replace(part, coordinates=("x", "u"))
+    errors = errors_with({"before": 0.5, "recalibrated": 0.3, "augmented": 0.05}, 0.04)
+    statement = Statement(MismatchVerdict.MISSING_PHYSICS, described=(part,), errors=errors)
+    text = statement.sentence.replace("\u00a0", " ")
+    assert text.startswith(f"An effect of x and u is missing in the equation of v, {words}. With it")
+    assert "As a formula: s_1*x times u, s_1 = 2.00 ± 0.10 m." in text
 
 
 def test_what_describes_a_rest_is_told_from_what_has_a_name():
@@ -242,7 +288,7 @@ def test_what_describes_a_rest_is_told_from_what_has_a_name():
     runs = {"before": 0.5, "recalibrated": 0.3, "augmented": 0.05, "named": 0.2}
     errors = errors_with(runs, 0.04)
     text = replace(statement, errors=errors, described=(part,)).sentence
-    named, rest = text.split("What is left has no name; a function of x in the equation of v describes it. ")
+    named, rest = text.split("What is left has no name; an effect of x in the equation of v describes it. ")
     assert percentages(named.split("falls from")[1])[:3] == [50.0, 30.0, 20.0]
     assert percentages(rest.split("falls from")[1])[:2] == [20.0, 5.0] and "refitted" not in rest
 

@@ -26,6 +26,7 @@ from siq.report.plots.diagnosis import (
     plot_described,
     plot_escapes,
     plot_held_out,
+    plot_ladder,
     plot_missing,
 )
 from siq.systems.cards import load_system
@@ -152,7 +153,7 @@ def test_page_says_what_where_how_sure_and_what_else(models):
     page = page_of(models)
     for part in (
         "missing physics",
-        "lacks cubic stiffness",
+        "Cubic stiffness (or quintic stiffness, which explains the recordings as well) is missing in the",
         "0.250 ± 0.010\u00a01/(mm²·s²)",
         "Duffing",
         "cannot tell cubic stiffness from quintic stiffness",
@@ -367,6 +368,54 @@ def test_the_unit_of_a_rate(unit, time, rate):
     assert _rate_unit(unit, time) == rate
 
 
+@pytest.mark.parametrize("spread", [None, 2.0])
+def test_the_ladder_has_a_step_for_each_name_and_for_what_has_none(spread):
+    errors = FIT | {"named": 0.04, "rungs": [0.2], "floor": 0.015, "spread": spread, "unit": "mm"}
+    said = {"mechanisms": VERDICT["mechanisms"] * 2, "described": [DESCRIBED], "errors": errors}
+    statement = TypeAdapter(Statement).validate_python(VERDICT | said)
+    (axes,) = plot_ladder(statement).axes
+    scale, unit = (100, "%") if spread is None else (2, "mm")
+    steps = [line for line in axes.lines if line.get_marker() not in ("None", None)]
+    assert [line.get_xdata()[0] for line in steps] == pytest.approx(
+        [scale * error for error in (0.5, 0.1, 0.2, 0.04, 0.02)]
+    )
+    words = [text.get_text() for text in axes.texts]
+    assert words[2].startswith("with cubic stiffness in v: ") and words[3].startswith("and cubic stiffness")
+    assert words[4].startswith("and a function of x in v: ") and all(text.endswith(unit) for text in words)
+    assert axes.get_xscale() == "log" and unit in axes.get_xlabel()
+    assert plot_ladder(replace(statement, errors=replace(statement.errors, noise_floor=None))) is None
+
+
+def test_a_simulation_that_runs_away_has_no_place_on_the_ladder():
+    statement = TypeAdapter(Statement).validate_python(VERDICT)
+    (axes,) = plot_ladder(statement).axes
+    assert axes.texts[0].get_text() == "as given: runs away"
+
+
+def test_a_model_at_the_floor_is_missing_physics_with_its_formula(models):
+    description = {
+        "share_described": 0.0, "by": [], "p_residuals_random": 0.5, "random_forces_admitted": False,
+    }  # fmt: skip
+    shape = {
+        "shape": "exponential", "formula": "s_1*exp(x/s_2)", "like": "cubic stiffness",
+        "sizes": {
+            "s_1": {"estimate": 2.0, "standard_error": 0.1, "unit": "mm/s**2"},
+            "s_2": {"estimate": 0.5, "standard_error": 0.01, "unit": "mm"},
+        },
+    }  # fmt: skip
+    said = {"mechanisms": [], "description": description, "described": [DESCRIBED | shape], "errors": FIT}
+    shown = findings(models, verdict=said)
+    sentence = shown.statement.sentence.replace("\u00a0", " ")
+    assert sentence.startswith(
+        "An effect of x is missing in the equation of v, exponential over 0.500 ± 0.010 mm, as cubic"
+        " stiffness would have. With it, the error"
+    )
+    assert "As a formula: s_1*exp(x/s_2), s_1 = 2.00 ± 0.10 mm/s²" in sentence
+    page = mismatch_page(shown, title="t", commands=())
+    assert "missing physics, modelled" in page and "simplest formula that the recordings allow" in page
+    assert page.index("A model of what is missing") < page.index("How sure it is")
+
+
 def test_candidates_are_told_apart_by_what_they_are():
     figure = plot_candidates(candidates())
     colours = {patch.get_facecolor() for patch in figure.axes[0].patches}
@@ -455,18 +504,19 @@ FIT = {"before": 0.5, "recalibrated": 0.1, "augmented": 0.02, "noise_floor": 0.0
 
 
 @pytest.mark.parametrize(
-    ("verdict", "named", "described", "after"),
+    ("verdict", "named", "described", "outcome", "after"),
     [
-        ("missing physics", ["cubic stiffness"], [], 0.02),
-        ("missing physics", ["process noise"], [], 0.1),
-        ("parameter shift", [], [], 0.1),
-        ("unexplained", [], [], 0.1),
-        ("unexplained", [], [DESCRIBED], 0.02),
-        ("no mismatch", [], [], 0.5),
+        ("missing physics", ["cubic stiffness"], [], "named", 0.02),
+        ("missing physics", ["process noise"], [], "process noise", 0.1),
+        ("missing physics", [], [DESCRIBED], "modelled", 0.02),
+        ("parameter shift", [], [], "parameter shift", 0.1),
+        ("unexplained", [], [], "unexplained", 0.1),
+        ("unexplained", [], [DESCRIBED], "unexplained", 0.02),
+        ("no mismatch", [], [], "no mismatch", 0.5),
     ],
 )
 def test_the_error_after_is_that_of_the_simulation_that_the_verdict_ends_with(
-    verdict, named, described, after
+    verdict, named, described, outcome, after
 ):
     statement = TypeAdapter(Statement).validate_python(
         VERDICT | {
@@ -477,7 +527,7 @@ def test_the_error_after_is_that_of_the_simulation_that_the_verdict_ends_with(
     answer = mismatch_answer(statement, title="A spring")
     assert answer.pop("sentence")
     assert answer == {
-        "title": "A spring", "verdict": verdict, "compared": True,
+        "title": "A spring", "verdict": verdict, "outcome": outcome, "compared": True,
         "held_out_before": 0.5, "held_out_after": after, "held_out_noise": 0.01,
     }  # fmt: skip
 

@@ -21,14 +21,17 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from siq.inference.trajectories import scored_rows
+from siq.numerics.text import value_text
 from siq.report.diagnosis_page import largest_difference
 from siq.report.formatting import with_unit
 from siq.report.plots.quasipotential import add_legend, new_axes
 from siq.report.plots.style import (
     BLACK,
     BLUE,
+    GREEN,
     GREY,
     ORANGE,
+    PURPLE,
     SKY_BLUE,
     VERMILLION,
     WIDTH,
@@ -41,6 +44,7 @@ from siq.report.plots.style import (
 
 if TYPE_CHECKING:
     from siq.diagnosis.diagnosis import Diagnosis
+    from siq.diagnosis.statement import Statement
     from siq.inference.measurements import Measurements
 
 
@@ -125,6 +129,49 @@ def plot_held_out(
         upper.set_title(f"recording {recording}", loc="left")
         upper.tick_params(labelbottom=False)
     _legend_of(axes[0])
+    return figure
+
+
+@drawn_to_be_read
+def plot_ladder(statement: Statement) -> Figure | None:
+    """Draw the error on held-out recordings step by step, down to the noise of the sensor.
+
+    As given, with its own parameters refitted, with each mechanism that is named on top of those before it,
+    and with the model of what has no name. None where no errors are known.
+    """
+    errors, described = statement.errors, statement.described
+    if errors.noise_floor is None or not errors.noise_floor > 0:
+        return None
+    last = errors.named if described and statement.mechanisms else errors.augmented
+    named = () if statement.random_forces else statement.mechanisms
+    steps = [("as given", errors.before, GREY, "s"), ("parameters refitted", errors.recalibrated, BLUE, "D")]
+    for place, (each, error) in enumerate(zip(named, (*errors.rungs, last), strict=False)):
+        steps.append((f"{'and' if place else 'with'} {each.label}", error, VERMILLION, "o"))
+    if described:
+        what = " and ".join(each.label for each in described)
+        steps.append((f"{'and' if named else 'with'} {what}", errors.augmented, PURPLE, "^"))
+    scale, unit = (100.0, "%") if errors.spread is None else (errors.spread, errors.unit)
+    known = [scale * error for _, error, *_ in steps if error is not None] + [scale * errors.noise_floor]
+    lowest, highest = 0.7 * min(known), 1.4 * max(known)
+    figure = Figure(figsize=(WIDTH, 1.3 + 0.55 * len(steps)))
+    axes = figure.subplots()
+    axes.set_xscale("log")
+    for place, (label, error, colour, marker) in enumerate(steps):
+        at = highest if error is None else scale * error
+        axes.plot([scale * errors.noise_floor, at], [place, place], color=colour, linewidth=2)
+        if error is not None:
+            axes.plot(at, place, marker, color=colour, markersize=7)
+        said = "runs away" if error is None else value_text(at, unit=unit, digits=3)
+        axes.text(1.08 * scale * errors.noise_floor, place - 0.15, f"{label}: {said}", va="bottom")
+    axes.axvline(scale * errors.noise_floor, color=BLACK, linestyle=":", label="noise of the sensor")
+    if errors.floor not in (None, errors.noise_floor):
+        axes.axvline(scale * errors.floor, color=GREEN, linestyle="--", label="and random forces")
+    axes.set_xlim(lowest, highest)
+    axes.set_ylim(len(steps) - 0.6, -0.8)
+    axes.set_yticks([])
+    whole = "error on held-out recordings"
+    axes.set_xlabel(f"{whole}, % of their spread" if errors.spread is None else with_unit(whole, unit))
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper left", ncols=2)
     return figure
 
 
