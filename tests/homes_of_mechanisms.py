@@ -14,14 +14,13 @@ import numpy as np
 import pandas as pd
 
 from siq.diagnosis.dictionary import roles_of, standard_dictionary
-from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
+from siq.diagnosis.mechanisms import MechanismCandidate, along, candidates_of
 from siq.diagnosis.study import _measurements_of
 from siq.inference.kalman_filter import Grid
 from siq.inference.measurements import Measurements
 from siq.numerics.files import Document, validate
 from siq.systems.cards import SystemCard, build_system
-from siq.systems.dynamics import Dynamics, Signals, symbol
-from siq.systems.formulas import compile_values
+from siq.systems.dynamics import Dynamics, Signals
 
 FINE = 10  # steps of integration between samples
 NOISE = 0.01  # of the spread of what is measured
@@ -206,6 +205,18 @@ HOMES: Mapping[str, Home] = {
         },
         0.15,
         lambda rng: rng.normal(size=4) * [0.8, 1.0, 0.8, 1.0],
+    ),
+    "cart": Home(
+        {
+            "time_unit": "s",
+            "states": states(v="m/s"),
+            "inputs": {"u": {"unit": "m/s"}, "p": {"unit": "V"}},
+            "parameters": numbers(g=0.4, d=0.3),
+            "equations": {"v": "g*p - d*v"},
+        },
+        0.2,
+        lambda rng: rng.normal(size=1),
+        lambda rng, t: np.concatenate([waves(rng, t, size=0.7), waves(rng, t, size=1.0)]),
     ),
     "rotating frame": Home(
         {
@@ -394,6 +405,13 @@ RESIDENTS: Sequence[Resident] = (
     Resident("clipping", "mass", {"L": 1.2}, "above"),
     Resident("clipping", "mass", {"L": -1.2}, "below"),
     Resident("clipping", "mass", {"H": 1.2, "L": -1.0}),
+    Resident("quadratic drag", "cart", {"c": 0.3}, "relative to u"),
+    Resident("input gain", "cart", {"c": 0.3}, "'v', c_1*u"),
+    Resident("thrust of a propeller", "cart", {"c": 0.3}, "p*Abs(p)"),
+    Resident("actuator lag", "mass", {"tau": 0.5}),
+    Resident("hidden capacity", "heat", {"c": 0.5, "tau": 3.0}, "in s"),
+    Resident("maturation delay", "crop", {"tau": 2.0}),
+    Resident("cogging or gear ripple", "arm", {"c": 1.0, "d": 0.5, "n": 3.0}),
     Resident("clock offset and drift", "mass", {"o": 0.06}),
     Resident("clock offset and drift", "mass", {"o": 0.05, "r": 0.01}),
     Resident("clock offset and drift", "two driven masses", {"o": 0.06}),
@@ -452,12 +470,12 @@ def simulated(truth: MechanismCandidate, data: Measurements, begin: np.ndarray) 
     """
     model, grid = truth.model, Grid(data, FINE)
     delays = model.lags(model.values)
-    names = [symbol(name) for name in model.states[: len(begin)]]
-    further = [
-        np.full(begin.shape[1], 0.0) + compile_values([each], names)(*begin)[0] for each in truth.begins
-    ]
-    x = np.concatenate([begin, np.array(further).reshape(-1, begin.shape[1])])
     count, length = len(data.labels), len(data.t) // len(data.labels)
+    x = np.zeros((model.dimension, count))
+    x[: len(begin)] = begin
+    if truth.begins:
+        rows = along(truth.begins, model, data, np.repeat(x, length, axis=1).T)
+        x[len(begin) :] = rows[:, ::length]
     path = np.empty((model.dimension, count, length))
     nodes = [grid.signals(node, delays) for node in range(3 * FINE)]
 

@@ -161,7 +161,7 @@ class Form(_Part):
     symmetric
         Whether exchanging the roles gives the same mechanism.
     one_unit
-        Whether the states that fill the roles must have one unit, and not be mere numbers.
+        Whether the states and inputs that fill the roles must have one unit, and not be mere numbers.
     """
 
     roles: dict[Name, Role]
@@ -300,6 +300,7 @@ def _parse(unit: str, words: dict[str, sympy.Symbol]) -> sympy.Expr:
 
 FORMULA_TOLERANCE = 1e-9  # relative difference of values of formulas that are the same
 TRIAL_POINTS = 12
+SPEED = re.compile(r"([cdkmnuµμ]?m|m?rad|deg|°|rev|ft|in) ?/ ?([mnuµμ]?s|min|h)|rpm")  # units of speeds
 ANYWHERE = (0.5, 1.5)  # where formulas of a state without a domain are compared, as those of inputs are
 
 
@@ -312,6 +313,8 @@ class Roles:
     motions, angles
         Pairs of position and velocity, ``x' = v``; and positions that are angles: in radians, or within a
         sine or cosine of the equations.
+    speeds
+        Velocities, by their unit (m/s, rad/s), of which no position is followed.
     amplitudes
         Pairs of quadratures: but for a constant drive, the equations look the same from every angle, and turn
         the state.
@@ -330,6 +333,7 @@ class Roles:
 
     motions: tuple[tuple[str, str], ...] = ()
     angles: tuple[str, ...] = ()
+    speeds: tuple[str, ...] = ()
     amplitudes: tuple[tuple[str, str], ...] = ()
     populations: tuple[str, ...] = ()
     feeding: tuple[tuple[str, str], ...] = ()
@@ -341,7 +345,7 @@ class Roles:
     @property
     def physical(self) -> bool:
         """Whether any state has a role for which mechanisms have names."""
-        return bool(self.motions or self.amplitudes or self.populations or self.levels)
+        return bool(self.motions or self.speeds or self.amplitudes or self.populations or self.levels)
 
 
 def roles_of(model: Dynamics) -> Roles:
@@ -354,16 +358,18 @@ def roles_of(model: Dynamics) -> Roles:
     others = [name for name in dynamic if name not in in_motion]
     amplitudes = tuple(pair for pair in itertools.combinations(others, 2) if _turns(model, *pair))
     in_pairs = {name for pair in amplitudes for name in pair}
-    alone = [name for name in others if name not in in_pairs]
+    units = dict(zip(model.states, model.units, strict=True))
+    speeds = tuple(name for name in others if name not in in_pairs and SPEED.fullmatch(units[name]))
+    alone = [name for name in others if name not in in_pairs and name not in speeds]
     levels = tuple(name for name in alone if _has_root(equations[name], name))
     populations = tuple(name for name in alone if name not in levels and _stays_zero(model, name))
-    units = dict(zip(model.states, model.units, strict=True))
     formulas = (*model.equations, *dict(model.outputs).values())
     sines = {each for formula in formulas for each in formula.atoms(sympy.sin, sympy.cos)}
     turning = {name for each in sines for name in each.free_symbols}
     return Roles(
         motions=motions,
         angles=tuple(x for x, _ in motions if units[x] == "rad" or symbol(x) in turning),
+        speeds=speeds,
         amplitudes=amplitudes,
         populations=populations,
         feeding=tuple(pair for pair in itertools.permutations(populations, 2) if _feeds(model, *pair)),
@@ -414,11 +420,24 @@ def _feeds(model: Dynamics, prey: str, predator: str) -> bool:
     lost, won = meetings(equations[prey], prey, predator), meetings(equations[predator], prey, predator)
     if lost == 0 or won == 0:
         return False
+    losses, gains = _among_many(model, [lost, won])
+    return bool(np.all(losses <= 0) and np.all(gains >= 0))
+
+
+def births(model: Dynamics, population: str) -> sympy.Expr:
+    """The terms of a population's equation that are positive wherever there is anybody."""
+    equation = sympy.expand(dict(zip(model.states, model.equations, strict=True))[population])
+    terms = sympy.Add.make_args(equation)
+    values = _among_many(model, terms)
+    return sympy.Add(*(term for term, value in zip(terms, values, strict=True) if np.all(value >= 0)))
+
+
+def _among_many(model: Dynamics, formulas: Sequence[sympy.Expr]) -> list[np.ndarray]:
+    """Values of formulas at trial points where no state is negative."""
     x, signals = trial_points(model)
     at = (*np.abs(x), *signals.inputs, *signals.delayed, *signals.slopes, signals.t, *model.values)
-    written = [model.evaluable(each) for each in (lost, won)]
-    losses, gains = compile_values(written, model.arguments, common=False)(*at)
-    return bool(np.all(np.asarray(losses) <= 0) and np.all(np.asarray(gains) >= 0))
+    written = [model.evaluable(each) for each in formulas]
+    return [np.asarray(each) for each in compile_values(written, model.arguments, common=False)(*at)]
 
 
 def _turns(model: Dynamics, one: str, other: str) -> bool:
@@ -485,7 +504,7 @@ def assignments(form: Form, model: Dynamics, roles: Roles) -> Iterator[dict[str,
         else:
             choices.append([{names[place]: name} for name in alone[kinds[place]]])
             place += 1
-    units = dict(zip(model.states, model.units, strict=True))
+    units = units_of(model)
     order = {name: place for place, name in enumerate(model.states)}
     for combination in itertools.product(*choices):
         filled = [name for part in combination for name in part.values()]
@@ -516,6 +535,7 @@ def _fillings(
             alone.setdefault(kind, tuple(pair[side] for pair in names))
     return pairs, alone | {
         "amplitude": tuple(name for pair in roles.amplitudes for name in pair),
+        "velocity": (*(velocity for _, velocity in roles.motions), *roles.speeds),
         "population": roles.populations,
         "level": roles.levels,
         "store": roles.stores,

@@ -2,10 +2,11 @@
 
 A mechanism is written for roles (`siq.diagnosis.dictionary`); here it becomes models, one for each way of
 filling the roles. Besides the roles its formulas may use what the simulation itself says of them: `v_rate`,
-the equation of the state v; `p_with_q`, the part of the equation of p in which q stands as well; `y_rate` and
-`y_curvature`, the first and second time derivative of the output y, inputs being held. What a mechanism does
-not depend on linearly is looked for about sizes, times and frequencies of the recorded motion; what the
-values themselves show of a sensor, its steps and the ends of its range, is read off them.
+the equation of the state v; `p_with_q`, the part of the equation of p in which q stands as well; `p_births`,
+the terms of it that are positive; `y_rate` and `y_curvature`, the first and second time derivative of the
+output y, inputs being held. What a mechanism does not depend on linearly is looked for about sizes, times and
+frequencies of the recorded motion; what the values themselves show of a sensor, its steps and the ends of its
+range, is read off them.
 
 Where a simulation has a free damping rate, linear damping is another value of it: no recording can tell the
 two apart, and a mechanism of that kind would only stand in the way of the parameter. To first order a
@@ -34,6 +35,7 @@ from siq.diagnosis.dictionary import (
     Roles,
     Shape,
     assignments,
+    births,
     meetings,
     trial_points,
     unit_of,
@@ -395,6 +397,8 @@ def _vocabulary(
     states = [role for role, kind in form.roles.items() if kind not in ("input", "parameter", "output")]
     for one in states:
         names[f"{one}_rate"] = equations[assignment[one]]
+        if f"{one}_births" in wanted:
+            names[f"{one}_births"] = births(model, assignment[one])
     for one, other in itertools.permutations(states, 2):
         if f"{one}_with_{other}" in wanted:
             names[f"{one}_with_{other}"] = meetings(

@@ -262,6 +262,8 @@ SCREENED = (
     "linear damping", "linear coupling", "mortality", "harvest", "Allee effect", "prey refuge",
     "sigmoid functional response", "predator interference", "decay or leakage", "delayed response",
     "thermal drift", "sensor lag", "quantisation", "clipping", "clock offset and drift",
+    "input gain", "thrust of a propeller", "actuator lag", "hidden capacity", "maturation delay",
+    "cogging or gear ripple",
 )  # fmt: skip
 
 
@@ -278,3 +280,66 @@ def test_each_mechanism_is_among_those_that_are_fitted(name: str) -> None:
         best[label] = max(best.get(label, 0.0), each.gain)
     ranked = sorted(best, key=lambda label: -best[label])[: SearchOptions().fitted]
     assert truth.label in ranked and best[truth.label] > SearchOptions().same
+
+
+# Formulas of the literature
+
+
+def the(name: str, home: str, label: str = "") -> MechanismCandidate:
+    """The candidate of a name in a home."""
+    return next(each for each in candidates(HOMES[home].model) if each.name == name and label in each.label)
+
+
+def test_a_speed_by_itself_is_known_by_its_unit() -> None:
+    for unit in ("m/s", "rad/s", "mm/s", "km/h", "rpm"):
+        card = {"states": states(v=unit), "parameters": numbers(k=1.0), "equations": {"v": "k - v"}}
+        roles = roles_of(model_of(card))
+        assert (roles.speeds, roles.stores) == (("v",), ()) and roles.physical, unit
+    for unit in ("1/s", "K", "m/s**2", "mol/s"):
+        card = {"states": states(v=unit), "parameters": numbers(k=1.0), "equations": {"v": "k - v"}}
+        assert roles_of(model_of(card)).speeds == (), unit
+    # A coasting cart stays at rest, as a population that is gone does; it is none.
+    coasting = model_of({"states": states(v="m/s"), "parameters": numbers(k=1.0), "equations": {"v": "-k*v"}})
+    assert roles_of(coasting).populations == () and {"quadratic drag", "dry friction"} <= names(coasting)
+
+
+def test_drag_in_a_stream_goes_with_the_square_of_the_relative_speed() -> None:
+    # Morison et al. (1950): F = C (u - v) |u - v|; it drives what is slower than the stream.
+    change = dict(the("quadratic drag", "cart", "relative to u").changes)["v"]
+    c, u, v = (next(each for each in change.free_symbols if each.name == name) for name in ("c_1", "u", "v"))
+    assert change.subs({c: 2, u: 3, v: 1}) == 8 and change.subs({c: 2, u: 1, v: 3}) == -8
+
+
+def test_an_actuator_that_lags_has_the_transfer_function_of_first_order() -> None:
+    # Åström and Murray (2008): 1 / (1 + s tau), of what reaches the mass.
+    model = the("actuator lag", "mass").model
+    rates = dict(zip(model.states, model.equations, strict=True))
+    by_name = {each.name: each for each in rates["z_1"].free_symbols | rates["v"].free_symbols}
+    assert "u" not in {each.name for each in rates["v"].free_symbols}
+    assert sympy.simplify(rates["z_1"] - (by_name["u"] - by_name["z_1"]) / by_name["tau_1"]) == 0
+
+
+def test_who_matures_in_three_stages_does_so_after_tau_with_a_variance_of_a_third_of_its_square() -> None:
+    # MacDonald (1978): the Laplace transform of the ages is (1 + s tau/3)**-3.
+    model = the("maturation delay", "crop").model
+    rates = dict(zip(model.states, model.equations, strict=True))
+    by_name = {each.name: each for formula in rates.values() for each in formula.free_symbols}
+    stages = [by_name[name] for name in ("z1_1", "z2_1", "z3_1")]
+    tau, n, r, c = (by_name[name] for name in ("tau_1", "n", "r", "c"))
+    assert sympy.expand(rates["n"] - (stages[2] - c * n**2)) == 0  # nobody else waits, and losses do not
+    s, b = sympy.symbols("s b")
+    born = sympy.solve([s * z - rates[z.name].subs(r * n, b) for z in stages], stages)
+    ages = sympy.simplify(born[stages[2]] / b)
+    assert sympy.simplify(-ages.diff(s).subs(s, 0) - tau) == 0
+    assert sympy.simplify(ages.diff(s, 2).subs(s, 0) - tau**2 - tau**2 / 3) == 0
+
+
+def test_a_hidden_capacity_takes_up_what_it_gives_back() -> None:
+    # Bacher and Madsen (2011), model TiTe: Ci dTi = (Te - Ti)/R dt, Ce dTe = (Ti - Te)/R dt; c = 1/(Ci R) and
+    # tau = Ce R, so that c tau = Ce/Ci and Ti + c tau Te is kept.
+    model = the("hidden capacity", "heat", "in s").model
+    before = HOMES["heat"].model.equations[0]
+    rates = dict(zip(model.states, model.equations, strict=True))
+    by_name = {each.name: each for formula in rates.values() for each in formula.free_symbols}
+    kept = rates["s"] - before + by_name["c_1"] * by_name["tau_1"] * rates["z_1"]
+    assert sympy.simplify(kept) == 0

@@ -23,7 +23,8 @@ NAMES = (
     "saturation", "parametric drive", "parameter drift", "periodic forcing", "overflow", "leak",
     "input delay",
     "hysteresis", "process noise", "sensor gain or offset", "thermal drift", "sensor lag", "quantisation",
-    "clipping", "clock offset and drift",
+    "clipping", "input gain", "thrust of a propeller", "actuator lag", "hidden capacity",
+    "maturation delay", "cogging or gear ripple", "clock offset and drift",
 )  # fmt: skip
 
 
