@@ -172,15 +172,15 @@ def load_system(card: str | Path | Mapping[str, Any], *, simulated: bool = False
     document = Document("the card", dict(card), {}) if isinstance(card, Mapping) else read_document(card)
     if simulated:
         states, written = document.data.get("states"), document.data.get("equations") or {}
-        for name, entry in states.items() if isinstance(states, dict) else ():
+        states = states if isinstance(states, dict) else {}
+        for name, entry in states.items():
             if not isinstance(entry, dict) or "unit" not in entry:
+                place = document.place(("states", name))
                 remedy = "give it, for no equation tells what the state is; a mere number has the unit 1"
-                raise InputError(
-                    document.file, document.place(("states", name)), f"'{name}' has no unit", remedy
-                )
-        if isinstance(states, dict) and isinstance(written, dict):
-            equations = dict.fromkeys(states, 0) | written
-            document = replace(document, data={"name": "simulator"} | document.data | {"equations": equations})
+                raise InputError(document.file, place, f"'{name}' has no unit", remedy)
+        if isinstance(written, dict):
+            filled = {"name": "simulator", **document.data, "equations": dict.fromkeys(states, 0) | written}
+            document = replace(document, data=filled)
     return build_system(document, validate(document, SystemCard))
 
 

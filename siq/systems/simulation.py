@@ -12,7 +12,6 @@ A simulator of somebody else has no equations to read, and is asked instead: `wi
 from __future__ import annotations
 
 import hashlib
-import itertools
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
