@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Annotated, ClassVar
@@ -329,7 +329,7 @@ class _Simulator:
         names = [*model.states, *(u.name for u in model.inputs), *(p.name for p in model.parameters)]
         self.names, self._parts = names, (self._d, self._d + len(model.inputs))
         self._functions: dict[tuple[int, tuple[int, ...]], type[Simulated]] = {}
-        self._answers: OrderedDict[bytes, np.ndarray] = OrderedDict()
+        self._answers: dict[bytes, np.ndarray] = {}
         self._together = False  # whether it takes many states at a time, as columns
 
     def function(self, row: int, by: tuple[int, ...] = ()) -> type[Simulated]:
@@ -348,8 +348,7 @@ class _Simulator:
         shape, at = given[0].shape, np.stack(given).reshape(len(given), -1)
         points, weight = at[:, None], np.ones((1, at.shape[1]))
         for one in by:
-            size = np.abs(at[one])
-            size = np.maximum(size, np.median(size))
+            size = np.maximum(np.abs(at[one]), np.median(np.abs(at[one])))
             # Truncation δ² and rounding ε/δ^m are alike at δ = ε^(1/(m+2)).
             reach = ACCURACY ** (1 / (len(by) + 2)) * np.where(size > 0, size, 1.0)
             shift = np.zeros((len(at), 1, at.shape[1]))
@@ -364,70 +363,63 @@ class _Simulator:
         key = hashlib.blake2b(at.tobytes()).digest()
         if key not in self._answers:
             x, u, p = np.split(at, self._parts)
-            path = [x]
-            for _ in range(3):
-                path.append(self.after(path[-1], u, p))
-            first, second, third = (each - x for each in path[1:])
-            self._answers[key] = (18 * first - 9 * second + 2 * third) / (6 * self._step)
-            if len(self._answers) > ANSWERS:
-                self._answers.popitem(last=False)
-        self._answers.move_to_end(key)
+            one = self.after(x, u, p)
+            two = self.after(one, u, p)
+            three = self.after(two, u, p)
+            if len(self._answers) == ANSWERS:
+                del self._answers[next(iter(self._answers))]  # the oldest
+            self._answers[key] = (18 * (one - x) - 9 * (two - x) + 2 * (three - x)) / (6 * self._step)
         return self._answers[key]
 
     def after(self, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
         """States a step later, in columns as they come; no number where there is no answer."""
+        result = np.full(x.shape, np.nan)
         with np.errstate(all="ignore"):
-            if self._together:
-                try:
-                    return self._checked(self._simulate(x, u, p, self._step), x.shape)
-                except Exception:  # of one of them perhaps; the others have an answer by themselves
-                    pass
-            result = np.full(x.shape, np.nan)
-            for place, each in enumerate(zip(x.T, u.T, p.T, strict=True)):
-                try:
-                    result[:, place] = self._checked(self._simulate(*each, self._step), (self._d,))
-                except Exception:  # as a formula that has no value at a trial state: fits step back
-                    continue
+            # Where all together raise an exception, some of them may have an answer by themselves.
+            for place in (*([slice(None)] * self._together), *range(x.shape[1])):
+                with suppress(Exception):  # as a formula that has no value at a trial state: fits step back
+                    result[:, place] = self._asked(x[:, place], u[:, place], p[:, place])
+                    if isinstance(place, slice):
+                        break
         return result
 
-    @staticmethod
-    def _checked(answer: Sequence[float] | np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        found = np.asarray(answer, dtype=float)
-        if found.shape != shape:
-            raise Fault(
-                f"it answers with numbers of the shape {found.shape}, and states have {shape}",
-                "return the next value of every state, in the order of the card",
-            )
+    def _asked(self, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
+        found = np.array(self._simulate(x.copy(), u.copy(), p.copy(), self._step), dtype=float)
+        if found.shape != x.shape:
+            fault = f"it answers with numbers of the shape {found.shape}, and states have {x.shape}"
+            raise Fault(fault, "return the next value of every state, in the order of the card")
         return found
 
     def try_out(self, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> None:
         """Ask at states ``(d, n)`` of recordings; raises InputError for what cannot be used."""
-        for each in zip(x.T, u.T, np.broadcast_to(p, (x.shape[1], len(p))), strict=True):
-            values = zip(self.names, np.concatenate(each), strict=True)
-            place = "at " + ", ".join(f"{name} = {value:.6g}" for name, value in values)
-            try:
-                found = self._checked(self._simulate(*(one.copy() for one in each), self._step), (self._d,))
-                again = self._checked(self._simulate(*(one.copy() for one in each), self._step), (self._d,))
-            except Fault as error:
-                raise error.at(SIMULATOR, place) from None
-            except Exception as error:
-                fault = f"it raises {type(error).__name__}: {error}"
-                raise InputError(SIMULATOR, place, fault, "it has to answer where recordings were") from error
-            if not np.isfinite(found).all():
-                name = self.names[int(np.flatnonzero(~np.isfinite(found))[0])]
-                remedy = "it has to answer where recordings were"
-                raise InputError(SIMULATOR, place, f"the next {name} is no number", remedy)
-            if (found != again).any():
-                remedy = "let it begin at the states that it is given, with nothing drawn and nothing kept"
-                raise InputError(SIMULATOR, place, "asked twice it gives two answers", remedy)
-        few = slice(0, x.shape[1] - (x.shape[1] == self._d))  # a matrix that is not square
-        x, u, p = x[:, few], u[:, few], np.broadcast_to(p[:, None], (len(p), x.shape[1]))[:, few]
-        one_by_one, self._together = self.after(x, u, p), True
+        p = np.broadcast_to(p[:, None], (len(p), x.shape[1]))
+        few = range(min(self._d + 1, x.shape[1]))  # so that a matrix of them is not square
+        one_by_one = np.stack([self._answer(x[:, k], u[:, k], p[:, k]) for k in few], axis=1)
+        with suppress(Exception):  # it takes states one by one, then
+            found = self._asked(x[:, few], u[:, few], p[:, few])
+            self._together = bool(np.allclose(found, one_by_one, rtol=ACCURACY, atol=0.0))
+        for k in np.flatnonzero(~np.isfinite(self.after(x, u, p)).all(axis=0)):
+            self._answer(x[:, k], u[:, k], p[:, k])
+
+    def _answer(self, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """The next state ``(d,)``, asked for twice."""
+        values = zip(self.names, (*x, *u, *p), strict=True)
+        place = "at " + ", ".join(f"{name} = {value:.6g}" for name, value in values)
+        remedy = "it has to answer wherever recordings were"
         try:
-            together = self._checked(self._simulate(x, u, p, self._step), x.shape)
-            self._together = bool(np.allclose(together, one_by_one, rtol=ACCURACY, atol=0.0))
-        except Exception:
-            self._together = False
+            found, again = self._asked(x, u, p), self._asked(x, u, p)
+        except Fault as error:
+            raise error.at(SIMULATOR, place) from None
+        except Exception as error:
+            fault = f"it raises {type(error).__name__}: {error}"
+            raise InputError(SIMULATOR, place, fault, remedy) from error
+        if not np.isfinite(found).all():
+            fault = f"the next {self.names[np.argmin(np.isfinite(found))]} is no number"
+            raise InputError(SIMULATOR, place, fault, remedy)
+        if (found != again).any():
+            remedy = "let it begin at the states that it is given, with nothing drawn and nothing kept"
+            raise InputError(SIMULATOR, place, "asked twice it gives two answers", remedy)
+        return found
 
 
 def with_simulator(
@@ -443,7 +435,8 @@ def with_simulator(
     inputs and parameters being held: three steps. This is the motion of the simulator as it is, the error of
     its own rule at the step h included. A quick mode, of which S leaves nothing after a step, has the rate
     11/(6h) and no more: Runge–Kutta steps up to 1.5 h stay stable, however stiff the simulator is. One that
-    overshoots (``S = -1``, the trapezoidal rule on stiff equations) has no such F.
+    overshoots (``S = -1``, the trapezoidal rule on stiff equations) has no such F. Nor is a definition told
+    from what a coarse rule makes of it: Euler's with position after velocity seems damped by up to h/2 ∂f/∂x.
 
     Derivatives are central differences; of the second order and the third, too, for filters.
 
@@ -476,11 +469,8 @@ def with_simulator(
     simulator = _Simulator(simulate, model, step)
     simulator.try_out(x[:, rows], inputs[:, rows], model.values)
     arguments = [model.names[name] for name in simulator.names]
-    rows_of = zip(model.equations, model.kinematic, strict=True)
+    told = (simulator.function(row)(*arguments) for row in range(model.dimension))
+    rows_of = zip(model.equations, told, model.kinematic, strict=True)
     return replace(
-        model,
-        equations=tuple(
-            written if defined else simulator.function(row)(*arguments)
-            for row, (written, defined) in enumerate(rows_of)
-        ),
+        model, equations=tuple(written if defined else asked for written, asked, defined in rows_of)
     )
