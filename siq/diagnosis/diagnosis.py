@@ -174,8 +174,8 @@ def diagnose(
         of the card, and returns the states a time dt later. See `siq.systems.simulation.with_simulator` for
         what it is taken for, and what nobody can locate without equations.
     step
-        dt, in the card's unit of time. By default a sixteenth of the shortest time between samples, so that
-        stiff simulators can be followed as well; a simulator with a step of its own needs a multiple of it.
+        dt, in the card's unit of time, by default a sixteenth of the shortest time between samples. A
+        simulator with a step of its own needs a multiple of it.
     settings
         What is held out (by default a quarter), what is known of the sensors' noise, further mechanisms, and
         what counts as found.
