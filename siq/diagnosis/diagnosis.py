@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -29,10 +29,14 @@ from siq.diagnosis.unnamed_models import fit_unnamed_models
 from siq.diagnosis.verdict import statement_of
 from siq.errors import InputError, NumericalFailure
 from siq.inference.budget import Budget
+from siq.inference.kalman_filter import MAX_SUBSTEPS
+from siq.inference.measurements import first_states
 from siq.inference.trajectories import scored_rows
 from siq.remarks import Remark
+from siq.systems.cards import load_system
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
+from siq.systems.simulation import Step, with_simulator
 
 if TYPE_CHECKING:
     from siq.data.recordings import Recordings
@@ -144,9 +148,11 @@ class Diagnosis:
 
 
 def diagnose(
-    system: Dynamics,
+    system: Dynamics | Mapping[str, Any] | str | Path,
     recordings: Recordings | pd.DataFrame | str | Path,
     *,
+    simulate: Step | None = None,
+    step: float | None = None,
     settings: MismatchStudy | None = None,
 ) -> Diagnosis:
     """Say whether, where and in which way a simulation differs from recordings of the system.
@@ -154,14 +160,22 @@ def diagnose(
     Main arguments
     --------------
     system
-        The simulation, such as `siq.load_system` reads from a card. Its parameters are recalibrated, unless
-        they are fixed.
+        The simulation, such as `siq.load_system` reads from a card, or the card. Its parameters are
+        recalibrated, unless they are fixed.
     recordings
         What was measured, with a column for each output and each input: recordings, a table with the columns
         ``recording`` and ``t``, or the path of one.
 
     Other arguments
     ---------------
+    simulate
+        A simulator in the place of the card's equations, but for definitions such as ``x: v``; the card may
+        then leave them out. It is called as ``simulate(states, inputs, parameters, dt)``, arrays in the order
+        of the card, and returns the states a time dt later. See `siq.systems.simulation.with_simulator` for
+        what it is taken for, and what nobody can locate without equations.
+    step
+        dt, in the card's unit of time, by default a sixteenth of the shortest time between samples. A
+        simulator with a step of its own needs a multiple of it.
     settings
         What is held out (by default a quarter), what is known of the sensors' noise, further mechanisms, and
         what counts as found.
@@ -169,7 +183,8 @@ def diagnose(
     Raises
     ------
     InputError
-        For recordings or settings that cannot be used.
+        For recordings or settings that cannot be used, and for a simulator that has no answer, or two, where
+        recordings were.
     NumericalFailure
         When the simulation cannot be fitted to the recordings at all, since it runs away along them.
 
@@ -194,7 +209,16 @@ def diagnose(
     >>> diagnosis.augmented.equations
     (-c_1*n**2 + n*r,)
     """
-    return solve_case(comparison_of(system, recordings, settings))
+    if not isinstance(system, Dynamics):
+        system = load_system(system, simulated=simulate is not None)
+    case = comparison_of(system, recordings, settings)
+    if simulate is not None:
+        data = case.learn
+        inputs = data.signals(data.t, data.recording, delays=()).inputs
+        x = first_states(system, data).T
+        step = float(data.step[data.begins].min()) / MAX_SUBSTEPS if step is None else step
+        case = replace(case, system=with_simulator(system, simulate, step=step, x=x, inputs=inputs))
+    return solve_case(case)
 
 
 def _completed(model: Dynamics, x: np.ndarray, *, process: np.ndarray | None = None) -> Dynamics:

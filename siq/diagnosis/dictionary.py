@@ -25,6 +25,7 @@ from siq.numerics.files import read_document, validate
 from siq.systems.cards import Formula, Name
 from siq.systems.dynamics import Dynamics, Signals, symbol
 from siq.systems.formulas import FormulaError, compile_values, parse_formula
+from siq.systems.simulation import Simulated
 
 Role = Literal[
     "position", "displacement", "angle", "velocity", "amplitude", "population", "prey", "predator", "level",
@@ -385,10 +386,10 @@ def roles_of(model: Dynamics) -> Roles:
 
 
 def meetings(equation: sympy.Expr, one: str, other: str) -> sympy.Expr:
-    """The part of an equation in which two states stand together."""
+    """The part of an equation in which two states stand together; of what a simulator does it is unknown."""
     terms = sympy.Add.make_args(sympy.expand(equation))
     both = {symbol(one), symbol(other)}
-    return sympy.Add(*(term for term in terms if both <= term.free_symbols))
+    return sympy.Add(*(term for term in terms if both <= term.free_symbols and not term.has(Simulated)))
 
 
 def trial_points(

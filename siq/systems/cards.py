@@ -9,7 +9,8 @@ same equations in other units are another problem unless D is carried along.
 from __future__ import annotations
 
 import keyword
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,7 +19,7 @@ import sympy
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from siq.errors import Fault
+from siq.errors import Fault, InputError
 from siq.numerics.files import Document, read_document, validate
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import TIME, Dynamics, Input, Parameter, symbol
@@ -151,8 +152,16 @@ def diffusion_rows(diffusion: DiffusionEntry, dimension: int) -> list[list[Formu
     return rows
 
 
-def load_system(path: str | Path) -> Dynamics:
+def load_system(card: str | Path | Mapping[str, Any], *, simulated: bool = False) -> Dynamics:
     """Read and check a system card.
+
+    Parameters
+    ----------
+    card
+        The path of one, or what one says, as a mapping.
+    simulated
+        Whether a simulator takes the place of its equations, which may then be left out, but for definitions
+        such as ``x: v``; so may its name. Units tell what states are, and may not.
 
     Raises
     ------
@@ -160,7 +169,18 @@ def load_system(path: str | Path) -> Dynamics:
         With the card, the line and the offending name, for anything that the schema or the whitelist of
         formulas refuses.
     """
-    document = read_document(path)
+    document = Document("the card", dict(card), {}) if isinstance(card, Mapping) else read_document(card)
+    if simulated:
+        states, written = document.data.get("states"), document.data.get("equations") or {}
+        states = states if isinstance(states, dict) else {}
+        for name, entry in states.items():
+            if not isinstance(entry, dict) or "unit" not in entry:
+                place = document.place(("states", name))
+                remedy = "give it, for no equation tells what the state is; a mere number has the unit 1"
+                raise InputError(document.file, place, f"'{name}' has no unit", remedy)
+        if isinstance(written, dict):
+            filled = {"name": "simulator", **document.data, "equations": dict.fromkeys(states, 0) | written}
+            document = replace(document, data=filled)
     return build_system(document, validate(document, SystemCard))
 
 

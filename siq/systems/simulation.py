@@ -5,14 +5,19 @@ at once; the arrays hold components first, ``(d, trajectories)``, so that each c
 
 The step of a pair follows from the fastest rate of the Jacobian over the card's domain, the length of a
 trajectory from the slowest relaxation to an attractor.
+
+A simulator of somebody else has no equations to read, and is asked instead: `with_simulator`.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
-from typing import Annotated
+from functools import partial
+from typing import Annotated, ClassVar
 
 import numpy as np
 import sympy
@@ -20,7 +25,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from siq.data.recordings import Recordings
-from siq.errors import Fault, NumericalFailure
+from siq.errors import Fault, InputError, NumericalFailure
 from siq.numerics.integration import euler_maruyama_step, runge_kutta_step
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -288,3 +293,184 @@ def _round_down(value: float) -> float:
     """The largest of 1, 2 and 5 times a power of ten that is not above a value: numbers that people read."""
     power = 10.0 ** math.floor(math.log10(value))
     return float(f"{max(one for one in (1, 2, 5) if one * power <= value * (1 + 1e-9)) * power:.1g}")
+
+
+Step = Callable[[np.ndarray, np.ndarray, np.ndarray, float], Sequence[float] | np.ndarray]
+"""From states, inputs, parameters and a time step to the states after it, each in the order of the card."""
+
+SIMULATOR = "the simulator"  # what messages call it
+ACCURACY = 1e-9  # relative, of answers: between rounding and the tolerance of a solver
+ANSWERS = 64  # kept: every state's rate and derivative is asked for at the same points
+ASKED = 200  # states along the recordings at which a simulator is tried before it is used
+
+
+class Simulated(sympy.Function):
+    """The rate of a state, or a derivative of it, of which a simulator tells values and nothing else.
+
+    It stands in formulas for what a card writes out. Its arguments are states, inputs and parameters, so that
+    whatever acts through one of them, such as a delay or a drift, can be put in.
+    """
+
+    is_real = True
+    simulator: ClassVar[_Simulator]
+    row: ClassVar[int]
+    by: ClassVar[tuple[int, ...]] = ()  #: arguments by which it is derived
+
+    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+        """Its derivative by one of its arguments, from 1."""
+        return self.simulator.function(self.row, (*self.by, argindex - 1))(*self.args)
+
+
+class _Simulator:
+    """The vector field behind a simulator, see `with_simulator`."""
+
+    def __init__(self, simulate: Step, model: Dynamics, step: float) -> None:
+        self._simulate, self._step, self._d = simulate, step, model.dimension
+        names = [*model.states, *(u.name for u in model.inputs), *(p.name for p in model.parameters)]
+        self.names, self._parts = names, (self._d, self._d + len(model.inputs))
+        self._functions: dict[tuple[int, tuple[int, ...]], type[Simulated]] = {}
+        self._answers: dict[bytes, np.ndarray] = {}
+        self._together = False  # whether it takes many states at a time, as columns
+
+    def function(self, row: int, by: tuple[int, ...] = ()) -> type[Simulated]:
+        """A state's rate, derived by some arguments, as sympy knows functions."""
+        by = tuple(sorted(by))
+        if (row, by) not in self._functions:
+            name = "_".join(["simulated", self.names[row], *(f"by_{self.names[one]}" for one in by)])
+            values = staticmethod(partial(self._derivative, row, by))
+            about = {"simulator": self, "row": row, "by": by, "_imp_": values}  # by which sympy evaluates it
+            self._functions[row, by] = type(name, (Simulated,), about)
+        return self._functions[row, by]
+
+    def _derivative(self, row: int, by: tuple[int, ...], *arguments: np.ndarray | float) -> np.ndarray:
+        """Central differences of the rate, of as many orders as there are arguments to derive by."""
+        given = np.broadcast_arrays(*(np.asarray(each, dtype=float) for each in arguments))
+        shape, at = given[0].shape, np.stack(given).reshape(len(given), -1)
+        points, weight = at[:, None], np.ones((1, at.shape[1]))
+        for one in by:
+            size = np.maximum(np.abs(at[one]), np.median(np.abs(at[one])))
+            # Truncation δ² and rounding ε/δ^m are alike at δ = ε^(1/(m+2)).
+            reach = ACCURACY ** (1 / (len(by) + 2)) * np.where(size > 0, size, 1.0)
+            shift = np.zeros((len(at), 1, at.shape[1]))
+            shift[one] = reach
+            points = np.concatenate([points + shift, points - shift], axis=1)
+            weight = np.concatenate([weight, -weight]) / (2 * reach)
+        rates = self._rates(points.reshape(len(at), -1))[row]
+        return np.asarray((weight * rates.reshape(weight.shape)).sum(axis=0).reshape(shape))
+
+    def _rates(self, at: np.ndarray) -> np.ndarray:
+        """The effective vector field at columns of arguments: shape ``(d, n)``."""
+        key = hashlib.blake2b(at.tobytes()).digest()
+        if key not in self._answers:
+            x, u, p = np.split(at, self._parts)
+            one = self.after(x, u, p)
+            two = self.after(one, u, p)
+            three = self.after(two, u, p)
+            if len(self._answers) == ANSWERS:
+                del self._answers[next(iter(self._answers))]  # the oldest
+            self._answers[key] = (18 * (one - x) - 9 * (two - x) + 2 * (three - x)) / (6 * self._step)
+        return self._answers[key]
+
+    def after(self, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """States a step later, in columns as they come; no number where there is no answer."""
+        result = np.full(x.shape, np.nan)
+        with np.errstate(all="ignore"):
+            # Where all together raise an exception, some of them may have an answer by themselves.
+            for place in (*([slice(None)] * self._together), *range(x.shape[1])):
+                with suppress(Exception):  # as a formula that has no value at a trial state: fits step back
+                    result[:, place] = self._asked(x[:, place], u[:, place], p[:, place])
+                    if isinstance(place, slice):
+                        break
+        return result
+
+    def _asked(self, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
+        found = np.array(self._simulate(x.copy(), u.copy(), p.copy(), self._step), dtype=float)
+        if found.shape != x.shape:
+            fault = f"it answers with numbers of the shape {found.shape}, and states have {x.shape}"
+            raise Fault(fault, "return the next value of every state, in the order of the card")
+        return found
+
+    def try_out(self, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> None:
+        """Ask at states ``(d, n)`` of recordings; raises InputError for what cannot be used."""
+        p = np.broadcast_to(p[:, None], (len(p), x.shape[1]))
+        few = range(min(self._d + 1, x.shape[1]))  # so that a matrix of them is not square
+        one_by_one = np.stack([self._answer(x[:, k], u[:, k], p[:, k]) for k in few], axis=1)
+        with suppress(Exception):  # it takes states one by one, then
+            found = self._asked(x[:, few], u[:, few], p[:, few])
+            self._together = bool(np.allclose(found, one_by_one, rtol=ACCURACY, atol=0.0))
+        for k in np.flatnonzero(~np.isfinite(self.after(x, u, p)).all(axis=0)):
+            self._answer(x[:, k], u[:, k], p[:, k])
+
+    def _answer(self, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """The next state ``(d,)``, asked for twice."""
+        values = zip(self.names, (*x, *u, *p), strict=True)
+        place = "at " + ", ".join(f"{name} = {value:.6g}" for name, value in values)
+        remedy = "it has to answer wherever recordings were"
+        try:
+            found, again = self._asked(x, u, p), self._asked(x, u, p)
+        except Fault as error:
+            raise error.at(SIMULATOR, place) from None
+        except Exception as error:
+            fault = f"it raises {type(error).__name__}: {error}"
+            raise InputError(SIMULATOR, place, fault, remedy) from error
+        if not np.isfinite(found).all():
+            fault = f"the next {self.names[np.argmin(np.isfinite(found))]} is no number"
+            raise InputError(SIMULATOR, place, fault, remedy)
+        if (found != again).any():
+            remedy = "let it begin at the states that it is given, with nothing drawn and nothing kept"
+            raise InputError(SIMULATOR, place, "asked twice it gives two answers", remedy)
+        return found
+
+
+def with_simulator(
+    model: Dynamics, simulate: Step, *, step: float, x: np.ndarray, inputs: np.ndarray
+) -> Dynamics:
+    """A dynamics whose equations, but for definitions such as ``x' = v``, are what a simulator does.
+
+    The simulator's steps S of length h are those of a vector field F, which may be integrated by other rules,
+    and to which terms may be added as to written equations. With ``ΔS = S(x) - x``, ``S = exp(hF)`` gives
+
+        h F = log(1 + Δ) = ΔS - Δ²S/2 + Δ³S/3,    with an error of F of (h/τ)³/(4τ) for motion within τ,
+
+    inputs and parameters being held: three steps. This is the motion of the simulator as it is, the error of
+    its own rule at the step h included. A quick mode, of which S leaves nothing after a step, has the rate
+    11/(6h) and no more: Runge–Kutta steps up to 1.5 h stay stable, however stiff the simulator is. One that
+    overshoots (``S = -1``, the trapezoidal rule on stiff equations) has no such F. Nor is a definition told
+    from what a coarse rule makes of it: Euler's with position after velocity seems damped by up to h/2 ∂f/∂x.
+
+    Derivatives are central differences; of the second order and the third, too, for filters.
+
+    Parameters
+    ----------
+    model
+        Names, units, inputs, parameters and outputs. Its equations count where they are definitions.
+    simulate
+        From states ``(d,)``, inputs ``(i,)``, parameters ``(p,)`` and a time step to the next states. If it
+        takes columns, ``(d, n)`` and so on, with the same result, all columns are asked for at once.
+    step
+        h, which it is always asked for.
+    x, inputs
+        States ``(d, n)`` and inputs ``(i, n)`` where it has to answer. Elsewhere an exception is no answer.
+
+    Raises
+    ------
+    InputError
+        Where it raises an exception, returns something else than a number for each state, or answers
+        differently when asked again.
+
+    Notes
+    -----
+    What the simulator does not report, or does not take, is out of reach: no term can be added to a state
+    that it keeps to itself, no parameter refitted that is not passed, and no part of a rate replaced. So a
+    saturation of a meeting of prey and predator, or an angle within a sine, is not looked for, or has to be
+    told by a unit.
+    """
+    rows = np.unique(np.linspace(0, x.shape[1] - 1, ASKED).astype(int))
+    simulator = _Simulator(simulate, model, step)
+    simulator.try_out(x[:, rows], inputs[:, rows], model.values)
+    arguments = [model.names[name] for name in simulator.names]
+    told = (simulator.function(row)(*arguments) for row in range(model.dimension))
+    rows_of = zip(model.equations, told, model.kinematic, strict=True)
+    return replace(
+        model, equations=tuple(written if defined else asked for written, asked, defined in rows_of)
+    )
