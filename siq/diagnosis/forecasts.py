@@ -62,6 +62,7 @@ FOLDS = 8  # parts of the recordings that are left out in turn: a choice
 ALONE, IN_PLACE = (0.1, 1.0), (1.0, 10.0)  # levels of process noise, relative to that of the fits
 PROMISING, SHAPES = 32, 3  # explanations, and shapes of each, that are asked at all horizons: a choice
 LEADERS, ATTEMPTS = 6, 12  # explanations that are fitted in earnest before none is said to lead: a choice
+SUSPECTS = 4  # rivals of the leader that are fitted in earnest before they count: a choice
 RIDGE = 1e-10  # numerical: of normal equations whose columns have unit length
 # Of an effect, or of what is gained: a choice, made when two cases had been seen, 0.93 for the linear damping
 # of a pendulum arm, and 0.46 for a preload in the place of a bump.
@@ -636,6 +637,19 @@ def _next_rung(
                 outdone, leader = {leader.site.label}, ground
         sites, gains = _gains(ground.horizons, remaining, ground.candidate, budget, untried)
         gains = gains + ground.gain
+    # What would outvote it is fitted first: a sensor's gain may promise what a parameter then takes over.
+    promised = gains + np.array([site.prior for site in sites])
+    suspects = [
+        alone[sites[place].label]
+        for place in np.argsort(-promised)
+        if promised[place] > leader.weight - options.least_log_odds
+        and sites[place].family != leader.site.family
+        and sites[place].label in alone.keys() - fitted.keys() - untried.keys()
+    ]
+    for site in suspects[:SUSPECTS]:
+        another = _fitted_at(horizons, site, budget, untried)
+        if another is not None:
+            fitted[site.label] = _Leader(site, *another)
     # What was fitted in earnest counts as it was fitted.
     kept = [place for place, site in enumerate(sites) if site.label not in fitted]
     sites = [*(sites[place] for place in kept), *(each.site for each in fitted.values())]

@@ -127,7 +127,7 @@ class HeldOutErrors:
     def change(self, first: Run, second: Run) -> Change:
         """Whether the second of two simulations is better, by more than appears by chance."""
         names = (self.better_without if each == "without" else each for each in (first, second))
-        return change_between(*map(self.squares.get, names))
+        return _change_between(*map(self.squares.get, names))
 
     @property
     def share_gained(self) -> float:
@@ -153,7 +153,7 @@ class HeldOutErrors:
         return error * (1 - tolerance) <= floor
 
 
-def change_between(first: tuple[float, ...] | None, second: tuple[float, ...] | None) -> Change:
+def _change_between(first: tuple[float, ...] | None, second: tuple[float, ...] | None) -> Change:
     """Whether the second of two simulations is better, by mean squared errors of the same blocks of samples.
 
     They are None where the simulation ran away.
@@ -287,11 +287,11 @@ def errors_left_out(
 def typically_better(before: tuple[float, ...], after: tuple[float, ...]) -> bool:
     """Whether errors of blocks fall, and not only in one in which a saddle point multiplies them.
 
-    Other than `change_between` this asks for the typical ratio of errors, not for that of their sums.
+    Other than `_change_between` this asks for the typical ratio of errors, not for that of their sums.
     """
     falls = np.log(np.maximum(before, np.finfo(float).tiny) / np.maximum(after, np.finfo(float).tiny))
     return bool(scipy.stats.ttest_1samp(falls, 0.0, alternative="greater").pvalue < CHANGE_BY_CHANCE) and (
-        change_between(before, after) != "worse"
+        _change_between(before, after) != "worse"
     )
 
 
@@ -365,7 +365,7 @@ def first_better(
     for place, (squares, limit) in enumerate(zip(models, limits, strict=True)):
         if squares is None:
             continue
-        change = change_between(before, in_blocks(squares))
+        change = _change_between(before, in_blocks(squares))
         if change == "better" or (change == "same" and squares.mean() < limit):
             return place
     return None

@@ -9,7 +9,7 @@ import pytest
 from siq.diagnosis.dictionary import roles_of
 from siq.diagnosis.holdout import (
     HeldOutErrors,
-    change_between,
+    _change_between,
     in_blocks,
     simulated,
 )
@@ -32,8 +32,8 @@ def test_a_gain_far_below_the_noise_is_seen_in_pairs() -> None:
     # 4 % of the squared error: two independent errors of 600 values would differ by 6 % by chance.
     noise = np.random.default_rng(1).normal(size=2000)
     without, with_it = squares_of(noise, 0.3, 0.0)
-    assert change_between(without, with_it) == "better"
-    assert change_between(with_it, without) == "worse"
+    assert _change_between(without, with_it) == "better"
+    assert _change_between(with_it, without) == "worse"
 
 
 def test_where_nothing_is_gained_one_in_twenty_looks_better() -> None:
@@ -42,7 +42,7 @@ def test_where_nothing_is_gained_one_in_twenty_looks_better() -> None:
     # Two simulations that are equally far off, in ways that have nothing to do with each other.
     first, second = 0.3 * draw.normal(size=(2, 1000, 240))
     said = [
-        change_between(in_blocks((noise + one) ** 2), in_blocks((noise + other) ** 2))
+        _change_between(in_blocks((noise + one) ** 2), in_blocks((noise + other) ** 2))
         for noise, one, other in zip(noises, first, second, strict=True)
     ]
     better = said.count("better") / len(said)
@@ -52,12 +52,12 @@ def test_where_nothing_is_gained_one_in_twenty_looks_better() -> None:
 
 def test_a_stretch_that_dominates_does_not_hide_a_gain_in_all_of_it() -> None:
     one = np.array([100.0] + [1.0] * 11)
-    assert change_between(tuple(one), tuple(0.5 * one)) == "better"
+    assert _change_between(tuple(one), tuple(0.5 * one)) == "better"
     # A gain in this stretch alone may be chance.
     other = one.copy()
     other[0] = 80.0
     other[1::2] *= 1.3
-    assert change_between(tuple(one), tuple(other)) == "same"
+    assert _change_between(tuple(one), tuple(other)) == "same"
 
 
 def test_scale_and_order_of_blocks_do_not_matter() -> None:
@@ -65,7 +65,7 @@ def test_scale_and_order_of_blocks_do_not_matter() -> None:
     one, other = draw.chisquare(1, (2, 12))
     order = draw.permutation(12)
     for scale in (1e-12, 1.0, 1e6):
-        assert change_between(tuple(scale * one), tuple(scale * other)) == change_between(
+        assert _change_between(tuple(scale * one), tuple(scale * other)) == _change_between(
             tuple(one[order]), tuple(other[order])
         )
 
@@ -84,7 +84,7 @@ def test_scale_and_order_of_blocks_do_not_matter() -> None:
     ],
 )
 def test_what_ran_away_and_what_is_empty(first: tuple | None, second: tuple | None, change: str) -> None:
-    assert change_between(first, second) == change
+    assert _change_between(first, second) == change
 
 
 def test_without_what_was_found_is_the_better_of_two() -> None:

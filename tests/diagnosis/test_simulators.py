@@ -76,8 +76,10 @@ def warmings() -> pd.DataFrame:
 
 @pytest.mark.parametrize(
     ("card", "simulate", "recordings", "kept"),
-    [(CARD, turned, swings(), {"phi": "omega"}), (BODY, warmed, warmings(), {})],
-    ids=["pendulum", "first order"],
+    [
+        pytest.param(CARD, turned, swings(), {"phi": "omega"}, marks=pytest.mark.slow, id="pendulum"),
+        pytest.param(BODY, warmed, warmings(), {}, id="first order"),
+    ],
 )
 def test_a_simulator_gets_what_its_equations_get(
     card: dict[str, Any], simulate: Any, recordings: pd.DataFrame, kept: dict[str, str]
