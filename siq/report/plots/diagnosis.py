@@ -144,7 +144,9 @@ def plot_ladder(statement: Statement) -> Figure | None:
         return None
     last = errors.named if described and statement.mechanisms else errors.augmented
     named = () if statement.random_forces else statement.mechanisms
-    steps = [("as given", errors.before, GREY, "s"), ("parameters refitted", errors.recalibrated, BLUE, "D")]
+    steps = [("as given", errors.before, GREY, "s")]
+    if errors.recalibrated != errors.before:  # otherwise no refit was better
+        steps.append(("parameters refitted", errors.recalibrated, BLUE, "D"))
     for place, (each, error) in enumerate(zip(named, (*errors.rungs, last), strict=False)):
         steps.append((f"{'and' if place else 'with'} {each.label}", error, VERMILLION, "o"))
     if described:
