@@ -123,10 +123,10 @@ def fit_with_process_noise_as_needed(
         model, data, begin, budget=budget, hopeless=MISSED, **options
     )
     chosen = _simpler_fit(loose, strict)
-    far = chosen is loose and loose is not None and _missed_without(loose, data) > MISSED
-    if chosen is loose and not far and strict.converged and strict.model.edges:
-        chosen = _simpler_fit(loose, sharpened(strict, data, budget=budget))
-    return chosen
+    coarse = strict.converged and strict.model.edges
+    if loose is None or chosen is strict or not coarse or _missed_without(loose, data) > MISSED:
+        return chosen
+    return _simpler_fit(loose, sharpened(strict, data, goal=loose.log_likelihood, budget=budget))
 
 
 def _simpler_fit(loose: Fit | None, strict: Fit) -> Fit:

@@ -453,6 +453,7 @@ EDGE_SUBSTEPS = 12  # between samples, for models whose f jumps
 # A guard, for where the likelihood still changes. Friction that sticks took more than 96 at 40 dB.
 FINEST = 384
 SHARP = 0.5  # change of the log-likelihood by halving the substeps, below which a jump is sharp enough
+LEAST_SHARE = 0.1  # of what is missing to a goal, that steps twice as fine have to gain: a choice
 EDGE = 0.05  # width of a jump, in what its argument passes in a substep
 
 
@@ -484,10 +485,11 @@ def spread_edges(model: Dynamics, data: Measurements, x: np.ndarray, *, substeps
     return replace(model, edges=tuple(zip(arguments, widths, strict=True)))
 
 
-def sharpened(rough: Fit, data: Measurements, *, budget: Budget | None = None) -> Fit:
+def sharpened(rough: Fit, data: Measurements, *, goal: float = -np.inf, budget: Budget | None = None) -> Fit:
     """A fit whose jumps are spread so little that it no longer matters; motion that sticks asks for this.
 
-    Without process noise only: with it the states follow the data anyway.
+    Without process noise only: with it the states follow the data anyway. The goal is a log-likelihood;
+    where steps twice as fine gain hardly anything of what is missing to it, jumps are not what it lacks.
     """
     while (
         rough.converged and rough.model.edges and not rough.has_process_noise and 2 * rough.substeps <= FINEST
@@ -499,7 +501,8 @@ def sharpened(rough: Fit, data: Measurements, *, budget: Budget | None = None) -
             finer = fit_by_multiple_shooting(model, data, x=rough.x, estimate_process=False, **same)
         if not finer.converged:
             break
-        gained, rough = finer.log_likelihood - rough.log_likelihood, finer
-        if abs(gained) < SHARP:
+        gained, missing = finer.log_likelihood - rough.log_likelihood, goal - rough.log_likelihood
+        rough = finer
+        if abs(gained) < SHARP or gained < LEAST_SHARE * missing:
             break
     return rough
