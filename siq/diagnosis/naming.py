@@ -292,7 +292,7 @@ def named_by_forecasts(
     remarks = [
         Remark(
             "diagnosis.by_prior",
-            {"name": each.accepted.best.candidate.name, "odds": np.exp(each.flat_log_odds)},
+            {"name": each.accepted.best.candidate.label, "odds": np.exp(each.flat_log_odds)},
         )
         for each in rungs
         if each.flat_log_odds < context.study.search.least_log_odds

@@ -97,7 +97,7 @@ class StatedTerm:
 
     Attributes
     ----------
-    name, label, family
+    name, label, family, variant
         Of the dictionary; told apart from its other forms and places; and the kind of physics that it is.
     kind
         ``mechanism``: one of the dictionary. ``formula``: a sum of a few powers. ``curve``, ``surface``: a
@@ -127,6 +127,7 @@ class StatedTerm:
     name: str
     label: str
     family: str = ""
+    variant: str = ""
     kind: Kind = MECHANISM
     terms: Mapping[str, str]
     parameters: Mapping[str, Estimate]

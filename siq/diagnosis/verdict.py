@@ -233,6 +233,7 @@ def _stated(trial: FittedCandidate, fit: Fit, *, log_odds: float | None = None, 
         name=candidate.name,
         label=candidate.label,
         family=candidate.family,
+        variant=candidate.variant,
         terms={name: str(formula) for name, formula in candidate.changes},
         parameters={
             name: Estimate(known[name].value, errors.get(name), known[name].unit)
