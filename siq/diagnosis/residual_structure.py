@@ -34,6 +34,7 @@ from siq.inference.kalman_filter import Grid, Noise, profile_likelihood, solve, 
 from siq.inference.maximum_likelihood import Fit, first_noise, fit_by_multiple_shooting
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import FAINT, process_noise_needed
+from siq.numerics.randomness import positive
 
 LAGS = 12  # of autocorrelations
 
@@ -277,8 +278,7 @@ def noise_nonstationarity(fit: Fit, data: Measurements) -> float:
     Both have their intensities at their best; of forces that follow the motion at least half are in
     proportion to the square of its size.
     """
-    spread = fit.x.std(axis=0)
-    moved = (fit.x - fit.x.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+    moved = (fit.x - fit.x.mean(axis=0)) / positive(fit.x.std(axis=0))
     motion = (moved**2).mean(axis=1)
     following = motion / motion.mean()
 

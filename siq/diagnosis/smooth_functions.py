@@ -217,11 +217,9 @@ class SmoothFunction:
         units = ("1",) * (self.width - last) + (whole,) * last
         candidate = self.place.added_to(model, formula, names, units)
         together = (*candidate.model.expected_together, *(each.expected(own) for each, own in pairs))
-        known = dict(zip(names, self.begin, strict=True))
-        values = [known.get(each.name, each.value) for each in candidate.model.parameters]
-        begun = replace(candidate.model, expected_together=together).with_values(np.array(values))
+        begun = candidate.begun(candidate.model, dict(zip(names, self.begin, strict=True)))
         kind: Kind = CURVE if len(self.place.coordinates) == 1 else SURFACE
-        return replace(candidate, model=begun, kind=kind, smooth=self)
+        return replace(candidate, model=replace(begun, expected_together=together), kind=kind, smooth=self)
 
 
 def _product_of(

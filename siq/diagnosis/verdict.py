@@ -389,14 +389,8 @@ def _locate(investigation: Investigation, described: AugmentedModel | None = Non
         equations, coordinate = _most_telling(investigation.remainder.before, investigation.context.roles)
     else:
         equations, coordinate = (), "unknown"
-    curve = next(
-        (
-            each
-            for each in curves
-            if each.term.words[0] == coordinate and set(each.term.targets) & set(equations)
-        ),
-        None,
-    )
+    there = (each for each in curves if set(each.term.targets) & set(equations))
+    curve = next((each for each in there if each.term.words[0] == coordinate), None)
     if investigation.process_noise:
         driven = zip(investigation.context.model.states, search.fit.noise.process, strict=False)
         equations, coordinate, curve = tuple(name for name, q in driven if q > 0), "random", None
