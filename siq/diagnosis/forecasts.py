@@ -531,17 +531,15 @@ def _fitted_at(
     candidate = site.candidate
     assert candidate is not None
     found: list[Horizon] = []
-    begin: Fit | None = None
     for each in horizons:
         try:
-            fit, x = _begun(site, each, begin)
+            fit, x = _begun(site, each, found[-1].fit if found else None)
             fit = _fitted(fit.model, each.data, fit, x, budget=budget)
             if not candidate.admits(fit):
                 raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
             if candidate.generalises and candidate.idle(fit):
                 raise NumericalFailure("it is no more than the special case of it")
             found.append(Horizon.of(fit, each.data))
-            begin = fit
         except NUMERICAL_ERRORS as error:
             LOGGER.info("%s at a horizon: %s", candidate.label, error)
             untried[candidate.label] = NotFitted.of(candidate, error)

@@ -75,9 +75,8 @@ def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigat
         with budget.keeping(BUDGET_FOR_FUNCTIONS):
             named, recalibrations = named_by_forecasts(recalibrated, least_squares, context)
     if named is None:
-        result = replace(
-            _by_tests(recalibrated, least_squares, context, dictionary), recalibrations=recalibrations
-        )
+        result = _by_tests(recalibrated, least_squares, context, dictionary)
+        result = replace(result, recalibrations=recalibrations)
     else:
         result = replace(named, p_shift=_shift_probability(model, recalibrated))
     budget.says("working out how well parameters are known")

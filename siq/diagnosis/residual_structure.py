@@ -221,13 +221,11 @@ def explained_by_quantisation(
     coarse = steps > np.sqrt(strict.noise.measurement)
     if not (strict.converged and coarse.any()):
         return None
-    deviation, fit = np.sqrt(strict.noise.measurement), strict
-    values = data
+    values, fit, deviation = data, strict, np.sqrt(strict.noise.measurement)
     for _ in range(QUANTISATION_ROUNDS):
         before = deviation
         signals = Grid(values, fit.substeps).at_samples(fit.model.lags(fit.model.values))
-        states = np.ascontiguousarray(fit.x.T)
-        simulated = fit.model.functions.outputs(states, signals, fit.model.values).T
+        simulated = fit.model.functions.outputs(np.ascontiguousarray(fit.x.T), signals, fit.model.values).T
         values, deviation = _before_quantisation(data, simulated, steps, before)
         fit = fit_by_multiple_shooting(
             fit.model, values, x=fit.x, noise=fit.noise, estimate_process=False, substeps=fit.substeps,
