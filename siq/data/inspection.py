@@ -251,6 +251,11 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
         low, high = float(x.min()), float(x.max())
         states.append(StateFacts(name, title, unit, low, high, resolution_step(x), noise, label))
     memory = markov_lag(recordings)
+    # Of the cells over the range of one state or two, those that were visited.
+    some = recordings.values[:, :2]
+    low, high = np.quantile(some, [OUTLIER_SHARE, 1 - OUTLIER_SHARE], axis=0)
+    place = np.floor((some - low) / positive(high - low) * CELLS).astype(int)
+    visits, _ = np.histogramdd(place, bins=[np.arange(CELLS + 1) - 0.5] * place.shape[1])
     return Inspection(
         file=str(source) if isinstance(source, str | Path) else named,
         recordings=recordings,
@@ -261,18 +266,10 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
         pairs=near,
         gaps=len(gaps) - near,
         memory=memory,
-        coverage=_coverage(recordings.values[:, :2]),
+        coverage=float((visits >= VISITED_SAMPLES).mean()),
         switching=switching(recordings) if memory.may_hop else None,
     )
 
 
 def _span(values: np.ndarray | Sequence[float]) -> Span:
     return Span(float(np.min(values)), float(np.median(values)), float(np.max(values)))
-
-
-def _coverage(values: np.ndarray) -> float:
-    """Share of the cells over the range of one state or two that were visited."""
-    low, high = np.quantile(values, [OUTLIER_SHARE, 1 - OUTLIER_SHARE], axis=0)
-    place = np.floor((values - low) / positive(high - low) * CELLS).astype(int)
-    counts, _ = np.histogramdd(place, bins=[np.arange(CELLS + 1) - 0.5] * place.shape[1])
-    return float((counts >= VISITED_SAMPLES).mean())

@@ -39,6 +39,7 @@ _SLASHED_DATE = re.compile(r"\d{1,4}/\d{1,2}/\d{1,4}.*")
 _NUMERIC = (
     pa.types.is_floating, pa.types.is_integer, pa.types.is_boolean, pa.types.is_decimal, pa.types.is_null,
 )  # fmt: skip
+_TEXT = (pa.types.is_string, pa.types.is_large_string, pa.types.is_string_view)
 RESTART_SHARE = 0.1  # of the time that a recording took: where it starts over, it does so near its beginning
 # Of the steps lead back in time where rows are shuffled: recordings of three samples, one after another, have
 # as many.
@@ -144,7 +145,7 @@ def _parse_numbers(file: str, name: str, cells: Column) -> tuple[np.ndarray, str
         cells = cells.cast(cells.type.value_type)
     unit: str | None = None
     fault: Fault | None = None
-    if _is_text(cells.type):
+    if any(is_kind(cells.type) for is_kind in _TEXT):
         cells, unit, fault = _split_units(file, name, cells)
     elif not any(is_kind(cells.type) for is_kind in _NUMERIC):
         remedy = "write it as numbers in one unit"
@@ -191,10 +192,6 @@ def _unit_of(cell: str) -> str | None:
     """Find the unit in a cell of text: empty where there is none, None where the cell holds no number."""
     match = re.fullmatch(f"{_NUMBER}({_UNIT})?", cell)
     return (match[1] or "").strip() if match else None
-
-
-def _is_text(kind: pa.DataType) -> bool:
-    return pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind)
 
 
 def _parse_labels(

@@ -495,7 +495,31 @@ def assignments(form: Form, model: Dynamics, roles: Roles) -> Iterator[dict[str,
     kinds = list(form.roles.values())
     names = list(form.roles)
     choices: list[list[dict[str, str]]] = []
-    pairs, alone = _fillings(model, roles)
+    # What fills two kinds of roles together, and what fills each by itself.
+    pairs: dict[tuple[str, ...], tuple[tuple[str, str], ...]] = {
+        ("position", "velocity"): roles.motions,
+        ("displacement", "velocity"): tuple(pair for pair in roles.motions if pair[0] not in roles.angles),
+        ("angle", "velocity"): tuple(pair for pair in roles.motions if pair[0] in roles.angles),
+        ("amplitude", "amplitude"): roles.amplitudes,
+        ("prey", "predator"): roles.feeding,
+        ("upper level", "lower level"): roles.cascades,
+    }
+    alone: dict[str, tuple[str, ...]] = {}
+    for both, motions in pairs.items():
+        for side, kind in enumerate(both):
+            alone.setdefault(kind, tuple(pair[side] for pair in motions))
+    alone |= {
+        "amplitude": tuple(name for pair in roles.amplitudes for name in pair),
+        "velocity": (*(velocity for _, velocity in roles.motions), *roles.speeds),
+        "population": roles.populations,
+        "level": roles.levels,
+        "store": roles.stores,
+        "stock": (*roles.populations, *roles.levels, *roles.stores),
+        "state": roles.states,
+        "input": tuple(entry.name for entry in model.inputs),
+        "parameter": tuple(entry.name for entry in model.parameters),  # what is known at first may drift, too
+        "output": model.output_names,
+    }
     place = 0
     while place < len(names):
         together = tuple(kinds[place : place + 2])
@@ -516,33 +540,3 @@ def assignments(form: Form, model: Dynamics, roles: Roles) -> Iterator[dict[str,
         if len(found) > 1 or "1" in found:
             continue
         yield {role: name for part in combination for role, name in part.items()}
-
-
-def _fillings(
-    model: Dynamics, roles: Roles
-) -> tuple[dict[tuple[str, ...], tuple[tuple[str, str], ...]], dict[str, tuple[str, ...]]]:
-    """What fills two kinds of roles together, and what fills each by itself."""
-    pairs: dict[tuple[str, ...], tuple[tuple[str, str], ...]] = {
-        ("position", "velocity"): roles.motions,
-        ("displacement", "velocity"): tuple(pair for pair in roles.motions if pair[0] not in roles.angles),
-        ("angle", "velocity"): tuple(pair for pair in roles.motions if pair[0] in roles.angles),
-        ("amplitude", "amplitude"): roles.amplitudes,
-        ("prey", "predator"): roles.feeding,
-        ("upper level", "lower level"): roles.cascades,
-    }
-    alone: dict[str, tuple[str, ...]] = {}
-    for kinds, names in pairs.items():
-        for side, kind in enumerate(kinds):
-            alone.setdefault(kind, tuple(pair[side] for pair in names))
-    return pairs, alone | {
-        "amplitude": tuple(name for pair in roles.amplitudes for name in pair),
-        "velocity": (*(velocity for _, velocity in roles.motions), *roles.speeds),
-        "population": roles.populations,
-        "level": roles.levels,
-        "store": roles.stores,
-        "stock": (*roles.populations, *roles.levels, *roles.stores),
-        "state": roles.states,
-        "input": tuple(entry.name for entry in model.inputs),
-        "parameter": tuple(entry.name for entry in model.parameters),  # what is known at first may drift, too
-        "output": model.output_names,
-    }

@@ -26,6 +26,7 @@ from siq.errors import NumericalFailure
 from siq.inference.kalman_filter import Noise, Whitened, solve, whiten
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
+from siq.numerics.randomness import positive
 from siq.remarks import Remark, sentence
 
 BLOCK_CORRELATION_TIMES = 4.0  # correlation times in a block
@@ -192,14 +193,11 @@ def probability_by_chance(
     names = [fit.model.parameters[place].name for place in fit.model.free]
     tested = np.array([names.index(name) for name in (candidate.amplitudes or candidate.shapes)], dtype=int)
     values = fit.model.values[[fit.model.free[place] for place in tested]] + change[tested]
-    owner = white.recording
-    if few:
-        owner = _blocks_of(owner, left, least=blocks)
+    owner = _blocks_of(white.recording, left, least=blocks) if few else white.recording
     others = np.setdiff1d(np.arange(white.columns.shape[1]), tested)
     nuisance = np.linalg.qr(white.columns[:, others])[0] if len(others) else np.zeros((len(left), 0))
     columns = white.columns[:, tested] - nuisance @ (nuisance.T @ white.columns[:, tested])
-    scale = np.sqrt((columns**2).sum(axis=0))
-    scale = np.where(scale > 0, scale, 1.0)
+    scale = positive(np.sqrt((columns**2).sum(axis=0)))
     columns = columns / scale
     scores = np.stack([np.bincount(owner, column * left) for column in columns.T], axis=1)
     count, width = len(scores), len(tested)
@@ -233,8 +231,8 @@ def orthonormal(columns: np.ndarray) -> np.ndarray:
     """Orthonormal basis of what columns span, shape ``(n, r)``."""
     if not columns.shape[1]:
         return columns
-    scale = np.sqrt((columns**2).sum(axis=0))
-    basis, values, _ = np.linalg.svd(columns / np.where(scale > 0, scale, 1.0), full_matrices=False)
+    scale = positive(np.sqrt((columns**2).sum(axis=0)))
+    basis, values, _ = np.linalg.svd(columns / scale, full_matrices=False)
     return basis[:, values > 1e-9 * values[0]] if values[0] > 0 else basis[:, :0]
 
 

@@ -51,6 +51,7 @@ from siq.inference.kalman_filter import Whitened, whiten
 from siq.inference.maximum_likelihood import Fit, first_noise, fit_by_multiple_shooting
 from siq.inference.measurements import Measurements
 from siq.inference.trajectories import EDGE_SUBSTEPS, jumps_of, spread_edges
+from siq.numerics.randomness import positive
 from siq.systems.dynamics import Dynamics
 
 LOGGER = logging.getLogger(__name__)
@@ -136,8 +137,7 @@ class _Foreseen:
     def signs(self, sums: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         """Signs of the coefficients of columns, fitted to all parts, shape ``(k,)``."""
         whole, right = (each.sum(axis=0) for each in sums)
-        scale = np.sqrt(np.diag(whole))
-        scale = np.where(scale > 0, scale, 1.0)
+        scale = positive(np.sqrt(np.diag(whole)))
         damped = whole / np.outer(scale, scale) + RIDGE * np.eye(len(scale))
         return np.asarray(np.sign(np.linalg.solve(damped, right / scale))[self.own.shape[1] :])
 
@@ -155,8 +155,7 @@ class _Foreseen:
         """The same by the normal equations of columns, see `sums`."""
         (squares, _, _, count), (whole, right), p = self._base, sums, self.own.shape[1]
         k = whole.shape[1] - p
-        scale = np.sqrt(np.einsum("fii->i", whole))
-        scale = np.where(scale > 0, scale, 1.0)
+        scale = positive(np.sqrt(np.einsum("fii->i", whole)))
         whole, right = whole / np.outer(scale, scale), right / scale
         damping = RIDGE * np.eye(p + k)
         if precision is not None:
@@ -392,8 +391,7 @@ def _gains(
     other horizons.
     """
     asked = _gained(horizons[0], [term for site in sites for term in site.terms], leading, budget)
-    ends = np.cumsum([len(site.terms) for site in sites])
-    promised = [asked[end - len(site.terms) : end] for site, end in zip(sites, ends, strict=True)]
+    promised = np.split(asked, np.cumsum([len(site.terms) for site in sites])[:-1])
     for site, one in zip(sites, promised, strict=True):
         if site.candidate is not None and np.isnan(one).all():
             untried[site.label] = NotFitted.of(site.candidate, OVERFLOWS)
@@ -408,15 +406,12 @@ def _gains(
     for each in horizons[1:]:
         gained = gained + _gained(each, [term for site in kept for term in site.terms], leading, budget)
     gained = np.where(np.isnan(gained), -np.inf, gained) / len(horizons)
-    ends = np.cumsum([len(site.terms) for site in kept])
+    own = np.split(gained, np.cumsum([len(site.terms) for site in kept])[:-1])
     # The prior of a mechanism is spread over all shapes at which it was looked for.
-    found = [
-        logsumexp(gained[end - len(site.terms) : end]) - np.log(len(sites[place].terms))
-        for place, site, end in zip(order, kept, ends, strict=True)
-    ]
+    found = [logsumexp(one) - np.log(len(sites[k].terms)) for k, one in zip(order, own, strict=True)]
     best = [
-        replace(site, terms=tuple(site.terms[k] for k in np.argsort(-gained[end - len(site.terms) : end])))
-        for site, end in zip(kept, ends, strict=True)
+        replace(site, terms=tuple(site.terms[shape] for shape in np.argsort(-one)))
+        for site, one in zip(kept, own, strict=True)
     ]
     return best, np.array(found)
 
@@ -427,7 +422,8 @@ def _in_place_of(
     """The problem of what is missing without a mechanism, along the trajectories of the fit with it."""
     own = white.columns[:, : len(fit.model.free)]
     tested, linear = (_places_of(leading, fit, linear=each) for each in (False, True))
-    values = fit.model.values[list(fit.model.free)] + _solved(own, white.innovations)
+    change = np.linalg.lstsq(own, white.innovations, rcond=1e-10)[0] if own.shape[1] else np.zeros(0)
+    values = fit.model.values[list(fit.model.free)] + change
     target = white.innovations + own[:, linear] @ values[linear]
     return _Foreseen(white, target, np.delete(own, tested, axis=1), fold)
 
@@ -458,10 +454,6 @@ def _containing(horizon: Horizon, sites: Sequence[_Site], leading: MechanismCand
             own = orthonormal(columns - basis @ (basis.T @ columns))
             found[place] = ((own.T @ effect) ** 2).sum() >= NEARLY_ALL * (effect @ effect)
     return found
-
-
-def _solved(columns: np.ndarray, target: np.ndarray) -> np.ndarray:
-    return np.linalg.lstsq(columns, target, rcond=1e-10)[0] if columns.shape[1] else np.zeros(0)
 
 
 def _density(problem: _Foreseen, term: Probe | Place, columns: np.ndarray) -> float:
@@ -540,17 +532,15 @@ def _fitted_at(
     candidate = site.candidate
     assert candidate is not None
     found: list[Horizon] = []
-    begin: Fit | None = None
     for each in horizons:
         try:
-            fit, x = _begun(site, each, begin)
+            fit, x = _begun(site, each, found[-1].fit if found else None)
             fit = _fitted(fit.model, each.data, fit, x, budget=budget)
             if not candidate.admits(fit):
                 raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
             if candidate.generalises and candidate.idle(fit):
                 raise NumericalFailure("it is no more than the special case of it")
             found.append(Horizon.of(fit, each.data))
-            begin = fit
         except NUMERICAL_ERRORS as error:
             LOGGER.info("%s at a horizon: %s", candidate.label, error)
             untried[candidate.label] = NotFitted.of(candidate, error)
@@ -567,40 +557,13 @@ def _fitted_at(
 
 def _begun(site: _Site, horizon: Horizon, before: Fit | None) -> tuple[Fit, np.ndarray]:
     """A fit with a mechanism to begin with, from its best shapes, or from the fit at the horizon before."""
-    candidate, fit = site.candidate, horizon.fit
-    assert candidate is not None
-    known = {each.name: each.value for each in fit.model.parameters}
-    known |= dict.fromkeys(candidate.amplitudes, 0.0)
-    probe = site.terms[0]
-    assert isinstance(probe, Probe)
-    known |= dict(probe.shapes)
+    candidate, fit, probe = site.candidate, horizon.fit, site.terms[0]
+    assert candidate is not None and isinstance(probe, Probe)
+    known = dict(probe.shapes)
     if before is not None:
         known |= {each.name: each.value for each in before.model.parameters if each.name in candidate.new}
-    values = np.array([known.get(each.name, each.value) for each in candidate.model.parameters])
-    return replace(fit, model=candidate.model.with_values(values)), probe.states_along(
-        fit, horizon.data, fit.x
-    )
-
-
-def _fitted_in_earnest(
-    horizons: Sequence[Horizon],
-    sites: Sequence[_Site],
-    gains: np.ndarray,
-    budget: Budget,
-    untried: dict[str, NotFitted],
-) -> dict[str, _Leader]:
-    """The mechanisms that promise most, fitted at every horizon; those that foresee better than nothing."""
-    found: dict[str, _Leader] = {}
-    weights = gains + np.array([site.prior for site in sites])
-    order = [place for place in np.argsort(-weights) if sites[place].candidate is not None]
-    for number, place in enumerate(order[:ATTEMPTS], start=1):
-        if not gains[place] > 0 or len(found) == LEADERS:
-            break
-        budget.says(f"candidate {number} of at most {min(ATTEMPTS, len(order))}: {sites[place].label}")
-        fitted = _fitted_at(horizons, sites[place], budget, untried)
-        if fitted is not None and fitted[1] > 0:
-            found[sites[place].label] = _Leader(sites[place], *fitted)
-    return found
+    begun = replace(fit, model=candidate.begun(fit.model, known))
+    return begun, probe.states_along(fit, horizon.data, fit.x)
 
 
 def _next_rung(
@@ -613,7 +576,17 @@ def _next_rung(
     options, base, budget = context.study.search, horizons[0].fit, context.budget
     budget.says("comparing forecasts of what was left out")
     sites, gains = _gains(horizons, _sites(candidates, base, context, untried), None, budget, untried)
-    fitted = _fitted_in_earnest(horizons, sites, gains, budget, untried)
+    # The mechanisms that promise most, fitted at every horizon; those that foresee better than nothing.
+    fitted: dict[str, _Leader] = {}
+    weights = gains + np.array([site.prior for site in sites])
+    order = [place for place in np.argsort(-weights) if sites[place].candidate is not None]
+    for number, place in enumerate(order[:ATTEMPTS], start=1):
+        if not gains[place] > 0 or len(fitted) == LEADERS:
+            break
+        budget.says(f"candidate {number} of at most {min(ATTEMPTS, len(order))}: {sites[place].label}")
+        found = _fitted_at(horizons, sites[place], budget, untried)
+        if found is not None and found[1] > 0:
+            fitted[sites[place].label] = _Leader(sites[place], *found)
     if not fitted:
         return None
     alone = {site.label: site for site in sites if site.candidate is not None}
@@ -669,7 +642,8 @@ def _next_rung(
         float(logsumexp(each[family]) - logsumexp(np.append(each[~family], 0.0)))  # and nothing at all
         for each in (weights, flat)
     )
-    _told(sites, gains)
+    for place in np.argsort(-gains)[:LEADERS]:
+        LOGGER.info("%s: gains %.1f", sites[place].label, gains[place])
     LOGGER.info("%s: log-odds of %s %.1f", leader.site.label, leader.site.family[0], log_odds)
     # The general form of a family may do more than any member of it: another physics then, of the same kind.
     general = max((gains[k] for k in np.flatnonzero(family) if sites[k].candidate is None), default=0.0)
@@ -694,12 +668,6 @@ def _next_rung(
         "less": tuple(each for label, each in known.items() if label not in alike),
     }
     return Rung(AcceptedMechanism(best, others), tuple(leader.horizons), log_odds, flat_log_odds, leader.gain)
-
-
-def _told(sites: Sequence[_Site], gains: np.ndarray) -> None:
-    """Log what gains most."""
-    for place in np.argsort(-gains)[:LEADERS]:
-        LOGGER.info("%s: gains %.1f", sites[place].label, gains[place])
 
 
 def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[Rung], tuple[NotFitted, ...]]:

@@ -75,9 +75,8 @@ def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigat
         with budget.keeping(BUDGET_FOR_FUNCTIONS):
             named, recalibrations = named_by_forecasts(recalibrated, least_squares, context)
     if named is None:
-        result = replace(
-            _by_tests(recalibrated, least_squares, context, dictionary), recalibrations=recalibrations
-        )
+        result = _by_tests(recalibrated, least_squares, context, dictionary)
+        result = replace(result, recalibrations=recalibrations)
     else:
         result = replace(named, p_shift=_shift_probability(model, recalibrated))
     budget.says("working out how well parameters are known")
@@ -111,8 +110,7 @@ def _by_tests(
             break
     tried = bool(found.found)
     if tried:
-        result = decide_naming(found, by_each, context)
-        result = replace(result, least_squares=least_squares)
+        result = replace(decide_naming(found, by_each, context), least_squares=least_squares)
     else:
         left = Remainder.of(data, recalibrated, recalibrated, roles)
         result = Investigation(context, found, left, MismatchVerdict.NO_MISMATCH, least_squares)
@@ -222,18 +220,14 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     def best_of(*fits: Fit | None) -> Fit:
         """The fit that runs nearest to what was learned from; the first of those that are as near."""
         known = [each for each in fits if each is not None]
-        return (
-            known[0] if len(known) == 1 else min(known, key=lambda fit: mean_error(errors_of(fit, learned)))
-        )
+        return min(known, key=lambda fit: mean_error(errors_of(fit, learned))) if known[1:] else known[0]
 
     card = replace(search.recalibrated, model=investigation.context.model)
     # What fits best with process noise admitted need not be what runs best without.
     recalibrated = search.recalibrated
     if recalibrated.has_process_noise:
-        refits = [(investigation.least_squares, learned)]
-        refits += [(each.fit, each.data) for each in investigation.recalibrations] or [
-            (recalibrated, learned)
-        ]
+        horizons = [(each.fit, each.data) for each in investigation.recalibrations]
+        refits = [(investigation.least_squares, learned), *(horizons or [(recalibrated, learned)])]
         recalibrated = preferred_recalibration(card, refits, learned, noise=noise)
     plain = best_of(investigation.exact, search.fit, *(each.fit for each in investigation.finals))
     choices = [(model, best_of(model.fit, model.exact)) for model in investigation.models]

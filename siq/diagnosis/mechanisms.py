@@ -44,6 +44,7 @@ from siq.diagnosis.dictionary import (
 from siq.errors import InputError
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
+from siq.numerics.randomness import positive
 from siq.systems.dynamics import TIME, Dynamics, Parameter, Signals, symbol
 from siq.systems.formulas import FormulaError, compile_values, parse_formula
 
@@ -203,6 +204,13 @@ class MechanismCandidate:
     def new(self) -> tuple[str, ...]:
         """All new parameters, in the order of the model's."""
         return tuple(p.name for p in self.model.parameters if p.name in {*self.amplitudes, *self.shapes})
+
+    def begun(self, base: Dynamics, known: Mapping[str, float]) -> Dynamics:
+        """Its model with values to begin with: those of a simulation, no effect, and what else is known."""
+        values = {each.name: each.value for each in base.parameters}
+        values |= dict.fromkeys(self.amplitudes, 0.0) | dict(known)
+        own = [values.get(each.name, each.value) for each in self.model.parameters]
+        return self.model.with_values(np.array(own))
 
     def rebased(self, before: Dynamics, now: Dynamics) -> MechanismCandidate:
         """It on top of a model that has grown since."""
@@ -490,9 +498,8 @@ def _new_columns(own: np.ndarray, columns: np.ndarray) -> list[bool]:
 
 def _of_unit_length(columns: np.ndarray) -> np.ndarray:
     largest = np.abs(columns).max(axis=0, initial=0.0)  # first, since squares may be beyond all numbers
-    columns = columns / np.where(largest > 0, largest, 1.0)
-    length = np.sqrt((columns**2).sum(axis=0))
-    return columns / np.where(length > 0, length, 1.0)
+    columns = columns / positive(largest)
+    return columns / positive(np.sqrt((columns**2).sum(axis=0)))
 
 
 def _columns(

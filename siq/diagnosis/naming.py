@@ -248,8 +248,7 @@ def decide_naming(whole: Search, left: Sequence[Remainder], context: FitContext)
     context
         What models are made from, and what could be named.
     """
-    decision = _judge_mechanisms(whole, left, context)
-    return _with_models(decision, whole, context)
+    return _with_models(_judge_mechanisms(whole, left, context), whole, context)
 
 
 def _with_models(decision: Investigation, whole: Search, context: FitContext) -> Investigation:
@@ -298,7 +297,9 @@ def named_by_forecasts(
         if each.flat_log_odds < context.study.search.least_log_odds
     ]
     if left.doubtful or fit.has_process_noise:
-        remarks.append(_remainder_remark(left, unnamed=True))
+        # How much of the excess over noise is left by what was found, and whether it looks like noise.
+        values = {"left": 1 - left.share, "doubtful": left.doubtful, "p": left.after.p_value, "unnamed": True}
+        remarks.append(Remark("diagnosis.remainder", values))
     decision = Investigation(
         context, search, left, MismatchVerdict.MISSING_PHYSICS, least_squares, convincing=True,
         log_odds=tuple(each.log_odds for each in rungs), remarks=tuple(remarks),
@@ -322,9 +323,3 @@ def _log_odds(search: Search, number: int, chosen: Sequence[int], context: FitCo
         odds += float(scipy.special.logsumexp(-0.5 * (np.array(same) - one.best.delta_bic)))
     LOGGER.info("%s: log-odds of the name %.1f", [each.label for each in named], odds)
     return odds
-
-
-def _remainder_remark(left: Remainder, *, unnamed: bool = False) -> Remark:
-    """How much of the excess over noise is left by what was found, and whether it looks like noise."""
-    values = {"left": 1 - left.share, "doubtful": left.doubtful, "p": left.after.p_value, "unnamed": unnamed}
-    return Remark("diagnosis.remainder", values)

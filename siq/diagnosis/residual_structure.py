@@ -34,6 +34,7 @@ from siq.inference.kalman_filter import Grid, Noise, profile_likelihood, solve, 
 from siq.inference.maximum_likelihood import Fit, first_noise, fit_by_multiple_shooting
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import FAINT, process_noise_needed
+from siq.numerics.randomness import positive
 
 LAGS = 12  # of autocorrelations
 
@@ -220,13 +221,11 @@ def explained_by_quantisation(
     coarse = steps > np.sqrt(strict.noise.measurement)
     if not (strict.converged and coarse.any()):
         return None
-    deviation, fit = np.sqrt(strict.noise.measurement), strict
-    values = data
+    values, fit, deviation = data, strict, np.sqrt(strict.noise.measurement)
     for _ in range(QUANTISATION_ROUNDS):
         before = deviation
         signals = Grid(values, fit.substeps).at_samples(fit.model.lags(fit.model.values))
-        states = np.ascontiguousarray(fit.x.T)
-        simulated = fit.model.functions.outputs(states, signals, fit.model.values).T
+        simulated = fit.model.functions.outputs(np.ascontiguousarray(fit.x.T), signals, fit.model.values).T
         values, deviation = _before_quantisation(data, simulated, steps, before)
         fit = fit_by_multiple_shooting(
             fit.model, values, x=fit.x, noise=fit.noise, estimate_process=False, substeps=fit.substeps,
@@ -277,8 +276,7 @@ def noise_nonstationarity(fit: Fit, data: Measurements) -> float:
     Both have their intensities at their best; of forces that follow the motion at least half are in
     proportion to the square of its size.
     """
-    spread = fit.x.std(axis=0)
-    moved = (fit.x - fit.x.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+    moved = (fit.x - fit.x.mean(axis=0)) / positive(fit.x.std(axis=0))
     motion = (moved**2).mean(axis=1)
     following = motion / motion.mean()
 

@@ -272,11 +272,10 @@ def _with_start(promised: Ranked[Probe], base: Dynamics) -> Dynamics:
     shapes need one.
     """
     candidate = promised.term.candidate
-    known = {parameter.name: parameter.value for parameter in base.parameters}
-    known |= dict.fromkeys(candidate.amplitudes, 0.0) | dict(promised.term.shapes)
+    known = dict(promised.term.shapes)
     if candidate.amplitudes and candidate.shapes:
         known |= dict(zip(candidate.amplitudes, map(float, promised.amplitudes), strict=True))
-    return candidate.model.with_values(np.array([known[each.name] for each in candidate.model.parameters]))
+    return candidate.begun(base, known)
 
 
 def _stands_together(
@@ -295,9 +294,8 @@ def _stands_together(
             else each
             for each in fit.model.parameters
         )
-        without = fit_with_process_noise_as_needed(replace(fit.model, parameters=absent), data, fit)
-    if without is not None and not without.converged:
-        without = None
+        refit = fit_with_process_noise_as_needed(replace(fit.model, parameters=absent), data, fit)
+        without = refit if refit.converged else None
     p_cluster = probability_by_chance(fit, without, data, candidate, blocks=blocks)
     LOGGER.info("%s on trial: p %.1e clustered", candidate.label, p_cluster)
     if p_cluster >= chance:

@@ -217,11 +217,9 @@ class SmoothFunction:
         units = ("1",) * (self.width - last) + (whole,) * last
         candidate = self.place.added_to(model, formula, names, units)
         together = (*candidate.model.expected_together, *(each.expected(own) for each, own in pairs))
-        known = dict(zip(names, self.begin, strict=True))
-        values = [known.get(each.name, each.value) for each in candidate.model.parameters]
-        begun = replace(candidate.model, expected_together=together).with_values(np.array(values))
+        begun = candidate.begun(candidate.model, dict(zip(names, self.begin, strict=True)))
         kind: Kind = CURVE if len(self.place.coordinates) == 1 else SURFACE
-        return replace(candidate, model=begun, kind=kind, smooth=self)
+        return replace(candidate, model=replace(begun, expected_together=together), kind=kind, smooth=self)
 
 
 def _product_of(
@@ -246,7 +244,20 @@ def _product_of(
     bases = [[basis(side, share) for share in shares] for side in range(2)]
     highest, best = -np.inf, None
     for (one, first), (other, second) in itertools.product(*bases):
-        evidence, f, g = _in_turns(first, deviation * second, gram, overlap)
+        second = deviation * second
+        g = np.linalg.lstsq(second.T, np.full(second.shape[1], np.sqrt((second**2).sum(axis=0).mean())))[0]
+        f, before = np.zeros(len(first)), np.inf
+        for _ in range(PRODUCT_ITERATIONS):
+            f, _ = _given(first * (g @ second), gram, overlap)
+            g, left = _given(second * (f @ first), gram, overlap)
+            left += float(f @ f)
+            if before - left < PRODUCT_TOLERANCE * abs(left):
+                break
+            before = left
+        # The evidence is averaged over all that the factors could be (Laplace's approximation).
+        both = np.concatenate([first * (g @ second), second * (f @ first)])
+        told = np.linalg.eigvalsh(both @ gram @ both.T)
+        evidence = -0.5 * left - 0.5 * float(np.log1p(np.maximum(told, 0.0)).sum())
         if evidence > highest:
             heights = [
                 scipy.linalg.solve_triangular(function.triangle, values, lower=True, trans="T")
@@ -257,27 +268,6 @@ def _product_of(
     if best is None:
         raise NumericalFailure("no product of two functions has an evidence that is a number")
     return best
-
-
-def _in_turns(
-    first: np.ndarray, second: np.ndarray, gram: np.ndarray, overlap: np.ndarray
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """Evidence and independent coefficients of two factors, given what each has at points ``(b, z)``.
-
-    The evidence is averaged over all that the factors could be (Laplace's approximation).
-    """
-    g = np.linalg.lstsq(second.T, np.full(second.shape[1], np.sqrt((second**2).sum(axis=0).mean())))[0]
-    f, before = np.zeros(len(first)), np.inf
-    for _ in range(PRODUCT_ITERATIONS):
-        f, _ = _given(first * (g @ second), gram, overlap)
-        g, left = _given(second * (f @ first), gram, overlap)
-        left += float(f @ f)
-        if before - left < PRODUCT_TOLERANCE * abs(left):
-            break
-        before = left
-    both = np.concatenate([first * (g @ second), second * (f @ first)])
-    told = np.linalg.eigvalsh(both @ gram @ both.T)
-    return -0.5 * left - 0.5 * float(np.log1p(np.maximum(told, 0.0)).sum()), f, g
 
 
 def _given(basis: np.ndarray, gram: np.ndarray, overlap: np.ndarray) -> tuple[np.ndarray, float]:

@@ -293,10 +293,8 @@ def _split(data: Measurements, study: MismatchStudy, *, file: str) -> tuple[Meas
         if not chosen or len(chosen) == count:
             fault = "one side of the split is empty"
             raise InputError(file, "held_out", fault, "hold out some, not all")
-    return (
-        data.select([place for place in range(count) if place not in chosen]),
-        data.select(sorted(chosen)),
-    )
+    learn = data.select([place for place in range(count) if place not in chosen])
+    return learn, data.select(sorted(chosen))
 
 
 def read_case(card: str | Path, recordings: str | Path, study: str | Path | None) -> Comparison:

@@ -207,10 +207,8 @@ def places_in(
             size = sympy.sqrt(a**2 + b**2 + TINY_AMPLITUDE)
         else:
             functions["t"] = symbol("t")
-        along_it, across = (
-            ((first, a / size), (second, b / size)),
-            ((first, b / size), (second, -a / size)),
-        )
+        along_it = ((first, a / size), (second, b / size))
+        across = ((first, b / size), (second, -a / size))
         found += [
             Place(equations, (), (formula,), (word,), linear=linear)
             for word, formula in functions.items()

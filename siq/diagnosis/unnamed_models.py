@@ -26,7 +26,8 @@ import sympy
 
 from siq.diagnosis.dictionary import Form, FurtherState, Mechanism, MechanismParameter, Role, Roles, Shape
 from siq.diagnosis.evidence import NUMERICAL_ERRORS, FittedCandidate, log_evidences
-from siq.diagnosis.mechanisms import FORMULA, MECHANISM, MechanismCandidate, candidates_of, coordinates_of
+from siq.diagnosis.holdout import simulated
+from siq.diagnosis.mechanisms import FORMULA, MechanismCandidate, candidates_of, coordinates_of
 from siq.diagnosis.residual_structure import has_structure
 from siq.diagnosis.screening import Ranked, screen_all
 from siq.diagnosis.search import FitContext, Search, best_probes
@@ -42,7 +43,7 @@ from siq.inference.recalibration import (
     fit_with_process_noise_as_needed,
     preferred_fit,
 )
-from siq.inference.trajectories import fit_trajectories, free_run, normalised_rms
+from siq.inference.trajectories import fit_trajectories, normalised_rms
 from siq.systems.dynamics import Dynamics, symbol
 
 LOGGER = logging.getLogger(__name__)
@@ -107,12 +108,11 @@ def runs_freely(fit: Fit, alone: Fit, data: Measurements) -> bool:
     """
     if fit.has_process_noise or alone.has_process_noise:
         return True
-    errors = []
-    for each in (fit, alone):
-        # Steps twice as fine: what depends on them is no property of the simulation.
-        run = free_run(each.model, data, noise=each.noise, substeps=2 * each.substeps, usual=each.x)
-        errors.append(normalised_rms(run, data))
-    one, other = errors
+    # Steps twice as fine: what depends on them is no property of the simulation.
+    one, other = (
+        normalised_rms(simulated(each, data, noise=each.noise, substeps=2 * each.substeps), data)
+        for each in (fit, alone)
+    )
     return one is not None and (other is None or one < other)
 
 
@@ -125,11 +125,9 @@ def _fitted_term(
         budget.says(f"a {kind}: {candidate.label}")
         with budget.part(LARGEST_PART):
             begun = fit if begin is None else begin
-            known = {each.name: each.value for each in begun.model.parameters}
             new = candidate.new
-            known |= {each.name: each.value for each in candidate.model.parameters if each.name in new}
-            values = [known.get(each.name, 0.0) for each in candidate.model.parameters]
-            model = candidate.model.with_values(np.array(values))
+            own = {each.name: each.value for each in candidate.model.parameters if each.name in new}
+            model = candidate.begun(begun.model, own)
             if not begun.has_process_noise:  # a function that was nearly right may lead no further
                 begun = replace(begun, noise=replace(begun.noise, process=fit.noise.process))
             trial = fit_with_process_noise_as_needed(model, data, begun, level=level, budget=budget)
@@ -354,9 +352,8 @@ def _with_memories(fit: Fit, models: Sequence[AugmentedModel], context: FitConte
         if each.gain < 2 * cost:
             break
         # Fitted from no effect on, with the τ that promises most.
-        candidate, known = each.term.candidate, dict(each.term.shapes)
-        values = [known.get(one.name, one.value) for one in candidate.model.parameters]
-        begun_model = candidate.model.with_values(np.array(values))
+        candidate = each.term.candidate
+        begun_model = candidate.begun(candidate.model, dict(each.term.shapes))
         candidate = replace(candidate, model=begun_model, log_cost=cost)
         try:
             x = each.term.states_along(fit, context.data, fit.x)
@@ -428,37 +425,31 @@ def _memory_forms() -> Iterator[Form]:
 MEMORY_FORMS = tuple(_memory_forms())
 
 
-def fit_unnamed_models(
-    search: Search, context: FitContext, *, functions: Sequence[AugmentedModel] | None = None
-) -> tuple[AugmentedModel, ...]:
+def fit_unnamed_models(search: Search, context: FitContext) -> tuple[AugmentedModel, ...]:
     """Models of what is missing, the likeliest first; none where none is likelier than the simulation alone.
 
-    Mechanisms that a search found are one of the models. Functions may be fitted already.
+    Mechanisms that a search found are one of the models.
     """
     base, data = search.recalibrated, context.data
-    models = list(with_function((), base, context) if functions is None else functions)
+    models = with_function((), base, context)
     if search.found and np.isfinite(search.fit.log_likelihood):
         models.append(AugmentedModel(_terms_of(search, context), search.fit))
     models = _weighed(models, base, data)
-    if functions is None:
-        models = _weighed([*models, *_with_surfaces(base, models, context)], base, data)
-        if _memory_suspected(models, data):
-            models = _weighed([*models, *_with_memories(base, models, context)], base, data)
+    models = _weighed([*models, *_with_surfaces(base, models, context)], base, data)
+    if _memory_suspected(models, data):
+        models = _weighed([*models, *_with_memories(base, models, context)], base, data)
     best = models[0] if models else None
     if (
         best is not None
         and best.fit.model.dimension == base.model.dimension
         and len(best.parts) < DESCRIBED_MOST
-        and (functions is None or best.parts[0].candidate.kind == MECHANISM)
         and has_structure(best.fit, data)
     ):
         models += with_function(best.parts, best.fit, context)
     return _likeliest(models, base, data)
 
 
-def fit_models_of_remainder(
-    named: Search, whole: Search, context: FitContext, *, functions: Sequence[AugmentedModel] | None = None
-) -> tuple[AugmentedModel, ...]:
+def fit_models_of_remainder(named: Search, whole: Search, context: FitContext) -> tuple[AugmentedModel, ...]:
     """Models of what mechanisms with a name leave, the likeliest first; none where none is likelier.
 
     They are what was found on top of the names, not certain enough for one itself, and functions on top of
@@ -470,8 +461,6 @@ def fit_models_of_remainder(
         The search with what is named, and with all that was found.
     context
         What models are made from.
-    functions
-        Those on top of the names alone, where they are fitted already.
     """
     base, data = named.fit, context.data
 
@@ -480,14 +469,10 @@ def fit_models_of_remainder(
             return []
         return with_function(parts, fit, context)
 
-    models = list(functions or ())
     parts = _terms_of(whole, context)[len(named.found) :]
     fits = [each.best.fit for each in whole.found[len(named.found) :]]
-    models += [AugmentedModel(parts[: place + 1], fit) for place, fit in enumerate(fits)]
-    if parts:
-        models += on_top(parts, whole.fit)
-    elif functions is None:
-        models += on_top((), base)
+    models = [AugmentedModel(parts[: place + 1], fit) for place, fit in enumerate(fits)]
+    models += on_top(parts, whole.fit if parts else base)
     names = [each.best.candidate for each in named.found]
     allowed = [
         each
@@ -523,7 +508,5 @@ def _likeliest(
         for each in _weighed(models, alone, data)
         if each.log_evidence > 0 and runs_freely(each.fit, alone, data)
     )
-    found = []
-    for each in itertools.islice(likelier, FUNCTIONS_FITTED):
-        found.append(replace(each, exact=exact_fit(each.fit, data)))
-    return tuple(found)
+    chosen = itertools.islice(likelier, FUNCTIONS_FITTED)
+    return tuple(replace(each, exact=exact_fit(each.fit, data)) for each in chosen)

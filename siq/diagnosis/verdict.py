@@ -309,10 +309,10 @@ def _shape_of(
 
     Where there is no such formula, whether it rises or falls all the way, as far as its errors tell.
     """
-    fits = []
+    asked, fits = None, []
     with suppress(*NUMERICAL_ERRORS):
-        if (asked := Smoothness.of(fit, context.data, place, known=part)) is not None:
-            fits = asked.fitting_forms()
+        asked = Smoothness.of(fit, context.data, place, known=part)
+        fits = [] if asked is None else asked.fitting_forms()
     if asked is None or not fits:
         value, error = np.array(curve.value), np.array(curve.standard_error)
         apart = np.subtract.outer(value, value)
@@ -390,14 +390,8 @@ def _locate(investigation: Investigation, described: AugmentedModel | None = Non
         equations, coordinate = _most_telling(investigation.remainder.before, investigation.context.roles)
     else:
         equations, coordinate = (), "unknown"
-    curve = next(
-        (
-            each
-            for each in curves
-            if each.term.words[0] == coordinate and set(each.term.targets) & set(equations)
-        ),
-        None,
-    )
+    there = (each for each in curves if set(each.term.targets) & set(equations))
+    curve = next((each for each in there if each.term.words[0] == coordinate), None)
     if investigation.process_noise:
         driven = zip(investigation.context.model.states, search.fit.noise.process, strict=False)
         equations, coordinate, curve = tuple(name for name, q in driven if q > 0), "random", None

@@ -189,18 +189,14 @@ class _PairRegression:
             moved = flow(lambda x: matrix @ self._terms(x), x0, h) - x0
             correction = moved / h - matrix @ self.theta[:, part]
             if noise_rate is not None and np.any(noise_rate):
-                curvature = self._curvature(x0, noise_rate)
+                # Σ_jk (εD)_jk ∂²θ/∂x_j∂x_k of the active functions, shape (active, n).
+                second = self._second(x0).reshape(*noise_rate.shape, len(self.active), -1)
+                curvature = np.einsum("ij,ijkn->kn", noise_rate, second)
                 correction += flow.response_share * h / 2 * (matrix @ curvature)
             # A trial f may run away on a few pairs; one round without their correction does no harm.
             correction[:, ~(np.abs(correction) <= most).all(axis=0)] = 0.0
             quotient[:, part] -= correction
         return quotient.T
-
-    def _curvature(self, x0: np.ndarray, noise_rate: np.ndarray) -> np.ndarray:
-        """Σ_jk (εD)_jk ∂²θ/∂x_j∂x_k of the active functions, shape ``(active, n)``."""
-        d = self.library.dimension
-        values = self._second(x0).reshape(d, d, len(self.active), -1)
-        return np.einsum("ij,ijkn->kn", noise_rate, values)
 
     @cached_property
     def _second(self) -> Callable[[np.ndarray], np.ndarray]:

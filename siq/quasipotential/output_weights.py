@@ -286,9 +286,14 @@ class OutputWeights:
         if not np.isfinite(slopes).all():  # of a training whose loss was lost
             return None
         steepness = float(networks.potential_scale[0, 0])
+        # Where f vanishes so does what is divided by its speed; about fixed points everything counts alike.
+        weight = 1 / (self.squared_speed + np.quantile(self.squared_speed, SLOW_SHARE))
         for basis in self._bases:
             # V over the units as the networks have it, by its gradient; |y|² keeps the weight that it has.
-            equation = self._equation(basis)
+            gradients = basis.gradients(self.points)
+            equation = HamiltonJacobi(
+                self.points, gradients, self._flow, self.diffusion, weight, self.diffusion
+            )
             n, d, m = equation.gradients.shape
             flat = equation.gradients.reshape(n * d, m)
             units, rest = flat[:, :-1], slopes.ravel() - steepness * flat[:, -1]
@@ -306,12 +311,6 @@ class OutputWeights:
                 leaving = all(self._leaves(one, basis, weights) for one in self._attractors)
                 return self._networks(basis, weights, self.points) if leaving else None
         return None
-
-    def _equation(self, basis: UnitBasis) -> HamiltonJacobi:
-        # Where f vanishes so does what is divided by its speed; about fixed points everything counts alike.
-        weight = 1 / (self.squared_speed + np.quantile(self.squared_speed, SLOW_SHARE))
-        gradients = basis.gradients(self.points)
-        return HamiltonJacobi(self.points, gradients, self._flow, self.diffusion, weight, self.diffusion)
 
     def by_wells(self) -> NetworksByWell | None:
         """Networks about each attractor of the identified f; None where some well has no solution."""

@@ -137,10 +137,6 @@ def percent_text(share: float, digits: int = 2) -> str:
     return f"{value_text(100 * share, digits=digits)} %" if np.isfinite(share) else ""
 
 
-def _named(unit: str) -> str:
-    return unit if unit_text(unit) else "time units"
-
-
 @cache
 def environment() -> Environment:
     """Templates of plain text, with numbers as filters: ``{{ value | value(error, unit="s") }}``."""
@@ -163,7 +159,7 @@ def environment() -> Environment:
         "count_word": lambda count: COUNTS[count] if count < len(COUNTS) else str(count),
         "term": term_text,
         "one_line": lambda text: " ".join(in_paragraphs(text)),
-        "time": lambda mean, unit: time_text(mean, _named(unit)),
+        "time": lambda mean, unit: time_text(mean, unit if unit_text(unit) else "time units"),
         "counted": counted_text,
         "predicted": predicted_text,
         "place": _position_text,

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
@@ -44,12 +43,6 @@ def answer_lines(
     return paragraphs(
         "answer.j2", s=summary, seen="" if seen is None else seen.sentence(), certified=certified
     )
-
-
-def _certificate_line(certificate: Mapping[str, Any] | None) -> str:
-    """The certificate in one sentence, for text."""
-    (line,) = paragraphs("certificate.j2", certificate=certificate, texts=texts("certificate"))[-1:]
-    return line
 
 
 def _complex_text(value: complex) -> str:
@@ -302,7 +295,9 @@ def _report(landscape: Landscape) -> tuple[list[str], list[tuple[str, pd.DataFra
     certified = certificate is not None and bool(certificate["certified"])
     answer, *further = answer_lines(summary, seen=landscape.seen, certified=certified)
     written = certificate is not None or any(well is not None for well in landscape.wells)
-    verdict = _certificate_line(certificate) if written else "U is not written as a formula."
+    verdict = "U is not written as a formula."
+    if written:
+        verdict = paragraphs("certificate.j2", certificate=certificate, texts=texts("certificate"))[-1]
     words = texts("tables")
     wells, _ = landscape_tables(summary)["wells"]
     tables = [] if wells.empty else [(words["wells"], wells)]

@@ -83,26 +83,28 @@ class _Progress:
         elif kind == "job_info":
             job = int(event["jobid"])
             self._rules[job] = event["rule_name"]
-            self._words[job] = self.running[job] = _in_short(event.get("rule_msg") or event["rule_name"])
+            # ``bead, run 000: drawing`` as ``drawing (bead)``: what is done comes first, the line is short.
+            message = event.get("rule_msg") or event["rule_name"]
+            of, colon, what = message.partition(": ")
+            short = f"{what} ({of.removesuffix(', run 000')})" if colon else message
+            self._words[job] = self.running[job] = short
             self.planned.append(self._words[job])
         elif kind == "doing":
             self._doing[str(event["of"])] = str(event["text"])
         elif kind == "job_finished":
-            self._end(int(event["job_id"]))
+            job = int(event["job_id"])
+            words = self._words.get(job, "")
+            self._doing = {of: text for of, text in self._doing.items() if not words.endswith(f"({of})")}
+            self.running.pop(job, None)
+            self.done += 1
+            self._worked += _seconds(self._rules.get(job, ""))
+            self._latest = self.clock()
         elif kind == "job_error":
             job = int(event["jobid"])
             self.running.pop(job, None)
             self.failed.append((self._words.get(job, str(event["rule_name"])), tuple(event.get("log") or ())))
         elif kind == "error":
             self.errors.append(str(event.get("text", "")))
-
-    def _end(self, job: int) -> None:
-        words = self._words.get(job, "")
-        self._doing = {of: text for of, text in self._doing.items() if not words.endswith(f"({of})")}
-        self.running.pop(job, None)
-        self.done += 1
-        self._worked += _seconds(self._rules.get(job, ""))
-        self._latest = self.clock()
 
     def _within(self, words: str) -> str:
         """What a running job said last of what it is doing."""
@@ -130,13 +132,6 @@ class _Progress:
         left = self.left()
         time_left = "" if left is None else f", {_duration(left)}"
         return f"{min(self.done + 1, self.total)} of {self.total}: {what}{more}{time_left}"
-
-
-def _in_short(message: str) -> str:
-    """``bead, run 000: drawing`` as ``drawing (bead)``: what is done comes first, and the line is short."""
-    of, colon, what = message.partition(": ")
-    name = of.removesuffix(", run 000")
-    return f"{what} ({name})" if colon else message
 
 
 def _seconds(rule: str) -> float:
@@ -309,15 +304,6 @@ def _lines(stream: IO[str]) -> Iterator[str]:
         yield line
 
 
-def _wait_once_more(process: subprocess.Popen[str] | subprocess.Popen[bytes], patience: float = 20.0) -> None:
-    """Let an interrupted workflow clean up; end it when it is interrupted again, or takes too long."""
-    try:
-        process.wait(timeout=patience)
-    except (KeyboardInterrupt, subprocess.TimeoutExpired):
-        process.kill()
-        process.wait()
-
-
 def _known_studies() -> Sequence[str]:
     """The names of the studies that come with the workflow."""
     return sorted(path.stem for path in (_workflow_folder() / "config" / "studies").glob("*.yaml"))
@@ -408,7 +394,11 @@ def _answered(request: Request, pages: Sequence[Path]) -> Exit:
             said = follow(_lines(process.stdout), Screen(sys.stderr, columns=columns), progress)
         code = process.wait()
     except KeyboardInterrupt:  # Snakemake has been told, too, and lets no half of a file stand
-        _wait_once_more(process)
+        try:  # it cleans up; interrupted again, or after too long, it is ended
+            process.wait(timeout=20.0)
+        except (KeyboardInterrupt, subprocess.TimeoutExpired):
+            process.kill()
+            process.wait()
         print("\nStopped. Give the same command again to go on from here.", file=sys.stderr)
         return Exit.INTERRUPTED
     if code and not request.verbose:

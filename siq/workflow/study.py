@@ -300,23 +300,22 @@ class Study(BaseModel):
                 " of both is missing",
                 f"{remedy}, or remove it",
             )
-        if self.entrance == "equations":
-            self._check_equations()
+        if self.entrance == "equations":  # nothing that only trajectories can give
+            if self.system is None:
+                raise Fault("'from: equations' needs equations", "add 'system: NAME'")
+            if self.landscape is None:
+                raise Fault(
+                    "'from: equations' finds a landscape and nothing else", "remove 'landscape: false'"
+                )
+            for key in OF_TRAJECTORIES:
+                if getattr(self, key) != type(self).model_fields[key].get_default():
+                    remedy = "remove it, or 'from: equations'"
+                    raise Fault(f"'{key}' belongs to studies of trajectories", remedy)
         elif self.sweep is not None:
             raise Fault("'sweep' belongs to studies of equations", "add 'from: equations', or remove it")
         if self.simulation.pair_step is not None and self.simulation.interval is not None:
             self.simulation.options()
         return self
-
-    def _check_equations(self) -> None:
-        """Whether a study of equations asks for what only trajectories can give."""
-        if self.system is None:
-            raise Fault("'from: equations' needs equations", "add 'system: NAME'")
-        if self.landscape is None:
-            raise Fault("'from: equations' finds a landscape and nothing else", "remove 'landscape: false'")
-        for key in OF_TRAJECTORIES:
-            if getattr(self, key) != type(self).model_fields[key].get_default():
-                raise Fault(f"'{key}' belongs to studies of trajectories", "remove it, or 'from: equations'")
 
 
 def completed(study: Study, system: Dynamics | None) -> Study:

@@ -10,7 +10,7 @@ plane. Times and weights follow from barriers and prefactors for a noise.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -475,24 +475,21 @@ def sweep(
         if given.ndim != 1 or not len(given) or not np.isfinite(given).all():
             raise ValueError(f"the values of {name} have to be finite numbers, at least one")
     base = system if isinstance(system, Dynamics) else load_system(system)
-    _check_parameters(base, named, with_noise=isinstance(system, Dynamics))
-    grid = np.stack(np.meshgrid(*named.values(), indexing="ij"), axis=-1).reshape(-1, len(named))
-    names = tuple(named)
-    points = [point_at(system, names, tuple(map(float, one)), seed=seed) for one in grid]
-    return collected(base, names, points, noise=noise)
-
-
-def _check_parameters(system: Dynamics, names: Iterable[str], *, with_noise: bool) -> None:
-    """Refuse unknown parameters, and with `with_noise` those in D, which has their values inserted."""
-    known, who = [each.name for each in system.parameters], system.name or "the system"
-    for name in names:
+    known, who = [each.name for each in base.parameters], base.name or "the system"
+    for name in named:
         if name not in known:
             otherwise = f"use one of {', '.join(known)}" if known else "make the number a parameter"
             remedy = suggestion(name, known, otherwise=otherwise)
             raise InputError(who, "parameters", f"there is no parameter '{name}'", remedy)
-    if with_noise and (of_noise := sorted(set(names) & set(system.parameters_of_noise))):
+    # Parameters in D have their values inserted.
+    of_noise = sorted(set(named) & set(base.parameters_of_noise)) if isinstance(system, Dynamics) else []
+    if of_noise:
         fault = f"D depends on {', '.join(of_noise)}, and was made with the value of the card"
         raise InputError(who, "diffusion", fault, "give the card instead of the dynamics")
+    grid = np.stack(np.meshgrid(*named.values(), indexing="ij"), axis=-1).reshape(-1, len(named))
+    names = tuple(named)
+    points = [point_at(system, names, tuple(map(float, one)), seed=seed) for one in grid]
+    return collected(base, names, points, noise=noise)
 
 
 def collected(

@@ -379,11 +379,9 @@ def plot_diagnosis(
     return axes
 
 
-def draw_errors(
-    axes: Axes, diagnosis: Diagnosis, *, output: str | None = None, recording: str | None = None
-) -> list[Any]:
+def draw_errors(axes: Axes, diagnosis: Diagnosis, *, output: str | None = None) -> list[Any]:
     """Draw simulation minus recording, held out; what is returned belongs into the legend."""
-    case, place, rows = _shown(diagnosis, output, recording)
+    case, place, rows = _shown(diagnosis, output, None)
     t, measured = case.t[rows], case.outputs[rows, place]
     handles: list[Any] = []
     sizes: list[float] = []

@@ -224,24 +224,14 @@ def plot_quasipotential(
 
 
 @drawn_in_style
-def quasipotential_figure(
-    landscape: LandscapeSummary, *, states: Sequence[str] | None = None, view: View = "projection"
-) -> Figure | None:
-    """The first picture of a page, None where U is known nowhere.
-
-    Parameters
-    ----------
-    landscape
-        What is drawn.
-    states, view
-        As for `plot_quasipotential`.
-    """
+def quasipotential_figure(landscape: LandscapeSummary) -> Figure | None:
+    """The first picture of a page, None where U is known nowhere."""
     if not landscape.wells:
         return None
     one = len(landscape.names) == 1
     figure = Figure(figsize=(WIDTH, 3.6 if one else 4.5))
     axes = figure.add_subplot()
-    handles = _draw_quasipotential(axes, landscape, states=states, view=view)
+    handles = _draw_quasipotential(axes, landscape)
     if not any(np.isfinite(_values_in(landscape))) and not landscape.cycles:
         return None
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
@@ -315,9 +305,13 @@ def _draw_curve(axes: Axes, landscape: LandscapeSummary) -> list[Any]:
     heights = {place: one.height for place, one in enumerate(landscape.wells)}
     for way in landscape.ways:
         if np.isfinite(way.barrier):
-            _draw_depth(
-                axes, landscape.wells[way.start].position[0], way.place[0], heights[way.start], way.barrier
-            )
+            well, bottom = landscape.wells[way.start].position[0], heights[way.start]
+            top_of_way = [bottom + way.barrier] * 2
+            axes.plot([well, way.place[0]], top_of_way, color=GREY, linewidth=0.9, linestyle=(0, (2, 2)))
+            axes.annotate(
+                "", (well, bottom + way.barrier), xytext=(well, bottom),
+                arrowprops={"arrowstyle": "<->", "color": GREY, "shrinkA": 0, "shrinkB": 0},
+            )  # fmt: skip
     marks = [(one, WELL) for one in landscape.wells] + [(one, SADDLE) for one in landscape.saddles]
     for one, style in marks:
         height = landscape.potential(one.position[None])[0]
@@ -333,14 +327,6 @@ def _draw_curve(axes: Axes, landscape: LandscapeSummary) -> list[Any]:
     name_axes(axes, landscape, (0,))
     name_energy(axes, landscape, max(abs(top), abs(lowest)))
     return handles
-
-
-def _draw_depth(axes: Axes, well: float, saddle: float, bottom: float, barrier: float) -> None:
-    axes.plot([well, saddle], [bottom + barrier] * 2, color=GREY, linewidth=0.9, linestyle=(0, (2, 2)))
-    axes.annotate(
-        "", (well, bottom + barrier), xytext=(well, bottom),
-        arrowprops={"arrowstyle": "<->", "color": GREY, "shrinkA": 0, "shrinkB": 0},
-    )  # fmt: skip
 
 
 def _draw_map(

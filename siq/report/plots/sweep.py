@@ -85,7 +85,13 @@ def plot_sweep(
         "weight": "share of time",
     }
     for axes, name in zip(rows[1:], columns, strict=True):
-        _draw_wells(axes, table, name)
+        for well in sorted({int(one) for one in table["well"] if one >= 0}):
+            some = table[table["well"] == well]
+            colour, style, marker = look(well)
+            axes.plot(
+                some["value"], some[name], color=colour, linestyle=style, marker=marker, markersize=3,
+                linewidth=1.2,
+            )  # fmt: skip
         axes.set_ylabel(labels[name])
         for value in bifurcations["value"]:
             axes.axvline(value, color=GREY, linewidth=0.5, linestyle=":")
@@ -111,16 +117,6 @@ def _draw_branches(axes: Axes, branches: pd.DataFrame, bifurcations: pd.DataFram
         rows = bifurcations[bifurcations["kind"] == kind]
         at = [ast.literal_eval(text)[place] for text in rows["position"]]
         axes.plot(rows["value"], at, linestyle="none", marker=marker, markersize=4.5, color=BLACK)
-
-
-def _draw_wells(axes: Axes, table: pd.DataFrame, name: str) -> None:
-    for well in sorted({int(one) for one in table["well"] if one >= 0}):
-        rows = table[table["well"] == well]
-        colour, style, marker = look(well)
-        axes.plot(
-            rows["value"], rows[name], color=colour, linestyle=style, marker=marker, markersize=3,
-            linewidth=1.2,
-        )  # fmt: skip
 
 
 def _handles(table: pd.DataFrame, branches: pd.DataFrame, bifurcations: pd.DataFrame) -> list[Line2D]:
@@ -164,7 +160,13 @@ def _map(
             bar.set_ticks(sorted(set(count.to_numpy().ravel())))
         axes.set_ylabel(axis_label(parameters[1], units.get(parameters[1], "1")))
         if curves is not None:
-            _draw_curves(axes, curves)
+            limits = axes.get_xlim(), axes.get_ylim()  # those of the cells stay
+            for _, rows in curves.groupby("curve"):
+                axes.plot(
+                    rows["value"], rows["second_value"], color=CURVE, linestyle=CURVES[rows["kind"].iloc[0]],
+                    linewidth=1.2, path_effects=OUTLINED,
+                )  # fmt: skip
+            axes.set(xlim=limits[0], ylim=limits[1])
     handles = [
         Line2D([], [], color=CURVE, linestyle=CURVES[kind], path_effects=OUTLINED, label=kind)
         for kind in CURVES
@@ -174,14 +176,3 @@ def _map(
         figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
     panels[-1].set_xlabel(axis_label(parameters[0], units.get(parameters[0], "1")))
     return figure
-
-
-def _draw_curves(axes: Axes, curves: pd.DataFrame) -> None:
-    """Curves over a map, whose limits stay those of its cells."""
-    limits = axes.get_xlim(), axes.get_ylim()
-    for _, rows in curves.groupby("curve"):
-        axes.plot(
-            rows["value"], rows["second_value"], color=CURVE, linestyle=CURVES[rows["kind"].iloc[0]],
-            linewidth=1.2, path_effects=OUTLINED,
-        )  # fmt: skip
-    axes.set(xlim=limits[0], ylim=limits[1])

@@ -283,24 +283,20 @@ def _draw_states(
         if place < 0 and rows.any():
             handles.append(Line2D([], [], linestyle="none", marker=".", color=GREY, label="no formula holds"))
     if len(landscape.names) == 2:
-        _draw_rims(axes, landscape, known)
+        # Around each well the line of U at the height of its lowest pass.
+        x1, x2 = landscape.along(0, POINTS), landscape.along(1, POINTS)
+        grid = np.stack(np.meshgrid(x1, x2, indexing="ij"), axis=-1).reshape(-1, 2)
+        for place, well in known:
+            level, heights = landscape.wells[place].depth, 2 * well.known_values(grid)
+            level = level if np.isfinite(level) else 2 * well.level
+            if np.nanmin(heights, initial=np.inf) < level:
+                look = _look(place, "color", "linestyle")
+                axes.contour(
+                    x1, x2, heights.reshape(POINTS, POINTS).T, levels=[level], colors=look["color"],
+                    linewidths=1.6, linestyles=look["linestyle"],
+                )  # fmt: skip
         handles.append(Line2D([], [], color=GREY, linewidth=1.6, label="rim: height of the lowest saddle"))
     return handles
-
-
-def _draw_rims(axes: Axes, landscape: LandscapeSummary, known: Sequence[tuple[int, Well]]) -> None:
-    """Around each well the line of U at the height of its lowest pass."""
-    x1, x2 = landscape.along(0, POINTS), landscape.along(1, POINTS)
-    grid = np.stack(np.meshgrid(x1, x2, indexing="ij"), axis=-1).reshape(-1, 2)
-    for place, well in known:
-        level, values = landscape.wells[place].depth, 2 * well.known_values(grid)
-        level = level if np.isfinite(level) else 2 * well.level
-        if np.nanmin(values, initial=np.inf) < level:
-            look = _look(place, "color", "linestyle")
-            axes.contour(
-                x1, x2, values.reshape(POINTS, POINTS).T, levels=[level], colors=look["color"],
-                linewidths=1.6, linestyles=look["linestyle"],
-            )  # fmt: skip
 
 
 NO_ERROR = 1e-4  # of a barrier: a smaller error is not written
