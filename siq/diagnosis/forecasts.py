@@ -673,9 +673,9 @@ def _next_rung(
 def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[Rung], tuple[NotFitted, ...]]:
     """Mechanisms one on top of the other, as long as the next is likelier than what has no name.
 
-    What stands on top of others may take over what these leave of an error of the model. So the last of
-    several also has to make free runs of parts left out typically better than without it, or it is taken
-    back, and then the one before it is the last.
+    A mechanism may take over a part of an error of the model, above all on top of others. So the last one
+    also has to make free runs of parts left out typically better than without it, or it is taken back, and
+    then the one before it is the last.
 
     Returned are also the fits of the simulation alone, empty where it cannot be fitted, and what could not be
     judged.
@@ -708,14 +708,14 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[Rung], tup
         """Of free runs of parts left out, with the first so many mechanisms, by blocks."""
         best = [each.accepted.best for each in found[:number]]
         squares = errors_left_out(
-            best[-1].fit, context.data, noise=alone[0].fit.noise,
+            best[-1].fit if best else alone[0].fit, context.data, noise=alone[0].fit.noise,
             candidates=[each.candidate for each in best], budget=budget,
         )  # fmt: skip
         return None if squares is None else in_blocks(squares)
 
     with budget.exempt():
-        last = errors(len(found)) if len(found) > 1 else None
-        while len(found) > 1:
+        last = errors(len(found)) if found else None
+        while found:
             before = errors(len(found) - 1)
             if last is not None and (before is None or typically_better(before, last)):
                 break

@@ -224,10 +224,11 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
 
     card = replace(search.recalibrated, model=investigation.context.model)
     # What fits best with process noise admitted need not be what runs best without.
-    recalibrated = search.recalibrated
+    recalibrated = fitted_alike = search.recalibrated
     if recalibrated.has_process_noise:
         horizons = [(each.fit, each.data) for each in investigation.recalibrations]
         refits = [(investigation.least_squares, learned), *(horizons or [(recalibrated, learned)])]
+        fitted_alike = best_of(*(fit for fit, _ in refits), recalibrated, card)
         recalibrated = preferred_recalibration(card, refits, learned, noise=noise)
     plain = best_of(investigation.exact, search.fit, *(each.fit for each in investigation.finals))
     choices = [(model, best_of(model.fit, model.exact)) for model in investigation.models]
@@ -240,7 +241,7 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         # tells nothing of a function whose fit had to find them, too. Where there is process noise a free run
         # is off by it, and a little may be chance.
         may_choose = data.select(judges)
-        alone = [errors_of(each, may_choose) for each in ((plain,) if named else (card, recalibrated))]
+        alone = [errors_of(each, may_choose) for each in ((plain,) if named else (card, fitted_alike))]
         least = min((each for each in alone if each is not None), key=np.mean, default=None)
         errors = [errors_of(fit, may_choose) for _, fit in choices]
         limits = [
@@ -310,9 +311,9 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
 def _spread_of_free_runs(fit: Fit, learned: Measurements, roles: Roles) -> np.ndarray:
     """Variance of what free runs of a fit are off by, as the noises of the fit foresee it, shape ``(m,)``.
 
-    The error of the model acts as a random force whose intensity over long times is that from one sample to
+    The error of the model acts as process noise whose intensity over long times is that from one sample to
     the next, times its correlation time τ in samples. What a function of a coordinate finds in it is no
-    random force, and not counted. Where τ is not short beside the times of the system, this is too much.
+    process noise, and not counted. Where τ is not short beside the times of the system, this is too much.
     """
     white, _, left = residuals(fit, learned)
     correlated = correlation_time_of(left, white.recording, outputs=len(fit.model.outputs))

@@ -460,7 +460,7 @@ def _without(white: Whitened, fit: Fit, known: FittedCandidate | None) -> tuple[
     return replace(white, innovations=innovations, columns=others), len(names) - len(mine)
 
 
-Z, A, B, D, C = sympy.symbols("z a b d c", real=True)
+Z, A, B, D, C = sympy.symbols("z a b d c", real=True, cls=sympy.Dummy)  # no names of a system
 THRESHOLD = "threshold"  # whose c is a place, and no length
 FITS = 0.05  # p-value from which on a formula is all that the recordings tell of a function
 

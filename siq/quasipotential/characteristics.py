@@ -414,6 +414,14 @@ def characteristics(
     )  # fmt: skip
 
 
+def _join(first: Fan, second: Fan) -> Fan:
+    """Two fans of the same attractor and level as one; the curves of the second are counted on."""
+    second = replace(second, curve=second.curve + len(first.directions))
+    names = [one.name for one in fields(Fan)[3:]]  # all but the attractor, the Hessian and the level
+    joined: dict[str, Any] = {n: np.concatenate([getattr(first, n), getattr(second, n)]) for n in names}
+    return replace(first, **joined)
+
+
 def crossed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Whether X has become singular between two tangent frames, ``(n, d, d)``.
 
@@ -484,12 +492,7 @@ def adapted_fan(
         between = _between(fan, gap)[: most - len(fan.directions)]
         if not len(between):
             break
-        # The curves of the second are counted on; both have the attractor, the Hessian and the level.
-        more = follow(between)
-        more = replace(more, curve=more.curve + len(fan.directions))
-        names = [one.name for one in fields(Fan)[3:]]
-        joined: dict[str, Any] = {n: np.concatenate([getattr(fan, n), getattr(more, n)]) for n in names}
-        fan = replace(fan, **joined)
+        fan = _join(fan, follow(between))
     return fan
 
 

@@ -326,7 +326,8 @@ def test_what_a_name_leaves_is_described_and_no_sample_of_a_test_chooses_it(
     # The card has both, and its error is shown beside that of the name alone.
     assert verdict["fit"]["augmented"] < verdict["fit"]["named"] < verdict["fit"]["recalibrated"]
     assert set(part["parameters"]) <= {entry.name for entry in diagnosis.augmented.parameters}
-    assert f"What is left has no name; {part['name']} in the equation of v desc" in verdict["sentence"]
+    effect = f"an effect of {part['coordinates'][0]} in the equation of v"
+    assert f"What is left has no name; {effect} desc" in verdict["sentence"]
     # Whatever stands in the tests, the card is the same.
     case = diagnosis.case
     other = replace(case.kept, outputs=case.kept.outputs[::-1] + 0.3)

@@ -134,7 +134,7 @@ def plot_held_out(
 
 @drawn_to_be_read
 def plot_ladder(statement: Statement) -> Figure | None:
-    """Draw the error on held-out recordings step by step, down to the noise of the sensor.
+    """Draw the error on held-out recordings step by step, down to the measurement noise.
 
     As given, with its own parameters refitted, with each mechanism that is named on top of those before it,
     and with the model of what has no name. None where no errors are known.
@@ -165,9 +165,9 @@ def plot_ladder(statement: Statement) -> Figure | None:
             axes.plot(at, place, marker, color=colour, markersize=7)
         said = "runs away" if error is None else value_text(at, unit=unit, digits=3)
         axes.text(1.08 * scale * errors.noise_floor, place - 0.15, f"{label}: {said}", va="bottom")
-    axes.axvline(scale * errors.noise_floor, color=BLACK, linestyle=":", label="noise of the sensor")
+    axes.axvline(scale * errors.noise_floor, color=BLACK, linestyle=":", label="measurement noise")
     if errors.floor not in (None, errors.noise_floor):
-        axes.axvline(scale * errors.floor, color=GREEN, linestyle="--", label="and random forces")
+        axes.axvline(scale * errors.floor, color=GREEN, linestyle="--", label="and process noise")
     axes.set_xlim(lowest, highest)
     axes.set_ylim(len(steps) - 0.6, -0.8)
     axes.set_yticks([])
