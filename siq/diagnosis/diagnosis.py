@@ -265,7 +265,8 @@ def solve_case(
         shown = held_out_runs(found, case.kept)
         named = found.verdict.names and not found.process_noise
         # Tests of somebody else may be among the recordings held out, and decide nothing.
-        if named and not case.settings.tests and shown.errors.change("without", "augmented") == "worse":
+        change, idle = shown.errors.change("without", "augmented"), found.remainder.share <= 0
+        if named and not case.settings.tests and (change == "worse" or (idle and change != "better")):
             found = _withdrawn(found)
             shown = held_out_runs(found, case.kept)
         statement = statement_of(found, shown)

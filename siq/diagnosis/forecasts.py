@@ -717,7 +717,9 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[Rung], tup
         last = errors(len(found)) if found else None
         while found:
             before = errors(len(found) - 1)
-            if last is not None and (before is None or typically_better(before, last)):
+            if last is not None and (
+                before is None or typically_better(before, last, least=-np.log(NEARLY_ALL))
+            ):
                 break
             LOGGER.info("%s makes no free run better", found[-1].accepted.best.candidate.label)
             found, last = found[:-1], before

@@ -284,15 +284,16 @@ def errors_left_out(
     return None if refits is None else np.concatenate([squares for _, squares in refits])
 
 
-def typically_better(before: tuple[float, ...], after: tuple[float, ...]) -> bool:
+def typically_better(before: tuple[float, ...], after: tuple[float, ...], *, least: float = 0.0) -> bool:
     """Whether errors of blocks fall, and not only in one in which a saddle point multiplies them.
 
-    Other than `_change_between` this asks for the typical ratio of errors, not for that of their sums.
+    Other than `_change_between` this asks for the typical ratio of errors, not for that of their sums; its
+    logarithm has to exceed the least that counts.
     """
     falls = np.log(np.maximum(before, np.finfo(float).tiny) / np.maximum(after, np.finfo(float).tiny))
-    return bool(scipy.stats.ttest_1samp(falls, 0.0, alternative="greater").pvalue < CHANGE_BY_CHANCE) and (
-        _change_between(before, after) != "worse"
-    )
+    chance = scipy.stats.ttest_1samp(falls, 0.0, alternative="greater").pvalue
+    known = falls.mean() > least and chance < CHANGE_BY_CHANCE
+    return bool(known) and _change_between(before, after) != "worse"
 
 
 def preferred_recalibration(

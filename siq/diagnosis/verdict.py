@@ -350,7 +350,8 @@ def _known_forms(place: Place, fit: Fit, context: FitContext) -> list[Any]:
         change = sympy.simplify((each.model.equations[row] - model.equations[row]) / factor)
         letters = dict(zip(own, (A, B) if len(each.amplitudes) == 2 else (A, C), strict=False))
         term = _in_coordinate(change, place.coordinates[0]).xreplace(values | letters | {COORDINATE: Z})
-        if term.free_symbols <= {Z, *letters.values()}:
+        linear = not any(term.diff(one).has(A, B) for one in (A, B))
+        if linear and {*letters.values()} <= term.free_symbols <= {Z, *letters.values()}:
             tried = [c for one in each.searches for c in places_of(one, context.data, model, fit.x)]
             shares = tuple(c / float(np.ptp(place.knots)) for c in tried)
             signs = tuple(letters[symbol(one)] for one in each.positive & set(each.amplitudes))

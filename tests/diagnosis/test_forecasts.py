@@ -243,7 +243,7 @@ def test_a_last_mechanism_that_makes_no_free_run_better_is_taken_back(
     assert climb(fit, context)[1] == [damped()]
     # One that makes free runs better stays, with those that it stands on.
     rungs = iter([damped(), damped(), None])
-    monkeypatch.setattr(forecasts, "typically_better", lambda *_: True)
+    monkeypatch.setattr(forecasts, "typically_better", lambda *_, **__: True)
     assert climb(fit, context)[1] == [damped(), damped()]
 
 
