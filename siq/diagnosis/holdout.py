@@ -343,7 +343,6 @@ def preferred_recalibration(
         squares = np.concatenate([each for _, each in known])
         moved = scipy.stats.f.sf(ratio, len(free), count - 1) < CHANGE_BY_CHANCE / len(refits)
         after = in_blocks(squares)
-        LOGGER.info("a refit: error of parts left out %.3g, ratio of shifts %.3g", squares.mean(), ratio)
         if moved and (least is None or typically_better(least, after)):
             chosen, least = fit, after
     return chosen
