@@ -65,8 +65,8 @@ PROMISING, SHAPES = 32, 3  # explanations, and shapes of each, that are asked at
 LEADERS, ATTEMPTS = 6, 12  # explanations that are fitted in earnest before none is said to lead: a choice
 SUSPECTS = 4  # rivals of the leader that are fitted in earnest before they count: a choice
 RIDGE = 1e-10  # numerical: of normal equations whose columns have unit length
-# Of an effect, or of what is gained: a choice, made when two cases had been seen, 0.93 for the linear damping
-# of a pendulum arm, and 0.46 for a preload in the place of a bump.
+# Of an effect, of what is gained, or of squared errors: a choice, made when two cases had been seen, 0.93 for
+# the linear damping of a pendulum arm, and 0.46 for a preload in the place of a bump.
 NEARLY_ALL = 0.9
 # Of the budget, for the first name, so that tests have something left where forecasts name nothing: a choice.
 FIRST_NAME_SHARE = 0.5

@@ -200,7 +200,8 @@ def fit_with_and_without_process_noise(
             model if of is None else of.model, data, begin=at[data.first[:-1]], noise=still, **same
         )
 
-    far = loose is not None and _missed_without(loose, data) > hopeless
+    finite = np.isfinite(hopeless)  # otherwise nothing is worked out
+    far = finite and loose is not None and _missed_without(loose, data) > hopeless
     # Where f jumps, steps of all samples at once go to and fro.
     ways = (as_trajectories, at_all_samples) if jumps and not far else (at_all_samples, as_trajectories)
     strict = ways[0]()
