@@ -439,15 +439,18 @@ def _most_likely(parts: np.ndarray, empirical: np.ndarray, count: float) -> tupl
 
 
 MOST_DECIMALS = 12  # a double of size 1 has 15 to 16; what has as many as that was not rounded
-FEWEST_VALUES = 8  # distinct values below which a step says nothing
+FEWEST_VALUES = 8  # distinct values below which their decimals say nothing
+FEWEST_LEVELS = 3  # of a digitiser; two are always a step apart
+LATTICE_BY_CHANCE, LATTICE_TOLERANCE = 1e-6, 0.05  # of levels: to lie on a lattice, and off it, in steps
 VALUES_SAMPLED = 2000  # looked at before all are
 
 
 def resolution_step(values: np.ndarray) -> float | None:
-    """The step of which all values ``(n,)`` are multiples, None where there is none.
+    """The step of which all known values ``(n,)`` are multiples, up to an offset; None where there is none.
 
-    A power of ten where the values have so many decimals; else the least difference of two values, where all
-    differences are multiples of it.
+    Where values repeat, the least difference of two, if all differences are multiples of it: the step of a
+    digitiser, which may be written with more decimals than it has. Else a power of ten, where the values have
+    so many decimals.
 
     Examples
     --------
@@ -456,29 +459,33 @@ def resolution_step(values: np.ndarray) -> float | None:
     >>> resolution_step(np.sin(np.arange(100.0))) is None
     True
     """
-    some = np.unique(values[:: max(len(values) // VALUES_SAMPLED, 1)])
-    largest = float(np.abs(some).max(initial=0.0))
-    if len(some) < FEWEST_VALUES or largest == 0:
+    values = values[np.isfinite(values)]
+    levels = np.unique(values)
+    largest = float(np.abs(levels).max(initial=0.0))
+    if len(levels) < FEWEST_LEVELS or largest == 0:
         return None
+    # The step of a digitiser: many equal values, all of them a whole number of steps apart.
+    if len(levels) <= len(values) // 2:
+        gaps = np.diff(levels)
+        # Levels that differ by less than numbers are written with are one level.
+        counts = (levels - levels[0]) / float(gaps[gaps > 1e-9 * np.ptp(levels)].min())
+        # By chance all of the others lie so near whole numbers once in a million times.
+        tolerance = min(0.5 * LATTICE_BY_CHANCE ** (1 / (len(levels) - 2)), LATTICE_TOLERANCE)
+        if counts[-1] <= 1e7 and np.abs(counts - np.round(counts)).max() <= tolerance:
+            return float(np.ptp(levels) / np.round(counts[-1]))
+    if len(levels) < FEWEST_VALUES:
+        return None
+    some = levels[:: max(len(levels) // VALUES_SAMPLED, 1)]
     most = MOST_DECIMALS - int(np.ceil(np.log10(largest)))
     for decimals in range(most - MOST_DECIMALS, most + 1):
         # Rounding as a writer does gives back the very number that was read, where it has no more decimals.
         if all(
             (decimals >= 0 and (np.round(each, decimals) == each).all())
             or np.allclose(np.round(each, decimals), each, rtol=1e-14, atol=0.0)
-            for each in (some, values)
+            for each in (some, levels)
         ):
             return float(f"1e{-decimals}")
-    # The step of a digitiser: many equal values, all of them a whole number of steps apart.
-    levels = np.unique(values)
-    if not FEWEST_VALUES <= len(levels) <= len(values) // 2:
-        return None
-    gaps = np.diff(levels)
-    # Levels that differ by less than numbers are written with are one level.
-    counts = (levels - levels[0]) / float(gaps[gaps > 1e-9 * np.ptp(levels)].min())
-    if counts[-1] > 1e7 or np.abs(counts - np.round(counts)).max() > 0.05:
-        return None
-    return float(np.ptp(levels) / np.round(counts[-1]))
+    return None
 
 
 def decimals_of(step: float) -> int | None:

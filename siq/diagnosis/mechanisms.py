@@ -28,6 +28,7 @@ import numpy as np
 import scipy.linalg
 import sympy
 
+from siq.data.correlation import resolution_step
 from siq.diagnosis.dictionary import (
     ANYWHERE,
     Form,
@@ -57,8 +58,6 @@ FORMULA: Final = "formula"
 CURVE: Final = "curve"
 SURFACE: Final = "surface"
 MECHANISM: Final = "mechanism"
-# Of a step: numbers that were written with a few digits lie on their lattice within this.
-LATTICE_TOLERANCE = 1e-3
 
 
 def places_of(search: Shape, data: Measurements, model: Dynamics, x: np.ndarray) -> np.ndarray:
@@ -75,7 +74,7 @@ def places_of(search: Shape, data: Measurements, model: Dynamics, x: np.ndarray)
         place = model.output_names.index(search.recorded)
         values = data.outputs[:, place]
         if search.lattice_of is not None:
-            found = lattice_step(values)
+            found = resolution_step(values)
         else:
             side = 1.0 if search.top_of is not None else -1.0
             top = _plateau(side * values, data.recording, noise=float(np.sqrt(data.roughness[place])))
@@ -97,20 +96,6 @@ def _sized(search: Shape, factors: np.ndarray, course: np.ndarray) -> np.ndarray
         return np.quantile(course, factors)
     size = float(np.sqrt(np.mean(course**2))) or 1.0
     return factors * size if search.scale_of is not None else factors / size
-
-
-def lattice_step(values: np.ndarray) -> float | None:
-    """The step of the lattice through zero on which all recorded values lie; None where there is none."""
-    values = values[np.isfinite(values)]
-    levels = np.unique(values)
-    if not 2 < len(levels) < len(values) / 2:  # of values that hardly repeat a lattice tells nothing
-        return None
-    step = float(np.diff(levels).min())
-    numbers = np.rint(levels / step)
-    if not numbers.any():
-        return None
-    step = float(levels @ numbers / (numbers @ numbers))
-    return step if np.abs(levels - numbers * step).max() < LATTICE_TOLERANCE * step else None
 
 
 def _plateau(values: np.ndarray, recording: np.ndarray, *, noise: float) -> float | None:

@@ -1,16 +1,8 @@
-"""Structure in residuals, quantisation, and whether process noise is stationary.
+"""Structure in residuals, what remains of it, and whether process noise is stationary.
 
 What may be missing is described without naming it: in every equation a piecewise linear function of every
 coordinate - a state, an input, the amplitude of a rotating frame, time - is let in, and the data say how
 large it would be. It tells where a mismatch sits, and whether one is left.
-
-**Quantisation.** Where the steps of a sensor are wide compared with its noise, rounding errors are
-autocorrelated and look like process noise, or like physics that is missing. The steps are known: the recorded
-values lie on them. Of a reading that was rounded it is known that the value lay within its step, and a
-simulation says where: at the mean of a normal distribution that is cut off at the edges of the step. About
-the right simulation the residuals to these values are independent of each other (the generalised residuals of
-Gourieroux, Monfort, Renault and Trognon, Journal of Econometrics 34, 5, 1987), and the fit to them is that of
-highest likelihood of the readings (Dempster, Laird and Rubin's EM algorithm).
 
 **Stationarity.** Process noise drives a system alike whether it moves or rests. What a simulation lacks of a
 hidden part - a second oscillator, a memory - can pass for process noise, too, where recordings are noisy; but
@@ -25,15 +17,14 @@ import numpy as np
 import scipy.stats
 
 from siq.diagnosis.dictionary import Roles, roles_of
-from siq.diagnosis.mechanisms import lattice_step
 from siq.diagnosis.screening import Projection, Ranked, linearised_with, portions
 from siq.diagnosis.terms import Place, places_in
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget
-from siq.inference.kalman_filter import Grid, Noise, profile_likelihood, solve, whiten
-from siq.inference.maximum_likelihood import Fit, first_noise, fit_by_multiple_shooting
+from siq.inference.kalman_filter import Noise, profile_likelihood, solve, whiten
+from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
-from siq.inference.recalibration import FAINT, process_noise_needed
+from siq.inference.recalibration import fit_before_rounding
 from siq.numerics.randomness import positive
 
 LAGS = 12  # of autocorrelations
@@ -189,10 +180,6 @@ def has_structure(current: Fit, data: Measurements) -> bool:
         return True
 
 
-QUANTISATION_ROUNDS = 30  # of fits at most
-NOISE_SETTLED = 0.01  # relative change of the noise, at which they have settled
-
-
 def explained_by_quantisation(
     data: Measurements,
     strict: Fit,
@@ -203,67 +190,19 @@ def explained_by_quantisation(
 ) -> tuple[Fit, Remainder, tuple[str, ...]] | None:
     """The fit to the values that were rounded, if it leaves noise; None where it does not, or nothing rounds.
 
-    Parameters
-    ----------
-    strict
-        The fit of the simulation without process noise.
-    least
-        Probability of structure by chance, below which it is no noise.
-
-    Returns
-    -------
-    (Fit, Remainder, tuple of str) or None
-        Parameters and states that fit the values before rounding, with errors of the fit to the readings,
-        which rounding makes wider; what is left of the values; and the names of the outputs that are rounded.
+    Besides the fit without process noise it takes the least probability of structure by chance, below which
+    what is left is no noise. With the fit (`siq.inference.recalibration.fit_before_rounding`) come what is
+    left of the values, and the names of the outputs that are rounded.
     """
-    steps = np.array([lattice_step(column) or 0.0 for column in data.outputs.T])
-    # What rounding does under noise half as wide as a step is white (Widrow and Kollár 2008), and fitted.
-    coarse = steps > np.sqrt(strict.noise.measurement)
-    if not (strict.converged and coarse.any()):
+    before = fit_before_rounding(data, strict, budget=budget)
+    if before is None:
         return None
-    values, fit, deviation = data, strict, np.sqrt(strict.noise.measurement)
-    for _ in range(QUANTISATION_ROUNDS):
-        before = deviation
-        signals = Grid(values, fit.substeps).at_samples(fit.model.lags(fit.model.values))
-        simulated = fit.model.functions.outputs(np.ascontiguousarray(fit.x.T), signals, fit.model.values).T
-        values, deviation = _before_quantisation(data, simulated, steps, before)
-        fit = fit_by_multiple_shooting(
-            fit.model, values, x=fit.x, noise=fit.noise, estimate_process=False, substeps=fit.substeps,
-            budget=budget,
-        )  # fmt: skip
-        if not fit.converged:
-            return None
-        if (np.abs(deviation - before) < NOISE_SETTLED * before).all():
-            break
-    faint = Noise(fit.noise.measurement, FAINT * first_noise(fit.model, values, fit.x).process)
-    forced = fit_by_multiple_shooting(
-        fit.model, values, x=fit.x, noise=faint, estimate_process=True, substeps=fit.substeps, budget=budget
-    )
-    if forced.converged and process_noise_needed(forced, fit):
-        return None
+    fit, values, names = before
     try:
         left = Remainder.of(values, fit, fit, roles)
     except NumericalFailure:
         return None
-    if left.after.p_value < least:
-        return None
-    names = tuple(name for name, wide in zip(fit.model.output_names, coarse, strict=True) if wide)
-    return replace(strict, model=fit.model, x=fit.x), left, names
-
-
-def _before_quantisation(
-    data: Measurements, simulation: np.ndarray, steps: np.ndarray, deviation: np.ndarray
-) -> tuple[Measurements, np.ndarray]:
-    """Recordings before they were rounded, as far as a simulation tells, and the deviation of their noise."""
-    outputs, wide = data.outputs.copy(), deviation.copy()
-    for place in np.flatnonzero(steps > 0):
-        off = (data.outputs[:, place] - simulation[:, place]) / deviation[place]
-        half = steps[place] / 2 / deviation[place]
-        known = np.isfinite(off)
-        mean, variance = scipy.stats.truncnorm.stats(off[known] - half, off[known] + half, moments="mv")
-        outputs[known, place] = simulation[known, place] + deviation[place] * mean
-        wide[place] = deviation[place] * np.sqrt(np.mean(mean**2 + variance))
-    return replace(data, outputs=outputs), wide
+    return None if left.after.p_value < least else (replace(strict, model=fit.model, x=fit.x), left, names)
 
 
 FOLLOWING_SHARES = (0.5, 0.9, 0.99)  # of the forces that follow the motion

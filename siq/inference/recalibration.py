@@ -1,10 +1,18 @@
-"""Recalibration: parameters with and without process noise, and what its uncertainty adds to their errors.
+"""Recalibration: parameters with and without process noise, and those of readings that were rounded.
 
 A filter that took a sensor for noisier than it is follows the recordings less, and takes f at other states:
 the coefficients of f depend on the noise, and the noise is an estimate. Forty samples seldom prove process
 noise, and a fit without it has errors that are right only if there is none. What the recordings do not rule
 out belongs to the errors: they are averaged over all strengths of the process noise, each with its
 likelihood, and so is how the parameters would change.
+
+*Quantisation.* Where the steps of a sensor are wide compared with its noise, rounding errors are
+autocorrelated and look like process noise, or like physics that is missing. The steps are known: the recorded
+values lie on them. Of a reading that was rounded it is known that the value lay within its step, and a
+simulation says where: at the mean of a normal distribution that is cut off at the edges of the step. About
+the right simulation the residuals to these values are independent of each other (the generalised residuals of
+Gourieroux, Monfort, Renault and Trognon, Journal of Econometrics 34, 5, 1987), and the fit to them is that of
+highest likelihood of the readings (Dempster, Laird and Rubin's EM algorithm).
 """
 
 from __future__ import annotations
@@ -15,7 +23,9 @@ from typing import Any
 
 import numpy as np
 import scipy.special
+import scipy.stats
 
+from siq.data.correlation import resolution_step
 from siq.errors import NumericalFailure
 from siq.inference.budget import COMPILATION, Budget, evaluation
 from siq.inference.kalman_filter import Grid, Noise, profile_likelihood, whiten
@@ -33,6 +43,8 @@ FAINT = 1e-4  # process noise, relative to the motion, from which a fit without 
 # Mean square of errors in units of the sensors' noise. Errors twice as large cost a log-likelihood of 0.7 for
 # each value, which nobody believes.
 MISSED = 4.0
+QUANTISATION_ROUNDS = 30  # of fits to values before they were rounded, at most
+NOISE_SETTLED = 0.01  # relative change of the noise, at which these have settled
 BETTER = 0.5  # of a log-likelihood: what half a parameter gains by chance, below which two fits are one
 
 
@@ -306,3 +318,64 @@ def recalibrate(model: Dynamics, data: Measurements, *, budget: Budget | None = 
     loosened = [each for each in (known, again) if each is not None and each.converged]
     best = max(loosened, key=lambda each: each.log_likelihood, default=None)
     return _simpler_fit(best, strict), strict
+
+
+def fit_before_rounding(
+    data: Measurements, strict: Fit, *, budget: Budget | None = None
+) -> tuple[Fit, Measurements, tuple[str, ...]] | None:
+    """The fit to readings before a sensor rounded them, where no process noise is needed any more.
+
+    Parameters
+    ----------
+    data
+        The readings.
+    strict
+        The fit of the simulation to them without process noise.
+
+    Returns
+    -------
+    (Fit, Measurements, tuple of str) or None
+        The fit, the values before rounding, and the names of the outputs that are rounded; None where no
+        output has steps wider than its noise, or the fit still needs process noise.
+    """
+    steps = np.array([resolution_step(each) or 0.0 for each in data.outputs.T])
+    # What rounding does under noise half as wide as a step is white (Widrow and Kollár 2008), and fitted.
+    coarse = steps > np.sqrt(strict.noise.measurement)
+    if not (strict.converged and coarse.any()):
+        return None
+    values, fit, deviation = data, strict, np.sqrt(strict.noise.measurement)
+    for _ in range(QUANTISATION_ROUNDS):
+        before = deviation
+        signals = Grid(values, fit.substeps).at_samples(fit.model.lags(fit.model.values))
+        simulated = fit.model.functions.outputs(np.ascontiguousarray(fit.x.T), signals, fit.model.values).T
+        values, deviation = _before_rounding(data, simulated, steps, before)
+        fit = fit_by_multiple_shooting(
+            fit.model, values, x=fit.x, noise=fit.noise, estimate_process=False, substeps=fit.substeps,
+            budget=budget,
+        )  # fmt: skip
+        if not fit.converged:
+            return None
+        if (np.abs(deviation - before) < NOISE_SETTLED * before).all():
+            break
+    faint = Noise(fit.noise.measurement, FAINT * first_noise(fit.model, values, fit.x).process)
+    forced = fit_by_multiple_shooting(
+        fit.model, values, x=fit.x, noise=faint, estimate_process=True, substeps=fit.substeps, budget=budget
+    )
+    if forced.converged and process_noise_needed(forced, fit):
+        return None
+    return fit, values, tuple(np.array(fit.model.output_names)[coarse].tolist())
+
+
+def _before_rounding(
+    data: Measurements, simulation: np.ndarray, steps: np.ndarray, deviation: np.ndarray
+) -> tuple[Measurements, np.ndarray]:
+    """Recordings before they were rounded, as far as a simulation tells, and the deviation of their noise."""
+    outputs, wide = data.outputs.copy(), deviation.copy()
+    for place in np.flatnonzero(steps > 0):
+        off = (data.outputs[:, place] - simulation[:, place]) / deviation[place]
+        half = steps[place] / 2 / deviation[place]
+        known = np.isfinite(off)
+        mean, variance = scipy.stats.truncnorm.stats(off[known] - half, off[known] + half, moments="mv")
+        outputs[known, place] = simulation[known, place] + deviation[place] * mean
+        wide[place] = deviation[place] * np.sqrt(np.mean(mean**2 + variance))
+    return replace(data, outputs=outputs), wide

@@ -11,13 +11,13 @@ import pytest
 import sympy
 from homes_of_mechanisms import HOMES, RESIDENTS, model_of, numbers, recorded, states, truth_of
 
+from siq.data.correlation import resolution_step
 from siq.diagnosis.dictionary import Mechanism, Shape, roles_of, standard_dictionary
 from siq.diagnosis.mechanisms import (
     MechanismCandidate,
     _plateau,
     candidates_of,
     generic_candidates,
-    lattice_step,
     places_of,
 )
 from siq.diagnosis.screening import screen_all
@@ -218,11 +218,11 @@ def test_a_clock_that_is_late_shows_what_was_before() -> None:
 def test_the_step_of_a_sensor_is_read_off_what_it_recorded() -> None:
     rng = np.random.default_rng(0)
     values = rng.normal(size=500)
-    assert lattice_step(0.25 * np.rint(values / 0.25)) == pytest.approx(0.25)
-    assert lattice_step(np.append(0.1 * np.rint(values / 0.1), np.nan)) == pytest.approx(0.1)
-    assert lattice_step(values) is None
-    assert lattice_step(0.25 * np.rint(values / 0.25) + 0.1) is None  # not through zero
-    assert lattice_step(np.zeros(50)) is None
+    assert resolution_step(0.25 * np.rint(values / 0.25)) == pytest.approx(0.25)
+    assert resolution_step(np.append(0.1 * np.rint(values / 0.1), np.nan)) == pytest.approx(0.1)
+    assert resolution_step(values) is None
+    assert resolution_step(0.25 * np.rint(values / 0.25) + 0.1) == pytest.approx(0.25)
+    assert resolution_step(np.zeros(50)) is None
 
 
 def test_a_sensor_ends_where_recorded_values_stay() -> None:

@@ -7,18 +7,17 @@ import pandas as pd
 import pytest
 import scipy.stats
 
+from siq.data.correlation import resolution_step
 from siq.diagnosis.diagnosis import diagnose
 from siq.diagnosis.dictionary import roles_of
-from siq.diagnosis.mechanisms import lattice_step
 from siq.diagnosis.residual_structure import (
     Remainder,
-    _before_quantisation,
     explained_by_quantisation,
 )
 from siq.diagnosis.study import MismatchVerdict, _measurements_of
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, with_expectations
-from siq.inference.recalibration import recalibrate
+from siq.inference.recalibration import _before_rounding, recalibrate
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, symbol
 
@@ -55,12 +54,12 @@ def asked(model: Dynamics, data: Measurements) -> tuple[Fit, Remainder, tuple[st
 def test_values_before_rounding_are_means_of_a_normal_distribution_cut_off() -> None:
     model = decaying(quadratic=0.0)
     data = _measurements_of(readings(quadratic=0.0), model)
-    step = lattice_step(data.outputs[:, 0])
+    step = resolution_step(data.outputs[:, 0])
     assert step == pytest.approx(STEP)
     exact = np.concatenate(
         [b * np.exp(-0.7 * np.arange(0, 4, 0.05)) for b in (1.1, 1.43, 1.78, 2.05, 2.49, 2.9)]
     )[:, None]
-    values, deviation = _before_quantisation(data, exact, np.array([step]), np.array([NOISE]))
+    values, deviation = _before_rounding(data, exact, np.array([step]), np.array([NOISE]))
     left = (values.outputs - exact)[:, 0] / NOISE
     # Independent, about zero, and as the truth goes the noise comes out as it was.
     assert abs(left.mean()) < 4 * left.std() / np.sqrt(len(left))
