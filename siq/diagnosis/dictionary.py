@@ -163,6 +163,8 @@ class Form(_Part):
         Whether exchanging the roles gives the same mechanism.
     one_unit
         Whether the states and inputs that fill the roles must have one unit, and not be mere numbers.
+    turning
+        Whether it shows only where the motion turns back: the coordinate is a velocity, and has both signs.
     """
 
     roles: dict[Name, Role]
@@ -177,6 +179,7 @@ class Form(_Part):
     variant: str = ""
     symmetric: bool = False
     one_unit: bool = False
+    turning: bool = False
 
     @model_validator(mode="after")
     def _about_roles(self) -> Form:

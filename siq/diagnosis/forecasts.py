@@ -40,7 +40,7 @@ from siq.diagnosis.evidence import (
     sizes_of_effects,
     smooth_prior,
 )
-from siq.diagnosis.holdout import errors_left_out, in_blocks, typically_better
+from siq.diagnosis.holdout import NEARLY_ALL, errors_left_out, in_blocks, typically_better
 from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.diagnosis.screening import PROBE_SUBSTEPS, Probe, linearised_with, portions
 from siq.diagnosis.search import AcceptedMechanism, FitContext, Standing
@@ -65,9 +65,6 @@ PROMISING, SHAPES = 32, 3  # explanations, and shapes of each, that are asked at
 LEADERS, ATTEMPTS = 6, 12  # explanations that are fitted in earnest before none is said to lead: a choice
 SUSPECTS = 4  # rivals of the leader that are fitted in earnest before they count: a choice
 RIDGE = 1e-10  # numerical: of normal equations whose columns have unit length
-# Of an effect, of what is gained, or of squared errors: a choice, made when two cases had been seen, 0.93 for
-# the linear damping of a pendulum arm, and 0.46 for a preload in the place of a bump.
-NEARLY_ALL = 0.9
 # Of the budget, for the first name, so that tests have something left where forecasts name nothing: a choice.
 FIRST_NAME_SHARE = 0.5
 EVEN = 0.5  # probability of a cause without a name, where nothing is known beforehand

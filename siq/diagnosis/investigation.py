@@ -14,12 +14,12 @@ from siq.diagnosis.forecasts import Horizon
 from siq.diagnosis.holdout import (
     HeldOutErrors,
     errors_left_out,
-    first_better,
+    predicts_better,
+    preferred_model,
     preferred_recalibration,
-    simplest_of,
     simulated,
 )
-from siq.diagnosis.mechanisms import candidates_of, generic_candidates
+from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of, generic_candidates
 from siq.diagnosis.naming import Investigation, decide_naming, named_by_forecasts
 from siq.diagnosis.residual_structure import (
     RANDOM_RESIDUALS,
@@ -34,12 +34,15 @@ from siq.diagnosis.unnamed_models import AugmentedModel, fit_unnamed_models
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget
 from siq.inference.maximum_likelihood import Fit
-from siq.inference.measurements import Measurements, with_expectations
+from siq.inference.measurements import Measurements, first_states, with_expectations
 from siq.inference.recalibration import covariance_with_unknown_process_noise, recalibrate
 from siq.inference.trajectories import scored_rows, squared_errors
 from siq.numerics.randomness import positive
 from siq.remarks import Remark
 from siq.systems.dynamics import Dynamics
+
+RARE = 0.2  # weight of what few systems have, as in the dictionary
+TURNED = 0.01  # share of a path that is gone back, from which on it is no error of the first velocities
 
 
 def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigation:
@@ -60,6 +63,17 @@ def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigat
     if study.generic if study.generic is not None else not roles.physical:
         monomials = generic_candidates(model, roles, degree=study.degree, named=candidates)
         candidates += [each for each in monomials if each.coordinate != "constant"]
+    # No path that is never gone back tells whether a force depends on it.
+    moved = np.abs(x := first_states(model, data)).sum(axis=0)
+    turns = dict(zip(model.states, moved - np.abs(x.sum(axis=0)) > 2 * TURNED * moved, strict=True))
+    candidates = [each for each in candidates if not each.turning or turns[each.coordinate]]
+    # The time since a recording was begun is no clock: what goes by it would begin anew with each of them.
+    begins = data.t[data.first[:-1]]
+    if len(begins) > 1 and np.ptp(begins) <= np.median(data.step[data.begins]):
+        candidates = [
+            replace(each, weight=min(each.weight, RARE)) if each.coordinate == "t" else each
+            for each in candidates
+        ]
     if study.search.prior == "flat":
         candidates = [replace(each, weight=1.0) for each in candidates]
     budget = budget or Budget()
@@ -199,10 +213,11 @@ class HeldOutRuns:
 def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRuns:
     """Run the simulations freely on recordings that had no part in anything.
 
-    Of several models of what has no name one may be adopted (`siq.diagnosis.holdout`): it makes the
-    prediction better than that of the mechanisms with a name, where there are any, or else of the simulation.
-    Where all recordings are tests of somebody else, parts of those to learn from are left out in turn, and
-    decide. The recordings that something was found in decide which estimates run freely best.
+    Of several models of what has no name one may be adopted (`siq.diagnosis.holdout`). Parts of the
+    recordings to learn from, each left out in turn, choose it. It has to make the prediction better than that
+    of the mechanisms with a name, where there are any, or else of the simulation: of recordings held out, or
+    where all of these are tests of somebody else, of the parts left out. The recordings that something was
+    found in decide which estimates run freely best.
     """
     search, learned, study = investigation.search, investigation.context.data, investigation.context.study
     noise, substeps = search.recalibrated.noise, max(search.fit.substeps, search.recalibrated.substeps)
@@ -234,43 +249,34 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     choices = [(model, best_of(model.fit, model.exact)) for model in investigation.models]
     named = investigation.verdict.names
     judges = [place for place, label in enumerate(data.labels) if label not in study.tests]
-    adopted: int | None = None
+    names = [each.best.candidate for each in search.found] if named else []
+
+    def left_out(fit: Fit, parts: Sequence[MechanismCandidate] = ()) -> np.ndarray | None:
+        """Errors of free runs of parts of what was learned from, each left out in turn."""
+        return errors_left_out(fit, learned, noise=noise, candidates=[*names, *parts])
+
+    # Of several models parts of what was learned from choose, each left out in turn.
+    foreseen = [left_out(fit, [part.candidate for part in model.parts]) for model, fit in choices]
+    best = preferred_model(foreseen, [model.coordinates for model, _ in choices]) if choices else 0
+    adopted = False
     if choices and judges:
-        # What is not certain where it was found has to be better by more than appears by chance, what is
-        # certain better than the simulation fitted alike. A card whose values are right predicts well, and
-        # tells nothing of a function whose fit had to find them, too. Where there is process noise a free run
-        # is off by it, and a little may be chance.
-        may_choose = data.select(judges)
+        # What is not certain where it was found, or what names leave, has to be better by more than appears
+        # by chance, what is certain better than the simulation fitted alike. A card whose values are right
+        # predicts well, and tells nothing of a function whose fit had to find them, too. Where there is
+        # process noise a free run is off by it, and a little may be chance.
+        may_choose, (model, fit) = data.select(judges), choices[best]
         alone = [errors_of(each, may_choose) for each in ((plain,) if named else (card, fitted_alike))]
         least = min((each for each in alone if each is not None), key=np.mean, default=None)
-        errors = [errors_of(fit, may_choose) for _, fit in choices]
-        limits = [
-            0.0
-            if model.log_evidence < study.search.least_log_odds
-            else mean_error(least if model.fit.has_process_noise else alone[-1])
-            for model, _ in choices
-        ]
-        adopted = first_better(least, errors, limits)
-        if adopted is not None:  # one of fewer coordinates that predicts no worse takes its place
-            coordinates = [model.coordinates for model, _ in choices]
-            adopted = simplest_of([mean_error(each) for each in errors], coordinates, adopted)
-    elif choices:  # parts of the recordings that were learned from, each left out in turn, choose
-        names = [each.best.candidate for each in search.found] if named else []
-        without = plain if named else search.recalibrated
-        errors = [
-            errors_left_out(
-                fit, learned, noise=noise,
-                candidates=[*names, *(part.candidate for part in model.parts)],
-            )
-            for model, fit in choices
-        ]  # fmt: skip
-        best = int(np.argmin([mean_error(each) for each in errors]))
-        left_out = errors_left_out(without, learned, noise=noise, candidates=names)
-        adopted = best if first_better(left_out, [errors[best]], [0.0]) == 0 else None
+        limit = mean_error(least if model.fit.has_process_noise else alone[-1])
+        if named or model.log_evidence < study.search.least_log_odds:
+            limit = 0.0
+        adopted = predicts_better(least, errors_of(fit, may_choose), limit=limit)
+    elif choices:
+        adopted = predicts_better(left_out(plain if named else search.recalibrated), foreseen[best])
     fit = plain if named or not choices else choices[0][1]
     described = None
-    if adopted is not None:
-        described, fit = choices[adopted]
+    if adopted:
+        described, fit = choices[best]
     before, refitted, augmented = (run(each, data) for each in (card, recalibrated, fit))
     squares = {
         "before": squared_errors(before, data),

@@ -155,6 +155,8 @@ class MechanismCandidate:
         the equations of further states.
     generalises
         Mechanisms that are special cases of it.
+    turning
+        Whether it shows only where the velocity that is its coordinate takes both signs.
     kind
         ``mechanism``, one of the dictionary; ``formula``, ``curve`` or ``surface``.
     log_cost
@@ -180,6 +182,7 @@ class MechanismCandidate:
     variant: str = ""
     family: str = ""
     weight: float = 1.0
+    turning: bool = False
     kind: Kind = MECHANISM
     log_cost: float = 0.0
     place: Place | None = None
@@ -364,6 +367,7 @@ def build_candidate(
         coordinate=" ".join(assignment.get(word, word) for word in form.coordinate.split()),
         changes=(*changes, *further),
         generalises=mechanism.generalises,
+        turning=form.turning,
         variant=form.variant.format_map(assignment),
         family=mechanism.family or mechanism.name,
         weight=mechanism.weight,

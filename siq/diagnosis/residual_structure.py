@@ -16,16 +16,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.stats
 
-from siq.diagnosis.dictionary import Roles, roles_of
+from siq.diagnosis.dictionary import Roles, roles_of, unit_of, units_of
+from siq.diagnosis.evidence import correlation_time_of
 from siq.diagnosis.screening import Projection, Ranked, linearised_with, portions
 from siq.diagnosis.terms import Place, places_in
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget
-from siq.inference.kalman_filter import Noise, profile_likelihood, solve, whiten
+from siq.inference.kalman_filter import Grid, Noise, profile_likelihood, solve, whiten
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import fit_before_rounding
 from siq.numerics.randomness import positive
+from siq.remarks import Remark
 
 LAGS = 12  # of autocorrelations
 
@@ -168,6 +170,42 @@ class Remainder:
         left = max(alone.total - alone.freedom, systematic, 0.0)
         share = float(np.clip(1 - left / (before.total - before.freedom), 0.0, 1.0))
         return cls(before, after, share)
+
+
+def remaining_forces(fit: Fit, data: Measurements, remainder: Structure) -> list[Remark]:
+    """What process noise stands in for: in each equation its size, how long it lasts, and where it shows.
+
+    A force lasts as long as its autocorrelation, integrated over all lags; process noise proper lasts no
+    longer than a sample. Smoothed states follow what they are driven by, so that its size is a little too
+    small.
+    """
+    rows, step = data.begins, data.step[data.begins]
+    forces = -fit.linearisation.gap[rows] / step[:, None]
+    signals = Grid(data, fit.substeps).at_samples(fit.model.lags(fit.model.values))
+    rates = fit.model.functions.rates(np.ascontiguousarray(fit.x.T), signals, fit.model.values).T
+    units, unit_of_time, found = units_of(fit.model), fit.model.time_unit, []
+    for place in np.flatnonzero(fit.noise.process > 0):
+        name, force = fit.model.states[place], forces[:, place]
+        there = (each for each in remainder.curves if each.term.targets == (name,))
+        best = max(there, key=lambda each: each.gain, default=None) if remainder.p_curves < DOUBTFUL else None
+        size, lasts = (
+            float(np.sqrt(np.mean(force**2))),
+            correlation_time_of(force, data.recording[rows], outputs=1),
+        )
+        values = {
+            "state": name,
+            "size": size,
+            "unit": unit_of("_x/_t", {"_x": units.get(name, "1"), "_t": unit_of_time}),
+            "share": size / max(float(np.sqrt(np.mean(rates[:, place] ** 2))), 1e-300),
+            "intensity": float(fit.noise.process[place]),
+            "intensity_unit": unit_of("_x**2/_t", {"_x": units.get(name, "1"), "_t": unit_of_time}),
+            "samples": lasts,
+            "lasts": lasts * float(np.median(step)),
+            "time_unit": unit_of_time,
+            "along": "" if best is None else best.term.words[0],
+        }
+        found.append(Remark("diagnosis.remains", values))
+    return found
 
 
 def has_structure(current: Fit, data: Measurements) -> bool:

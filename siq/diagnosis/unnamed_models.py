@@ -27,7 +27,7 @@ import sympy
 from siq.diagnosis.dictionary import Form, FurtherState, Mechanism, MechanismParameter, Role, Roles, Shape
 from siq.diagnosis.evidence import NUMERICAL_ERRORS, FittedCandidate, log_evidences
 from siq.diagnosis.holdout import simulated
-from siq.diagnosis.mechanisms import FORMULA, MechanismCandidate, candidates_of, coordinates_of
+from siq.diagnosis.mechanisms import FORMULA, MECHANISM, MechanismCandidate, candidates_of, coordinates_of
 from siq.diagnosis.residual_structure import has_structure
 from siq.diagnosis.screening import Ranked, screen_all
 from siq.diagnosis.search import FitContext, Search, best_probes
@@ -508,5 +508,11 @@ def _likeliest(
         for each in _weighed(models, alone, data)
         if each.log_evidence > 0 and runs_freely(each.fit, alone, data)
     )
-    chosen = itertools.islice(likelier, FUNCTIONS_FITTED)
+    known = list(likelier)
+    # What a search named or nearly named stays, even where several functions without a name are likelier.
+    chosen = known[:FUNCTIONS_FITTED] + [
+        each
+        for each in known[FUNCTIONS_FITTED:]
+        if all(part.candidate.kind == MECHANISM for part in each.parts)
+    ]
     return tuple(replace(each, exact=exact_fit(each.fit, data)) for each in chosen)

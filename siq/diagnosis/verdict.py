@@ -15,10 +15,11 @@ import sympy
 
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
 from siq.diagnosis.evidence import BUDGET_SPENT, NUMERICAL_ERRORS, FittedCandidate, log_evidences, residuals
+from siq.diagnosis.holdout import NEARLY_ALL
 from siq.diagnosis.investigation import HeldOutRuns
 from siq.diagnosis.mechanisms import PROCESS_NOISE, SURFACE, fresh_names, places_of
 from siq.diagnosis.naming import Investigation
-from siq.diagnosis.residual_structure import Remainder, Structure
+from siq.diagnosis.residual_structure import Remainder, Structure, remaining_forces
 from siq.diagnosis.search import FitContext
 from siq.diagnosis.smooth_functions import FORMS, A, B, C, Smoothness, Z
 from siq.diagnosis.statement import (
@@ -48,7 +49,6 @@ GRID_POINTS = 25  # places along either coordinate of a curve or surface, for it
 BOUND_ERRORS = 1.96  # standard errors on either side of an estimate within which 95 % lie
 VISIBLE_SHARE = 0.1  # of the largest value of a curve
 VISIBLE_ERRORS = 2.0  # standard errors beyond which a curve differs from zero
-NEARLY_ALL = 0.9  # of what the best coordinate, or a perfect description, would explain
 MOTION_SHARE = 0.75  # of what the time or an input explains, from which on it is rather a state
 AFFECTED_SHARE = 0.5  # of its fair share of the excess, from which on a recording counts as affected
 
@@ -91,6 +91,16 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
         untried = sum(each.remark == BUDGET_SPENT for each in search.untried)
         stopped_by = investigation.account.stopped_by
         remarks.append(Remark("diagnosis.partial", {"untried": untried, "stopped_by": stopped_by}))
+    forced = (
+        search.fit
+        if described is None and named
+        else search.recalibrated
+        if described is None
+        else described.fit
+    )
+    if verdict.mismatch and forced.has_process_noise and not investigation.process_noise:
+        structure = Remainder.of(context.data, forced, forced, context.roles).after
+        remarks += remaining_forces(forced, context.data, structure)
     if kept and errors:
         remarks.append(Remark("diagnosis.values_stay"))
     if not shown.independent:

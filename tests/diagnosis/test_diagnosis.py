@@ -228,7 +228,8 @@ def test_random_forces_are_no_noise_where_a_function_beside_them_is_likelier(
         return (AugmentedModel((part,), search.recalibrated, 5.0),)
 
     monkeypatch.setattr(investigation, "fit_unnamed_models", models)
-    monkeypatch.setattr(investigation, "first_better", lambda *_: None)
+    monkeypatch.setattr(investigation, "predicts_better", lambda *_, **__: False)
+    monkeypatch.setattr(investigation, "errors_left_out", lambda *_, **__: None)
     diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.05, count=4), study={"held_out": ["r2"]})
     assert said(diagnosis)["verdict"] == "unexplained" and names(diagnosis) == []
     # It is located where the likeliest function stands.

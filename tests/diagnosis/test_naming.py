@@ -11,7 +11,7 @@ import pytest
 
 from siq.data.recordings import Recordings
 from siq.diagnosis.evidence import correlation_time_of
-from siq.diagnosis.holdout import _cross_validation_folds, errors_left_out, first_better
+from siq.diagnosis.holdout import _cross_validation_folds, errors_left_out, predicts_better
 from siq.diagnosis.naming import _MissingEffect
 from siq.diagnosis.unnamed_models import runs_freely
 from siq.inference.kalman_filter import Whitened
@@ -160,20 +160,19 @@ def squares(draw: np.random.Generator, size: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("without", "models", "certain", "place"),
+    ("without", "model", "certain", "adopted"),
     [
-        (1.0, [0.95, 0.5, 0.1], False, 1),  # the first by more than chance, not the least
-        (1.0, [0.95], False, None),
-        (1.0, [0.95], True, 0),  # what is certain where it was found has to be better, by however little
-        (1.0, [1.2], True, None),
-        (1.0, [None, 0.5], False, 1),  # one that runs away is none
-        (None, [3.0], False, 0),  # without, it runs away
-        (1.0, [], False, None),
+        (1.0, 0.5, False, True),
+        (1.0, 0.95, False, False),  # no better than by chance
+        (1.0, 0.95, True, True),  # what is certain where it was found has to be better, by however little
+        (1.0, 1.2, True, False),
+        (1.0, None, True, False),  # one that runs away is none
+        (None, 3.0, False, True),  # without, it runs away
     ],
 )
-def test_the_likeliest_model_that_foresees_better_is_adopted(
-    without: float | None, models: list, certain: bool, place: int | None
+def test_a_model_is_adopted_that_foresees_better(
+    without: float | None, model: float | None, certain: bool, adopted: bool
 ) -> None:
     draw = np.random.default_rng(1)
-    runs = [None if size is None else squares(draw, size) for size in (without, *models)]
-    assert first_better(runs[0], runs[1:], [runs[0].mean() if certain else 0.0] * len(models)) == place
+    before, after = (None if size is None else squares(draw, size) for size in (without, model))
+    assert predicts_better(before, after, limit=before.mean() if certain else 0.0) is adopted

@@ -13,7 +13,7 @@ import sympy
 from siq.diagnosis import unnamed_models
 from siq.diagnosis.diagnosis import solve_case
 from siq.diagnosis.evidence import _log_evidence_of, evidences_by_size
-from siq.diagnosis.holdout import simplest_of
+from siq.diagnosis.holdout import preferred_model
 from siq.diagnosis.smooth_functions import (
     LENGTH_SCALES,
     Bumps,
@@ -174,10 +174,15 @@ def test_what_is_beyond_all_numbers_ends_a_function_and_not_the_case(monkeypatch
     assert unnamed_models._with_smooth_term((), fit, where, 0.0, context, product=True) == []
 
 
-def test_the_model_of_fewest_coordinates_is_taken_that_foresees_no_worse() -> None:
-    assert simplest_of([1.0, 0.9, 1.1], [2, 1, 1], 0) == 1
-    assert simplest_of([1.0, 1.1, 1.2], [2, 1, 1], 0) == 0
-    assert simplest_of([1.0, 0.5], [1, 1], 0) == 0  # the likeliest of as many
+def test_the_model_is_taken_that_foresees_parts_left_out_best_and_of_those_alike_the_simplest() -> None:
+    draw = np.random.default_rng(3)
+    errors = draw.chisquare(1, 400)
+    other = errors * np.exp(0.1 * draw.normal(size=400))
+    assert preferred_model([errors, 0.3 * other, 2 * other], [1, 2, 1]) == 1
+    assert preferred_model([errors, other], [2, 1]) == 1  # as good, and of fewer coordinates
+    assert preferred_model([errors, other], [1, 1]) == 0  # the first of as many
+    assert preferred_model([None, errors], [0, 2]) == 1  # one that runs away is none
+    assert preferred_model([None, None], [1, 1]) == 0
 
 
 def test_a_fit_takes_no_more_than_its_part_of_the_budget() -> None:
