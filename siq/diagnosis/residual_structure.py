@@ -176,8 +176,7 @@ def remaining_forces(fit: Fit, data: Measurements, remainder: Structure) -> list
     """What process noise stands in for: in each equation its size, how long it lasts, and where it shows.
 
     A force lasts as long as its autocorrelation, integrated over all lags; process noise proper lasts no
-    longer than a sample. Smoothed states follow what they are driven by, so that its size is a little too
-    small.
+    longer than a sample. Sizes are those of the smoothed states, up to a fifth too small.
     """
     rows, step = data.begins, data.step[data.begins]
     forces = -fit.linearisation.gap[rows] / step[:, None]

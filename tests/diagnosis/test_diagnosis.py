@@ -17,14 +17,15 @@ from siq.diagnosis import forecasts, investigation, naming, search
 from siq.diagnosis.diagnosis import Diagnosis, _withdrawn, solve_case
 from siq.diagnosis.dictionary import standard_dictionary
 from siq.diagnosis.evidence import FittedCandidate
-from siq.diagnosis.investigation import held_out_runs
+from siq.diagnosis.investigation import held_out_runs, investigate
 from siq.diagnosis.naming import Investigation
 from siq.diagnosis.residual_structure import Remainder
 from siq.diagnosis.screening import Probe, Ranked
 from siq.diagnosis.search import FitContext, Search
-from siq.diagnosis.study import MismatchVerdict, read_case
+from siq.diagnosis.study import Comparison, MismatchVerdict, read_case
 from siq.diagnosis.unnamed_models import AugmentedModel
 from siq.errors import InputError, NumericalFailure
+from siq.inference.budget import Budget
 from siq.remarks import has_code
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics, Signals
@@ -92,12 +93,17 @@ def recordings_of(
     )
 
 
-def solved(folder: Path, table: pd.DataFrame, *, card: dict = CARD, study: dict | None = None) -> Diagnosis:
+def compared(
+    folder: Path, table: pd.DataFrame, *, card: dict = CARD, study: dict | None = None
+) -> Comparison:
     (folder / "system.yaml").write_text(yaml.safe_dump(card, sort_keys=False), encoding="utf-8")
     (folder / "study.yaml").write_text(yaml.safe_dump(study or {"held_out": ["r2", "r5"]}), encoding="utf-8")
     table.to_parquet(folder / "recordings.parquet")
-    case = read_case(folder / "system.yaml", folder / "recordings.parquet", folder / "study.yaml")
-    return solve_case(case)
+    return read_case(folder / "system.yaml", folder / "recordings.parquet", folder / "study.yaml")
+
+
+def solved(folder: Path, table: pd.DataFrame, **how: Any) -> Diagnosis:
+    return solve_case(compared(folder, table, **how))
 
 
 def nothing(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
@@ -197,6 +203,23 @@ def test_drag_is_named_from_one_drop_of_45_heights(drag: float, tmp_path: Path) 
     said_of = {each["what"]: each["log_evidence"] for each in said(diagnosis)["explanations"]}
     assert said_of["quadratic drag in w"] == 0
     assert said_of["other parameters"] < said_of["other parameters and process noise"] < -10
+
+
+def test_a_path_that_is_never_gone_back_shows_no_hysteresis_and_time_since_a_begin_is_no_clock(
+    tmp_path: Path,
+) -> None:
+    falls = falling_ball(0.05).read(tmp_path)
+    swings = compared(tmp_path, recordings_of(nothing, count=3), study={"held_out": ["r2"]})
+    seen = [
+        {each.name: each.weight for each in investigate(case, budget=Budget(work=1.0)).context.candidates}
+        for case in (falls, swings, replace(swings, learn=swings.learn.select([0])))
+    ]
+    assert ["hysteresis" in each for each in seen] == [False, True, True]
+    assert [each["periodic forcing"] for each in seen] == [
+        1.0,
+        0.2,
+        1.0,
+    ]  # the falls: one drop
 
 
 def test_dry_friction_is_told_from_other_friction(tmp_path: Path) -> None:

@@ -13,11 +13,13 @@ from siq.diagnosis.dictionary import roles_of
 from siq.diagnosis.residual_structure import (
     Remainder,
     explained_by_quantisation,
+    remaining_forces,
 )
 from siq.diagnosis.study import MismatchVerdict, _measurements_of
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, with_expectations
 from siq.inference.recalibration import _before_rounding, recalibrate
+from siq.remarks import sentence
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, symbol
 
@@ -89,3 +91,29 @@ def test_a_diagnosis_raises_no_alarm_where_sensors_round() -> None:
     assert not diagnosis.verdict.mismatch or [each.name for each in diagnosis.mechanisms] == ["quantisation"]
     diagnosis = diagnose(decaying(quadratic=0.0), readings(quadratic=0.1))
     assert diagnosis.verdict is not MismatchVerdict.NO_MISMATCH
+
+
+@pytest.mark.parametrize("lasts", [0.0, 0.8])
+def test_what_remains_has_the_size_and_the_time_of_the_force_that_is_not_known(lasts: float) -> None:
+    rng, t, size, step = np.random.default_rng(2), np.arange(0, 30, 0.05), 0.3, 0.05
+    keep = np.exp(-step / lasts) if lasts else 0.0
+    frames = []
+    for place in range(4):
+        x, force, values = 1.0 + 0.3 * place, size * rng.normal(), []
+        for _ in t:
+            values.append(x)
+            x = x * np.exp(-0.7 * step) + force * (1 - np.exp(-0.7 * step)) / 0.7
+            force = keep * force + size * np.sqrt(1 - keep**2) * rng.normal()
+        read = np.array(values) + 0.0005 * rng.normal(size=len(t))
+        frames.append(pd.DataFrame({"recording": f"r{place}", "t": t, "x": read}))
+    model = with_expectations(decaying(quadratic=0.0))
+    data = _measurements_of(pd.concat(frames), model)
+    fit, _ = recalibrate(model, data)
+    (remark,) = remaining_forces(fit, data, Remainder.of(data, fit, fit, roles_of(model)).after)
+    values = remark.values
+    assert values["state"] == "x" and values["size"] == pytest.approx(size, rel=0.25)
+    if lasts:  # the integral of the autocorrelation over both sides
+        assert values["lasts"] == pytest.approx(2 * lasts, rel=0.5)
+        assert "at a time" in sentence(remark)
+    else:
+        assert values["samples"] < 2 and values["intensity"] == pytest.approx(size**2 * step, rel=0.2)
