@@ -246,7 +246,9 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         fitted_alike = best_of(*(fit for fit, _ in refits), recalibrated, card)
         recalibrated = preferred_recalibration(card, refits, learned, noise=noise)
     plain = best_of(investigation.exact, search.fit, *(each.fit for each in investigation.finals))
-    choices = [(model, best_of(model.fit, model.exact)) for model in investigation.models]
+    choices = [
+        (model, fit) for model in investigation.models for fit in (model.fit, model.exact) if fit is not None
+    ]
     named = investigation.verdict.names
     judges = [place for place, label in enumerate(data.labels) if label not in study.tests]
     names = [each.best.candidate for each in search.found] if named else []
@@ -255,7 +257,7 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         """Errors of free runs of parts of what was learned from, each left out in turn."""
         return errors_left_out(fit, learned, noise=noise, candidates=[*names, *parts])
 
-    # Of several models parts of what was learned from choose, each left out in turn.
+    # Of several models, and ways to fit them, parts of what was learned from choose, each left out in turn.
     foreseen = [left_out(fit, [part.candidate for part in model.parts]) for model, fit in choices]
     best = preferred_model(foreseen, [model.coordinates for model, _ in choices]) if choices else 0
     adopted = False
@@ -273,7 +275,7 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         adopted = predicts_better(least, errors_of(fit, may_choose), limit=limit)
     elif choices:
         adopted = predicts_better(left_out(plain if named else search.recalibrated), foreseen[best])
-    fit = plain if named or not choices else choices[0][1]
+    fit = plain if named or not choices else choices[best][1]
     described = None
     if adopted:
         described, fit = choices[best]
@@ -282,7 +284,7 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         "before": squared_errors(before, data),
         "recalibrated": squared_errors(refitted, data),
         "augmented": squared_errors(augmented, data),
-        "named": errors_of(plain, data) if named and adopted is not None else None,
+        "named": errors_of(plain, data) if named and adopted else None,
     }
     # What a fit leaves may be more than noise; the one that leaves least is nearest to it. Where there is
     # process noise, that takes a part of the sensor's noise over.
