@@ -30,7 +30,7 @@ from siq.diagnosis.verdict import statement_of
 from siq.errors import InputError, NumericalFailure
 from siq.inference.budget import Budget
 from siq.inference.kalman_filter import MAX_SUBSTEPS
-from siq.inference.measurements import first_states
+from siq.inference.measurements import first_states, without_variation
 from siq.inference.trajectories import scored_rows
 from siq.remarks import Remark
 from siq.systems.cards import load_system
@@ -225,7 +225,8 @@ def _completed(model: Dynamics, x: np.ndarray, *, process: np.ndarray | None = N
     """A fitted simulation as a dynamics of its own.
 
     A state without a domain gets the range of the states ``(n, d)`` along the recordings; process noise with
-    intensities ``(d,)`` becomes its D, with zeros for states that nothing drives.
+    intensities ``(d,)`` becomes its D, with zeros for states that nothing drives. Parameters that differ
+    from recording to recording have their means.
     """
     limits = np.stack([x.min(axis=0), x.max(axis=0)], axis=1)
     limits[limits[:, 0] == limits[:, 1]] = np.nan  # of a state that rests nothing is known
@@ -233,7 +234,7 @@ def _completed(model: Dynamics, x: np.ndarray, *, process: np.ndarray | None = N
     noise = model.diffusion
     if process is not None and (process > 0).any():
         noise = Diffusion(np.diag(process))
-    return replace(model, domain=domain, diffusion=noise)
+    return without_variation(replace(model, domain=domain, diffusion=noise))
 
 
 def solve_case(

@@ -519,8 +519,9 @@ def assignments(form: Form, model: Dynamics, roles: Roles) -> Iterator[dict[str,
         "store": roles.stores,
         "stock": (*roles.populations, *roles.levels, *roles.stores),
         "state": roles.states,
-        "input": tuple(entry.name for entry in model.inputs),
-        "parameter": tuple(entry.name for entry in model.parameters),  # what is known at first may drift, too
+        "input": tuple(entry.name for entry in model.inputs if not entry.name.startswith("_")),
+        # What is known at first may drift, too.
+        "parameter": tuple(entry.name for entry in model.parameters if not entry.name.startswith("_")),
         "output": model.output_names,
     }
     place = 0

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.stats
 
 from siq.diagnosis.dictionary import Mechanism, Roles, roles_of, units_of
 from siq.diagnosis.evidence import NotFitted, correlation_time_of, residuals
@@ -26,7 +25,6 @@ from siq.diagnosis.residual_structure import (
     STRUCTURED,
     Remainder,
     explained_by_quantisation,
-    noise_nonstationarity,
 )
 from siq.diagnosis.search import BUDGET_FOR_FUNCTIONS, FitContext, Search, search_mechanisms
 from siq.diagnosis.study import Comparison, MismatchVerdict
@@ -35,7 +33,12 @@ from siq.errors import NumericalFailure
 from siq.inference.budget import Budget
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, first_states, with_expectations
-from siq.inference.recalibration import covariance_with_unknown_process_noise, recalibrate
+from siq.inference.recalibration import (
+    covariance_with_unknown_process_noise,
+    noise_nonstationarity,
+    recalibrate,
+    wald_probability,
+)
 from siq.inference.trajectories import scored_rows, squared_errors
 from siq.numerics.randomness import positive
 from siq.remarks import Remark
@@ -167,17 +170,8 @@ def _by_tests(
 
 def _shift_probability(model: Dynamics, recalibrated: Fit) -> float:
     """p-value of the test that the card's parameters are the true ones, given the recalibrated ones."""
-    free = np.array(model.free, dtype=int)
-    if not len(free):
-        return 1.0
-    difference = recalibrated.model.values[free] - model.values[free]
-    scale = np.sqrt(np.diag(recalibrated.covariance))
-    scale = np.where(scale > 0, scale, np.inf)
-    correlation = recalibrated.covariance / np.outer(scale, scale)
-    values, vectors = np.linalg.eigh(correlation)
-    kept = values > 1e-9 * values[-1]
-    along = vectors[:, kept].T @ (difference / scale) / np.sqrt(values[kept])
-    return float(scipy.stats.chi2.sf(float(along @ along), int(kept.sum())))
+    free = list(model.free)
+    return wald_probability(recalibrated.model.values[free] - model.values[free], recalibrated.covariance)
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,8 @@
-"""Structure in residuals, what remains of it, and whether process noise is stationary.
+"""Structure in residuals, and what remains of it once mechanisms are found.
 
 What may be missing is described without naming it: in every equation a piecewise linear function of every
 coordinate - a state, an input, the amplitude of a rotating frame, time - is let in, and the data say how
 large it would be. It tells where a mismatch sits, and whether one is left.
-
-**Stationarity.** Process noise drives a system alike whether it moves or rests. What a simulation lacks of a
-hidden part - a second oscillator, a memory - can pass for process noise, too, where recordings are noisy; but
-such forces fade with the motion that excites them. The likelihood tells the two apart.
 """
 
 from __future__ import annotations
@@ -22,11 +18,10 @@ from siq.diagnosis.screening import Projection, Ranked, linearised_with, portion
 from siq.diagnosis.terms import Place, places_in
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget
-from siq.inference.kalman_filter import Grid, Noise, profile_likelihood, solve, whiten
+from siq.inference.kalman_filter import Grid, Noise, solve, whiten
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import fit_before_rounding
-from siq.numerics.randomness import positive
 from siq.remarks import Remark
 
 LAGS = 12  # of autocorrelations
@@ -240,27 +235,3 @@ def explained_by_quantisation(
     except NumericalFailure:
         return None
     return None if left.after.p_value < least else (replace(strict, model=fit.model, x=fit.x), left, names)
-
-
-FOLLOWING_SHARES = (0.5, 0.9, 0.99)  # of the forces that follow the motion
-NOISE_RATIOS = (1 / 8, 1 / 4, 1 / 2, 1 / 1.4, 1.0, 1.4, 2.0, 4.0, 8.0)  # of process noise, to that of the fit
-
-
-def noise_nonstationarity(fit: Fit, data: Measurements) -> float:
-    """How much better process noise fits that follows the motion than stationary noise does, in χ².
-
-    Both have their intensities at their best; of forces that follow the motion at least half are in
-    proportion to the square of its size.
-    """
-    moved = (fit.x - fit.x.mean(axis=0)) / positive(fit.x.std(axis=0))
-    motion = (moved**2).mean(axis=1)
-    following = motion / motion.mean()
-
-    def likelihood(weight: np.ndarray) -> float:
-        """With both kinds of noise at their best; the weight is of the process noise at every sample."""
-        noises = (Noise(fit.noise.measurement, ratio * fit.noise.process) for ratio in NOISE_RATIOS)
-        sums = (fit.linearisation.sums(data.first, weight * data.step, noise) for noise in noises)
-        return max(profile_likelihood(total, freedom, logarithm) for total, logarithm, freedom in sums)
-
-    steady = likelihood(np.ones(len(motion)))
-    return 2 * (max(likelihood(1 - share + share * following) for share in FOLLOWING_SHARES) - steady)

@@ -20,7 +20,7 @@ from siq.data.recordings import Recordings, read_recordings
 from siq.diagnosis.dictionary import Mechanism, dictionary_of
 from siq.errors import Fault, InputError
 from siq.inference.budget import DEFAULT_SECONDS, DEFAULT_WORK
-from siq.inference.measurements import Measurements, columns_of, measurements
+from siq.inference.measurements import Measurements, columns_of, measurements, with_variation
 from siq.numerics.files import read_document, validate
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
@@ -131,6 +131,8 @@ class MismatchStudy(BaseModel):
         to learn from, each left out of its fit in turn.
     noise
         Standard deviation of the measurement noise by output, where it is known; by default it is estimated.
+    varies
+        Parameters that differ from recording to recording, such as a friction that the temperature changes.
     mechanisms
         Further entries of the dictionary; one of a known name replaces it.
     without
@@ -154,6 +156,7 @@ class MismatchStudy(BaseModel):
     held_out: tuple[str, ...] | Annotated[float, Field(gt=0, lt=1)] = 0.25
     tests: tuple[str, ...] = ()
     noise: dict[str, Annotated[float, Field(gt=0)]] = {}
+    varies: tuple[str, ...] = ()
     mechanisms: tuple[Mechanism, ...] = ()
     without: tuple[str, ...] = ()
     generic: bool | None = None
@@ -263,6 +266,16 @@ def comparison_of(
         known = [settings.noise.get(name, np.nan) ** 2 for name in system.output_names]
         data = replace(data, sensor_noise=np.array(known))
     learn, kept = _split(data, settings, file=file)
+    for name in settings.varies:
+        if not any(each.name == name and each.value and not each.fixed for each in system.parameters):
+            fault = f"'{name}' is no parameter of the card that is free, with a value other than zero"
+            raise InputError(file, "varies", fault, "name one that is")
+        if len(learn.labels) < 2:
+            raise InputError(
+                file, "varies", "there is one recording to learn from", "give several, or leave it out"
+            )
+    if settings.varies:
+        system, learn, kept = with_variation(system, settings.varies, learn, kept)
     dictionary = dictionary_of(without=settings.without, further=settings.mechanisms, file=file)
     return Comparison(system, learn, kept, settings, dictionary)
 

@@ -218,7 +218,7 @@ def places_in(
         found += [
             Place(((name, ONE),), (), (formula,), (word,), linear=linear)
             for word, formula in coordinates.items()
-            if not (name in framed and word in framed)
+            if not (name in framed and word in framed) and not word.startswith("_")  # of recordings
         ]
     values = {symbol(each.name): exact_number(each.value) for each in model.parameters}
     for name, written in () if linear else model.outputs:
@@ -241,7 +241,7 @@ def products_in(
         if len(place.equations) > 1:  # in a rotating frame only the amplitude
             factors = {"amplitude": _amplitude(*place.targets)}
         for name, formula in factors.items():
-            if place.equations and name not in place.words:
+            if place.equations and name not in place.words and not name.startswith("_"):
                 equations = tuple((target, factor * formula) for target, factor in place.equations)
                 found.append(replace(place, equations=equations, words=(*place.words, name)))
     return tuple(_with_knots(found, model, data, x))

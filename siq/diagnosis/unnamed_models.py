@@ -223,7 +223,7 @@ def _with_surfaces(fit: Fit, models: Sequence[AugmentedModel], context: FitConte
             begins.append((place, each))
     if not single:  # one of two may tell so little of either coordinate alone
         begins = [(each.term, None) for each in rank_places(fit, data, context.roles)[:FUNCTIONS_FITTED]]
-    names = [name for name in coordinates_of(fit.model) if name != "t"]
+    names = [name for name in coordinates_of(fit.model) if name != "t" and not name.startswith("_")]
     asked: list[tuple[float, Place, AugmentedModel | None]] = []
     done = set()
     for place, like in begins:

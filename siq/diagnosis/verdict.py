@@ -7,6 +7,7 @@ found.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -40,6 +41,7 @@ from siq.diagnosis.terms import Place
 from siq.diagnosis.unnamed_models import AugmentedModel
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
+from siq.inference.recalibration import wald_probability
 from siq.remarks import Remark
 from siq.systems.dynamics import symbol
 from siq.systems.formulas import compile_values
@@ -101,6 +103,8 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
     if verdict.mismatch and forced.has_process_noise and not investigation.process_noise:
         structure = Remainder.of(context.data, forced, forced, context.roles).after
         remarks += remaining_forces(forced, context.data, structure)
+    for name in context.study.varies:
+        remarks.append(_variation_of(name, final, context.data.labels))
     if kept and errors:
         remarks.append(Remark("diagnosis.values_stay"))
     if not shown.independent:
@@ -128,7 +132,7 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
                 entry.value, float(final.model.values[place]), errors[entry.name], entry.unit
             )
             for place, entry in enumerate(investigation.context.model.parameters)
-            if entry.name in errors and not kept
+            if entry.name in errors and not kept and not entry.name.startswith("_")
         },
         errors=errors_seen,
         excluded={} if verdict.mismatch else _excluded(investigation),
@@ -137,6 +141,20 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
         not_fitted=search.untried,
         account=investigation.account,
     )
+
+
+def _variation_of(name: str, fit: Fit, labels: Sequence[str]) -> Remark:
+    """Values of a parameter by recording, and the probability that they are as different by chance."""
+    free = [fit.model.parameters[place] for place in fit.model.free]
+    each = np.array([[p.name in (name, f"_{name}_{k + 1}") for p in free] for k in range(len(labels))], float)
+    values, covariance = each @ [p.value for p in free], each @ fit.covariance @ each.T
+    apart = np.eye(len(labels)) - 1 / len(labels)
+    known = {
+        "unit": next(p.unit for p in free if p.name == name),
+        "runs": list(zip(values.tolist(), np.sqrt(np.diag(covariance)).tolist(), strict=True)),
+        "p": wald_probability(apart @ values, apart @ covariance @ apart),
+    }
+    return Remark("diagnosis.varies", {"name": name, "labels": list(labels)} | known)
 
 
 def _standard_errors(fit: Fit) -> dict[str, float]:

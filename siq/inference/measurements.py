@@ -19,7 +19,7 @@ import sympy
 
 from siq.data.recordings import Recordings
 from siq.errors import Fault
-from siq.systems.dynamics import Dynamics, Signals, symbol
+from siq.systems.dynamics import Dynamics, Input, JointExpectation, Parameter, Signals, symbol
 
 OVERSAMPLING = 16  # of band-limited inputs, between whose dense samples cubics are exact enough
 PADDING = 64  # samples by which they are continued, mirrored, so that the ends do not ring
@@ -303,3 +303,65 @@ def with_expectations(model: Dynamics) -> Dynamics:
         for each in model.parameters
     )
     return replace(model, parameters=tuple(parameters))
+
+
+def with_variation(
+    model: Dynamics, names: Sequence[str], data: Measurements, further: Measurements
+) -> tuple[Dynamics, Measurements, Measurements]:
+    """A model in which parameters differ from recording to recording, with the recordings for it.
+
+    Each of them is a mean, plus a deviation of every recording that is expected about zero within the size of
+    the mean, ``c + Σ c_k i_k``: inputs i_k tell which recording it is. What is not learned from has the mean.
+    Names of the inputs and of the deviations, which have the order of the recordings, begin with a low line.
+
+    Parameters
+    ----------
+    model
+        Its parameters of these names have values other than zero.
+    names
+        Of the parameters that differ.
+    data, further
+        Recordings that are learned from, and others.
+    """
+    count, change, parameters, expected = len(data.labels), {}, [], []
+    signs = tuple(Input(f"_run_{k + 1}", "1", "zero_order") for k in range(count))
+    for entry in (each for each in model.parameters if each.name in names):
+        own = tuple(f"_{entry.name}_{k + 1}" for k in range(count))
+        parameters += [Parameter(name, 0.0, entry.unit) for name in own]
+        expected.append(JointExpectation(own, np.eye(count) / abs(entry.value)))
+        terms = (symbol(name) * symbol(sign.name) for name, sign in zip(own, signs, strict=True))
+        change[symbol(entry.name)] = symbol(entry.name) + sympy.Add(*terms)
+    constant = [scipy.interpolate.PPoly(np.array([[value]]), np.array([0.0, 1.0])) for value in (0.0, 1.0)]
+
+    def courses(of: Measurements, learned: bool) -> tuple[tuple[scipy.interpolate.PPoly, ...], ...]:
+        marks = ([constant[learned and k == place] for k in range(count)] for place in range(len(of.labels)))
+        return tuple((*own, *mark) for own, mark in zip(of.courses, marks, strict=True))
+
+    varied = replace(
+        model,
+        equations=tuple(each.xreplace(change) for each in model.equations),
+        outputs=tuple((name, formula.xreplace(change)) for name, formula in model.outputs),
+        inputs=(*model.inputs, *signs),
+        parameters=(*model.parameters, *parameters),
+        expected_together=(*model.expected_together, *expected),
+        covariance=None,
+    )
+    return (
+        varied,
+        replace(data, courses=courses(data, True)),
+        replace(further, courses=courses(further, False)),
+    )
+
+
+def without_variation(model: Dynamics) -> Dynamics:
+    """A model with the means of parameters that differ from recording to recording."""
+    change = {symbol(each.name): sympy.S.Zero for each in model.inputs if each.name.startswith("_")}
+    return replace(
+        model,
+        equations=tuple(each.xreplace(change) for each in model.equations),
+        outputs=tuple((name, formula.xreplace(change)) for name, formula in model.outputs),
+        inputs=tuple(each for each in model.inputs if not each.name.startswith("_")),
+        parameters=tuple(each for each in model.parameters if not each.name.startswith("_")),
+        expected_together=(),
+        covariance=None,
+    )

@@ -13,6 +13,10 @@ simulation says where: at the mean of a normal distribution that is cut off at t
 the right simulation the residuals to these values are independent of each other (the generalised residuals of
 Gourieroux, Monfort, Renault and Trognon, Journal of Econometrics 34, 5, 1987), and the fit to them is that of
 highest likelihood of the readings (Dempster, Laird and Rubin's EM algorithm).
+
+*Stationarity.* Process noise drives a system alike whether it moves or rests. What a simulation lacks of a
+hidden part - a second oscillator, a memory - can pass for process noise, too, where recordings are noisy; but
+such forces fade with the motion that excites them. The likelihood tells the two apart.
 """
 
 from __future__ import annotations
@@ -43,8 +47,11 @@ FAINT = 1e-4  # process noise, relative to the motion, from which a fit without 
 # Mean square of errors in units of the sensors' noise. Errors twice as large cost a log-likelihood of 0.7 for
 # each value, which nobody believes.
 MISSED = 4.0
+FOLLOWING_SHARES = (0.5, 0.9, 0.99)  # of the forces that follow the motion
+NOISE_RATIOS = (1 / 8, 1 / 4, 1 / 2, 1 / 1.4, 1.0, 1.4, 2.0, 4.0, 8.0)  # of process noise, to that of the fit
 QUANTISATION_ROUNDS = 30  # of fits to values before they were rounded, at most
 NOISE_SETTLED = 0.01  # relative change of the noise, at which these have settled
+SINGULAR = 1e-9  # numerical: of the largest eigenvalue of a correlation
 BETTER = 0.5  # of a log-likelihood: what half a parameter gains by chance, below which two fits are one
 
 
@@ -379,3 +386,38 @@ def _before_rounding(
         outputs[known, place] = simulation[known, place] + deviation[place] * mean
         wide[place] = deviation[place] * np.sqrt(np.mean(mean**2 + variance))
     return replace(data, outputs=outputs), wide
+
+
+def noise_nonstationarity(fit: Fit, data: Measurements) -> float:
+    """How much better process noise fits that follows the motion than stationary noise does, in χ².
+
+    Both have their intensities at their best; of forces that follow the motion at least half are in
+    proportion to the square of its size.
+    """
+    moved = (fit.x - fit.x.mean(axis=0)) / positive(fit.x.std(axis=0))
+    motion = (moved**2).mean(axis=1)
+    following = motion / motion.mean()
+
+    def likelihood(weight: np.ndarray) -> float:
+        """With both kinds of noise at their best; the weight is of the process noise at every sample."""
+        noises = (Noise(fit.noise.measurement, ratio * fit.noise.process) for ratio in NOISE_RATIOS)
+        sums = (fit.linearisation.sums(data.first, weight * data.step, noise) for noise in noises)
+        return max(profile_likelihood(total, freedom, logarithm) for total, logarithm, freedom in sums)
+
+    steady = likelihood(np.ones(len(motion)))
+    return 2 * (max(likelihood(1 - share + share * following) for share in FOLLOWING_SHARES) - steady)
+
+
+def wald_probability(differences: np.ndarray, covariance: np.ndarray) -> float:
+    """Probability that differences ``(p,)`` with a covariance are as large by chance (Wald's test).
+
+    Only directions that the covariance tells count; it is 1 where there are none.
+    """
+    if not len(differences):
+        return 1.0
+    scale = np.sqrt(np.diag(covariance))
+    scale = np.where(scale > 0, scale, np.inf)
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    kept = values > SINGULAR * values[-1]
+    along = vectors[:, kept].T @ (differences / scale) / np.sqrt(values[kept])
+    return float(scipy.stats.chi2.sf(float(along @ along), int(kept.sum())))

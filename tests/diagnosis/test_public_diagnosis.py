@@ -136,3 +136,26 @@ def test_what_cannot_be_fitted_has_a_verdict_and_tables_all_the_same(diagnosis: 
     assert {name: list(table.columns)[:3] for name, table in full.items()} == {
         name: list(table.columns)[:3] for name, table in empty.items()
     }
+
+
+def test_parameters_that_differ_from_recording_to_recording_are_no_missing_physics() -> None:
+    rates, t, noise = [0.5, 0.7, 0.78, 0.9, 1.1], np.arange(0, 4, 0.1), np.random.default_rng(4)
+    table = pd.concat(
+        pd.DataFrame({"recording": f"r{k}", "t": t, "n": 0.2 * np.exp(rate * t)})
+        for k, rate in enumerate(rates)
+    )
+    table["n"] += 0.01 * noise.normal(size=len(table))
+    settings = siq.MismatchStudy(varies=("r",), held_out=("r2",))
+    diagnosis = siq.diagnose(GROWTH, table, settings=settings)
+    assert not diagnosis.verdict.mismatch
+    (remark,) = [each for each in diagnosis.statement.remarks if each.code == "diagnosis.varies"]
+    assert remark.values["labels"] == ["r0", "r1", "r3", "r4"] and remark.values["p"] < 1e-6
+    for rate, (value, error) in zip([0.5, 0.7, 0.9, 1.1], remark.values["runs"], strict=True):
+        assert abs(value - rate) < 4 * error < 0.05
+    # The card of the result is one of the card's own names, with the mean.
+    assert diagnosis.augmented.inputs == () and [each.name for each in diagnosis.augmented.parameters] == [
+        "r"
+    ]
+    assert diagnosis.recalibrated.equations == GROWTH.equations
+    assert diagnosis.recalibrated.values == pytest.approx([0.8], abs=0.05)
+    assert "differs from recording to recording" in diagnosis.report()
