@@ -483,7 +483,10 @@ def test_a_candidate_whose_fit_fails_unforeseen_is_recorded_with_the_reason(
         ({"without": ["friction"]}, "no mechanism is called 'friction'"),
         ({"noise": {"v": 0.1}}, "'v' is no output"),
         ({"varies": ["m"]}, "'m' is no parameter of the card that is free"),
-        ({"varies": ["d"], "held_out": ["r0"]}, "there is one recording to learn from"),
+        (
+            {"varies": ["d"], "held_out": [f"r{index}" for index in range(1, 8)]},
+            "there is one recording to learn from",
+        ),
         ({"held_oud": 0.2}, "perhaps you meant 'held_out'"),
     ],
 )
