@@ -351,12 +351,11 @@ def preferred_recalibration(
     return chosen
 
 
-def preferred_model(errors: Sequence[np.ndarray | None], coordinates: Sequence[int]) -> int:
+def preferred_model(errors: Sequence[np.ndarray | None], parameters: Sequence[int]) -> int:
     """The place of the model that foresees parts left out best.
 
-    Of those that foresee them as well, it is one of the fewest coordinates, and of these the first: errors of
-    a sensor's clock, for one, grow with the motion, and look like functions of more than there is. Errors are
-    squares, None where a fit has no result or runs away.
+    Of those whose errors are larger by less than a tenth, and by no more than chance, it is one of the fewest
+    parameters, and of these the first. Errors come as squares, None where a fit has no result or runs away.
     """
     known = {place: each for place, each in enumerate(errors) if each is not None}
     if not known:
@@ -367,11 +366,11 @@ def preferred_model(errors: Sequence[np.ndarray | None], coordinates: Sequence[i
         for place, each in known.items()
         if each is least
         or (
-            NEARLY_ALL * each.mean() <= least.mean()
+            NEARLY_ALL**2 * each.mean() <= least.mean()
             and _change_between(in_blocks(least), in_blocks(each)) != "worse"
         )
     ]
-    return min(alike, key=lambda place: (coordinates[place], place))
+    return min(alike, key=lambda place: (parameters[place], place))
 
 
 def predicts_better(without: np.ndarray | None, squares: np.ndarray | None, *, limit: float = 0.0) -> bool:

@@ -253,7 +253,8 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
 
     # Of several models, and ways to fit them, parts of what was learned from choose, each left out in turn.
     foreseen = [left_out(fit, [part.candidate for part in model.parts]) for model, fit in choices]
-    best = preferred_model(foreseen, [model.coordinates for model, _ in choices]) if choices else 0
+    sizes = [sum(len(part.candidate.new) for part in model.parts) for model, _ in choices]
+    best = preferred_model(foreseen, sizes) if choices else 0
     adopted = False
     if choices and judges:
         # What is not certain where it was found, or what names leave, has to be better by more than appears

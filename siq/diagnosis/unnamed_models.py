@@ -79,12 +79,6 @@ class AugmentedModel:
     exact: Fit | None = None
 
     @property
-    def coordinates(self) -> int:
-        """On how many coordinates the parts depend, each by itself."""
-        places = [part.candidate.place for part in self.parts]
-        return sum(1 if place is None else len(place.words) for place in places)
-
-    @property
     def cost(self) -> float:
         """Logarithm of how many combinations of parts this one was chosen among."""
         return sum(part.candidate.log_cost for part in self.parts)

@@ -179,7 +179,7 @@ def test_the_model_is_taken_that_foresees_parts_left_out_best_and_of_those_alike
     errors = draw.chisquare(1, 400)
     other = errors * np.exp(0.1 * draw.normal(size=400))
     assert preferred_model([errors, 0.3 * other, 2 * other], [1, 2, 1]) == 1
-    assert preferred_model([errors, other], [2, 1]) == 1  # as good, and of fewer coordinates
+    assert preferred_model([errors, other], [2, 1]) == 1  # as good, and of fewer parameters
     assert preferred_model([errors, other], [1, 1]) == 0  # the first of as many
     assert preferred_model([None, errors], [0, 2]) == 1  # one that runs away is none
     assert preferred_model([None, None], [1, 1]) == 0
