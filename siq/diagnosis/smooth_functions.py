@@ -462,6 +462,7 @@ def _without(white: Whitened, fit: Fit, known: FittedCandidate | None) -> tuple[
 
 Z, A, B, D, C = sympy.symbols("z a b d c", real=True, cls=sympy.Dummy)  # no names of a system
 THRESHOLD = "threshold"  # whose c is a place, and no length
+KNOWN_ERRORS = 2.0  # standard errors from zero, from which on a length is known
 FITS = 0.05  # p-value from which on a formula is all that the recordings tell of a function
 
 
@@ -542,6 +543,9 @@ def _fitting(
         errors = np.sqrt(np.diag(np.linalg.pinv(columns.T @ columns)))
         values = dict(zip([*linear, C], zip(found, errors, strict=True), strict=False))
         if any(values[each][0] < 0 for each in form.positive):
+            continue
+        # A length that may as well be any other is none that a function has.
+        if len(places) and form.name != THRESHOLD and abs(found[-1]) < KNOWN_ERRORS * errors[-1]:
             continue
         if scipy.stats.chi2.sf(total, max(freedom - len(found), 1.0)) >= FITS:
             fitting.append((len(found), total, form, values))
