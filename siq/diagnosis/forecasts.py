@@ -478,7 +478,7 @@ def _density(problem: _Foreseen, term: Probe | Place, columns: np.ndarray) -> fl
 
 
 @dataclass(frozen=True)
-class Rung:
+class _Rung:
     """A mechanism with the family that it belongs to, on top of those before it.
 
     Attributes
@@ -568,7 +568,7 @@ def _next_rung(
     candidates: Sequence[MechanismCandidate],
     context: FitContext,
     untried: dict[str, NotFitted],
-) -> Rung | None:
+) -> _Rung | None:
     """The mechanism that stands first on top of fits; None where none is likelier than what has no name."""
     options, base, budget = context.study.search, horizons[0].fit, context.budget
     budget.says("comparing forecasts of what was left out")
@@ -664,10 +664,12 @@ def _next_rung(
         "needless": (),
         "less": tuple(each for label, each in known.items() if label not in alike),
     }
-    return Rung(AcceptedMechanism(best, others), tuple(leader.horizons), log_odds, flat_log_odds, leader.gain)
+    return _Rung(
+        AcceptedMechanism(best, others), tuple(leader.horizons), log_odds, flat_log_odds, leader.gain
+    )
 
 
-def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[Rung], tuple[NotFitted, ...]]:
+def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], tuple[NotFitted, ...]]:
     """Mechanisms one on top of the other, as long as the next is likelier than what has no name.
 
     A mechanism may take over a part of an error of the model, above all on top of others. So the last one
@@ -677,7 +679,7 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[Rung], tup
     Returned are also the fits of the simulation alone, empty where it cannot be fitted, and what could not be
     judged.
     """
-    model, found, untried = context.model, list[Rung](), dict[str, NotFitted]()
+    model, found, untried = context.model, list[_Rung](), dict[str, NotFitted]()
     alone, budget = list[Horizon](), context.budget
     try:
         with budget.part(FIRST_NAME_SHARE):

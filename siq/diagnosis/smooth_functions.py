@@ -58,7 +58,7 @@ PRODUCT_TOLERANCE = 1e-4  # of what is left, by which an iteration has to be bet
 
 
 @dataclass(frozen=True)
-class Bumps:
+class _Bumps:
     """A smooth function as a sum of bumps, and what is expected of it: a `siq.diagnosis.terms.Basis`.
 
     Attributes
@@ -90,7 +90,7 @@ class Bumps:
         deviation: float = 1.0,
         weight: float = 1.0,
         most: int | None = None,
-    ) -> Bumps:
+    ) -> _Bumps:
         """A smooth function with its bumps where the recordings have been.
 
         Parameters
@@ -179,7 +179,7 @@ class SmoothFunction:
     """
 
     place: Place
-    factors: tuple[Bumps, ...]
+    factors: tuple[_Bumps, ...]
     begin: np.ndarray
 
     @property
@@ -235,9 +235,9 @@ def _product_of(
 ) -> SmoothFunction:
     """The likeliest product, whose lengths may be any of several."""
 
-    def basis(side: int, share: float) -> tuple[Bumps, np.ndarray]:
+    def basis(side: int, share: float) -> tuple[_Bumps, np.ndarray]:
         """A factor, and what a unit of each of its independent coefficients is at the points."""
-        bumps = Bumps.along((place.coordinates[side],), courses[side, None], (share,), weight=weight)
+        bumps = _Bumps.along((place.coordinates[side],), courses[side, None], (share,), weight=weight)
         values = bumps.values(points[:, side, None].T)
         return bumps, scipy.linalg.solve_triangular(bumps.triangle, values, lower=True)
 
@@ -309,7 +309,7 @@ class Smoothness:
     level: float
     correlated: float
     considered: int
-    fine: Bumps
+    fine: _Bumps
     gram: np.ndarray
     overlap: np.ndarray
     log_evidence: float = float("nan")
@@ -344,11 +344,11 @@ class Smoothness:
         room = LARGEST_LINEARISATION // (len(data.t) * (fit.model.dimension + len(fit.model.outputs)))
         most = max(min(MOST_BUMPS, room), 1)
         for least in LENGTH_SCALES:
-            fine = Bumps.along(place.coordinates, courses, (least,) * count, most=most + 1)
+            fine = _Bumps.along(place.coordinates, courses, (least,) * count, most=most + 1)
             if fine.width <= most:
                 break
         else:
-            fine = Bumps.along(place.coordinates, courses, (least,) * count, most=most)
+            fine = _Bumps.along(place.coordinates, courses, (least,) * count, most=most)
         some = [share for share in LENGTH_SCALES if share >= least]
         choices = [(each,) * count for each in some] if alike else list(itertools.product(some, repeat=count))
         # What processes of these lengths have for values at the finest bumps, as heights of these.
@@ -400,7 +400,7 @@ class Smoothness:
         place, weight = self.place, self.correlated
         if not product:
             shares = tuple(times * share for share in self.shares)
-            bumps = Bumps.along(
+            bumps = _Bumps.along(
                 place.coordinates, self.courses, shares, deviation=self.deviation, weight=weight
             )
             return SmoothFunction(place, (bumps,), np.zeros(bumps.width))

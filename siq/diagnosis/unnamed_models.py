@@ -94,7 +94,7 @@ def _weighed(models: Sequence[AugmentedModel], alone: Fit, data: Measurements) -
     return sorted(known, key=lambda each: -each.log_evidence)
 
 
-def runs_freely(fit: Fit, alone: Fit, data: Measurements) -> bool:
+def _runs_freely(fit: Fit, alone: Fit, data: Measurements) -> bool:
     """Whether a fit without process noise runs along the recordings, and nearer to them than one without it.
 
     A fit that holds on to every sample may not: where it is steeper than any step of an integration, it runs
@@ -249,7 +249,9 @@ def _with_surfaces(fit: Fit, models: Sequence[AugmentedModel], context: FitConte
     return found
 
 
-def with_function(before: tuple[FittedCandidate, ...], fit: Fit, context: FitContext) -> list[AugmentedModel]:
+def _with_function(
+    before: tuple[FittedCandidate, ...], fit: Fit, context: FitContext
+) -> list[AugmentedModel]:
     """Models with one function more on top of a fit, that earns it, the likeliest first.
 
     The evidence is that over the fit with what was added before.
@@ -425,7 +427,7 @@ def fit_unnamed_models(search: Search, context: FitContext) -> tuple[AugmentedMo
     Mechanisms that a search found are one of the models.
     """
     base, data = search.recalibrated, context.data
-    models = with_function((), base, context)
+    models = _with_function((), base, context)
     if search.found and np.isfinite(search.fit.log_likelihood):
         models.append(AugmentedModel(_terms_of(search, context), search.fit))
     models = _weighed(models, base, data)
@@ -439,7 +441,7 @@ def fit_unnamed_models(search: Search, context: FitContext) -> tuple[AugmentedMo
         and len(best.parts) < DESCRIBED_MOST
         and has_structure(best.fit, data)
     ):
-        models += with_function(best.parts, best.fit, context)
+        models += _with_function(best.parts, best.fit, context)
     return _likeliest(models, base, data)
 
 
@@ -461,7 +463,7 @@ def fit_models_of_remainder(named: Search, whole: Search, context: FitContext) -
     def on_top(parts: tuple[FittedCandidate, ...], fit: Fit) -> list[AugmentedModel]:
         if fit.model.dimension > named.recalibrated.model.dimension or not has_structure(fit, data):
             return []
-        return with_function(parts, fit, context)
+        return _with_function(parts, fit, context)
 
     parts = _terms_of(whole, context)[len(named.found) :]
     fits = [each.best.fit for each in whole.found[len(named.found) :]]
@@ -500,7 +502,7 @@ def _likeliest(
     likelier = (
         each
         for each in _weighed(models, alone, data)
-        if each.log_evidence > 0 and runs_freely(each.fit, alone, data)
+        if each.log_evidence > 0 and _runs_freely(each.fit, alone, data)
     )
     known = list(likelier)
     # What a search named or nearly named stays, even where several functions without a name are likelier.

@@ -16,13 +16,13 @@ from siq.diagnosis import forecasts
 from siq.diagnosis.dictionary import roles_of, standard_dictionary
 from siq.diagnosis.forecasts import (
     FOLDS,
-    Rung,
     _fold_of,
     _Foreseen,
     _gained,
     _horizons_of,
     _log_priors,
     _next_rung,
+    _Rung,
     _thinned,
     climb,
 )
@@ -92,14 +92,14 @@ def context_of(model: Dynamics, data: Measurements, among: tuple[str, ...] = ())
     return FitContext(model, data, roles, tuple(candidates_of(model, roles, dictionary)))
 
 
-def first_rung(context: FitContext) -> Rung | None:
+def first_rung(context: FitContext) -> _Rung | None:
     fit, _ = recalibrate(context.model, context.data)
     assert fit.has_process_noise
     return _next_rung(_horizons_of(fit, context), context.candidates, context, {})
 
 
 @cache
-def damped() -> Rung:
+def damped() -> _Rung:
     """What is found first where linear damping is missing."""
     found = first_rung(context_of(pendulum(), recorded(0.15, 0.2), CLOSE))
     assert found is not None
@@ -288,7 +288,7 @@ def test_units_of_the_state_say_nothing() -> None:
     same_as_before(first_rung(context_of(pendulum(scale), recorded(0.15, 0.2, scale=scale), CLOSE)))
 
 
-def same_as_before(found: Rung | None) -> None:
+def same_as_before(found: _Rung | None) -> None:
     assert found is not None
     assert found.accepted.best.candidate.label == damped().accepted.best.candidate.label
     assert found.log_odds == pytest.approx(damped().log_odds, rel=1e-3)

@@ -13,7 +13,7 @@ from siq.data.recordings import Recordings
 from siq.diagnosis.evidence import correlation_time_of
 from siq.diagnosis.holdout import _cross_validation_folds, errors_left_out, predicts_better
 from siq.diagnosis.naming import _MissingEffect
-from siq.diagnosis.unnamed_models import runs_freely
+from siq.diagnosis.unnamed_models import _runs_freely
 from siq.inference.kalman_filter import Whitened
 from siq.inference.measurements import Measurements, measurements
 from siq.inference.recalibration import recalibrate
@@ -151,8 +151,8 @@ def test_a_model_that_runs_away_from_where_it_is_held_is_none() -> None:
     data = decays(2, 40)
     fit, _ = recalibrate(DECAY, data)
     steeper = replace(fit, model=fit.model.with_values(np.array([-40.0])))
-    assert runs_freely(fit, replace(fit, model=fit.model.with_values(np.array([1.3]))), data)
-    assert not runs_freely(steeper, fit, data)
+    assert _runs_freely(fit, replace(fit, model=fit.model.with_values(np.array([1.3]))), data)
+    assert not _runs_freely(steeper, fit, data)
 
 
 def squares(draw: np.random.Generator, size: float) -> np.ndarray:

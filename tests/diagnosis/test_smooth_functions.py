@@ -16,8 +16,8 @@ from siq.diagnosis.evidence import _log_evidence_of, evidences_by_size
 from siq.diagnosis.holdout import preferred_model
 from siq.diagnosis.smooth_functions import (
     LENGTH_SCALES,
-    Bumps,
     SmoothFunction,
+    _Bumps,
     _product_of,
     _triangle_of,
 )
@@ -40,11 +40,11 @@ def courses_of(count: int) -> np.ndarray:
     return np.random.default_rng(3).uniform(-1, 3, size=(count, 400))
 
 
-def bumps(*coordinates: sympy.Symbol, shares: tuple[float, ...], deviation: float = 1.0) -> Bumps:
-    return Bumps.along(coordinates, courses_of(len(coordinates)), shares, deviation=deviation)
+def bumps(*coordinates: sympy.Symbol, shares: tuple[float, ...], deviation: float = 1.0) -> _Bumps:
+    return _Bumps.along(coordinates, courses_of(len(coordinates)), shares, deviation=deviation)
 
 
-def function_of(*factors: Bumps) -> SmoothFunction:
+def function_of(*factors: _Bumps) -> SmoothFunction:
     coordinates = tuple(each for factor in factors for each in factor.coordinates)
     place = Place((("v", ONE),), (), coordinates, tuple(map(str, coordinates)))
     return SmoothFunction(place, factors, np.ones(sum(each.width for each in factors)))
@@ -140,7 +140,7 @@ def test_a_product_is_told_where_both_coordinates_were_never_large_at_a_time() -
 def test_evidence_of_parameters_expected_together_is_the_marginal_likelihood() -> None:
     """Exact for a linear model with normal errors: log N(y; 0, ΦKΦᵀ + σ²)."""
     t, noise = np.arange(0, 8, 0.1), 0.1**2
-    bell = Bumps.along((TIME,), t[None], (0.125,), deviation=0.8)
+    bell = _Bumps.along((TIME,), t[None], (0.125,), deviation=0.8)
     function = SmoothFunction(Place((), (("y", ONE),), (TIME,), ("t",)), (bell,), np.zeros(bell.width))
     still = Dynamics(("y",), (sympy.Integer(0),), Diffusion.identity(1))
     along = 0.8 * np.linalg.solve(bell.triangle, bell.values(t[None]))
