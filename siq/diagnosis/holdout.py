@@ -12,9 +12,8 @@ new card, if it predicts recordings held out better than they are predicted with
 
 from __future__ import annotations
 
-import itertools
 import logging
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -26,7 +25,7 @@ from siq.errors import NumericalFailure
 from siq.inference.budget import Budget
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
-from siq.inference.measurements import Measurements
+from siq.inference.measurements import Measurements, cross_validation_folds
 from siq.inference.recalibration import fit_with_process_noise_as_needed
 from siq.inference.trajectories import free_run, scored_rows, squared_errors
 from siq.numerics.randomness import positive
@@ -40,8 +39,6 @@ NEARLY_ALL = 0.9
 CONFIDENCE_95 = 1.96  # standard errors within which 95 % lie
 BLOCKS = 12  # as many as tell an error of a ratio; fewer leave more samples that belong together in one
 CHANGE_BY_CHANCE = 0.05  # probability of a gain, or a loss, where there is none
-FOLDS = 4  # of which one is left out at a time: a quarter, as is held out by default
-MIN_STRETCH_SAMPLES = 16  # of a stretch that an initial state and an error can be told from
 
 
 def simulated(fit: Fit, data: Measurements, *, noise: Noise, substeps: int) -> np.ndarray:
@@ -183,49 +180,6 @@ def in_blocks(squares: np.ndarray) -> tuple[float, ...]:
     return tuple(float(each.mean()) for each in np.array_split(squares, max(min(BLOCKS, len(squares)), 1)))
 
 
-def _cross_validation_folds(
-    learned: Measurements,
-) -> Iterator[tuple[Measurements, Measurements, np.ndarray]]:
-    """The recordings in parts: one that is left out, the rest, and the rows of the rest in all of them.
-
-    Of recordings, so many at equal distances are a part; a single one is cut into stretches, of which the
-    rest has two recordings unless it is the first or the last that is left out.
-    """
-    count, rows = len(learned.labels), len(learned.t)
-    if count > 1:
-        edges, owner = learned.first, list(range(count))
-        groups = [list(range(part, count, FOLDS)) for part in range(min(FOLDS, count))]
-    else:
-        parts = max(min(FOLDS, rows // MIN_STRETCH_SAMPLES), 2)
-        edges, owner = np.linspace(0, rows, parts + 1).round().astype(int), [0] * parts
-        groups = [[part] for part in range(parts)]
-    pieces = list(itertools.pairwise(edges))
-
-    def stretches(chosen: Sequence[tuple[int, int]], of: Sequence[int]) -> tuple[Measurements, np.ndarray]:
-        """Stretches of rows as recordings of their own, and their rows; the inputs stay whole."""
-        at = np.concatenate([np.arange(begin, end) for begin, end in chosen])
-        named = zip(of, chosen, strict=True)
-        return replace(
-            learned,
-            labels=tuple(f"{learned.labels[place]}, rows {a} to {b}" for place, (a, b) in named),
-            first=np.cumsum([0, *(end - begin for begin, end in chosen)]),
-            t=learned.t[at],
-            outputs=learned.outputs[at],
-            courses=tuple(learned.courses[place] for place in of) if learned.courses else learned.courses,
-        ), at
-
-    for group in groups:
-        out = [pieces[place] for place in group]
-        others = [place for place in range(len(pieces)) if place not in group]
-        kept = [pieces[place] for place in others]
-        if count == 1:  # what was not cut stays one recording
-            ((begin, end),) = out
-            kept = [(a, b) for a, b in ((0, begin), (end, rows)) if b > a]
-            others = others[: len(kept)]
-        rest = stretches(kept, [owner[place] for place in others])
-        yield stretches(out, [owner[place] for place in group])[0], *rest
-
-
 def _refits_left_out(
     fit: Fit,
     learned: Measurements,
@@ -238,7 +192,7 @@ def _refits_left_out(
     """Fits without each part in turn, and their errors on it, see `errors_left_out`."""
     signed = {name for each in candidates for name in each.positive.intersection(each.amplitudes)}
     spread, found = np.nanvar(learned.outputs[scored_rows(learned)], axis=0), []
-    for out, rest, rows in _cross_validation_folds(learned):
+    for out, rest, rows in cross_validation_folds(learned):
         model, wrong = fit.model, {""}
         rest = rest if shown is None else replace(rest, outputs=shown.outputs[rows])
         try:

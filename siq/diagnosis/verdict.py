@@ -9,14 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import sympy
 
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
-from siq.diagnosis.evidence import BUDGET_SPENT, NUMERICAL_ERRORS, FittedCandidate, log_evidences, residuals
-from siq.diagnosis.holdout import NEARLY_ALL
+from siq.diagnosis.evidence import (
+    BUDGET_SPENT,
+    NUMERICAL_ERRORS,
+    FittedCandidate,
+    correlation_time_of,
+    log_evidences,
+    residuals,
+)
+from siq.diagnosis.holdout import NEARLY_ALL, simulated
 from siq.diagnosis.investigation import HeldOutRuns
 from siq.diagnosis.mechanisms import PROCESS_NOISE, SURFACE, fresh_names, places_of
 from siq.diagnosis.naming import Investigation
@@ -39,6 +47,7 @@ from siq.diagnosis.statement import (
 from siq.diagnosis.study import MismatchVerdict
 from siq.diagnosis.terms import Place
 from siq.diagnosis.unnamed_models import AugmentedModel
+from siq.inference.design import next_experiment
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.recalibration import wald_probability
@@ -52,6 +61,9 @@ BOUND_ERRORS = 1.96  # standard errors on either side of an estimate within whic
 VISIBLE_SHARE = 0.1  # of the largest value of a curve
 VISIBLE_ERRORS = 2.0  # standard errors beyond which a curve differs from zero
 MOTION_SHARE = 0.75  # of what the time or an input explains, from which on it is rather a state
+# Log-odds that an experiment should promise, in those that a name takes: forecasts count all horizons alike,
+# and the far ones see one sample in four, in sixteen, in 64.
+EXPECTED = 4.0
 AFFECTED_SHARE = 0.5  # of its fair share of the excess, from which on a recording counts as affected
 
 
@@ -103,6 +115,7 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
     if verdict.mismatch and forced.has_process_noise and not investigation.process_noise:
         structure = Remainder.of(context.data, forced, forced, context.roles).after
         remarks += remaining_forces(forced, context.data, structure)
+    remarks += _experiment_to_tell(investigation)
     for name in context.study.varies:
         remarks.append(_variation_of(name, final, context.data.labels))
     if kept and errors:
@@ -141,6 +154,34 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
         not_fitted=search.untried,
         account=investigation.account,
     )
+
+
+def _experiment_to_tell(investigation: Investigation) -> list[Remark]:
+    """The recording that would tell what was found from what explains the recordings as well."""
+    data = investigation.context.data
+    for each in investigation.search.found:
+        fit, name = each.best.fit, each.best.candidate.name
+        alike = [
+            other
+            for other in each.others.get("same", ())
+            if other.candidate.name != name and other.fit.model.dimension == fit.model.dimension
+        ]
+        if alike:
+            missed = np.nan_to_num(
+                data.outputs - simulated(fit, data, noise=fit.noise, substeps=fit.substeps)
+            )
+            outputs = missed.shape[1]
+            lasts = correlation_time_of(missed.ravel(), np.repeat(data.recording, outputs), outputs=outputs)
+            plan = None
+            with suppress(*NUMERICAL_ERRORS):
+                plan = next_experiment(
+                    fit, [other.fit for other in alike], data, correlated=lasts,
+                    variance=np.maximum((missed**2).mean(axis=0), fit.noise.measurement),
+                    enough=EXPECTED * investigation.context.study.search.least_log_odds,
+                )  # fmt: skip
+            names = {"name": name, "others": list(dict.fromkeys(other.candidate.name for other in alike))}
+            return [] if plan is None else [replace(plan, values=names | dict(plan.values))]
+    return []
 
 
 def _variation_of(name: str, fit: Fit, labels: Sequence[str]) -> Remark:

@@ -9,7 +9,7 @@ What recordings do tell, they tell far better.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,6 +22,8 @@ from siq.errors import Fault
 from siq.systems.dynamics import Dynamics, Input, JointExpectation, Parameter, Signals, symbol
 
 OVERSAMPLING = 16  # of band-limited inputs, between whose dense samples cubics are exact enough
+FOLDS = 4  # of which one is left out at a time: a quarter, as is held out by default
+MIN_STRETCH_SAMPLES = 16  # of a stretch that an initial state and an error can be told from
 PADDING = 64  # samples by which they are continued, mirrored, so that the ends do not ring
 
 
@@ -156,7 +158,7 @@ class Measurements:
         return replace(self, first=first, t=self.t[at], outputs=self.outputs[at], **changes)
 
 
-def _course_of_input(t: np.ndarray, u: np.ndarray, interpolation: str) -> scipy.interpolate.PPoly:
+def course_of_input(t: np.ndarray, u: np.ndarray, interpolation: str) -> scipy.interpolate.PPoly:
     """An input as a function of time, from samples ``(n,)`` of one recording.
 
     ``zero_order`` holds each sample until the next; ``linear`` joins them; ``band_limited`` takes the one
@@ -202,7 +204,7 @@ def measurements(recordings: Recordings, model: Dynamics) -> Measurements:
         t, mine = recordings.t[begin:end], []
         for column, entry in enumerate(model.inputs, count):
             try:
-                mine.append(_course_of_input(t, recordings.values[begin:end, column], entry.interpolation))
+                mine.append(course_of_input(t, recordings.values[begin:end, column], entry.interpolation))
             except Fault as error:
                 raise Fault(f"input {entry.name}: {error.fault}", error.remedy) from None
         courses.append(tuple(mine))
@@ -365,3 +367,46 @@ def without_variation(model: Dynamics) -> Dynamics:
         expected_together=(),
         covariance=None,
     )
+
+
+def cross_validation_folds(
+    learned: Measurements,
+) -> Iterator[tuple[Measurements, Measurements, np.ndarray]]:
+    """The recordings in parts: one that is left out, the rest, and the rows of the rest in all of them.
+
+    Of recordings, so many at equal distances are a part; a single one is cut into stretches, of which the
+    rest has two recordings unless it is the first or the last that is left out.
+    """
+    count, rows = len(learned.labels), len(learned.t)
+    if count > 1:
+        edges, owner = learned.first, list(range(count))
+        groups = [list(range(part, count, FOLDS)) for part in range(min(FOLDS, count))]
+    else:
+        parts = max(min(FOLDS, rows // MIN_STRETCH_SAMPLES), 2)
+        edges, owner = np.linspace(0, rows, parts + 1).round().astype(int), [0] * parts
+        groups = [[part] for part in range(parts)]
+    pieces = list(itertools.pairwise(edges))
+
+    def stretches(chosen: Sequence[tuple[int, int]], of: Sequence[int]) -> tuple[Measurements, np.ndarray]:
+        """Stretches of rows as recordings of their own, and their rows; the inputs stay whole."""
+        at = np.concatenate([np.arange(begin, end) for begin, end in chosen])
+        named = zip(of, chosen, strict=True)
+        return replace(
+            learned,
+            labels=tuple(f"{learned.labels[place]}, rows {a} to {b}" for place, (a, b) in named),
+            first=np.cumsum([0, *(end - begin for begin, end in chosen)]),
+            t=learned.t[at],
+            outputs=learned.outputs[at],
+            courses=tuple(learned.courses[place] for place in of) if learned.courses else learned.courses,
+        ), at
+
+    for group in groups:
+        out = [pieces[place] for place in group]
+        others = [place for place in range(len(pieces)) if place not in group]
+        kept = [pieces[place] for place in others]
+        if count == 1:  # what was not cut stays one recording
+            ((begin, end),) = out
+            kept = [(a, b) for a, b in ((0, begin), (end, rows)) if b > a]
+            others = others[: len(kept)]
+        rest = stretches(kept, [owner[place] for place in others])
+        yield stretches(out, [owner[place] for place in group])[0], *rest

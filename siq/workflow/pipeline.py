@@ -154,7 +154,7 @@ def _regressed(
 
 
 @dataclass(frozen=True)
-class RefinedRun:
+class _RefinedRun:
     """Formulas of a run by method, with a certificate for each and for the control, and the outcome.
 
     Certificates are plain data, as they stand in `model.json`. `refinement` has the refined formulas with
@@ -190,7 +190,7 @@ def refine_run(
     identified: StepResult[FieldEstimate],
     trained: StepResult[AnyNetworks],
     regressed: SymbolicDecomposition | None = None,
-) -> RefinedRun:
+) -> _RefinedRun:
     """V about every attractor of the identified f, or over the region, with its certificate.
 
     It follows from trajectories and f alone; networks are a second route, which has to agree.
@@ -241,7 +241,7 @@ def refine_run(
     for method in formulas.keys() - certificates.keys():
         certificates[method] = uncertified(f"no test was made: {outcome.reason}")
     portrait = None if context is None else context.portrait
-    return RefinedRun(formulas, certificates, outcome, refinement, portrait)
+    return _RefinedRun(formulas, certificates, outcome, refinement, portrait)
 
 
 def landscape_of_run(
@@ -309,7 +309,7 @@ class Analysis:
     identified: StepResult[FieldEstimate]  #: f, and the test of its predictions
     trained: StepResult[AnyNetworks]  #: the networks
     regressed: StepResult[SymbolicDecomposition] | None  #: the published method's formulas, where asked for
-    refined: RefinedRun  #: formulas by method, with their certificates
+    refined: _RefinedRun  #: formulas by method, with their certificates
     landscape: StepResult[Landscape] | None  #: wells, barriers, ways; None where not asked for
 
     @property

@@ -11,11 +11,11 @@ import pytest
 
 from siq.data.recordings import Recordings
 from siq.diagnosis.evidence import correlation_time_of
-from siq.diagnosis.holdout import _cross_validation_folds, errors_left_out, predicts_better
+from siq.diagnosis.holdout import errors_left_out, predicts_better
 from siq.diagnosis.naming import _MissingEffect
 from siq.diagnosis.unnamed_models import _runs_freely
 from siq.inference.kalman_filter import Whitened
-from siq.inference.measurements import Measurements, measurements
+from siq.inference.measurements import Measurements, cross_validation_folds, measurements
 from siq.inference.recalibration import recalibrate
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, symbol
@@ -92,7 +92,7 @@ def decays(count: int, samples: int, *, rate: float = 1.0) -> Measurements:
 def test_every_row_is_left_out_once_and_never_fitted_then(count: int, samples: int, parts: int) -> None:
     data = decays(count, samples)
     seen = []
-    every = list(_cross_validation_folds(data))
+    every = list(cross_validation_folds(data))
     for out, rest, rows in every:
         np.testing.assert_array_equal(rest.outputs, data.outputs[rows])
         assert len(out.t) + len(rest.t) == len(data.t)
