@@ -3,15 +3,16 @@
     python -m benchmarks.next_experiment 24 --seed 1
 
 A case is an oscillator whose card lacks a damping or a stiffness, drawn at random. It swings twice, so little
-and under so much noise that members of a family look alike. Where the diagnosis proposes a recording, that one
-is simulated from the truth, noise and all, added, and the diagnosis is asked again.
-The integrator is SciPy's, and shares nothing with siq.
+and under so much noise that members of a family look alike. Where the diagnosis proposes a recording, it is
+simulated from the truth, noise and all, added, and the diagnosis is asked again. SciPy integrates, and shares
+nothing with siq.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections import Counter
+from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
@@ -23,11 +24,11 @@ from siq.diagnosis.diagnosis import Diagnosis
 from siq.systems.dynamics import Parameter
 
 SAMPLES, STEP = 150, 0.1
-TRUTHS = {
+TRUTHS: dict[str, Callable[[float, float], float]] = {
     "linear damping": lambda x, v: -v,
     "quadratic drag": lambda x, v: -v * abs(v),
     "cubic damping": lambda x, v: -(v**3),
-    "dry friction": lambda x, v: -np.tanh(v / 1e-3),
+    "dry friction": lambda x, v: -float(np.tanh(v / 1e-3)),
     "quadratic stiffness": lambda x, v: -(x**2),
     "cubic stiffness": lambda x, v: -(x**3),
     "quintic stiffness": lambda x, v: -(x**5),
