@@ -88,10 +88,12 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
     remarks, errors_seen = list(investigation.remarks), shown.errors
     left, context = investigation.remainder.after, investigation.context
     if verdict is MismatchVerdict.UNEXPLAINED and described is not None:
-        # A model that leaves no more than sensor and randomness do is an explanation, though it has no name.
+        # A model that leaves no more than sensor and randomness do, and not most of the recordings, is an
+        # explanation, though it has no name.
         rest = Remainder.of(context.data, described.fit, described.fit, context.roles)
         gained = errors_seen.change("without", "augmented") == "better"
-        nearly = gained and errors_seen.share_gained >= NEARLY_ALL
+        most = errors_seen.augmented is not None and errors_seen.augmented**2 < 0.5  # of the spread's square
+        nearly = gained and most and errors_seen.share_gained >= NEARLY_ALL
         if nearly and (errors_seen.at_noise("augmented", random=True) or not rest.doubtful):
             verdict, left = MismatchVerdict.MISSING_PHYSICS, rest.after
     elif verdict is MismatchVerdict.PARAMETER_SHIFT:
