@@ -80,7 +80,8 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
     kept = final.model is investigation.context.model  # the card's own values
     if described is not None:
         final, kept = shown.fit, False
-    found = _found_mechanisms(investigation, final if named else search.fit)
+    # What describes the rest may take a part of what is named over.
+    found = _found_mechanisms(investigation, investigation.final if named else search.fit)
     names = tuple(each.best.candidate.label for each in search.found) if named else ()
     parts = () if described is None else described.parts
     labels = [each.candidate.label for each in parts]
