@@ -59,6 +59,8 @@ class ScaledSystem:
         self.dynamics, self.center, self.units, self.inverse = dynamics, center, units, np.linalg.inv(units)
         self.unit, self.rate, self.dimension = unit, rate, dynamics.dimension
         self.noise = dynamics.diffusion.in_units(center, units, unit / rate)
+        # Of matrices as rows: a product for each point takes several times as long as one for all.
+        self._of_slopes, self._of_bends = np.kron(self.inverse.T / rate, units), np.kron(units, units)
 
     def points(self, y: np.ndarray) -> np.ndarray:
         """x of y, ``(n, d)``."""
@@ -86,11 +88,13 @@ class ScaledSystem:
 
     def jacobian(self, y: np.ndarray) -> np.ndarray:
         """∂F/∂y, ``(n, d, d)``."""
-        return self.inverse @ self.dynamics.jacobian(self.points(y)) @ self.units / self.rate
+        slopes = self.dynamics.jacobian(self.points(y))
+        return np.asarray((slopes.reshape(len(y), self.dimension**2) @ self._of_slopes).reshape(slopes.shape))
 
     def bend(self, y: np.ndarray, q: np.ndarray) -> np.ndarray:
         """``Σ_k q_k ∂²F_k + q·∂²D q``, the matrix before X in Ṗ: ``(n, d, d)``."""
-        second = self.units.T @ self.dynamics.bend(self.points(y), q @ self.inverse / self.rate) @ self.units
+        bends = self.dynamics.bend(self.points(y), q @ self.inverse / self.rate)
+        second = (bends.reshape(len(y), self.dimension**2) @ self._of_bends).reshape(bends.shape)
         return np.asarray(second if self.noise.constant else second + self.noise.contract(y, q, 2))
 
     def turned(self, y: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -102,7 +106,7 @@ class ScaledSystem:
         """q̇ at positions and momenta ``(n, d)``; `turned` where it is known."""
         turned = self.turned(y, q) if turned is None else turned
         # Of the slope of D the turn has twice as much.
-        return np.asarray(self.noise.contract(y, q, 1) - (turned.transpose(0, 2, 1) @ q[:, :, None])[:, :, 0])
+        return np.asarray(self.noise.contract(y, q, 1) - np.einsum("nik,ni->nk", turned, q))
 
     def velocities(
         self, y: np.ndarray, q: np.ndarray, turned: np.ndarray | None = None
@@ -142,13 +146,15 @@ class HamiltonianFlow(ScaledSystem):
 
     def rates(self, state: np.ndarray) -> np.ndarray:
         """Time derivative of rows."""
-        y, q, _, x_tangents, p_tangents = self.parts(state)
-        turned = self.turned(y, q)
-        new = np.empty_like(state)
-        y_rate, q_rate, v_rate, x_rate, p_rate = self.parts(new)
+        y, q, *_ = self.parts(state)
+        d, turned, new = self.dimension, self.turned(y, q), np.empty_like(state)
+        y_rate, q_rate, v_rate, *_ = self.parts(new)
         y_rate[...], q_rate[...], v_rate[...] = self.velocities(y, q, turned)
-        x_rate[...] = turned @ x_tangents + 2 * self.noise.at(y) @ p_tangents
-        p_rate[...] = -turned.transpose(0, 2, 1) @ p_tangents - self.bend(y, q) @ x_tangents
+        upper = np.concatenate([turned, 2 * self.noise.at(y)], axis=2)
+        lower = np.concatenate([-self.bend(y, q), -turned.transpose(0, 2, 1)], axis=2)
+        tangents = state[:, 2 * d + 1 :].reshape(len(state), 2 * d, d)
+        tangents = np.concatenate([upper, lower], axis=1) @ tangents
+        new[:, 2 * d + 1 :] = tangents.reshape(len(state), 2 * d * d)
         return new
 
     def orthonormal(self, state: np.ndarray) -> np.ndarray:
@@ -161,7 +167,8 @@ class HamiltonianFlow(ScaledSystem):
 
 
 MAX_STEPS = 20_000  # numerical, a guard: a curve that takes more is stiff, or circles
-HALVINGS = 24  # of the last step, to find where a curve ends
+END_WIDTH = 2.0**-24  # of the last step, by which it is known where a curve ends
+NEAR_END = 2.0**-7  # of what is left to search, from where its cubic ends
 MAX_RELAXATION_TIMES = 60.0  # in units of the slowest relaxation time of the attractor
 REST_RATIO = 1e-3  # p to x - A, in units in which both are equal near A
 SHEET_DISTANCE = 0.06  # of neighbours, the level being at about 1: more than the gaps of a fan
@@ -389,16 +396,32 @@ def characteristics(
         ends[running[resting]] = End.REST
         stalled = steps[running] < 1e-13 * time_limit
         running = running[~(ended | late | resting | stalled)]
-    # The last states before the ends within a step are found by halving it.
+    # The last states before the ends within a step: where its cubic ends, and just before and behind that.
     crossing = np.flatnonzero(last_steps)
-    before, low, high = states[crossing], np.zeros(len(crossing)), last_steps[crossing]
-    advance = partial(dormand_prince_step, flow.rates, before, first=flow.rates(before))
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        found = reason(before, advance(middle)[0])
-        low, high = np.where(found >= 0, low, middle), np.where(found >= 0, middle, high)
-    kept.append(advance(low)[0])
-    ends[crossing] = reason(before, advance(high)[0])
+    before, bracket = states[crossing], np.stack([np.zeros(len(crossing)), last_steps[crossing]])
+    first, rows = flow.rates(before), np.arange(len(crossing))
+    around = np.stack([before, dormand_prince_step(flow.rates, before, bracket[1], first=first)[0]])
+    while len(rows) and (np.ptp(bracket, axis=0) > END_WIDTH * last_steps[crossing]).any():
+        width, rise = np.ptp(bracket, axis=0), around[1] - around[0]
+        slopes = width[:, None] * flow.rates(np.concatenate(around)).reshape(around.shape)
+        bends = 3 * rise - 2 * slopes[0] - slopes[1], slopes[0] + slopes[1] - 2 * rise
+        share = np.zeros((len(rows), 1))
+        for part in NEAR_END * 2.0 ** np.arange(np.log2(1 / NEAR_END) - 1, -2, -1):
+            at = share + part
+            cubic = around[0] + at * (slopes[0] + at * (bends[0] + at * bends[1]))
+            share = np.where(reason(before, cubic)[:, None] >= 0, share, at)
+        shares = np.sort([share[:, 0] - NEAR_END, np.full(len(rows), 0.5), share[:, 0] + NEAR_END], axis=0)
+        places = bracket[0] + width * np.clip(shares, 0.0, 1.0)
+        tried = dormand_prince_step(
+            flow.rates, np.tile(before, (3, 1)), places.ravel(), first=np.tile(first, (3, 1))
+        )[0]
+        ended = (reason(np.tile(before, (3, 1)), tried) >= 0).reshape(3, -1)
+        end = 1 + np.concatenate([ended, np.ones((1, len(rows)), dtype=bool)]).argmax(axis=0)
+        places = np.concatenate([bracket[:1], places, bracket[1:]])
+        known = np.concatenate([around[:1], tried.reshape(3, *before.shape), around[1:]])
+        bracket, around = (np.stack([each[end - 1, rows], each[end, rows]]) for each in (places, known))
+    kept.append(around[0])
+    ends[crossing] = reason(before, around[1])
     curve = np.concatenate([*kept_curves, crossing])
     order = np.argsort(curve, kind="stable")
     curve = curve[order]
