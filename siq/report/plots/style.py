@@ -63,6 +63,9 @@ _SETTINGS = {
     "svg.hashsalt": "siq",  # otherwise the identifiers in an SVG are drawn by lot
 }
 
+# A figure that had a layout keeps a placeholder of one otherwise, and is drawn twice whenever it is saved.
+_FROZEN = {"figure.constrained_layout.use": False}
+
 _GREEK = re.compile(
     "alpha|beta|gamma|delta|epsilon|zeta|eta|theta|iota|kappa|lambda|mu|nu|xi|pi|rho|sigma|tau|upsilon|phi|chi|psi"
     "|omega|Gamma|Delta|Theta|Lambda|Xi|Pi|Sigma|Upsilon|Phi|Psi|Omega"
@@ -94,7 +97,8 @@ def drawn_in_style(function: Callable[Parameters, Drawn], **settings: object) ->
             # The constrained layout moves on a little with every drawing. Worked out once and then
             # frozen, the same figure gives the same file however often it is saved.
             figure.draw_without_rendering()
-            figure.set_layout_engine("none")
+            with mpl.rc_context(_FROZEN):
+                figure.set_layout_engine(None)
         return figure
 
     return draw
@@ -189,7 +193,7 @@ def save_figure(figure: Figure, path_without_suffix: str | Path) -> tuple[Path, 
     vector, image = (stem.with_name(stem.name + suffix) for suffix in DOTS_PER_INCH)
     # Date and Software would make the same figure differ between days and versions.
     for path, metadata in ((vector, {"Date": None}), (image, {"Software": None})):
-        with whole_file(path) as partial, _drawing_style():
+        with whole_file(path) as partial, _drawing_style(), mpl.rc_context(_FROZEN):
             figure.savefig(partial, dpi=DOTS_PER_INCH[path.suffix], metadata=metadata)
     return vector, image
 
