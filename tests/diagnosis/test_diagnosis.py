@@ -237,8 +237,7 @@ def test_random_forces_are_no_noise_where_a_function_beside_them_is_likelier(
 
 
 def test_random_forces_that_follow_the_motion_are_not_those_of_surroundings(tmp_path: Path) -> None:
-    table = recordings_of(nothing, count=6, drive=0.03, fading=True)
-    diagnosis = solved(tmp_path, table, study={"held_out": ["r2", "r5"]})
+    diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.03, fading=True))
     assert said(diagnosis)["verdict"] == "unexplained"
     assert any("hidden state" in remark for remark in said(diagnosis)["remarks"])
     # No function foresees them: the card stays as it was, and this is said.

@@ -75,7 +75,7 @@ def test_there_is_an_answer_to_what_is_large(name: str, tmp_path: Path) -> None:
 
 
 def test_dry_friction_of_a_motor_is_named(tmp_path: Path) -> None:
-    found = answered(motor_axis(samples=1200), tmp_path)
+    found = answered(motor_axis(samples=800), tmp_path)
     names = [each.name for each in found.mechanisms]
     assert names == ["dry friction"] or "dry friction" in found.mechanisms[0].indistinguishable_from
     assert found.mechanisms[0].parameters["c_1"].estimate == pytest.approx(20 / 95, rel=2e-3)
