@@ -396,11 +396,11 @@ def characteristics(
     # The last states before the ends within a step: where its cubic ends, and just before and behind that.
     crossing = np.flatnonzero(last_steps)
     before, bracket = states[crossing], np.stack([np.zeros(len(crossing)), last_steps[crossing]])
-    rows, thrice = np.arange(len(crossing)), np.tile(before, (3, 1))
+    index, thrice = np.arange(len(crossing)), np.tile(before, (3, 1))
     first = flow.rates(before)
     around = np.stack([before, dormand_prince_step(flow.rates, before, bracket[1], first=first)[0]])
-    while len(rows) and (np.ptp(bracket, axis=0) > END_WIDTH * last_steps[crossing]).any():
-        width, rise, share = np.ptp(bracket, axis=0), around[1] - around[0], np.zeros((len(rows), 1))
+    while len(index) and (np.ptp(bracket, axis=0) > END_WIDTH * last_steps[crossing]).any():
+        width, rise, share = np.ptp(bracket, axis=0), around[1] - around[0], np.zeros((len(index), 1))
         slopes = width[:, None] * flow.rates(np.concatenate(around)).reshape(around.shape)
         bends = 3 * rise - 2 * slopes[0] - slopes[1], slopes[0] + slopes[1] - 2 * rise
         for part in 0.5 ** np.arange(1, HALVINGS + 1):
@@ -408,12 +408,12 @@ def characteristics(
             cubic = around[0] + at * (slopes[0] + at * (bends[0] + at * bends[1]))
             share = np.where(reason(before, cubic)[:, None] >= 0, share, at)
         shares = np.sort(np.hstack([share - 2 * part, np.full_like(share, 0.5), share + 2 * part]).T, axis=0)
-        places = bracket[0] + width * np.clip(shares, 0.0, 1.0)
-        tried = dormand_prince_step(flow.rates, thrice, places.ravel(), first=np.tile(first, (3, 1)))[0]
-        ended = np.append(reason(thrice, tried) >= 0, np.ones(len(rows), dtype=bool)).reshape(4, -1)
-        end, places = 1 + ended.argmax(axis=0), np.vstack([bracket[0], places, bracket[1]])
+        inside = bracket[0] + width * np.clip(shares, 0.0, 1.0)
+        tried = dormand_prince_step(flow.rates, thrice, inside.ravel(), first=np.tile(first, (3, 1)))[0]
+        beyond = np.append(reason(thrice, tried) >= 0, np.ones(len(index), dtype=bool)).reshape(4, -1)
+        end, places = 1 + beyond.argmax(axis=0), np.vstack([bracket[0], inside, bracket[1]])
         known = np.concatenate([around[:1], tried.reshape(3, *before.shape), around[1:]])
-        bracket, around = (np.stack([each[end - 1, rows], each[end, rows]]) for each in (places, known))
+        bracket, around = (np.stack([each[end - 1, index], each[end, index]]) for each in (places, known))
     kept.append(around[0])
     ends[crossing] = reason(before, around[1])
     curve = np.concatenate([*kept_curves, crossing])

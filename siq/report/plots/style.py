@@ -76,7 +76,7 @@ Drawn = TypeVar("Drawn", Figure, Figure | None)
 
 def _drawing_style(settings: Mapping[str, object]) -> AbstractContextManager[None]:
     """Make matplotlib's defaults, those of this module and some more settings hold for a ``with`` block."""
-    context: AbstractContextManager[None] = matplotlib.style.context(["default", _SETTINGS | settings])
+    context: AbstractContextManager[None] = matplotlib.style.context(["default", {**_SETTINGS, **settings}])
     return context
 
 
