@@ -197,16 +197,7 @@ def save_figure(figure: Figure, path_without_suffix: str | Path) -> tuple[Path, 
 
 
 WIDTH = 5.0  # inches; on a phone of 400 pixels a point of text is then one pixel high
-_LARGE = {
-    "font.size": 10,
-    "axes.titlesize": 10,
-    "axes.labelsize": 10,
-    "xtick.labelsize": 9,
-    "ytick.labelsize": 9,
-    "legend.fontsize": 9.5,
-    "figure.titlesize": 10,
-    "lines.linewidth": 1.4,
-}
+_LARGE = {"xtick.labelsize": 9, "ytick.labelsize": 9, "lines.linewidth": 1.4}
 
 
 def drawn_to_be_read(function: Callable[Parameters, Drawn]) -> Callable[Parameters, Drawn]:
