@@ -13,6 +13,8 @@ from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
 
 ROOT = Path(__file__).parents[1]
+FOLDERS = ("inference", "rules", "diagnosis", "quasipotential", "workflow", "")
+"""Those whose tests come first, in this order, and all others."""
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
@@ -25,11 +27,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Folders that take longest first; the tests of a file in one process, which makes what they share once.
 
     Those that look at the same finished workflow are a group of their own. Inference is one, too: its first
-    test has the filter's machine code made, which takes longer than all of its tests beside.
+    test has the filter's machine code made, which takes longer than all of its tests beside. The diagnosis,
+    which needs that code as well, comes after it.
     """
-    items.sort(
-        key=lambda item: not {"inference", "quasipotential", "rules", "workflow"} & set(item.path.parts)
-    )
+    items.sort(key=lambda item: min(FOLDERS.index(one) for one in (*item.path.parts, "") if one in FOLDERS))
     for item in items:
         alike = item.path.parent if "inference" in item.path.parts else item.path
         shared = "finished" in getattr(item, "fixturenames", ())

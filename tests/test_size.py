@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import json
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -19,6 +20,7 @@ def lines(*files: Path) -> int:
     return sum(len(file.read_text(encoding="utf-8").splitlines()) for file in files)
 
 
+@cache
 def sizes() -> dict[str, int]:
     modules = sorted((ROOT / "siq").rglob("*.py"))
     trees = [ast.parse(file.read_text(encoding="utf-8")) for file in modules]

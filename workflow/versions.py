@@ -80,6 +80,7 @@ def files_of_task(name: str) -> list[Path]:
     return _closure(name)[1]
 
 
+@cache
 def digest(name: str) -> str:
     """A digest of all code that a task runs; comments and docstrings do not count."""
     parts, files = _closure(name)

@@ -513,7 +513,9 @@ def _fitting(
     """
     width = float(np.ptp(at))
     fitting: list[tuple[int, float, _Form, dict[sympy.Symbol, tuple[float, float]]]] = []
-    for form in forms:
+    for form in sorted(forms, key=lambda each: len(each.formula.free_symbols)):
+        if fitting and len(form.formula.free_symbols) > 1 + fitting[0][0]:  # z is none of its coefficients
+            break
         linear = [each for each in (A, B, D) if each in form.formula.free_symbols]
         slopes = compile_values([form.formula.diff(each) for each in linear], [Z, C], common=False)
 
@@ -549,6 +551,4 @@ def _fitting(
             continue
         if scipy.stats.chi2.sf(total, max(freedom - len(found), 1.0)) >= FITS:
             fitting.append((len(found), total, form, values))
-    fewest = min((count for count, *_ in fitting), default=0)
-    ranked = sorted((each for each in fitting if each[0] == fewest), key=lambda each: each[1])
-    return [(form, values) for *_, form, values in ranked]
+    return [(form, values) for *_, form, values in sorted(fitting, key=lambda each: each[1])]

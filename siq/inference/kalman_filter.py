@@ -184,7 +184,8 @@ class Linearisation:
         """
         d = self.gap.shape[1]
         return filter_recursion(
-            first, self.transition, self.response, self.gap, self.measured, self.measured_response,
+            first, self.transition, self.response, self.gap, self.measured,
+            np.ascontiguousarray(self.measured_response),  # each order has machine code of its own
             self.residual, noise.measurement, step, noise.intensity,
             np.zeros((len(first) - 1, d)) if begin is None else begin,
             np.zeros((d, d)) if begin_covariance is None else begin_covariance,
@@ -301,7 +302,7 @@ def _carried(
             after, begin_rate, end_rate = _runge_kutta(drift, grid, values, state, part, delays)
             middle = (state + after) / 2 + step / 8 * (begin_rate - end_rate)
         at = [slopes(place, 3 * part + node) for node, place in enumerate((state, middle, after))]
-        jacobians, forcings = (np.stack(each) for each in zip(*at, strict=True))
+        jacobians, forcings = (np.ascontiguousarray(np.stack(each)) for each in zip(*at, strict=True))
         carry_linearly(step, jacobians, forcings, transition, response)
         state = after
     return state, transition, response

@@ -59,6 +59,8 @@ class ScaledSystem:
         self.dynamics, self.center, self.units, self.inverse = dynamics, center, units, np.linalg.inv(units)
         self.unit, self.rate, self.dimension = unit, rate, dynamics.dimension
         self.noise = dynamics.diffusion.in_units(center, units, unit / rate)
+        # Of matrices as rows: a product for each point takes several times as long as one for all.
+        self._of_slopes, self._of_bends = np.kron(self.inverse.T / rate, units), np.kron(units, units)
 
     def points(self, y: np.ndarray) -> np.ndarray:
         """x of y, ``(n, d)``."""
@@ -86,11 +88,13 @@ class ScaledSystem:
 
     def jacobian(self, y: np.ndarray) -> np.ndarray:
         """∂F/∂y, ``(n, d, d)``."""
-        return self.inverse @ self.dynamics.jacobian(self.points(y)) @ self.units / self.rate
+        slopes = self.dynamics.jacobian(self.points(y))
+        return np.asarray((slopes.reshape(len(y), self.dimension**2) @ self._of_slopes).reshape(slopes.shape))
 
     def bend(self, y: np.ndarray, q: np.ndarray) -> np.ndarray:
         """``Σ_k q_k ∂²F_k + q·∂²D q``, the matrix before X in Ṗ: ``(n, d, d)``."""
-        second = self.units.T @ self.dynamics.bend(self.points(y), q @ self.inverse / self.rate) @ self.units
+        bends = self.dynamics.bend(self.points(y), q @ self.inverse / self.rate)
+        second = (bends.reshape(len(y), self.dimension**2) @ self._of_bends).reshape(bends.shape)
         return np.asarray(second if self.noise.constant else second + self.noise.contract(y, q, 2))
 
     def turned(self, y: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -102,7 +106,7 @@ class ScaledSystem:
         """q̇ at positions and momenta ``(n, d)``; `turned` where it is known."""
         turned = self.turned(y, q) if turned is None else turned
         # Of the slope of D the turn has twice as much.
-        return np.asarray(self.noise.contract(y, q, 1) - (turned.transpose(0, 2, 1) @ q[:, :, None])[:, :, 0])
+        return np.asarray(self.noise.contract(y, q, 1) - np.einsum("nik,ni->nk", turned, q))
 
     def velocities(
         self, y: np.ndarray, q: np.ndarray, turned: np.ndarray | None = None
@@ -135,33 +139,34 @@ class HamiltonianFlow(ScaledSystem):
         self.relaxation, self.diffusion = self.jacobian(rest)[0], self.noise.at(rest)[0]
 
     def parts(self, state: np.ndarray) -> tuple[np.ndarray, ...]:
-        """y, q, v, X, P of rows."""
+        """y, q, v of rows, and X above P, ``(n, 2d, d)``."""
         d = self.dimension
-        tangents = state[:, 2 * d + 1 :].reshape(len(state), 2, d, d)
-        return state[:, :d], state[:, d : 2 * d], state[:, 2 * d], tangents[:, 0], tangents[:, 1]
+        frames = state[:, 2 * d + 1 :].reshape(len(state), 2 * d, d)
+        return state[:, :d], state[:, d : 2 * d], state[:, 2 * d], frames
 
     def rates(self, state: np.ndarray) -> np.ndarray:
         """Time derivative of rows."""
-        y, q, _, x_tangents, p_tangents = self.parts(state)
-        turned = self.turned(y, q)
-        new = np.empty_like(state)
-        y_rate, q_rate, v_rate, x_rate, p_rate = self.parts(new)
+        y, q, _, frames = self.parts(state)
+        turned, new = self.turned(y, q), np.empty_like(state)
+        y_rate, q_rate, v_rate, frames_rate = self.parts(new)
         y_rate[...], q_rate[...], v_rate[...] = self.velocities(y, q, turned)
-        x_rate[...] = turned @ x_tangents + 2 * self.noise.at(y) @ p_tangents
-        p_rate[...] = -turned.transpose(0, 2, 1) @ p_tangents - self.bend(y, q) @ x_tangents
+        upper = np.concatenate([turned, 2 * self.noise.at(y)], axis=2)
+        lower = np.concatenate([-self.bend(y, q), -turned.transpose(0, 2, 1)], axis=2)
+        frames_rate[...] = np.concatenate([upper, lower], axis=1) @ frames
         return new
 
     def orthonormal(self, state: np.ndarray) -> np.ndarray:
         """The same planes of tangents with orthonormal columns, which neither grow nor collapse."""
-        y, q, v, x_tangents, p_tangents = self.parts(state)
-        frames, upper = np.linalg.qr(np.concatenate([x_tangents, p_tangents], axis=1))
+        y, q, v, frames = self.parts(state)
+        frames, upper = np.linalg.qr(frames)
         frames = frames * np.sign(np.diagonal(upper, axis1=1, axis2=2))[:, None, :]  # det X keeps its sign
         flat = frames.reshape(len(state), 2 * self.dimension**2)
         return np.concatenate([y, q, v[:, None], flat], axis=1)
 
 
 MAX_STEPS = 20_000  # numerical, a guard: a curve that takes more is stiff, or circles
-HALVINGS = 24  # of the last step, to find where a curve ends
+END_WIDTH = 2.0**-24  # of the last step, by which it is known where a curve ends
+HALVINGS = 8  # of what is left to search, on its cubic
 MAX_RELAXATION_TIMES = 60.0  # in units of the slowest relaxation time of the attractor
 REST_RATIO = 1e-3  # p to x - A, in units in which both are equal near A
 SHEET_DISTANCE = 0.06  # of neighbours, the level being at about 1: more than the gaps of a fan
@@ -337,21 +342,20 @@ def characteristics(
     box = np.asarray(box, dtype=float)
 
     def relative(error: np.ndarray, state: np.ndarray) -> np.ndarray:
-        y, q, v, _, _ = flow.parts(state)
-        y_error, q_error, v_error, x_error, p_error = flow.parts(error)
-        worst = norm(np.concatenate([y_error, q_error], axis=1)) / norm(np.concatenate([y, q], axis=1))
-        worst = np.maximum(worst, np.abs(v_error) / v)
-        frames = np.concatenate([x_error, p_error], axis=1)
+        place = slice(2 * flow.dimension)
+        *_, v, _ = flow.parts(state)
+        *_, v_error, frames = flow.parts(error)
+        worst = np.maximum(norm(error[:, place]) / norm(state[:, place]), np.abs(v_error) / v)
         return np.maximum(worst, np.linalg.norm(frames, axis=(1, 2))) / tolerance
 
     def reason(before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """An `End` where a step from `before` to `after` leads to one, otherwise -1."""
-        y, _, v, tangents, _ = flow.parts(after)
+        y, _, v, frames = flow.parts(after)
         found = np.full(len(after), -1)
         x = flow.points(y)
         found[np.any((x < box[:, 0]) | (x > box[:, 1]), axis=1)] = End.BOX
         found[v >= 1] = End.LEVEL
-        found[crossed(flow.parts(before)[3], tangents)] = End.CAUSTIC
+        found[crossed(flow.parts(before)[3][:, : y.shape[1]], frames[:, : y.shape[1]])] = End.CAUSTIC
         return found
 
     # Many curves at once, each with a step of its own, until each has ended.
@@ -389,21 +393,35 @@ def characteristics(
         ends[running[resting]] = End.REST
         stalled = steps[running] < 1e-13 * time_limit
         running = running[~(ended | late | resting | stalled)]
-    # The last states before the ends within a step are found by halving it.
+    # The last states before the ends within a step: where its cubic ends, and just before and behind that.
     crossing = np.flatnonzero(last_steps)
-    before, low, high = states[crossing], np.zeros(len(crossing)), last_steps[crossing]
-    advance = partial(dormand_prince_step, flow.rates, before, first=flow.rates(before))
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        found = reason(before, advance(middle)[0])
-        low, high = np.where(found >= 0, low, middle), np.where(found >= 0, middle, high)
-    kept.append(advance(low)[0])
-    ends[crossing] = reason(before, advance(high)[0])
+    before, bracket = states[crossing], np.stack([np.zeros(len(crossing)), last_steps[crossing]])
+    index, thrice = np.arange(len(crossing)), np.tile(before, (3, 1))
+    first = flow.rates(before)
+    around = np.stack([before, dormand_prince_step(flow.rates, before, bracket[1], first=first)[0]])
+    while len(index) and (np.ptp(bracket, axis=0) > END_WIDTH * last_steps[crossing]).any():
+        width, rise, share = np.ptp(bracket, axis=0), around[1] - around[0], np.zeros((len(index), 1))
+        slopes = width[:, None] * flow.rates(np.concatenate(around)).reshape(around.shape)
+        bends = 3 * rise - 2 * slopes[0] - slopes[1], slopes[0] + slopes[1] - 2 * rise
+        for part in 0.5 ** np.arange(1, HALVINGS + 1):
+            at = share + part
+            cubic = around[0] + at * (slopes[0] + at * (bends[0] + at * bends[1]))
+            share = np.where(reason(before, cubic)[:, None] >= 0, share, at)
+        shares = np.sort(np.hstack([share - 2 * part, np.full_like(share, 0.5), share + 2 * part]).T, axis=0)
+        inside = bracket[0] + width * np.clip(shares, 0.0, 1.0)
+        tried = dormand_prince_step(flow.rates, thrice, inside.ravel(), first=np.tile(first, (3, 1)))[0]
+        beyond = np.append(reason(thrice, tried) >= 0, np.ones(len(index), dtype=bool)).reshape(4, -1)
+        end, places = 1 + beyond.argmax(axis=0), np.vstack([bracket[0], inside, bracket[1]])
+        known = np.concatenate([around[:1], tried.reshape(3, *before.shape), around[1:]])
+        bracket, around = (np.stack([each[end - 1, index], each[end, index]]) for each in (places, known))
+    kept.append(around[0])
+    ends[crossing] = reason(before, around[1])
     curve = np.concatenate([*kept_curves, crossing])
     order = np.argsort(curve, kind="stable")
     curve = curve[order]
     met = (ends[curve] == End.CAUSTIC) & np.append(curve[1:] != curve[:-1], True)
-    y, q, v, x_tangents, p_tangents = flow.parts(np.concatenate(kept)[order])
+    y, q, v, frames = flow.parts(np.concatenate(kept)[order])
+    x_tangents, p_tangents = np.split(frames, 2, axis=1)
     points, momenta, values = flow.points(y), flow.momenta(q), level * v
     # A pseudoinverse, because at a caustic itself X is singular; that Hessian is not handed on.
     hessians = flow.unit * flow.inverse.T @ (p_tangents @ np.linalg.pinv(x_tangents)) @ flow.inverse

@@ -75,13 +75,23 @@ def test_there_is_an_answer_to_what_is_large(name: str, tmp_path: Path) -> None:
 
 
 def test_dry_friction_of_a_motor_is_named(tmp_path: Path) -> None:
-    found = answered(motor_axis(samples=1200), tmp_path)
+    found = answered(motor_axis(samples=800), tmp_path)
     names = [each.name for each in found.mechanisms]
     assert names == ["dry friction"] or "dry friction" in found.mechanisms[0].indistinguishable_from
     assert found.mechanisms[0].parameters["c_1"].estimate == pytest.approx(20 / 95, rel=2e-3)
 
 
-def test_what_the_budget_does_not_reach_is_named(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def followed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Diagnosis, list[str]]:
+    """A diagnosis with all that was told while it was made."""
+    told: list[str] = []
+    found = solve_case(falling_ball(0.3).read(tmp_path_factory.mktemp("followed")), tell=told.append)
+    return found, told
+
+
+def test_what_the_budget_does_not_reach_is_named(
+    tmp_path: Path, followed: tuple[Diagnosis, list[str]]
+) -> None:
     whole = answered(falling_ball(0.3), tmp_path / "whole")
     work = whole.statement.account.spent
     parts = [answered(falling_ball(0.3), tmp_path / f"{s}", evaluations=s * work) for s in (0.01, 0.5)]
@@ -94,8 +104,7 @@ def test_what_the_budget_does_not_reach_is_named(tmp_path: Path) -> None:
     assert len(parts[1].statement.not_tried) < len(parts[0].statement.not_tried) <= len(labels)
     assert not parts[0].investigation.search.screened and parts[1].investigation.search.screened
     # Work is counted, not timed: the same case takes the same.
-    again = answered(falling_ball(0.3), tmp_path / "again")
-    assert again.statement.account.spent == work
+    assert followed[0].statement.account.spent == work
 
 
 def test_a_clock_that_runs_out_is_said(tmp_path: Path) -> None:
@@ -105,9 +114,8 @@ def test_a_clock_that_runs_out_is_said(tmp_path: Path) -> None:
     assert "the time allowed" in found.statement.as_data()["remarks"][-1]
 
 
-def test_progress_is_told(tmp_path: Path) -> None:
-    told: list[str] = []
-    solve_case(falling_ball(0.3).read(tmp_path), tell=told.append)
+def test_progress_is_told(followed: tuple[Diagnosis, list[str]]) -> None:
+    told = followed[1]
     assert told[0].startswith("fitting the simulation's own parameters; 0% of the budget")
     assert any(text.startswith("candidate 2 of at most") for text in told)
     shares = [int(text.rpartition("; ")[2].partition("%")[0]) for text in told]

@@ -17,9 +17,13 @@ from siq.networks import training as networks_training
 from siq.networks.decomposition import CheckOptions, NetworksByWell, TrainedNetworks, TrainingOptions, pack
 from siq.networks.regression import RegressionOptions
 from siq.networks.training import start
-from siq.quasipotential.certificate_tests import CertificateOptions
+from siq.quasipotential import refinement as quasipotential_refinement
+from siq.quasipotential.certificate import references_about
+from siq.quasipotential.certificate_tests import CertificateOptions, Reference
 from siq.quasipotential.formulas import _decomposition_data, exact_decomposition
 from siq.quasipotential.refinement import RefinementOptions
+from siq.systems.dynamics import Dynamics
+from siq.systems.phase_portrait import PhasePortrait
 from siq.systems.simulation import SimulationOptions
 from siq.workflow import pipeline, training
 from siq.workflow.pipeline import Analysis, PipelineSettings, analyse
@@ -71,6 +75,25 @@ def analysis(recordings: Recordings) -> Analysis:
     return analyse(recordings, SETTINGS)
 
 
+@pytest.fixture(scope="module")
+def known_references() -> dict[Any, Any]:
+    return {}
+
+
+@pytest.fixture
+def followed_once(known_references: dict[Any, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Characteristics of the same f from the same attractors, which no networks change: once for all."""
+
+    def references(dynamics: Dynamics, portrait: PhasePortrait, *, seed: int) -> tuple[Reference, ...]:
+        attractors = [one.position.tobytes() for one in portrait.attractors]
+        key = (seed, *map(str, dynamics.formulas), portrait.box.tobytes(), *attractors)
+        if key not in known_references:
+            known_references[key] = references_about(dynamics, portrait, seed=seed)
+        return known_references[key]
+
+    monkeypatch.setattr(quasipotential_refinement, "references_about", references)
+
+
 def test_every_step_that_was_asked_for_has_an_outcome(analysis: Analysis) -> None:
     said = {one.step: one.status for one in analysis.outcomes}
     assert said == {
@@ -104,6 +127,7 @@ def test_the_same_seed_gives_the_same_and_another_run_another_answer(
     assert first is not None and second is not None and not np.array_equal(first.values, second.values)
 
 
+@pytest.mark.usefixtures("followed_once")
 @pytest.mark.parametrize(
     ("training", "agrees"),
     [
@@ -245,6 +269,7 @@ def test_why_a_check_could_not_be_prepared_is_the_reason(
     assert said.reason.endswith("could not be prepared: the attractors cannot be told apart")
 
 
+@pytest.mark.usefixtures("followed_once")
 @pytest.mark.parametrize(
     "further",
     [
@@ -262,6 +287,7 @@ def test_why_a_training_failed_is_what_refinement_says_first(
     assert found.outcome.reason.startswith("the training gave no networks (the loss became infinite)")
 
 
+@pytest.mark.usefixtures("followed_once")
 def test_where_refinement_needs_no_networks_their_failure_is_a_note(
     recordings: Recordings, analysis: Analysis
 ) -> None:

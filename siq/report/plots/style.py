@@ -5,12 +5,11 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
-import matplotlib as mpl
 import matplotlib.style
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -63,6 +62,9 @@ _SETTINGS = {
     "svg.hashsalt": "siq",  # otherwise the identifiers in an SVG are drawn by lot
 }
 
+# A figure that had a layout keeps a placeholder of one otherwise, and is drawn twice whenever it is saved.
+_FROZEN = {"figure.constrained_layout.use": False}
+
 _GREEK = re.compile(
     "alpha|beta|gamma|delta|epsilon|zeta|eta|theta|iota|kappa|lambda|mu|nu|xi|pi|rho|sigma|tau|upsilon|phi|chi|psi"
     "|omega|Gamma|Delta|Theta|Lambda|Xi|Pi|Sigma|Upsilon|Phi|Psi|Omega"
@@ -72,9 +74,9 @@ Parameters = ParamSpec("Parameters")
 Drawn = TypeVar("Drawn", Figure, Figure | None)
 
 
-def _drawing_style() -> AbstractContextManager[None]:
-    """Make matplotlib's defaults and the settings of this module hold for a ``with`` block only."""
-    context: AbstractContextManager[None] = matplotlib.style.context(["default", _SETTINGS])
+def _drawing_style(settings: Mapping[str, object]) -> AbstractContextManager[None]:
+    """Make matplotlib's defaults, those of this module and some more settings hold for a ``with`` block."""
+    context: AbstractContextManager[None] = matplotlib.style.context(["default", {**_SETTINGS, **settings}])
     return context
 
 
@@ -86,15 +88,15 @@ def drawn_in_style(function: Callable[Parameters, Drawn], **settings: object) ->
 
     @functools.wraps(function)
     def draw(*arguments: Parameters.args, **options: Parameters.kwargs) -> Drawn:
-        with _drawing_style():
-            mpl.rcParams.update(settings)  # which the context undoes
+        with _drawing_style(settings):
             figure = function(*arguments, **options)
             if figure is None:
                 return figure
             # The constrained layout moves on a little with every drawing. Worked out once and then
             # frozen, the same figure gives the same file however often it is saved.
             figure.draw_without_rendering()
-            figure.set_layout_engine("none")
+        with _drawing_style(_FROZEN):
+            figure.set_layout_engine(None)
         return figure
 
     return draw
@@ -189,22 +191,13 @@ def save_figure(figure: Figure, path_without_suffix: str | Path) -> tuple[Path, 
     vector, image = (stem.with_name(stem.name + suffix) for suffix in DOTS_PER_INCH)
     # Date and Software would make the same figure differ between days and versions.
     for path, metadata in ((vector, {"Date": None}), (image, {"Software": None})):
-        with whole_file(path) as partial, _drawing_style():
+        with whole_file(path) as partial, _drawing_style(_FROZEN):
             figure.savefig(partial, dpi=DOTS_PER_INCH[path.suffix], metadata=metadata)
     return vector, image
 
 
 WIDTH = 5.0  # inches; on a phone of 400 pixels a point of text is then one pixel high
-_LARGE = {
-    "font.size": 10,
-    "axes.titlesize": 10,
-    "axes.labelsize": 10,
-    "xtick.labelsize": 9,
-    "ytick.labelsize": 9,
-    "legend.fontsize": 9.5,
-    "figure.titlesize": 10,
-    "lines.linewidth": 1.4,
-}
+_LARGE = {"xtick.labelsize": 9, "ytick.labelsize": 9, "lines.linewidth": 1.4}
 
 
 def drawn_to_be_read(function: Callable[Parameters, Drawn]) -> Callable[Parameters, Drawn]:
