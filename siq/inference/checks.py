@@ -44,6 +44,8 @@ COARSE_ROUNDING = 0.05  # of the rms step of a state: rounding to less than that
 STEP_ACCURACY = 0.05  # step times the norm of the Jacobian, per step of the integrator
 MAX_STEPS = 5000  # between two samples; what is faster than that between samples is not what was recorded
 RUNAWAY_WIDTHS = 1e3  # widths of the recorded states: so far off a prediction has run away
+# prediction, descent, one_system, unchanged, state_complete, gaussian_increments, times, record
+CHANCE_TESTS = 8
 UNPREDICTED = "f does not predict held-out recordings"
 
 
@@ -59,13 +61,18 @@ class PredictionLimits:
         Mean square of the residuals of f on held-out recordings over that on its own, for recordings with
         noise. The default, a tenth more, is what a systematic error of √0.1 of the noise adds.
     false_alarms
-        Probability with which the noise alone refuses what is right; `descent` has it too. The default is
-        one in ten thousand runs.
+        Probability with which a whole certificate is refused by chance where everything is right. The tests
+        that chance can refuse share it evenly, see `each`.
     """
 
     prediction: Annotated[float, Field(gt=0)] = 0.01
     held_out_ratio: Annotated[float, Field(gt=1)] = 1.1
-    false_alarms: Annotated[float, Field(gt=0, lt=0.5)] = 1e-4
+    false_alarms: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
+
+    @property
+    def each(self) -> float:
+        """Probability with which one of `CHANCE_TESTS` refuses what is right (Bonferroni)."""
+        return self.false_alarms / CHANCE_TESTS
 
 
 def residual_noise(
@@ -231,6 +238,7 @@ def unexplained_probability(
     *,
     freedom: int | None = None,
     variance: np.ndarray | None = None,
+    inflation: float = 1.0,
 ) -> float:
     """Probability of residuals having no part left that columns explain: tiny where f misses a term.
 
@@ -245,9 +253,12 @@ def unexplained_probability(
         Degrees of freedom of the residuals, n by default.
     variance
         Of each of the r residuals, shape ``(r,)``, where it is known.
+    inflation
+        By how much more columns explain of residuals that were not fitted: 1 + n/m, where the columns were
+        fitted to m others, whose errors these have as well.
     """
     basis = np.linalg.qr(columns / positive(np.linalg.norm(columns, axis=0)))[0]
-    explained, count = ((basis.T @ rest) ** 2).sum(axis=0), columns.shape[1]
+    explained, count = ((basis.T @ rest) ** 2).sum(axis=0) / inflation, columns.shape[1]
     if variance is not None:
         probability = scipy.special.chdtrc(count, explained / variance)
     else:
@@ -260,24 +271,28 @@ def unexplained_probability(
 def mean_residual_probability(found: FieldEstimate, pairs: SnapshotPairs, *, seen: int = 0) -> float:
     """Probability of the residuals of held-out pairs having no mean left that f's library could express.
 
-    Of `LaggedPairs` the number of pairs `seen` that f was fitted to counts: its own error adds the share
-    ``len(pairs.h)/seen`` to their residuals at most.
+    The number of pairs `seen` that f was fitted to counts, if it is known: its own error adds the share
+    ``len(pairs.h)/seen`` to what the library explains of their residuals, at most.
     """
-    library = found.library
+    library, inflation = found.library, 1 + (len(pairs.h) / seen if seen else 0.0)
     if isinstance(pairs, LaggedPairs):
         rest = residuals(found, pairs)
         spread = np.diag(found.noise_rate) * float(np.median(pairs.h)) * copies(pairs)
-        variance = spread * (1 + len(rest) / seen)
-        return unexplained_probability(pairs.directions(library), rest, variance=variance)
+        return unexplained_probability(
+            pairs.directions(library), rest, variance=spread, inflation=inflation
+        )
     # Copies of resampled recordings would count as evidence that there is not.
     _, single = np.unique(np.column_stack([pairs.x0, pairs.xh]), axis=0, return_index=True)
     pairs = pairs.take(single)
     if not found.diffusion.constant:
         triangle = weighted_triangle(found, pairs, None, of_rest=True)[0]
         freedom = len(pairs.h) * library.dimension
-        return unexplained_probability(triangle[:, :-1], triangle[:, -1:], freedom=freedom)
+        return unexplained_probability(
+            triangle[:, :-1], triangle[:, -1:], freedom=freedom, inflation=inflation
+        )
     weight = np.sqrt(pairs.h)[:, None]
-    return unexplained_probability(library.evaluate(pairs.x0) * weight, residuals(found, pairs) / weight)
+    columns, rest = library.evaluate(pairs.x0) * weight, residuals(found, pairs) / weight
+    return unexplained_probability(columns, rest, inflation=inflation)
 
 
 def predict(dynamics: Dynamics, recordings: Recordings) -> np.ndarray:
@@ -346,7 +361,7 @@ def check_prediction(
         return Verdict.of(float(np.median(errors)), limits.prediction, UNPREDICTED)
     assert mean_probability is not None
     value, limit = max(held_out_ratio - 1, 0.0), limits.held_out_ratio - 1
-    rarity, rare = -float(np.log10(max(mean_probability, 1e-300))), -float(np.log10(limits.false_alarms))
+    rarity, rare = -float(np.log10(max(mean_probability, 1e-300))), -float(np.log10(limits.each))
     if value <= limit and not rarity <= rare:
         reason = (
             "the residuals of f on held-out recordings have a mean, of a probability of"

@@ -324,7 +324,7 @@ def _check_descent(
     Without noise a pair rises where ``V(x_h) - V(x_0)`` is more than the residuals of f over such a pair, and
     rounding, explain; a share of them may. With noise the mean of ``∇V(X)·ΔX/h`` at the left point (Itô) is
     ``-∇V·D∇V``, as g is orthogonal to ∇V. The figure is the largest deviation of its mean over a bin in V, in
-    standard errors; all bins keep the limit by chance except with probability `false_alarms`. Allowed for
+    standard errors; all bins keep the limit by chance except with the probability `each` of the options. Allowed for
     are 2e of ``∇V·D∇V``, e being the relative error of V; and over a pair of length h the drift's difference
     from f, ``(h/2) Lf`` with ``Lf = Jf + ½ Σ:∇²f``, Σ being the noise per unit of time.
     """
@@ -365,7 +365,7 @@ def _check_descent(
     change += 0.5 * np.einsum("nkij,nij->nk", dynamics.hessian(x0), forces)
     curved = (slope * change).sum(axis=1) * h / 2
     bins = np.array_split(np.argsort(values), max(min(DESCENT_BINS, len(h) // MIN_POINTS), 1))
-    limit = float(-scipy.special.ndtri(options.false_alarms / (2 * len(bins))))
+    limit = float(-scipy.special.ndtri(options.each / (2 * len(bins))))
     worst = 0.0
     for rows in bins:
         explained = 2 * min(error, options.error) * claimed[rows].mean() + abs(curved[rows].mean())
