@@ -173,11 +173,12 @@ def check_claims(
     whole = joined(states)
     if found.memory is not None:
         pairs = coarse_pairs(whole, found.memory[0], lost=found.memory[1])
-    else:  # a filter begins anew in each stretch
-        pairs = snapshot_pairs(states if filtered else whole, pair_step=pair_step)
-    if pairs.recording.max() >= len(whole.labels):
+    elif filtered:  # a filter begins anew in each stretch
+        pairs = snapshot_pairs(states, pair_step=pair_step)
         begins = np.searchsorted(states.recording, np.arange(len(states.labels)))
         pairs = replace(pairs, recording=whole.recording[begins][pairs.recording])
+    else:
+        pairs = snapshot_pairs(whole, pair_step=pair_step)
     rest = _Residuals(found, pairs)
     return {
         "one_system": _one_system(rest, whole.labels, false_alarms),
@@ -204,23 +205,43 @@ def _one_system(rest: _Residuals, labels: Sequence[str], limit: float) -> Verdic
     group = alike[0]
     while (alike[group].any(axis=0) & ~group).any():
         group = alike[group].any(axis=0)
-    # What each explains by itself, of the mean and of the variance.
-    slopes, probabilities = rest.states, np.ones(len(enough))
-    for place, which in enumerate(enough):
-        own = index == which
-        columns = slopes * own[:, None]
-        chances = [rest.probability(columns, rest.noise), rest.probability(columns[:, :1], rest.power)]
-        probabilities[place] = min(2 * min(chances), 1.0)
-    chance = float(probabilities.min()) * len(enough)
-    apart = enough[np.argsort(probabilities)[: max(int((probabilities * len(enough) < limit).sum()), 1)]]
-    names = [labels[numbers[which]] for which in apart[:3]]
-    if chance < limit:
-        return _verdict("one_system", chance, limit, names=names, count=len(apart))
-    if not group.all():
-        side = [labels[numbers[which]] for which in enough[~group][:3]]
-        first = labels[numbers[enough[0]]]
+    # What each explains by itself, of the mean and of the variance; then again without the worst.
+    noise, power, apart, least = rest.noise, rest.power, [], 1.0
+    while len(apart) <= len(enough) // 2:
+        chances = {}
+        for which in enough[~np.isin(enough, apart)].tolist():
+            own = index == which
+            mean = _explained(rest.states[own], noise[own], rest.basis[own])
+            chances[which] = 2 * min(mean, _explained(rest.states[own, :1], power[own], rest.basis[own]))
+        worst = min(chances, key=lambda which: chances[which])
+        chance = chances[worst] * len(enough)
+        least = least if apart else chance
+        if chance >= limit:
+            break
+        apart.append(worst)
+        own_columns = rest.without(rest.states * (index == worst)[:, None])
+        noise, power = (
+            one - basis @ (basis.T @ one)
+            for one, basis in ((noise, _orthonormal(own_columns)), (power, _orthonormal(own_columns[:, :1])))
+        )
+    if not apart and not group.all():
+        first, *side = (labels[numbers[which]] for which in [enough[0], *enough[~group][:3]])
         return Verdict.not_tested(sentence(Remark("inference.no_common_states", {"names": side, "first": first})))
-    return _verdict("one_system", chance, limit, names=names, count=len(apart))
+    names = [labels[numbers[which]] for which in apart]
+    return _verdict("one_system", least, limit, names=names[:3], count=len(names))
+
+
+def _explained(columns: np.ndarray, rest: np.ndarray, basis: np.ndarray) -> float:
+    """Probability of what columns that vanish elsewhere explain of residuals of variance one.
+
+    All are given where columns do not vanish: what the basis of the state explains of them is taken off.
+    """
+    inner, pushed = basis.T @ columns, columns.T @ rest
+    values, vectors = np.linalg.eigh(columns.T @ columns - inner.T @ inner)
+    kept = values > 1e-8 * len(columns)
+    explained = ((vectors[:, kept].T @ pushed) ** 2 / values[kept, None]).sum(axis=0)
+    chances = scipy.special.chdtrc(max(int(kept.sum()), 1), explained)
+    return min(float(chances.min()) * rest.shape[1], 1.0)
 
 
 def _unchanged(rest: _Residuals, limit: float) -> Verdict:
@@ -278,7 +299,7 @@ def _gaussian(rest: _Residuals, recordings: Recordings, limit: float) -> Verdict
     beyond = int((np.abs(noise) > TAIL).sum())
     expected = 2 * float(scipy.special.ndtr(-TAIL)) * noise.size
     chances.append((float(scipy.special.gammainc(beyond, expected)), "tails", beyond / expected))
-    for column in np.flatnonzero(rest.noisy):
+    for column in np.flatnonzero(rest.noisy[: recordings.values.shape[1]]):
         x, step = recordings.values[:, column], resolution_step(recordings.values[:, column])
         same = np.diff(recordings.recording) == 0
         moves = np.diff(x)
