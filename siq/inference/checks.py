@@ -278,9 +278,7 @@ def mean_residual_probability(found: FieldEstimate, pairs: SnapshotPairs, *, see
     if isinstance(pairs, LaggedPairs):
         rest = residuals(found, pairs)
         spread = np.diag(found.noise_rate) * float(np.median(pairs.h)) * copies(pairs)
-        return unexplained_probability(
-            pairs.directions(library), rest, variance=spread, inflation=inflation
-        )
+        return unexplained_probability(pairs.directions(library), rest, variance=spread, inflation=inflation)
     # Copies of resampled recordings would count as evidence that there is not.
     _, single = np.unique(np.column_stack([pairs.x0, pairs.xh]), axis=0, return_index=True)
     pairs = pairs.take(single)

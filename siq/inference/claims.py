@@ -12,18 +12,21 @@ P being the projection on G less what functions of the state explain of it, thos
 their coefficients may have been fitted to the same residuals (a score test; Rao, 1948). Columns may be made
 of the past alone, and then the products ``G z`` are martingale differences, whatever f is.
 
-``one_system``            each recording by itself: a constant, and slopes in the states. Likewise of ``z² - 1``,
-                          for D. Recordings that share no states cannot be compared
-``unchanged``             cosines and sines of time, and these times the states, from half a period in a
-                          recording to ten samples. The highest peak of the periodograms of z, of ``φ(x) z``
-                          and of ``z² - 1`` counts. Each octave of frequencies is as likely to hold one, and so
-                          the price of a peak is the number of octaves times that of frequencies in its own
-``state_complete``        means of the past that fade with memories from a few samples to a thirtieth of the
-                          record, of the states, and of ``φ(x) z``, which follow what a hidden variable does to
-                          the force. A hidden variable that changes D shows in those of ``z² - 1``
-``gaussian_increments``   tails: the largest residual, and how many are beyond three; their fourth cumulant, as
-                          far as it moves barriers; and values, or steps, that repeat themselves more often than
-                          rounding lets them
+``one_system``
+    Each recording by itself: a constant, and slopes in the states. Likewise of ``z² - 1``, for D. Recordings
+    that share no states cannot be compared.
+``unchanged``
+    Cosines and sines of time, and these times the states, from half a period in a recording to ten samples.
+    The highest peak of the periodograms of z, of ``φ(x) z`` and of ``z² - 1`` counts. Each octave of
+    frequencies is as likely to hold one, and so the price of a peak is the number of octaves times that of
+    frequencies in its own.
+``state_complete``
+    Means of the past that fade with memories from a few samples to a thirtieth of the record, of the states,
+    and of ``φ(x) z``, which follow what a hidden variable does to the force. A hidden variable that changes D
+    shows in those of ``z² - 1``.
+``gaussian_increments``
+    The largest residual, and how many are beyond three; and values, or steps, that repeat themselves more
+    often than rounding lets them.
 
 Of the neighbouring residual `siq.inference.checks` judges, which knows sensors and rounding: what it explains
 is left out here, and the past begins two steps back.
@@ -33,6 +36,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import scipy.signal
@@ -52,11 +56,10 @@ STATE_BINS = 12  # of each state: what any function of it explains is no memory,
 NOISELESS = 1e-3  # of the rms step: a state with less has no noise of its own, and its residuals say nothing
 FEWEST_PAIRS = 30  # of a recording that is compared, or of a run of samples whose spectrum is asked for
 FEWEST_PER_COLUMN = 10  # pairs for each column of a regression
-FASTEST_PERIOD = 10  # samples: swings that are faster are noise to a fit, and its colour is asked for elsewhere
+FASTEST_PERIOD = 10  # samples: faster swings are noise to a fit, whose colour is asked for elsewhere
 SHORTEST_MEMORY, MEMORY_GROWTH, LONGEST_MEMORY = 4, 2.0, 1 / 30  # samples; a ratio; of the record
 OVERLAP = 0.02  # quantile between which, and one minus it, recordings share states
 TAIL = 3.0  # standard deviations: beyond are 2.7 in 1000
-HARMLESS_CHANGE = 0.01  # of a barrier, by a fourth cumulant
 ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 
 
@@ -86,7 +89,7 @@ class _Residuals:
         self.states = np.concatenate([np.ones((n, 1)), scaled], axis=1)
         goes_on = (pairs.recording[1:] == pairs.recording[:-1]) & (pairs.xh[:-1] == pairs.x0[1:]).all(axis=1)
         bounds = np.concatenate([[0], np.flatnonzero(~goes_on) + 1, [n]])
-        self.runs = [slice(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+        self.runs = [slice(int(a), int(b)) for a, b in pairwise(bounds)]
         self.noise = self._standardised(rest[:, self.noisy])
         self.neighbour = self._standardised(self.past(self.noise, 0.0, delay=1))
         self.power = self._standardised(self.noise**2 - 1)
@@ -106,11 +109,13 @@ class _Residuals:
             if run.stop - run.start > delay:
                 earlier = values[run][:-delay]
                 begin = earlier[:1] * fade  # as if it had been so before
-                found[run][delay:] = scipy.signal.lfilter([1 - fade], [1, -fade], earlier, axis=0, zi=begin)[0]
+                found[run][delay:] = scipy.signal.lfilter([1 - fade], [1, -fade], earlier, axis=0, zi=begin)[
+                    0
+                ]
         return found
 
     def probability(self, columns: np.ndarray, rest: np.ndarray) -> float:
-        """That columns explain as much of some residuals by chance, what neighbours and the state do apart."""
+        """Probability of what columns explain of residuals, neighbours and the state apart."""
         columns = self.without(columns)
         near = _orthonormal(self.neighbour)
         columns, rest = (one - near @ (near.T @ one) for one in (columns, rest))
@@ -201,12 +206,12 @@ def _one_system(rest: _Residuals, labels: Sequence[str], limit: float) -> Verdic
         np.array([np.quantile(rest.pairs.x0[index == k], q, axis=0) for k in enough])
         for q in (OVERLAP, 1 - OVERLAP)
     )
-    alike = ((low[:, None] <= high) & (low <= high[:, None])).all(axis=2)
+    alike = np.asarray(((low[:, None] <= high) & (low <= high[:, None])).all(axis=2))
     group = alike[0]
     while (alike[group].any(axis=0) & ~group).any():
         group = alike[group].any(axis=0)
     # What each explains by itself, of the mean and of the variance; then again without the worst.
-    noise, power, apart, least = rest.noise, rest.power, [], 1.0
+    noise, power, apart, least = rest.noise, rest.power, list[int](), 1.0
     while len(apart) <= len(enough) // 2:
         chances = {}
         for which in enough[~np.isin(enough, apart)].tolist():
@@ -226,7 +231,9 @@ def _one_system(rest: _Residuals, labels: Sequence[str], limit: float) -> Verdic
         )
     if not apart and not group.all():
         first, *side = (labels[numbers[which]] for which in [enough[0], *enough[~group][:3]])
-        return Verdict.not_tested(sentence(Remark("inference.no_common_states", {"names": side, "first": first})))
+        return Verdict.not_tested(
+            sentence(Remark("inference.no_common_states", {"names": side, "first": first}))
+        )
     names = [labels[numbers[which]] for which in apart]
     return _verdict("one_system", least, limit, names=names[:3], count=len(names))
 
@@ -293,7 +300,7 @@ def _state_complete(rest: _Residuals, limit: float) -> Verdict:
 
 def _gaussian(rest: _Residuals, recordings: Recordings, limit: float) -> Verdict:
     chances: list[tuple[float, str, float]] = []
-    noise, n = rest.noise, len(rest.noise)
+    noise = rest.noise
     largest = float(np.abs(noise).max())
     chances.append((2 * float(scipy.special.ndtr(-largest)) * noise.size, "jump", largest))
     beyond = int((np.abs(noise) > TAIL).sum())

@@ -102,7 +102,11 @@ class Certificate:
 
     def with_tests(self, tests: Mapping[str, Verdict]) -> Certificate:
         """With further tests; the reason says which of them refused it, or could not be made."""
-        further = [one.reason for name, one in tests.items() if not (one.passed or name in OF_TIMES and not one.tested)]
+        further = [
+            one.reason
+            for name, one in tests.items()
+            if not (one.passed or (name in OF_TIMES and not one.tested))
+        ]
         reason = "; ".join(dict.fromkeys(one for one in (self.reason, *further) if one))
         return replace(self, tests={**self.tests, **tests}, reason=reason)
 

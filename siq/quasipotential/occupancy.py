@@ -370,13 +370,9 @@ class VisitTest:
     method: str
     probability: float
 
-    def figures(self) -> tuple[float, float, float]:
-        """Time on held-out recordings, mean visit that is predicted, and its relative error."""
-        return self.held_out.time, self.predicted, self.error
-
 
 @dataclass(frozen=True, eq=False)
-class DensityTest:
+class _DensityTest:
     """How a state is spread during the visits to one well.
 
     Attributes
@@ -407,21 +403,23 @@ class OccupancyCheck:
 
     `missing` says why neither is compared. `unseen` are two states between which the record hops, where a
     single one was identified. `passages` are how often the record went from one well, a row, into another, a
-    column; empty where there is none to go to.
+    column; empty where there is none to go to. `foreseen` are how many visits ought to have ended in all, by
+    fits to other recordings, and the relative error of that.
     """
 
     visits: tuple[VisitTest, ...] = ()
-    densities: tuple[DensityTest, ...] = ()
+    densities: tuple[_DensityTest, ...] = ()
     missing: Remark | None = None
     unseen: RecordStates | None = None
     passages: tuple[tuple[int, ...], ...] = ()
+    foreseen: tuple[float, float] = (0.0, 0.0)
 
     def verdicts(self, *, false_alarms: float) -> dict[str, Verdict]:
         """The verdicts for the certificate, each refused by chance with a probability `false_alarms`.
 
-        ``connected``: whether recordings passed from well to well. ``times``: whether visits last as foreseen.
-        ``record``: whether states are spread so. The figure of the last two is how many powers of ten their
-        least probability lies below 1, times the number of figures compared.
+        ``connected``: whether recordings passed from well to well. ``times``: whether visits last as
+        foreseen. ``record``: whether states are spread so. The figure of the last two is how many powers of
+        ten their least probability lies below 1, times the number of figures compared.
         """
         tests: dict[str, Verdict] = {}
         why = "" if self.missing is None else sentence(self.missing)
@@ -448,13 +446,12 @@ class OccupancyCheck:
 
     def _times(self, false_alarms: float) -> Verdict:
         """All visits together, and those to each well."""
-        held, predicted, error = (np.array(one) for one in zip(*map(VisitTest.figures, self.visits), strict=True))
-        count = DwellCount(int(sum(one.held_out.visits for one in self.visits)), float(held.sum()))
-        expected = float((held / predicted).sum())
+        (expected, spread), held = self.foreseen, [one.held_out for one in self.visits]
         if not expected > 0:
             return Verdict.not_tested(sentence(Remark("quasipotential.no_power", {"factor": None})))
-        mean, spread = held.sum() / expected, float((held / predicted) @ error) / expected
-        chances = [*(one.probability for one in self.visits), _probability_of(count, mean, spread)]
+        count = DwellCount(sum(one.visits for one in held), sum(one.time for one in held))
+        chances = [one.probability for one in self.visits]
+        chances.append(_probability_of(count, count.time / expected, spread))
         chance = min(chances) * len(chances)
         worst = min(self.visits, key=lambda one: one.probability)
         counted = f"{worst.held_out.mean:.3g}" if worst.held_out.visits else "no end"
@@ -484,7 +481,9 @@ def _passages_of(
     counts = np.zeros((len(portrait.attractors),) * 2, dtype=int)
     starts, ends = portrait.descents.paths[:, 0], portrait.descents.ends
     width = positive(np.ptp(portrait.box, axis=1))
-    nearest = cKDTree(starts / width).query(np.array([recordings.values[run.start] for run in runs]) / width)[1]
+    nearest = cKDTree(starts / width).query(np.array([recordings.values[run.start] for run in runs]) / width)[
+        1
+    ]
     for run, begin in zip(runs, nearest, strict=True):
         inside = visits[run]
         order = np.concatenate([[ends[begin]], inside[inside >= 0]])
@@ -548,21 +547,19 @@ def check_occupancy(
         process = processes[0].of(fit.dynamics) if processes and fit is not found else None
         counts = DwellCount.of_visits(recordings.t, visits, used, states=states)
         apart.append((mask[recordings.recording], counts, process or (processes[0] if processes else None)))
-    tested = []
+    tested, foreseen = [], np.zeros(2)  # the number of visits, and the sum of its errors
     for well, mean, error in times:
         held = DwellCount(
-            sum(counts[well].visits for _, counts, _ in apart), sum(counts[well].time for _, counts, _ in apart)
+            sum(counts[well].visits for _, counts, _ in apart),
+            sum(counts[well].time for _, counts, _ in apart),
         )
         expected = sum(
             counts[well].time / (mean if process is None else float(process.means[well]))
             for _, counts, process in apart
         )
-        foreseen = held.time / expected if expected > 0 else mean
-        tested.append(
-            VisitTest(
-                well, held, whole[well], mean, error, method, _probability_of(held, foreseen, error)
-            )
-        )
+        foreseen += [expected, expected * error]  # errors of one f: they do not average out
+        chance = _probability_of(held, held.time / expected if expected > 0 else mean, error)
+        tested.append(VisitTest(well, held, whole[well], mean, error, method, chance))
     if not tested:
         return OccupancyCheck(missing=unknown, passages=passages)
     chance = min(_probability_of(one.whole, one.predicted, one.error) for one in tested)
@@ -601,11 +598,12 @@ def check_occupancy(
             counts = np.histogram(x, bins=edges)[0] / (len(x) * width)
             probability = float(special.kolmogorov(distance * np.sqrt(effective)))
             densities.append(
-                DensityTest(
+                _DensityTest(
                     well, state, distance, float(independent), probability, edges, counts, share / width
                 )
             )
-    return OccupancyCheck(tuple(tested), tuple(densities), passages=passages)
+    told = (float(foreseen[0]), float(foreseen[1] / foreseen[0]) if foreseen[0] > 0 else 0.0)
+    return OccupancyCheck(tuple(tested), tuple(densities), passages=passages, foreseen=told)
 
 
 def _probability_of(count: DwellCount, mean: float, error: float) -> float:

@@ -498,7 +498,7 @@ def _run_figures(tables: Mapping[str, pd.DataFrame], *, runs: int, method: str) 
 
 
 def _tests_table(certificates: pd.DataFrame, run: int, method: Method) -> pd.DataFrame:
-    """The claims of a certificate: what was asked, the figure, its limit, the verdict, what would refute it."""
+    """The claims of a certificate: what was asked and found, the verdict, and what would refute it."""
     mine = certificates[(certificates["run"] == run) & (certificates["method"] == method)]
     words = texts("certificate")
     asks, refutes, verdicts = words["asks"], words["refutes"], words["verdicts"]

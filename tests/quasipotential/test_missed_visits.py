@@ -100,7 +100,11 @@ def test_a_single_state_is_no_contradiction() -> None:
     alone = field({"x": -0.5}, 0.1)
     portrait = phase_portrait(alone.dynamics, x[::10], seed=0)
     found = check_occupancy(
-        alone, portrait, NoiseStrength(0.1), recordings, [(alone, np.zeros(len(recordings.labels), dtype=bool))]
+        alone,
+        portrait,
+        NoiseStrength(0.1),
+        recordings,
+        [(alone, np.zeros(len(recordings.labels), dtype=bool))],
     )
     assert found.unseen is None and not found.verdicts(false_alarms=1e-4)
     assert sum(one.whole.visits for one in found.visits) == 0

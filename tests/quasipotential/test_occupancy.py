@@ -99,6 +99,31 @@ def test_a_record_too_short_to_hop_is_no_test(recorded: RECORDED) -> None:
     assert not tests["connected"].tested and not tests["times"].tested
 
 
+def test_wells_that_no_recording_joins_are_not_connected(recorded: RECORDED) -> None:
+    recordings, record, portrait, _ = recorded
+    side = np.where(np.arange(RECORDS) % 2, 1.0, -1.0)[recordings.recording][:, None]
+    apart = replace(recordings, values=side * np.abs(recordings.values))
+    parts = [(record, np.ones(RECORDS, dtype=bool))]
+    tests = check_occupancy(record, portrait, NoiseStrength(INTENSITY), apart, parts).verdicts(
+        false_alarms=0.01
+    )
+    assert not tests["connected"].tested and "no recording passed" in tests["connected"].reason
+    tests = check_occupancy(record, portrait, NoiseStrength(INTENSITY), recordings, parts).verdicts(
+        false_alarms=0.01
+    )
+    assert tests["connected"].passed and tests["times"].passed and "factor" in tests["times"].reason
+
+
+def test_a_few_hops_do_not_test_a_time(recorded: RECORDED) -> None:
+    recordings, record, portrait, _ = recorded
+    some = recordings.select([0, 1])
+    parts = [(record, np.ones(2, dtype=bool))]
+    found = check_occupancy(record, portrait, NoiseStrength(INTENSITY), some, parts)
+    assert sum(one.whole.visits for one in found.visits) > 0
+    times = found.verdicts(false_alarms=0.05 / 8)["times"]
+    assert not times.tested and not times.passed and "too few hops" in times.reason
+
+
 def test_cores_keep_clear_of_the_saddle(recorded: RECORDED) -> None:
     _, record, portrait, _ = recorded
     cores = _cores_about(record.dynamics, portrait, 10.0)
