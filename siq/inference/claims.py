@@ -57,8 +57,9 @@ NOISELESS = 1e-3  # of the rms step: a state with less has no noise of its own, 
 FEWEST_PAIRS = 30  # of a recording that is compared, or of a run of samples whose spectrum is asked for
 FEWEST_PER_COLUMN = 10  # pairs for each column of a regression
 FASTEST_PERIOD = 10  # samples: faster swings are noise to a fit, whose colour is asked for elsewhere
-SHORTEST_MEMORY, MEMORY_GROWTH, LONGEST_MEMORY = 4, 2.0, 1 / 30  # samples; a ratio; of the record
+SHORTEST_MEMORY, MEMORY_GROWTH, LONGEST_MEMORY = 4, 2.0, 1 / 30  # samples; a ratio; of all samples
 OVERLAP = 0.02  # quantile between which, and one minus it, recordings share states
+RANK = 1e-8  # numerical: of the squares of a column, what is left of it by chance
 TAIL = 3.0  # standard deviations: beyond are 2.7 in 1000
 ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 
@@ -68,7 +69,7 @@ class _Residuals:
 
     `noise` are the residuals of the states that noise acts on, of variance one, less what functions of the
     state explain: ``(n, c)``. `basis` are these functions, orthonormal, ``(n, q)``; `states` are one and the
-    states, scaled, ``(n, 1 + d)``; `runs` are slices of pairs of which each begins where the last one ends.
+    states, scaled, ``(n, 1 + d)``; `runs` are slices of the pairs of a recording, one after the other; gaps between them are passed over.
     """
 
     def __init__(self, found: FieldEstimate, pairs: SnapshotPairs) -> None:
@@ -87,8 +88,7 @@ class _Residuals:
         self.basis = _orthonormal(together)
         scaled = (pairs.x0 - pairs.x0.mean(axis=0)) / positive(pairs.x0.std(axis=0))
         self.states = np.concatenate([np.ones((n, 1)), scaled], axis=1)
-        goes_on = (pairs.recording[1:] == pairs.recording[:-1]) & (pairs.xh[:-1] == pairs.x0[1:]).all(axis=1)
-        bounds = np.concatenate([[0], np.flatnonzero(~goes_on) + 1, [n]])
+        bounds = np.concatenate([[0], np.flatnonzero(np.diff(pairs.recording)) + 1, [n]])
         self.runs = [slice(int(a), int(b)) for a, b in pairwise(bounds)]
         self.noise = self._standardised(rest[:, self.noisy])
         self.neighbour = self._standardised(self.past(self.noise, 0.0, delay=1))
@@ -127,7 +127,7 @@ class _Residuals:
 
     def memories(self) -> Iterator[float]:
         """Memories to be looked at, in pairs."""
-        longest = max(run.stop - run.start for run in self.runs) * LONGEST_MEMORY
+        longest = min(max(run.stop - run.start for run in self.runs) / 2, len(self.noise) * LONGEST_MEMORY)
         memory = float(SHORTEST_MEMORY)
         while memory <= longest:
             yield memory
@@ -139,7 +139,7 @@ def _orthonormal(columns: np.ndarray) -> np.ndarray:
     sizes = np.linalg.norm(columns, axis=0)
     columns = columns[:, sizes > 0] / sizes[sizes > 0]
     values, vectors = np.linalg.eigh(columns.T @ columns)
-    kept = values > 1e-8
+    kept = values > RANK
     return np.asarray(columns @ (vectors[:, kept] / np.sqrt(values[kept])))
 
 
@@ -195,64 +195,75 @@ def check_claims(
 
 def _one_system(rest: _Residuals, labels: Sequence[str], limit: float) -> Verdict:
     numbers, index = np.unique(rest.pairs.recording, return_inverse=True)
-    counts = np.bincount(index)
-    enough = np.flatnonzero(counts >= FEWEST_PAIRS)
+    rows = np.split(np.argsort(index, kind="stable"), np.cumsum(np.bincount(index))[:-1])
     if len(numbers) < 2:
         return Verdict(0.0, -float(np.log10(limit)), True)
-    if len(enough) < 2:
-        return Verdict.not_tested(sentence(Remark("inference.recordings_too_short")))
-    # Which share states: each with the next of an order of their middles, in every state.
-    low, high = (
-        np.array([np.quantile(rest.pairs.x0[index == k], q, axis=0) for k in enough])
-        for q in (OVERLAP, 1 - OVERLAP)
-    )
-    alike = np.asarray(((low[:, None] <= high) & (low <= high[:, None])).all(axis=2))
-    group = alike[0]
-    while (alike[group].any(axis=0) & ~group).any():
-        group = alike[group].any(axis=0)
+    enough = [place for place, own in enumerate(rows) if len(own) >= FEWEST_PAIRS]
     # What each explains by itself, of the mean and of the variance; then again without the worst.
-    noise, power, apart, least = rest.noise, rest.power, list[int](), 1.0
-    while len(apart) <= len(enough) // 2:
-        chances = {}
-        for which in enough[~np.isin(enough, apart)].tolist():
-            own = index == which
+    noise, power, apart, order, least = rest.noise, rest.power, list[int](), list[int](), 1.0
+    while len(apart) <= len(numbers) // 2:
+        sums, of_power, chances = (0, np.zeros(noise.shape[1])), (0, np.zeros(noise.shape[1])), {}
+        for place, own in enumerate(rows):
+            if place in apart or len(own) <= rest.states.shape[1]:
+                continue
             mean = _explained(rest.states[own], noise[own], rest.basis[own])
-            chances[which] = 2 * min(mean, _explained(rest.states[own, :1], power[own], rest.basis[own]))
-        worst = min(chances, key=lambda which: chances[which])
-        chance = chances[worst] * len(enough)
-        least = least if apart else chance
-        if chance >= limit:
+            sums = (sums[0] + mean[0], sums[1] + mean[1])
+            if place in enough:
+                variance = _explained(rest.states[own, :1], power[own], rest.basis[own])
+                of_power = (of_power[0] + variance[0], of_power[1] + variance[1])
+                chances[place] = 2 * min(_chance(*mean), _chance(*variance)) * len(enough)
+        if not sums[0]:
+            return Verdict.not_tested(sentence(Remark("inference.recordings_too_short")))
+        single = min(chances.values(), default=1.0)
+        if not apart:
+            least = 3 * min(single, _chance(*sums), _chance(*of_power))
+            order = sorted(chances, key=lambda place: chances[place])
+        if 3 * single >= limit:
             break
-        apart.append(worst)
-        own_columns = rest.without(rest.states * (index == worst)[:, None])
+        apart.append(min(chances, key=lambda place: chances[place]))
+        columns = rest.without(rest.states * (index == apart[-1])[:, None])
         noise, power = (
             one - basis @ (basis.T @ one)
-            for one, basis in ((noise, _orthonormal(own_columns)), (power, _orthonormal(own_columns[:, :1])))
+            for one, basis in ((noise, _orthonormal(columns)), (power, _orthonormal(columns[:, :1])))
         )
-    if not apart and not group.all():
-        first, *side = (labels[numbers[which]] for which in [enough[0], *enough[~group][:3]])
-        return Verdict.not_tested(
-            sentence(Remark("inference.no_common_states", {"names": side, "first": first}))
+    if least >= limit and len(enough) > 1:
+        # Recordings are compared with those that share states with them, and these with others.
+        low, high = (
+            np.array([np.quantile(rest.pairs.x0[rows[place]], q, axis=0) for place in enough])
+            for q in (OVERLAP, 1 - OVERLAP)
         )
-    names = [labels[numbers[which]] for which in apart]
+        alike = np.asarray(((low[:, None] <= high) & (low <= high[:, None])).all(axis=2))
+        group = alike[0]
+        while (alike[group].any(axis=0) & ~group).any():
+            group = alike[group].any(axis=0)
+        if not group.all():
+            others = [labels[numbers[enough[place]]] for place in np.flatnonzero(~group)[:3]]
+            values = {"names": others, "first": labels[numbers[enough[0]]]}
+            return Verdict.not_tested(sentence(Remark("inference.no_common_states", values)))
+    names = [labels[numbers[place]] for place in apart or order[:3]]
     return _verdict("one_system", least, limit, names=names[:3], count=len(names))
 
 
-def _explained(columns: np.ndarray, rest: np.ndarray, basis: np.ndarray) -> float:
-    """Probability of what columns that vanish elsewhere explain of residuals of variance one.
+def _explained(columns: np.ndarray, rest: np.ndarray, basis: np.ndarray) -> tuple[int, np.ndarray]:
+    """How many columns that vanish elsewhere are independent; what they explain of residuals of variance one.
 
     All are given where columns do not vanish: what the basis of the state explains of them is taken off.
     """
     inner, pushed = basis.T @ columns, columns.T @ rest
     values, vectors = np.linalg.eigh(columns.T @ columns - inner.T @ inner)
-    kept = values > 1e-8 * len(columns)
-    explained = ((vectors[:, kept].T @ pushed) ** 2 / values[kept, None]).sum(axis=0)
-    chances = scipy.special.chdtrc(max(int(kept.sum()), 1), explained)
-    return min(float(chances.min()) * rest.shape[1], 1.0)
+    kept = values > RANK * len(columns)
+    return int(kept.sum()), ((vectors[:, kept].T @ pushed) ** 2 / values[kept, None]).sum(axis=0)
+
+
+def _chance(count: int, explained: np.ndarray) -> float:
+    """Probability of so much explained, of the residual of which most is, by so many columns."""
+    if not count:
+        return 1.0
+    return min(float(scipy.special.chdtrc(count, explained).min()) * len(explained), 1.0)
 
 
 def _unchanged(rest: _Residuals, limit: float) -> Verdict:
-    runs = [run for run in rest.runs if run.stop - run.start >= 2 * FASTEST_PERIOD]
+    runs = [run for run in rest.runs if run.stop - run.start >= FASTEST_PERIOD]
     if not runs:
         return Verdict.not_tested(sentence(Remark("inference.runs_too_short")))
     phi = _orthonormal(rest.states) * np.sqrt(len(rest.states))
