@@ -271,18 +271,22 @@ def _unchanged(rest: _Residuals, limit: float) -> Verdict:
     size = 2 * max(run.stop - run.start for run in runs)
     frequencies = np.arange(1, size // FASTEST_PERIOD + 1)
     octaves = np.log2(frequencies).astype(int)
-    tried = [(rest.noise, False), (products, False), (rest.power, True)]
+    sizes = np.tile(phi**2, rest.noise.shape[1])
+    tried = [(rest.noise, rest.noise**0, False), (products, sizes, False), (rest.power, rest.power**0, True)]
     price = len(tried) * (octaves[-1] + 1) * np.bincount(octaves)[octaves]
     best = (1.0, 0.0, False)
-    for series, of_noise in tried:
+    for series, size_of, of_noise in tried:
         peaks, freedom = np.zeros(len(frequencies)), np.zeros(len(frequencies))
         for run in runs:
             part = series[run]
             seen = frequencies >= size / (2 * len(part))  # half a period in the run, or more
             power = np.abs(np.fft.rfft(part, n=size, axis=0)[frequencies]) ** 2
-            peaks += np.where(seen, (power / positive((part**2).sum(axis=0) / 2)).sum(axis=1), 0.0)
+            peaks += np.where(seen, (2 * power / positive(size_of[run].sum(axis=0))).sum(axis=1), 0.0)
             freedom += 2 * series.shape[1] * seen
-        chances = scipy.special.chdtrc(np.maximum(freedom, 1), peaks) * price
+        # The variance of a peak of n samples is larger by the share of their fourth cumulant over n.
+        excess = float(((series**4).mean(axis=0) / (series**2).mean(axis=0) ** 2).max() - 3)
+        wider = 1 + max(excess, 0.0) * len(runs) / sum(run.stop - run.start for run in runs)
+        chances = scipy.special.chdtrc(np.maximum(freedom, 1) / wider, peaks / wider) * price
         place = int(np.argmin(chances))
         best = min(best, (float(chances[place]), size / float(frequencies[place]), of_noise))
     chance, period, of_noise = best

@@ -43,7 +43,7 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from siq.data.preparation import joined
-from siq.data.recordings import Recordings
+from siq.data.recordings import LONGEST_STEP, Recordings
 from siq.data.stationarity import correlated_samples, runs_of, usual_step
 from siq.data.two_states import (
     BINS,
@@ -88,6 +88,7 @@ MIN_INDEPENDENT_SAMPLES = 20  # fewer say nothing of a distribution
 COMPARED_PLACES = 200  # at which distribution functions are compared
 MEAN_DISTANCE = 0.8687  # of Kolmogorov's statistic: √(π/2) ln 2
 POWER = 0.8  # probability with which a disagreement would have been noticed
+USUAL_GAPS = 0.9  # quantile of the times between samples
 LEAST_POWER = 10.0  # the factor of a time: a record that would not have shown it tests no times (a choice)
 
 
@@ -472,12 +473,17 @@ class OccupancyCheck:
 
 
 def _passages_of(
-    portrait: PhasePortrait, recordings: Recordings, runs: list[slice], visits: np.ndarray
+    portrait: PhasePortrait, recordings: Recordings, cores: _Cores
 ) -> tuple[tuple[int, ...], ...]:
     """How often a record went from one well into the core of another.
 
-    Where a run of samples begins outside all cores, it begins in the well that f leads to.
+    Where a run of samples begins outside all cores, it begins in the well that f leads to. Gaps as they are
+    usual, as between pairs of samples, end no run.
     """
+    gaps = np.diff(recordings.t)[np.diff(recordings.recording) == 0]
+    usual = LONGEST_STEP * float(np.quantile(gaps, USUAL_GAPS)) if len(gaps) else None
+    runs = runs_of(recordings, longest=usual)
+    visits = continued_visits(_core_of(cores, recordings.values), runs)
     counts = np.zeros((len(portrait.attractors),) * 2, dtype=int)
     starts, ends = portrait.descents.paths[:, 0], portrait.descents.ends
     width = positive(np.ptp(portrait.box, axis=1))
@@ -532,7 +538,7 @@ def check_occupancy(
     cores = _cores_about(found.dynamics, portrait, noise.intensity)
     runs, whole_runs = runs_of(recordings), runs_of(joined(recordings))
     visits = continued_visits(_core_of(cores, recordings.values), whole_runs)
-    passages = _passages_of(portrait, recordings, whole_runs, visits)
+    passages = _passages_of(portrait, joined(recordings), cores)
     states = len(portrait.attractors)
     whole = DwellCount.of_visits(recordings.t, visits, whole_runs, states=states)
     if found.dynamics.dimension not in CELLS and not any(one.visits for one in whole):
