@@ -16,7 +16,7 @@ of the past alone, and then the products ``G z`` are martingale differences, wha
     Each recording by itself: a constant, and slopes in the states. Likewise of ``z² - 1``, for D. Recordings
     that share no states cannot be compared.
 ``unchanged``
-    Cosines and sines of time, and these times the states, from half a period in a recording to ten samples.
+    Cosines and sines of time, and these times the states, from half a period in a recording to two samples.
     The highest peak of the periodograms of z, of ``φ(x) z`` and of ``z² - 1`` counts. Each octave of
     frequencies is as likely to hold one, and so the price of a peak is the number of octaves times that of
     frequencies in its own.
@@ -25,8 +25,8 @@ of the past alone, and then the products ``G z`` are martingale differences, wha
     and of ``φ(x) z``, which follow what a hidden variable does to the force. A hidden variable that changes D
     shows in those of ``z² - 1``.
 ``gaussian_increments``
-    The largest residual, and how many are beyond three; and values, or steps, that repeat themselves more
-    often than rounding lets them.
+    The largest residual, and how many are beyond three; values, or steps, that repeat themselves more often
+    than rounding lets them; and stretches that stand in the record twice.
 
 Of the neighbouring residual `siq.inference.checks` judges, which knows sensors and rounding: what it explains
 is left out here, and the past begins two steps back.
@@ -54,13 +54,15 @@ from siq.remarks import Remark, sentence
 
 STATE_BINS = 12  # of each state: what any function of it explains is no memory, and no change
 NOISELESS = 1e-3  # of the rms step: a state with less has no noise of its own, and its residuals say nothing
-FEWEST_PAIRS = 30  # of a recording that is compared, or of a run of samples whose spectrum is asked for
+FEWEST_PAIRS = 30  # of a recording that is compared by itself
 FEWEST_PER_COLUMN = 10  # pairs for each column of a regression
-FASTEST_PERIOD = 10  # samples: faster swings are noise to a fit, whose colour is asked for elsewhere
+FASTEST_PERIOD = 2  # samples
+FEWEST_OF_SPECTRUM = 10  # pairs of a run whose spectrum is asked for
 SHORTEST_MEMORY, MEMORY_GROWTH, LONGEST_MEMORY = 4, 2.0, 1 / 30  # samples; a ratio; of all samples
 OVERLAP = 0.02  # quantile between which, and one minus it, recordings share states
 RANK = 1e-8  # numerical: of the squares of a column, what is left of it by chance
 TAIL = 3.0  # standard deviations: beyond are 2.7 in 1000
+COPIED = 12  # samples of a stretch that is sought a second time
 ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 
 
@@ -69,7 +71,8 @@ class _Residuals:
 
     `noise` are the residuals of the states that noise acts on, of variance one, less what functions of the
     state explain: ``(n, c)``. `basis` are these functions, orthonormal, ``(n, q)``; `states` are one and the
-    states, scaled, ``(n, 1 + d)``; `runs` are slices of the pairs of a recording, one after the other; gaps between them are passed over.
+    states, scaled, ``(n, 1 + d)``; `runs` are slices of the pairs of a recording, one after the other; gaps
+    between them are passed over.
     """
 
     def __init__(self, found: FieldEstimate, pairs: SnapshotPairs) -> None:
@@ -263,7 +266,7 @@ def _chance(count: int, explained: np.ndarray) -> float:
 
 
 def _unchanged(rest: _Residuals, limit: float) -> Verdict:
-    runs = [run for run in rest.runs if run.stop - run.start >= FASTEST_PERIOD]
+    runs = [run for run in rest.runs if run.stop - run.start >= FEWEST_OF_SPECTRUM]
     if not runs:
         return Verdict.not_tested(sentence(Remark("inference.runs_too_short")))
     phi = _orthonormal(rest.states) * np.sqrt(len(rest.states))
@@ -334,5 +337,14 @@ def _gaussian(rest: _Residuals, recordings: Recordings, limit: float) -> Verdict
             count = int(repeated.sum())
             usual = len(moves) * min(width / (np.sqrt(2 * np.pi) * spread), 1.0)
             chances.append((float(scipy.special.gammainc(count, usual)), kind, count / len(moves)))
+        # Stretches of so many samples are the same by chance where each step is, and where they begin.
+        scale, begins = width / (2 * np.sqrt(np.pi) * size), np.arange(len(x) - COPIED + 1)
+        begins = begins[recordings.recording[begins] == recordings.recording[begins + COPIED - 1]]
+        weights = np.random.default_rng(0).standard_normal(COPIED)
+        marks = np.convolve(x - x.mean(), weights[::-1], mode="valid")[begins]
+        moved = np.ptp(x[begins[:, None] + np.arange(COPIED)], axis=1) > ALIKE * size
+        count = int(moved.sum()) - len(np.unique(marks[moved]))
+        usual = len(begins) ** 2 / 2 * min(scale, 1.0) ** (COPIED - 1)
+        chances.append((float(scipy.special.gammainc(count, usual)), "copied", count / max(len(begins), 1)))
     chance, kind, value = min(chances)
     return _verdict("gaussian_increments", chance * len(chances), limit, kind=kind, value=value)

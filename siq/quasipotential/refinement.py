@@ -288,6 +288,11 @@ class RefinementContext:
             recordings = filtered_recordings(found, recordings, pair_step=pair_step)
         pairs = snapshot_pairs(recordings, pair_step=pair_step)
         held, x = mask[pairs.recording], pairs.x0
+        if held.all() or not held.any():
+            raise NumericalFailure(
+                "the samples of some recordings are so much closer than those of others that these make no"
+                " pairs, and nothing is held out; give recordings of one time between samples"
+            )
         draw = generator(seed, number, Purpose.REFINE)
         self.points = x[~held][evenly_spread(x[~held], generator=draw)]
         self.held_out = x[held][evenly_spread(x[held], generator=draw)]

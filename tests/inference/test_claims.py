@@ -139,7 +139,8 @@ def test_noise_that_is_not_gaussian_is_noticed() -> None:
     for begin in generator.integers(0, 7900, 30):
         held[begin : begin + 5] = held[begin]
         filled[begin : begin + 6] = np.linspace(filled[begin], filled[begin + 5], 6)
-    for record in (jumped, held, filled):
+    copied = np.concatenate([seen, seen[1000:2000]])
+    for record in (jumped, held, filled, copied):
         assert not claims(record)["gaussian_increments"].passed
     rounded = claims(np.round(seen, 3))["gaussian_increments"]
     assert rounded.passed
