@@ -46,6 +46,8 @@ MAX_STEPS = 5000  # between two samples; what is faster than that between sample
 RUNAWAY_WIDTHS = 1e3  # widths of the recorded states: so far off a prediction has run away
 # prediction, descent, one_system, unchanged, state_complete, gaussian_increments, times, record
 CHANCE_TESTS = 8
+COPIED = 12  # samples of a stretch that is sought a second time
+ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 UNPREDICTED = "f does not predict held-out recordings"
 
 
@@ -230,6 +232,47 @@ def rounding_text(recordings: Recordings, *, coarse: bool = False) -> str | None
         new = {"names": [], "step": step, "unit": behind, "decimals": decimals_of(step), "error": error}
         alike.setdefault((step, behind), new)["names"].append(f"'{name}'")
     return sentence(Remark("inference.written", {"steps": list(alike.values())})) if alike else None
+
+
+def repetitions(recordings: Recordings, column: int) -> list[tuple[float, str, float]]:
+    """Values of a noisy state that repeat themselves: the probability of so many, their kind, their share.
+
+    ``held``: equal to the one before. ``straight``: steps that are. ``copied``: stretches of `COPIED` samples
+    that stand in the recordings twice. What rounding to a resolution step makes of it is allowed for.
+    """
+    x, which = recordings.values[:, column], recordings.recording
+    same, moves = np.diff(which) == 0, np.diff(x)
+    size = float(np.sqrt((moves[same] ** 2).mean())) if same.any() else 0.0
+    if len(x) <= COPIED or not size > 0:
+        return []
+    step = resolution_step(x)
+    found, width = [], ALIKE * size if step is None else step
+    held, straight = np.abs(moves) < ALIKE * size, np.abs(np.diff(moves)) < ALIKE * size
+    for kind, repeated, spread in (
+        ("held", held & same, size),
+        ("straight", straight & same[1:] & same[:-1], np.sqrt(2) * size),
+    ):
+        count, usual = int(repeated.sum()), len(moves) * min(width / (np.sqrt(2 * np.pi) * spread), 1.0)
+        found.append((float(scipy.special.gammainc(count, usual)), kind, count / len(moves)))
+    # A stretch is another one by chance where each of its steps is.
+    begins = np.arange(len(x) - COPIED + 1)
+    begins = begins[which[begins] == which[begins + COPIED - 1]]
+    weights = np.random.default_rng(0).standard_normal(COPIED)
+    marks = np.convolve(x - x.mean(), weights, mode="valid")[begins]
+    moved = np.ptp(x[begins[:, None] + np.arange(COPIED)], axis=1) > ALIKE * size
+    count = int(moved.sum()) - len(np.unique(marks[moved]))
+    alike = min(width / (2 * np.sqrt(np.pi) * size), 1.0) ** (COPIED - 1)
+    chance = float(scipy.special.gammainc(count, len(begins) ** 2 / 2 * alike))
+    return [*found, (chance, "copied", count / max(len(begins), 1))]
+
+
+def repeated_text(recordings: Recordings, *, limit: float) -> str | None:
+    """What repeats itself in a recording more often than chance lets it with a probability, in words."""
+    for column, name in enumerate(recordings.titles):
+        chance, kind, share = min(repetitions(recordings, column), default=(1.0, "", 0.0))
+        if chance < limit:
+            return sentence(Remark("inference.repeated", {"kind": kind, "value": share, "state": name}))
+    return None
 
 
 def unexplained_probability(

@@ -42,10 +42,9 @@ import numpy as np
 import scipy.signal
 import scipy.special
 
-from siq.data.correlation import resolution_step
 from siq.data.preparation import joined
 from siq.data.recordings import Recordings, SnapshotPairs, parent_recordings, snapshot_pairs
-from siq.inference.checks import unexplained_probability
+from siq.inference.checks import repetitions, unexplained_probability
 from siq.inference.diffusion_model import process_noise_increments
 from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.inference.regression import coarse_pairs, residuals
@@ -63,8 +62,6 @@ OVERLAP = 0.02  # quantile between which, and one minus it, recordings share sta
 RANK = 1e-8  # numerical: of the squares of a column, what is left of it by chance
 TAIL = 3.0  # standard deviations: beyond are 2.7 in 1000
 HARMLESS_CHANGE = 0.01  # of a barrier
-COPIED = 12  # samples of a stretch that is sought a second time
-ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 
 
 class _Residuals:
@@ -286,7 +283,7 @@ def _unchanged(rest: _Residuals, limit: float) -> Verdict:
     for series, size_of, of_noise in tried:
         peaks, freedom = np.zeros(len(frequencies)), np.zeros(len(frequencies))
         for run in runs:
-            part = series[run]
+            part = series[run] - (series[run].mean(axis=0) if len(runs) > 1 else 0.0)  # an offset is no swing
             seen = frequencies >= size / (2 * len(part))  # half a period in the run, or more
             power = np.abs(np.fft.rfft(part, n=size, axis=0)[frequencies]) ** 2
             peaks += np.where(seen, (2 * power / positive(size_of[run].sum(axis=0))).sum(axis=1), 0.0)
@@ -335,26 +332,6 @@ def _gaussian(rest: _Residuals, recordings: Recordings, limit: float) -> Verdict
     count = int((np.abs(noise) > TAIL).sum())
     chances.append((float(scipy.special.gammainc(count, beyond(TAIL))), "tails", count / beyond(TAIL)))
     for column in np.flatnonzero(rest.noisy[: recordings.values.shape[1]]):
-        x, step = recordings.values[:, column], resolution_step(recordings.values[:, column])
-        same = np.diff(recordings.recording) == 0
-        moves = np.diff(x)
-        size = float(np.sqrt((moves[same] ** 2).mean()))
-        width = ALIKE * size if step is None else step
-        for kind, repeated, spread in (
-            ("held", (np.abs(moves) < ALIKE * size) & same, size),
-            ("straight", (np.abs(np.diff(moves)) < ALIKE * size) & same[1:] & same[:-1], np.sqrt(2) * size),
-        ):
-            count = int(repeated.sum())
-            usual = len(moves) * min(width / (np.sqrt(2 * np.pi) * spread), 1.0)
-            chances.append((float(scipy.special.gammainc(count, usual)), kind, count / len(moves)))
-        # Stretches of so many samples are the same by chance where each step is, and where they begin.
-        scale, begins = width / (2 * np.sqrt(np.pi) * size), np.arange(len(x) - COPIED + 1)
-        begins = begins[recordings.recording[begins] == recordings.recording[begins + COPIED - 1]]
-        weights = np.random.default_rng(0).standard_normal(COPIED)
-        marks = np.convolve(x - x.mean(), weights[::-1], mode="valid")[begins]
-        moved = np.ptp(x[begins[:, None] + np.arange(COPIED)], axis=1) > ALIKE * size
-        count = int(moved.sum()) - len(np.unique(marks[moved]))
-        usual = len(begins) ** 2 / 2 * min(scale, 1.0) ** (COPIED - 1)
-        chances.append((float(scipy.special.gammainc(count, usual)), "copied", count / max(len(begins), 1)))
+        chances += repetitions(recordings, int(column))
     chance, kind, value = min(chances)
     return _verdict("gaussian_increments", chance * len(chances), limit, kind=kind, value=value)

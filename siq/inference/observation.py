@@ -260,7 +260,7 @@ def unbroken(recordings: Recordings, *, pair_step: float | None = None, every: i
 
 
 @dataclass(frozen=True)
-class InertiaTest:
+class _InertiaTest:
     """The test of the inertia of one recorded position.
 
     The gain is the log-likelihood of the model with inertia over that without, at Schwarz's price, its error
@@ -303,7 +303,7 @@ class InertiaTest:
 
 def inertia_test(
     recordings: Recordings, *, degree: int = 5, pair_step: float | None = None, limit: bool = True
-) -> InertiaTest:
+) -> _InertiaTest:
     """Ask recordings of one position whether it has inertia, with powers of x up to a degree in F.
 
     Where no inertia is seen a limit of γ may be searched for; if not, γ means nothing there.
@@ -319,7 +319,7 @@ def inertia_test(
     friction, fastest = float(best.model.values[-1]), MAX_FRICTION / models.step
     shown = best.converged and not best.fault and 0 < friction < fastest
     if not (shown or limit):
-        return InertiaTest(0.0, np.inf, 0.0, None, 0.0, np.nan, np.nan, models.step)
+        return _InertiaTest(0.0, np.inf, 0.0, None, 0.0, np.nan, np.nan, models.step)
     frequency, error = np.nan, np.nan
     if shown:
         stiffness, error = models.stiffness(best.model.values[:-1], best.covariance[:-1, :-1])
@@ -328,7 +328,7 @@ def inertia_test(
     else:
         friction, best = fastest, models.with_friction(fastest)
     relaxation = models.stiffness(models.without.model.values, models.without.covariance)[0]
-    test = InertiaTest(
+    test = _InertiaTest(
         *models.compared(best), friction, float(best.standard_errors[-1]), relaxation, frequency, error,
         models.step,
     )  # fmt: skip
