@@ -67,10 +67,10 @@ HARMLESS_CHANGE = 0.01  # of a barrier
 class _Residuals:
     """White residuals of pairs, with what is known where each begins.
 
-    `noise` are the residuals of the states that noise acts on, of variance one, less what functions of the
-    state explain: ``(n, c)``. `basis` are these functions, orthonormal, ``(n, q)``; `states` are one and the
-    states, scaled, ``(n, 1 + d)``; `runs` are slices of the pairs of a recording, one after the other; gaps
-    between them are passed over.
+    `noise` are the residuals of the states that noise acts on, uncorrelated, of variance one, less what
+    functions of the state explain: ``(n, c)``. `basis` are these functions, orthonormal, ``(n, q)``; `states`
+    are one and the states, scaled, ``(n, 1 + d)``; `runs` are slices of the pairs of a recording, one after
+    the other; gaps between them are passed over.
     """
 
     def __init__(self, found: FieldEstimate, pairs: SnapshotPairs) -> None:
@@ -81,6 +81,8 @@ class _Residuals:
             rest, force = (np.einsum("nij,nj->ni", whitening, one) for one in (rest, force))
         moved = np.sqrt(((pairs.xh - pairs.x0) ** 2 / pairs.h[:, None]).mean(axis=0))
         self.noisy = np.sqrt((rest**2).mean(axis=0)) > NOISELESS * moved
+        if found.hidden_velocities:  # there is one innovation for each position
+            self.noisy[found.library.dimension // 2 :] = False
         shares = (force**2).mean(axis=0)[self.noisy] / (rest**2).mean(axis=0)[self.noisy]
         self.drift = float(shares.max(initial=0.0))  # of the squares of steps, over that of the noise
         self.pairs, n = pairs, len(pairs.h)
@@ -95,7 +97,8 @@ class _Residuals:
         self.states = np.concatenate([np.ones((n, 1)), scaled], axis=1)
         bounds = np.concatenate([[0], np.flatnonzero(np.diff(pairs.recording)) + 1, [n]])
         self.runs = [slice(int(a), int(b)) for a, b in pairwise(bounds)]
-        self.noise = self._standardised(rest[:, self.noisy])
+        self.noise = self.without(rest[:, self.noisy])
+        self.noise = _orthonormal(self.noise) * np.sqrt(n)
         self.neighbour = self._standardised(self.past(self.noise, 0.0, delay=1))
         self.power = self._standardised(self.noise**2 - 1)
 
@@ -271,23 +274,22 @@ def _unchanged(rest: _Residuals, limit: float) -> Verdict:
     runs = [run for run in rest.runs if run.stop - run.start >= FEWEST_OF_SPECTRUM]
     if not runs:
         return Verdict.not_tested(sentence(Remark("inference.runs_too_short")))
-    phi = _orthonormal(rest.states) * np.sqrt(len(rest.states))
-    products = (rest.noise[:, :, None] * phi[:, None, :]).reshape(len(phi), -1)
     size = 2 * max(run.stop - run.start for run in runs)
     frequencies = np.arange(1, size // FASTEST_PERIOD + 1)
     octaves = np.log2(frequencies).astype(int)
-    sizes = np.tile(phi**2, rest.noise.shape[1])
-    tried = [(rest.noise, rest.noise**0, False), (products, sizes, False), (rest.power, rest.power**0, True)]
+    one = rest.states[:, :1]
+    tried = [(rest.noise, one, False), (rest.noise, rest.states, False), (rest.power, one, True)]
     price = len(tried) * (octaves[-1] + 1) * np.bincount(octaves)[octaves]
     best = (1.0, 0.0, False)
-    for series, size_of, of_noise in tried:
+    for series, shapes, of_noise in tried:
         peaks, freedom = np.zeros(len(frequencies)), np.zeros(len(frequencies))
         for run in runs:
             part = series[run] - (series[run].mean(axis=0) if len(runs) > 1 else 0.0)  # an offset is no swing
+            products = (part[:, :, None] * _orthonormal(shapes[run])[:, None, :]).reshape(len(part), -1)
             seen = frequencies >= size / (2 * len(part))  # half a period in the run, or more
-            power = np.abs(np.fft.rfft(part, n=size, axis=0)[frequencies]) ** 2
-            peaks += np.where(seen, (2 * power / positive(size_of[run].sum(axis=0))).sum(axis=1), 0.0)
-            freedom += 2 * series.shape[1] * seen
+            power = np.abs(np.fft.rfft(products, n=size, axis=0)[frequencies]) ** 2
+            peaks += np.where(seen, 2 * power.sum(axis=1), 0.0)
+            freedom += 2 * products.shape[1] * seen
         # The variance of a peak of n samples is larger by the share of their fourth cumulant over n.
         excess = float(((series**4).mean(axis=0) / (series**2).mean(axis=0) ** 2).max() - 3)
         wider = 1 + max(excess, 0.0) * len(runs) / sum(run.stop - run.start for run in runs)
