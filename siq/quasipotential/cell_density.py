@@ -165,7 +165,7 @@ class SampledPotential:
         least = scipy.ndimage.minimum_filter(lowest, footprint=around, mode="nearest")
         return np.where(known, np.inf, least)
 
-    def density(self, coarse: SampledPotential, lowest: np.ndarray, *, intensity: float) -> KnownDensity:
+    def density(self, coarse: SampledPotential, lowest: np.ndarray, *, intensity: float) -> _KnownDensity:
         """The density for one ε, in the unit of U.
 
         U on cells twice as wide tells how accurate the integral is; `lowest` has what it cannot be below in
@@ -192,7 +192,7 @@ class SampledPotential:
         shares = np.bincount(self.well[self.known], weights[self.known], minlength=self.wells)
         normalisation = float(total * np.exp(-bottom / intensity))
         unknown = elsewhere / (elsewhere + float(total))
-        return KnownDensity(
+        return _KnownDensity(
             self, intensity, normalisation, change, unknown, weights / weights.sum(), shares / shares.sum()
         )
 
@@ -219,7 +219,7 @@ class SampledPotential:
 
 
 @dataclass(frozen=True)
-class KnownDensity:
+class _KnownDensity:
     """``exp(-U/ε)/Z`` where U is known, and how much of all probability lies elsewhere at most.
 
     Attributes
