@@ -44,6 +44,10 @@ COARSE_ROUNDING = 0.05  # of the rms step of a state: rounding to less than that
 STEP_ACCURACY = 0.05  # step times the norm of the Jacobian, per step of the integrator
 MAX_STEPS = 5000  # between two samples; what is faster than that between samples is not what was recorded
 RUNAWAY_WIDTHS = 1e3  # widths of the recorded states: so far off a prediction has run away
+# prediction, descent, one_system, unchanged, state_complete, gaussian_increments, times, record
+CHANCE_TESTS = 8
+COPIED = 12  # samples of a stretch that is sought a second time
+ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 UNPREDICTED = "f does not predict held-out recordings"
 
 
@@ -59,13 +63,18 @@ class PredictionLimits:
         Mean square of the residuals of f on held-out recordings over that on its own, for recordings with
         noise. The default, a tenth more, is what a systematic error of √0.1 of the noise adds.
     false_alarms
-        Probability with which the noise alone refuses what is right; `descent` has it too. The default is
-        one in ten thousand runs.
+        Probability with which a whole certificate is refused by chance where everything is right. The tests
+        that chance can refuse share it evenly, see `each`.
     """
 
     prediction: Annotated[float, Field(gt=0)] = 0.01
     held_out_ratio: Annotated[float, Field(gt=1)] = 1.1
-    false_alarms: Annotated[float, Field(gt=0, lt=0.5)] = 1e-4
+    false_alarms: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
+
+    @property
+    def each(self) -> float:
+        """Probability with which one of `CHANCE_TESTS` refuses what is right (Bonferroni)."""
+        return self.false_alarms / CHANCE_TESTS
 
 
 def residual_noise(
@@ -225,12 +234,54 @@ def rounding_text(recordings: Recordings, *, coarse: bool = False) -> str | None
     return sentence(Remark("inference.written", {"steps": list(alike.values())})) if alike else None
 
 
+def repetitions(recordings: Recordings, column: int) -> list[tuple[float, str, float]]:
+    """Values of a noisy state that repeat themselves: the probability of so many, their kind, their share.
+
+    ``held``: equal to the one before. ``straight``: steps that are. ``copied``: stretches of `COPIED` samples
+    that stand in the recordings twice. What rounding to a resolution step makes of it is allowed for.
+    """
+    x, which = recordings.values[:, column], recordings.recording
+    same, moves = np.diff(which) == 0, np.diff(x)
+    size = float(np.sqrt((moves[same] ** 2).mean())) if same.any() else 0.0
+    if len(x) <= COPIED or not size > 0:
+        return []
+    step = resolution_step(x)
+    found, width = [], ALIKE * size if step is None else step
+    held, straight = np.abs(moves) < ALIKE * size, np.abs(np.diff(moves)) < ALIKE * size
+    for kind, repeated, spread in (
+        ("held", held & same, size),
+        ("straight", straight & same[1:] & same[:-1], np.sqrt(2) * size),
+    ):
+        count, usual = int(repeated.sum()), len(moves) * min(width / (np.sqrt(2 * np.pi) * spread), 1.0)
+        found.append((float(scipy.special.gammainc(count, usual)), kind, count / len(moves)))
+    # A stretch is another one by chance where each of its steps is.
+    begins = np.arange(len(x) - COPIED + 1)
+    begins = begins[which[begins] == which[begins + COPIED - 1]]
+    weights = np.random.default_rng(0).standard_normal(COPIED)
+    marks = np.convolve(x - x.mean(), weights, mode="valid")[begins]
+    moved = np.ptp(x[begins[:, None] + np.arange(COPIED)], axis=1) > ALIKE * size
+    count = int(moved.sum()) - len(np.unique(marks[moved]))
+    alike = min(width / (2 * np.sqrt(np.pi) * size), 1.0) ** (COPIED - 1)
+    chance = float(scipy.special.gammainc(count, len(begins) ** 2 / 2 * alike))
+    return [*found, (chance, "copied", count / max(len(begins), 1))]
+
+
+def repeated_text(recordings: Recordings, *, limit: float) -> str | None:
+    """What repeats itself in a recording more often than chance lets it with a probability, in words."""
+    for column, name in enumerate(recordings.titles):
+        chance, kind, share = min(repetitions(recordings, column), default=(1.0, "", 0.0))
+        if chance < limit:
+            return sentence(Remark("inference.repeated", {"kind": kind, "value": share, "state": name}))
+    return None
+
+
 def unexplained_probability(
     columns: np.ndarray,
     rest: np.ndarray,
     *,
     freedom: int | None = None,
     variance: np.ndarray | None = None,
+    inflation: float = 1.0,
 ) -> float:
     """Probability of residuals having no part left that columns explain: tiny where f misses a term.
 
@@ -245,9 +296,12 @@ def unexplained_probability(
         Degrees of freedom of the residuals, n by default.
     variance
         Of each of the r residuals, shape ``(r,)``, where it is known.
+    inflation
+        By how much more columns explain of residuals that were not fitted: 1 + n/m, where the columns were
+        fitted to m others, whose errors these have as well.
     """
     basis = np.linalg.qr(columns / positive(np.linalg.norm(columns, axis=0)))[0]
-    explained, count = ((basis.T @ rest) ** 2).sum(axis=0), columns.shape[1]
+    explained, count = ((basis.T @ rest) ** 2).sum(axis=0) / inflation, columns.shape[1]
     if variance is not None:
         probability = scipy.special.chdtrc(count, explained / variance)
     else:
@@ -260,24 +314,26 @@ def unexplained_probability(
 def mean_residual_probability(found: FieldEstimate, pairs: SnapshotPairs, *, seen: int = 0) -> float:
     """Probability of the residuals of held-out pairs having no mean left that f's library could express.
 
-    Of `LaggedPairs` the number of pairs `seen` that f was fitted to counts: its own error adds the share
-    ``len(pairs.h)/seen`` to their residuals at most.
+    The number of pairs `seen` that f was fitted to counts, if it is known: its own error adds the share
+    ``len(pairs.h)/seen`` to what the library explains of their residuals, at most.
     """
-    library = found.library
+    library, inflation = found.library, 1 + (len(pairs.h) / seen if seen else 0.0)
     if isinstance(pairs, LaggedPairs):
         rest = residuals(found, pairs)
         spread = np.diag(found.noise_rate) * float(np.median(pairs.h)) * copies(pairs)
-        variance = spread * (1 + len(rest) / seen)
-        return unexplained_probability(pairs.directions(library), rest, variance=variance)
+        return unexplained_probability(pairs.directions(library), rest, variance=spread, inflation=inflation)
     # Copies of resampled recordings would count as evidence that there is not.
     _, single = np.unique(np.column_stack([pairs.x0, pairs.xh]), axis=0, return_index=True)
     pairs = pairs.take(single)
     if not found.diffusion.constant:
         triangle = weighted_triangle(found, pairs, None, of_rest=True)[0]
         freedom = len(pairs.h) * library.dimension
-        return unexplained_probability(triangle[:, :-1], triangle[:, -1:], freedom=freedom)
+        return unexplained_probability(
+            triangle[:, :-1], triangle[:, -1:], freedom=freedom, inflation=inflation
+        )
     weight = np.sqrt(pairs.h)[:, None]
-    return unexplained_probability(library.evaluate(pairs.x0) * weight, residuals(found, pairs) / weight)
+    columns, rest = library.evaluate(pairs.x0) * weight, residuals(found, pairs) / weight
+    return unexplained_probability(columns, rest, inflation=inflation)
 
 
 def predict(dynamics: Dynamics, recordings: Recordings) -> np.ndarray:
@@ -346,7 +402,7 @@ def check_prediction(
         return Verdict.of(float(np.median(errors)), limits.prediction, UNPREDICTED)
     assert mean_probability is not None
     value, limit = max(held_out_ratio - 1, 0.0), limits.held_out_ratio - 1
-    rarity, rare = -float(np.log10(max(mean_probability, 1e-300))), -float(np.log10(limits.false_alarms))
+    rarity, rare = -float(np.log10(max(mean_probability, 1e-300))), -float(np.log10(limits.each))
     if value <= limit and not rarity <= rare:
         reason = (
             "the residuals of f on held-out recordings have a mean, of a probability of"

@@ -184,12 +184,16 @@ class NoiseFormula:
 
 @dataclass(frozen=True)
 class Verdict:
-    """One test: the figure, its limit, the verdict, and what it means in words."""
+    """One test: the figure, its limit, the verdict, and what it means in words.
+
+    What could not be tested has not `passed`, and has not failed either; the reason says why.
+    """
 
     value: float
     limit: float
     passed: bool
     reason: str = ""
+    tested: bool = True
 
     def as_data(self) -> dict[str, Any]:
         """As it is stored; a figure that is not finite becomes null."""
@@ -207,10 +211,21 @@ class Verdict:
         """A test that cannot be made, or fails without a figure."""
         return cls(np.inf, limit, False, reason)
 
+    @classmethod
+    def of_probability(cls, probability: float, limit: float, reason: str = "") -> Verdict:
+        """Passed where chance makes a figure so likely; the figures are powers of ten below 1."""
+        rarity = -float(np.log10(min(max(probability, 1e-300), 1.0)))
+        return cls.of(rarity, -float(np.log10(limit)), reason)
+
+    @classmethod
+    def not_tested(cls, reason: str) -> Verdict:
+        """What the recordings could neither bear out nor refute, and why."""
+        return cls(np.inf, 0.0, False, reason, tested=False)
+
     @staticmethod
     def worst(verdicts: Sequence[Verdict]) -> Verdict:
         """Of several verdicts of one test the one that decides."""
-        return max(verdicts, key=lambda one: (not one.passed, one.value / (one.limit or 1.0)))
+        return max(verdicts, key=lambda one: (not one.passed, one.tested, one.value / (one.limit or 1.0)))
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any]) -> Verdict:

@@ -31,6 +31,7 @@ from siq.inference.checks import (
     mean_residual_probability,
     neighbour_correlations,
     prediction_errors,
+    repeated_text,
     residual_noise,
     rounding_text,
 )
@@ -154,6 +155,8 @@ def identify(
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         rounding = rounding_text(recordings, coarse=True)
         reason = str(error) if rounding is None else f"{error}; mind that {rounding}"
+        if (repeated := repeated_text(recordings, limit=case.limits.each)) is not None:
+            reason = f"{reason}; {repeated}"
         advice = case.advice(hidden=hidden)
         raise NumericalFailure(reason if advice is None else f"{reason}; {advice}") from error
 

@@ -288,7 +288,9 @@ def held_out_innovations(
     if white.degrees_of_freedom <= white.columns.shape[1]:
         return 1.0, 1.0
     rest, freedom = white.innovations, white.degrees_of_freedom
-    probability = unexplained_probability(white.columns, rest[:, None], freedom=freedom)
+    probability = unexplained_probability(
+        white.columns, rest[:, None], freedom=freedom, inflation=1 + freedom / fit.degrees_of_freedom
+    )
     return probability, float(rest @ rest) / freedom / (fit.sum_of_squares / fit.degrees_of_freedom)
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -48,6 +48,7 @@ from siq.systems.equilibria import hessian_at
 from siq.systems.formulas import compile_formulas
 from siq.systems.phase_portrait import PhasePortrait, RecordedRegion
 
+OF_TIMES = ("times",)  # what answers on times rest on, and nothing else does
 INDEPENDENT = ("characteristics",)  # tests of V that share nothing with a fit of V but f and D
 GO_WITHOUT = "or do without them: 'refinement: {routes: [local]}'"
 ALONE = f"only one of the two routes that the study names led to V; train other networks, {GO_WITHOUT}"
@@ -87,13 +88,33 @@ class Certificate:
 
     @property
     def certified(self) -> bool:
-        """Whether every test passed, one of them an independent one."""
-        return bool(self.independent) and all(verdict.passed for verdict in self.tests.values())
+        """Whether every claim was tested and passed, one test an independent one; times apart.
+
+        Where the record is too short to test times, these are not `times_certified`, and the rest may be.
+        """
+        needed = [one for name, one in self.tests.items() if one.tested or name not in OF_TIMES]
+        return bool(self.independent) and all(verdict.passed for verdict in needed)
+
+    @property
+    def times_certified(self) -> bool:
+        """Whether times are: the record could have shown that they are wrong, and did not."""
+        return self.certified and all(self.tests[name].passed for name in OF_TIMES if name in self.tests)
+
+    def with_tests(self, tests: Mapping[str, Verdict]) -> Certificate:
+        """With further tests; the reason says which of them refused it, or could not be made."""
+        further = [
+            one.reason
+            for name, one in tests.items()
+            if not (one.passed or (name in OF_TIMES and not one.tested))
+        ]
+        reason = "; ".join(dict.fromkeys(one for one in (self.reason, *further) if one))
+        return replace(self, tests={**self.tests, **tests}, reason=reason)
 
     def as_data(self) -> dict[str, Any]:
         """As it stands in model.json."""
         return {
             "certified": self.certified,
+            "times_certified": self.times_certified,
             "scope": self.scope,
             "stated_error": float(self.error) if np.isfinite(self.error) else None,
             "reason": self.reason,

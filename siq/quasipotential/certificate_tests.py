@@ -16,8 +16,10 @@ without it.
 `agreement`        the networks' own V is the same within the errors of both: two routes from the same
                    recordings, see `siq.quasipotential.certificate.check_agreement`
 `prediction`       f predicts held-out recordings, and its residuals are white
-`record`           held-out recordings hop, and are spread, as f and D say (`occupancy`). Only
-                   where they show process noise and two states, and where they hop or should
+`connected`        recordings passed from well to well, where they show process noise (`occupancy`)
+`times`            they hop, and `record`: are spread, as f of other recordings and D say
+`one_system`       and `unchanged`, `state_complete`, `gaussian_increments`: nothing but the state predicts
+                   the next sample, where there is process noise (`siq.inference.claims`)
 =================  ===========================================================================================
 
 The error of a V with ``R = ∇V·(f + D∇V)``, V* being the true one and both zero at an attractor: following
@@ -319,14 +321,17 @@ RISES = "V does not fall along the recordings"
 def _check_descent(
     candidate: Candidate, found: FieldEstimate, options: CertificateOptions, *, error: float = 0.0
 ) -> Verdict:
-    """Whether V falls along recordings that no fit saw; `error` is the relative one of V that is stated.
+    """Whether V falls along held-out recordings; `error` is the relative one of V that is stated.
+
+    Under noise the f that V follows from was fitted to them as well: what f makes of recordings that it did
+    not see, `prediction` and ``times`` ask.
 
     Without noise a pair rises where ``V(x_h) - V(x_0)`` is more than the residuals of f over such a pair, and
     rounding, explain; a share of them may. With noise the mean of ``∇V(X)·ΔX/h`` at the left point (Itô) is
     ``-∇V·D∇V``, as g is orthogonal to ∇V. The figure is the largest deviation of its mean over a bin in V, in
-    standard errors; all bins keep the limit by chance except with probability `false_alarms`. Allowed for
-    are 2e of ``∇V·D∇V``, e being the relative error of V; and over a pair of length h the drift's difference
-    from f, ``(h/2) Lf`` with ``Lf = Jf + ½ Σ:∇²f``, Σ being the noise per unit of time.
+    standard errors; all bins keep the limit by chance except with the probability `each` of the options.
+    Allowed for are 2e of ``∇V·D∇V``, e being the relative error of V; and over a pair of length h the drift's
+    difference from f, ``(h/2) Lf`` with ``Lf = Jf + ½ Σ:∇²f``, Σ being the noise per unit of time.
     """
     pairs = candidate.pairs
     assert pairs is not None
@@ -365,7 +370,7 @@ def _check_descent(
     change += 0.5 * np.einsum("nkij,nij->nk", dynamics.hessian(x0), forces)
     curved = (slope * change).sum(axis=1) * h / 2
     bins = np.array_split(np.argsort(values), max(min(DESCENT_BINS, len(h) // MIN_POINTS), 1))
-    limit = float(-scipy.special.ndtri(options.false_alarms / (2 * len(bins))))
+    limit = float(-scipy.special.ndtri(options.each / (2 * len(bins))))
     worst = 0.0
     for rows in bins:
         explained = 2 * min(error, options.error) * claimed[rows].mean() + abs(curved[rows].mean())

@@ -33,15 +33,17 @@ and Smirnov do, with as many samples as the correlation time leaves independent.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 
 import numpy as np
 from scipy import sparse, special
 from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
 
 from siq.data.preparation import joined
-from siq.data.recordings import Recordings
+from siq.data.recordings import LONGEST_STEP, Recordings
 from siq.data.stationarity import correlated_samples, runs_of, usual_step
 from siq.data.two_states import (
     BINS,
@@ -54,7 +56,7 @@ from siq.data.two_states import (
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.inference.library import field_dynamics
-from siq.numerics.randomness import normal_draws
+from siq.numerics.randomness import normal_draws, positive
 from siq.numerics.text import place_text
 from siq.quasipotential.characteristics import Function, ScaledSystem
 from siq.quasipotential.rates import NoiseStrength, mean_residence_time
@@ -85,6 +87,9 @@ HERMITE_NODES = 41  # of the integral over the prediction's own error
 MIN_INDEPENDENT_SAMPLES = 20  # fewer say nothing of a distribution
 COMPARED_PLACES = 200  # at which distribution functions are compared
 MEAN_DISTANCE = 0.8687  # of Kolmogorov's statistic: √(π/2) ln 2
+POWER = 0.8  # probability with which a disagreement would have been noticed
+USUAL_GAPS = 0.9  # quantile of the times between samples
+LEAST_POWER = 10.0  # the factor of a time: a record that would not have shown it tests no times (a choice)
 
 
 _Cores = list[tuple[np.ndarray, np.ndarray, float]]
@@ -109,6 +114,7 @@ class _CellProcess:
         cells: int | None = None,
     ) -> None:
         dimension = dynamics.dimension
+        self._given = (intensity, box, cores, cells)
         if dimension not in CELLS:
             raise NumericalFailure("the Fokker–Planck operator is solved for one and two states only")
         count = cells or CELLS[dimension]
@@ -160,6 +166,14 @@ class _CellProcess:
             flow = float(own @ (rates @ ((core >= 0) & (core != well)).astype(float)))
             if flow > 0:
                 self.means[well] = own.sum() / flow
+
+    def of(self, dynamics: Dynamics) -> _CellProcess | None:
+        """The same of another f; None where that has none."""
+        intensity, box, cores, cells = self._given
+        try:
+            return _CellProcess(dynamics, intensity, box, cores, cells=cells)
+        except (NumericalFailure, np.linalg.LinAlgError, RuntimeError, ValueError):
+            return None
 
     def _last_visited(self, rates: sparse.csr_matrix, core: np.ndarray, which: int) -> np.ndarray:
         found = (core == which).astype(float)
@@ -342,7 +356,7 @@ class VisitTest:
     well, method
         Index of the attractor; and ``operator``, of Fokker and Planck, or ``law``, of Eyring and Kramers.
     held_out, whole
-        Counted on recordings that no fit saw, and on all.
+        Counted on recordings of which each is foreseen by a fit that did not see it, and on all.
     predicted, error
         Mean time, in the unit of time, and its relative standard error.
     probability
@@ -359,7 +373,7 @@ class VisitTest:
 
 
 @dataclass(frozen=True, eq=False)
-class DensityTest:
+class _DensityTest:
     """How a state is spread during the visits to one well.
 
     Attributes
@@ -389,37 +403,99 @@ class OccupancyCheck:
     """Visits to the wells, and the spread of states about them, against the record.
 
     `missing` says why neither is compared. `unseen` are two states between which the record hops, where a
-    single one was identified.
+    single one was identified. `passages` are how often the record went from one well, a row, into another, a
+    column; empty where there is none to go to. `foreseen` are how many visits ought to have ended in all, by
+    fits to other recordings, and the relative error of that.
     """
 
     visits: tuple[VisitTest, ...] = ()
-    densities: tuple[DensityTest, ...] = ()
+    densities: tuple[_DensityTest, ...] = ()
     missing: Remark | None = None
     unseen: RecordStates | None = None
+    passages: tuple[tuple[int, ...], ...] = ()
+    foreseen: tuple[float, float] = (0.0, 0.0)
 
-    def verdict(self, *, false_alarms: float) -> Verdict | None:
-        """The verdict for the certificate, refused by chance with a probability `false_alarms`; None without.
+    def verdicts(self, *, false_alarms: float) -> dict[str, Verdict]:
+        """The verdicts for the certificate, each refused by chance with a probability `false_alarms`.
 
-        Its figure is how many powers of ten the least probability lies below 1, times the number of figures
-        compared.
+        ``connected``: whether recordings passed from well to well. ``times``: whether visits last as
+        foreseen. ``record``: whether states are spread so. The figure of the last two is how many powers of
+        ten their least probability lies below 1, times the number of figures compared.
         """
+        tests: dict[str, Verdict] = {}
+        why = "" if self.missing is None else sentence(self.missing)
         if self.unseen is not None:
             rarity, limit = -float(np.log10(self.unseen.probability)), -float(np.log10(SIGNIFICANCE))
-            return Verdict(rarity, limit, False, "" if self.missing is None else sentence(self.missing))
-        compared: tuple[VisitTest | DensityTest, ...] = (*self.visits, *self.densities)
-        if self.missing is not None or not compared:
-            return None
-        worst = min(compared, key=lambda one: one.probability)
-        rarity = -float(np.log10(min(max(worst.probability * len(compared), 1e-300), 1.0)))
-        limit = -float(np.log10(false_alarms))
-        reason = f"states in well {worst.well + 1} are spread otherwise than what was identified says"
-        if isinstance(worst, VisitTest):
-            counted = f"{worst.held_out.mean:.3g}" if worst.held_out.visits else "no end"
-            reason = (
-                f"visits to well {worst.well + 1} last {worst.predicted:.3g} by what was identified, and"
-                f" {counted} as counted on held-out recordings"
-            )
-        return Verdict.of(rarity, limit, reason)
+            return {"record": Verdict(rarity, limit, False, why)}
+        if self.passages:
+            tests["connected"] = self._connected()
+            tests["times"] = Verdict.not_tested(why) if self.missing else self._times(false_alarms)
+        if self.densities:
+            worst = min(self.densities, key=lambda one: one.probability)
+            reason = f"states in well {worst.well + 1} are spread otherwise than what was identified says"
+            chance = worst.probability * len(self.densities)
+            tests["record"] = Verdict.of_probability(chance, false_alarms, reason)
+        return tests
+
+    def _connected(self) -> Verdict:
+        """Whether all wells are joined by passages, one way at least; the figure is how many are not."""
+        counts = np.array(self.passages)
+        _, piece = sparse.csgraph.connected_components(counts > 0, directed=False)
+        apart = [int(well) + 1 for well in np.flatnonzero(piece != piece[0])]
+        told = sentence(Remark("quasipotential.passages", {"passages": int(counts.sum()), "apart": apart}))
+        return Verdict.not_tested(told) if apart else Verdict(0.0, 0.0, True, told)
+
+    def _times(self, false_alarms: float) -> Verdict:
+        """All visits together, and those to each well."""
+        (expected, spread), held = self.foreseen, [one.held_out for one in self.visits]
+        if not expected > 0:
+            return Verdict.not_tested(sentence(Remark("quasipotential.no_power", {"factor": None})))
+        count = DwellCount(sum(one.visits for one in held), sum(one.time for one in held))
+        chances = [one.probability for one in self.visits]
+        chances.append(_probability_of(count, count.time / expected, spread))
+        chance = min(chances) * len(chances)
+        worst = min(self.visits, key=lambda one: one.probability)
+        counted = f"{worst.held_out.mean:.3g}" if worst.held_out.visits else "no end"
+        reason = (
+            f"visits to well {worst.well + 1} last {worst.predicted:.3g} by what was identified, and"
+            f" {counted} as counted on recordings that it was not fitted to"
+        )
+        verdict = Verdict.of_probability(chance, false_alarms, reason)
+        # 2√n has the variance 1, and 1 + n e² where its mean is uncertain by the share e.
+        share = (special.ndtri(1 - false_alarms / (2 * len(chances))) + special.ndtri(POWER)) / 2
+        left = 1 - share * np.hypot(expected**-0.5, spread)
+        factor = left**-2 if left > 0 else np.inf
+        values = {"factor": float(factor) if factor <= LEAST_POWER else None}
+        told = sentence(Remark("quasipotential.no_power", values))
+        if not verdict.passed:
+            return verdict
+        return Verdict.not_tested(told) if values["factor"] is None else replace(verdict, reason=told)
+
+
+def _passages_of(
+    portrait: PhasePortrait, recordings: Recordings, cores: _Cores
+) -> tuple[tuple[int, ...], ...]:
+    """How often a record went from one well into the core of another.
+
+    Where a run of samples begins outside all cores, it begins in the well that f leads to. Gaps as they are
+    usual, as between pairs of samples, end no run.
+    """
+    gaps = np.diff(recordings.t)[np.diff(recordings.recording) == 0]
+    usual = LONGEST_STEP * float(np.quantile(gaps, USUAL_GAPS)) if len(gaps) else None
+    runs = runs_of(recordings, longest=usual)
+    visits = continued_visits(_core_of(cores, recordings.values), runs)
+    counts = np.zeros((len(portrait.attractors),) * 2, dtype=int)
+    starts, ends = portrait.descents.paths[:, 0], portrait.descents.ends
+    width = positive(np.ptp(portrait.box, axis=1))
+    nearest = cKDTree(starts / width).query(np.array([recordings.values[run.start] for run in runs]) / width)[
+        1
+    ]
+    for run, begin in zip(runs, nearest, strict=True):
+        inside = visits[run]
+        order = np.concatenate([[ends[begin]], inside[inside >= 0]])
+        order = order[(order >= 0) & (order < len(counts))]
+        np.add.at(counts, (order[:-1], order[1:]), order[:-1] != order[1:])
+    return tuple(map(tuple, counts.tolist()))
 
 
 def check_occupancy(
@@ -427,7 +503,7 @@ def check_occupancy(
     portrait: PhasePortrait,
     noise: NoiseStrength | None,
     recordings: Recordings,
-    held_out: np.ndarray,
+    parts: Sequence[tuple[FieldEstimate, np.ndarray]],
     *,
     sensor: np.ndarray | None = None,
     seed: int = 0,
@@ -438,8 +514,9 @@ def check_occupancy(
     ----------
     found, portrait, noise
         f with its uncertainty, what follows from it, and ε, None where the recordings show none.
-    recordings, held_out
-        All of them, and a mask over their labels: those that no fit saw.
+    recordings, parts
+        All of them; and estimates of f, each with a mask over labels of the recordings: of those that it was
+        not fitted to, and is compared with.
     sensor
         Standard deviation of each state's sensor noise, shape ``(d,)``; None where there is none.
     seed
@@ -447,41 +524,59 @@ def check_occupancy(
     """
     if found.noise_free:
         return OccupancyCheck(missing=Remark("quasipotential.record_without_noise"))
-    if noise is None:
-        return OccupancyCheck(missing=Remark("quasipotential.record_of_unknown_noise"))
     if len(portrait.attractors) < 2:
+        if noise is None:
+            return OccupancyCheck(missing=Remark("quasipotential.record_of_unknown_noise"))
         seen = switching(joined(recordings)) if found.dynamics.dimension == 1 else None
         if seen is None or not seen.supported:
             return OccupancyCheck(missing=Remark("quasipotential.record_of_one_state"))
         low, high = seen.levels
         values = {"low": low, "high": high, "hops": seen.transitions}
         return OccupancyCheck(missing=Remark("quasipotential.hops_unseen", values), unseen=seen)
+    if noise is None:
+        return OccupancyCheck(missing=Remark("quasipotential.record_of_unknown_noise"))
     cores = _cores_about(found.dynamics, portrait, noise.intensity)
-    runs = runs_of(recordings)
-    visits = continued_visits(_core_of(cores, recordings.values), runs_of(joined(recordings)))
-    apart = [run for run in runs if held_out[recordings.recording[run.start]]]
+    runs, whole_runs = runs_of(recordings), runs_of(joined(recordings))
+    visits = continued_visits(_core_of(cores, recordings.values), whole_runs)
+    passages = _passages_of(portrait, joined(recordings), cores)
     states = len(portrait.attractors)
-    whole = DwellCount.of_visits(recordings.t, visits, runs_of(joined(recordings)), states=states)
-    held = DwellCount.of_visits(recordings.t, visits, apart, states=states)
+    whole = DwellCount.of_visits(recordings.t, visits, whole_runs, states=states)
     if found.dynamics.dimension not in CELLS and not any(one.visits for one in whole):
-        return OccupancyCheck(missing=Remark("quasipotential.record_without_hops"))
+        return OccupancyCheck(missing=Remark("quasipotential.record_without_hops"), passages=passages)
     sampled = _as_sampled(cores, found.dynamics, noise.intensity, usual_step(recordings))
     times, processes, unknown = _predicted_visits(found, portrait, noise, sampled, seed=seed)
     method = "operator" if processes else "law"
-    chances = [_probability_of(held[well], mean, error) for well, mean, error in times]
-    tested = tuple(
-        VisitTest(well, held[well], whole[well], mean, error, method, chance)
-        for (well, mean, error), chance in zip(times, chances, strict=True)
-    )
+    # What each part foresees of the recordings that it did not see. A law of three states and more has all.
+    apart: list[tuple[np.ndarray, tuple[DwellCount, ...], _CellProcess | None]] = []
+    for fit, mask in parts:
+        used = [run for run in runs if mask[recordings.recording[run.start]]]
+        process = processes[0].of(fit.dynamics) if processes and fit is not found else None
+        counts = DwellCount.of_visits(recordings.t, visits, used, states=states)
+        apart.append((mask[recordings.recording], counts, process or (processes[0] if processes else None)))
+    tested, foreseen = [], np.zeros(2)  # the number of visits, and the sum of its errors
+    for well, mean, error in times:
+        held = DwellCount(
+            sum(counts[well].visits for _, counts, _ in apart),
+            sum(counts[well].time for _, counts, _ in apart),
+        )
+        expected = sum(
+            counts[well].time / (mean if process is None else float(process.means[well]))
+            for _, counts, process in apart
+        )
+        foreseen += [expected, expected * error]  # errors of one f: they do not average out
+        chance = _probability_of(held, held.time / expected if expected > 0 else mean, error)
+        tested.append(VisitTest(well, held, whole[well], mean, error, method, chance))
     if not tested:
-        return OccupancyCheck(missing=unknown)
+        return OccupancyCheck(missing=unknown, passages=passages)
     chance = min(_probability_of(one.whole, one.predicted, one.error) for one in tested)
     if not any(one.visits for one in whole) and chance > NO_HOP_PROBABILITY:
-        return OccupancyCheck(missing=Remark("quasipotential.record_too_short_to_hop"))
-    # Each state's distribution during the visits to each well, on the held-out runs.
-    used, densities = held_out[recordings.recording], []
+        missing = Remark("quasipotential.record_too_short_to_hop")
+        return OccupancyCheck(missing=missing, passages=passages)
+    # Each state's distribution during the visits to each well, on recordings that the parts did not see.
+    densities = []
     for well, *_ in times if processes else ():
-        rows = np.flatnonzero(used & (visits == well))
+        chosen = [np.flatnonzero(used & (visits == well)) for used, *_ in apart]
+        rows = np.sort(np.concatenate(chosen))
         if len(rows) < MIN_INDEPENDENT_SAMPLES:
             continue
         breaks = np.flatnonzero(np.diff(rows) > 1) + 1
@@ -494,9 +589,13 @@ def check_occupancy(
                 continue
             places = np.quantile(x, np.linspace(0.005, 0.995, COMPARED_PLACES))
             counted = np.searchsorted(np.sort(x), places, side="right") / len(x)
-            predicted, *drawn = (one.distribution(well, state, places, blur) for one in processes)
+            whole_f, *drawn = (one.distribution(well, state, places, blur) for one in processes)
+            predicted = sum(
+                len(own) / len(rows) * (process or processes[0]).distribution(well, state, places, blur)
+                for own, (_, _, process) in zip(chosen, apart, strict=True)
+            )
             distance = float(np.abs(counted - predicted).max())
-            error = float(np.mean([np.abs(one - predicted).max() for one in drawn])) if drawn else 0.0
+            error = float(np.mean([np.abs(one - whole_f).max() for one in drawn])) if drawn else 0.0
             # The mean distance of n samples is 0.87/√n: an error of the prediction is as if there were fewer.
             effective = 1 / (1 / independent + (error / MEAN_DISTANCE) ** 2)
             edges = np.linspace(x.min(), x.max(), BINS + 1)
@@ -505,11 +604,12 @@ def check_occupancy(
             counts = np.histogram(x, bins=edges)[0] / (len(x) * width)
             probability = float(special.kolmogorov(distance * np.sqrt(effective)))
             densities.append(
-                DensityTest(
+                _DensityTest(
                     well, state, distance, float(independent), probability, edges, counts, share / width
                 )
             )
-    return OccupancyCheck(tested, tuple(densities))
+    told = (float(foreseen[0]), float(foreseen[1] / foreseen[0]) if foreseen[0] > 0 else 0.0)
+    return OccupancyCheck(tuple(tested), tuple(densities), passages=passages, foreseen=told)
 
 
 def _probability_of(count: DwellCount, mean: float, error: float) -> float:

@@ -19,12 +19,13 @@ import numpy as np
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
-from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
+from siq.data.recordings import Recordings, SnapshotPairs, parent_recordings, snapshot_pairs
 from siq.errors import NumericalFailure
+from siq.inference.claims import check_claims
 from siq.inference.field_estimate import FieldEstimate
 from siq.inference.kalman_identification import filtered_recordings
 from siq.inference.library import CandidateLibrary, joint_library
-from siq.inference.regression import coarse_pairs
+from siq.inference.regression import coarse_pairs, lagged_pairs, refit
 from siq.networks.decomposition import AnyNetworks, shuffled
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.certificate import (
@@ -281,11 +282,17 @@ class RefinementContext:
         self.number, self.seed, self.limits = number, seed, limits
         self.options = refinement.with_routes(networks=networks is not None)
         mask = recordings.held_out(generator=generator(seed, number, Purpose.HOLD_OUT))
+        self.measured, self.pair_step = recordings, pair_step
         if found.sensor_variance is not None or found.hidden_velocities:
             # Of measured values the increments do not have the mean of f.
             recordings = filtered_recordings(found, recordings, pair_step=pair_step)
         pairs = snapshot_pairs(recordings, pair_step=pair_step)
         held, x = mask[pairs.recording], pairs.x0
+        if held.all() or not held.any():
+            raise NumericalFailure(
+                "the samples of some recordings are so much closer than those of others that these make no"
+                " pairs, and nothing is held out; give recordings of one time between samples"
+            )
         draw = generator(seed, number, Purpose.REFINE)
         self.points = x[~held][evenly_spread(x[~held], generator=draw)]
         self.held_out = x[held][evenly_spread(x[held], generator=draw)]
@@ -316,16 +323,41 @@ class RefinementContext:
             record = check_occupancy(
                 found, self.portrait,
                 None if strength is None else NoiseStrength(*strength, source="estimated"),
-                self.recordings, self.unseen,
+                self.recordings, self._halves(),
                 sensor=None if variance is None else np.sqrt(variance), seed=self.number,
             )  # fmt: skip
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             record = OccupancyCheck(missing=Remark("quasipotential.reason", {"reason": str(error)}))
-        verdict = record.verdict(false_alarms=self.limits.false_alarms)
-        if verdict is not None:
-            reason = "; ".join(one for one in (certificate.reason, verdict.reason) if one)
-            certificate = replace(certificate, tests={**certificate.tests, "record": verdict}, reason=reason)
+        if not found.noise_free:
+            each = self.limits.each
+            claims = check_claims(
+                found, self.recordings, self.measured, pair_step=self.pair_step, false_alarms=each
+            )
+            certificate = certificate.with_tests(claims | record.verdicts(false_alarms=each))
         return Refinement(formulas, certificate, record, (*refined.remarks, *caustics))
+
+    def _halves(self) -> list[tuple[FieldEstimate, np.ndarray]]:
+        """Each half of the recordings with the terms of f fitted to the other one.
+
+        Of hidden velocities f follows from whole recordings alone: all of them have the f of all.
+        """
+        found, recordings = self.found, self.recordings
+        parents = parent_recordings(recordings.labels)
+        second = np.searchsorted(np.unique(parents), parents) % 2 == 1
+        if found.noise_free or found.hidden_velocities or second.all() or not second.any():
+            return [(found, np.ones(len(second), dtype=bool))]
+        halves = []
+        for mask in (second, ~second):
+            other = recordings.select(np.flatnonzero(~mask))
+            try:
+                if (memory := found.memory) is not None:
+                    fit = refit(found, lagged_pairs(other, memory[0]))
+                else:
+                    fit = refit(found, snapshot_pairs(other, pair_step=self.pair_step))
+            except (NumericalFailure, np.linalg.LinAlgError, ValueError):
+                fit = found
+            halves.append((fit, mask))
+        return halves
 
     def control(self, refined: SymbolicDecomposition | None) -> dict[str, Any]:
         """What the comparison with the refined V says of networks with their weights in random order.

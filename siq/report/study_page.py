@@ -498,17 +498,22 @@ def _run_figures(tables: Mapping[str, pd.DataFrame], *, runs: int, method: str) 
 
 
 def _tests_table(certificates: pd.DataFrame, run: int, method: Method) -> pd.DataFrame:
-    """The tests of the formulas of a run: what was asked, the figure, its limit, the verdict."""
+    """The claims of a certificate: what was asked and found, the verdict, and what would refute it."""
     mine = certificates[(certificates["run"] == run) & (certificates["method"] == method)]
-    asks = texts("certificate")["asks"]
+    words = texts("certificate")
+    asks, refutes, verdicts = words["asks"], words["refutes"], words["verdicts"]
     return pd.DataFrame(
         {
             "test": [str(name).replace("_", " ") for name in mine["test"]],
             "what it asks": [asks.get(str(name), "") for name in mine["test"]],
             "found": mine["value"].to_numpy(),
             "limit": mine["limit"].to_numpy(),
-            "passed": mine["passed"].to_numpy(),
-            "reason": mine["reason"].to_numpy(),
+            "verdict": [
+                verdicts["passed" if passed else "failed" if tested else "not_tested"]
+                for passed, tested in zip(mine["passed"], mine["tested"], strict=True)
+            ],
+            "what would refute it": [refutes.get(str(name), "") for name in mine["test"]],
+            "in words": mine["reason"].to_numpy(),
         }
     )
 

@@ -125,7 +125,7 @@ _TYPES = {  # of a column, wherever it stands; of all others float64
 _TABLES = {
     "coefficients": "run method component term estimate exact standard_error",
     "prediction": "run method trajectory error",
-    "certificates": "run method test value limit passed reason",
+    "certificates": "run method test value limit passed tested reason",
     "invariant": (
         "run method intensity bessel quadrature simulated_distance sampling_floor published unknown_at_most "
         "simulated_unknown"

@@ -75,9 +75,9 @@ def test_a_state_that_the_record_shows_and_f_does_not_is_noticed() -> None:
     alone = field({"1": 0.3, "x": -0.5}, 0.3)
     portrait = phase_portrait(alone.dynamics, values[::20], seed=0)
     held = np.arange(len(recordings.labels)) < 2
-    found = check_occupancy(alone, portrait, NoiseStrength(0.3), recordings, held)
-    verdict = found.verdict(false_alarms=1e-4)
-    assert verdict is not None and not verdict.passed and verdict.value > -np.log10(SIGNIFICANCE)
+    found = check_occupancy(alone, portrait, NoiseStrength(0.3), recordings, [(alone, held)])
+    verdict = found.verdicts(false_alarms=1e-4)["record"]
+    assert not verdict.passed and verdict.value > -np.log10(SIGNIFICANCE)
     assert (
         "hops between two states" in verdict.reason
         and found.missing is not None
@@ -85,9 +85,10 @@ def test_a_state_that_the_record_shows_and_f_does_not_is_noticed() -> None:
     )
     both = field({"x": 1.0, "x**3": -1.0}, 0.3)
     portrait = phase_portrait(both.dynamics, values[::20], seed=0)
-    agreed = check_occupancy(both, portrait, NoiseStrength(0.3, 0.003), recordings, held)
-    verdict = agreed.verdict(false_alarms=1e-4)
-    assert verdict is not None and verdict.passed and sum(one.whole.visits for one in agreed.visits) > 30
+    agreed = check_occupancy(both, portrait, NoiseStrength(0.3, 0.003), recordings, [(both, held)])
+    tests = agreed.verdicts(false_alarms=1e-4)
+    assert all(one.passed for one in tests.values() if one.tested) and {"connected", "record"} <= tests.keys()
+    assert sum(one.whole.visits for one in agreed.visits) > 30
 
 
 def test_a_single_state_is_no_contradiction() -> None:
@@ -99,7 +100,11 @@ def test_a_single_state_is_no_contradiction() -> None:
     alone = field({"x": -0.5}, 0.1)
     portrait = phase_portrait(alone.dynamics, x[::10], seed=0)
     found = check_occupancy(
-        alone, portrait, NoiseStrength(0.1), recordings, np.zeros(len(recordings.labels), dtype=bool)
+        alone,
+        portrait,
+        NoiseStrength(0.1),
+        recordings,
+        [(alone, np.zeros(len(recordings.labels), dtype=bool))],
     )
-    assert found.unseen is None and found.verdict(false_alarms=1e-4) is None
+    assert found.unseen is None and not found.verdicts(false_alarms=1e-4)
     assert sum(one.whole.visits for one in found.visits) == 0

@@ -47,13 +47,12 @@ def recorded() -> RECORDED:
 
 def compared(recorded: RECORDED, intensity: float = INTENSITY) -> OccupancyCheck:
     recordings, record, portrait, held_out = recorded
-    return check_occupancy(record, portrait, NoiseStrength(intensity), recordings, held_out)
+    return check_occupancy(record, portrait, NoiseStrength(intensity), recordings, [(record, held_out)])
 
 
 def verdict_of(found: OccupancyCheck) -> Verdict:
-    verdict = found.verdict(false_alarms=1e-4)
-    assert verdict is not None
-    return verdict
+    tests = found.verdicts(false_alarms=0.05 / 8)
+    return Verdict.worst([tests["times"], tests["record"]])
 
 
 def test_what_is_right_passes(recorded: RECORDED) -> None:
@@ -75,14 +74,14 @@ def test_a_wrong_strength_of_the_noise_is_refused(recorded: RECORDED, intensity:
 def test_a_wrong_depth_is_refused(recorded: RECORDED) -> None:
     recordings, record, portrait, held_out = recorded
     deeper = replace(record, coefficients=2.5 * record.coefficients)
-    found = check_occupancy(deeper, portrait, NoiseStrength(INTENSITY), recordings, held_out)
+    found = check_occupancy(deeper, portrait, NoiseStrength(INTENSITY), recordings, [(deeper, held_out)])
     assert not verdict_of(found).passed
 
 
 def test_without_noise_there_is_no_test(recorded: RECORDED) -> None:
     recordings, record, portrait, held_out = recorded
-    found = check_occupancy(record, portrait, None, recordings, held_out)
-    assert found.verdict(false_alarms=1e-4) is None
+    found = check_occupancy(record, portrait, None, recordings, [(record, held_out)])
+    assert not found.verdicts(false_alarms=1e-4)
     assert found.missing == Remark("quasipotential.record_of_unknown_noise")
     assert "strength of the process noise" in sentence(found.missing)
 
@@ -94,8 +93,35 @@ def test_a_record_too_short_to_hop_is_no_test(recorded: RECORDED) -> None:
         recordings, labels=("0",), recording=recordings.recording[rows], t=recordings.t[rows],
         values=recordings.values[rows],
     )  # fmt: skip
-    found = check_occupancy(record, portrait, NoiseStrength(INTENSITY), short, np.array([True]))
+    found = check_occupancy(record, portrait, NoiseStrength(INTENSITY), short, [(record, np.array([True]))])
     assert found.missing == Remark("quasipotential.record_too_short_to_hop")
+    tests = found.verdicts(false_alarms=0.01)
+    assert not tests["connected"].tested and not tests["times"].tested
+
+
+def test_wells_that_no_recording_joins_are_not_connected(recorded: RECORDED) -> None:
+    recordings, record, portrait, _ = recorded
+    side = np.where(np.arange(RECORDS) % 2, 1.0, -1.0)[recordings.recording][:, None]
+    apart = replace(recordings, values=side * np.abs(recordings.values))
+    parts = [(record, np.ones(RECORDS, dtype=bool))]
+    tests = check_occupancy(record, portrait, NoiseStrength(INTENSITY), apart, parts).verdicts(
+        false_alarms=0.01
+    )
+    assert not tests["connected"].tested and "no recording passed" in tests["connected"].reason
+    tests = check_occupancy(record, portrait, NoiseStrength(INTENSITY), recordings, parts).verdicts(
+        false_alarms=0.01
+    )
+    assert tests["connected"].passed and tests["times"].passed and "factor" in tests["times"].reason
+
+
+def test_a_few_hops_do_not_test_a_time(recorded: RECORDED) -> None:
+    recordings, record, portrait, _ = recorded
+    some = recordings.select([0])
+    parts = [(record, np.ones(1, dtype=bool))]
+    found = check_occupancy(record, portrait, NoiseStrength(INTENSITY), some, parts)
+    assert sum(one.whole.visits for one in found.visits) > 0
+    times = found.verdicts(false_alarms=0.05 / 8)["times"]
+    assert not times.tested and not times.passed and "too few hops" in times.reason
 
 
 def test_cores_keep_clear_of_the_saddle(recorded: RECORDED) -> None:

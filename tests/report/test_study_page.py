@@ -263,7 +263,7 @@ def test_hops_are_counted_and_what_they_allow_is_said(tmp_path: Path) -> None:
     rows = [record_row(), record_row(attractor="(-1)", visits=25)]
     section = section_of(page_of(tmp_path, overview=WELLS, record=rows), "Against the record itself")
     (said,) = section.text
-    assert said.startswith("41 hops") and "8 of them" in said and "is known to 25 % at best" in said
+    assert said.startswith("41 hops") and "f of the other half" in said and "is known to 25 % at best" in said
     counted = section.tables[0].frame["mean visit, counted (s)"].tolist()
     assert counted == ["50.0 (31 to 87)", "32.0 (22 to 49)"]
     assert section.tables[0].frame["predicted (s)"].tolist()[0] == "51.0 ± 3.0"

@@ -1,0 +1,339 @@
+"""What recordings would have to show if an estimate of f and D were not the whole of their system.
+
+A fit of f presumes that the states recorded are all of them, that nothing changes in time, that all
+recordings are one system, and that the noise is Gaussian. None of it is asked by a test of f against the same
+functions of the state. All of it says one thing of the residuals ``z = σ⁻¹(x)(Xh - E[Xh | X0])/√(εh)``: given
+the state, *nothing else in the record predicts the next one*. So one test asks for each claim, with columns G
+of its own,
+
+    F = (‖P z‖²/q) / (‖z - P z‖²/(n - q)),
+
+P being the projection on G less what functions of the state explain of it, those of f among them: so that
+their coefficients may have been fitted to the same residuals (a score test; Rao, 1948). Columns may be made
+of the past alone, and then the products ``G z`` are martingale differences, whatever f is.
+
+``one_system``
+    Each recording by itself: a constant, and slopes in the states. Likewise of ``z² - 1``, for D. Recordings
+    that share no states cannot be compared.
+``unchanged``
+    Cosines and sines of time, and these times the states, from half a period in a recording to two samples.
+    The highest peak of the periodograms of z, of ``φ(x) z`` and of ``z² - 1`` counts. Each octave of
+    frequencies is as likely to hold one, and so the price of a peak is the number of octaves times that of
+    frequencies in its own.
+``state_complete``
+    Means of the past that fade with memories from a few samples to a thirtieth of the record, of the states,
+    and of ``φ(x) z``, which follow what a hidden variable does to the force. A hidden variable that changes D
+    shows in those of ``z² - 1``.
+``gaussian_increments``
+    The largest residual, and how many are beyond three; values, or steps, that repeat themselves more often
+    than rounding lets them; and stretches that stand in the record twice.
+
+Of the neighbouring residual `siq.inference.checks` judges, which knows sensors and rounding: what it explains
+is left out here, and the past begins two steps back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import scipy.signal
+import scipy.special
+
+from siq.data.preparation import joined
+from siq.data.recordings import Recordings, SnapshotPairs, parent_recordings, snapshot_pairs
+from siq.inference.checks import repetitions, unexplained_probability
+from siq.inference.diffusion_model import process_noise_increments
+from siq.inference.field_estimate import FieldEstimate, Verdict
+from siq.inference.regression import coarse_pairs, residuals
+from siq.numerics.randomness import positive
+from siq.remarks import Remark, sentence
+
+STATE_BINS = 12  # of each state: what any function of it explains is no memory, and no change
+NOISELESS = 1e-3  # of the rms step: a state with less has no noise of its own, and its residuals say nothing
+FEWEST_PAIRS = 30  # of a recording that is compared by itself
+FEWEST_PER_COLUMN = 10  # pairs for each column of a regression
+FASTEST_PERIOD = 2  # samples
+FEWEST_OF_SPECTRUM = 10  # pairs of a run whose spectrum is asked for
+SHORTEST_MEMORY, MEMORY_GROWTH, LONGEST_MEMORY = 4, 2.0, 1 / 30  # samples; a ratio; of all samples
+OVERLAP = 0.02  # quantile between which, and one minus it, recordings share states
+RANK = 1e-8  # numerical: of the squares of a column, what is left of it by chance
+TAIL = 3.0  # standard deviations: beyond are 2.7 in 1000
+HARMLESS_CHANGE = 0.01  # of a barrier
+
+
+class _Residuals:
+    """White residuals of pairs, with what is known where each begins.
+
+    `noise` are the residuals of the states that noise acts on, uncorrelated, of variance one, less what
+    functions of the state explain: ``(n, c)``. `basis` are these functions, orthonormal, ``(n, q)``; `states`
+    are one and the states, scaled, ``(n, 1 + d)``; `runs` are slices of the pairs of a recording, one after
+    the other; gaps between them are passed over.
+    """
+
+    def __init__(self, found: FieldEstimate, pairs: SnapshotPairs) -> None:
+        rest = process_noise_increments(found, pairs, residuals(found, pairs))
+        force = found.dynamics.drift(pairs.x0) * np.sqrt(pairs.h)[:, None]
+        if not found.diffusion.constant:
+            whitening = found.diffusion.whitening_at(pairs.x0)
+            rest, force = (np.einsum("nij,nj->ni", whitening, one) for one in (rest, force))
+        moved = np.sqrt(((pairs.xh - pairs.x0) ** 2 / pairs.h[:, None]).mean(axis=0))
+        self.noisy = np.sqrt((rest**2).mean(axis=0)) > NOISELESS * moved
+        if found.hidden_velocities:  # there is one innovation for each position
+            self.noisy[found.library.dimension // 2 :] = False
+        shares = (force**2).mean(axis=0)[self.noisy] / (rest**2).mean(axis=0)[self.noisy]
+        self.drift = float(shares.max(initial=0.0))  # of the squares of steps, over that of the noise
+        self.pairs, n = pairs, len(pairs.h)
+        functions = np.unique(found.support[:, 1])
+        columns = [found.library.evaluate(pairs.x0)[:, functions], np.ones((n, 1))]
+        for state in pairs.x0.T:
+            edges = np.unique(np.quantile(state, np.linspace(0, 1, STATE_BINS + 1)[1:-1]))
+            columns.append(np.eye(len(edges) + 1)[np.searchsorted(edges, state, side="right")])
+        together = np.concatenate(columns, axis=1) * np.sqrt(pairs.h / pairs.h.mean())[:, None]
+        self.basis = _orthonormal(together)
+        scaled = (pairs.x0 - pairs.x0.mean(axis=0)) / positive(pairs.x0.std(axis=0))
+        self.states = np.concatenate([np.ones((n, 1)), scaled], axis=1)
+        bounds = np.concatenate([[0], np.flatnonzero(np.diff(pairs.recording)) + 1, [n]])
+        self.runs = [slice(int(a), int(b)) for a, b in pairwise(bounds)]
+        self.noise = self.without(rest[:, self.noisy])
+        self.noise = _orthonormal(self.noise) * np.sqrt(n)
+        self.neighbour = self._standardised(self.past(self.noise, 0.0, delay=1))
+        self.power = self._standardised(self.noise**2 - 1)
+
+    def _standardised(self, values: np.ndarray) -> np.ndarray:
+        values = self.without(values)
+        return values / positive(np.sqrt((values**2).mean(axis=0)))
+
+    def without(self, values: np.ndarray) -> np.ndarray:
+        """Columns less what functions of the state explain."""
+        return np.asarray(values - self.basis @ (self.basis.T @ values))
+
+    def past(self, values: np.ndarray, memory: float, *, delay: int = 2) -> np.ndarray:
+        """Means of columns so many pairs ago and earlier, which fade with a memory in pairs; run by run."""
+        fade, found = np.exp(-1 / memory) if memory > 0 else 0.0, np.zeros_like(values)
+        for run in self.runs:
+            if run.stop - run.start > delay:
+                earlier = values[run][:-delay]
+                begin = earlier[:1] * fade  # as if it had been so before
+                found[run][delay:] = scipy.signal.lfilter([1 - fade], [1, -fade], earlier, axis=0, zi=begin)[
+                    0
+                ]
+        return found
+
+    def probability(self, columns: np.ndarray, rest: np.ndarray) -> float:
+        """Probability of what columns explain of residuals, neighbours and the state apart."""
+        columns = self.without(columns)
+        near = _orthonormal(self.neighbour)
+        columns, rest = (one - near @ (near.T @ one) for one in (columns, rest))
+        columns = _orthonormal(columns)
+        if not columns.shape[1] or len(rest) < FEWEST_PER_COLUMN * (columns.shape[1] + self.basis.shape[1]):
+            return 1.0
+        freedom = len(rest) - self.basis.shape[1] - near.shape[1]
+        return unexplained_probability(columns, rest, freedom=freedom)
+
+    def memories(self) -> Iterator[float]:
+        """Memories to be looked at, in pairs."""
+        longest = min(max(run.stop - run.start for run in self.runs) / 2, len(self.noise) * LONGEST_MEMORY)
+        memory = float(SHORTEST_MEMORY)
+        while memory <= longest:
+            yield memory
+            memory *= MEMORY_GROWTH
+
+
+def _orthonormal(columns: np.ndarray) -> np.ndarray:
+    """A basis of what columns span, without what is rounding only."""
+    sizes = np.linalg.norm(columns, axis=0)
+    columns = columns[:, sizes > 0] / sizes[sizes > 0]
+    values, vectors = np.linalg.eigh(columns.T @ columns)
+    kept = values > RANK
+    return np.asarray(columns @ (vectors[:, kept] / np.sqrt(values[kept])))
+
+
+def _verdict(claim: str, probability: float, limit: float, **values: object) -> Verdict:
+    remark = Remark(f"inference.not_{claim}", values | {"probability": min(probability, 1.0)})
+    return Verdict.of_probability(probability, limit, sentence(remark))
+
+
+def check_claims(
+    found: FieldEstimate,
+    states: Recordings,
+    measured: Recordings,
+    *,
+    pair_step: float | None = None,
+    false_alarms: float,
+) -> dict[str, Verdict]:
+    """Whether recordings bear out what an estimate of f and D presumes, by the names of the claims.
+
+    Parameters
+    ----------
+    found
+        f and D, from recordings with process noise.
+    states, measured
+        The recordings as they show the states: filtered where the sensor was noisy, else as they are; and as
+        they are, for values that repeat themselves.
+    pair_step
+        See `siq.data.recordings.snapshot_pairs`.
+    false_alarms
+        Probability with which each claim is refused where it holds.
+    """
+    filtered = states is not measured
+    states, measured = (
+        one.select(np.flatnonzero(parent_recordings(one.labels) == np.arange(len(one.labels))))
+        for one in (states, measured)
+    )
+    whole = joined(states)
+    if found.memory is not None:
+        pairs = coarse_pairs(whole, found.memory[0], lost=found.memory[1])
+    elif filtered:  # a filter begins anew in each stretch
+        pairs = snapshot_pairs(states, pair_step=pair_step)
+        begins = np.searchsorted(states.recording, np.arange(len(states.labels)))
+        pairs = replace(pairs, recording=whole.recording[begins][pairs.recording])
+    else:
+        pairs = snapshot_pairs(whole, pair_step=pair_step)
+    rest = _Residuals(found, pairs)
+    return {
+        "one_system": _one_system(rest, whole.labels, false_alarms),
+        "unchanged": _unchanged(rest, false_alarms),
+        "state_complete": _state_complete(rest, false_alarms),
+        "gaussian_increments": _gaussian(rest, measured, false_alarms),
+    }
+
+
+def _one_system(rest: _Residuals, labels: Sequence[str], limit: float) -> Verdict:
+    numbers, index = np.unique(rest.pairs.recording, return_inverse=True)
+    rows = np.split(np.argsort(index, kind="stable"), np.cumsum(np.bincount(index))[:-1])
+    if len(numbers) < 2:
+        return Verdict(0.0, -float(np.log10(limit)), True)
+    enough = [place for place, own in enumerate(rows) if len(own) >= FEWEST_PAIRS]
+    # What each explains by itself, of the mean and of the variance; then again without the worst.
+    noise, power, apart, order, least = rest.noise, rest.power, list[int](), list[int](), 1.0
+    while len(apart) <= len(numbers) // 2:
+        sums, of_power, chances = (0, np.zeros(noise.shape[1])), (0, np.zeros(noise.shape[1])), {}
+        for place, own in enumerate(rows):
+            if place in apart or len(own) <= rest.states.shape[1]:
+                continue
+            mean = _explained(rest.states[own], noise[own], rest.basis[own])
+            sums = (sums[0] + mean[0], sums[1] + mean[1])
+            if place in enough:
+                variance = _explained(rest.states[own, :1], power[own], rest.basis[own])
+                of_power = (of_power[0] + variance[0], of_power[1] + variance[1])
+                chances[place] = 2 * min(_chance(*mean), _chance(*variance)) * len(enough)
+        if not sums[0]:
+            return Verdict.not_tested(sentence(Remark("inference.recordings_too_short")))
+        single = min(chances.values(), default=1.0)
+        if not apart:
+            least = 3 * min(single, _chance(*sums), _chance(*of_power))
+            order = sorted(chances, key=lambda place: chances[place])
+        if 3 * single >= limit:
+            break
+        apart.append(min(chances, key=lambda place: chances[place]))
+        columns = rest.without(rest.states * (index == apart[-1])[:, None])
+        noise, power = (
+            one - basis @ (basis.T @ one)
+            for one, basis in ((noise, _orthonormal(columns)), (power, _orthonormal(columns[:, :1])))
+        )
+    if least >= limit and len(enough) > 1:
+        # Recordings are compared with those that share states with them, and these with others.
+        low, high = (
+            np.array([np.quantile(rest.pairs.x0[rows[place]], q, axis=0) for place in enough])
+            for q in (OVERLAP, 1 - OVERLAP)
+        )
+        alike = np.asarray(((low[:, None] <= high) & (low <= high[:, None])).all(axis=2))
+        group = alike[0]
+        while (alike[group].any(axis=0) & ~group).any():
+            group = alike[group].any(axis=0)
+        if not group.all():
+            others = [labels[numbers[enough[place]]] for place in np.flatnonzero(~group)[:3]]
+            values = {"names": others, "first": labels[numbers[enough[0]]]}
+            return Verdict.not_tested(sentence(Remark("inference.no_common_states", values)))
+    names = [labels[numbers[place]] for place in apart or order[:3]]
+    return _verdict("one_system", least, limit, names=names[:3], count=len(names))
+
+
+def _explained(columns: np.ndarray, rest: np.ndarray, basis: np.ndarray) -> tuple[int, np.ndarray]:
+    """How many columns that vanish elsewhere are independent; what they explain of residuals of variance one.
+
+    All are given where columns do not vanish: what the basis of the state explains of them is taken off.
+    """
+    inner, pushed = basis.T @ columns, columns.T @ rest
+    values, vectors = np.linalg.eigh(columns.T @ columns - inner.T @ inner)
+    kept = values > RANK * len(columns)
+    return int(kept.sum()), ((vectors[:, kept].T @ pushed) ** 2 / values[kept, None]).sum(axis=0)
+
+
+def _chance(count: int, explained: np.ndarray) -> float:
+    """Probability of so much explained, of the residual of which most is, by so many columns."""
+    if not count:
+        return 1.0
+    return min(float(scipy.special.chdtrc(count, explained).min()) * len(explained), 1.0)
+
+
+def _unchanged(rest: _Residuals, limit: float) -> Verdict:
+    runs = [run for run in rest.runs if run.stop - run.start >= FEWEST_OF_SPECTRUM]
+    if not runs:
+        return Verdict.not_tested(sentence(Remark("inference.runs_too_short")))
+    size = 2 * max(run.stop - run.start for run in runs)
+    frequencies = np.arange(1, size // FASTEST_PERIOD + 1)
+    octaves = np.log2(frequencies).astype(int)
+    one = rest.states[:, :1]
+    tried = [(rest.noise, one, False), (rest.noise, rest.states, False), (rest.power, one, True)]
+    price = len(tried) * (octaves[-1] + 1) * np.bincount(octaves)[octaves]
+    best = (1.0, 0.0, False)
+    for series, shapes, of_noise in tried:
+        peaks, freedom = np.zeros(len(frequencies)), np.zeros(len(frequencies))
+        for run in runs:
+            part = series[run] - (series[run].mean(axis=0) if len(runs) > 1 else 0.0)  # an offset is no swing
+            products = (part[:, :, None] * _orthonormal(shapes[run])[:, None, :]).reshape(len(part), -1)
+            seen = frequencies >= size / (2 * len(part))  # half a period in the run, or more
+            power = np.abs(np.fft.rfft(products, n=size, axis=0)[frequencies]) ** 2
+            peaks += np.where(seen, 2 * power.sum(axis=1), 0.0)
+            freedom += 2 * products.shape[1] * seen
+        # The variance of a peak of n samples is larger by the share of their fourth cumulant over n.
+        excess = float(((series**4).mean(axis=0) / (series**2).mean(axis=0) ** 2).max() - 3)
+        wider = 1 + max(excess, 0.0) * len(runs) / sum(run.stop - run.start for run in runs)
+        chances = scipy.special.chdtrc(np.maximum(freedom, 1) / wider, peaks / wider) * price
+        place = int(np.argmin(chances))
+        best = min(best, (float(chances[place]), size / float(frequencies[place]), of_noise))
+    chance, period, of_noise = best
+    period *= float(np.median(rest.pairs.h))
+    return _verdict("unchanged", chance, limit, period=period, of_noise=of_noise)
+
+
+def _state_complete(rest: _Residuals, limit: float) -> Verdict:
+    best, tried = (1.0, 0.0, "force"), 0
+    shapes = rest.states
+    forces = (rest.noise[:, :, None] * shapes[:, None, :]).reshape(len(shapes), -1)
+    for memory in rest.memories():
+        pushed = rest.past(forces, memory).reshape(len(shapes), -1, shapes.shape[1]) * shapes[:, None, :]
+        chances = {
+            "force": rest.probability(pushed.reshape(len(shapes), -1), rest.noise),
+            "past": rest.probability(rest.past(shapes[:, 1:], memory), rest.noise),
+            "noise": rest.probability(rest.past(rest.power, memory), rest.power),
+        }
+        tried += len(chances)
+        best = min(best, *((chance, memory, kind) for kind, chance in chances.items()))
+    if not tried:
+        return Verdict.not_tested(sentence(Remark("inference.runs_too_short")))
+    time = best[1] * float(np.median(rest.pairs.h))
+    return _verdict("state_complete", best[0] * tried, limit, memory=time, kind=best[2])
+
+
+def _gaussian(rest: _Residuals, recordings: Recordings, limit: float) -> Verdict:
+    chances: list[tuple[float, str, float]] = []
+    # A fourth cumulant k of a step changes the action of a path by its share k (2fh)²/(12 εh); what changes
+    # barriers by less is harmless, and makes tails larger by 1 + k (z⁴ - 3z²)/24 (Edgeworth).
+    noise, harmless = rest.noise, min(12 * HARMLESS_CHANGE / max(4 * rest.drift, 1e-300), 1.0)
+
+    def beyond(z: float) -> float:
+        return 2 * float(scipy.special.ndtr(-z)) * (1 + harmless * (z**4 - 3 * z**2) / 24) * noise.size
+
+    largest = float(np.abs(noise).max())
+    chances.append((beyond(largest), "jump", largest))
+    count = int((np.abs(noise) > TAIL).sum())
+    chances.append((float(scipy.special.gammainc(count, beyond(TAIL))), "tails", count / beyond(TAIL)))
+    for column in np.flatnonzero(rest.noisy[: recordings.values.shape[1]]):
+        chances += repetitions(recordings, int(column))
+    chance, kind, value = min(chances)
+    return _verdict("gaussian_increments", chance * len(chances), limit, kind=kind, value=value)

@@ -1,0 +1,146 @@
+"""What recordings would show if f and D were not the whole of their system, and that honest ones do not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from siq.data.recordings import Recordings, snapshot_pairs
+from siq.inference.claims import check_claims
+from siq.inference.field_estimate import FieldEstimate, FlowMap, Verdict
+from siq.inference.library import IdentificationOptions, field_library
+from siq.inference.regression import refit
+from siq.systems.diffusion import Diffusion
+
+STEP, WITHIN, INTENSITY, LIMIT = 0.05, 4, 0.25, 0.05 / 8
+LIBRARY = field_library(["x"], IdentificationOptions(degree=3))
+Force = Callable[[np.ndarray, float, np.random.Generator], np.ndarray]
+
+
+def nothing(x: np.ndarray, time: float, generator: np.random.Generator) -> np.ndarray:
+    return np.zeros_like(x)
+
+
+def records(
+    count: int, *, samples: int, seed: int, force: Force = nothing, strength: np.ndarray | float = 1.0
+) -> np.ndarray:
+    """``dx = (x - x³ + force) dt + √0.25 dW``: shape ``(count, samples, 1)``."""
+    generator, h = np.random.default_rng(seed), STEP / WITHIN
+    x, seen = np.sign(generator.standard_normal(count)), np.empty((count, samples, 1))
+    for k in range(samples):
+        seen[:, k, 0] = x
+        for part in range(WITHIN):
+            kick = np.sqrt(INTENSITY * h * strength) * generator.standard_normal(count)
+            x = x + h * (x - x**3 + force(x, k * STEP + part * h, generator)) + kick
+    return seen
+
+
+def claims(*parts: np.ndarray) -> dict[str, Verdict]:
+    """Of recordings ``(n, 1)`` each, with x and x³ fitted to them."""
+    times = [STEP * np.arange(len(one)) for one in parts]
+    recordings = Recordings.from_arrays(times, list(parts), names=["x"])
+    support = np.array([[0, LIBRARY.names.index(name)] for name in ("1", "x", "x**3")])
+    found = FieldEstimate.on_support(
+        LIBRARY, support, np.array([0.0, 1.0, -1.0]), np.eye(3), np.array([[INTENSITY]]), 0.1,
+        FlowMap(1), Diffusion.identity(1),
+    )  # fmt: skip
+    found = refit(found, snapshot_pairs(recordings))
+    return check_claims(found, recordings, recordings, false_alarms=LIMIT)
+
+
+def test_honest_records_are_refused_as_seldom_as_they_may_be() -> None:
+    seen = records(160, samples=3000, seed=1)
+    probabilities: dict[str, list[float]] = {}
+    for first in range(0, 160, 4):  # forty records of four recordings
+        for name, verdict in claims(*seen[first : first + 4]).items():
+            assert verdict.tested
+            probabilities.setdefault(name, []).append(10.0**-verdict.value)
+    for name, chances in probabilities.items():
+        # Of forty with the probability 0.05 more than six are one case in a hundred.
+        assert np.sum(np.array(chances) < 0.05) <= 6, name
+        assert np.sum(np.array(chances) < LIMIT) <= 2, name
+
+
+def swinging(x: np.ndarray, time: float, generator: np.random.Generator) -> np.ndarray:
+    return np.full_like(x, 0.25 * np.cos(2 * np.pi * time / 10))
+
+
+def drifting(x: np.ndarray, time: float, generator: np.random.Generator) -> np.ndarray:
+    return np.full_like(x, 0.3 * (time / 1000 - 1))
+
+
+class Hidden:
+    """A slow variable that nobody recorded: it pushes, or opens and shuts a gate."""
+
+    def __init__(self, *, gate: bool) -> None:
+        self.gate, self.value, self.time = gate, np.ones(1), 15.0
+
+    def __call__(self, x: np.ndarray, time: float, generator: np.random.Generator) -> np.ndarray:
+        h = STEP / WITHIN
+        if self.gate:
+            self.value = np.where(generator.random(len(x)) < h / self.time, -self.value, self.value)
+        else:
+            kick = np.sqrt(2 * h / self.time) * generator.standard_normal(len(x))
+            self.value = self.value * (1 - h / self.time) + kick
+        return 0.3 * self.value
+
+
+class Remembering:
+    """A force that follows where the state was."""
+
+    def __init__(self) -> None:
+        self.mean: np.ndarray | float = 0.0
+
+    def __call__(self, x: np.ndarray, time: float, generator: np.random.Generator) -> np.ndarray:
+        self.mean = self.mean + (x - self.mean) * STEP / WITHIN / 5.0
+        return -0.4 * np.asarray(self.mean)
+
+
+@pytest.mark.parametrize(
+    ("force", "claim"),
+    [
+        (swinging, "unchanged"),
+        (drifting, "unchanged"),
+        (Hidden(gate=False), "state_complete"),
+        (Hidden(gate=True), "state_complete"),
+        (Remembering(), "state_complete"),
+    ],
+)
+def test_what_is_not_in_the_state_is_noticed(force: Force, claim: str) -> None:
+    found = claims(*records(1, samples=40_000, seed=3, force=force))
+    assert found[claim].tested and not found[claim].passed and found[claim].reason
+    assert found["gaussian_increments"].passed
+
+
+def test_a_recording_that_stands_apart_is_named() -> None:
+    seen = records(6, samples=4000, seed=4)
+    seen[3] += 0.5  # another instrument
+    found = claims(*seen)["one_system"]
+    assert found.tested and not found.passed and ": 3 stands apart" in found.reason
+    louder = records(6, samples=4000, seed=4, strength=np.array([1, 1, 1.3, 1, 1, 1]))
+    found = claims(*louder)["one_system"]
+    assert not found.passed and ": 2 stands apart" in found.reason
+
+
+def test_recordings_that_share_no_states_are_not_compared() -> None:
+    seen = records(4, samples=600, seed=5) * 0.1
+    seen += np.array([1.0, -1.0, 1.0, -1.0])[:, None, None]
+    found = claims(*seen)["one_system"]
+    assert not found.tested and not found.passed and "share no states" in found.reason
+
+
+def test_noise_that_is_not_gaussian_is_noticed() -> None:
+    seen = records(1, samples=8000, seed=6)[0]
+    generator = np.random.default_rng(0)
+    jumped = seen + 0.8 * (np.arange(len(seen)) > 4000)[:, None] * (seen < 0)
+    held, filled = seen.copy(), seen.copy()
+    for begin in generator.integers(0, 7900, 30):
+        held[begin : begin + 5] = held[begin]
+        filled[begin : begin + 6] = np.linspace(filled[begin], filled[begin + 5], 6)
+    copied = np.concatenate([seen, seen[1000:2000]])
+    for record in (jumped, held, filled, copied):
+        assert not claims(record)["gaussian_increments"].passed
+    rounded = claims(np.round(seen, 3))["gaussian_increments"]
+    assert rounded.passed
