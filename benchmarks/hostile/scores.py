@@ -173,7 +173,7 @@ def fault(claim: Claim, longer: Record) -> str:
     nearest = min(max(claim.value, low), high)
     margin = error * nearest if np.isfinite(nearest) else 0.0
     inside = claim.low - margin <= nearest <= claim.high + margin
-    if inside or abs(claim.value - nearest) <= TOLERANCE * nearest:
+    if inside or (np.isfinite(nearest) and abs(claim.value - nearest) <= TOLERANCE * nearest):
         return ""
     truth = f"{low:.3g}" if high - low <= 1e-3 * low else f"{low:.3g} to {high:.3g}"
     return (
