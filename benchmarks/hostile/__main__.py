@@ -26,7 +26,7 @@ from benchmarks.hostile.scores import as_row, scored
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")  # one each: cases run side by side
 Case = tuple[str, int, float, bool]
 COLUMNS = (
-    "kind", "seed", "strength", "honest", "certified", "claims", "false", "named", "codes", "off",
+    "kind", "seed", "strength", "honest", "certified", "claims", "false", "named", "codes", "off", "excess",
     "seconds", "said",
 )  # fmt: skip
 

@@ -66,6 +66,8 @@ class Score:
         Whether anything was certified.
     claims, off
         How many numbers were claimed, and of which, in words, the truth is another one.
+    excess
+        How far the worst of these is off, in halves of its interval: 1 to 1.5 comes by chance, 3 does not.
     codes
         What refused, by name.
     seconds
@@ -77,6 +79,7 @@ class Score:
     certified: bool = False
     claims: int = 0
     off: list[str] = field(default_factory=list)
+    excess: float = 0.0
     codes: list[str] = field(default_factory=list)
     seconds: float = float("nan")
     said: str = ""
@@ -94,8 +97,9 @@ def scored(kind: Kind, seed: int, strength: float, *, honest: bool = False) -> S
     if score.certified and found is not None:
         claims = claims_of(found, record)
         longer = record if record.law else kind.record(seed, strength, honest=honest, copies=LONGER)
-        score.claims = len(claims)
-        score.off = [text for one in claims if (text := fault(one, longer))]
+        faults = [fault(one, longer) for one in claims]
+        score.claims, score.off = len(claims), [text for text, _ in faults if text]
+        score.excess = max((excess for _, excess in faults), default=0.0)
     return score
 
 
@@ -164,8 +168,11 @@ def claims_of(found: Landscape, record: Record) -> list[Claim]:
     return claims
 
 
-def fault(claim: Claim, longer: Record) -> str:
-    """What a claim says and what is true, in words; empty where it is not off."""
+def fault(claim: Claim, longer: Record) -> tuple[str, float]:
+    """What a claim says and what is true, in words, and how far it is off in halves of its interval.
+
+    Empty and zero where it is not off.
+    """
     if claim.what == "barrier":
         low, high, error = _true_barrier(claim, longer)
     else:
@@ -174,12 +181,14 @@ def fault(claim: Claim, longer: Record) -> str:
     margin = error * nearest if np.isfinite(nearest) else 0.0
     inside = claim.low - margin <= nearest <= claim.high + margin
     if inside or (np.isfinite(nearest) and abs(claim.value - nearest) <= TOLERANCE * nearest):
-        return ""
+        return "", 0.0
     truth = f"{low:.3g}" if high - low <= 1e-3 * low else f"{low:.3g} to {high:.3g}"
-    return (
+    text = (
         f"{claim.what} from {claim.start:.2f} to {claim.end:.2f}: claimed {claim.value:.3g}"
         f" ({claim.low:.3g} to {claim.high:.3g}), true {truth}"
     )
+    half = claim.high - claim.value if nearest > claim.value else claim.value - claim.low
+    return text, float(abs(nearest - claim.value) / max(half + margin, 1e-12))
 
 
 def _true_barrier(claim: Claim, longer: Record) -> tuple[float, float, float]:
@@ -240,6 +249,6 @@ def as_row(kind: Kind, seed: int, strength: float, honest: bool, score: Score) -
     return {
         "kind": kind.name, "seed": seed, "strength": strength, "honest": honest,
         "certified": score.certified, "claims": score.claims, "false": score.false, "named": named,
-        "codes": " ".join(score.codes), "off": "; ".join(score.off), "seconds": round(score.seconds, 2),
-        "said": score.said,
+        "codes": " ".join(score.codes), "off": "; ".join(score.off), "excess": round(score.excess, 2),
+        "seconds": round(score.seconds, 2), "said": score.said,
     }  # fmt: skip

@@ -82,7 +82,7 @@ def test_a_claim_is_off_beyond_its_interval_and_a_tenth(honest: Record) -> None:
     true = law.time(-1.0, 1.0)
 
     def said(value: float, factor: float) -> str:
-        return fault(Claim("visit", -1.0, 1.0, value, value / factor, value * factor), honest)
+        return fault(Claim("visit", -1.0, 1.0, value, value / factor, value * factor), honest)[0]
 
     assert not said(true, 1.01)
     assert not said(1.5 * true, 1.8)  # within its interval
@@ -96,7 +96,7 @@ def test_no_barrier_is_true_where_no_passage_is_possible() -> None:
     levels = sorted({float(np.median(one)) for one in record.states})
     assert counted(record.states, levels[0], levels[-1])[1] == 0
     claim = Claim("barrier", levels[0], levels[-1], 4.0, 3.5, 4.5)
-    assert "inf" in fault(claim, record)
+    assert "inf" in fault(claim, record)[0]
 
 
 def test_the_density_of_a_long_record_shows_the_barrier_of_the_law(honest: Record) -> None:
@@ -106,8 +106,8 @@ def test_the_density_of_a_long_record_shows_the_barrier_of_the_law(honest: Recor
     start = -1.0
     between = law.height[(law.grid > -1) & (law.grid < 1)].max()
     true = between - float(np.interp(start, law.grid, law.height))
-    assert not fault(Claim("barrier", start, 1.0, true, 0.99 * true, 1.01 * true), without)
-    assert fault(Claim("barrier", start, 1.0, 1.5 * true, 1.4 * true, 1.6 * true), without)
+    assert not fault(Claim("barrier", start, 1.0, true, 0.99 * true, 1.01 * true), without)[0]
+    assert fault(Claim("barrier", start, 1.0, 1.5 * true, 1.4 * true, 1.6 * true), without)[0]
 
 
 def test_a_run_goes_on_where_it_was(tmp_path, monkeypatch, capsys) -> None:
