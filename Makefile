@@ -79,7 +79,7 @@ supports: environment
 discrepancies: environment
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m benchmarks.discrepancies
 
-# Records of fifty kinds that nobody should certify, and honest ones that look alike: hours, and it goes on where it was
+# Records of seventy kinds that nobody should certify, and honest ones that look alike: hours, and it goes on where it was
 # stopped. `make hostile HOSTILE='--seeds 0'` for a look; a fifth of the kinds runs with HOSTILE=--held-out alone.
 HOSTILE ?=
 hostile: environment
