@@ -6,7 +6,7 @@ that it is the same however many are made.
 
 What a refusal may name are the claims of a certificate: ``state_complete``, ``unchanged``, ``one_system``,
 ``gaussian_increments``, ``connected``, ``prediction`` (f and D are right where the path runs) and ``record``
-(times foreseen and counted agree). A flaw that cannot be told from another one in a single state allows both.
+(times and histogram are as foreseen), of which ``times`` is a part. A flaw that cannot be told from another one in a single state allows both.
 """
 
 from __future__ import annotations
@@ -75,8 +75,9 @@ def kind(*named: str, twin: Maker | None = None) -> Callable[[Maker], Maker]:
             return make(draw, 0.0, copies)
 
         name = make.__name__
+        claims = {*named, "times"} if "record" in named else set(named)
         about = (make.__doc__ or "").splitlines()[0].rstrip(".")
-        KINDS[name] = Kind(name, about, make, twin or faultless, frozenset(named))
+        KINDS[name] = Kind(name, about, make, twin or faultless, frozenset(claims))
         return make
 
     return entered

@@ -154,6 +154,9 @@ def claims_of(found: Landscape, record: Record) -> list[Claim]:
         margin, gain = INTERVAL * error, float(np.log(strengths[1] / strengths[0]))
         claims.append(Claim("barrier", wells[way.start], end, height, height - margin, height + margin, gain))
     times = [(one.well, one.predicted, one.error, "visit") for one in found.visits]
+    # Times may be untested where the rest is certified; of older certificates all are claimed.
+    if not getattr(found.certificate, "times_certified", True):
+        return claims
     if noise is not None:
         for row in found.dwell_times().itertuples():
             spread = float(np.hypot(row.data_error, row.law_error))

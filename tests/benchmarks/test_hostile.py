@@ -13,6 +13,7 @@ from benchmarks.hostile.scores import Claim, counted, fault
 
 CLAIMS = {
     "state_complete", "unchanged", "one_system", "gaussian_increments", "connected", "prediction", "record",
+    "times",
 }  # fmt: skip
 
 
