@@ -6,7 +6,8 @@ that it is the same however many are made.
 
 What a refusal may name are the claims of a certificate: ``state_complete``, ``unchanged``, ``one_system``,
 ``gaussian_increments``, ``connected``, ``prediction`` (f and D are right where the path runs) and ``record``
-(times and histogram are as foreseen), of which ``times`` is a part. A flaw that cannot be told from another one in a single state allows both.
+(times and histogram are as foreseen), of which ``times`` is a part. A flaw that cannot be told from another
+one in a single state allows both.
 """
 
 from __future__ import annotations
