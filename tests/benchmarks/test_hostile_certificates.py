@@ -1,0 +1,30 @@
+"""Records that nobody should certify, and honest ones, from end to end: a few of `make hostile`."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks.hostile.catalogue import KINDS
+from benchmarks.hostile.scores import scored
+
+# Chosen for what they are, and for a short computing time: a minute and a half together.
+REFUSED = (
+    "joined_levels", "swinging_tilt", "gate", "growing_noise", "force_with_memory", "hidden_velocity",
+    "relaxation_oscillator", "held_values", "held_gaps", "lost_buffers", "square_wave", "resets",
+    "growing_oscillation", "levy_noise_in_wells",
+)  # fmt: skip
+HONEST = ("gate", "swinging_tilt", "two_offsets", "growing_noise")
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_nothing_is_certified_that_is_not_so(name: str) -> None:
+    score = scored(KINDS[name], 0, 1.0)
+    assert not score.false, score.off
+    assert not score.certified
+
+
+@pytest.mark.parametrize("name", HONEST)
+def test_an_honest_record_that_looks_alike_is_certified(name: str) -> None:
+    score = scored(KINDS[name], 0, 1.0, honest=True)
+    assert score.certified, score.said
+    assert not score.off
