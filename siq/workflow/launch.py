@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import IO, Any, TextIO
 
 from siq.errors import InputError, MissingExtra, suggestion
-from siq.numerics.files import CARD, case_folders, read_document
+from siq.numerics.files import CARD, case_folders, given_path, read_document
 from siq.workflow.answers import Exit, answer_of_page
 from siq.workflow.examples import is_study, name_for, own_path, write_generated
 
@@ -320,13 +320,15 @@ def run_study(given: str, asked: Request) -> Exit:
     file cannot be used, with `MissingExtra` when the workflow is not installed.
     """
     _need_workflow()
-    path = Path(given).expanduser()
+    path = given_path(given)
     settings: tuple[str, ...] = ()
     study: Path | None = None
     if not path.exists() and given in _known_studies():
         name = given
     elif not path.exists():
         raise _not_there(given)
+    elif any(each in path.name for each in "{}"):  # to Snakemake a blank that is filled in
+        raise InputError(given, "", "the name has braces", "rename the file")
     elif (path / CARD).is_file():
         raise InputError(
             given, "", f"this is a case of a simulation and its recordings, since it has {CARD}",
@@ -356,7 +358,7 @@ def diagnose_cases(folder: str, asked: Request) -> Exit:
     It has ``system.yaml`` and recordings, or folders that have them. Fails as `run_study` does.
     """
     _need_workflow()
-    place = Path(folder).expanduser()
+    place = given_path(folder)
     if place.name == CARD and place.is_file():
         place = place.parent
     if not place.is_dir():
@@ -367,7 +369,7 @@ def diagnose_cases(folder: str, asked: Request) -> Exit:
 
 def _not_there(given: str) -> InputError:
     """A wrong path, with where it was looked for and what is there of a similar name."""
-    place = Path(given).expanduser().absolute()
+    place = given_path(given).absolute()
     beside = [entry.name for entry in place.parent.iterdir()] if place.parent.is_dir() else []
     otherwise = suggestion(given, _known_studies(), otherwise="correct the path")
     remedy = suggestion(place.name, beside, otherwise=otherwise)
