@@ -6,6 +6,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from workflow.pages import origin_of
 from workflow.task import Given, task
 
 if TYPE_CHECKING:
@@ -193,5 +194,6 @@ def mismatch_page(given: Given, settings: PipelineSettings) -> Any:
         folder=str(Path(given.files["candidates"]).parent),
     )
     found = f"# the simulation with what was found, a system card like any other: {given.files['system']}"
-    html = rendered(findings, title=title, commands=[given.options["command"], found])
+    commands, origin = [given.options["command"], found], origin_of(given)
+    html = rendered(findings, title=title, commands=commands, origin=origin)
     return {"html": html, "answer": mismatch_answer(findings.statement, title=title)}

@@ -89,12 +89,15 @@ def read(name: str, path: str | Path) -> Any:
         from siq.quasipotential.landscape_comparison import ReferenceLandscape
 
         return ReferenceLandscape.read(path)
-    if name.endswith("_outcome"):
-        return read_outcomes(path)
     if path.suffix == ".parquet":
         return read_table(path)
-    text = path.read_text(encoding="utf-8")
-    return json.loads(text) if path.suffix == ".json" else text
+    try:
+        if name.endswith("_outcome"):
+            return read_outcomes(path)
+        text = path.read_text(encoding="utf-8")
+        return json.loads(text) if path.suffix == ".json" else text
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(path, "", "it is not a result as it was written", "make it again") from None
 
 
 def read_states(path: str | Path, field: str | Path) -> Recordings | None:
@@ -215,5 +218,5 @@ def read_table(path: str | Path) -> pd.DataFrame:
     """
     try:
         return pd.read_parquet(path)
-    except (OSError, ValueError):
+    except (OSError, ValueError, KeyError, TypeError):
         raise InputError(path, "", "it is not a Parquet table", "make it again") from None

@@ -26,6 +26,13 @@ def _versions(*programs: str) -> dict[str, str]:
     return {"siq": siq.__version__} | {name: version(name) for name in programs}
 
 
+def origin_of(given: Given) -> str:
+    """What the results beside a page came from, in one line."""
+    from siq.workflow.answers import Provenance
+
+    return Provenance(Path(given.outputs["html"]).parent).origin()
+
+
 def _files(folders: Iterable[str], suffix: str) -> dict[str, bytes]:
     """Drawn figures by name."""
     found = [path for folder in folders for path in sorted(Path(folder).glob(f"*{suffix}"))]
@@ -226,7 +233,13 @@ def page(given: Given, settings: PipelineSettings) -> Any:
         interactive=Markup(view.read_text(encoding="utf-8")) if view.is_file() else None,
     )
     programs = PACKAGES if study.training is None else (*PACKAGES, *OF_NETWORKS)
-    content = study_page(study, results, command=given.options["command"], versions=_versions(*programs))
+    content = study_page(
+        study,
+        results,
+        command=given.options["command"],
+        versions=_versions(*programs),
+        origin=origin_of(given),
+    )
     gathered = {f"{name}.png": one for name, one in images.items()}
     gathered |= {f"{name}.svg": one for name, one in vectors.items()}
     answer = answer_data(content, study, results)
@@ -272,6 +285,6 @@ def equations_page(given: Given, settings: PipelineSettings) -> Any:
         interactive=None if summary is None or system.dimension < 3 else interactive_view(summary),
     )
     command, versions = given.options["command"], _versions(*PACKAGES)
-    content = study_page(study, results, command=command, versions=versions)
+    content = study_page(study, results, command=command, versions=versions, origin=origin_of(given))
     answer = answer_data(content, study, results)
     return {"html": render_report(content), "answer": answer, "figures": gathered}

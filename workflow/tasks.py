@@ -19,6 +19,7 @@ from typing import Any
 from benchmarks.proof import tasks as proof
 from benchmarks.publication import tasks as publication
 from siq.errors import InputError
+from siq.workflow.answers import Provenance
 from workflow import diagnosis, pages, steps
 from workflow.task import TASKS, Given
 
@@ -91,12 +92,26 @@ class Job:
             wildcards=self.wildcards, outputs=self.output, device=self.device, threads=self.threads,
             tell=_teller(self.wildcards.get("case", "")),
         )  # fmt: skip
+        read = _files(self.input)
+        Provenance.check(read)
         made = TASKS[self.task].run(given, settings)
         for name, path in self.output.items():
             if name in made:
                 write(name, path, made[name], settings)
         for then in given.afterwards:
             then()
+        keys = ("seed", "study", "command", "version")
+        said = {key: given.options[key] for key in keys if key in given.options}
+        Provenance(self.log.rpartition("/logs/")[0]).record(
+            self.task, inputs=read, outputs=_files(self.output), said=said
+        )
+
+
+def _files(named: Mapping[str, Any]) -> list[str]:
+    """The paths that a rule names, one by one or in lists."""
+    return [
+        each for value in named.values() for each in ([value] if isinstance(value, str) else value) if each
+    ]
 
 
 def _plain(value: Any) -> Any:

@@ -149,7 +149,7 @@ def _duration(seconds: float) -> str:
     return f"about {round(seconds / 3600)} h left"
 
 
-class Screen:
+class _Screen:
     """Shows the line: rewritten in place on a terminal of so many columns, now and then in a log."""
 
     def __init__(
@@ -185,7 +185,7 @@ class Screen:
         self._stream.flush()
 
 
-def follow(lines: Iterable[str], screen: Screen, progress: _Progress) -> list[str]:
+def _follow(lines: Iterable[str], screen: _Screen, progress: _Progress) -> list[str]:
     """Read what a workflow writes, show where it stands, and pass on what its jobs say, which is returned.
 
     The traceback of a job is not passed on: it stands in the job's log, which `_faults` names. An empty line
@@ -393,7 +393,7 @@ def _answered(request: Request, pages: Sequence[Path]) -> Exit:
     try:
         if process.stdout is not None:
             columns = shutil.get_terminal_size().columns if sys.stderr.isatty() else None
-            said = follow(_lines(process.stdout), Screen(sys.stderr, columns=columns), progress)
+            said = _follow(_lines(process.stdout), _Screen(sys.stderr, columns=columns), progress)
         code = process.wait()
     except KeyboardInterrupt:  # Snakemake has been told, too, and lets no half of a file stand
         try:  # it cleans up; interrupted again, or after too long, it is ended

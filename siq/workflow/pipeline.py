@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from siq.data.preparation import in_stretches, joined, without_slow_drift
+from siq.data.preparation import in_stretches, joined, read_pairs, without_slow_drift
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.data.two_states import RecordStates
 from siq.errors import NumericalFailure
@@ -39,6 +39,7 @@ from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.refinement import Refinement, RefinementContext
 from siq.quasipotential.wells import Well
 from siq.remarks import Remark, sentence
+from siq.systems.cards import load_system
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import PhasePortrait, evenly_spread, phase_portrait
@@ -68,6 +69,33 @@ def draw_run(
         return StepResult(recordings, Outcome(number, Step.SIMULATE))
     except NumericalFailure as error:
         return StepResult(None, Outcome(number, Step.SIMULATE, Status.FAILED, str(error)))
+
+
+def source_of(path: str | Path, settings: PipelineSettings) -> Dynamics | Recordings:
+    """The card that is simulated, or the recordings in its place.
+
+    Raises
+    ------
+    InputError
+        When the file is refused.
+    """
+    if settings.simulation is not None:
+        return load_system(path)
+    recordings, _ = read_pairs(
+        path,
+        states=settings.space.names,
+        units=settings.space.units,
+        pair_step=settings.sampling.pair_step,
+        hidden_velocities=settings.identification.hidden_velocities,
+    )
+    space = settings.space
+    units = tuple(
+        unit or space.unit(name, unknown="") or None
+        for name, unit in zip(recordings.names, recordings.units, strict=True)
+    )
+    return replace(
+        recordings, units=units, time_unit=recordings.time_unit or space.unit("t", unknown="") or None
+    )
 
 
 def identify_run(
@@ -154,7 +182,7 @@ def _regressed(
 
 
 @dataclass(frozen=True)
-class RefinedRun:
+class _RefinedRun:
     """Formulas of a run by method, with a certificate for each and for the control, and the outcome.
 
     Certificates are plain data, as they stand in `model.json`. `refinement` has the refined formulas with
@@ -190,7 +218,7 @@ def refine_run(
     identified: StepResult[FieldEstimate],
     trained: StepResult[AnyNetworks],
     regressed: SymbolicDecomposition | None = None,
-) -> RefinedRun:
+) -> _RefinedRun:
     """V about every attractor of the identified f, or over the region, with its certificate.
 
     It follows from trajectories and f alone; networks are a second route, which has to agree.
@@ -241,7 +269,7 @@ def refine_run(
     for method in formulas.keys() - certificates.keys():
         certificates[method] = uncertified(f"no test was made: {outcome.reason}")
     portrait = None if context is None else context.portrait
-    return RefinedRun(formulas, certificates, outcome, refinement, portrait)
+    return _RefinedRun(formulas, certificates, outcome, refinement, portrait)
 
 
 def landscape_of_run(
@@ -309,7 +337,7 @@ class Analysis:
     identified: StepResult[FieldEstimate]  #: f, and the test of its predictions
     trained: StepResult[AnyNetworks]  #: the networks
     regressed: StepResult[SymbolicDecomposition] | None  #: the published method's formulas, where asked for
-    refined: RefinedRun  #: formulas by method, with their certificates
+    refined: _RefinedRun  #: formulas by method, with their certificates
     landscape: StepResult[Landscape] | None  #: wells, barriers, ways; None where not asked for
 
     @property

@@ -1,6 +1,6 @@
 # Helpers of the rules: studies and their parameters, tasks and their versions, one workflow at a time.
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from filelock import FileLock, Timeout
 from siq.errors import InputError
 from siq.numerics.files import files_of
 from siq.report.formatting import texts
-from siq.workflow.answers import Exit, answer_of_page
+from siq.workflow.answers import PROVENANCE, Exit, Provenance, answer_of_page
 from siq.workflow.study import point_name
 from workflow.places import config_path, find_file
 from workflow.published import load_published
@@ -322,12 +322,19 @@ def say_what_has_no_answer():
 
 # Snakemake's own lock outlives a killed process and would ask for --unlock; the profile switches it off.
 # The kernel's lock goes with the process.
-LOCK = None
+LOCK = FileLock(".snakemake/siq.lock", timeout=0)
 WARM = None
+
+# What is not as its job wrote it is made again, before anything is built upon it.
+with suppress(Timeout), LOCK:  # whoever has it is writing
+    for depth in ("*", "*/*"):
+        for record in Path("results").glob(f"{depth}/{PROVENANCE}"):
+            planned = bool({"-n", "--dry-run", "--dryrun"} & set(sys.argv))
+            for sentence in Provenance(record.parent).set_aside(remove=not planned):
+                print(sentence, file=sys.stderr)
 
 
 onstart:
-    globals()["LOCK"] = FileLock(".snakemake/siq.lock", timeout=0)
     try:
         LOCK.acquire()
     except Timeout:
