@@ -144,6 +144,14 @@ def run(snakemake: Any) -> None:
         logging.error("%s", error)
         print(error, file=sys.stderr)
         sys.exit(1)
+    except OSError as error:  # a full disk, a folder or a file that may not be written or read
+        logging.exception("the step stopped")
+        what = error.strerror or str(error)
+        print(
+            f"{error.filename or job.log}: {what}; see to it, and give the same command again.",
+            file=sys.stderr,
+        )
+        sys.exit(1)
     except BaseException:
         logging.exception("the step stopped")
         raise

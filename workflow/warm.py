@@ -25,6 +25,7 @@ import tempfile
 import threading
 import traceback
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import TypedDict
 
@@ -33,6 +34,23 @@ ADDRESS = "SIQ_WARM_INTERPRETER"
 
 STREAMS = 3  # standard input, output and error of the job
 LONGEST_REQUEST = 1 << 20
+
+
+PARENT = "SIQ_PARENT"
+"""Environment variable of a workflow whose standard input ends with the process that has started it."""
+
+
+def end_with_parent() -> None:
+    """End this process with the one that has started it, however that ends; all jobs end with this one."""
+    if os.environ.pop(PARENT, None):
+        threading.Thread(target=_end_with_input, args=(lambda: None,), daemon=True).start()
+
+
+def _end_with_input(before: Callable[[], None]) -> None:
+    while os.read(0, 1):
+        pass
+    before()
+    os._exit(1)
 
 
 class Request(TypedDict):
@@ -86,8 +104,8 @@ def run_warm(task: str) -> None:
     connection = socket.socket(socket.AF_UNIX)
     try:
         connection.connect(address)
-    except OSError:
-        return
+    except OSError:  # it ends with the workflow, and nobody waits for this job any more
+        sys.exit("The workflow has ended, and this job with it.")
     request: Request = {
         "task": task,
         "script": str(Path(sys.argv[0]).resolve()),  # Snakemake runs a copy, which says what the job is
@@ -105,15 +123,23 @@ def serve(listening: socket.socket, folder: Path) -> None:
     """Give every script that connects to a fork, until standard input ends; then remove the folder."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the workflow, which then ends
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # forks that have ended are reaped by the system
-    threading.Thread(target=_end_with_workflow, args=(folder,), daemon=True).start()
     forks: dict[socket.socket, bool] = {}  # whether each is at work
+    numbers: dict[socket.socket, int] = {}
+
+    def end_all() -> None:
+        for number in list(numbers.values()):
+            with contextlib.suppress(OSError):
+                os.kill(number, signal.SIGKILL)
+        shutil.rmtree(folder, ignore_errors=True)
+
+    threading.Thread(target=_end_with_input, args=(end_all,), daemon=True).start()
     while True:
         ready, _, _ = select.select([listening, *forks], [], [])
         for fork in set(ready) & set(forks):
             with contextlib.suppress(OSError):
                 forks[fork] = not fork.recv(1)
             if forks[fork]:  # it has ended with its job
-                del forks[fork]
+                del forks[fork], numbers[fork]
                 fork.close()
         if listening not in ready:
             continue
@@ -129,13 +155,14 @@ def serve(listening: socket.socket, folder: Path) -> None:
             with contextlib.suppress(Exception):  # the job says itself what is wrong
                 _load(request["task"])
             idle, ours = socket.socketpair()
-            if os.fork() == 0:
+            if not (number := os.fork()):
                 for each in (listening, connection, idle, *forks):
                     each.close()
                 for descriptor in descriptors:
                     os.close(descriptor)
                 _work(ours)
             ours.close()
+            numbers[idle] = number
         forks[idle] = True
         with contextlib.suppress(OSError):  # one that was killed; the script sees its connection end
             _send(idle, request, [*descriptors, connection.fileno()])
@@ -151,13 +178,6 @@ def _load(task: str) -> None:
     for module in imports_of_task(task):
         with contextlib.suppress(ImportError):  # a name in a module, and no module
             importlib.import_module(module)
-
-
-def _end_with_workflow(folder: Path) -> None:
-    while os.read(0, 1):
-        pass
-    shutil.rmtree(folder, ignore_errors=True)
-    os._exit(0)
 
 
 def _send(connection: socket.socket, request: Request, descriptors: list[int]) -> None:

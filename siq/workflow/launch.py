@@ -11,6 +11,7 @@ import json
 import os
 import queue
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -269,6 +270,9 @@ class Request:
         return [*words, *self.further, "--", *self.targets]
 
 
+PARENT = "SIQ_PARENT"
+"""Environment variable that tells Snakemake to end when its standard input does, see `workflow.warm`."""
+
 FOLLOWED = "SIQ_FOLLOWED"
 """Environment variable that tells jobs that what they say of their progress is read."""
 
@@ -380,9 +384,11 @@ def _not_there(given: str) -> InputError:
 
 def _answered(request: Request, pages: Sequence[Path]) -> Exit:
     """Run the workflow in the folder in which you work, with one line of progress; say how it ended."""
+    # Its standard input ends with this process, however that ends, and Snakemake then ends, too.
     process = subprocess.Popen(
         request.command(),
-        env=_environment() | ({} if request.verbose else {FOLLOWED: "1"}),
+        env=_environment() | {PARENT: "1"} | ({} if request.verbose else {FOLLOWED: "1"}),
+        stdin=subprocess.PIPE,
         stdout=None if request.verbose else subprocess.PIPE,
         stderr=None if request.verbose else subprocess.STDOUT,
         text=None if request.verbose else True,
@@ -390,20 +396,31 @@ def _answered(request: Request, pages: Sequence[Path]) -> Exit:
         errors=None if request.verbose else "replace",
     )
     progress, said = _Progress(), []
+
+    def stop(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, stop)
     try:
         if process.stdout is not None:
             columns = shutil.get_terminal_size().columns if sys.stderr.isatty() else None
             said = _follow(_lines(process.stdout), _Screen(sys.stderr, columns=columns), progress)
         code = process.wait()
-    except KeyboardInterrupt:  # Snakemake has been told, too, and lets no half of a file stand
-        try:  # it cleans up; interrupted again, or after too long, it is ended
+    except KeyboardInterrupt:  # files are whole or not there; what was begun is made again
+        try:
+            if process.stdin is not None:
+                process.stdin.close()
             process.wait(timeout=20.0)
         except (KeyboardInterrupt, subprocess.TimeoutExpired):
             process.kill()
             process.wait()
         print("\nStopped. Give the same command again to go on from here.", file=sys.stderr)
         return Exit.INTERRUPTED
-    if code and not request.verbose:
+    if code < 0:
+        said = [f"Snakemake was ended by signal {-code}. Give the same command again to go on from here."]
+        print(*said, file=sys.stderr)
+    elif code and not request.verbose:
         said += (more := _faults(progress, said))
         for line in more:
             print(line, file=sys.stderr)

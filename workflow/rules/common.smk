@@ -16,7 +16,7 @@ from workflow.published import load_published
 from workflow.settings import Studies, prepare_environment
 from workflow.tasks import TASKS
 from workflow.versions import versions
-from workflow.warm import start
+from workflow.warm import end_with_parent, start
 
 
 def say_and_stop(error):
@@ -34,6 +34,7 @@ def bad_input_told(refused=InputError):
         say_and_stop(error)
 
 
+end_with_parent()
 prepare_environment()
 
 with bad_input_told():
