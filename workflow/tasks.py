@@ -92,26 +92,15 @@ class Job:
             wildcards=self.wildcards, outputs=self.output, device=self.device, threads=self.threads,
             tell=_teller(self.wildcards.get("case", "")),
         )  # fmt: skip
-        read = _files(self.input)
-        Provenance.check(read)
+        Provenance.check(self.input)
         made = TASKS[self.task].run(given, settings)
         for name, path in self.output.items():
             if name in made:
                 write(name, path, made[name], settings)
         for then in given.afterwards:
             then()
-        keys = ("seed", "study", "command", "version")
-        said = {key: given.options[key] for key in keys if key in given.options}
-        Provenance(self.log.rpartition("/logs/")[0]).record(
-            self.task, inputs=read, outputs=_files(self.output), said=said
-        )
-
-
-def _files(named: Mapping[str, Any]) -> list[str]:
-    """The paths that a rule names, one by one or in lists."""
-    return [
-        each for value in named.values() for each in ([value] if isinstance(value, str) else value) if each
-    ]
+        kept = Provenance(self.log.rpartition("/logs/")[0])
+        kept.record(self.task, inputs=self.input, outputs=self.output, said=given.options)
 
 
 def _plain(value: Any) -> Any:

@@ -13,7 +13,7 @@ import platform
 import shutil
 import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from enum import IntEnum
 from functools import cached_property
 from pathlib import Path
@@ -89,6 +89,11 @@ def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
+def _paths(named: Mapping[str, Any]) -> list[Path]:
+    several = ([value] if isinstance(value, str) else value for value in named.values())
+    return [Path(path) for paths in several for path in paths if path]
+
+
 def _versions() -> dict[str, str]:
     """The programs that take part, where they are loaded."""
     from importlib.metadata import version as installed
@@ -148,18 +153,21 @@ class Provenance:
         )
 
     def record(
-        self, task: str, *, inputs: Iterable[str], outputs: Iterable[str], said: Mapping[str, Any]
+        self, task: str, *, inputs: Mapping[str, Any], outputs: Mapping[str, Any], said: Mapping[str, Any]
     ) -> None:
-        """Add a job that has ended; the table beside a Parquet file counts as its output, too."""
-        made = [Path(path) for path in outputs]
+        """Add a job that has ended: the files of its rule by name, one or several, and its options.
+
+        The table beside a Parquet file counts as its output, too.
+        """
+        made = _paths(outputs)
         made += [
             path.with_suffix(".csv") for path in made
             if path.suffix == ".parquet" and path.with_suffix(".csv").is_file()
         ]  # fmt: skip
         line = {
             "task": task,
-            **said,
-            "inputs": {self._own(path): Provenance.digest_of(Path(path)) for path in inputs},
+            **{key: said[key] for key in ("seed", "study", "command", "version") if key in said},
+            "inputs": {self._own(path): Provenance.digest_of(path) for path in _paths(inputs)},
             "outputs": {self._own(path): Provenance.digest_of(path) for path in made},
             "versions": _versions(),
             "machine": f"{platform.system()} {platform.release()} {platform.machine()}",
@@ -201,15 +209,8 @@ class Provenance:
     def set_aside(self, *, remove: bool = True) -> list[str]:
         """Remove what is damaged, with all that the same job has made, so that it is made again.
 
-        Parameters
-        ----------
-        remove
-            Whether to do so, or only to say it.
-
-        Returns
-        -------
-        list of str
-            A sentence for each damaged file. What is not there at all is for the workflow to see.
+        It gives a sentence for each damaged file; without `remove` that is all. What is not there at all is
+        for the workflow to see.
         """
         damaged = [path for path in self.changed() if (self.folder / path).exists() or path.endswith(".csv")]
         for place in {self.folder / other for path in damaged for other in self.made[path]["outputs"]}:
@@ -222,8 +223,18 @@ class Provenance:
         return [f"{self.folder / path} is not as it was written; it is made again." for path in damaged]
 
     @classmethod
-    def check(cls, paths: Iterable[str]) -> None:
+    def mend(cls, *, planned: bool) -> None:
+        """Say what is damaged in ``results``, and set it aside unless that is only `planned`."""
+        for depth in ("*", "*/*"):
+            for file in Path("results").glob(f"{depth}/{PROVENANCE}"):
+                for told in cls(file.parent).set_aside(remove=not planned):
+                    print(told, file=sys.stderr)
+
+    @classmethod
+    def check(cls, inputs: Mapping[str, Any]) -> None:
         """Refuse files of results that are not as they were written, before anything is built upon them.
+
+        They are those of a rule by name, one or several.
 
         Raises
         ------
@@ -231,7 +242,7 @@ class Provenance:
             For the first of them.
         """
         known: dict[Path, Provenance] = {}
-        for path in map(Path, paths):
+        for path in _paths(inputs):
             for folder in path.parents:
                 if folder not in known:
                     known[folder] = cls(folder)

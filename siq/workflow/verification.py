@@ -1,23 +1,23 @@
 """Whether results are what they say: their files by digests, their numbers derived again from the recordings.
 
 The files are compared with ``provenance.jsonl``, in which each step has written what it read and made. Then
-the trajectories are drawn from the recordings again, f and D identified, and the certificate computed, by the
-steps that the study names. What the formulas claim is judged by other means than those that found them: the
+trajectories are drawn from the recordings again, f and D identified and the certificate computed, by the
+steps that the study names. What formulas claim is judged by other means than those that found them: the
 residual of ``f·p + p·Dp = 0``, p = ∇V, by derivatives of the stored formula; the branch by the flow ``f +
-2Dp``, which has to lead away from the attractor; and a barrier by a quadrature, a mesh, or the action of the
+2Dp``, which has to lead away from the attractor; a barrier by a quadrature, a mesh, or the action of the
 stored path.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import sympy
 
-from siq.data.recordings import Recordings, read_recordings
+from siq.data.recordings import read_recordings
 from siq.errors import InputError, NumericalFailure
 from siq.inference.field_estimate import read_field
 from siq.numerics.files import given_path
@@ -25,6 +25,7 @@ from siq.quasipotential.formulas import read_model
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import EquationSettings, landscape_from_equations
 from siq.quasipotential.landscape_files import read_landscape
+from siq.quasipotential.wells import Well
 from siq.remarks import Remark
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
@@ -33,17 +34,17 @@ from siq.systems.formulas import compile_formulas
 from siq.validation.mesh import mesh_quasipotential
 from siq.workflow.answers import UNRECORDED, Provenance
 from siq.workflow.pipeline import draw_run, identify_run, refine_run, source_of
-from siq.workflow.study import PipelineSettings, Study, settings_of
+from siq.workflow.study import Study, settings_of
 from siq.workflow.tables import Method, Outcome, Step, StepResult
 from siq.workflow.training import not_trained
 
 Finding = tuple[Literal["agrees", "differs", "open"], Remark]
 """What was found of one claim: it holds, it does not, or it could not be derived again."""
 
-SAME_FIELD = 1e-6  # of the size of f: another machine may round otherwise, and a search then ends elsewhere
+SAME_FIELD = 1e-6  # of the size of f: another machine rounds otherwise
 AGREEMENT = 0.05  # of a barrier: as far as a formula is believed whose residual is within its tolerance
 NODES = 200  # of the mesh along a state: errors of a per cent, in seconds
-STATES = 2000  # at which a residual is judged
+STATES = 2000  # at which f and a residual are judged
 
 
 def verify(result: str | Path) -> Iterator[Finding]:
@@ -57,7 +58,7 @@ def verify(result: str | Path) -> Iterator[Finding]:
     Yields
     ------
     tuple
-        ``"agrees"``, ``"differs"`` or ``"open"``, and what was found, in the order in which it is.
+        ``"agrees"``, ``"differs"`` or ``"open"``, and what was found.
 
     Raises
     ------
@@ -68,296 +69,196 @@ def verify(result: str | Path) -> Iterator[Finding]:
     folder = folder.parent if folder.is_file() else folder
     kept = Provenance(folder)
     if not kept.file.is_file():
-        fault = "there are no results" if not folder.is_dir() else f"there is no {kept.file.name} in it"
+        fault = f"there is no {kept.file.name} in it" if folder.is_dir() else "there are no results"
         raise InputError(folder, "", fault, "name a folder in results, or make the results again")
-    found = list(_files(kept))
-    yield from found
-    jobs = list(kept.made.values())
-    said = next((job for job in jobs if "study" in job), None)
-    if said is None:
-        yield "open", Remark("workflow.not_derived", {"what": "the diagnosis: its search is not made again"})
-    elif not _stopped(found):
-        study = Study.model_validate(said["study"])
-        card = _source(kept, ("score", "equations", "draw", "page"), (".yaml", ".yml"))
-        if study.entrance == "equations":
-            yield from _of_equations(study, card, folder)
-        else:
-            yield from _of_trajectories(study, card, kept)
+    differences = list(_files(kept))
+    yield from differences
+    asked = next((job["study"] for job in kept.made.values() if "study" in job), None)
+    if any(kind == "differs" for kind, _ in differences):
+        yield _open("numbers_of_damaged_files")
+    elif asked is None:
+        yield _open("diagnosis")
     else:
-        yield "open", Remark("workflow.not_derived", {"what": "the numbers: the files are not as they were"})
-    yield "open", Remark("workflow.page_by_digest")
-    yield "open", Remark("workflow.source_gone_on")
+        study = Study.model_validate(asked)
+        card = _source(kept, "score", "equations")
+        of = _of_equations if study.entrance == "equations" else _of_trajectories
+        yield from of(study, card, kept)
+    yield _open("page")
+    yield _open("logs")
 
 
-def _stopped(found: list[Finding]) -> bool:
-    return any(kind == "differs" for kind, _ in found)
+def _open(what: str) -> Finding:
+    return "open", Remark("workflow.not_derived", {"what": what})
+
+
+def _told(code: str, holds: bool, **values: Any) -> Finding:
+    return "agrees" if holds else "differs", Remark(f"workflow.{code}", {"holds": holds, **values})
 
 
 def _files(kept: Provenance) -> Iterator[Finding]:
-    """The files against their digests, and every digest that a step read against the one that was made."""
-    before = True
+    """The files against their digests, and what each step read against what the step before had made."""
+    wrong = [_told("file_changed", False, file=str(kept.folder / path)) for path in kept.changed()]
     if kept.broken:
-        before = False
-        yield "differs", Remark("workflow.broken_lines", {"count": kept.broken, "file": str(kept.file)})
-    for path in kept.changed():
-        before = False
-        yield "differs", Remark("workflow.file_changed", {"file": str(kept.folder / path)})
+        wrong.append(_told("file_changed", False, file=str(kept.file)))
     folders = {path for path in kept.made if (kept.folder / path).is_dir()}
     for file in sorted(kept.folder.rglob("*")):
         place = file.relative_to(kept.folder)
         inside = folders & {each.as_posix() for each in place.parents}
         known = inside or place.as_posix() in kept.made or file.name in UNRECORDED
         if file.is_file() and not known and place.parts[0] not in ("logs", "benchmarks"):
-            before = False
-            yield "differs", Remark("workflow.file_unknown", {"file": str(file)})
+            wrong.append(_told("file_unknown", False, file=str(file)))
     outside: dict[str, str] = {}
     for path, job in kept.made.items():
         for source, digest in job["inputs"].items():
             if source not in kept.made:
                 outside[source] = digest
             elif kept.made[source]["outputs"][source] != digest:
-                before = False
-                yield "differs", Remark("workflow.file_older", {"file": path, "source": source})
+                wrong.append(_told("file_older", False, file=path, source=source))
     for source, digest in outside.items():
-        place = kept.folder / source
-        now = kept.digest_of(place)
-        if now != digest:
-            before = False
-            code = "workflow.source_missing" if now is None else "workflow.source_changed"
-            yield "differs" if now else "open", Remark(code, {"file": str(place.resolve())})
-    if before:
-        yield "agrees", Remark("workflow.files_as_made", {"count": len(kept.made)})
+        if (now := Provenance.digest_of(kept.folder / source)) != digest:
+            file = str((kept.folder / source).resolve())
+            wrong.append(_told("source_changed", False, file=file, missing=now is None))
+    yield from wrong or [_told("files_as_made", True, count=len(kept.made))]
 
 
-def _source(kept: Provenance, tasks: tuple[str, ...], suffixes: tuple[str, ...] | None) -> Path | None:
-    """A file from outside that a step of these names has read."""
-    for task in tasks:
-        for job in kept.made.values():
-            if job["task"] == task:
-                for source in job["inputs"]:
-                    if source not in kept.made and (suffixes is None or source.endswith(suffixes)):
-                        return kept.folder / source
-    return None
+def _source(kept: Provenance, *tasks: str) -> Path | None:
+    """The file from outside that a step of one of these names has read."""
+    read = [source for job in kept.made.values() if job["task"] in tasks for source in job["inputs"]]
+    return next((kept.folder / source for source in read if source not in kept.made), None)
 
 
 def _of_trajectories(study: Study, card: Path | None, kept: Provenance) -> Iterator[Finding]:
-    """Trajectories, f, formulas, verdict and barrier of a run that has them."""
-    system = None if study.system is None or card is None else load_system(card)
-    settings = settings_of(study, system)
-    run = next((run for run in range(study.runs) if _any_formula(kept.folder, run)), 0)
-    place = kept.folder / "runs" / f"{run:03d}"
-    file = card if study.recordings is None else _source(kept, ("draw",), None)
-    recordings = read_recordings(place / "recordings.parquet")
-    if file is None or not file.exists():
-        yield "open", Remark("workflow.not_derived", {"what": "the trajectories: their source is not there"})
-    else:
-        drawn = draw_run(settings, source_of(file, settings), number=run).result
-        same = drawn is not None and _same_trajectories(drawn, recordings)
-        values = {"run": run, "source": file.name}
-        code = "workflow.recordings_drawn" if same else "workflow.recordings_differ"
-        yield "agrees" if same else "differs", Remark(code, values)
-    record = read_field(place / "vector_field.json")
-    again = identify_run(settings, recordings, number=run)
-    if record is None or again.result is None:
-        yield "open", Remark("workflow.not_derived", {"what": "f: none was identified"})
+    """Trajectories, f, verdict, formulas and barrier of the first run that has a formula."""
+    settings = settings_of(study, None if study.system is None or card is None else load_system(card))
+    places = [kept.folder / "runs" / f"{run:03d}" for run in range(study.runs)]
+    models = [read_model(place / "model.json") for place in places]
+    run = next((run for run, model in enumerate(models) if model[0]), 0)
+    place, (formulas, certificates) = places[run], models[run]
+    stored = read_recordings(place / "recordings.parquet")
+    source = _source(kept, "draw")
+    if source is not None and source.exists():
+        drawn = draw_run(settings, source_of(source, settings), number=run).result
+        same = drawn is not None and drawn.names == stored.names
+        same = same and np.array_equal(drawn.t, stored.t) and np.array_equal(drawn.values, stored.values)
+        yield _told("trajectories", same, run=run, source=source.name)
+    record, again = read_field(place / "vector_field.json"), identify_run(settings, stored, number=run).result
+    if record is None or again is None:
+        yield _open("field")
         return
-    error = _difference(record.dynamics, again.result.dynamics, recordings)
-    code = "workflow.field_derived" if error < SAME_FIELD else "workflow.field_differs"
-    yield "agrees" if error < SAME_FIELD else "differs", Remark(code, {"error": error})
-    formulas, certificates = read_model(place / "model.json")
-    if study.training is not None:
-        yield (
-            "open",
-            Remark("workflow.not_derived", {"what": "networks, and the certificate that they are part of"}),
-        )
-    else:
+    dynamics, x = record.dynamics, stored.values[:: max(1, len(stored.values) // STATES)]
+    yield from _field(dynamics, again.dynamics, x)
+    if study.training is None:
         identified = StepResult(record, Outcome(run, Step.IDENTIFY))
-        refined = refine_run(settings, recordings, identified, not_trained(run))
-        yield from _verdict(certificates, refined.certificates)
-    yield from _formulas(formulas, record.dynamics, recordings)
-    stored = place / "quasipotential.json"
-    if stored.is_file() and stored.stat().st_size:
-        yield from _barrier(read_landscape(stored, dynamics=record.dynamics), recordings)
+        refined = refine_run(settings, stored, identified, not_trained(run))
+        yield from _verdict(certificates.get(Method.REFINED), refined.certificates.get(Method.REFINED))
+    else:
+        yield _open("networks")
+    for number, well in enumerate(formulas[Method.REFINED].wells if Method.REFINED in formulas else ()):
+        yield from _formula(number, well, dynamics, x)
+    file = place / "quasipotential.json"
+    yield from _barrier(read_landscape(file, dynamics=dynamics) if file.is_file() else None, x)
 
 
-def _any_formula(folder: Path, run: int) -> bool:
-    file = folder / "runs" / f"{run:03d}" / "model.json"
-    return file.is_file() and bool(read_model(file)[0])
+def _of_equations(study: Study, card: Path | None, kept: Provenance) -> Iterator[Finding]:
+    """The certificate of the landscape of equations, its formulas, and a barrier."""
+    assert card is not None and study.landscape is not None  # or there would be no such study
+    system = load_system(card)
+    stored = read_landscape(kept.folder / "quasipotential.json", dynamics=system)
+    if stored is None:
+        yield _open("landscape")
+        return
+    settings = settings_of(study, system)
+    own = EquationSettings(settings.seed, settings.refinement, settings.certificate, study.landscape)
+    both = (stored, landscape_from_equations(system, own))
+    yield from _verdict(*(one.certificate and one.certificate.as_data() for one in both))
+    for number, well in enumerate(stored.wells):
+        if well is not None:
+            yield from _formula(number, well, system, well.points)
+    yield from _barrier(stored, system.box.T)
 
 
-def _same_trajectories(one: Recordings, other: Recordings) -> bool:
-    return (
-        one.names == other.names
-        and np.array_equal(one.t, other.t)
-        and np.array_equal(one.values, other.values)
-    )
-
-
-def _difference(one: Dynamics, other: Dynamics, recordings: Recordings) -> float:
+def _field(one: Dynamics, other: Dynamics, x: np.ndarray) -> Iterator[Finding]:
     """The largest difference of f and of D at recorded states, as a share of the largest there."""
-    x = recordings.values[:: max(1, len(recordings.values) // STATES)]
-    if x.shape[1] != one.dimension or one.dimension != other.dimension:
-        return 0.0 if [str(f) for f in one.formulas] == [str(f) for f in other.formulas] else np.inf
-    pairs = [(one.drift(x), other.drift(x)), (one.diffusion.at(x), other.diffusion.at(x))]
-    return max(float(np.abs(a - b).max() / max(np.abs(a).max(), 1e-300)) for a, b in pairs)
-
-
-def _verdict(stored: dict[str, Any], again: Any) -> Iterator[Finding]:
-    """The certificate of the refined formula, and each of its tests."""
-    if Method.REFINED not in stored or Method.REFINED not in again:
-        yield "open", Remark("workflow.not_derived", {"what": "the certificate: there is no refined formula"})
-        return
-    one, other = stored[Method.REFINED], again[Method.REFINED]
-    tests = [
-        name for name in sorted({*one["tests"], *other["tests"]})
-        if one["tests"].get(name, {}).get("passed") != other["tests"].get(name, {}).get("passed")
-    ]  # fmt: skip
-    if one["certified"] == other["certified"] and not tests:
-        yield "agrees", Remark("workflow.verdict_derived", {"certified": one["certified"]})
+    if one.dimension != x.shape[1] or other.dimension != x.shape[1]:  # velocities that nobody recorded
+        error = 0.0 if list(map(str, one.formulas)) == list(map(str, other.formulas)) else np.inf
     else:
-        values = {"certified": one["certified"], "again": other["certified"], "tests": ", ".join(tests)}
-        yield "differs", Remark("workflow.verdict_differs", values)
+        pairs = ((one.drift(x), other.drift(x)), (one.diffusion.at(x), other.diffusion.at(x)))
+        error = max(float(np.abs(a - b).max() / (np.abs(a).max() or 1.0)) for a, b in pairs)
+    yield _told("field", error < SAME_FIELD, error=error)
 
 
-def _formulas(formulas: dict[str, Any], dynamics: Dynamics, recordings: Recordings) -> Iterator[Finding]:
-    """Residual and branch of V of every refined formula, by derivatives of what is stored."""
-    refined = formulas.get(Method.REFINED)
-    if refined is None:
-        yield (
-            "open",
-            Remark("workflow.not_derived", {"what": "residual and branch: there is no refined formula"}),
-        )
+def _verdict(one: Mapping[str, Any] | None, other: Mapping[str, Any] | None) -> Iterator[Finding]:
+    """The certificate, and whether each of its tests passed."""
+    if one is None or other is None:
+        yield _open("certificate")
         return
-    x = recordings.values[:: max(1, len(recordings.values) // STATES)]
-    for number, well in enumerate(refined.wells):
-        yield from _formula(f"well {number}", well.to_sympy(), well, dynamics, x)
+    passed = [{name: test["passed"] for name, test in each["tests"].items()} for each in (one, other)]
+    tests = sorted(name for name in {*passed[0], *passed[1]} if passed[0].get(name) != passed[1].get(name))
+    holds = one["certified"] == other["certified"] and not tests
+    yield _told(
+        "verdict", holds, certified=one["certified"], again=other["certified"], tests=", ".join(tests)
+    )
 
 
-def _formula(
-    of: str, potential: sympy.Expr, well: Any, dynamics: Dynamics, x: np.ndarray
-) -> Iterator[Finding]:
-    gradient = [potential.diff(each) for each in dynamics.symbols]
-    values = compile_formulas([potential, *gradient], dynamics.symbols)
+def _formula(number: int, well: Well, dynamics: Dynamics, x: np.ndarray) -> Iterator[Finding]:
+    """Residual and branch of V, by derivatives of what is stored."""
     if x.shape[1] != dynamics.dimension:
-        yield (
-            "open",
-            Remark("workflow.not_derived", {"what": f"residual of {of}: not all states are recorded"}),
-        )
+        yield _open("residual")
         return
-    # About the attractor to the level, where V rises along every ray: recorded states of other wells are out.
-    at = values(np.ascontiguousarray(x.T))
-    rays = [
-        values(np.ascontiguousarray((well.attractor + s * (x - well.attractor)).T))[0]
-        for s in (0.25, 0.5, 0.75)
-    ]
-    rising = np.all(np.diff([0 * at[0], *rays, at[0]], axis=0) > 0, axis=0)
-    near = rising & (at[0] < 0.9 * well.level)
+    potential, symbols = well.to_sympy(), dynamics.symbols
+    values = compile_formulas([potential, *(potential.diff(each) for each in symbols)], symbols)
+    # Where V rises along the ray from the attractor: recorded states of other wells are left out.
+    along = [values((well.attractor + share * (x - well.attractor)).T) for share in (0.25, 0.5, 0.75, 1.0)]
+    rising = np.all(np.diff([0 * along[0][0], *(one[0] for one in along)], axis=0) > 0, axis=0)
+    near = rising & (along[-1][0] < 0.9 * well.level)
     if near.any():
-        y, p = x[near], at[1:, near].T
+        y, p = x[near], along[-1][1:, near].T
         pushed = np.einsum("ni,nij,nj->n", p, dynamics.diffusion.at(y), p)
-        along = np.einsum("ni,ni->n", dynamics.drift(y), p)
-        residual = float(np.quantile(np.abs(along + pushed) / (np.abs(along) + pushed), 0.95))
-        values_of = {"of": of, "residual": residual, "points": int(near.sum()), "tolerance": well.tolerance}
-        solves = residual <= well.tolerance
-        yield (
-            "agrees" if solves else "differs",
-            Remark("workflow.formula_solves" if solves else "workflow.formula_fails", values_of),
-        )
-    at_rest = dict(zip(dynamics.symbols, well.attractor, strict=True))
-    curvature = np.array(sympy.hessian(potential, dynamics.symbols).xreplace(at_rest), dtype=float)
-    place = well.attractor[None]
+        carried = np.einsum("ni,ni->n", dynamics.drift(y), p)
+        residual = float(np.quantile(np.abs(carried + pushed) / (np.abs(carried) + pushed), 0.95))
+        count, limit = int(near.sum()), well.tolerance
+        yield _told("residual", residual <= limit, well=number, residual=residual, count=count, limit=limit)
+    place, at_rest = well.attractor[None], dict(zip(symbols, well.attractor, strict=True))
+    curvature = np.array(sympy.hessian(potential, symbols).xreplace(at_rest), dtype=float)
     flow = dynamics.jacobian(place)[0] + 2 * dynamics.diffusion.at(place)[0] @ curvature
-    right = bool((np.linalg.eigvals(flow).real > 0).all())
-    yield (
-        "agrees" if right else "differs",
-        Remark("workflow.branch_right" if right else "workflow.branch_wrong", {"of": of}),
-    )
+    yield _told("branch", bool((np.linalg.eigvals(flow).real > 0).all()), well=number)
 
 
-def _barrier(landscape: Landscape | None, recordings: Recordings | None) -> Iterator[Finding]:
-    """The lowest barrier by another method: a quadrature, a mesh, or the action of the stored path."""
-    ways = [] if landscape is None else [one for one in landscape.transitions if np.isfinite(one.barrier)]
-    if landscape is None or not ways:
-        yield "open", Remark("workflow.not_derived", {"what": "a barrier: none is claimed"})
+def _barrier(landscape: Landscape | None, x: np.ndarray) -> Iterator[Finding]:
+    """The lowest barrier by another method: a quadrature, a mesh over the states, the action of its path."""
+    ways = () if landscape is None else landscape.transitions
+    known = [way for way in ways if np.isfinite(way.barrier) and not way.from_cycle]
+    way = min(known, key=lambda one: one.barrier, default=None)
+    if landscape is None or way is None or not landscape.dynamics.diffusion.regular:
+        yield _open("barrier")
         return
-    way = min(ways, key=lambda one: one.barrier)
-    dynamics = landscape.dynamics
-    start = landscape.attractors[way.start].position if not way.from_cycle else None
-    if start is None or not dynamics.diffusion.regular:
-        what = "a barrier: from a cycle, or with a singular D, there is no second method"
-        yield "open", Remark("workflow.not_derived", {"what": what})
-        return
+    dynamics, start = landscape.dynamics, landscape.attractors[way.start].position
     if dynamics.dimension == 1:
-        other, method = _by_quadrature(dynamics, start, way.place), "by a quadrature of -2f/D"
+        other, method = _action(dynamics, np.linspace(start, way.place, 10 * STATES)), "quadrature"
     elif dynamics.dimension == 2:
-        region = dynamics.box if recordings is None else _box(recordings.values, way.place)
-        other, method = _by_mesh(dynamics, start, way.place, region), "on a mesh"
+        low, high = np.minimum(x.min(axis=0), way.place), np.maximum(x.max(axis=0), way.place)
+        box = np.stack([low - 0.1 * (high - low), high + 0.1 * (high - low)], axis=1)
+        try:
+            mesh = mesh_quasipotential(
+                dynamics.drift, start, hessian=hessian_at(dynamics, start), box=box, shape=(NODES, NODES),
+                diffusion=dynamics.diffusion, stop_at_boundary=False,
+            )  # fmt: skip
+        except (ValueError, NumericalFailure):  # the mesh is too coarse for this start, or D none everywhere
+            yield _open("barrier")
+            return
+        other, method = float(2 * mesh.evaluate(way.place[None])[0]), "mesh"
     elif way.path is not None:
-        other, method = _action(dynamics, way.path.points), "by the action of its path"
+        other, method = _action(dynamics, way.path.points), "path"
     else:
-        yield "open", Remark("workflow.not_derived", {"what": "a barrier: its path is not stored"})
+        yield _open("barrier")
         return
-    values = {"start": way.start, "barrier": way.barrier, "other": other, "method": method}
-    agrees = abs(other - way.barrier) <= AGREEMENT * abs(way.barrier)
-    yield (
-        "agrees" if agrees else "differs",
-        Remark("workflow.barrier_agrees" if agrees else "workflow.barrier_differs", values),
-    )
-
-
-def _box(x: np.ndarray, place: np.ndarray) -> np.ndarray:
-    low, high = np.minimum(x.min(axis=0), place), np.maximum(x.max(axis=0), place)
-    return np.stack([low - 0.1 * (high - low), high + 0.1 * (high - low)], axis=1)
-
-
-def _by_quadrature(dynamics: Dynamics, start: np.ndarray, end: np.ndarray) -> float:
-    """``∫ -2f/D dx`` of one state, by Gauss's rule."""
-    nodes, weights = np.polynomial.legendre.leggauss(200)
-    half = (end - start) / 2
-    x = (start + end) / 2 + half * nodes[:, None]
-    return float(-2 * half[0] * weights @ (dynamics.drift(x)[:, 0] / dynamics.diffusion.at(x)[:, 0, 0]))
-
-
-def _by_mesh(dynamics: Dynamics, start: np.ndarray, end: np.ndarray, box: np.ndarray) -> float:
-    """U of a state by ordered line integrals, see `siq.validation.mesh`; NaN where it ends before."""
-    try:
-        mesh = mesh_quasipotential(
-            dynamics.drift, start, hessian=hessian_at(dynamics, start), box=box, shape=(NODES, NODES),
-            diffusion=dynamics.diffusion, stop_at_boundary=False,
-        )  # fmt: skip
-    except (ValueError, NumericalFailure):
-        return np.nan
-    return float(2 * mesh.evaluate(end[None])[0])
+    agrees = abs(other - way.barrier) <= AGREEMENT * way.barrier
+    yield _told("barrier", agrees, start=way.start, barrier=way.barrier, other=other, method=method)
 
 
 def _action(dynamics: Dynamics, points: np.ndarray) -> float:
-    """The geometric action ``∫ (|f| |dx| - f·dx)`` of U of a chain of states, in the metric of D⁻¹."""
+    """U along a chain of states, the geometric action ``∫ (|f| |dx| - f·dx)`` in the metric of D⁻¹."""
     middle, step = (points[1:] + points[:-1]) / 2, np.diff(points, axis=0)
     inverse, f = np.linalg.inv(dynamics.diffusion.at(middle)), dynamics.drift(middle)
-
-    def product(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-        return np.einsum("ni,nij,nj->n", one, inverse, other)
-
-    return float((np.sqrt(product(f, f) * product(step, step)) - product(f, step)).sum())
-
-
-def _of_equations(study: Study, card: Path | None, folder: Path) -> Iterator[Finding]:
-    """The landscape of the equations found again, and a barrier by another method."""
-    if card is None or not card.is_file():
-        yield "open", Remark("workflow.not_derived", {"what": "the landscape: the card is not there"})
-        return
-    system = load_system(card)
-    settings: PipelineSettings = settings_of(study, system)
-    stored = read_landscape(folder / "quasipotential.json", dynamics=system)
-    if stored is None or settings.landscape is None:
-        yield "open", Remark("workflow.not_derived", {"what": "the landscape: none was found"})
-        return
-    own = EquationSettings(settings.seed, settings.refinement, settings.certificate, settings.landscape)
-    again = landscape_from_equations(system, own)
-    pairs = [(one.certificate.as_data() if one.certificate else None) for one in (stored, again)]
-    if None not in pairs:
-        yield from _verdict({Method.REFINED: pairs[0]}, {Method.REFINED: pairs[1]})
-    for number, well in enumerate(stored.wells):
-        if well is not None:
-            yield from _formula(f"well {number}", well.to_sympy(), well, system, well.points)
-    yield from _barrier(stored, None)
+    f_f, s_s, f_s = (np.einsum("ni,nij,nj->n", a, inverse, b) for a, b in ((f, f), (step, step), (f, step)))
+    return float((np.sqrt(f_f * s_s) - f_s).sum())

@@ -9,7 +9,7 @@ from filelock import FileLock, Timeout
 from siq.errors import InputError
 from siq.numerics.files import files_of
 from siq.report.formatting import texts
-from siq.workflow.answers import PROVENANCE, Exit, Provenance, answer_of_page
+from siq.workflow.answers import Exit, Provenance, answer_of_page
 from siq.workflow.study import point_name
 from workflow.places import config_path, find_file
 from workflow.published import load_published
@@ -328,11 +328,7 @@ WARM = None
 
 # What is not as its job wrote it is made again, before anything is built upon it.
 with suppress(Timeout), LOCK:  # whoever has it is writing
-    for depth in ("*", "*/*"):
-        for record in Path("results").glob(f"{depth}/{PROVENANCE}"):
-            planned = bool({"-n", "--dry-run", "--dryrun"} & set(sys.argv))
-            for sentence in Provenance(record.parent).set_aside(remove=not planned):
-                print(sentence, file=sys.stderr)
+    Provenance.mend(planned=bool({"-n", "--dry-run", "--dryrun"} & set(sys.argv)))
 
 
 onstart:
