@@ -247,6 +247,6 @@ def files_of(folder: Path) -> list[Path]:
         remedy = f"put one file per recording into it, with one of the suffixes {', '.join(SUFFIXES)}"
         raise InputError(folder, "", "the folder holds no recordings", remedy)
     for path in found:
-        if "{" in path.name or "}" in path.name:  # to Snakemake a blank that is filled in
+        if "{" in path.name or "}" in path.name:  # to the workflow a blank that is filled in
             raise InputError(path, "", "the name has braces", "rename the file")
     return found

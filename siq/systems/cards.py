@@ -23,7 +23,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validat
 
 from siq.errors import Fault, InputError
 from siq.numerics.files import Document, read_document, validate
-from siq.systems.diffusion import Diffusion
+from siq.systems.diffusion import LARGEST_STATE, Diffusion
 from siq.systems.dynamics import TIME, Dynamics, Input, Parameter, symbol
 from siq.systems.formulas import (
     CONSTANTS,
@@ -50,8 +50,8 @@ def check_name(text: str) -> str:
 def check_title(text: str) -> str:
     """Return a name that files and folders can have; raises ValueError for any other.
 
-    It stands in names of files, which have up to 255 bytes. Snakemake takes what is repeated 20 times for a
-    rule that calls itself.
+    It stands in names of files, which have up to 255 bytes. What is repeated 20 times would be
+    taken for a rule that calls itself.
     """
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", text):
         remedy = "use letters, digits, dots, dashes and underscores, and begin with a letter or a digit"
@@ -70,7 +70,6 @@ DiffusionEntry = Literal["identity"] | list[Formula] | list[list[Formula]]
 
 LINE_WIDTH = 110
 LONGEST_NAME = 100  # letters: names of files have up to 255 bytes, of which two names may be a part
-LARGEST, SMALLEST = 1e30, 1e-30  # numerical: the eighth power of a state, as of a series, is a number still
 
 
 class _CardPart(BaseModel):
@@ -91,7 +90,7 @@ class StateEntry(_CardPart):
         if domain is not None and not domain[0] < domain[1]:
             raise Fault("the domain is empty", "write it as [lower, upper] with lower < upper")
         if domain is not None and not (
-            max(map(abs, domain)) <= LARGEST and domain[1] - domain[0] >= SMALLEST
+            max(map(abs, domain)) <= LARGEST_STATE and domain[1] - domain[0] >= 1 / LARGEST_STATE
         ):
             raise Fault("the domain is too wide or too narrow for numbers", "write it in another unit")
         return domain
@@ -181,9 +180,6 @@ def diffusion_rows(diffusion: DiffusionEntry, dimension: int) -> list[list[Formu
         row if isinstance(row, list) else [row if i == j else 0.0 for j in range(dimension)]
         for i, row in enumerate(diffusion)
     ]
-    numbers = [abs(entry) for row in rows for entry in row if not isinstance(entry, str)]
-    if any(number and not SMALLEST**2 <= number <= LARGEST**2 for number in numbers):
-        raise Fault("the diffusion is too large or too small for numbers", "write the states in other units")
     if all(not isinstance(entry, str) for row in rows for entry in row):
         Diffusion(np.array(rows, dtype=float))
     return rows

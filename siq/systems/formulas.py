@@ -95,7 +95,7 @@ class _TooLong(BaseException):
 def formulas_in_time(what: str) -> Iterator[None]:
     """Refuse formulas on which sympy would work for ever, as where many functions stand in one another.
 
-    Its time grows exponentially with them, and no count of terms foretells it. A timer of the process
+    Its time grows exponentially with them, and no count of terms predicts it. A timer of the process
     interrupts it after `LONGEST_WORK`; elsewhere than in the main thread, and on systems without such a
     timer, there is no limit.
 

@@ -150,7 +150,7 @@ def _usable_path(text: str) -> str:
 
 
 FilePath = Annotated[str, AfterValidator(_usable_path)]
-"""Of a file; to Snakemake braces are a blank that is filled in."""
+"""Of a file; to the workflow braces are a blank that is filled in."""
 
 
 class RecordingsOptions(BaseModel):

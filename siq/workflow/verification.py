@@ -11,6 +11,7 @@ stored path.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -53,7 +54,7 @@ def verify(result: str | Path) -> Iterator[Finding]:
     Parameters
     ----------
     result
-        ``results/NAME``, or the page in it.
+        A folder of results, or the page in it.
 
     Yields
     ------
@@ -91,34 +92,35 @@ def _open(what: str) -> Finding:
     return "open", Remark("workflow.not_derived", {"what": what})
 
 
-def _told(code: str, holds: bool, **values: Any) -> Finding:
-    return "agrees" if holds else "differs", Remark(f"workflow.{code}", {"holds": holds, **values})
+def _told(holds: bool, remark: Remark) -> Finding:
+    return "agrees" if holds else "differs", replace(remark, values={**remark.values, "holds": holds})
 
 
 def _files(kept: Provenance) -> Iterator[Finding]:
     """The files against their digests, and what each step read against what the step before had made."""
-    wrong = [_told("file_changed", False, file=str(kept.folder / path)) for path in kept.changed()]
-    if kept.broken:
-        wrong.append(_told("file_changed", False, file=str(kept.file)))
+    changed = [kept.folder / path for path in kept.changed()] + [kept.file] * bool(kept.broken)
+    wrong = [_told(False, Remark("workflow.file_changed", {"file": str(file)})) for file in changed]
     folders = {path for path in kept.made if (kept.folder / path).is_dir()}
     for file in sorted(kept.folder.rglob("*")):
         place = file.relative_to(kept.folder)
         inside = folders & {each.as_posix() for each in place.parents}
         known = inside or place.as_posix() in kept.made or file.name in UNRECORDED
         if file.is_file() and not known and place.parts[0] not in ("logs", "benchmarks"):
-            wrong.append(_told("file_unknown", False, file=str(file)))
+            wrong.append(_told(False, Remark("workflow.file_unknown", {"file": str(file)})))
     outside: dict[str, str] = {}
-    for path, job in kept.made.items():
+    for made, job in kept.made.items():
         for source, digest in job["inputs"].items():
             if source not in kept.made:
                 outside[source] = digest
             elif kept.made[source]["outputs"][source] != digest:
-                wrong.append(_told("file_older", False, file=path, source=source))
+                wrong.append(_told(False, Remark("workflow.file_older", {"file": made, "source": source})))
     for source, digest in outside.items():
         if (now := Provenance.digest_of(kept.folder / source)) != digest:
             file = str((kept.folder / source).resolve())
-            wrong.append(_told("source_changed", False, file=file, missing=now is None))
-    yield from wrong or [_told("files_as_made", True, count=len(kept.made))]
+            wrong.append(
+                _told(False, Remark("workflow.source_changed", {"file": file, "missing": now is None}))
+            )
+    yield from wrong or [_told(True, Remark("workflow.files_as_made", {"count": len(kept.made)}))]
 
 
 def _source(kept: Provenance, *tasks: str) -> Path | None:
@@ -138,9 +140,11 @@ def _of_trajectories(study: Study, card: Path | None, kept: Provenance) -> Itera
     source = _source(kept, "draw")
     if source is not None and source.exists():
         drawn = draw_run(settings, source_of(source, settings), number=run).result
-        same = drawn is not None and drawn.names == stored.names
-        same = same and np.array_equal(drawn.t, stored.t) and np.array_equal(drawn.values, stored.values)
-        yield _told("trajectories", same, run=run, source=source.name)
+        same = (
+            drawn is not None and drawn.names == stored.names and np.array_equal(drawn.t, stored.t)
+            and np.array_equal(drawn.values, stored.values)
+        )  # fmt: skip
+        yield _told(same, Remark("workflow.trajectories", {"run": run, "source": source.name}))
     record, again = read_field(place / "vector_field.json"), identify_run(settings, stored, number=run).result
     if record is None or again is None:
         yield _open("field")
@@ -170,7 +174,7 @@ def _of_equations(study: Study, card: Path | None, kept: Provenance) -> Iterator
     settings = settings_of(study, system)
     own = EquationSettings(settings.seed, settings.refinement, settings.certificate, study.landscape)
     both = (stored, landscape_from_equations(system, own))
-    yield from _verdict(*(one.certificate and one.certificate.as_data() for one in both))
+    yield from _verdict(*(None if one.certificate is None else one.certificate.as_data() for one in both))
     for number, well in enumerate(stored.wells):
         if well is not None:
             yield from _formula(number, well, system, well.points)
@@ -184,7 +188,7 @@ def _field(one: Dynamics, other: Dynamics, x: np.ndarray) -> Iterator[Finding]:
     else:
         pairs = ((one.drift(x), other.drift(x)), (one.diffusion.at(x), other.diffusion.at(x)))
         error = max(float(np.abs(a - b).max() / (np.abs(a).max() or 1.0)) for a, b in pairs)
-    yield _told("field", error < SAME_FIELD, error=error)
+    yield _told(error < SAME_FIELD, Remark("workflow.field", {"error": error}))
 
 
 def _verdict(one: Mapping[str, Any] | None, other: Mapping[str, Any] | None) -> Iterator[Finding]:
@@ -195,9 +199,8 @@ def _verdict(one: Mapping[str, Any] | None, other: Mapping[str, Any] | None) -> 
     passed = [{name: test["passed"] for name, test in each["tests"].items()} for each in (one, other)]
     tests = sorted(name for name in {*passed[0], *passed[1]} if passed[0].get(name) != passed[1].get(name))
     holds = one["certified"] == other["certified"] and not tests
-    yield _told(
-        "verdict", holds, certified=one["certified"], again=other["certified"], tests=", ".join(tests)
-    )
+    values = {"certified": one["certified"], "again": other["certified"], "tests": ", ".join(tests)}
+    yield _told(holds, Remark("workflow.verdict", values))
 
 
 def _formula(number: int, well: Well, dynamics: Dynamics, x: np.ndarray) -> Iterator[Finding]:
@@ -216,12 +219,12 @@ def _formula(number: int, well: Well, dynamics: Dynamics, x: np.ndarray) -> Iter
         pushed = np.einsum("ni,nij,nj->n", p, dynamics.diffusion.at(y), p)
         carried = np.einsum("ni,ni->n", dynamics.drift(y), p)
         residual = float(np.quantile(np.abs(carried + pushed) / (np.abs(carried) + pushed), 0.95))
-        count, limit = int(near.sum()), well.tolerance
-        yield _told("residual", residual <= limit, well=number, residual=residual, count=count, limit=limit)
+        holds, limits = residual <= well.tolerance, {"count": int(near.sum()), "limit": well.tolerance}
+        yield _told(holds, Remark("workflow.residual", {"well": number, "residual": residual, **limits}))
     place, at_rest = well.attractor[None], dict(zip(symbols, well.attractor, strict=True))
     curvature = np.array(sympy.hessian(potential, symbols).xreplace(at_rest), dtype=float)
     flow = dynamics.jacobian(place)[0] + 2 * dynamics.diffusion.at(place)[0] @ curvature
-    yield _told("branch", bool((np.linalg.eigvals(flow).real > 0).all()), well=number)
+    yield _told(bool((np.linalg.eigvals(flow).real > 0).all()), Remark("workflow.branch", {"well": number}))
 
 
 def _barrier(landscape: Landscape | None, x: np.ndarray) -> Iterator[Finding]:
@@ -252,8 +255,8 @@ def _barrier(landscape: Landscape | None, x: np.ndarray) -> Iterator[Finding]:
     else:
         yield _open("barrier")
         return
-    agrees = abs(other - way.barrier) <= AGREEMENT * way.barrier
-    yield _told("barrier", agrees, start=way.start, barrier=way.barrier, other=other, method=method)
+    values = {"start": way.start, "barrier": way.barrier, "other": other, "method": method}
+    yield _told(abs(other - way.barrier) <= AGREEMENT * way.barrier, Remark("workflow.barrier", values))
 
 
 def _action(dynamics: Dynamics, points: np.ndarray) -> float:
