@@ -197,10 +197,7 @@ def read_outcomes(path: str | Path) -> list[Outcome]:
 
 
 def write_table(path: str | Path, table: pd.DataFrame) -> None:
-    """Write a table as Parquet to `path`, and as CSV beside it.
-
-    Numbers in the CSV have as many digits as it takes to read the same numbers back.
-    """
+    """Write a table as Parquet to `path`, and as CSV with all digits beside it."""
     path = Path(path)
     with whole_file(path.with_suffix(".csv")) as partial:
         table.to_csv(partial, index=False)
@@ -209,13 +206,7 @@ def write_table(path: str | Path, table: pd.DataFrame) -> None:
 
 
 def read_table(path: str | Path) -> pd.DataFrame:
-    """Read a table that `write_table` wrote.
-
-    Raises
-    ------
-    InputError
-        When the file is missing or is not Parquet.
-    """
+    """Read a table that `write_table` wrote; InputError when the file is missing or is not Parquet."""
     try:
         return pd.read_parquet(path)
     except (OSError, ValueError, KeyError, TypeError):

@@ -129,17 +129,13 @@ def run(snakemake: Any) -> None:
     logging.info("%s%s", GIVEN, json.dumps(vars(job)))
     try:
         job()
-    except InputError as error:
-        logging.error("%s", error)
-        print(error, file=sys.stderr)
-        sys.exit(1)
-    except OSError as error:  # a full disk, a folder or a file that may not be written or read
-        logging.exception("the step stopped")
-        what = error.strerror or str(error)
-        print(
-            f"{error.filename or job.log}: {what}; see to it, and give the same command again.",
-            file=sys.stderr,
-        )
+    except (InputError, OSError) as error:  # of the system: a full disk, or what may not be read or written
+        told = str(error)
+        if isinstance(error, OSError):
+            what = error.strerror or error
+            told = f"{error.filename or log}: {what}; see to it, and give the same command again."
+        logging.error("%s", told, exc_info=isinstance(error, OSError))
+        print(told, file=sys.stderr)
         sys.exit(1)
     except BaseException:
         logging.exception("the step stopped")

@@ -1,11 +1,9 @@
 """A warm interpreter: every job of a workflow starts where its imports are done already.
 
-A step of a run takes seconds, and the imports of numpy, sympy, torch and pysindy as long again; and what is
-worked out once for a library of functions serves every run. So one process imports them, and jobs that run at
-the same time are forks of it. A fork whose job ends well takes the next one, so that there are as many as
-jobs run at once. `serve` is that process, which the Snakefile starts; `run_warm` is what a script calls
-first. Files, rules and jobs stay one a run. Where there is no such process, as on systems that cannot fork, a
-script runs as it would by itself.
+A step of a run takes seconds, and the imports of numpy, sympy, torch and pysindy as long again. So one
+process imports them, and jobs that run at the same time are forks of it. A fork whose job ends well takes the
+next one. `serve` is that process, which the Snakefile starts; `run_warm` is what a script calls first. Where there
+is no such process, as on systems that cannot fork, a script runs as it would by itself.
 """
 
 from __future__ import annotations
@@ -40,17 +38,16 @@ PARENT = "SIQ_PARENT"
 """Environment variable of a workflow whose standard input ends with the process that has started it."""
 
 
-def end_with_parent() -> None:
-    """End this process with the one that has started it, however that ends; all jobs end with this one."""
-    if os.environ.pop(PARENT, None):
-        threading.Thread(target=_end_with_input, args=(lambda: None,), daemon=True).start()
+def end_with_parent(before: Callable[[], None] = lambda: None) -> None:
+    """End this process when its standard input ends, and so with the one that holds that open."""
 
+    def wait() -> None:
+        while os.read(0, 1):
+            pass
+        before()
+        os._exit(1)
 
-def _end_with_input(before: Callable[[], None]) -> None:
-    while os.read(0, 1):
-        pass
-    before()
-    os._exit(1)
+    threading.Thread(target=wait, daemon=True).start()
 
 
 class Request(TypedDict):
@@ -127,12 +124,12 @@ def serve(listening: socket.socket, folder: Path) -> None:
     numbers: dict[socket.socket, int] = {}
 
     def end_all() -> None:
-        for number in list(numbers.values()):
+        for number in [*numbers.values()]:
             with contextlib.suppress(OSError):
                 os.kill(number, signal.SIGKILL)
         shutil.rmtree(folder, ignore_errors=True)
 
-    threading.Thread(target=_end_with_input, args=(end_all,), daemon=True).start()
+    end_with_parent(end_all)
     while True:
         ready, _, _ = select.select([listening, *forks], [], [])
         for fork in set(ready) & set(forks):

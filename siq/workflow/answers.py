@@ -6,6 +6,7 @@ made, the versions of the programs, seed, machine and time.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -98,10 +99,8 @@ def _versions() -> dict[str, str]:
     """The programs that take part, where they are loaded."""
     from importlib.metadata import version as installed
 
-    loaded = [name for name in PROGRAMS if name in sys.modules or name == "snakemake"]
-    return {"siq": version(), "python": platform.python_version()} | {
-        name: installed(name) for name in loaded
-    }
+    loaded = {name: installed(name) for name in PROGRAMS if name in sys.modules or name == "snakemake"}
+    return {"siq": version(), "python": platform.python_version()} | loaded
 
 
 class Provenance:
@@ -147,10 +146,8 @@ class Provenance:
         return {path: job for job in self._lines[0] for path in job["outputs"]}
 
     def _is_as_made(self, path: str) -> bool:
-        return (
-            path not in self.made
-            or Provenance.digest_of(self.folder / path) == self.made[path]["outputs"][path]
-        )
+        job = self.made.get(path)
+        return job is None or Provenance.digest_of(self.folder / path) == job["outputs"][path]
 
     def record(
         self, task: str, *, inputs: Mapping[str, Any], outputs: Mapping[str, Any], said: Mapping[str, Any]
@@ -179,8 +176,9 @@ class Provenance:
         text = b"\n" + json.dumps(line).encode() + b"\n"
         number = os.open(self.file, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
         try:
-            if os.write(number, text) < len(text):
-                raise OSError(28, "No space left on device", str(self.file))
+            if (written := os.write(number, text)) < len(text):
+                os.ftruncate(number, os.fstat(number).st_size - written)
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.file))
         finally:
             os.close(number)
 

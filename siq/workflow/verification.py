@@ -116,10 +116,8 @@ def _files(kept: Provenance) -> Iterator[Finding]:
                 wrong.append(_told(False, Remark("workflow.file_older", {"file": made, "source": source})))
     for source, digest in outside.items():
         if (now := Provenance.digest_of(kept.folder / source)) != digest:
-            file = str((kept.folder / source).resolve())
-            wrong.append(
-                _told(False, Remark("workflow.source_changed", {"file": file, "missing": now is None}))
-            )
+            values = {"file": str((kept.folder / source).resolve()), "missing": now is None}
+            wrong.append(_told(False, Remark("workflow.source_changed", values)))
     yield from wrong or [_told(True, Remark("workflow.files_as_made", {"count": len(kept.made)}))]
 
 

@@ -1,4 +1,5 @@
 # Helpers of the rules: studies and their parameters, tasks and their versions, one workflow at a time.
+import os
 import sys
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -16,7 +17,7 @@ from workflow.published import load_published
 from workflow.settings import Studies, prepare_environment
 from workflow.tasks import TASKS
 from workflow.versions import versions
-from workflow.warm import end_with_parent, start
+from workflow.warm import PARENT, end_with_parent, start
 
 
 def say_and_stop(error):
@@ -34,7 +35,8 @@ def bad_input_told(refused=InputError):
         say_and_stop(error)
 
 
-end_with_parent()
+if os.environ.pop(PARENT, None):  # ``siq`` has started this, and holds its standard input open
+    end_with_parent()
 prepare_environment()
 
 with bad_input_told():
