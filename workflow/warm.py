@@ -2,8 +2,8 @@
 
 A step of a run takes seconds, and the imports of numpy, sympy, torch and pysindy as long again. So one
 process imports them, and jobs that run at the same time are forks of it. A fork whose job ends well takes the
-next one. `serve` is that process, which the Snakefile starts; `run_warm` is what a script calls first. Where there
-is no such process, as on systems that cannot fork, a script runs as it would by itself.
+next one. `serve` is that process, which the Snakefile starts; `run_warm` is what a script calls first. Where
+there is no such process, as on systems that cannot fork, a script runs as it would by itself.
 """
 
 from __future__ import annotations

@@ -99,7 +99,8 @@ def _told(holds: bool, remark: Remark) -> Finding:
 def _files(kept: Provenance) -> Iterator[Finding]:
     """The files against their digests, and what each step read against what the step before had made."""
     changed = [kept.folder / path for path in kept.changed()] + [kept.file] * bool(kept.broken)
-    wrong = [_told(False, Remark("workflow.file_changed", {"file": str(file)})) for file in changed]
+    values = [{"file": str(file), "missing": not file.exists()} for file in changed]
+    wrong = [_told(False, Remark("workflow.file_changed", each)) for each in values]
     folders = {path for path in kept.made if (kept.folder / path).is_dir()}
     for file in sorted(kept.folder.rglob("*")):
         place = file.relative_to(kept.folder)
