@@ -117,8 +117,9 @@ def _files(kept: Provenance) -> Iterator[Finding]:
                 wrong.append(_told(False, Remark("workflow.file_older", {"file": made, "source": source})))
     for source, digest in outside.items():
         if (now := Provenance.digest_of(kept.folder / source)) != digest:
-            values = {"file": str((kept.folder / source).resolve()), "missing": now is None}
-            wrong.append(_told(False, Remark("workflow.source_changed", values)))
+            place = (kept.folder / source).resolve()
+            remark = Remark("workflow.source_changed", {"file": str(place), "missing": now is None})
+            wrong.append(_told(False, remark))
     yield from wrong or [_told(True, Remark("workflow.files_as_made", {"count": len(kept.made)}))]
 
 
