@@ -9,6 +9,8 @@ from pathlib import Path
 
 from siq.version import DISTRIBUTION
 
+LONGEST_FAULT = 1000  # letters: some messages list all names that could be meant
+
 
 class Fault(ValueError):
     """A value that cannot be used, told by code that does not know which file it came from.
@@ -54,7 +56,10 @@ class InputError(ValueError):
 
     def __init__(self, file: str | Path, place: str, fault: str, remedy: str) -> None:
         where = f"{file}, {place}" if place else f"{file}"
-        super().__init__(f"{where}: {fault}; {remedy}.")
+        # What a file says may have lines, or no end.
+        told = " ".join(fault.split())
+        told = told if len(told) <= LONGEST_FAULT else f"{told[: LONGEST_FAULT - 1]}…"
+        super().__init__(f"{where}: {told}; {remedy}.")
         self.file = str(file)
         self.place = place
         self.fault = fault

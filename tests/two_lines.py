@@ -6,10 +6,9 @@ from pathlib import Path
 
 from siq.systems.cards import load_system
 from siq.workflow import pipeline
-from siq.workflow.pipeline import Analysis, analyse
+from siq.workflow.pipeline import Analysis, analyse, source_of
 from siq.workflow.study import load_study, settings_of
 from workflow.places import named_file
-from workflow.steps import source_of
 
 
 def analysed(data: str, folder: Path) -> Analysis:

@@ -7,21 +7,19 @@ first asked for, and imports what it needs only then, so that other workflows st
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from benchmarks.publication.public_recordings import BENCHMARKS
-from siq.errors import InputError
-from siq.numerics.files import CARD, RECORDINGS, Document, case_folders, read_document, validate
-from siq.systems.cards import SystemCard
+from siq.errors import Fault, InputError
+from siq.numerics.files import CARD, RECORDINGS, Document, case_folders, given_path, read_document, validate
+from siq.systems.cards import SystemCard, check_title
 from workflow.places import config_path, find_file, named_file, needed_file
 
 MADE = "results/recordings"
 STUDY = "study.yaml"
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
 @dataclass(frozen=True)
@@ -144,17 +142,16 @@ class Cases:
 
     def _folders(self) -> dict[str, Path]:
         """The cases of the folder: itself, or every folder in it with a card or with recordings."""
-        base = Path(str(self._folder)).expanduser()
+        base = given_path(str(self._folder))
         if not base.is_dir():
             raise InputError(str(self._folder), "", "there is no such folder", "correct --config cases=DIR")
         return case_folders(base)
 
     def _of_folder(self, name: str, folder: Path) -> CheckedCase:
-        if not NAME.fullmatch(name):
-            raise InputError(
-                folder, "", f"'{name}' cannot name a folder of results",
-                "rename it, with letters, digits, dots, dashes and underscores",
-            )  # fmt: skip
+        try:
+            check_title(name)
+        except Fault as error:
+            raise error.at(folder) from None
         if (taken := config_path("mismatch", f"{name}.yaml")).exists():
             raise InputError(folder, "", f"a study of that name is {taken}", "rename the folder of the case")
         found = [str(folder / each) for each in RECORDINGS if (folder / each).is_file()]

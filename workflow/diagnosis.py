@@ -6,6 +6,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from siq.workflow.answers import Provenance
 from workflow.task import Given, task
 
 if TYPE_CHECKING:
@@ -193,5 +194,7 @@ def mismatch_page(given: Given, settings: PipelineSettings) -> Any:
         folder=str(Path(given.files["candidates"]).parent),
     )
     found = f"# the simulation with what was found, a system card like any other: {given.files['system']}"
-    html = rendered(findings, title=title, commands=[given.options["command"], found])
+    commands = [given.options["command"], found]
+    origin = Provenance(Path(given.outputs["html"]).parent).origin()
+    html = rendered(findings, title=title, commands=commands, origin=origin)
     return {"html": html, "answer": mismatch_answer(findings.statement, title=title)}

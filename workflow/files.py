@@ -89,12 +89,15 @@ def read(name: str, path: str | Path) -> Any:
         from siq.quasipotential.landscape_comparison import ReferenceLandscape
 
         return ReferenceLandscape.read(path)
-    if name.endswith("_outcome"):
-        return read_outcomes(path)
     if path.suffix == ".parquet":
         return read_table(path)
-    text = path.read_text(encoding="utf-8")
-    return json.loads(text) if path.suffix == ".json" else text
+    try:
+        if name.endswith("_outcome"):
+            return read_outcomes(path)
+        text = path.read_text(encoding="utf-8")
+        return json.loads(text) if path.suffix == ".json" else text
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(path, "", "it is not a result as it was written", "make it again") from None
 
 
 def read_states(path: str | Path, field: str | Path) -> Recordings | None:
@@ -194,10 +197,7 @@ def read_outcomes(path: str | Path) -> list[Outcome]:
 
 
 def write_table(path: str | Path, table: pd.DataFrame) -> None:
-    """Write a table as Parquet to `path`, and as CSV beside it.
-
-    Numbers in the CSV have as many digits as it takes to read the same numbers back.
-    """
+    """Write a table as Parquet to `path`, and as CSV with all digits beside it."""
     path = Path(path)
     with whole_file(path.with_suffix(".csv")) as partial:
         table.to_csv(partial, index=False)
@@ -206,14 +206,8 @@ def write_table(path: str | Path, table: pd.DataFrame) -> None:
 
 
 def read_table(path: str | Path) -> pd.DataFrame:
-    """Read a table that `write_table` wrote.
-
-    Raises
-    ------
-    InputError
-        When the file is missing or is not Parquet.
-    """
+    """Read a table that `write_table` wrote; InputError when the file is missing or is not Parquet."""
     try:
         return pd.read_parquet(path)
-    except (OSError, ValueError):
+    except (OSError, ValueError, KeyError, TypeError):
         raise InputError(path, "", "it is not a Parquet table", "make it again") from None

@@ -7,6 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from siq.workflow.answers import Provenance
 from workflow.steps import model_files, published_mesh, trained_run
 from workflow.task import Given, task
 
@@ -226,7 +227,9 @@ def page(given: Given, settings: PipelineSettings) -> Any:
         interactive=Markup(view.read_text(encoding="utf-8")) if view.is_file() else None,
     )
     programs = PACKAGES if study.training is None else (*PACKAGES, *OF_NETWORKS)
-    content = study_page(study, results, command=given.options["command"], versions=_versions(*programs))
+    versions, origin = _versions(*programs), Provenance(Path(given.outputs["html"]).parent).origin()
+    command = given.options["command"]
+    content = study_page(study, results, command=command, versions=versions, origin=origin)
     gathered = {f"{name}.png": one for name, one in images.items()}
     gathered |= {f"{name}.svg": one for name, one in vectors.items()}
     answer = answer_data(content, study, results)
@@ -272,6 +275,7 @@ def equations_page(given: Given, settings: PipelineSettings) -> Any:
         interactive=None if summary is None or system.dimension < 3 else interactive_view(summary),
     )
     command, versions = given.options["command"], _versions(*PACKAGES)
-    content = study_page(study, results, command=command, versions=versions)
+    origin = Provenance(Path(given.outputs["html"]).parent).origin()
+    content = study_page(study, results, command=command, versions=versions, origin=origin)
     answer = answer_data(content, study, results)
     return {"html": render_report(content), "answer": answer, "figures": gathered}

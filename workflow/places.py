@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from siq.errors import InputError
+from siq.numerics.files import given_path
 
 BASE = Path(__file__).resolve().parents[1]
 """The folder of the Snakefile."""
@@ -109,7 +110,7 @@ def needed_file(file: str, *, start: Path, where: tuple[str, str]) -> str:
 
 def _places(file: str, start: Path | None) -> Iterator[Path]:
     """Everywhere that a file is looked for, in this order."""
-    path = Path(file).expanduser()
+    path = given_path(file)
     if path.is_absolute():
         yield path
         return

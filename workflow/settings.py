@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -107,6 +108,9 @@ class CheckedStudy:
         recordings = self.study.recordings
         if recordings is None or recordings.file.startswith("results/"):
             return
+        if Path(self.source()).stat().st_mtime > time.time() + 60.0:
+            remedy = f"set the clock, or give the file the time of now by: touch {self.source()}"
+            raise InputError(self.source(), "", "it is of the future, as where a clock was set back", remedy)
         space = self.settings.space
         found, _ = read_pairs(
             self.source(),

@@ -14,13 +14,10 @@ from typing import TYPE_CHECKING, Any
 from workflow.task import Given, task
 
 if TYPE_CHECKING:
-    from siq.data.recordings import Recordings
     from siq.networks.decomposition import AnyNetworks
     from siq.quasipotential.wells import Well
-    from siq.systems.dynamics import Dynamics
-    from siq.workflow.models import ModelFiles
     from siq.workflow.study import PipelineSettings
-    from siq.workflow.tables import StepResult
+    from siq.workflow.tables import ModelFiles, StepResult
 
 # The published method, and ours.
 
@@ -31,42 +28,10 @@ if TYPE_CHECKING:
 )  # fmt: skip
 def draw(given: Given, settings: PipelineSettings) -> Any:
     """Trajectories of a run: a simulation of the card, or recordings resampled."""
-    from siq.workflow.pipeline import draw_run
+    from siq.workflow.pipeline import draw_run, source_of
 
     drawn = draw_run(settings, source_of(given.files["source"], settings), number=given.number)
     return {"recordings": drawn.result, "draw_outcome": [drawn.outcome]}
-
-
-def source_of(path: str | Path, settings: PipelineSettings) -> Dynamics | Recordings:
-    """The card that is simulated, or the recordings in its place.
-
-    Raises
-    ------
-    InputError
-        When the file is refused.
-    """
-    from dataclasses import replace
-
-    from siq.data.preparation import read_pairs
-    from siq.systems.cards import load_system
-
-    if settings.simulation is not None:
-        return load_system(path)
-    recordings, _ = read_pairs(
-        path,
-        states=settings.space.names,
-        units=settings.space.units,
-        pair_step=settings.sampling.pair_step,
-        hidden_velocities=settings.identification.hidden_velocities,
-    )
-    space = settings.space
-    units = tuple(
-        unit or space.unit(name, unknown="") or None
-        for name, unit in zip(recordings.names, recordings.units, strict=True)
-    )
-    return replace(
-        recordings, units=units, time_unit=recordings.time_unit or space.unit("t", unknown="") or None
-    )
 
 
 @task("recordings", options=("seed", "space", "sampling", "identification", "certificate"))
@@ -389,7 +354,7 @@ def _wells(model: Any) -> tuple[Well, ...]:
 
 def model_files(given: Given) -> ModelFiles:
     """The formulas of all runs."""
-    from siq.workflow.models import ModelFiles
+    from siq.workflow.tables import ModelFiles
 
     return ModelFiles(tuple(given.files["model"]))
 

@@ -19,6 +19,7 @@ from typing import Any
 from benchmarks.proof import tasks as proof
 from benchmarks.publication import tasks as publication
 from siq.errors import InputError
+from siq.workflow.answers import Provenance
 from workflow import diagnosis, pages, steps
 from workflow.task import TASKS, Given
 
@@ -91,12 +92,15 @@ class Job:
             wildcards=self.wildcards, outputs=self.output, device=self.device, threads=self.threads,
             tell=_teller(self.wildcards.get("case", "")),
         )  # fmt: skip
+        Provenance.check(self.input)
         made = TASKS[self.task].run(given, settings)
         for name, path in self.output.items():
             if name in made:
                 write(name, path, made[name], settings)
         for then in given.afterwards:
             then()
+        kept = Provenance(self.log.rpartition("/logs/")[0])
+        kept.record(self.task, inputs=self.input, outputs=self.output, said=given.options)
 
 
 def _plain(value: Any) -> Any:
@@ -125,9 +129,13 @@ def run(snakemake: Any) -> None:
     logging.info("%s%s", GIVEN, json.dumps(vars(job)))
     try:
         job()
-    except InputError as error:
-        logging.error("%s", error)
-        print(error, file=sys.stderr)
+    except (InputError, OSError) as error:  # of the system: a full disk, or what may not be read or written
+        told = str(error)
+        if isinstance(error, OSError):
+            what = error.strerror or error
+            told = f"{error.filename or log}: {what}; see to it, and give the same command again."
+        logging.error("%s", told, exc_info=isinstance(error, OSError))
+        print(told, file=sys.stderr)
         sys.exit(1)
     except BaseException:
         logging.exception("the step stopped")

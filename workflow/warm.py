@@ -1,11 +1,9 @@
 """A warm interpreter: every job of a workflow starts where its imports are done already.
 
-A step of a run takes seconds, and the imports of numpy, sympy, torch and pysindy as long again; and what is
-worked out once for a library of functions serves every run. So one process imports them, and jobs that run at
-the same time are forks of it. A fork whose job ends well takes the next one, so that there are as many as
-jobs run at once. `serve` is that process, which the Snakefile starts; `run_warm` is what a script calls
-first. Files, rules and jobs stay one a run. Where there is no such process, as on systems that cannot fork, a
-script runs as it would by itself.
+A step of a run takes seconds, and the imports of numpy, sympy, torch and pysindy as long again. So one
+process imports them, and jobs that run at the same time are forks of it. A fork whose job ends well takes the
+next one. `serve` is that process, which the Snakefile starts; `run_warm` is what a script calls first. Where
+there is no such process, as on systems that cannot fork, a script runs as it would by itself.
 """
 
 from __future__ import annotations
@@ -25,6 +23,7 @@ import tempfile
 import threading
 import traceback
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import TypedDict
 
@@ -33,6 +32,22 @@ ADDRESS = "SIQ_WARM_INTERPRETER"
 
 STREAMS = 3  # standard input, output and error of the job
 LONGEST_REQUEST = 1 << 20
+
+
+PARENT = "SIQ_PARENT"
+"""Environment variable of a workflow whose standard input ends with the process that has started it."""
+
+
+def end_with_parent(before: Callable[[], None] = lambda: None) -> None:
+    """End this process when its standard input ends, and so with the one that holds that open."""
+
+    def wait() -> None:
+        while os.read(0, 1):
+            pass
+        before()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 class Request(TypedDict):
@@ -86,8 +101,8 @@ def run_warm(task: str) -> None:
     connection = socket.socket(socket.AF_UNIX)
     try:
         connection.connect(address)
-    except OSError:
-        return
+    except OSError:  # it ends with the workflow, and nobody waits for this job any more
+        sys.exit("The workflow has ended, and this job with it.")
     request: Request = {
         "task": task,
         "script": str(Path(sys.argv[0]).resolve()),  # Snakemake runs a copy, which says what the job is
@@ -105,15 +120,23 @@ def serve(listening: socket.socket, folder: Path) -> None:
     """Give every script that connects to a fork, until standard input ends; then remove the folder."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the workflow, which then ends
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # forks that have ended are reaped by the system
-    threading.Thread(target=_end_with_workflow, args=(folder,), daemon=True).start()
     forks: dict[socket.socket, bool] = {}  # whether each is at work
+    numbers: dict[socket.socket, int] = {}
+
+    def end_all() -> None:
+        for number in [*numbers.values()]:
+            with contextlib.suppress(OSError):
+                os.kill(number, signal.SIGKILL)
+        shutil.rmtree(folder, ignore_errors=True)
+
+    end_with_parent(end_all)
     while True:
         ready, _, _ = select.select([listening, *forks], [], [])
         for fork in set(ready) & set(forks):
             with contextlib.suppress(OSError):
                 forks[fork] = not fork.recv(1)
             if forks[fork]:  # it has ended with its job
-                del forks[fork]
+                del forks[fork], numbers[fork]
                 fork.close()
         if listening not in ready:
             continue
@@ -129,13 +152,14 @@ def serve(listening: socket.socket, folder: Path) -> None:
             with contextlib.suppress(Exception):  # the job says itself what is wrong
                 _load(request["task"])
             idle, ours = socket.socketpair()
-            if os.fork() == 0:
+            if not (number := os.fork()):
                 for each in (listening, connection, idle, *forks):
                     each.close()
                 for descriptor in descriptors:
                     os.close(descriptor)
                 _work(ours)
             ours.close()
+            numbers[idle] = number
         forks[idle] = True
         with contextlib.suppress(OSError):  # one that was killed; the script sees its connection end
             _send(idle, request, [*descriptors, connection.fileno()])
@@ -151,13 +175,6 @@ def _load(task: str) -> None:
     for module in imports_of_task(task):
         with contextlib.suppress(ImportError):  # a name in a module, and no module
             importlib.import_module(module)
-
-
-def _end_with_workflow(folder: Path) -> None:
-    while os.read(0, 1):
-        pass
-    shutil.rmtree(folder, ignore_errors=True)
-    os._exit(0)
 
 
 def _send(connection: socket.socket, request: Request, descriptors: list[int]) -> None:

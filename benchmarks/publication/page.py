@@ -34,8 +34,7 @@ from siq.report.landscape import in_words
 from siq.report.page import ReportFigure, ReportSection, ReportTable, render_template
 from siq.report.study_page import errors_over_runs
 from siq.systems.dynamics import Dynamics
-from siq.workflow.models import ModelFiles
-from siq.workflow.tables import Method, as_table
+from siq.workflow.tables import Method, ModelFiles, as_table
 from workflow.files import read_table
 from workflow.published import PublishedFigure
 from workflow.scoring import summary_row, summary_table

@@ -49,7 +49,7 @@ NEGLIGIBLE_ROUNDING = 1e-6  # of the range of a state
 COARSE_STEP = 0.5  # relaxation times: over a longer step most of what f does is forgotten
 
 
-class Span(NamedTuple):
+class _Span(NamedTuple):
     """The least, the usual (median) and the greatest of something."""
 
     least: float
@@ -58,7 +58,7 @@ class Span(NamedTuple):
 
 
 @dataclass(frozen=True)
-class StateFacts:
+class _StateFacts:
     """What is known of one measured column."""
 
     name: str  #: in formulas
@@ -85,10 +85,10 @@ class Inspection:
 
     file: str  #: as it was named
     recordings: Recordings  #: what was read
-    states: tuple[StateFacts, ...]  #: the measured columns
-    samples: Span  #: of a recording: the fewest, the usual number, the most
-    durations: Span  #: of a recording, in the unit of time
-    steps: Span | None  #: between neighbouring samples, in the unit of time; None where no recording has two
+    states: tuple[_StateFacts, ...]  #: the measured columns
+    samples: _Span  #: of a recording: the fewest, the usual number, the most
+    durations: _Span  #: of a recording, in the unit of time
+    steps: _Span | None  #: between neighbouring samples, in the unit of time; None where no recording has two
     pairs: int  #: number of neighbouring samples that are close enough to learn from
     gaps: int  #: number of neighbouring samples that are further apart than that
     memory: MarkovLag  #: from which lag on they are Markovian, and what makes them remember until then
@@ -249,7 +249,7 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
         different = len(np.unique(x[:: max(len(x) // VALUES_SAMPLED, 1)]))
         label = different if different < FEWEST_VALUES <= len(x) / MIN_REPETITIONS else None
         low, high = float(x.min()), float(x.max())
-        states.append(StateFacts(name, title, unit, low, high, resolution_step(x), noise, label))
+        states.append(_StateFacts(name, title, unit, low, high, resolution_step(x), noise, label))
     memory = markov_lag(recordings)
     # Of the cells over the range of one state or two, those that were visited.
     some = recordings.values[:, :2]
@@ -271,5 +271,5 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
     )
 
 
-def _span(values: np.ndarray | Sequence[float]) -> Span:
-    return Span(float(np.min(values)), float(np.median(values)), float(np.max(values)))
+def _span(values: np.ndarray | Sequence[float]) -> _Span:
+    return _Span(float(np.min(values)), float(np.median(values)), float(np.max(values)))

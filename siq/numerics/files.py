@@ -6,8 +6,9 @@ built, a key that stands twice is refused, and whatever the schema refuses is to
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -35,6 +36,17 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     finally:
         partial.unlink(missing_ok=True)
 
+
+def given_path(text: str | Path) -> Path:
+    """The path that somebody wrote: as it stands where that is there, and ``~`` for a home otherwise."""
+    path = Path(text)
+    with suppress(OSError, ValueError, RuntimeError):  # no such user, or no path at all
+        return path if path.exists() else path.expanduser()
+    return path
+
+
+LARGEST_DOCUMENT = 1_000_000  # bytes: the largest card that comes with siq has 6,000
+DEEPEST = 20  # levels of brackets: the deepest key of a schema lies five deep
 
 UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
 Keys = tuple[str | int, ...]
@@ -64,22 +76,22 @@ def read_document(path: str | Path) -> Document:
     """
     file = str(path)
     try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        size = Path(path).stat().st_size
+        text = Path(path).read_text(encoding="utf-8") if size <= LARGEST_DOCUMENT else ""
+    except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or type(error).__name__
         raise InputError(
             file, "", f"it cannot be read ({reason})", "check the name and permissions"
         ) from None
+    if size > LARGEST_DOCUMENT:
+        fault = f"the file has {size / 1e6:.1f} MB, too many for a card or a study"
+        raise InputError(file, "", fault, f"keep it below {LARGEST_DOCUMENT / 1e6:g} MB")
     try:
-        loader = _loader_of(text)
-        for event in yaml.parse(text, Loader=loader):
-            if isinstance(event, yaml.AliasEvent):  # may refer to itself, or multiply without bound
-                place = f"line {event.start_mark.line + 1}" if event.start_mark else ""
-                raise InputError(
-                    file, place, f"the alias '*{event.anchor}' is not allowed", "write the value out"
-                )
-        root = yaml.compose(text, Loader=loader)
-        data = yaml.load(text, Loader=loader)
+        try:  # the loader in C, ten times as fast, for what it can read; the other tells faults in its words
+            loader, root = _composed(file, text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        except (yaml.YAMLError, UnicodeError):
+            loader, root = _composed(file, text, yaml.SafeLoader)
+        data = None if root is None else loader.construct_document(root)
     except InputError:
         raise
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -95,14 +107,34 @@ def read_document(path: str | Path) -> Document:
     return Document(file=file, data=data, lines=lines)
 
 
-def _loader_of(text: str) -> Any:
-    """The loader in C, ten times as fast, for what it can read; the other tells faults in its words."""
-    fast = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    try:
-        yaml.compose(text, Loader=fast)
-    except (yaml.YAMLError, ValueError, RecursionError):
-        return yaml.SafeLoader
-    return fast
+def _composed(file: str, text: str, kind: Any) -> tuple[Any, yaml.Node | None]:
+    """A loader, and the nodes of a document, whose keys are written as formulas are read."""
+    deep = 0
+    for event in yaml.parse(text, Loader=kind):
+        place = f"line {event.start_mark.line + 1}" if event.start_mark else ""
+        if isinstance(event, yaml.AliasEvent):  # may refer to itself, or multiply without bound
+            fault = f"the alias '*{event.anchor}' is not allowed"
+            raise InputError(file, place, fault, "write the value out")
+        deep += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if deep > DEEPEST:  # to compose it takes a call for each, of which there are only so many
+            fault = f"brackets stand in one another more than {DEEPEST} deep"
+            raise InputError(file, place, fault, "write it as 'key: value' lines")
+    loader = kind(text)
+    root = loader.get_single_node()
+    _normalise_keys(root)
+    return loader, root
+
+
+def _normalise_keys(node: yaml.Node | None) -> None:
+    """Write keys as formulas are read (NFKC): a letter of full width is the letter, the micro sign is mu."""
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                key.value = unicodedata.normalize("NFKC", key.value)
+            _normalise_keys(value)
+    elif isinstance(node, yaml.SequenceNode):
+        for value in node.value:
+            _normalise_keys(value)
 
 
 def validate(document: Document, model: type[Model]) -> Model:
@@ -214,4 +246,7 @@ def files_of(folder: Path) -> list[Path]:
     if not found:
         remedy = f"put one file per recording into it, with one of the suffixes {', '.join(SUFFIXES)}"
         raise InputError(folder, "", "the folder holds no recordings", remedy)
+    for path in found:
+        if "{" in path.name or "}" in path.name:  # to the workflow a blank that is filled in
+            raise InputError(path, "", "the name has braces", "rename the file")
     return found

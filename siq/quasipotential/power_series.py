@@ -34,7 +34,7 @@ from siq.inference.library import monomial_exponents
 from siq.quasipotential.hamilton_jacobi import Expansion, PowerBasis
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import classify, hessian_at
-from siq.systems.formulas import compile_formulas
+from siq.systems.formulas import compile_formulas, formulas_in_time
 
 MOST_STATES_OF_DEGREE_4 = 8  # beyond, the local series is of degree 3
 
@@ -96,7 +96,8 @@ def quasipotential_series(dynamics: Dynamics, attractor: np.ndarray, *, degree: 
         raise Fault(f"a series of degree {degree} was asked for", "V begins with degree 2")
     center = np.asarray(attractor, dtype=float)
     basis = _Homogeneous(dynamics.dimension, degree)
-    force = basis.expanded("f", dynamics.formulas, dynamics.symbols, center, degree - 1)
+    with formulas_in_time("the series at an attractor"):
+        force = basis.expanded("f", dynamics.formulas, dynamics.symbols, center, degree - 1)
     jacobian = dynamics.jacobian(center[None])[0]
     if classify(dynamics, center).kind != "attractor":
         raise ValueError(

@@ -112,8 +112,11 @@ def diagnosis_html(statement: Statement, system: Dynamics) -> str:
     return f"<div>{''.join(parts)}</ul></div>"
 
 
-def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str]) -> str:
-    """Write the page as HTML: the recording that differs most, the verdict, the number, and the rest."""
+def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str], origin: str = "") -> str:
+    """Write the page as HTML: the recording that differs most, the verdict, the number, and the rest.
+
+    `commands` make it again; `origin` says what it came from.
+    """
     statement, before = findings.statement, findings.before
     units = dict(zip(before.states, before.units, strict=True))
     of_outputs = {name: units.get(str(formula), "1") for name, formula in before.outputs}
@@ -133,6 +136,7 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str]) ->
         st=statement,
         d=findings,
         commands=commands,
+        origin=origin,
         largest=largest,
         units=of_outputs,
         mechanism_sentences=[

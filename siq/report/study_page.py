@@ -41,9 +41,8 @@ from siq.report.page import FormulaRow, ReportContent, ReportFigure, compose
 from siq.report.summary import LandscapeSummary, well_name
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
-from siq.workflow.models import ModelFiles, Shown
 from siq.workflow.study import Study, SweepOptions
-from siq.workflow.tables import Method, Outcome, Status, Step, why_no_landscape
+from siq.workflow.tables import Method, ModelFiles, Outcome, Shown, Status, Step, why_no_landscape
 
 NEGLIGIBLE_TERM = 1e-3  # of the depth: a term that adds less everywhere is left to the whole formula
 ROUNDED_CONSTANT = 1e-9  # of the depth: a constant of U far below it is what rounding left of zero
@@ -100,11 +99,12 @@ class StudyResults:
 
 
 def study_page(
-    study: Study, results: StudyResults, *, command: str, versions: Mapping[str, str]
+    study: Study, results: StudyResults, *, command: str, versions: Mapping[str, str], origin: str = ""
 ) -> ReportContent:
     """All that the page of a study says.
 
-    `command` makes the page again; `versions` are those of the programs that took part, by name.
+    `command` makes the page again; `versions` are those of the programs that took part, by name; `origin`
+    says what the results came from.
     """
     (run, method), summary, given = results.shown, results.landscape, results.system
     several, beside_paper = study.runs > 1, study.published is not None
@@ -139,6 +139,7 @@ def study_page(
         method=str(method),
         beside_paper=beside_paper,
         command=command,
+        origin=origin,
         help=texts("help"),
         words=texts("certificate"),
         answer=_answer(results, certified=certified),

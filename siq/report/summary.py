@@ -66,7 +66,7 @@ def energy_unit(units: Sequence[str], time_unit: str) -> str:
 
 
 @dataclass(frozen=True)
-class EquilibriumSummary:
+class _EquilibriumSummary:
     """An equilibrium that is no well, such as a saddle; U there is as high as the lowest exit over it."""
 
     kind: str  #: attractor, saddle, repeller or degenerate
@@ -131,7 +131,7 @@ class LandscapeSummary:
     dynamics: Dynamics | None = None  #: f and D, where a plot needs their errors
     matched: bool = True  #: whether U is known over all wells; if not, each is drawn from its own bottom
     formula: SymbolicDecomposition | None = None  #: one V over all wells, in the box of the recorded states
-    equilibria: tuple[EquilibriumSummary, ...] = ()  #: all of them, in the order in which they were found
+    equilibria: tuple[_EquilibriumSummary, ...] = ()  #: all of them, in the order in which they were found
     #: How large each state becomes, shape (d,); of states of one unit, how large any does.
     size: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
@@ -203,17 +203,17 @@ class LandscapeSummary:
         return np.stack([low - room, high + room], axis=1)
 
     @property
-    def others(self) -> tuple[EquilibriumSummary, ...]:
+    def others(self) -> tuple[_EquilibriumSummary, ...]:
         """The equilibria that are no wells."""
         return tuple(one for one in self.equilibria if not one.label)
 
     @property
-    def saddles(self) -> tuple[EquilibriumSummary, ...]:
+    def saddles(self) -> tuple[_EquilibriumSummary, ...]:
         """Those between the wells."""
         return tuple(one for one in self.others if one.kind == "saddle")
 
     @property
-    def marks(self) -> tuple[WellSummary | EquilibriumSummary, ...]:
+    def marks(self) -> tuple[WellSummary | _EquilibriumSummary, ...]:
         """Wells and saddles."""
         return (*self.wells, *self.saddles)
 
@@ -353,7 +353,7 @@ def summarise(
         tops[key] = top if np.isnan(tops.get(key, np.nan)) else min(top, tops[key])
     letters = {tuple(one.position.tolist()): well_name(index) for index, one in enumerate(attractors)}
     equilibria = tuple(
-        EquilibriumSummary(
+        _EquilibriumSummary(
             one.kind, one.position, tops.get(place, np.nan), tuple(one.eigenvalues.tolist()),
             letters.get(place, ""),
         )

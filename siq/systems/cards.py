@@ -9,6 +9,8 @@ same equations in other units are another problem unless D is carried along.
 from __future__ import annotations
 
 import keyword
+import re
+import unicodedata
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -21,13 +23,23 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validat
 
 from siq.errors import Fault, InputError
 from siq.numerics.files import Document, read_document, validate
-from siq.systems.diffusion import Diffusion
+from siq.systems.diffusion import LARGEST_STATE, Diffusion
 from siq.systems.dynamics import TIME, Dynamics, Input, Parameter, symbol
-from siq.systems.formulas import CONSTANTS, FUNCTIONS, FormulaError, exact_number, parse_formula
+from siq.systems.formulas import (
+    CONSTANTS,
+    FUNCTIONS,
+    FormulaError,
+    exact_number,
+    formulas_in_time,
+    parse_formula,
+)
 
 
 def check_name(text: str) -> str:
-    """Return a name that formulas can use; raises ValueError for any other."""
+    """Return a name that formulas can use, as they are read (NFKC); raises ValueError for any other."""
+    text = unicodedata.normalize("NFKC", text)
+    if len(text) > LONGEST_NAME:
+        raise Fault(f"the name '{text[:20]}…' has {len(text)} letters", f"keep it to {LONGEST_NAME}")
     if not text.isidentifier() or keyword.iskeyword(text):
         raise Fault(f"'{text}' cannot be a name in a formula", "use letters, digits and underscores")
     if text in FUNCTIONS or text in CONSTANTS or text in ("recording", "t", "delay"):
@@ -35,12 +47,29 @@ def check_name(text: str) -> str:
     return text
 
 
+def check_title(text: str) -> str:
+    """Return a name that files and folders can have; raises ValueError for any other.
+
+    It stands in names of files, which have up to 255 bytes. What is repeated 20 times would be
+    taken for a rule that calls itself.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", text):
+        remedy = "use letters, digits, dots, dashes and underscores, and begin with a letter or a digit"
+        raise Fault(f"'{text[:80]}' cannot be the name of files", remedy)
+    if len(text) > LONGEST_NAME or re.search(r"(.+?)\1{18}", text):
+        fault = f"the name '{text[:20]}…' is too long, or repeats itself"
+        raise Fault(fault, f"give it another of at most {LONGEST_NAME} letters")
+    return text
+
+
 Name = Annotated[str, AfterValidator(check_name)]
+FileName = Annotated[str, AfterValidator(check_title)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Formula = str | Number
 DiffusionEntry = Literal["identity"] | list[Formula] | list[list[Formula]]
 
 LINE_WIDTH = 110
+LONGEST_NAME = 100  # letters: names of files have up to 255 bytes, of which two names may be a part
 
 
 class _CardPart(BaseModel):
@@ -60,6 +89,10 @@ class StateEntry(_CardPart):
     def _ordered(cls, domain: tuple[float, float] | None) -> tuple[float, float] | None:
         if domain is not None and not domain[0] < domain[1]:
             raise Fault("the domain is empty", "write it as [lower, upper] with lower < upper")
+        if domain is not None and not (
+            max(map(abs, domain)) <= LARGEST_STATE and domain[1] - domain[0] >= 1 / LARGEST_STATE
+        ):
+            raise Fault("the domain is too wide or too narrow for numbers", "write it in another unit")
         return domain
 
 
@@ -94,7 +127,7 @@ class SystemCard(_CardPart):
     """
 
     #: Letters, digits, ``_``, ``.`` and ``-``; in ``config/systems/`` the file is called the same.
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
+    name: FileName
     title: str = ""  #: what people call the system; by default the name
     time_unit: str = "1"  #: of t
     states: dict[Name, StateEntry] = Field(min_length=1)  #: by name, in the order of the state vector
@@ -247,8 +280,9 @@ def _parser(
     def parse(keys: tuple[str, ...], text: Formula) -> sympy.Expr:
         try:
             # A power may be too high, or a divisor zero, at the parameters' values alone.
-            parse_formula(text, names | values, inputs=tuple(card.inputs))
-            return parse_formula(text, names, inputs=tuple(card.inputs))
+            with formulas_in_time("the formula"):
+                parse_formula(text, names | values, inputs=tuple(card.inputs))
+                return parse_formula(text, names, inputs=tuple(card.inputs))
         except FormulaError as error:
             raise error.at(document.file, document.place(keys)) from None
 

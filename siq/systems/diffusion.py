@@ -25,6 +25,8 @@ from siq.systems.formulas import compile_formulas, exact_number, parse_formula
 
 ROUNDING = 1e-12  # of numbers of size one, and some products of them
 
+LARGEST_STATE = 1e30  # numerical: its eighth power, as in a series, is a number still, and so is its inverse
+
 
 class Diffusion:
     """D(x): ``Diffusion(matrix)`` is constant, `Diffusion.of_formulas` depends on the state.
@@ -102,9 +104,15 @@ class Diffusion:
         """
         names = {each.name: each for each in symbols}
         if all(not isinstance(entry, str) for row in rows for entry in row):
-            return Diffusion(np.array(rows, dtype=float))
-        read = parse or (lambda text: parse_formula(text, names))
-        return cls.of_formulas(symbols, [[read(entry) for entry in row] for row in rows])
+            found = Diffusion(np.array(rows, dtype=float))
+        else:
+            read = parse or (lambda text: parse_formula(text, names))
+            found = cls.of_formulas(symbols, [[read(entry) for entry in row] for row in rows])
+        sizes = np.abs(found.matrix[found.matrix != 0]) if found.constant else np.ones(1)
+        if not ((sizes >= LARGEST_STATE**-2) & (sizes <= LARGEST_STATE**2)).all():
+            fault = "the diffusion is too large or too small for numbers"
+            raise Fault(fault, "write the states in other units")
+        return found
 
     @property
     def rows(self) -> list[list[str | float]]:

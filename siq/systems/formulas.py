@@ -18,7 +18,10 @@ import builtins
 import functools
 import keyword
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+import signal
+import threading
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
@@ -69,6 +72,7 @@ LARGEST_BASE = 1e9  # numerical: the same for numbers in formulas; (1e9)^32 = 1e
 LARGEST_VALUE = 1e300  # numerical: below the largest double, 1.8e308
 MAX_COMPILED = 4096  # compiled formulas that are kept: each takes some kilobytes
 DIGITS = 17  # of decimal digits, that a double is read back exactly
+LONGEST_WORK = 10.0  # seconds of processor time: cards of ten states take less than one
 MAX_FORMULA_LENGTH = 20_000  # characters, a guard against files that are no formulas
 
 _OPERATORS: Mapping[type[ast.operator], Callable[[sympy.Expr, sympy.Expr], sympy.Expr]] = {
@@ -81,6 +85,43 @@ _OPERATORS: Mapping[type[ast.operator], Callable[[sympy.Expr, sympy.Expr], sympy
 
 class FormulaError(Fault):
     """A formula that the whitelist refuses; the fault names the offending part."""
+
+
+class _TooLong(BaseException):
+    """The time is over; no handler of errors may take it for one."""
+
+
+@contextmanager
+def formulas_in_time(what: str) -> Iterator[None]:
+    """Refuse formulas on which sympy would work for ever, as where many functions stand in one another.
+
+    Its time grows exponentially with them, and no count of terms predicts it. A timer of the process
+    interrupts it after `LONGEST_WORK`; elsewhere than in the main thread, and on systems without such a
+    timer, there is no limit.
+
+    Raises
+    ------
+    FormulaError
+        When `what` is not worked out by then.
+    """
+    main = threading.current_thread() is threading.main_thread()
+    if not main or not hasattr(signal, "setitimer") or signal.getitimer(signal.ITIMER_VIRTUAL)[0]:
+        yield
+        return
+
+    def stop(number: int, frame: object) -> None:
+        raise _TooLong
+
+    before = signal.signal(signal.SIGVTALRM, stop)
+    signal.setitimer(signal.ITIMER_VIRTUAL, LONGEST_WORK)
+    try:
+        yield
+    except _TooLong:
+        fault = f"{what} could not be worked out within {LONGEST_WORK:g} s"
+        raise FormulaError(fault, "let fewer functions stand in one another") from None
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+        signal.signal(signal.SIGVTALRM, before)
 
 
 def parse_formula(
@@ -233,7 +274,10 @@ def _compiled(
         printer=_ProductPrinter(),
         cse=common,
         # Renaming is slow, and needed only for names that the generated code may use itself.
-        dummify=any(hasattr(np, str(each)) or hasattr(builtins, str(each)) for each in variables),
+        dummify=any(
+            str(each) == "integer_power" or hasattr(np, str(each)) or hasattr(builtins, str(each))
+            for each in variables
+        ),
     )
 
 

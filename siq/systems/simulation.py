@@ -30,7 +30,7 @@ from siq.numerics.integration import euler_maruyama_step, runge_kutta_step
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import find_equilibria
-from siq.systems.formulas import compile_formulas
+from siq.systems.formulas import FormulaError, compile_formulas, formulas_in_time
 
 TRAJECTORIES = 1000  # enough for every state of a box in three dimensions, and simulated in seconds
 STATES = 400  # of the domain, at which rates are asked for
@@ -278,7 +278,12 @@ def fault_over_domain(dynamics: Dynamics) -> tuple[str, str] | None:
     x = np.random.default_rng(0).uniform(low, high, size=(STATES, dynamics.dimension))
     x = np.concatenate([x, low[None], high[None]])
     with np.errstate(all="ignore"):
-        flow, slopes = dynamics.drift(x), dynamics.jacobian(x)
+        try:
+            with formulas_in_time("the derivatives"):
+                flow, slopes = dynamics.drift(x), dynamics.jacobian(x)
+                dynamics.hessian(x[:1])  # on which paths and series depend
+        except FormulaError as error:
+            raise error.at(dynamics.name or "the system", "equations") from None
         for index, (name, formula) in enumerate(zip(dynamics.states, dynamics.formulas, strict=True)):
             bases = [one.base for one in formula.atoms(sympy.Pow) if one.exp.is_negative]
             divisors = compile_formulas(bases, dynamics.symbols)(np.ascontiguousarray(x.T))

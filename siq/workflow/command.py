@@ -72,6 +72,15 @@ def parser() -> argparse.ArgumentParser:
     )
     one.set_defaults(action=_inspect)
     one = commands.add_parser(
+        "verify",
+        help="derive again what a page claims",
+        description="Compares the files of a result with what the steps wrote, and derives its numbers again:"
+        " trajectories, f, certificate, formulas and a barrier. Says what it could not derive. Ends with"
+        " code 1 where something differs.",
+    )
+    one.add_argument("result", metavar="RESULT", help="a folder of results, results/NAME, or the page in it")
+    one.set_defaults(action=_verify)
+    one = commands.add_parser(
         "init",
         help="write a commented study for a file of recordings",
         description="Looks at recordings and writes a study for them that runs as it is, with comments on"
@@ -163,6 +172,21 @@ def _inspect(options: argparse.Namespace) -> Exit:
     for file in options.recordings:
         print(inspect_recordings(file).text())
     return Exit.ANSWERED
+
+
+def _verify(options: argparse.Namespace) -> Exit:
+    from siq.remarks import sentence
+    from siq.workflow.verification import verify
+
+    found = []
+    for kind, remark in verify(options.result):
+        print(f"{TOLD[kind]}{sentence(remark)}", flush=True)
+        found.append(kind)
+    print("It does not hold." if "differs" in found else "All that was derived again agrees.")
+    return Exit.FAULT if "differs" in found else Exit.ANSWERED
+
+
+TOLD = {"agrees": "agrees:       ", "differs": "DIFFERS:      ", "open": "not derived:  "}
 
 
 def _init(options: argparse.Namespace) -> Exit:

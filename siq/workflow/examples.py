@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import os
@@ -14,8 +15,9 @@ import numpy as np
 from siq.data.inspection import Inspection
 from siq.data.inspection import inspect as inspect_recordings
 from siq.data.recordings import read_recordings
-from siq.errors import InputError
+from siq.errors import Fault, InputError
 from siq.numerics.files import whole_file
+from siq.systems.cards import check_title
 from siq.version import DISTRIBUTION
 
 GENERATED = Path(".snakemake", "siq")
@@ -31,7 +33,11 @@ def name_for(path: Path) -> str:
     """A name for the results of a file or folder of recordings: its own, without what no name may have."""
     resolved = path.resolve()
     stem = resolved.name if resolved.is_dir() else resolved.stem
-    return re.sub(r"[^A-Za-z0-9_.-]+", "-", stem).strip("-.") or "recordings"
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "-", stem).strip("-._") or "recordings"
+    try:
+        return check_title(name)
+    except Fault:  # too long: what it begins with, and what tells it from others
+        return f"{name[:10]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
 def own_path(path: Path, *, start: Path | None = None) -> str:

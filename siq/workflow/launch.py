@@ -11,6 +11,7 @@ import json
 import os
 import queue
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -21,7 +22,7 @@ from pathlib import Path
 from typing import IO, Any, TextIO
 
 from siq.errors import InputError, MissingExtra, suggestion
-from siq.numerics.files import CARD, case_folders, read_document
+from siq.numerics.files import CARD, case_folders, given_path, read_document
 from siq.workflow.answers import Exit, answer_of_page
 from siq.workflow.examples import is_study, name_for, own_path, write_generated
 
@@ -149,7 +150,7 @@ def _duration(seconds: float) -> str:
     return f"about {round(seconds / 3600)} h left"
 
 
-class Screen:
+class _Screen:
     """Shows the line: rewritten in place on a terminal of so many columns, now and then in a log."""
 
     def __init__(
@@ -185,7 +186,7 @@ class Screen:
         self._stream.flush()
 
 
-def follow(lines: Iterable[str], screen: Screen, progress: _Progress) -> list[str]:
+def _follow(lines: Iterable[str], screen: _Screen, progress: _Progress) -> list[str]:
     """Read what a workflow writes, show where it stands, and pass on what its jobs say, which is returned.
 
     The traceback of a job is not passed on: it stands in the job's log, which `_faults` names. An empty line
@@ -269,6 +270,9 @@ class Request:
         return [*words, *self.further, "--", *self.targets]
 
 
+PARENT = "SIQ_PARENT"
+"""Environment variable that tells Snakemake to end when its standard input does, see `workflow.warm`."""
+
 FOLLOWED = "SIQ_FOLLOWED"
 """Environment variable that tells jobs that what they say of their progress is read."""
 
@@ -320,13 +324,15 @@ def run_study(given: str, asked: Request) -> Exit:
     file cannot be used, with `MissingExtra` when the workflow is not installed.
     """
     _need_workflow()
-    path = Path(given).expanduser()
+    path = given_path(given)
     settings: tuple[str, ...] = ()
     study: Path | None = None
     if not path.exists() and given in _known_studies():
         name = given
     elif not path.exists():
         raise _not_there(given)
+    elif any(each in path.name for each in "{}"):  # to Snakemake a blank that is filled in
+        raise InputError(given, "", "the name has braces", "rename the file")
     elif (path / CARD).is_file():
         raise InputError(
             given, "", f"this is a case of a simulation and its recordings, since it has {CARD}",
@@ -356,7 +362,7 @@ def diagnose_cases(folder: str, asked: Request) -> Exit:
     It has ``system.yaml`` and recordings, or folders that have them. Fails as `run_study` does.
     """
     _need_workflow()
-    place = Path(folder).expanduser()
+    place = given_path(folder)
     if place.name == CARD and place.is_file():
         place = place.parent
     if not place.is_dir():
@@ -367,7 +373,7 @@ def diagnose_cases(folder: str, asked: Request) -> Exit:
 
 def _not_there(given: str) -> InputError:
     """A wrong path, with where it was looked for and what is there of a similar name."""
-    place = Path(given).expanduser().absolute()
+    place = given_path(given).absolute()
     beside = [entry.name for entry in place.parent.iterdir()] if place.parent.is_dir() else []
     otherwise = suggestion(given, _known_studies(), otherwise="correct the path")
     remedy = suggestion(place.name, beside, otherwise=otherwise)
@@ -378,9 +384,11 @@ def _not_there(given: str) -> InputError:
 
 def _answered(request: Request, pages: Sequence[Path]) -> Exit:
     """Run the workflow in the folder in which you work, with one line of progress; say how it ended."""
+    # Its standard input ends with this process, however that ends, and Snakemake then ends, too.
     process = subprocess.Popen(
         request.command(),
-        env=_environment() | ({} if request.verbose else {FOLLOWED: "1"}),
+        env=_environment() | {PARENT: "1"} | ({} if request.verbose else {FOLLOWED: "1"}),
+        stdin=subprocess.PIPE,
         stdout=None if request.verbose else subprocess.PIPE,
         stderr=None if request.verbose else subprocess.STDOUT,
         text=None if request.verbose else True,
@@ -388,20 +396,31 @@ def _answered(request: Request, pages: Sequence[Path]) -> Exit:
         errors=None if request.verbose else "replace",
     )
     progress, said = _Progress(), []
+
+    def stop(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, stop)
     try:
         if process.stdout is not None:
             columns = shutil.get_terminal_size().columns if sys.stderr.isatty() else None
-            said = follow(_lines(process.stdout), Screen(sys.stderr, columns=columns), progress)
+            said = _follow(_lines(process.stdout), _Screen(sys.stderr, columns=columns), progress)
         code = process.wait()
-    except KeyboardInterrupt:  # Snakemake has been told, too, and lets no half of a file stand
-        try:  # it cleans up; interrupted again, or after too long, it is ended
+    except KeyboardInterrupt:  # files are whole or not there; what was begun is made again
+        try:
+            if process.stdin is not None:
+                process.stdin.close()
             process.wait(timeout=20.0)
         except (KeyboardInterrupt, subprocess.TimeoutExpired):
             process.kill()
             process.wait()
         print("\nStopped. Give the same command again to go on from here.", file=sys.stderr)
         return Exit.INTERRUPTED
-    if code and not request.verbose:
+    if code < 0:
+        said = [f"Snakemake was ended by signal {-code}. Give the same command again to go on from here."]
+        print(*said, file=sys.stderr)
+    elif code and not request.verbose:
         said += (more := _faults(progress, said))
         for line in more:
             print(line, file=sys.stderr)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from siq.data.preparation import in_stretches, joined, without_slow_drift
+from siq.data.preparation import in_stretches, joined, read_pairs, without_slow_drift
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.data.two_states import RecordStates
 from siq.errors import NumericalFailure
@@ -39,6 +39,7 @@ from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.refinement import Refinement, RefinementContext
 from siq.quasipotential.wells import Well
 from siq.remarks import Remark, sentence
+from siq.systems.cards import load_system
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import PhasePortrait, evenly_spread, phase_portrait
@@ -68,6 +69,33 @@ def draw_run(
         return StepResult(recordings, Outcome(number, Step.SIMULATE))
     except NumericalFailure as error:
         return StepResult(None, Outcome(number, Step.SIMULATE, Status.FAILED, str(error)))
+
+
+def source_of(path: str | Path, settings: PipelineSettings) -> Dynamics | Recordings:
+    """The card that is simulated, or the recordings in its place.
+
+    Raises
+    ------
+    InputError
+        When the file is refused.
+    """
+    if settings.simulation is not None:
+        return load_system(path)
+    recordings, _ = read_pairs(
+        path,
+        states=settings.space.names,
+        units=settings.space.units,
+        pair_step=settings.sampling.pair_step,
+        hidden_velocities=settings.identification.hidden_velocities,
+    )
+    space = settings.space
+    units = tuple(
+        unit or space.unit(name, unknown="") or None
+        for name, unit in zip(recordings.names, recordings.units, strict=True)
+    )
+    return replace(
+        recordings, units=units, time_unit=recordings.time_unit or space.unit("t", unknown="") or None
+    )
 
 
 def identify_run(

@@ -14,7 +14,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    field_validator,
+    model_validator,
+)
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from siq.data.layout import read_heading, usable_name
@@ -28,7 +36,7 @@ from siq.quasipotential.certificate_tests import CertificateOptions
 from siq.quasipotential.landscape import LandscapeOptions
 from siq.quasipotential.landscape_assembly import fault_for_landscape
 from siq.quasipotential.refinement import RefinementOptions
-from siq.systems.cards import DiffusionEntry, Name, Number, SystemCard, build_system, diffusion_rows
+from siq.systems.cards import DiffusionEntry, FileName, Name, Number, SystemCard, build_system, diffusion_rows
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, symbol
 from siq.systems.formulas import FormulaError
@@ -134,7 +142,15 @@ def point_values(name: str) -> tuple[tuple[str, ...], tuple[float, ...]]:
 
 Entrance = Literal["trajectories", "equations"]
 
-NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
+
+def _usable_path(text: str) -> str:
+    if any(each in text for each in "{}\n\0"):
+        raise Fault(f"the name of the file '{text}' holds braces or a line break", "rename the file")
+    return text
+
+
+FilePath = Annotated[str, AfterValidator(_usable_path)]
+"""Of a file; to the workflow braces are a blank that is filled in."""
 
 
 class RecordingsOptions(BaseModel):
@@ -167,7 +183,7 @@ class RecordingsOptions(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    file: str
+    file: FilePath
     states: Annotated[tuple[Name, ...], Field(min_length=1)] | None = None
     units: dict[str, str] | None = None
     pair_step: Annotated[float, Field(gt=0)] | None = None
@@ -244,9 +260,9 @@ class Study(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
 
-    name: str = Field(pattern=NAME)
+    name: FileName
     title: str = ""
-    system: str | None = None
+    system: FilePath | None = None
     entrance: Annotated[Entrance, Field(alias="from")] = "trajectories"
     recordings: RecordingsOptions | None = None
     runs: Annotated[int, Field(ge=1, le=10_000)] = 1

@@ -26,10 +26,9 @@ from siq.quasipotential.transitions import barrier_uncertainty, ways_out
 from siq.systems.diffusion import Diffusion
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
 from siq.workflow import pipeline
-from siq.workflow.pipeline import PipelineSettings
+from siq.workflow.pipeline import PipelineSettings, source_of
 from siq.workflow.study import StateSpace
 from siq.workflow.tables import Status, StepResult
-from workflow.steps import source_of
 
 FRICTION, SENSOR = 0.3, 0.02
 SETTINGS = PipelineSettings(identification=IdentificationOptions(degree=3, hidden_velocities=True))

@@ -10,7 +10,7 @@ import pytest
 from pydantic import BaseModel, ConfigDict
 
 from siq.errors import InputError
-from siq.numerics.files import read_document, validate, whole_file
+from siq.numerics.files import given_path, read_document, validate, whole_file
 
 Write = Callable[..., Path]
 
@@ -159,3 +159,27 @@ def test_after_an_error_the_old_file_is_there_and_no_other(tmp_path: Path) -> No
         _ = 1 / 0
     assert path.read_text(encoding="utf-8") == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_document_that_is_too_large_or_nests_too_deep_is_refused(write: Write) -> None:
+    assert "1.2 MB, too many" in refusal(write("name: a\ntitle: " + "a" * 1_200_000)).fault
+    deep = refusal(write("name: a\nmany: " + "[" * 100_000 + "]" * 100_000))
+    assert deep.place == "line 2" and "more than 20 deep" in deep.fault
+
+
+def test_keys_are_read_as_formulas_read_names(write: Write) -> None:
+    document = read_document(write("ｘ: 1\nµ:\n  Ω: 2\n"))
+    assert document.data == {"x": 1, "μ": {"Ω": 2}}
+    assert document.lines == {("x",): 1, ("μ",): 2, ("μ", "Ω"): 3}
+    assert "stands twice" in refusal(write("µ: 1\nμ: 2\n")).fault
+
+
+def test_a_path_is_meant_as_it_stands_where_that_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    Path("~root.csv").touch()
+    assert given_path("~root.csv") == Path("~root.csv")
+    assert given_path("~nobody-of-this-name.csv") == Path("~nobody-of-this-name.csv")
+    assert given_path("~/a.csv") == tmp_path / "home" / "a.csv"

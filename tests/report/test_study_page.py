@@ -19,9 +19,8 @@ from siq.report.page import ReportContent, ReportSection, render_report
 from siq.report.study_page import LEADING, StudyResults, study_page
 from siq.report.summary import summarise
 from siq.systems.dynamics import Dynamics
-from siq.workflow.models import ModelFiles
 from siq.workflow.study import Study
-from siq.workflow.tables import COLUMNS, Method, as_table
+from siq.workflow.tables import COLUMNS, Method, ModelFiles, as_table
 from workflow.scoring import _coefficient_table, summary_table
 
 FIGURES = texts("captions")["figures"]

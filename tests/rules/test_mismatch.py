@@ -149,7 +149,7 @@ def test_a_folder_without_cases_is_told_with_its_remedy(tmp_path, monkeypatch, f
 
 def test_folders_that_cannot_name_results_are_refused(tmp_path, monkeypatch):
     write_case(tmp_path / "my case")
-    with pytest.raises(ValueError, match="cannot name a folder of results; rename it"):
+    with pytest.raises(ValueError, match="cannot be the name of files; use letters"):
         Cases({"cases": str(tmp_path)}).in_folder()
 
 

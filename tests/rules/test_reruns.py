@@ -10,6 +10,10 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from benchmarks import faults
+from siq.remarks import sentence
+from siq.workflow.verification import verify
+
 pytestmark = pytest.mark.workflow
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -72,6 +76,40 @@ def test_what_a_plan_says_a_run_does(finished, tmp_path):
     project.make(MODEL)
     after = project.modified(DATA, NETWORKS, MODEL)
     assert [new != old for new, old in zip(after, before, strict=True)] == [False, False, True]
+
+
+def test_damaged_results_are_found_and_made_again(finished, tmp_path):
+    project = finished.copied(tmp_path / "project")
+    results, page = project.path("results/mini"), "results/mini/report.html"
+    assert "differs" not in [kind for kind, _ in verify(results)]
+    whole = project.path(MODEL).read_bytes()
+    place = whole.index(b'"coefficients"') + 25
+    project.path(MODEL).write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+    project.path(page).write_text("")
+    told = [sentence(remark) for kind, remark in verify(results) if kind == "differs"]
+    assert told == [f"{project.path(name)} is not as it was written" for name in (MODEL, page)]
+    output = project.make(MODEL)
+    for name in (MODEL, page):
+        assert f"{name} is not as it was written; it is made again." in output
+    assert project.path(MODEL).read_bytes() == whole
+    assert not project.path(page).exists()  # nobody asked for it
+
+
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="processes are found under /proc")
+def test_no_process_outlives_siq(tmp_path):
+    faults.recordings(tmp_path / "record.csv")
+    process = faults.start(tmp_path, tmp_path.name)
+    deadline = time.monotonic() + 300
+    while not (tmp_path / "results/record/logs/000/draw.log").exists():
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.02)
+    assert len(faults.processes(tmp_path.name)) > 2
+    process.kill()
+    process.communicate()
+    deadline = time.monotonic() + faults.PATIENCE
+    while faults.processes(tmp_path.name) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert faults.processes(tmp_path.name) == {}
 
 
 def wait_for(pattern, process, *, within, seconds=600):

@@ -8,6 +8,7 @@ import pytest
 import sympy
 
 from siq.errors import InputError
+from siq.systems import formulas
 from siq.systems.cards import diffusion_rows, load_exact, load_system
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -222,3 +223,41 @@ def test_a_hostile_card_is_refused_without_being_run(write: Write, tmp_path: Pat
     error = refusal(write(CARD.replace('p: "q"', f'p: "{formula}"')))
     assert error.place == "line 9 (equations.p)"
     assert not trap.exists()
+
+
+@pytest.mark.parametrize(
+    ("entry", "fault"),
+    [
+        (("domain: [-1, 2]", "domain: [-1, 1e300]"), "the domain is too wide or too narrow"),
+        (("domain: [-1, 2]", "domain: [0, 1e-300]"), "the domain is too wide or too narrow"),
+        (("parameters:", "diffusion: [1e300, 1]\nparameters:"), "the diffusion is too large or too small"),
+        (("zeta:", "z" * 101 + ":"), "has 101 letters"),
+    ],
+)
+def test_numbers_and_names_without_measure_are_refused(
+    write: Write, entry: tuple[str, str], fault: str
+) -> None:
+    assert fault in refusal(write(CARD.replace(*entry, 1))).fault
+
+
+def test_names_match_however_their_letters_are_written(write: Write) -> None:
+    micro, full = "µ", "ｐ"  # the sign of micro, and a letter of full width, which formulas read as others
+    system = load_system(write(CARD.replace("zeta", micro).replace("  p:", f"  {full}:")))
+    assert system.states == ("p", "q") and system.parameters[0].name == "μ"
+
+
+def test_a_state_may_be_called_as_a_function_of_the_generated_code(write: Write) -> None:
+    name = "integer_power"
+    system = load_system(write(f"name: a\nstates: {{{name}: {{}}}}\nequations: {{{name}: -{name}**3}}\n"))
+    np.testing.assert_allclose(system.drift(np.array([[2.0]])), [[-8.0]])
+    np.testing.assert_allclose(system.jacobian(np.array([[2.0]])), [[[-12.0]]])
+
+
+def test_formulas_that_take_for_ever_are_refused(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(formulas, "LONGEST_WORK", 0.3)
+    nested = "p"
+    for _ in range(8):
+        nested = f"Max(sin({nested}), exp(-({nested})), p)"
+    error = refusal(write(CARD.replace('"q"', f'"{nested}"')))
+    assert error.place == "line 9 (equations.p)"
+    assert error.fault == "the formula could not be worked out within 0.3 s"

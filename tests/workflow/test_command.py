@@ -42,6 +42,9 @@ def test_what_is_not_understood_ends_with_the_code_of_usage(arguments: list[str]
     [
         (["run", "measured.csv"], {"measurd.csv": ROWS}, ("measured.csv", "perhaps you meant 'measurd.csv'")),
         (["run", "archetype3"], {}, ("perhaps you meant 'archetype3d",)),
+        (["run", "{x}.csv"], {"{x}.csv": ROWS}, ("{x}.csv: the name has braces; rename the file",)),
+        (["run", "~root.csv"], {"root.csv": ROWS}, ("~root.csv: there is no file", "'root.csv'")),
+        (["verify", "results/mine"], {}, ("results/mine: there are no results; name a folder",)),
         (["run", "no/where.csv"], {}, ("there is no folder", "/no")),
         (["run", "card.yaml"], {"card.yaml": CARD}, ("the card of a system", "'system: card.yaml'")),
         (["run", "."], {"system.yaml": CARD}, ("siq diagnose .",)),

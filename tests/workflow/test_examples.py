@@ -74,3 +74,8 @@ def test_an_example_can_be_read_and_is_not_written_twice(tmp_path: Path, name: s
     with pytest.raises(InputError, match="--force"):
         write_example(name, tmp_path)
     assert files[0].stat().st_mtime_ns == before
+
+
+def test_a_name_that_is_too_long_is_cut_and_stays_apart_from_others() -> None:
+    names = {name_for(Path(f"{'long-' * 40}{end}.csv")) for end in "ab"}
+    assert len(names) == 2 and all(len(name) < 30 for name in names)

@@ -6,7 +6,7 @@ import io
 import json
 from typing import Any
 
-from siq.workflow.launch import MARK, Screen, _faults, _Progress, follow
+from siq.workflow.launch import MARK, _faults, _follow, _Progress, _Screen
 
 EVENTS: list[dict[str, Any]] = [
     {"event": "run_info", "stats": {"draw": 1, "refine": 1, "page": 1, "total": 3}},
@@ -61,7 +61,7 @@ def test_a_job_says_what_it_is_doing() -> None:
 
 def test_on_a_terminal_the_line_is_rewritten_and_fits() -> None:
     stream = io.StringIO()
-    follow(map(line, EVENTS), Screen(stream, columns=30), _Progress(clock=Clock()))
+    _follow(map(line, EVENTS), _Screen(stream, columns=30), _Progress(clock=Clock()))
     shown = stream.getvalue()
     assert "\n" not in shown and max(map(len, shown.split("\r"))) <= 30
     assert shown.endswith("\r")  # nothing of it stays
@@ -69,7 +69,7 @@ def test_on_a_terminal_the_line_is_rewritten_and_fits() -> None:
 
 def test_in_a_log_a_line_stands_now_and_then() -> None:
     stream = io.StringIO()
-    follow(map(line, EVENTS * 10), Screen(stream, columns=None, clock=Clock()), _Progress(clock=Clock()))
+    _follow(map(line, EVENTS * 10), _Screen(stream, columns=None, clock=Clock()), _Progress(clock=Clock()))
     assert 2 <= stream.getvalue().count("\n") <= 5 and "\r" not in stream.getvalue()
 
 
@@ -83,7 +83,7 @@ def test_the_sentence_of_a_job_comes_through_and_its_traceback_does_not() -> Non
         "KeyError: 'what'\n",
         line({"event": "job_error", "jobid": 2, "rule_name": "refine", "log": ["results/refine.log"]}),
     ]
-    passed_on = follow(lines, Screen(stream, columns=None, clock=Clock()), progress)
+    passed_on = _follow(lines, _Screen(stream, columns=None, clock=Clock()), progress)
     assert passed_on == ["bead.csv, row 3: it is empty; remove it."]
     assert "KeyError" not in stream.getvalue() and "row 3" in stream.getvalue()
     (fault,) = _faults(progress, passed_on)

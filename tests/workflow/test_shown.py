@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from siq.workflow.models import ModelFiles
-from siq.workflow.tables import Method
+from siq.workflow.tables import Method, ModelFiles
 
 
 def models(folder: Path, *methods: dict[str, object]) -> ModelFiles:

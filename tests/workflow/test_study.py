@@ -113,7 +113,7 @@ def test_a_study_without_data_is_refused(write: Write) -> None:
         ("name: s\nsystem: a\nruns: 0\n", "line 3 (runs)", "0", "greater than or equal to 1"),
         ("name: s\nsystem: a\nruns: many\n", "line 3 (runs)", "'many'", "integer"),
         ("name: s\nsystem: a\nseed: -1\n", "line 3 (seed)", "-1", "greater than or equal to 0"),
-        ("name: a/b\nsystem: a\n", "line 1 (name)", "'a/b'", "pattern"),
+        ("name: a/b\nsystem: a\n", "line 1 (name)", "'a/b'", "use letters"),
         ("name: s\nsystem: a\npublished: ../x\n", "line 3 (published)", "'../x'", "letters"),
         ("name: s\nsystem: a\ntraining:\n  matching_order: 3\n", "line 4", "3", "2 or 4"),
         ("name: s\nsystem: a\ntraining:\n  steps: 0\n", "line 4 (training.steps)", "0", "1"),
@@ -256,3 +256,22 @@ def test_a_missing_card_is_refused_by_name(write: Write) -> None:
 def test_two_landscapes_are_compared_where_there_are_two(write, study, remedy):
     with pytest.raises(InputError, match=remedy):
         load_study(write(f"name: plain\nbeside_equations: true\n{study}"))
+
+
+@pytest.mark.parametrize(
+    ("study", "fault"),
+    [
+        (f"name: {'ab' * 60}\nsystem: lake\n", "the name 'abababababababababab…' is too long"),
+        (f"name: {'a' * 25}\nsystem: lake\n", "is too long, or repeats itself"),
+        ("name: a\nrecordings: {file: '{x}.csv'}\n", "the name of the file '{x}.csv' holds braces"),
+    ],
+)
+def test_names_that_no_file_can_have_are_refused(write: Write, study: str, fault: str) -> None:
+    assert fault in refusal(write(study)).fault
+
+
+def test_states_are_named_as_formulas_read_them(write: Write) -> None:
+    study = load_study(write("name: a\nrecordings: {file: a.csv, states: [µ, ｘ], units: {µ: m}}\n"))
+    assert study.recordings is not None
+    assert study.recordings.states == ("μ", "x")
+    assert study.recordings.units == {"μ": "m"}

@@ -25,9 +25,8 @@ from siq.report.summary import LandscapeSummary, energy_unit
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import compile_formulas
 from siq.systems.simulation import simulate_snapshots
-from siq.workflow.models import ModelFiles, Shown
 from siq.workflow.study import PipelineSettings, StateSpace, Study, SweepOptions
-from siq.workflow.tables import METHODS, Method
+from siq.workflow.tables import METHODS, Method, ModelFiles, Shown
 from workflow.figures.comparison import plot_degrees, plot_error_curves, plot_error_maps, plot_escape
 from workflow.figures.prediction import plot_prediction, plot_record
 from workflow.figures.recorded import ComponentFields, Dataset, plot_components, plot_dataset
@@ -254,7 +253,7 @@ def representative_run(
     Parameters
     ----------
     shown
-        The formula that is shown, see `siq.workflow.models.ModelFiles.representative`.
+        The formula that is shown, see `siq.workflow.tables.ModelFiles.representative`.
     models
         The formulas of all runs.
     complete

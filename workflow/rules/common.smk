@@ -1,6 +1,7 @@
 # Helpers of the rules: studies and their parameters, tasks and their versions, one workflow at a time.
+import os
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
@@ -9,14 +10,14 @@ from filelock import FileLock, Timeout
 from siq.errors import InputError
 from siq.numerics.files import files_of
 from siq.report.formatting import texts
-from siq.workflow.answers import Exit, answer_of_page
+from siq.workflow.answers import Exit, Provenance, answer_of_page
 from siq.workflow.study import point_name
 from workflow.places import config_path, find_file
 from workflow.published import load_published
 from workflow.settings import Studies, prepare_environment
 from workflow.tasks import TASKS
 from workflow.versions import versions
-from workflow.warm import start
+from workflow.warm import PARENT, end_with_parent, start
 
 
 def say_and_stop(error):
@@ -34,6 +35,8 @@ def bad_input_told(refused=InputError):
         say_and_stop(error)
 
 
+if os.environ.pop(PARENT, None):  # ``siq`` has started this, and holds its standard input open
+    end_with_parent()
 prepare_environment()
 
 with bad_input_told():
@@ -322,12 +325,15 @@ def say_what_has_no_answer():
 
 # Snakemake's own lock outlives a killed process and would ask for --unlock; the profile switches it off.
 # The kernel's lock goes with the process.
-LOCK = None
+LOCK = FileLock(".snakemake/siq.lock", timeout=0)
 WARM = None
+
+# What is not as its job wrote it is made again, before anything is built upon it.
+with suppress(Timeout), LOCK:  # whoever has it is writing
+    Provenance.mend(planned=bool({"-n", "--dry-run", "--dryrun"} & set(sys.argv)))
 
 
 onstart:
-    globals()["LOCK"] = FileLock(".snakemake/siq.lock", timeout=0)
     try:
         LOCK.acquire()
     except Timeout:
