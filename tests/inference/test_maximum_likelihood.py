@@ -15,7 +15,7 @@ from siq.inference.maximum_likelihood import (
     first_noise,
     fit_by_multiple_shooting,
 )
-from siq.inference.measurements import Measurements, _course_of_input, expectations, first_states
+from siq.inference.measurements import Measurements, course_of_input, expectations, first_states
 from siq.numerics.files import Document, validate
 from siq.systems.cards import SystemCard, build_system
 from siq.systems.dynamics import Dynamics
@@ -276,16 +276,16 @@ def test_an_input_between_its_samples() -> None:
     u = np.sin(2 * np.pi * 1.1 * t) + 0.3 * np.cos(2 * np.pi * 2.3 * t)
     exact = np.sin(2 * np.pi * 1.1 * (t + 0.05)) + 0.3 * np.cos(2 * np.pi * 2.3 * (t + 0.05))
     inside = slice(30, 170)
-    smooth = _course_of_input(t, u, "band_limited")(t + 0.05)
+    smooth = course_of_input(t, u, "band_limited")(t + 0.05)
     np.testing.assert_allclose(smooth[inside], exact[inside], atol=2e-3)
-    linear = _course_of_input(t, u, "linear")(t[:-1] + 0.05)
+    linear = course_of_input(t, u, "linear")(t[:-1] + 0.05)
     np.testing.assert_allclose(linear, (u[1:] + u[:-1]) / 2, atol=1e-12)
-    np.testing.assert_array_equal(_course_of_input(t, u, "zero_order")(t[:-1] + 0.099), u[:-1])
+    np.testing.assert_array_equal(course_of_input(t, u, "zero_order")(t[:-1] + 0.099), u[:-1])
 
 
 def test_a_band_limited_input_needs_regular_sampling() -> None:
     with pytest.raises(ValueError, match="irregularly"):
-        _course_of_input(np.array([0.0, 1.0, 2.5, 3.0]), np.zeros(4), "band_limited")
+        course_of_input(np.array([0.0, 1.0, 2.5, 3.0]), np.zeros(4), "band_limited")
 
 
 def test_the_products_of_columns_are_eliminated_as_by_projection(linearised) -> None:

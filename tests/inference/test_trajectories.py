@@ -10,7 +10,7 @@ import sympy
 
 from siq.inference.kalman_filter import Grid, Noise, integrate_intervals, linearise
 from siq.inference.maximum_likelihood import fit_by_multiple_shooting
-from siq.inference.measurements import Measurements, _course_of_input, expectations, first_states
+from siq.inference.measurements import Measurements, course_of_input, expectations, first_states
 from siq.inference.recalibration import fit_with_and_without_process_noise
 from siq.inference.trajectories import (
     _NormalEquations,
@@ -53,7 +53,7 @@ def driven(model: Dynamics, *, noise: float = 0.0, substeps: int = 48) -> tuple[
         first=np.array([0, SAMPLES, 2 * SAMPLES]),
         t=np.tile(t, 2),
         outputs=np.zeros((2 * SAMPLES, 1)),
-        courses=tuple((_course_of_input(t, push, "zero_order"),) for push in pushes),
+        courses=tuple((course_of_input(t, push, "zero_order"),) for push in pushes),
     )
     sharp = spread_edges(model, data, np.ones((2 * SAMPLES, 2)), substeps=substeps)
     states = run(sharp, Grid(data, substeps), np.array([[0.5, 0.0], [-1.0, 0.4]]))
