@@ -135,8 +135,8 @@ def _levels_of(series: np.ndarray, runs: list[slice], centre: np.ndarray) -> _Le
 
 def path_of(
     values: np.ndarray, runs: list[slice], relaxation: float, *, column: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Places of the states ``(k, d)``, the path ``(n,)``, and transitions expected between samples.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, int]:
+    """Places of the states ``(k, d)``, the path ``(n,)``, expected transitions, and wells of the density.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def path_of(
     Returns
     -------
     tuple
-        The path is -1 before a state was reached. Transitions ``(k, k)`` are those of a hidden Markov model,
+        The path is -1 before a state was reached. Transitions between samples ``(k, k)`` are those of a hidden Markov model,
         None where the path goes from core to core.
     """
     series = values[:, column]
@@ -178,7 +178,7 @@ def path_of(
         if share < WHITE_CORRELATION and correlation < limit:
             levels = _levels_of(series, runs, levels.centre) or levels
             path, blurred = _without_blurred(levels.path, runs, states)
-            return _places(values, levels.path, states), path, None if blurred else levels.counts
+            return _places(values, levels.path, states), path, None if blurred else levels.counts, len(wells)
     if len(wells) <= max(len(alone), 2):
         states = max(len(alone), 2)
         means, rows = [], []
@@ -188,7 +188,7 @@ def path_of(
                 rows.append(slice(sum(map(len, means)), sum(map(len, means)) + len(begins)))
                 means.append(series[begins[:, None] + np.arange(width)].mean(axis=1))
         if not means or not np.ptp(guess(states)) > 0:
-            return np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None
+            return np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None, len(wells)
         levels = _levels_of(np.concatenate(means), rows, guess(states))
         centre = guess(states) if levels is None else levels.centre
         distance = np.abs(series[:, None] - centre)
@@ -201,13 +201,13 @@ def path_of(
         core[(core == states - 1) & (series < centre[-1])] = -1
         places = _places(values, near, states)
         places[:, column] = centre
-        return places, continued_visits(core, runs), None
+        return places, continued_visits(core, runs), None, len(wells)
     wells = wells[np.argsort(wells[:, column])]
     distance = np.linalg.norm((smooth[:, None] - wells) / positive(values.std(axis=0)), axis=2)
     near = distance.argmin(axis=1)
     core = np.where(distance[np.arange(len(near)), near] <= _medians(distance, near)[near], near, -1)
     places = _places(values, near, len(wells))
-    return places, continued_visits(core, runs), None
+    return places, continued_visits(core, runs), None, len(wells)
 
 
 def _without_blurred(path: np.ndarray, runs: list[slice], states: int) -> tuple[np.ndarray, bool]:

@@ -35,6 +35,7 @@ from siq.data.correlation import markov_lag
 from siq.data.kinetics import (
     AVERAGING_TIME,
     CONFIDENCE,
+    FALSE_WELL,
     MarkovModel,
     Profile,
     continued_visits,
@@ -114,7 +115,7 @@ SURROGATES = 999  # for each state that is looked at: fewer could not be rare en
 ENOUGH_DEEPER = 20  # as deep as the record: the probability is then known to a fifth
 MOST_POINTS = 8192  # of a series that surrogates are made of
 BINS = 40  # of a histogram with a valley
-DEGREE = 5  # of f in the test: two attractors that differ in depth and width need more than a cubic
+DEGREES = (5, 9)  # of f in the test: two attractors that differ need more than a cubic, three more than that
 STRETCH_TIMES = 40  # local relaxation times: shorter ones bias f towards one state, longer ones let drifts in
 FEWEST_STRETCHES, SHORTEST_TIMES = 6, 10  # for so many stretches they may be as short as ten of these
 LAG_SHARE = 0.1  # of the local relaxation time: over it a state hardly changes what pushes it
@@ -122,38 +123,41 @@ PLACES_COMPARED = 25  # at which f is compared with itself, between the quantile
 INNER_QUANTILE = 0.02  # the quantile from which on f is known well enough
 
 
-def _pushed_apart(values: np.ndarray, runs: list[slice], relaxation: float) -> tuple[float, float] | None:
+def _pushed_apart(
+    values: np.ndarray, runs: list[slice], relaxation: float, *, degree: int
+) -> tuple[float, float]:
     """The largest ``(f(b) - f(a)) / error`` with a < b, and its probability where a single state attracts.
 
-    `relaxation` is the local relaxation time in samples; None where there are too few stretches.
+    `relaxation` is the local relaxation time in samples, `degree` that of f; where there are too few stretches
+    nothing is told.
     """
     lag = max(int(LAG_SHARE * relaxation), 1)
     longest = sum(run.stop - run.start for run in runs) / (lag * FEWEST_STRETCHES) - 2
     rows = int(min(np.ceil(STRETCH_TIMES * relaxation / lag), longest))
     low, high = np.quantile(values, [0.001, 0.999])
     if rows * lag < SHORTEST_TIMES * relaxation or not high > low:
-        return None
+        return 0.0, 1.0
     begins = stretches_of(runs, (rows + 2) * lag, most=MOST_STRETCHES)
     if len(begins) < FEWEST_STRETCHES - 2:  # gaps cost some
-        return None
+        return 0.0, 1.0
     scaled = 2 * (values - low) / (high - low) - 1
     at = begins[:, None] + lag * np.arange(rows)
     now = np.clip(scaled[at], -1.2, 1.2)  # a polynomial has no business beyond
     increments = scaled[at + 2 * lag] - scaled[at + lag]
-    terms = np.polynomial.legendre.legvander(now, DEGREE)[..., 1:]
-    design = (terms - terms.mean(axis=1, keepdims=True)).reshape(-1, DEGREE)
+    terms = np.polynomial.legendre.legvander(now, degree)[..., 1:]
+    design = (terms - terms.mean(axis=1, keepdims=True)).reshape(-1, degree)
     goal = (increments - increments.mean(axis=1, keepdims=True)).ravel()
     normal = design.T @ design
     if np.linalg.cond(normal) > 1e12:  # numerical: a record of hardly any different values
-        return None
+        return 0.0, 1.0
     inverse = np.linalg.inv(normal)
     coefficients = inverse @ design.T @ goal
     rest = goal - design @ coefficients
     # Each stretch is one draw: its residuals may depend on each other and on the state as they like.
-    scores = (design * rest[:, None]).reshape(len(begins), rows, DEGREE).sum(axis=1)
-    freedom = goal.size - len(begins) - DEGREE
+    scores = (design * rest[:, None]).reshape(len(begins), rows, degree).sum(axis=1)
+    freedom = goal.size - len(begins) - degree
     covariance = inverse * float(rest @ rest) / freedom
-    if len(begins) >= 4 * DEGREE:
+    if len(begins) >= 4 * degree:
         robust = inverse @ (scores.T @ scores) @ inverse * len(begins) / (len(begins) - 1)
         # Not smaller than either in any direction in which they differ.
         root = np.linalg.cholesky(covariance)
@@ -163,12 +167,12 @@ def _pushed_apart(values: np.ndarray, runs: list[slice], relaxation: float) -> t
     places = np.linspace(
         np.quantile(now, INNER_QUANTILE), np.quantile(now, 1 - INNER_QUANTILE), PLACES_COMPARED
     )
-    at_places = np.polynomial.legendre.legvander(places, DEGREE)[:, 1:]
+    at_places = np.polynomial.legendre.legvander(places, degree)[:, 1:]
     first, second = np.triu_indices(PLACES_COMPARED, k=1)
     contrasts = at_places[second] - at_places[first]
     errors = np.sqrt(np.einsum("ij,jk,ik->i", contrasts, covariance, contrasts))
     largest = float(np.max(contrasts @ coefficients / errors))
-    return largest, float(special.fdtrc(DEGREE, freedom, max(largest, 0.0) ** 2 / DEGREE))
+    return largest, float(special.fdtrc(degree, freedom, max(largest, 0.0) ** 2 / degree))
 
 
 def _valley_between(
@@ -176,16 +180,19 @@ def _valley_between(
     runs: list[slice],
     relaxation: float,
     *,
+    averaged: bool,
     generator: np.random.Generator | None,
     surrogates: int = SURROGATES,
 ) -> tuple[float, float]:
     """Share of the samples in the lesser peak of the histogram, and its probability among surrogates.
 
+    Samples apart, or else means over half a relaxation time (`averaged`), which measurement noise does not blur.
     Surrogates have random phases from `generator`; None makes none. No more are drawn once `ENOUGH_DEEPER` of
     them are as deep: then it is not rare (Besag and Clifford, Biometrika 78 (1991) 301).
     """
-    every = max(int(relaxation / 4), -(-len(values) // MOST_POINTS), 1)
-    levelled, width = values.copy(), max(int(AVERAGING_TIME * relaxation), 1)
+    width = max(int(AVERAGING_TIME * relaxation), 1) if averaged else 1
+    every = max(1 if averaged else int(relaxation / 4), -(-len(values) // MOST_POINTS), 1)
+    levelled = values.copy()
     for run in runs:  # less a straight line in every stretch, the last of a run longer
         count = max((run.stop - run.start) // max(int(STRETCH_TIMES * relaxation), 2), 1)
         for rows in np.array_split(np.arange(run.start, run.stop), count):
@@ -397,31 +404,34 @@ from siq.data.kinetics import (
     (True, [-0.9, 0.8])
     """
     runs, generator = runs_of(recordings), np.random.default_rng(0)  # always the same surrogates
-    tests: dict[int, tuple[float, float, float]] = {}  # probability, less the depth, relaxation
+    tests: dict[int, tuple[float, ...]] = {}  # probability, less the depth, relaxation, that of the first test
     for place, one in enumerate(recordings.values.T):
         relaxation = relaxation_samples(one, runs)
         if relaxation is None:  # too short, or a column that runs on like a clock
             continue
-        _, chance = _pushed_apart(one, runs, relaxation) or (float("nan"), 1.0)
-        depth, rarity = _valley_between(
-            one, runs, relaxation, generator=None if chance < DECISIVE_P else generator,
-            surrogates=SURROGATES * recordings.values.shape[1],
-        )  # fmt: skip
-        tests[place] = (min(chance, rarity), -depth, relaxation)
+        chance = min(_pushed_apart(one, runs, relaxation, degree=degree)[1] for degree in DEGREES)
+        valleys = [
+            _valley_between(
+                one, runs, relaxation, averaged=averaged, generator=None if chance < DECISIVE_P else generator,
+                surrogates=SURROGATES * recordings.values.shape[1],
+            ) for averaged in (False, True)
+        ]  # fmt: skip
+        tests[place] = (min(chance, *(rarity for _, rarity in valleys)), -valleys[0][0], relaxation, chance)
     if not tests:
         return None
     columns = sorted(sorted(tests, key=lambda place: tests[place][:2])[:MOST_COLUMNS])
     state = min(tests, key=lambda place: tests[place][:2])
-    probability = min(2 * tests[state][0] * len(tests), 1.0)
+    probability = min((len(DEGREES) + 2) * tests[state][0] * len(tests), 1.0)
     values, column = recordings.values[:, columns], columns.index(state)
     relaxation = min(tests[place][2] for place in columns)
     background, offset = np.zeros_like(values), 0.0
     places, path, expected = np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None
+    wells = 1
     if probability >= SIGNIFICANCE:
         background[:, column] = background_of(recordings, values[:, column])[0]
     for _ in range(MOST_PASSES if probability < SIGNIFICANCE else 0):
         flat = values - background
-        places, path, expected = path_of(flat, runs, relaxation, column=column)
+        places, path, expected, wells = path_of(flat, runs, relaxation, column=column)
         level = np.where(path[:, None] >= 0, places[path], np.median(flat, axis=0))
         slow = np.array([background_of(recordings, one)[0] for one in (values - level).T]).T
         baseline = _baselines(recordings, values - level - slow)
@@ -432,7 +442,12 @@ from siq.data.kinetics import (
     flat, number = values - background, len(places)
     counts = DwellCount.of_visits(recordings.t, path, runs, states=number)
     density, edges = np.histogram(flat[:, column], bins=BINS, density=True)
+    # A valley that is deeper than a linear system's may be the floor of one flat well.
+    pushed = tests[state][3] * (len(DEGREES) + 2) * len(tests) < SIGNIFICANCE
     supported = probability < SIGNIFICANCE and any(one.visits for one in counts)
+    profile = profile_of(flat[:, column], runs, path, places[:, column]) if supported else None
+    if profile is not None and not pushed and wells == 1:
+        supported = bool((profile.tops[:, ::2] > FALSE_WELL * profile.tops[:, 1::2]).all())
     hops = np.zeros((number, number))
     for run in runs:
         part = path[run][path[run] >= 0]
@@ -449,7 +464,7 @@ from siq.data.kinetics import (
         return found
     if not stationary(path, runs, number):
         return replace(found, limit=Remark("data.not_stationary"))
-    found = replace(found, rung=2, profile=profile_of(flat[:, column], runs, path, places[:, column]))
+    found = replace(found, rung=2, profile=profile)
     if min(one.visits for one in counts) < FEWEST_HOPS:
         return replace(found, limit=Remark("data.few_hops", {"fewest": FEWEST_HOPS}))
     model = markov_model(path, runs, number, expected)
