@@ -2,16 +2,16 @@
 
 *How many.* Where hops are quick against everything else, each state is a level with white noise about it, and
 a hidden Markov model of normal distributions with so many states as leave white residuals is the record's
-(deeptime). Otherwise states are the wells of the density: maxima that stand above the saddle to any higher one
-by more than its error. The density at a sample is that of its nearest neighbours, of which so many are
+(deeptime). Otherwise states are the wells of the density: maxima that stand above the saddle to any higher
+one by more than its error. The density at a sample is that of its nearest neighbours, of which so many are
 independent as the relaxation time leaves, and wells are joined in the order of their density (persistence).
 
 *Profile.* ``-log p`` along a state is the free energy in units of kT, or of ε. A bin is visited as often as
 the correlation time of its own indicator leaves independent samples, which gives the error.
 
-*Markov model.* From the hops along the path, ``P(τ)`` for lags τ (deeptime), with draws from its posterior. A
-lag is long enough where ``P(τ)^m`` foresees ``P(mτ)`` (Chapman and Kolmogorov), and the shortest one is taken.
-Times between hops follow from the generator ``log P(τ)/τ``, which allows for hops that were too quick to see.
+*Markov model.* From the hops along the path, ``P(τ)`` for lags τ (deeptime), with draws from its posterior.
+A lag is long enough where ``P(τ)^m`` foresees ``P(mτ)`` (Chapman and Kolmogorov), and the shortest one is
+taken. Times between hops follow from the generator ``log P(τ)/τ``, which allows for hops that were too quick to see.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ DRAWS = 200  # of the transition matrix: ends of intervals are then known to a t
 REFUSED = 0.01  # probability with which a Markov process is refused at a lag
 CONFIDENCE = 0.95
 PROFILE_BINS = 40
+MOST_RUNS = 200  # without a gap, from which a correlation time is found
 OUTSIDE = 0.001  # of the samples on either side: a few outliers would make the rest one bin
 FEWEST_BINS = 4  # a parabola through three knows no error
 FEWEST_STAYS = 10  # from which their distribution is told
@@ -71,7 +72,9 @@ def _wells_of(values: np.ndarray, relaxation: float) -> np.ndarray:
         return node
 
     for node in np.argsort(-density):
-        tops = sorted({top(other) for other in linked[node] if parent[other] >= 0}, key=lambda one: -density[one])
+        tops = sorted(
+            {top(other) for other in linked[node] if parent[other] >= 0}, key=lambda one: -density[one]
+        )
         parent[node] = tops[0] if tops else node
         for lower in tops[1:]:
             if density[lower] - density[node] < needed:
@@ -110,7 +113,9 @@ def _levels_of(series: np.ndarray, runs: list[slice], centre: np.ndarray) -> _Le
     states, scale = len(centre), max(float(series.std()), 1e-300)
     shift = float(series.mean())
     near = np.abs(series[:, None] - centre).argmin(axis=1)
-    spread = [max(float(series[near == k].std() if (near == k).any() else 0.0), 1e-2 * scale) for k in range(states)]
+    spread = [
+        max(float(series[near == k].std() if (near == k).any() else 0.0), 1e-2 * scale) for k in range(states)
+    ]
     transition = np.full((states, states), 0.1 / states) + 0.9 * np.eye(states)
     guess = HiddenMarkovModel(
         MarkovStateModel(transition),
@@ -127,9 +132,14 @@ def _levels_of(series: np.ndarray, runs: list[slice], centre: np.ndarray) -> _Le
         return None
     order = np.argsort(fitted.output_model.means)
     weights, path = np.zeros((len(series), states)), np.full(len(series), -1)
-    for run, own, likeliest in zip(used, fitted.state_probabilities, fitted.hidden_state_trajectories, strict=True):
+    for run, own, likeliest in zip(
+        used, fitted.state_probabilities, fitted.hidden_state_trajectories, strict=True
+    ):
         weights[run], path[run] = own[:, order], np.argsort(order)[likeliest]
-    centre, spread = fitted.output_model.means[order] * scale + shift, fitted.output_model.sigmas[order] * scale
+    centre, spread = (
+        fitted.output_model.means[order] * scale + shift,
+        fitted.output_model.sigmas[order] * scale,
+    )
     return _Levels(centre, spread, weights, path, fitted.transition_counts[order][:, order])
 
 
@@ -141,15 +151,16 @@ def path_of(
     Parameters
     ----------
     values, runs, relaxation
-        Samples ``(n, d)`` without a drifting background, rows without a gap, and the relaxation time in samples.
+        Samples ``(n, d)`` without a drifting background, rows without a gap, and the relaxation time in
+        samples.
     column
         The quantity that shows the states best. There are at least two, by other tests.
 
     Returns
     -------
     tuple
-        The path is -1 before a state was reached. Transitions between samples ``(k, k)`` are those of a hidden Markov model,
-        None where the path goes from core to core.
+        The path is -1 before a state was reached. Transitions between samples ``(k, k)`` are those of a hidden
+        Markov model, None where the path goes from core to core.
     """
     series = values[:, column]
     width = max(int(AVERAGING_TIME * relaxation), 1)
@@ -242,12 +253,16 @@ def _first(runs: list[slice], most: int) -> list[slice]:
 
 def _places(values: np.ndarray, core: np.ndarray, states: int) -> np.ndarray:
     middle = np.median(values, axis=0)
-    return np.array([np.median(values[core == k], axis=0) if (core == k).any() else middle for k in range(states)])
+    return np.array(
+        [np.median(values[core == k], axis=0) if (core == k).any() else middle for k in range(states)]
+    )
 
 
 def _medians(distance: np.ndarray, near: np.ndarray) -> np.ndarray:
     """Of the distances of samples from the state that is nearest: half of them make its core."""
-    return np.array([np.median(distance[near == k, k]) if (near == k).any() else 0.0 for k in range(distance.shape[1])])
+    return np.array(
+        [np.median(distance[near == k, k]) if (near == k).any() else 0.0 for k in range(distance.shape[1])]
+    )
 
 
 def continued_visits(core: np.ndarray, runs: list[slice]) -> np.ndarray:
@@ -297,7 +312,9 @@ class MarkovModel(NamedTuple):
     rates: np.ndarray  #: (k, k): from state to state, per sample
 
 
-def markov_model(path: np.ndarray, runs: list[slice], states: int, counts: np.ndarray | None) -> MarkovModel | None:
+def markov_model(
+    path: np.ndarray, runs: list[slice], states: int, counts: np.ndarray | None
+) -> MarkovModel | None:
     """The Markov model of a path at the shortest lag that its test allows; None where there is none.
 
     `counts` are transitions from sample to sample, where a hidden Markov model knows them better.
@@ -313,7 +330,12 @@ def markov_model(path: np.ndarray, runs: list[slice], states: int, counts: np.nd
         if not longer:
             return np.zeros((states, states))
         model = TransitionCountEstimator(lag, "sliding", n_states=states).fit(longer).fetch_model()
-        return np.asarray(model.count_matrix.toarray() if hasattr(model.count_matrix, "toarray") else model.count_matrix) / lag
+        return (
+            np.asarray(
+                model.count_matrix.toarray() if hasattr(model.count_matrix, "toarray") else model.count_matrix
+            )
+            / lag
+        )
 
     for lag in 2 ** np.arange(max(int(np.log2(max(min(stays), 1))), 0) + 1):
         own = counts if counts is not None and lag == 1 else counted(int(lag))
@@ -334,7 +356,9 @@ def markov_model(path: np.ndarray, runs: list[slice], states: int, counts: np.nd
                 continue
             seen = later / visits
             foreseen = np.linalg.matrix_power(usual, int(multiple))
-            spread = np.linalg.matrix_power(drawn, int(multiple)).var(axis=0) + foreseen * (1 - foreseen) / visits
+            spread = (
+                np.linalg.matrix_power(drawn, int(multiple)).var(axis=0) + foreseen * (1 - foreseen) / visits
+            )
             worst = max(worst, float((np.abs(seen - foreseen) / np.sqrt(np.maximum(spread, 1e-12))).max()))
         chance = min(2 * float(special.ndtr(-worst)) * states * (states - 1) * len(multiples), 1.0)
         if chance > REFUSED:
@@ -349,7 +373,11 @@ def markov_model(path: np.ndarray, runs: list[slice], states: int, counts: np.nd
 def _generator(transition: np.ndarray) -> np.ndarray:
     """log P, or ``P - 1`` where that is none of a Markov process."""
     found = np.asarray(scipy.linalg.logm(transition))
-    return found.real if np.isrealobj(found) or np.abs(found.imag).max() < 1e-9 else transition - np.eye(len(transition))
+    return (
+        found.real
+        if np.isrealobj(found) or np.abs(found.imag).max() < 1e-9
+        else transition - np.eye(len(transition))
+    )
 
 
 class Profile(NamedTuple):
@@ -358,24 +386,32 @@ class Profile(NamedTuple):
     place: np.ndarray  #: (b,): middles of the bins that were visited
     height: np.ndarray  #: (b,)
     error: np.ndarray  #: (b,): standard errors, by independent visits
-    curvatures: np.ndarray  #: (k,): at the bottom of each state, per unit of the state squared; NaN where unknown
-    tops: np.ndarray  #: (k - 1, 4): above the lower neighbour, its error, above the upper neighbour, its error
+    curvatures: (
+        np.ndarray
+    )  #: (k,): at the bottom of each state, per unit of the state squared; NaN where unknown
+    tops: (
+        np.ndarray
+    )  #: (k - 1, 4): above the lower neighbour, its error, above the upper neighbour, its error
 
 
 def profile_of(series: np.ndarray, runs: list[slice], path: np.ndarray, places: np.ndarray) -> Profile:
-    """The profile of a series ``(n,)`` between its quantiles, with the states' places ``(k,)`` in rising order."""
+    """The profile of a series ``(n,)`` between its quantiles; the states' places ``(k,)`` rise."""
     low, high = np.quantile(series, [OUTSIDE, 1 - OUTSIDE])
     counts, edges = np.histogram(series, bins=PROFILE_BINS, range=(float(low), float(high)))
     bins = np.clip(np.searchsorted(edges, series, side="right") - 1, 0, PROFILE_BINS - 1)
     inside = (series >= low) & (series <= high)
     place, kept = (edges[1:] + edges[:-1]) / 2, np.flatnonzero(counts >= 2)
+    some = runs[:: -(-len(runs) // MOST_RUNS)]
     independent = [
-        counts[one] / (2 * correlated_samples(((bins == one) & inside).astype(float), runs)) for one in kept
+        counts[one] / (2 * correlated_samples(((bins == one) & inside).astype(float), some)) for one in kept
     ]
     error = 1 / np.sqrt(np.maximum(independent, 1.0))
     height = -np.log(counts[kept] / counts.max())
     place = place[kept]
-    bottoms = [int(np.argmin(np.where(np.abs(place - one) <= _reach(series, path, k), height, np.inf))) for k, one in enumerate(places)]
+    bottoms = [
+        int(np.argmin(np.where(np.abs(place - one) <= _reach(series, path, k), height, np.inf)))
+        for k, one in enumerate(places)
+    ]
     curvatures = np.full(len(places), np.nan)
     for k, bottom in enumerate(bottoms):
         near = (height < height[bottom] + 1) & (np.abs(place - places[k]) <= 2 * _reach(series, path, k))
@@ -385,7 +421,13 @@ def profile_of(series: np.ndarray, runs: list[slice], path: np.ndarray, places: 
     for first, second in pairwise(bottoms):
         between = slice(min(first, second), max(first, second) + 1)
         top = between.start + int(np.argmax(height[between]))
-        tops.append([one for end in (first, second) for one in (height[top] - height[end], np.hypot(error[top], error[end]))])
+        tops.append(
+            [
+                one
+                for end in (first, second)
+                for one in (height[top] - height[end], np.hypot(error[top], error[end]))
+            ]
+        )
     return Profile(place, height, error, curvatures, np.array(tops).reshape(-1, 4))
 
 
@@ -401,7 +443,11 @@ def stationary(path: np.ndarray, runs: list[slice], states: int) -> bool:
     half = len(known) // 2
     for state in range(states):
         inside = (path == state).astype(float)
-        spread = 2 * float(inside[known].std()) * np.sqrt(2 * correlated_samples(inside, runs) / max(len(known), 1))
+        spread = (
+            2
+            * float(inside[known].std())
+            * np.sqrt(2 * correlated_samples(inside, runs) / max(len(known), 1))
+        )
         change = abs(float(inside[known[:half]].mean() - inside[known[half:]].mean()))
         if change > float(special.ndtri(1 - REFUSED / states / 2)) * spread:
             return False

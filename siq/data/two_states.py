@@ -1,15 +1,14 @@
-"""Two states of a record: whether it supports two, their levels, hops and residence times.
+"""States of a record: whether it supports several, their levels, hops and residence times.
 
 Nothing is identified here: this is what the numbers say before any f is known, and it holds where none is
-found or certified.
+found or certified. How many states there are, and where the record is in which, is the matter of
+`siq.data.kinetics`; what these have in common is the background (`siq.data.stationarity.background_of`), and
+each recording may have a baseline of its own.
 
-*Levels.* A hidden Markov model of two normal distributions finds the levels, and what both have in common is
-the background (`siq.data.stationarity.background_of`); each in turn.
-
-*Hops* are counted with two thresholds, the levels of the two states: a visit begins where the record reaches
-the level of a state, and lasts until it reaches the level of the other one. The mean residence time is the
-time of all visits, those that the record cuts at its ends included, over the number of visits whose end was
-seen: the best estimate for exponential times, with a relative error of ``1/√n``.
+*Hops* are counted from core to core: a visit begins where the record reaches the core of a state, and lasts
+until it reaches that of another one. The mean residence time is the time of all visits, those that the record
+cuts at its ends included, over the number of visits whose end was seen: the best estimate for exponential
+times, with a relative error of ``1/√n``.
 
 *Two tests.* A histogram with two peaks is no evidence: a slow background makes one of a single state. Two
 states have a place between them from which the record is pushed away to both sides. The first test regresses
@@ -19,7 +18,8 @@ level of its own, which takes with it whatever drifts slowly. With the polynomia
 single state attracted. The largest of them in standard errors counts, with Scheffé's bound for having looked
 at all pairs. The second test asks for a valley of the histogram, deeper than in surrogates of the record with
 the same spectrum and random phases, which are what a linear system could have shown; it is not asked where
-the first one is beyond doubt. Two states are supported if one of the tests says so, and a hop was seen.
+the first one is beyond doubt. Several states are supported if one of the tests says so, a hop was seen, and
+the valley is none of the floor of a flat well: it is told from none by the errors of the profile.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from siq.data.kinetics import (
     FALSE_WELL,
     MarkovModel,
     Profile,
-    continued_visits,
+    continued_visits as continued_visits,
     exponential,
     markov_model,
     path_of,
@@ -128,8 +128,7 @@ def _pushed_apart(
 ) -> tuple[float, float]:
     """The largest ``(f(b) - f(a)) / error`` with a < b, and its probability where a single state attracts.
 
-    `relaxation` is the local relaxation time in samples, `degree` that of f; where there are too few stretches
-    nothing is told.
+    `relaxation` is the local relaxation time in samples, `degree` that of f. Too few stretches tell nothing.
     """
     lag = max(int(LAG_SHARE * relaxation), 1)
     longest = sum(run.stop - run.start for run in runs) / (lag * FEWEST_STRETCHES) - 2
@@ -186,7 +185,7 @@ def _valley_between(
 ) -> tuple[float, float]:
     """Share of the samples in the lesser peak of the histogram, and its probability among surrogates.
 
-    Samples apart, or else means over half a relaxation time (`averaged`), which measurement noise does not blur.
+    Samples apart, or else means over half a relaxation time (`averaged`), which hardly any noise blurs.
     Surrogates have random phases from `generator`; None makes none. No more are drawn once `ENOUGH_DEEPER` of
     them are as deep: then it is not rare (Besag and Clifford, Biometrika 78 (1991) 301).
     """
@@ -242,9 +241,10 @@ MOST_COLUMNS = 3  # in which states are sought together: neighbours are far away
 class RecordStates:
     """States that recordings show by themselves, the hops between them, and how far these can be relied on.
 
-    The states are supported if a single one is refused, and the record was seen to hop at least once. `rung`
-    is what the record supports: 0 a single state; 1 states with counted stays; 2 their profile, too, since the
-    record is stationary; 3 a Markov model of the hops, too. `as_data` leaves out what is of each sample.
+    The states are supported if a single one is refused, and the record was seen to hop at least once. The
+    `rung` is what the record supports: 0 a single state; 1 states with counted stays; 2 their profile, too,
+    since the record is stationary; 3 a Markov model of the hops, too. `as_data` leaves out what is of each
+    sample.
     """
 
     state: str  #: the measured quantity that shows them best, as its file calls it
@@ -252,7 +252,9 @@ class RecordStates:
     time_unit: str | None
     supported: bool  #: whether the record supports several states at all
     probability: float  #: of so much with a single state over a drifting background, all tests counted
-    levels: tuple[float, ...]  #: of each state, in the unit of the quantity, of the record less its background
+    levels: tuple[
+        float, ...
+    ]  #: of each state, in the unit of the quantity, of the record less its background
     counts: tuple[DwellCount, ...]  #: how long each lasts
     edges: np.ndarray  #: (b + 1,): of the histogram of the state
     density: np.ndarray  #: (b,): per unit of the state
@@ -303,17 +305,21 @@ class RecordStates:
             (level, one.time / whole, one.visits, one.mean, *one.limits, law, *model)
             for level, one, law, model in zip(self.levels, self.counts, exponential, markov, strict=True)
         ]
-        names = "level share visits mean_time lowest highest exponential markov_time markov_lowest markov_highest"
+        names = (
+            "level share visits mean_time lowest highest exponential markov_time markov_lowest markov_highest"
+        )
         return pd.DataFrame(rows, columns=names.split())
 
     def remark(self) -> Remark:
         """The same as a remark."""
         values = {
-            "state": self.state, "unit": self.unit, "time_unit": self.time_unit, "levels": self.levels,
+            "columns": self.columns or (self.state,), "unit": self.unit, "time_unit": self.time_unit,
+            "places": self.places.tolist() or [[one] for one in self.levels], "levels": self.levels,
             "transitions": self.transitions, "means": [one.mean for one in self.counts],
             "limits": [one.limits for one in self.counts], "visits": [one.visits for one in self.counts],
             "rung": self.rung, "lag": None if self.markov is None else self.markov.lag,
-            "tops": [] if self.profile is None else self.profile.tops.tolist(), "offset": self.offset,
+            "tops": [] if self.profile is None or len(self.columns) > 1 else self.profile.tops.tolist(),
+            "offset": self.offset,
         }  # fmt: skip
         return Remark("data.record_hops", values)
 
@@ -326,7 +332,9 @@ class RecordStates:
         """As plain data, which `from_data` reads back."""
         kept = {name: value for name, value in vars(self).items() if name not in ("visits", "background")}
         kept |= {"counts": [vars(one) for one in self.counts]}
-        kept |= {name: None if (one := kept[name]) is None else one._asdict() for name in ("profile", "markov")}
+        kept |= {
+            name: None if (one := kept[name]) is None else one._asdict() for name in ("profile", "markov")
+        }
         kept |= {"limit": None if self.limit is None else self.limit.as_data()}
         return {name: _plain(value) for name, value in kept.items()}
 
@@ -336,7 +344,9 @@ class RecordStates:
         data = dict(data)
         for name, kind in (("profile", Profile), ("markov", MarkovModel)):
             if (one := data[name]) is not None:
-                arrays = {key: _array(value) if isinstance(value, list) else value for key, value in one.items()}
+                arrays = {
+                    key: _array(value) if isinstance(value, list) else value for key, value in one.items()
+                }
                 data[name] = kind(**arrays)
         data |= {name: tuple(data[name]) for name in ("levels", "columns", "exponential")}
         data |= {name: _array(data[name]) for name in ("edges", "density", "places", "hops")}
@@ -364,47 +374,47 @@ def _plain(value: Any) -> Any:
 def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | None:
     """The states that the recordings show by themselves; None where they are too short to tell anything.
 
-    Every quantity is looked at by itself, and the one in which a single state is refused most clearly is
-    taken for levels and histogram; states are sought in up to three together. Where a background drifts
-    slowly, or recordings differ in their baselines, it is taken off.
+        Every quantity is looked at by itself, and the one in which a single state is refused most clearly is
+        taken for levels and histogram; states are sought in up to three together. Where a background drifts
+        slowly, or recordings differ in their baselines, it is taken off.
 
     Parameters
     ----------
-    recordings
-        What was measured.
-    rungs
-        Whether profile and Markov model are worked out, too.
+        recordings
+            What was measured.
+        rungs
+            Whether profile and Markov model are worked out, too.
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from siq.data.correlation import markov_lag
-from siq.data.kinetics import (
-    AVERAGING_TIME,
-    CONFIDENCE,
-    MarkovModel,
-    Profile,
-    continued_visits,
-    exponential,
-    markov_model,
-    path_of,
-    profile_of,
-    stationary,
-    stays_of,
-)
-    >>> from siq.data.recordings import Recordings
-    >>> generator = np.random.default_rng(1)
-    >>> x = np.empty((20_000, 1))
-    >>> x[0] = 1.0
-    >>> for before in range(len(x) - 1):
-    ...     kick = np.sqrt(0.25 * 0.05) * generator.standard_normal()
-    ...     x[before + 1] = x[before] + 0.05 * (x[before] - x[before] ** 3) + kick
-    >>> found = switching(Recordings.from_arrays(0.05 * np.arange(len(x)), x, names=["x"]))
-    >>> found.supported, [round(level, 1) for level in found.levels]
-    (True, [-0.9, 0.8])
+        >>> import numpy as np
+        >>> from siq.data.correlation import markov_lag
+    from siq.data.kinetics import (
+        AVERAGING_TIME,
+        CONFIDENCE,
+        MarkovModel,
+        Profile,
+        continued_visits,
+        exponential,
+        markov_model,
+        path_of,
+        profile_of,
+        stationary,
+        stays_of,
+    )
+        >>> from siq.data.recordings import Recordings
+        >>> generator = np.random.default_rng(1)
+        >>> x = np.empty((20_000, 1))
+        >>> x[0] = 1.0
+        >>> for before in range(len(x) - 1):
+        ...     kick = np.sqrt(0.25 * 0.05) * generator.standard_normal()
+        ...     x[before + 1] = x[before] + 0.05 * (x[before] - x[before] ** 3) + kick
+        >>> found = switching(Recordings.from_arrays(0.05 * np.arange(len(x)), x, names=["x"]))
+        >>> found.supported, [round(level, 1) for level in found.levels]
+        (True, [-0.9, 0.8])
     """
     runs, generator = runs_of(recordings), np.random.default_rng(0)  # always the same surrogates
-    tests: dict[int, tuple[float, ...]] = {}  # probability, less the depth, relaxation, that of the first test
+    tests: dict[int, tuple[float, ...]] = {}  # probability, less the depth, relaxation, the first test's
     for place, one in enumerate(recordings.values.T):
         relaxation = relaxation_samples(one, runs)
         if relaxation is None:  # too short, or a column that runs on like a clock

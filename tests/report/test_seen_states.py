@@ -19,7 +19,7 @@ SEEN = RecordStates(
 
 def test_two_states_of_a_record_are_told_without_any_formula() -> None:
     said = SEEN.sentence()
-    assert "two states of rate, at 0.825\u00a0Hz and 35.3\u00a0Hz: 48 transitions were seen" in said
+    assert "has two states of rate, at 0.825\u00a0Hz and 35.3\u00a0Hz: 48 transitions were seen" in said
     assert "last 1.74 (1.3 to 2.4) and more than 0.30 s in the mean" in said
     assert replace(SEEN, supported=False).sentence() == ""
 
