@@ -11,7 +11,8 @@ the correlation time of its own indicator leaves independent samples, which give
 
 *Markov model.* From the hops along the path, ``P(τ)`` for lags τ (deeptime), with draws from its posterior.
 A lag is long enough where ``P(τ)^m`` foresees ``P(mτ)`` (Chapman and Kolmogorov), and the shortest one is
-taken. Times between hops follow from the generator ``log P(τ)/τ``, which allows for hops that were too quick to see.
+taken. Times between hops follow from the generator ``log P(τ)/τ``, which allows for hops that were too quick
+to see.
 """
 
 from __future__ import annotations
@@ -128,7 +129,7 @@ def _levels_of(series: np.ndarray, runs: list[slice], centre: np.ndarray) -> _Le
     )
     try:
         fitted = estimator.fit([(series[run] - shift) / scale for run in used]).fetch_model()
-    except (AssertionError, ValueError):  # a state of hardly any samples, whose spread is lost
+    except (AssertionError, RuntimeError, ValueError):  # a state of hardly any samples, whose spread is lost
         return None
     order = np.argsort(fitted.output_model.means)
     weights, path = np.zeros((len(series), states)), np.full(len(series), -1)
@@ -159,8 +160,8 @@ def path_of(
     Returns
     -------
     tuple
-        The path is -1 before a state was reached. Transitions between samples ``(k, k)`` are those of a hidden
-        Markov model, None where the path goes from core to core.
+        The path is -1 before a state was reached. Transitions between samples ``(k, k)`` are those of a
+        hidden Markov model, None where the path goes from core to core.
     """
     series = values[:, column]
     width = max(int(AVERAGING_TIME * relaxation), 1)
@@ -214,7 +215,7 @@ def path_of(
         places[:, column] = centre
         return places, continued_visits(core, runs), None, len(wells)
     wells = wells[np.argsort(wells[:, column])]
-    distance = np.linalg.norm((smooth[:, None] - wells) / positive(values.std(axis=0)), axis=2)
+    distance = np.linalg.norm((values[:, None] - wells) / positive(values.std(axis=0)), axis=2)
     near = distance.argmin(axis=1)
     core = np.where(distance[np.arange(len(near)), near] <= _medians(distance, near)[near], near, -1)
     places = _places(values, near, len(wells))
@@ -440,15 +441,14 @@ def _reach(series: np.ndarray, path: np.ndarray, state: int) -> float:
 def stationary(path: np.ndarray, runs: list[slice], states: int) -> bool:
     """Whether both halves of a record spend the same share of time in each state, within their errors."""
     known = np.flatnonzero(path >= 0)
-    half = len(known) // 2
+    halves = known[: len(known) // 2], known[len(known) // 2 :]
     for state in range(states):
-        inside = (path == state).astype(float)
-        spread = (
-            2
-            * float(inside[known].std())
-            * np.sqrt(2 * correlated_samples(inside, runs) / max(len(known), 1))
-        )
-        change = abs(float(inside[known[:half]].mean() - inside[known[half:]].mean()))
-        if change > float(special.ndtri(1 - REFUSED / states / 2)) * spread:
+        rest = np.zeros(len(path))
+        shares = [float((path[half] == state).mean()) if len(half) else 0.0 for half in halves]
+        for half, share in zip(halves, shares, strict=True):
+            rest[half] = (path[half] == state) - share
+        some = runs[:: -(-len(runs) // MOST_RUNS)]
+        error = 2 * float(rest.std()) * np.sqrt(2 * correlated_samples(rest, some) / max(len(known), 1))
+        if abs(shares[1] - shares[0]) > float(special.ndtri(1 - REFUSED / states / 2)) * error:
             return False
     return True

@@ -38,13 +38,15 @@ from siq.data.kinetics import (
     FALSE_WELL,
     MarkovModel,
     Profile,
-    continued_visits as continued_visits,
     exponential,
     markov_model,
     path_of,
     profile_of,
     stationary,
     stays_of,
+)
+from siq.data.kinetics import (
+    continued_visits as continued_visits,
 )
 from siq.data.recordings import Recordings
 from siq.data.stationarity import (
@@ -422,8 +424,8 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         chance = min(_pushed_apart(one, runs, relaxation, degree=degree)[1] for degree in DEGREES)
         valleys = [
             _valley_between(
-                one, runs, relaxation, averaged=averaged, generator=None if chance < DECISIVE_P else generator,
-                surrogates=SURROGATES * recordings.values.shape[1],
+                one, runs, relaxation, averaged=averaged, surrogates=SURROGATES * recordings.values.shape[1],
+                generator=None if chance < DECISIVE_P else generator,
             ) for averaged in (False, True)
         ]  # fmt: skip
         tests[place] = (min(chance, *(rarity for _, rarity in valleys)), -valleys[0][0], relaxation, chance)
@@ -468,7 +470,8 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         recordings.titles[state], recordings.units[state], recordings.time_unit, supported, probability,
         tuple(map(float, places[:, column])), counts, edges, density, path, background[:, column],
         int(supported), columns=tuple(recordings.titles[one] for one in columns), places=places, hops=hops,
-        exponential=tuple(map(exponential, lengths)), stays=tuple(step * one for one in lengths), offset=offset,
+        exponential=tuple(map(exponential, lengths)), offset=offset,
+        stays=tuple(step * one for one in lengths),
     )  # fmt: skip
     if not rungs or not supported:
         return found

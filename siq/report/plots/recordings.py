@@ -56,7 +56,7 @@ def plot_inspection(found: Inspection) -> Figure:
 
 
 def inspection_figures(found: Inspection) -> dict[str, Figure]:
-    """The figures of a page: ``states_in_time``, ``visited``, ``memory``, and ``states`` where it has some."""
+    """Figures of a page: ``states_in_time``, ``visited``, ``memory``, and ``states`` where it has some."""
     hops = found.switching
     states = {"states": _states_figure(found, hops)} if hops is not None and hops.supported else {}
     return states | {
