@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-from scipy import ndimage, special
+from scipy import ndimage, sparse, special
 from scipy.spatial import cKDTree
 
 from siq.data.correlation import resolution_step
@@ -341,7 +341,7 @@ def markov_model(
     for lag in 2 ** np.arange(max(int(np.log2(max(min(stays), 1))), 0) + 1):
         own = counts if counts is not None and lag == 1 else counted(int(lag))
         hops = own - np.diag(np.diag(own))
-        if (hops.sum(axis=1) < 1).any() or (hops.sum(axis=0) < 1).any():
+        if sparse.csgraph.connected_components(hops >= 1, connection="strong")[0] > 1:
             return None
         # The posterior of transitions that are as many as independent ones; the prior is no hop at all.
         posterior = BayesianMSM(DRAWS, reversible=False).fit(TransitionCountModel(own)).fetch_model()

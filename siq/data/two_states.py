@@ -29,7 +29,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import ndimage, special
+from scipy import ndimage, sparse, special
 
 from siq.data.correlation import markov_lag
 from siq.data.kinetics import (
@@ -460,18 +460,13 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     profile = profile_of(flat[:, column], runs, path, places[:, column]) if supported else None
     if profile is not None and not pushed and wells == 1:
         supported = bool((profile.tops[:, ::2] > FALSE_WELL * profile.tops[:, 1::2]).all())
-    hops = np.zeros((number, number))
-    for run in runs:
-        part = path[run][path[run] >= 0]
-        turns = np.flatnonzero(np.diff(part))
-        np.add.at(hops, (part[turns], part[turns + 1]), 1)
     step, lengths = usual_step(recordings), stays_of(path, runs, number)
     found = RecordStates(
         recordings.titles[state], recordings.units[state], recordings.time_unit, supported, probability,
         tuple(map(float, places[:, column])), counts, edges, density, path, background[:, column],
-        int(supported), columns=tuple(recordings.titles[one] for one in columns), places=places, hops=hops,
+        int(supported), columns=tuple(recordings.titles[one] for one in columns), places=places,
         exponential=tuple(map(exponential, lengths)), offset=offset,
-        stays=tuple(step * one for one in lengths),
+        stays=tuple(step * one for one in lengths), hops=_hops(path, runs, number),
     )  # fmt: skip
     if not rungs or not supported:
         return found
@@ -480,11 +475,23 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     found = replace(found, rung=2, profile=profile)
     if min(one.visits for one in counts) < FEWEST_HOPS:
         return replace(found, limit=Remark("data.few_hops", {"fewest": FEWEST_HOPS}))
+    if sparse.csgraph.connected_components(found.hops, connection="strong")[0] > 1:
+        return replace(found, limit=Remark("data.states_apart"))
     model = markov_model(path, runs, number, expected)
     if model is None:
         return replace(found, limit=Remark("data.not_markov"))
     model = model._replace(lag=step * model.lag, stays=step * model.stays, rates=model.rates / step)
     return replace(found, rung=3, markov=model)
+
+
+def _hops(path: np.ndarray, runs: list[slice], states: int) -> np.ndarray:
+    """How often each state followed each other one, ``(k, k)``."""
+    found = np.zeros((states, states))
+    for run in runs:
+        part = path[run][path[run] >= 0]
+        turns = np.flatnonzero(np.diff(part))
+        np.add.at(found, (part[turns], part[turns + 1]), 1)
+    return found
 
 
 def _baselines(recordings: Recordings, rest: np.ndarray) -> np.ndarray:
