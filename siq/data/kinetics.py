@@ -175,7 +175,8 @@ def path_of(
     alone = wells[:, [column]] if values.shape[1] == 1 else _wells_of(smooth[:, [column]], relaxation)
 
     def guess(states: int) -> np.ndarray:
-        evenly = np.linspace(*np.quantile(series, [0.05, 0.95]), states)
+        low, high = np.quantile(series, [0.05, 0.95])
+        evenly = np.linspace(low, high, states)
         return np.sort(alone[:, 0]) if len(alone) == states else evenly
 
     most = _first(runs, MOST_SAMPLES)
@@ -193,11 +194,13 @@ def path_of(
             return _places(values, levels.path, states), path, None if blurred else levels.counts, len(wells)
     if len(wells) <= max(len(alone), 2):
         states = max(len(alone), 2)
-        means, rows = [], []
+        means: list[np.ndarray] = []
+        rows: list[slice] = []
         for run in runs:
             begins = np.arange(run.start, run.stop - width + 1, width)
             if len(begins) > 1:
-                rows.append(slice(sum(map(len, means)), sum(map(len, means)) + len(begins)))
+                first = rows[-1].stop if rows else 0
+                rows.append(slice(first, first + len(begins)))
                 means.append(series[begins[:, None] + np.arange(width)].mean(axis=1))
         if not means or not np.ptp(guess(states)) > 0:
             return np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None, len(wells)
@@ -307,7 +310,7 @@ def exponential(stays: np.ndarray) -> bool | None:
 class MarkovModel(NamedTuple):
     """Hops between states as a Markov process."""
 
-    lag: int  #: in samples: the shortest at which later hops are foreseen
+    lag: float  #: in samples: the shortest at which later hops are foreseen
     chance: float  #: of hops as far from those foreseen, if it is Markovian at this lag
     stays: np.ndarray  #: (k, 3): mean times between hops, in samples, and the ends of their intervals
     rates: np.ndarray  #: (k, k): from state to state, per sample

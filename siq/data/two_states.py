@@ -346,7 +346,7 @@ class RecordStates:
         data = dict(data)
         for name, kind in (("profile", Profile), ("markov", MarkovModel)):
             if (one := data[name]) is not None:
-                arrays = {
+                arrays: dict[str, Any] = {
                     key: _array(value) if isinstance(value, list) else value for key, value in one.items()
                 }
                 data[name] = kind(**arrays)

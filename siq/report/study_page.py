@@ -277,21 +277,22 @@ def _states_table(seen: RecordStates) -> pd.DataFrame:
     law = {True: "exponential", False: "not exponential"}
     tops = [] if seen.profile is None or len(seen.columns) > 1 else seen.profile.tops.tolist()
     cells: dict[str, list[str]] = defaultdict(list)
-    for number, row in enumerate(found.itertuples(index=False)):
+    for number, row in enumerate(found.to_dict("records")):
         cells["place"].append(", ".join(value_text(one, digits=3) for one in seen.places[number]))
-        cells["share of the time"].append(f"{100 * row.share:.0f} %")
-        cells["visits seen to end"].append(str(row.visits))
-        counted = f"{value_text(row.mean_time, digits=3)} ({range_text(row.lowest, row.highest)})"
-        least = f"more than {value_text(row.lowest, digits=2)}"
-        cells[with_unit("mean stay, counted", time_unit)].append(counted if row.visits else least)
-        cells["stays are"].append(law.get(row.exponential, "too few to tell"))
+        cells["share of the time"].append(f"{100 * row['share']:.0f} %")
+        cells["visits seen to end"].append(str(row["visits"]))
+        stay = f"more than {value_text(row['lowest'], digits=2)}"
+        if row["visits"]:
+            stay = f"{value_text(row['mean_time'], digits=3)} ({range_text(row['lowest'], row['highest'])})"
+        cells[with_unit("mean stay, counted", time_unit)].append(stay)
+        cells["stays are"].append(law.get(row["exponential"], "too few to tell"))
         if tops:
             ways = [tops[number - 1][2:]] if number else []
             ways += [tops[number][:2]] if number < len(tops) else []
             cells["tops beside it, −log p"].append(" and ".join(value_text(*one) for one in ways))
         if seen.markov is not None:
-            limits = range_text(row.markov_lowest, row.markov_highest)
-            model = f"{value_text(row.markov_time, digits=3)} ({limits})"
+            limits = range_text(row["markov_lowest"], row["markov_highest"])
+            model = f"{value_text(row['markov_time'], digits=3)} ({limits})"
             cells[with_unit("mean stay, Markov model", time_unit)].append(model)
     names = [f"state {number + 1}" for number in range(len(found))]
     rows = [(name, *one) for name, one in cells.items()]
