@@ -323,8 +323,7 @@ def markov_model(
 
     `counts` are transitions from sample to sample, where a hidden Markov model knows them better.
     """
-    from deeptime.markov import TransitionCountEstimator, TransitionCountModel
-    from deeptime.markov.msm import BayesianMSM
+    from deeptime.markov import TransitionCountEstimator
 
     pieces = [part[part >= 0] for part in (path[run] for run in runs)]
     stays = [one.mean() if len(one) else len(path) for one in stays_of(path, runs, states)]
@@ -346,9 +345,9 @@ def markov_model(
         hops = own - np.diag(np.diag(own))
         if sparse.csgraph.connected_components(hops >= 1, connection="strong")[0] > 1:
             return None
-        # The posterior of transitions that are as many as independent ones; the prior is no hop at all.
-        posterior = BayesianMSM(DRAWS, reversible=False).fit(TransitionCountModel(own)).fetch_model()
-        drawn = np.array([one.transition_matrix for one in posterior.samples])
+        # Rows of the transition matrix have Dirichlet's distribution; the prior is no hop at all.
+        drawn = np.random.default_rng(0).standard_gamma(own, size=(DRAWS, states, states))
+        drawn /= drawn.sum(axis=2, keepdims=True)
         usual = own / own.sum(axis=1, keepdims=True)
         worst = 0.0
         # Up to the time that visits last: before, hardly anything hops, and any model passes.
