@@ -161,13 +161,9 @@ class Inspection:
             values = {"time": memory.relaxation, "steps": memory.relaxation / memory.step, "unit": unit}
             found.append(Remark("data.relaxation", values))
         if (hops := self.switching) is not None:
-            values = {
-                "state": hops.state, "unit": unit, "levels": hops.levels, "hops": hops.transitions,
-                "means": [count.mean for count in hops.counts],
-                "limits": [count.limits for count in hops.counts],
-                "visits": [count.visits for count in hops.counts],
-            }  # fmt: skip
-            found.append(Remark("data.two_states", values) if hops.supported else Remark("data.one_state"))
+            found.append(hops.remark() if hops.supported else Remark("data.one_state"))
+            if hops.limit is not None:
+                found.append(hops.limit)
             fewest = min(hops.counts, key=lambda count: count.visits)
             if hops.supported and fewest.visits:
                 values = {"transitions": fewest.visits, "relative_error": fewest.relative_error}

@@ -184,7 +184,7 @@ def without_slow_drift(recordings: Recordings) -> Recordings:
     floors = noise_floors(recordings) if len(recordings.labels) == 1 else None
     if floors is None or any(floor.process == 0 for floor in floors):
         return recordings
-    found = switching(recordings)
+    found = switching(recordings, rungs=False)
     flat, remarks = recordings.values.copy(), list(recordings.remarks)
     for state, values in enumerate(recordings.values.T):
         background, _ = background_of(recordings, values)

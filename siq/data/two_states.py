@@ -1,15 +1,14 @@
-"""Two states of a record: whether it supports two, their levels, hops and residence times.
+"""States of a record: whether it supports several, their levels, hops and residence times.
 
 Nothing is identified here: this is what the numbers say before any f is known, and it holds where none is
-found or certified.
+found or certified. How many states there are, and where the record is in which, is the matter of
+`siq.data.kinetics`; what these have in common is the background (`siq.data.stationarity.background_of`), and
+each recording may have a baseline of its own.
 
-*Levels.* A hidden Markov model of two normal distributions finds the levels, and what both have in common is
-the background (`siq.data.stationarity.background_of`); each in turn.
-
-*Hops* are counted with two thresholds, the levels of the two states: a visit begins where the record reaches
-the level of a state, and lasts until it reaches the level of the other one. The mean residence time is the
-time of all visits, those that the record cuts at its ends included, over the number of visits whose end was
-seen: the best estimate for exponential times, with a relative error of ``1/√n``.
+*Hops* are counted from core to core: a visit begins where the record reaches the core of a state, and lasts
+until it reaches that of another one. The mean residence time is the time of all visits, those that the record
+cuts at its ends included, over the number of visits whose end was seen: the best estimate for exponential
+times, with a relative error of ``1/√n``.
 
 *Two tests.* A histogram with two peaks is no evidence: a slow background makes one of a single state. Two
 states have a place between them from which the record is pushed away to both sides. The first test regresses
@@ -19,129 +18,52 @@ level of its own, which takes with it whatever drifts slowly. With the polynomia
 single state attracted. The largest of them in standard errors counts, with Scheffé's bound for having looked
 at all pairs. The second test asks for a valley of the histogram, deeper than in surrogates of the record with
 the same spectrum and random phases, which are what a linear system could have shown; it is not asked where
-the first one is beyond doubt. Two states are supported if one of the tests says so, and a hop was seen.
+the first one is beyond doubt. Several states are supported if one of the tests says so, a hop was seen, and
+the valley is none of the floor of a flat well: it is told from none by the errors of the profile.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import special
+from scipy import ndimage, sparse, special
 
 from siq.data.correlation import markov_lag
+from siq.data.kinetics import (
+    AVERAGING_TIME,
+    CONFIDENCE,
+    FALSE_WELL,
+    MarkovModel,
+    Profile,
+    exponential,
+    markov_model,
+    path_of,
+    profile_of,
+    stationary,
+    stays_of,
+)
+from siq.data.kinetics import (
+    continued_visits as continued_visits,
+)
 from siq.data.recordings import Recordings
 from siq.data.stationarity import (
     MOST_STRETCHES,
     background_of,
+    correlated_samples,
     relaxation_samples,
     runs_of,
     stretches_of,
+    usual_step,
 )
-from siq.numerics.integration import machine_code
 from siq.remarks import Remark, sentence
 
 if TYPE_CHECKING:
     import pandas as pd
 
-AVERAGING_TIME = 0.5  # of the local relaxation time: of samples for the hidden Markov model
-MOST_ITERATIONS = 200  # of its estimation, at most
-
-
-def _two_levels(
-    recordings: Recordings, values: np.ndarray, runs: list[slice], relaxation: float
-) -> tuple[np.ndarray, tuple[float, float]]:
-    """Two levels over a common background: each in turn, until neither changes."""
-    width = max(int(AVERAGING_TIME * relaxation), 1)
-    background, half_periods = np.zeros(len(values)), 0
-    levels = (0.0, 0.0)
-    for _ in range(5):
-        flat = values - background
-        begins = stretches_of(runs, width)
-        means = flat[begins[:, None] + np.arange(width)].mean(axis=1)
-        first = np.append(True, np.diff(begins) != width)
-        centre, spread, weights = _two_normals(means, first)
-        low, high = np.argsort(centre)
-        levels = (float(centre[low]), float(centre[high]))
-        known = (begins[:, None] + np.arange(width)).ravel()
-        share = np.interp(np.arange(len(values)), known, np.repeat(weights[:, high], width))
-        found, number = background_of(recordings, values - (1 - share) * levels[0] - share * levels[1])
-        unchanged = number == half_periods and np.abs(found - background).max() <= 0.01 * spread.min()
-        background, half_periods = found, number
-        if unchanged:
-            break
-    return background, levels
-
-
-def _two_normals(series: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, ...]:
-    """A hidden Markov model of two normal distributions: centres, spreads, and weights ``(n, 2)``."""
-    centre = np.quantile(series, [0.1, 0.9])
-    if not centre[1] > centre[0]:
-        centre = np.array([series.min(), series.max()])
-    spread = np.full(2, max(np.ptp(centre) / 4, 1e-12))
-    transition = np.array([[0.95, 0.05], [0.05, 0.95]])
-    smallest = 1e-3 * max(float(series.std()), 1e-300)  # a level of a single repeated value has no spread
-    before = -np.inf
-    weights = np.full((len(series), 2), 0.5)
-    for _ in range(MOST_ITERATIONS):
-        logs = -0.5 * ((series[:, None] - centre) / spread) ** 2 - np.log(spread)
-        highest = logs.max(axis=1, keepdims=True)
-        weights, pairs, likelihood = _forward_backward(np.exp(logs - highest), transition, first)
-        likelihood += float(highest.sum())
-        total = weights.sum(axis=0) + 1e-12
-        centre = weights.T @ series / total
-        spread = np.sqrt(np.maximum((weights * (series[:, None] - centre) ** 2).sum(axis=0) / total, 0))
-        spread = np.maximum(spread, smallest)
-        transition = (pairs + 1e-6) / (pairs + 1e-6).sum(axis=1, keepdims=True)
-        if likelihood - before < 1e-6 * len(series) ** 0.5:
-            break
-        before = likelihood
-    return centre, spread, weights
-
-
-@machine_code
-def _forward_backward(
-    density: np.ndarray, transition: np.ndarray, first: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Probabilities of the two states at each time, expected transitions, and the log-likelihood."""
-    count = len(density)
-    forward = np.empty((count, 2))
-    scale = np.empty(count)
-    weights = np.empty((count, 2))
-    pairs = np.zeros((2, 2))
-    likelihood = 0.0
-    for k in range(count):
-        for j in range(2):
-            if first[k]:
-                prior = 0.5
-            else:
-                prior = forward[k - 1, 0] * transition[0, j] + forward[k - 1, 1] * transition[1, j]
-            forward[k, j] = prior * density[k, j]
-        scale[k] = max(forward[k, 0] + forward[k, 1], 1e-300)
-        forward[k, 0] /= scale[k]
-        forward[k, 1] /= scale[k]
-        likelihood += np.log(scale[k])
-    after = np.ones(2)
-    for k in range(count - 1, -1, -1):
-        if k + 1 == count or first[k + 1]:
-            after[0], after[1] = 1.0, 1.0
-        else:
-            low = density[k + 1, 0] * after[0] / scale[k + 1]
-            high = density[k + 1, 1] * after[1] / scale[k + 1]
-            for i in range(2):
-                pairs[i, 0] += forward[k, i] * transition[i, 0] * low
-                pairs[i, 1] += forward[k, i] * transition[i, 1] * high
-            one = transition[0, 0] * low + transition[0, 1] * high
-            two = transition[1, 0] * low + transition[1, 1] * high
-            after[0], after[1] = one, two
-        weights[k, 0] = forward[k, 0] * after[0]
-        weights[k, 1] = forward[k, 1] * after[1]
-    return weights, pairs, likelihood
-
-
-CONFIDENCE = 0.95  # of the intervals of mean dwell times
+FEWEST_HOPS = 5  # out of each state: fewer test no model of them
 
 
 @dataclass(frozen=True)
@@ -191,26 +113,11 @@ class DwellCount:
         return float(2 * self.time / upper), float(2 * self.time / lower) if lower > 0 else float("inf")
 
 
-def _counted_visits(values: np.ndarray, runs: list[slice], levels: tuple[float, float]) -> np.ndarray:
-    """0 from where the lower level is reached, 1 from where the upper one is, -1 before: shape ``(n,)``."""
-    return continued_visits(np.select([values >= levels[1], values <= levels[0]], [1, 0], -1), runs)
-
-
-def continued_visits(core: np.ndarray, runs: list[slice]) -> np.ndarray:
-    """Which core was entered last, at every sample of a run; a core ``(n,)`` is -1 where there is none."""
-    visits = np.full(len(core), -1)
-    for run in runs:
-        part = core[run]
-        last = np.maximum.accumulate(np.where(part >= 0, np.arange(len(part)), -1))
-        visits[run] = np.where(last >= 0, part[np.maximum(last, 0)], -1)
-    return visits
-
-
 SURROGATES = 999  # for each state that is looked at: fewer could not be rare enough for all of them
 ENOUGH_DEEPER = 20  # as deep as the record: the probability is then known to a fifth
 MOST_POINTS = 8192  # of a series that surrogates are made of
 BINS = 40  # of a histogram with a valley
-DEGREE = 5  # of f in the test: two attractors that differ in depth and width need more than a cubic
+DEGREES = (5, 9)  # of f in the test: two attractors that differ need more than a cubic, three more than that
 STRETCH_TIMES = 40  # local relaxation times: shorter ones bias f towards one state, longer ones let drifts in
 FEWEST_STRETCHES, SHORTEST_TIMES = 6, 10  # for so many stretches they may be as short as ten of these
 LAG_SHARE = 0.1  # of the local relaxation time: over it a state hardly changes what pushes it
@@ -218,38 +125,40 @@ PLACES_COMPARED = 25  # at which f is compared with itself, between the quantile
 INNER_QUANTILE = 0.02  # the quantile from which on f is known well enough
 
 
-def _pushed_apart(values: np.ndarray, runs: list[slice], relaxation: float) -> tuple[float, float] | None:
+def _pushed_apart(
+    values: np.ndarray, runs: list[slice], relaxation: float, *, degree: int
+) -> tuple[float, float]:
     """The largest ``(f(b) - f(a)) / error`` with a < b, and its probability where a single state attracts.
 
-    `relaxation` is the local relaxation time in samples; None where there are too few stretches.
+    `relaxation` is the local relaxation time in samples, `degree` that of f. Too few stretches tell nothing.
     """
     lag = max(int(LAG_SHARE * relaxation), 1)
     longest = sum(run.stop - run.start for run in runs) / (lag * FEWEST_STRETCHES) - 2
     rows = int(min(np.ceil(STRETCH_TIMES * relaxation / lag), longest))
     low, high = np.quantile(values, [0.001, 0.999])
     if rows * lag < SHORTEST_TIMES * relaxation or not high > low:
-        return None
+        return 0.0, 1.0
     begins = stretches_of(runs, (rows + 2) * lag, most=MOST_STRETCHES)
     if len(begins) < FEWEST_STRETCHES - 2:  # gaps cost some
-        return None
+        return 0.0, 1.0
     scaled = 2 * (values - low) / (high - low) - 1
     at = begins[:, None] + lag * np.arange(rows)
     now = np.clip(scaled[at], -1.2, 1.2)  # a polynomial has no business beyond
     increments = scaled[at + 2 * lag] - scaled[at + lag]
-    terms = np.polynomial.legendre.legvander(now, DEGREE)[..., 1:]
-    design = (terms - terms.mean(axis=1, keepdims=True)).reshape(-1, DEGREE)
+    terms = np.polynomial.legendre.legvander(now, degree)[..., 1:]
+    design = (terms - terms.mean(axis=1, keepdims=True)).reshape(-1, degree)
     goal = (increments - increments.mean(axis=1, keepdims=True)).ravel()
     normal = design.T @ design
     if np.linalg.cond(normal) > 1e12:  # numerical: a record of hardly any different values
-        return None
+        return 0.0, 1.0
     inverse = np.linalg.inv(normal)
     coefficients = inverse @ design.T @ goal
     rest = goal - design @ coefficients
     # Each stretch is one draw: its residuals may depend on each other and on the state as they like.
-    scores = (design * rest[:, None]).reshape(len(begins), rows, DEGREE).sum(axis=1)
-    freedom = goal.size - len(begins) - DEGREE
+    scores = (design * rest[:, None]).reshape(len(begins), rows, degree).sum(axis=1)
+    freedom = goal.size - len(begins) - degree
     covariance = inverse * float(rest @ rest) / freedom
-    if len(begins) >= 4 * DEGREE:
+    if len(begins) >= 4 * degree:
         robust = inverse @ (scores.T @ scores) @ inverse * len(begins) / (len(begins) - 1)
         # Not smaller than either in any direction in which they differ.
         root = np.linalg.cholesky(covariance)
@@ -259,12 +168,12 @@ def _pushed_apart(values: np.ndarray, runs: list[slice], relaxation: float) -> t
     places = np.linspace(
         np.quantile(now, INNER_QUANTILE), np.quantile(now, 1 - INNER_QUANTILE), PLACES_COMPARED
     )
-    at_places = np.polynomial.legendre.legvander(places, DEGREE)[:, 1:]
+    at_places = np.polynomial.legendre.legvander(places, degree)[:, 1:]
     first, second = np.triu_indices(PLACES_COMPARED, k=1)
     contrasts = at_places[second] - at_places[first]
     errors = np.sqrt(np.einsum("ij,jk,ik->i", contrasts, covariance, contrasts))
     largest = float(np.max(contrasts @ coefficients / errors))
-    return largest, float(special.fdtrc(DEGREE, freedom, max(largest, 0.0) ** 2 / DEGREE))
+    return largest, float(special.fdtrc(degree, freedom, max(largest, 0.0) ** 2 / degree))
 
 
 def _valley_between(
@@ -272,21 +181,26 @@ def _valley_between(
     runs: list[slice],
     relaxation: float,
     *,
+    averaged: bool,
     generator: np.random.Generator | None,
     surrogates: int = SURROGATES,
 ) -> tuple[float, float]:
     """Share of the samples in the lesser peak of the histogram, and its probability among surrogates.
 
+    Samples apart, or else means over half a relaxation time (`averaged`), which hardly any noise blurs.
     Surrogates have random phases from `generator`; None makes none. No more are drawn once `ENOUGH_DEEPER` of
     them are as deep: then it is not rare (Besag and Clifford, Biometrika 78 (1991) 301).
     """
-    every = max(int(relaxation / 4), -(-len(values) // MOST_POINTS), 1)
+    width = max(int(AVERAGING_TIME * relaxation), 1) if averaged else 1
+    every = max(1 if averaged else int(relaxation / 4), -(-len(values) // MOST_POINTS), 1)
     levelled = values.copy()
     for run in runs:  # less a straight line in every stretch, the last of a run longer
         count = max((run.stop - run.start) // max(int(STRETCH_TIMES * relaxation), 2), 1)
         for rows in np.array_split(np.arange(run.start, run.stop), count):
             line = np.vander(np.linspace(-1, 1, len(rows)), 2)
             levelled[rows] -= line @ np.linalg.lstsq(line, values[rows], rcond=None)[0]
+        # What the sensor adds to each sample would fill the valley.
+        levelled[run] = ndimage.uniform_filter1d(levelled[run], width, mode="nearest")
     parts = [levelled[run][::every] for run in runs if run.stop - run.start >= 4 * every]
     if not parts:
         return 0.0, 1.0
@@ -317,32 +231,49 @@ def _valley(series: np.ndarray) -> float:
     return float(np.minimum(left, right).max())
 
 
-SIGNIFICANCE = 0.01  # probability with which a single state is taken for two
+SIGNIFICANCE = 0.01  # probability with which a single state is taken for several
 DECISIVE_P = 1e-5  # probability for the first test from which on the second one is not asked
-PULLED_TOGETHER = -3.0  # standard errors: where f falls so clearly between all places, one state attracts
+MOST_PASSES = 5  # over states and background, each in turn
+SETTLED_BACKGROUND = 0.01  # of the spread of a state
+FALSE_OFFSET_RATE = 1e-3  # probability with which recordings with one baseline are given one each
+MOST_COLUMNS = 3  # in which states are sought together: neighbours are far away in more
 
 
 @dataclass(frozen=True, eq=False)
 class RecordStates:
-    """Two states that recordings show by themselves, and the hops between them.
+    """States that recordings show by themselves, the hops between them, and how far these can be relied on.
 
-    Two are supported if the record is pushed apart, and was seen to hop at least once. Levels and counts have
-    the lower one first. `as_data` leaves out what is of each sample.
+    The states are supported if a single one is refused, and the record was seen to hop at least once. The
+    `rung` is what the record supports: 0 a single state; 1 states with counted stays; 2 their profile, too,
+    since the record is stationary; 3 a Markov model of the hops, too. `as_data` leaves out what is of each
+    sample.
     """
 
     state: str  #: the measured quantity that shows them best, as its file calls it
     unit: str | None  #: None where the file does not say
     time_unit: str | None
-    supported: bool  #: whether the record supports two states at all
+    supported: bool  #: whether the record supports several states at all
     probability: float  #: of so much with a single state over a drifting background, all tests counted
-    levels: tuple[float, float]  #: in the unit of the state, of the record less its background
-    counts: tuple[DwellCount, DwellCount]  #: how long each lasts
+    levels: tuple[
+        float, ...
+    ]  #: of each state, in the unit of the quantity, of the record less its background
+    counts: tuple[DwellCount, ...]  #: how long each lasts
     edges: np.ndarray  #: (b + 1,): of the histogram of the state
     density: np.ndarray  #: (b,): per unit of the state
-    #: (n,): 0 or 1 at each sample, -1 before the record has reached a level
+    #: (n,): the state at each sample, -1 before the record has reached one
     visits: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
-    #: (n,): what drifts slowly below both levels; zero where nothing does
+    #: (n,): what drifts slowly below all levels; zero where nothing does
     background: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    rung: int = 0
+    limit: Remark | None = None  #: why the next rung is out of reach, and what would help
+    columns: tuple[str, ...] = ()  #: measured quantities in which they were sought
+    places: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  #: (k, d): of the states in these
+    hops: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  #: (k, k): seen from state to state
+    exponential: tuple[bool | None, ...] = ()  #: whether stays are; None of too few to tell
+    stays: tuple[np.ndarray, ...] = ()  #: lengths of the visits to each state, in the unit of time
+    profile: Profile | None = None
+    markov: MarkovModel | None = None  #: in the unit of time
+    offset: float = 0.0  #: the range of the baselines of the recordings; 0 where these do not differ
 
     @classmethod
     def of(cls, recordings: Recordings) -> RecordStates | None:
@@ -351,8 +282,8 @@ class RecordStates:
 
     @property
     def transitions(self) -> int:
-        """How many were seen, both ways."""
-        return self.counts[0].visits + self.counts[1].visits
+        """How many were seen, all ways together."""
+        return sum(one.visits for one in self.counts)
 
     def dwell_times(self) -> pd.DataFrame:
         """How long each state lasts, a row for each.
@@ -360,86 +291,222 @@ class RecordStates:
         Returns
         -------
         pandas.DataFrame
-            Columns ``level visits mean_time lowest highest``: the level of the state; how many visits were
-            seen to end; their mean in the unit of time, NaN where none ended, with its interval of 95 %.
+            Columns ``level share visits mean_time lowest highest exponential markov_time markov_lowest
+            markov_highest``: the level of the state; its share of the time; how many visits were seen to end;
+            their mean in the unit of time, NaN where none ended, with its interval of 95 %; whether they are
+            spread as exponential times; and the same mean by the Markov model, which allows for hops that
+            were too quick to see, NaN without one.
         """
         import pandas as pd
 
-        pairs = zip(self.levels, self.counts, strict=True)
-        rows = [(level, one.visits, one.mean, *one.limits) for level, one in pairs]
-        return pd.DataFrame(rows, columns=["level", "visits", "mean_time", "lowest", "highest"])
+        whole = sum(one.time for one in self.counts) or np.nan
+        unknown = np.full((len(self.counts), 3), np.nan)
+        markov = unknown if self.markov is None else self.markov.stays
+        exponential = self.exponential or (None,) * len(self.counts)
+        rows = [
+            (level, one.time / whole, one.visits, one.mean, *one.limits, law, *model)
+            for level, one, law, model in zip(self.levels, self.counts, exponential, markov, strict=True)
+        ]
+        names = (
+            "level share visits mean_time lowest highest exponential markov_time markov_lowest markov_highest"
+        )
+        return pd.DataFrame(rows, columns=names.split())
 
-    def sentence(self) -> str:
-        """The same in a sentence; empty where two states are not supported."""
+    def remark(self) -> Remark:
+        """The same as a remark."""
         values = {
-            "state": self.state, "unit": self.unit, "time_unit": self.time_unit, "levels": self.levels,
+            "columns": self.columns or (self.state,), "unit": self.unit, "time_unit": self.time_unit,
+            "places": self.places.tolist() or [[one] for one in self.levels], "levels": self.levels,
             "transitions": self.transitions, "means": [one.mean for one in self.counts],
             "limits": [one.limits for one in self.counts], "visits": [one.visits for one in self.counts],
+            "rung": self.rung, "lag": None if self.markov is None else self.markov.lag,
+            "tops": [] if self.profile is None or len(self.columns) > 1 else self.profile.tops.tolist(),
+            "offset": self.offset,
         }  # fmt: skip
-        return sentence(Remark("data.record_hops", values)) if self.supported else ""
+        return Remark("data.record_hops", values)
+
+    def sentence(self) -> str:
+        """The same in a sentence; empty where only one state is supported."""
+        limit = "" if self.limit is None else " " + sentence(self.limit)
+        return sentence(self.remark()) + limit if self.supported else ""
 
     def as_data(self) -> dict[str, Any]:
         """As plain data, which `from_data` reads back."""
         kept = {name: value for name, value in vars(self).items() if name not in ("visits", "background")}
-        counts = [vars(one) for one in self.counts]
-        arrays = {"edges": self.edges.tolist(), "density": self.density.tolist()}
-        return {**kept, "levels": list(self.levels), "counts": counts, **arrays}
+        kept |= {"counts": [vars(one) for one in self.counts]}
+        kept |= {
+            name: None if (one := kept[name]) is None else one._asdict() for name in ("profile", "markov")
+        }
+        kept |= {"limit": None if self.limit is None else self.limit.as_data()}
+        return {name: _plain(value) for name, value in kept.items()}
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any]) -> RecordStates:
         """What `as_data` gave."""
-        first, second = (DwellCount(**one) for one in data["counts"])
-        arrays = {name: np.array(data[name], dtype=float) for name in ("edges", "density")}
-        return cls(**{**data, "levels": tuple(data["levels"]), "counts": (first, second), **arrays})
+        data = dict(data)
+        for name, kind in (("profile", Profile), ("markov", MarkovModel)):
+            if (one := data[name]) is not None:
+                arrays: dict[str, Any] = {
+                    key: _array(value) if isinstance(value, list) else value for key, value in one.items()
+                }
+                data[name] = kind(**arrays)
+        data |= {name: tuple(data[name]) for name in ("levels", "columns", "exponential")}
+        data |= {name: _array(data[name]) for name in ("edges", "density", "places", "hops")}
+        data["counts"] = tuple(DwellCount(**one) for one in data["counts"])
+        data["stays"] = tuple(map(_array, data["stays"]))
+        data["limit"] = None if data["limit"] is None else Remark.from_data(data["limit"])
+        return cls(**data)
 
 
-def switching(recordings: Recordings) -> RecordStates | None:
-    """The two states that the recordings show best; None where they are too short to tell anything.
+def _array(values: Any) -> np.ndarray:
+    return np.array(values, dtype=float)  # None is read as NaN
 
-    Every state is looked at by itself, and the one in which the record is pushed apart most clearly is taken.
-    Where a background drifts slowly it is taken off the histogram, as it is off the levels.
+
+def _plain(value: Any) -> Any:
+    """Arrays as lists, and what is no number as None, as JSON has neither."""
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {key: _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | None:
+    """The states that the recordings show by themselves; None where they are too short to tell anything.
+
+        Every quantity is looked at by itself, and the one in which a single state is refused most clearly is
+        taken for levels and histogram; states are sought in up to three together. Where a background drifts
+        slowly, or recordings differ in their baselines, it is taken off.
+
+    Parameters
+    ----------
+        recordings
+            What was measured.
+        rungs
+            Whether profile and Markov model are worked out, too.
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from siq.data.correlation import markov_lag
-    >>> from siq.data.recordings import Recordings
-    >>> generator = np.random.default_rng(1)
-    >>> x = np.empty((20_000, 1))
-    >>> x[0] = 1.0
-    >>> for before in range(len(x) - 1):
-    ...     kick = np.sqrt(0.25 * 0.05) * generator.standard_normal()
-    ...     x[before + 1] = x[before] + 0.05 * (x[before] - x[before] ** 3) + kick
-    >>> found = switching(Recordings.from_arrays(0.05 * np.arange(len(x)), x, names=["x"]))
-    >>> found.supported, [round(level, 1) for level in found.levels]
-    (True, [-0.9, 0.8])
+        >>> import numpy as np
+        >>> from siq.data.correlation import markov_lag
+    from siq.data.kinetics import (
+        AVERAGING_TIME,
+        CONFIDENCE,
+        MarkovModel,
+        Profile,
+        continued_visits,
+        exponential,
+        markov_model,
+        path_of,
+        profile_of,
+        stationary,
+        stays_of,
+    )
+        >>> from siq.data.recordings import Recordings
+        >>> generator = np.random.default_rng(1)
+        >>> x = np.empty((20_000, 1))
+        >>> x[0] = 1.0
+        >>> for before in range(len(x) - 1):
+        ...     kick = np.sqrt(0.25 * 0.05) * generator.standard_normal()
+        ...     x[before + 1] = x[before] + 0.05 * (x[before] - x[before] ** 3) + kick
+        >>> found = switching(Recordings.from_arrays(0.05 * np.arange(len(x)), x, names=["x"]))
+        >>> found.supported, [round(level, 1) for level in found.levels]
+        (True, [-0.9, 0.8])
     """
     runs, generator = runs_of(recordings), np.random.default_rng(0)  # always the same surrogates
-    tests: dict[int, tuple[float, float, float]] = {}  # probability, less the depth, relaxation
-    for place, column in enumerate(recordings.values.T):
-        relaxation = relaxation_samples(column, runs)
+    tests: dict[int, tuple[float, ...]] = {}  # probability, less the depth, relaxation, the first test's
+    for place, one in enumerate(recordings.values.T):
+        relaxation = relaxation_samples(one, runs)
         if relaxation is None:  # too short, or a column that runs on like a clock
             continue
-        pushed, chance = _pushed_apart(column, runs, relaxation) or (float("nan"), 1.0)
-        clear = pushed < PULLED_TOGETHER or chance < DECISIVE_P
-        depth, rarity = _valley_between(
-            column, runs, relaxation, generator=None if clear else generator,
-            surrogates=SURROGATES * recordings.values.shape[1],
-        )  # fmt: skip
-        tests[place] = (min(chance, rarity), -depth, relaxation)
+        chance = min(_pushed_apart(one, runs, relaxation, degree=degree)[1] for degree in DEGREES)
+        valleys = [
+            _valley_between(
+                one, runs, relaxation, averaged=averaged, surrogates=SURROGATES * recordings.values.shape[1],
+                generator=None if chance < DECISIVE_P else generator,
+            ) for averaged in (False, True)
+        ]  # fmt: skip
+        tests[place] = (min(chance, *(rarity for _, rarity in valleys)), -valleys[0][0], relaxation, chance)
     if not tests:
         return None
+    columns = sorted(sorted(tests, key=lambda place: tests[place][:2])[:MOST_COLUMNS])
     state = min(tests, key=lambda place: tests[place][:2])
-    probability, _, relaxation = tests[state]
-    values = recordings.values[:, state]
-    background, levels = _two_levels(recordings, values, runs, relaxation)
-    flat = values - background
-    visits = _counted_visits(flat, runs, levels)
-    counts = DwellCount.of_visits(recordings.t, visits, runs)
-    chance = min(2 * probability * len(tests), 1.0)
-    density, edges = np.histogram(flat, bins=BINS, density=True)
-    return RecordStates(
-        recordings.titles[state], recordings.units[state], recordings.time_unit,
-        chance < SIGNIFICANCE and any(one.visits for one in counts), chance, levels,
-        (counts[0], counts[1]), edges, density, visits, background,
+    probability = min((len(DEGREES) + 2) * tests[state][0] * len(tests), 1.0)
+    values, column = recordings.values[:, columns], columns.index(state)
+    relaxation = min(tests[place][2] for place in columns)
+    background, offset = np.zeros_like(values), 0.0
+    places, path, expected = np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None
+    wells = 1
+    if probability >= SIGNIFICANCE:
+        background[:, column] = background_of(recordings, values[:, column])[0]
+    for _ in range(MOST_PASSES if probability < SIGNIFICANCE else 0):
+        flat = values - background
+        places, path, expected, wells = path_of(flat, runs, relaxation, column=column)
+        level = np.where(path[:, None] >= 0, places[path], np.median(flat, axis=0))
+        slow = np.array([background_of(recordings, one)[0] for one in (values - level).T]).T
+        baseline = _baselines(recordings, values - level - slow)
+        moved = slow + baseline - background
+        background, offset = slow + baseline, float(np.ptp(baseline[:, column]))
+        if (np.abs(moved).max(axis=0) <= SETTLED_BACKGROUND * (values - level).std(axis=0)).all():
+            break
+    flat, number = values - background, len(places)
+    counts = DwellCount.of_visits(recordings.t, path, runs, states=number)
+    density, edges = np.histogram(flat[:, column], bins=BINS, density=True)
+    # A valley that is deeper than a linear system's may be the floor of one flat well.
+    pushed = tests[state][3] * (len(DEGREES) + 2) * len(tests) < SIGNIFICANCE
+    supported = probability < SIGNIFICANCE and any(one.visits for one in counts)
+    profile = profile_of(flat[:, column], runs, path, places[:, column]) if supported else None
+    if profile is not None and not pushed and wells == 1:
+        supported = bool((profile.tops[:, ::2] > FALSE_WELL * profile.tops[:, 1::2]).all())
+    step, lengths = usual_step(recordings), stays_of(path, runs, number)
+    found = RecordStates(
+        recordings.titles[state], recordings.units[state], recordings.time_unit, supported, probability,
+        tuple(map(float, places[:, column])), counts, edges, density, path, background[:, column],
+        int(supported), columns=tuple(recordings.titles[one] for one in columns), places=places,
+        exponential=tuple(map(exponential, lengths)), offset=offset,
+        stays=tuple(step * one for one in lengths), hops=_hops(path, runs, number),
     )  # fmt: skip
+    if not rungs or not supported:
+        return found
+    if not stationary(path, runs, number):
+        return replace(found, limit=Remark("data.not_stationary"))
+    found = replace(found, rung=2, profile=profile)
+    if min(one.visits for one in counts) < FEWEST_HOPS:
+        return replace(found, limit=Remark("data.few_hops", {"fewest": FEWEST_HOPS}))
+    if sparse.csgraph.connected_components(found.hops, connection="strong")[0] > 1:
+        return replace(found, limit=Remark("data.states_apart"))
+    model = markov_model(path, runs, number, expected)
+    if model is None:
+        return replace(found, limit=Remark("data.not_markov"))
+    model = model._replace(lag=step * model.lag, stays=step * model.stays, rates=model.rates / step)
+    return replace(found, rung=3, markov=model)
+
+
+def _hops(path: np.ndarray, runs: list[slice], states: int) -> np.ndarray:
+    """How often each state followed each other one, ``(k, k)``."""
+    found = np.zeros((states, states))
+    for run in runs:
+        part = path[run][path[run] >= 0]
+        turns = np.flatnonzero(np.diff(part))
+        np.add.at(found, (part[turns], part[turns + 1]), 1)
+    return found
+
+
+def _baselines(recordings: Recordings, rest: np.ndarray) -> np.ndarray:
+    """What recordings differ by in the mean of what states leave, ``(n, d)``; zero where by chance alone."""
+    labels, number = recordings.recording, len(recordings.labels)
+    found = np.zeros_like(rest)
+    if number < 2:
+        return found
+    counts = np.bincount(labels, minlength=number)
+    for place, one in enumerate(rest.T):
+        means = np.bincount(labels, weights=one, minlength=number) / np.maximum(counts, 1)
+        inside = one - means[labels]
+        error = inside.var() * 2 * correlated_samples(inside, runs_of(recordings)) / np.maximum(counts, 1)
+        centre = np.average(means, weights=counts)
+        squares = float((((means - centre) ** 2)[counts > 0] / np.maximum(error[counts > 0], 1e-300)).sum())
+        if special.chdtrc((counts > 0).sum() - 1, squares) < FALSE_OFFSET_RATE:
+            found[:, place] = (means - centre)[labels]
+    return found

@@ -530,7 +530,7 @@ def check_occupancy(
         seen = switching(joined(recordings)) if found.dynamics.dimension == 1 else None
         if seen is None or not seen.supported:
             return OccupancyCheck(missing=Remark("quasipotential.record_of_one_state"))
-        low, high = seen.levels
+        low, *_, high = seen.levels
         values = {"low": low, "high": high, "hops": seen.transitions}
         return OccupancyCheck(missing=Remark("quasipotential.hops_unseen", values), unseen=seen)
     if noise is None:

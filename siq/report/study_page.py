@@ -23,7 +23,7 @@ from markupsafe import Markup
 
 from siq.data.two_states import RecordStates
 from siq.inference.field_estimate import DiffusionSource, FieldEstimate
-from siq.numerics.text import unit_text, value_text
+from siq.numerics.text import range_text, unit_text, value_text
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import sentences_without_landscape
 from siq.quasipotential.wells import Well
@@ -149,6 +149,7 @@ def study_page(
         certified=0 if rrmse is None else int(rrmse[rrmse["method"] == method]["certified"].sum()),
         refusals=list(dict(zip(refused["test"], refused["reason"], strict=True)).values()),
         landscape=landscape_tables(summary, noises),
+        states=None if results.seen is None or not results.seen.supported else _states_table(results.seen),
         formulas=_formulas(results),
         coefficients=_coefficients(results),
         record=record,
@@ -267,7 +268,36 @@ def answer_data(page: ReportContent, study: Study, results: StudyResults) -> dic
     return {
         "title": page.title, "sentence": page.answer[0], "certified": how, "formulas": formulas,
         "runs": study.runs, "failed": failed,
+        "states": len(results.seen.counts) if results.seen is not None and results.seen.supported else 0,
     }  # fmt: skip
+
+
+def _states_table(seen: RecordStates) -> pd.DataFrame:
+    """The states that a record shows by itself, a column for each, as the rungs answer them."""
+    found, time_unit = seen.dwell_times(), seen.time_unit or "1"
+    law = {True: "exponential", False: "not exponential"}
+    tops = [] if seen.profile is None or len(seen.columns) > 1 else seen.profile.tops.tolist()
+    cells: dict[str, list[str]] = defaultdict(list)
+    for number, row in enumerate(found.to_dict("records")):
+        cells["place"].append(", ".join(value_text(one, digits=3) for one in seen.places[number]))
+        cells["share of the time"].append(f"{100 * row['share']:.0f} %")
+        cells["visits seen to end"].append(str(row["visits"]))
+        stay = f"more than {value_text(row['lowest'], digits=2)}"
+        if row["visits"]:
+            stay = f"{value_text(row['mean_time'], digits=3)} ({range_text(row['lowest'], row['highest'])})"
+        cells[with_unit("mean stay, counted", time_unit)].append(stay)
+        cells["stays are"].append(law.get(row["exponential"], "too few to tell"))
+        if tops:
+            ways = [tops[number - 1][2:]] if number else []
+            ways += [tops[number][:2]] if number < len(tops) else []
+            cells["tops beside it, −log p"].append(" and ".join(value_text(*one) for one in ways))
+        if seen.markov is not None:
+            limits = range_text(row["markov_lowest"], row["markov_highest"])
+            model = f"{value_text(row['markov_time'], digits=3)} ({limits})"
+            cells[with_unit("mean stay, Markov model", time_unit)].append(model)
+    names = [f"state {number + 1}" for number in range(len(found))]
+    rows = [(name, *one) for name, one in cells.items()]
+    return pd.DataFrame(rows, columns=["", *names])
 
 
 def _formulas(results: StudyResults) -> list[FormulaRow]:

@@ -67,6 +67,8 @@ def answer_of_page(page: Path) -> tuple[list[str], Exit]:
 def _of_study(answer: Mapping[str, Any]) -> tuple[list[str], Exit]:
     sentence = str(answer["sentence"])
     lines = [sentence] if sentence else []
+    if not answer["formulas"] and answer.get("states"):
+        return [*lines, "No formula was found: the states and their times are the answer."], Exit.ANSWERED
     if not answer["formulas"]:
         why = "No formula was found; the page says at which step, and what to do."
         return [*lines, why], Exit.NO_ANSWER

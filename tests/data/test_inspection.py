@@ -34,8 +34,8 @@ def test_memory_transitions_coverage_and_prospects_are_said(blurred: Inspection)
     for words in (
         "beyond an exposure of 0.03 s",
         "Markovian from 4 steps (0.04 s) on",
-        "Two states are supported",
-        "transitions seen",
+        "The record has two states of x",
+        "transitions were seen",
         "of the range of x was visited",
         "Process noise is seen",
         "seen from a sample 4 steps earlier",

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from siq.data.kinetics import continued_visits
 from siq.data.preparation import in_stretches, without_slow_drift
 from siq.data.recordings import Recordings
 from siq.data.stationarity import background_of, correlated_samples, relaxation_samples, runs_of, usual_step
-from siq.data.two_states import DwellCount, _counted_visits, switching
+from siq.data.two_states import DwellCount, switching
 
 STEP, COUNT = 0.05, 20_000
 TIME = STEP * np.arange(COUNT)
@@ -33,6 +34,10 @@ def two_states(seed: int, intensity: float, count: int = COUNT) -> np.ndarray:
 
 def recorded(*series: np.ndarray) -> Recordings:
     return Recordings.from_arrays(TIME[: len(series[0])], np.array(series)[:, :, None], names=["x"])
+
+
+def from_level_to_level(x: np.ndarray, runs: list[slice]) -> np.ndarray:
+    return continued_visits(np.select([x >= 1, x <= -1], [1, 0], -1), runs)
 
 
 BACKGROUNDS = {
@@ -68,7 +73,7 @@ def test_visits_go_from_level_to_level() -> None:
     x = np.array([0.0, -1.0, 0.5, -0.5, 1.0, 0.0, 1.2, -1.0, 0.9])
     recordings = Recordings.from_arrays(np.arange(9.0), x[:, None], names=["x"])
     runs = runs_of(recordings)
-    visits = _counted_visits(x, runs, (-1.0, 1.0))
+    visits = from_level_to_level(x, runs)
     assert visits.tolist() == [-1, 0, 0, 0, 1, 1, 1, 0, 0]
     low, high = DwellCount.of_visits(recordings.t, visits, runs)
     assert (low, high) == (DwellCount(1, 4.0), DwellCount(1, 3.0))
@@ -79,7 +84,7 @@ def test_a_gap_in_time_ends_no_visit() -> None:
     x = np.array([-1.0, -1.0, -1.0, 1.0, 1.0, -1.0])
     recordings = Recordings.from_arrays(t, x[:, None], names=["x"])
     runs = runs_of(recordings)
-    low, high = DwellCount.of_visits(t, _counted_visits(x, runs, (-1.0, 1.0)), runs)
+    low, high = DwellCount.of_visits(t, from_level_to_level(x, runs), runs)
     assert (low, high) == (DwellCount(0, 2.0), DwellCount(1, 2.0))
 
 

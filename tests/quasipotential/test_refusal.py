@@ -57,7 +57,7 @@ def test_a_refusal_carries_the_states_of_the_record() -> None:
     assert states.levels == pytest.approx((-1, 1), abs=0.3)
     assert (states.density * np.diff(states.edges)).sum() == pytest.approx(1)
     said = str(refused.value)
-    assert said.startswith("The recordings hop between two states of x")
+    assert said.startswith("The record has two states of x")
     assert said.endswith(f"But no landscape was found: {refused.value.reason}.")
     assert said.count(refused.value.reason) == 1
 
@@ -84,7 +84,7 @@ def test_nothing_is_added_to_what_is_certified() -> None:
     (answer, *further) = answer_lines(two, seen=seen, certified=True)
     assert answer_lines(two) == [answer, *further]
     last = answer_lines(two, seen=seen)[-1]
-    assert last.startswith("Without any formula: the recordings hop between two states of x")
+    assert last.startswith("Without any formula: the record has two states of x")
 
 
 def test_the_reason_is_that_of_the_step_that_failed() -> None:

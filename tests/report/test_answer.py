@@ -35,5 +35,5 @@ def test_how_many_runs_are_certified_is_one_word(certified, said):
 def test_the_file_says_what_a_terminal_needs():
     assert json.loads(json.dumps(answer([True, False], failed=[1]))) == {
         "title": "A study", "sentence": "Two wells.", "certified": "some", "formulas": 0, "runs": 2,
-        "failed": 1,
+        "failed": 1, "states": 0,
     }  # fmt: skip

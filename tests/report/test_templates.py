@@ -13,7 +13,7 @@ FOLDER = files("siq.report") / "templates"
 TEXT = sorted(
     file.name for file in FOLDER.iterdir() if file.name.endswith(".j2") and ".html" not in file.name
 )
-PARTS = {"lead", "evidence", "record", "landscape", "sweep", "runs", "published", "workings"}
+PARTS = {"lead", "states", "evidence", "record", "landscape", "sweep", "runs", "published", "workings"}
 
 
 @pytest.mark.parametrize("name", TEXT)

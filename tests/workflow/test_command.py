@@ -106,6 +106,11 @@ def test_a_file_is_inspected(folder: Path, capsys: pytest.CaptureFixture[str]) -
         ({"formulas": 1, "runs": 1, "failed": 0, "certified": "none"}, Exit.ANSWERED, "No formula passed"),
         ({"formulas": 2, "runs": 3, "failed": 1, "certified": "some"}, Exit.ANSWERED, "1 of 3 runs failed"),
         (
+            {"formulas": 0, "runs": 1, "failed": 0, "certified": "none", "states": 3},
+            Exit.ANSWERED,
+            "the states and their times are the answer",
+        ),
+        (
             {"formulas": 0, "runs": 1, "failed": 1, "certified": "none"},
             Exit.NO_ANSWER,
             "No formula was found",

@@ -9,10 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from siq.data.inspection import Inspection
+from siq.data.two_states import RecordStates
 from siq.report.plots.style import (
     BLACK,
     BLUE,
     COLUMN_WIDTH,
+    GREEN,
     GREY,
     VERMILLION,
     axis_label,
@@ -29,6 +31,8 @@ SHORT = 20  # recordings; where there are more, each is a relaxation, and severa
 LONG = 0.9  # of the longest recording
 BINS = 60
 LAGS = 60  # shown at most
+STAYS_SHOWN = 60  # stays of the usual length
+STATE_COLOURS = (BLUE, VERMILLION, GREEN, BLACK)
 STATES = 4  # drawn below each other; the text has all
 
 
@@ -52,8 +56,10 @@ def plot_inspection(found: Inspection) -> Figure:
 
 
 def inspection_figures(found: Inspection) -> dict[str, Figure]:
-    """The figures of a page by name: ``states_in_time``, ``visited``, ``memory``."""
-    return {
+    """Figures of a page: ``states_in_time``, ``visited``, ``memory``, and ``states`` where it has some."""
+    hops = found.switching
+    states = {"states": _states_figure(found, hops)} if hops is not None and hops.supported else {}
+    return states | {
         "states_in_time": _record_figure(found),
         "visited": _figure_of(_draw_visits, found, 2.9),
         "memory": _figure_of(_draw_memory, found, 2.7),
@@ -71,6 +77,54 @@ def _record_figure(found: Inspection) -> Figure:
             axes.set_xlabel("")
         if state > 0:
             axes.set_title("", loc="left")
+    return figure
+
+
+@drawn_in_style
+def _states_figure(found: Inspection, hops: RecordStates) -> Figure:
+    """The record with its states in colour, the profile, and stays against the exponential law."""
+    figure = Figure(figsize=(COLUMN_WIDTH, 6.4))
+    record, profile, stays = figure.subplots(3, 1)
+    recordings = found.recordings
+    column = recordings.titles.index(hops.state)
+    # The longest recording, so much of it that some tens of stays can be seen.
+    counts = np.bincount(recordings.recording)
+    begin = int(counts[: np.argmax(counts)].sum())
+    usual = np.median(np.concatenate(hops.stays)) if any(map(len, hops.stays)) else np.inf
+    rows = slice(begin, begin + int(counts.max()))
+    t = recordings.t[rows] - recordings.t[begin]
+    shown = t <= min(STAYS_SHOWN * usual, t[-1])
+    t, x, visits = t[shown], recordings.values[rows, column][shown], hops.visits[rows][shown]
+    every = max(len(t) // POINTS, 1)
+    record.plot(t[::every], x[::every], color=GREY, linewidth=0.4, rasterized=True)
+    label, time_label = _labels(found)[column], unit_label(recordings.time_unit or "")
+    colours = [STATE_COLOURS[state % len(STATE_COLOURS)] for state in range(len(hops.counts))]
+    for state, (colour, lengths) in enumerate(zip(colours, hops.stays, strict=True)):
+        mine = visits == state
+        record.plot(t[mine][::every], x[mine][::every], ".", color=colour, markersize=2, rasterized=True)
+        if len(lengths):
+            times = np.sort(lengths)
+            share = 1 - np.arange(len(times)) / len(times)
+            stays.step(times, share, where="post", color=colour, label=f"state {state + 1}")
+            # The dead time is that of the shortest stay.
+            law = np.exp(-(times - times[0]) / max(times.mean() - times[0], 1e-300))
+            stays.plot(times, law, color=colour, linestyle="--", linewidth=0.8)
+    record.set(xlabel=f"time {time_label}".strip(), ylabel=label)
+    if (drawn := hops.profile) is not None:
+        profile.fill_between(
+            drawn.place, drawn.height - 2 * drawn.error, drawn.height + 2 * drawn.error, color=GREY, alpha=0.4
+        )
+        profile.plot(drawn.place, drawn.height, color=BLACK)
+        for level, colour in zip(hops.levels, colours, strict=True):
+            profile.axvline(level, color=colour, linestyle="--", linewidth=0.8)
+        profile.set(xlabel=label, ylabel=r"$-\log p$")
+    else:
+        say(profile, "no profile: the record is not stationary")
+    if any(map(len, hops.stays)):
+        stays.set(xlabel=f"stay {time_label}".strip(), ylabel="share that last longer", yscale="log")
+        stays.legend()
+    else:
+        say(stays, "no stay was seen from its begin to its end")
     return figure
 
 

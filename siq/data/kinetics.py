@@ -1,0 +1,456 @@
+"""States of a record of any number, their profile, and a Markov model of the hops between them.
+
+*How many.* Where hops are quick against everything else, each state is a level with white noise about it, and
+a hidden Markov model of normal distributions with so many states as leave white residuals is the record's
+(deeptime). Otherwise states are the wells of the density: maxima that stand above the saddle to any higher
+one by more than its error. The density at a sample is that of its nearest neighbours, of which so many are
+independent as the relaxation time leaves, and wells are joined in the order of their density (persistence).
+
+*Profile.* ``-log p`` along a state is the free energy in units of kT, or of ε. A bin is visited as often as
+the correlation time of its own indicator leaves independent samples, which gives the error.
+
+*Markov model.* From the hops along the path, ``P(τ)`` for lags τ (deeptime), with draws from its posterior.
+A lag is long enough where ``P(τ)^m`` foresees ``P(mτ)`` (Chapman and Kolmogorov), and the shortest one is
+taken. Times between hops follow from the generator ``log P(τ)/τ``, which allows for hops that were too quick
+to see.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+from scipy import ndimage, sparse, special
+from scipy.spatial import cKDTree
+
+from siq.data.correlation import resolution_step
+from siq.data.stationarity import WHITE_CORRELATION, correlated_samples
+from siq.numerics.randomness import positive
+
+MOST_STATES = 6  # looked for
+MOST_SAMPLES = 20_000  # from which their number is told, where they are levels with white noise
+SMOOTH = 0.5  # a correlation of neighbours: no white noise about a level leaves as much
+AVERAGING_TIME = 0.5  # of the local relaxation time: of samples, before wells are sought
+MOST_NODES = 4000  # samples at which the density is estimated
+FALSE_WELL = 3.5  # standard errors by which a well has to stand out: of the many saddles none does by chance
+LEAST_NEIGHBOURS = 16  # independent ones: a density is then known to a quarter
+LINKS = 24  # neighbours that a sample is linked with
+MOST_ITERATIONS = 200  # of a hidden Markov model
+DRAWS = 200  # of the transition matrix: ends of intervals are then known to a tenth of their width
+REFUSED = 0.01  # probability with which a Markov process is refused at a lag
+CONFIDENCE = 0.95
+PROFILE_BINS = 40
+MOST_RUNS = 200  # without a gap, from which a correlation time is found
+OUTSIDE = 0.001  # of the samples on either side: a few outliers would make the rest one bin
+FEWEST_BINS = 4  # a parabola through three knows no error
+FEWEST_STAYS = 10  # from which their distribution is told
+# Of Kolmogorov's statistic for exponential times whose mean is estimated (Stephens, JASA 69 (1974) 730).
+STEPHENS = 1.308  # at one per cent
+
+
+def _wells_of(values: np.ndarray, relaxation: float) -> np.ndarray:
+    """Places of the wells of the density of points ``(n, d)``, a row for each: shape ``(k, d)``."""
+    scale = np.maximum(values.std(axis=0), np.finfo(float).tiny)
+    every = -(-len(values) // MOST_NODES)
+    nodes = (values[::every] - values.mean(axis=0)) / scale
+    count, dimension = nodes.shape
+    together = max(2 * relaxation / every, 1.0)
+    independent = max((count / together) ** (4 / (4 + dimension)) / 4, LEAST_NEIGHBOURS)
+    neighbours = int(min(independent * together, count // 4))
+    if neighbours < LEAST_NEIGHBOURS:
+        return np.median(values, axis=0)[None]
+    distance, near = cKDTree(nodes).query(nodes, k=neighbours + 1)
+    density = -dimension * np.log(distance[:, -1])
+    needed = FALSE_WELL * np.sqrt(2 * together / neighbours)
+    linked = near[:, 1 :: max(neighbours // LINKS, 1)] if dimension == 1 else near[:, 1 : LINKS + 1]
+    parent = np.full(count, -1)
+
+    def top(node: int) -> int:
+        while parent[node] != node:
+            node = parent[node]
+        return node
+
+    for node in np.argsort(-density):
+        tops = sorted(
+            {top(other) for other in linked[node] if parent[other] >= 0}, key=lambda one: -density[one]
+        )
+        parent[node] = tops[0] if tops else node
+        for lower in tops[1:]:
+            if density[lower] - density[node] < needed:
+                parent[lower] = tops[0]
+    well = np.array([top(node) for node in range(count)])
+    kept = [one for one in np.unique(well) if (well == one).sum() >= neighbours / 2]
+    places = np.array([np.median(values[::every][well == one], axis=0) for one in kept])
+    return places[np.lexsort(places.T[::-1])]
+
+
+class _Levels(NamedTuple):
+    """A hidden Markov model of normal distributions about levels."""
+
+    centre: np.ndarray  # (k,), rising
+    spread: np.ndarray  # (k,)
+    weights: np.ndarray  # (n, k): probability of each state at each sample; zero where there is none
+    path: np.ndarray  # (n,): the likeliest, -1 where there is none
+    counts: np.ndarray  # (k, k): expected transitions
+
+    def left(self, series: np.ndarray, runs: list[slice]) -> tuple[float, float]:
+        """What levels leave of a series: its share of the covariance of neighbours, and their correlation."""
+        known, mean = self.path >= 0, float(series.mean())
+        moved, rest = (np.where(known, series - one, 0.0) for one in (mean, self.weights @ self.centre))
+        whole, left = (sum(float(one[run][:-1] @ one[run][1:]) for run in runs) for one in (moved, rest))
+        return left / max(whole, 1e-300), left / max(float(rest @ rest), 1e-300)
+
+
+def _levels_of(series: np.ndarray, runs: list[slice], centre: np.ndarray) -> _Levels | None:
+    """Levels of a series ``(n,)``, from a first guess ``(k,)``, by deeptime's hidden Markov model.
+
+    None where it is degenerate.
+    """
+    from deeptime.markov.hmm import GaussianOutputModel, HiddenMarkovModel, MaximumLikelihoodHMM
+    from deeptime.markov.msm import MarkovStateModel
+
+    states, scale = len(centre), max(float(series.std()), 1e-300)
+    shift = float(series.mean())
+    near = np.abs(series[:, None] - centre).argmin(axis=1)
+    spread = [
+        max(float(series[near == k].std() if (near == k).any() else 0.0), 1e-2 * scale) for k in range(states)
+    ]
+    transition = np.full((states, states), 0.1 / states) + 0.9 * np.eye(states)
+    guess = HiddenMarkovModel(
+        MarkovStateModel(transition),
+        GaussianOutputModel(states, (centre - shift) / scale, np.array(spread) / scale),
+        initial_distribution=np.full(states, 1 / states),
+    )
+    used = [run for run in runs if run.stop - run.start > 1]
+    estimator = MaximumLikelihoodHMM(
+        guess, 1, reversible=False, accuracy=1e-6 * len(series) ** 0.5, maxit=MOST_ITERATIONS
+    )
+    try:
+        fitted = estimator.fit([(series[run] - shift) / scale for run in used]).fetch_model()
+    except (AssertionError, RuntimeError, ValueError):  # a state of hardly any samples, whose spread is lost
+        return None
+    order = np.argsort(fitted.output_model.means)
+    weights, path = np.zeros((len(series), states)), np.full(len(series), -1)
+    for run, own, likeliest in zip(
+        used, fitted.state_probabilities, fitted.hidden_state_trajectories, strict=True
+    ):
+        weights[run], path[run] = own[:, order], np.argsort(order)[likeliest]
+    centre, spread = (
+        fitted.output_model.means[order] * scale + shift,
+        fitted.output_model.sigmas[order] * scale,
+    )
+    return _Levels(centre, spread, weights, path, fitted.transition_counts[order][:, order])
+
+
+def path_of(
+    values: np.ndarray, runs: list[slice], relaxation: float, *, column: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, int]:
+    """Places of the states ``(k, d)``, the path ``(n,)``, expected transitions, and wells of the density.
+
+    Parameters
+    ----------
+    values, runs, relaxation
+        Samples ``(n, d)`` without a drifting background, rows without a gap, and the relaxation time in
+        samples.
+    column
+        The quantity that shows the states best. There are at least two, by other tests.
+
+    Returns
+    -------
+    tuple
+        The path is -1 before a state was reached. Transitions between samples ``(k, k)`` are those of a
+        hidden Markov model, None where the path goes from core to core.
+    """
+    series = values[:, column]
+    width = max(int(AVERAGING_TIME * relaxation), 1)
+    smooth = np.empty_like(values)
+    for run in runs:
+        smooth[run] = ndimage.uniform_filter1d(values[run], width, axis=0, mode="nearest")
+    # Values of a counter or a digitiser have no nearest neighbours.
+    steps = np.array([resolution_step(one) or 0.0 for one in values.T])
+    draw = np.random.default_rng(0)
+    wells = _wells_of(smooth + steps * (draw.random(values.shape) - 0.5), relaxation)
+    alone = wells[:, [column]] if values.shape[1] == 1 else _wells_of(smooth[:, [column]], relaxation)
+
+    def guess(states: int) -> np.ndarray:
+        low, high = np.quantile(series, [0.05, 0.95])
+        evenly = np.linspace(low, high, states)
+        return np.sort(alone[:, 0]) if len(alone) == states else evenly
+
+    most = _first(runs, MOST_SAMPLES)
+    for states in range(max(len(alone), 2), MOST_STATES + 1):
+        if (levels := _levels_of(series, most, guess(states))) is None:
+            break
+        share, correlation = levels.left(series, most)
+        # With levels enough any motion is cut into pieces that look white; wells of the density are no such.
+        limit = SMOOTH if states == len(alone) else 2 * WHITE_CORRELATION
+        if correlation > SMOOTH and states > max(len(alone), 2):
+            break
+        if share < WHITE_CORRELATION and correlation < limit:
+            levels = _levels_of(series, runs, levels.centre) or levels
+            path, blurred = _without_blurred(levels.path, runs, states)
+            return _places(values, levels.path, states), path, None if blurred else levels.counts, len(wells)
+    if len(wells) <= max(len(alone), 2):
+        states = max(len(alone), 2)
+        means: list[np.ndarray] = []
+        rows: list[slice] = []
+        for run in runs:
+            begins = np.arange(run.start, run.stop - width + 1, width)
+            if len(begins) > 1:
+                first = rows[-1].stop if rows else 0
+                rows.append(slice(first, first + len(begins)))
+                means.append(series[begins[:, None] + np.arange(width)].mean(axis=1))
+        if not means or not np.ptp(guess(states)) > 0:
+            return np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None, len(wells)
+        levels = _levels_of(np.concatenate(means), rows, guess(states))
+        centre = guess(states) if levels is None else levels.centre
+        distance = np.abs(series[:, None] - centre)
+        near = distance.argmin(axis=1)
+        inside = distance[np.arange(len(series)), near] <= _medians(distance, near)[near]
+        # Beyond the outermost levels a sample is in the state as at the level itself.
+        core = np.where(inside, near, -1)
+        core[series <= centre[0]], core[series >= centre[-1]] = 0, states - 1
+        core[(core == 0) & (series > centre[0])] = -1
+        core[(core == states - 1) & (series < centre[-1])] = -1
+        places = _places(values, near, states)
+        places[:, column] = centre
+        return places, continued_visits(core, runs), None, len(wells)
+    wells = wells[np.argsort(wells[:, column])]
+    distance = np.linalg.norm((values[:, None] - wells) / positive(values.std(axis=0)), axis=2)
+    near = distance.argmin(axis=1)
+    core = np.where(distance[np.arange(len(near)), near] <= _medians(distance, near)[near], near, -1)
+    places = _places(values, near, len(wells))
+    return places, continued_visits(core, runs), None, len(wells)
+
+
+def _without_blurred(path: np.ndarray, runs: list[slice], states: int) -> tuple[np.ndarray, bool]:
+    """The path without visits of a single sample, where these are more than hops within a sample explain."""
+    for stays in stays_of(path, runs, states):
+        longer = stays[stays > 1]
+        if len(longer) < FEWEST_STAYS:
+            continue
+        ended = 1 / float((longer - 1).mean())  # of a geometric law, after each sample
+        expected = len(longer) * ended / max(1 - ended, 1e-9)
+        if (stays == 1).sum() > expected + FALSE_WELL * np.sqrt(expected * (1 + expected / len(longer))):
+            break
+    else:
+        return path, False
+    core = np.full(len(path), -1)
+    for run in runs:
+        lasts = np.diff(path[run]) == 0
+        core[run] = np.where(np.append(lasts, False) | np.append(False, lasts), path[run], -1)
+    return continued_visits(core, runs), True
+
+
+def _first(runs: list[slice], most: int) -> list[slice]:
+    """The first runs that have so many samples together, the last of them cut."""
+    found: list[slice] = []
+    for run in runs:
+        if most <= 1:
+            break
+        found.append(slice(run.start, min(run.stop, run.start + most)))
+        most -= run.stop - run.start
+    return found
+
+
+def _places(values: np.ndarray, core: np.ndarray, states: int) -> np.ndarray:
+    middle = np.median(values, axis=0)
+    return np.array(
+        [np.median(values[core == k], axis=0) if (core == k).any() else middle for k in range(states)]
+    )
+
+
+def _medians(distance: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Of the distances of samples from the state that is nearest: half of them make its core."""
+    return np.array(
+        [np.median(distance[near == k, k]) if (near == k).any() else 0.0 for k in range(distance.shape[1])]
+    )
+
+
+def continued_visits(core: np.ndarray, runs: list[slice]) -> np.ndarray:
+    """Which core was entered last, at every sample of a run; a core ``(n,)`` is -1 where there is none."""
+    visits = np.full(len(core), -1)
+    for run in runs:
+        part = core[run]
+        last = np.maximum.accumulate(np.where(part >= 0, np.arange(len(part)), -1))
+        visits[run] = np.where(last >= 0, part[np.maximum(last, 0)], -1)
+    return visits
+
+
+def stays_of(path: np.ndarray, runs: list[slice], states: int) -> list[np.ndarray]:
+    """Lengths, in samples, of the visits to each state that were seen from begin to end."""
+    found: list[list[np.ndarray]] = [[] for _ in range(states)]
+    for run in runs:
+        part = path[run]
+        turns = np.flatnonzero(np.diff(part)) + 1
+        lengths, visited = np.diff(turns), part[turns[:-1]]
+        for state in range(states):
+            found[state].append(lengths[visited == state])
+    return [np.concatenate(one) if one else np.zeros(0) for one in found]
+
+
+def exponential(stays: np.ndarray) -> bool | None:
+    """Whether stays, in samples, are spread as exponential times; None of too few to tell.
+
+    The shortest one is the dead time, and is taken off; a stay may have ended at any time within its last
+    step.
+    """
+    if len(stays) < FEWEST_STAYS:
+        return None
+    draw = np.random.default_rng(0)
+    times = np.sort(stays - stays.min() + draw.random(len(stays)))
+    count = len(times)
+    law = -np.expm1(-times / times.mean())
+    distance = max((np.arange(1, count + 1) / count - law).max(), (law - np.arange(count) / count).max())
+    return bool((distance - 0.2 / count) * (np.sqrt(count) + 0.26 + 0.5 / np.sqrt(count)) < STEPHENS)
+
+
+class MarkovModel(NamedTuple):
+    """Hops between states as a Markov process."""
+
+    lag: float  #: in samples: the shortest at which later hops are foreseen
+    chance: float  #: of hops as far from those foreseen, if it is Markovian at this lag
+    stays: np.ndarray  #: (k, 3): mean times between hops, in samples, and the ends of their intervals
+    rates: np.ndarray  #: (k, k): from state to state, per sample
+
+
+def markov_model(
+    path: np.ndarray, runs: list[slice], states: int, counts: np.ndarray | None
+) -> MarkovModel | None:
+    """The Markov model of a path at the shortest lag that its test allows; None where there is none.
+
+    `counts` are transitions from sample to sample, where a hidden Markov model knows them better.
+    """
+    from deeptime.markov import TransitionCountEstimator
+
+    pieces = [part[part >= 0] for part in (path[run] for run in runs)]
+    stays = [one.mean() if len(one) else len(path) for one in stays_of(path, runs, states)]
+
+    def counted(lag: int) -> np.ndarray:
+        longer = [part for part in pieces if len(part) > lag]
+        if not longer:
+            return np.zeros((states, states))
+        model = TransitionCountEstimator(lag, "sliding", n_states=states).fit(longer).fetch_model()
+        return (
+            np.asarray(
+                model.count_matrix.toarray() if hasattr(model.count_matrix, "toarray") else model.count_matrix
+            )
+            / lag
+        )
+
+    for lag in 2 ** np.arange(max(int(np.log2(max(min(stays), 1))), 0) + 1):
+        own = counts if counts is not None and lag == 1 else counted(int(lag))
+        hops = own - np.diag(np.diag(own))
+        if sparse.csgraph.connected_components(hops >= 1, connection="strong")[0] > 1:
+            return None
+        # Rows of the transition matrix have Dirichlet's distribution; the prior is no hop at all.
+        drawn = np.random.default_rng(0).standard_gamma(own, size=(DRAWS, states, states))
+        drawn /= drawn.sum(axis=2, keepdims=True)
+        usual = own / own.sum(axis=1, keepdims=True)
+        worst = 0.0
+        # Up to the time that visits last: before, hardly anything hops, and any model passes.
+        multiples = 2 ** np.arange(1, max(int(np.log2(max(max(stays) / lag, 2))), 1) + 1)
+        for multiple in multiples:
+            later = counted(int(lag * multiple))
+            visits = later.sum(axis=1, keepdims=True)
+            if (visits < 1).any():
+                continue
+            seen = later / visits
+            foreseen = np.linalg.matrix_power(usual, int(multiple))
+            spread = (
+                np.linalg.matrix_power(drawn, int(multiple)).var(axis=0) + foreseen * (1 - foreseen) / visits
+            )
+            worst = max(worst, float((np.abs(seen - foreseen) / np.sqrt(np.maximum(spread, 1e-12))).max()))
+        chance = min(2 * float(special.ndtr(-worst)) * states * (states - 1) * len(multiples), 1.0)
+        if chance > REFUSED:
+            times = np.array([-1 / np.diag(_generator(one)) for one in drawn]) * lag
+            tail = (1 - CONFIDENCE) / 2
+            rates = _generator(usual) / lag
+            limits = np.quantile(times, [tail, 1 - tail], axis=0)
+            return MarkovModel(int(lag), chance, np.column_stack([-1 / np.diag(rates), *limits]), rates)
+    return None
+
+
+def _generator(transition: np.ndarray) -> np.ndarray:
+    """log P, or ``P - 1`` where that is none of a Markov process."""
+    found = np.asarray(scipy.linalg.logm(transition))
+    return (
+        found.real
+        if np.isrealobj(found) or np.abs(found.imag).max() < 1e-9
+        else transition - np.eye(len(transition))
+    )
+
+
+class Profile(NamedTuple):
+    """Free energy along a state, in units of kT, or of ε: ``-log p`` less its least value."""
+
+    place: np.ndarray  #: (b,): middles of the bins that were visited
+    height: np.ndarray  #: (b,)
+    error: np.ndarray  #: (b,): standard errors, by independent visits
+    curvatures: (
+        np.ndarray
+    )  #: (k,): at the bottom of each state, per unit of the state squared; NaN where unknown
+    tops: (
+        np.ndarray
+    )  #: (k - 1, 4): above the lower neighbour, its error, above the upper neighbour, its error
+
+
+def profile_of(series: np.ndarray, runs: list[slice], path: np.ndarray, places: np.ndarray) -> Profile:
+    """The profile of a series ``(n,)`` between its quantiles; the states' places ``(k,)`` rise."""
+    low, high = np.quantile(series, [OUTSIDE, 1 - OUTSIDE])
+    counts, edges = np.histogram(series, bins=PROFILE_BINS, range=(float(low), float(high)))
+    bins = np.clip(np.searchsorted(edges, series, side="right") - 1, 0, PROFILE_BINS - 1)
+    inside = (series >= low) & (series <= high)
+    place, kept = (edges[1:] + edges[:-1]) / 2, np.flatnonzero(counts >= 2)
+    some = runs[:: -(-len(runs) // MOST_RUNS)]
+    independent = [
+        counts[one] / (2 * correlated_samples(((bins == one) & inside).astype(float), some)) for one in kept
+    ]
+    error = 1 / np.sqrt(np.maximum(independent, 1.0))
+    height = -np.log(counts[kept] / counts.max())
+    place = place[kept]
+    bottoms = [
+        int(np.argmin(np.where(np.abs(place - one) <= _reach(series, path, k), height, np.inf)))
+        for k, one in enumerate(places)
+    ]
+    curvatures = np.full(len(places), np.nan)
+    for k, bottom in enumerate(bottoms):
+        near = (height < height[bottom] + 1) & (np.abs(place - places[k]) <= 2 * _reach(series, path, k))
+        if near.sum() >= FEWEST_BINS:
+            curvatures[k] = 2 * np.polyfit(place[near] - place[bottom], height[near], 2, w=1 / error[near])[0]
+    tops = []
+    for first, second in pairwise(bottoms):
+        between = slice(min(first, second), max(first, second) + 1)
+        top = between.start + int(np.argmax(height[between]))
+        tops.append(
+            [
+                one
+                for end in (first, second)
+                for one in (height[top] - height[end], np.hypot(error[top], error[end]))
+            ]
+        )
+    return Profile(place, height, error, curvatures, np.array(tops).reshape(-1, 4))
+
+
+def _reach(series: np.ndarray, path: np.ndarray, state: int) -> float:
+    """How far a state spreads about its place."""
+    inside = series[path == state]
+    return float(inside.std()) if len(inside) else 0.0
+
+
+def stationary(path: np.ndarray, runs: list[slice], states: int) -> bool:
+    """Whether both halves of a record spend the same share of time in each state, within their errors."""
+    known = np.flatnonzero(path >= 0)
+    halves = known[: len(known) // 2], known[len(known) // 2 :]
+    for state in range(states):
+        rest = np.zeros(len(path))
+        shares = [float((path[half] == state).mean()) if len(half) else 0.0 for half in halves]
+        for half, share in zip(halves, shares, strict=True):
+            rest[half] = (path[half] == state) - share
+        some = runs[:: -(-len(runs) // MOST_RUNS)]
+        error = 2 * float(rest.std()) * np.sqrt(2 * correlated_samples(rest, some) / max(len(known), 1))
+        if abs(shares[1] - shares[0]) > float(special.ndtri(1 - REFUSED / states / 2)) * error:
+            return False
+    return True

@@ -1,0 +1,142 @@
+"""The ladder of a record: how many states, their profile, and a Markov model of the hops, each tested."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import scipy.linalg
+from scipy.signal import lfilter
+
+from siq.data.inspection import inspect
+from siq.data.kinetics import markov_model
+from siq.data.recordings import Recordings
+from siq.data.stationarity import runs_of
+from siq.data.two_states import DwellCount, RecordStates, switching
+from siq.remarks import Remark
+
+RATES = np.array([[-0.10, 0.06, 0.04], [0.10, -0.15, 0.05], [0.05, 0.10, -0.15]])
+"""Per sample: stays of 10, 6.7 and 6.7 of them."""
+
+
+def chain(seed: int, rates: np.ndarray, count: int) -> np.ndarray:
+    """States of a jump process, seen once a step."""
+    generator = np.random.default_rng(seed)
+    reached = np.cumsum(scipy.linalg.expm(rates), axis=1)
+    draws, path = generator.random(count), np.zeros(count, dtype=int)
+    for k in range(1, count):
+        path[k] = min(int(np.searchsorted(reached[path[k - 1]], draws[k])), len(rates) - 1)
+    return path
+
+
+def recorded(values: np.ndarray) -> Recordings:
+    values = values.reshape(len(values), -1)
+    return Recordings.from_arrays(np.arange(float(len(values))), values, names=["x", "y"][: values.shape[1]])
+
+
+def noise(seed: int, count: int, memory: float = 0.0) -> np.ndarray:
+    """Of standard deviation 1, with so much left of it after a step."""
+    kicks = np.sqrt(1 - memory**2) * np.random.default_rng(1000 + seed).standard_normal(count)
+    return np.asarray(lfilter([1.0], [1.0, -memory], kicks))
+
+
+def found_in(values: np.ndarray) -> RecordStates:
+    found = switching(recorded(values))
+    assert found is not None
+    return found
+
+
+def test_intervals_of_stays_cover() -> None:
+    truth, counted, modelled = -1 / np.diag(RATES), [], []
+    for seed in range(40):
+        path = chain(seed, RATES, 1500)
+        runs = [slice(0, len(path))]
+        model = markov_model(path, runs, 3, None)
+        assert model is not None and model.lag == 1
+        modelled += [low <= one <= high for one, (_, low, high) in zip(truth, model.stays, strict=True)]
+        # What is seen once a step hops less: its stays are those of the chain.
+        seen = 1 / (1 - np.diag(scipy.linalg.expm(RATES)))
+        counts = DwellCount.of_visits(np.arange(float(len(path))), path, runs, states=3)
+        counted += [one.limits[0] <= mean <= one.limits[1] for one, mean in zip(counts, seen, strict=True)]
+    assert np.mean(counted) > 0.9 and np.mean(modelled) > 0.88
+
+
+@pytest.mark.parametrize("power", [1, 3])
+def test_one_well_is_never_two(power: int) -> None:
+    step, seeds = 0.05, 20
+    kicks = np.sqrt(0.5 * step) * np.random.default_rng(power).standard_normal((4000, seeds))
+    x = np.zeros((4000, seeds))
+    for k in range(1, len(x)):
+        x[k] = x[k - 1] - step * x[k - 1] ** power + kicks[k]
+    assert not any(found_in(one).supported for one in x.T)
+
+
+def test_three_levels_that_noise_blurs() -> None:
+    path = chain(0, RATES, 20_000)
+    found = found_in(path + 0.2 * noise(0, len(path)))
+    assert found.supported and found.rung == 3 and found.markov is not None
+    assert found.levels == pytest.approx((0, 1, 2), abs=0.05)
+    assert found.markov.stays[:, 0] == pytest.approx(-1 / np.diag(RATES), rel=0.15)
+    assert all(one in (True, None) for one in found.exponential)
+    stored = json.loads(json.dumps(found.as_data(), allow_nan=False))
+    assert RecordStates.from_data(stored).sentence() == found.sentence()
+    assert "has three states of x" in found.sentence()
+
+
+def test_three_states_in_two_dimensions() -> None:
+    path = chain(1, RATES / 20, 20_000)
+    corners = np.array([[-1.0, -0.5], [0.0, 1.0], [1.0, -0.5]])
+    x = corners[path] + 0.2 * np.column_stack([noise(seed, len(path), memory=0.8) for seed in (1, 2)])
+    found = found_in(x)
+    assert found.supported and len(found.counts) == 3 and found.rung == 3
+    order = np.argsort(found.places[:, 0])
+    assert found.places[order] == pytest.approx(corners, abs=0.1)
+    turns = np.flatnonzero(np.diff(path))
+    assert found.transitions == pytest.approx(len(turns), rel=0.1)
+    assert "(−1.0" in found.sentence() or "(−0.9" in found.sentence()
+
+
+def states_of_noise(path: np.ndarray) -> RecordStates:
+    return found_in(path + 0.1 * noise(5, len(path)))
+
+
+def test_a_record_whose_stays_change_ends_on_the_first_rung() -> None:
+    pair = np.array([[-0.1, 0.1], [0.02, -0.02]])
+    found = states_of_noise(np.concatenate([chain(2, pair, 4000), chain(3, pair[::-1, ::-1], 4000)]))
+    assert found.rung == 1 and found.limit == Remark("data.not_stationary")
+    assert found.profile is None and found.markov is None
+
+
+def test_hops_that_depend_on_what_was_not_recorded_end_on_the_second_rung() -> None:
+    # Two hidden states in each seen one: stays are long or short for a while.
+    rates = np.zeros((4, 4))
+    rates[0, 1] = rates[1, 0] = 0.2
+    rates[2, 3] = rates[3, 2] = 0.01
+    rates[0, 2] = rates[2, 0] = rates[1, 3] = rates[3, 1] = 0.002
+    found = states_of_noise(chain(4, rates - np.diag(rates.sum(axis=1)), 40_000) % 2)
+    assert found.rung == 2 and found.limit == Remark("data.not_markov") and found.markov is None
+    assert False in found.exponential
+    assert found.profile is not None and (found.profile.tops[:, ::2] > 2).all()
+
+
+def test_baselines_that_differ_are_given_one_each() -> None:
+    pair = np.array([[-0.06, 0.06], [0.10, -0.10]])
+    path = np.array([chain(seed, pair, 4000) for seed in range(4)])
+    x = 3.0 * path + 0.2 * np.array([noise(seed, 4000) for seed in range(4)])
+    offsets = np.array([0.0, 0.1, -0.1, 0.15])
+    names = ["x"]
+    together = Recordings.from_arrays(np.arange(4000.0), (x + offsets[:, None])[:, :, None], names=names)
+    found = switching(together)
+    assert found is not None and found.offset == pytest.approx(0.25, abs=0.05)
+    assert "differ in their baselines" in found.sentence()
+    alike = switching(Recordings.from_arrays(np.arange(4000.0), x[:, :, None], names=names))
+    assert alike is not None and alike.offset == 0
+
+
+def test_an_inspection_tells_the_rungs() -> None:
+    path = chain(0, RATES, 6000)
+    found = inspect(recorded(path + 0.1 * noise(0, len(path))))
+    assert found.switching is not None and found.switching.rung == 3
+    assert len(runs_of(found.recordings)) == 1
+    assert "The hops are a Markov process" in found.text()
