@@ -32,9 +32,9 @@ from siq.inference.kalman_filter import Grid, Noise, linearise, whiten
 from siq.inference.kalman_identification import of_all_states
 from siq.inference.library import IdentificationOptions
 from siq.inference.maximum_likelihood import fit_by_filter
-from siq.inference.observation import seen_positions, smoothed_motion, unbroken
+from siq.inference.observation import _seen_positions, smoothed_motion, unbroken
 from siq.numerics.files import whole_file
-from siq.quasipotential.transitions import barrier_uncertainty, ways_out
+from siq.quasipotential.transitions import _barrier_uncertainty, ways_out
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, symbol
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
@@ -111,7 +111,7 @@ def information(particle: Particle, recordings: Recordings) -> np.ndarray:
     force = sympy.Add(*(symbol(name) * term for name, term in zip(names, terms, strict=True)))
     values = np.array([1.0, -1.0, -particle.friction])
     parameters = tuple(Parameter(n, float(one)) for n, one in zip(names, values, strict=True))
-    model = seen_positions(
+    model = _seen_positions(
         Dynamics(("x", "v_x"), (sympy.S.Zero, force), Diffusion.identity(2), parameters=parameters)
     )
     known = replace(model, parameters=tuple(replace(each, fixed=True) for each in parameters))
@@ -174,7 +174,7 @@ def only_barriers(particle: Particle, seed: int) -> dict[str, object]:
     barriers, errors = [], []
     for way in ways_out(record.dynamics, portrait):
         if way.path is not None:
-            error, by_rivals = barrier_uncertainty(way.path, record)
+            error, by_rivals = _barrier_uncertainty(way.path, record)
             barriers.append(way.path.action + by_rivals)
             errors.append(error)
     return {

@@ -16,7 +16,7 @@ import time
 import numpy as np
 
 from siq.systems.diffusion import Diffusion
-from siq.validation.mesh import MeshQuasipotential, mesh_quasipotential
+from siq.validation.mesh import _MeshQuasipotential, mesh_quasipotential
 
 BOX = np.array([[-2.0, 0.0], [-1.0, 1.0]])
 COUNTS = (64, 128, 256, 512)
@@ -28,7 +28,7 @@ def potential(x: np.ndarray) -> np.ndarray:
     return (x[..., 0] ** 2 - 1) ** 2 / 2 + x[..., 1] ** 2 / 2
 
 
-def solve(rotation: float, count: int, *, as_published: bool) -> MeshQuasipotential:
+def solve(rotation: float, count: int, *, as_published: bool) -> _MeshQuasipotential:
     """V on a mesh of `count` widths each way."""
 
     def field(x: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ import sympy
 from benchmarks.proof.keys import CaseKey
 from siq.diagnosis.dictionary import Form, FurtherState, Mechanism, MechanismParameter
 from siq.diagnosis.dictionary import Role as RoleKind
-from siq.diagnosis.mechanisms import MechanismCandidate, build_candidate
+from siq.diagnosis.mechanisms import MechanismCandidate, _build_candidate
 from siq.diagnosis.study import Comparison
 from siq.errors import NumericalFailure
 from siq.inference.recalibration import fit_with_process_noise_as_needed, recalibrate
@@ -152,7 +152,7 @@ def built(model: Dynamics, key: CaseKey) -> MechanismCandidate:
         coordinate="t",
     )
     mechanism = Mechanism(name=key.mechanism or "none", sentence="", forms=(form,))
-    candidate = build_candidate(model, mechanism, form, {name: name for name in roles})
+    candidate = _build_candidate(model, mechanism, form, {name: name for name in roles})
     if candidate is None:
         raise ValueError("the key's effect changes nothing in the simulation")
     return candidate

@@ -21,7 +21,7 @@ import pandas as pd
 from matplotlib import pyplot
 
 import siq
-from siq.data.two_states import RecordStates
+from siq.data.states import RecordStates
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "images" / "real-records"

@@ -30,7 +30,7 @@ from siq.data.recordings import (
     SINGLE_RECORDING_REMEDY,
     Recordings,
 )
-from siq.data.two_states import RecordStates, switching
+from siq.data.states import RecordStates, switching
 from siq.numerics.randomness import positive
 from siq.remarks import Remark, sentence
 

@@ -315,62 +315,61 @@ class MarkovModel(NamedTuple):
     stays: np.ndarray  #: (k, 3): mean times between hops, in samples, and the ends of their intervals
     rates: np.ndarray  #: (k, k): from state to state, per sample
 
+    @classmethod
+    def of(
+        cls, path: np.ndarray, runs: list[slice], states: int, counts: np.ndarray | None
+    ) -> MarkovModel | None:
+        """The Markov model of a path at the shortest lag that its test allows; None where there is none.
 
-def markov_model(
-    path: np.ndarray, runs: list[slice], states: int, counts: np.ndarray | None
-) -> MarkovModel | None:
-    """The Markov model of a path at the shortest lag that its test allows; None where there is none.
+        `counts` are transitions from sample to sample, where a hidden Markov model knows them better.
+        """
+        from deeptime.markov import TransitionCountEstimator
 
-    `counts` are transitions from sample to sample, where a hidden Markov model knows them better.
-    """
-    from deeptime.markov import TransitionCountEstimator
+        pieces = [part[part >= 0] for part in (path[run] for run in runs)]
+        stays = [one.mean() if len(one) else len(path) for one in stays_of(path, runs, states)]
 
-    pieces = [part[part >= 0] for part in (path[run] for run in runs)]
-    stays = [one.mean() if len(one) else len(path) for one in stays_of(path, runs, states)]
+        def counted(lag: int) -> np.ndarray:
+            longer = [part for part in pieces if len(part) > lag]
+            if not longer:
+                return np.zeros((states, states))
+            model = TransitionCountEstimator(lag, "sliding", n_states=states).fit(longer).fetch_model()
+            found = model.count_matrix
+            return np.asarray(found.toarray() if sparse.issparse(found) else found) / lag
 
-    def counted(lag: int) -> np.ndarray:
-        longer = [part for part in pieces if len(part) > lag]
-        if not longer:
-            return np.zeros((states, states))
-        model = TransitionCountEstimator(lag, "sliding", n_states=states).fit(longer).fetch_model()
-        return (
-            np.asarray(
-                model.count_matrix.toarray() if hasattr(model.count_matrix, "toarray") else model.count_matrix
-            )
-            / lag
-        )
-
-    for lag in 2 ** np.arange(max(int(np.log2(max(min(stays), 1))), 0) + 1):
-        own = counts if counts is not None and lag == 1 else counted(int(lag))
-        hops = own - np.diag(np.diag(own))
-        if sparse.csgraph.connected_components(hops >= 1, connection="strong")[0] > 1:
-            return None
-        # Rows of the transition matrix have Dirichlet's distribution; the prior is no hop at all.
-        drawn = np.random.default_rng(0).standard_gamma(own, size=(DRAWS, states, states))
-        drawn /= drawn.sum(axis=2, keepdims=True)
-        usual = own / own.sum(axis=1, keepdims=True)
-        worst = 0.0
-        # Up to the time that visits last: before, hardly anything hops, and any model passes.
-        multiples = 2 ** np.arange(1, max(int(np.log2(max(max(stays) / lag, 2))), 1) + 1)
-        for multiple in multiples:
-            later = counted(int(lag * multiple))
-            visits = later.sum(axis=1, keepdims=True)
-            if (visits < 1).any():
-                continue
-            seen = later / visits
-            foreseen = np.linalg.matrix_power(usual, int(multiple))
-            spread = (
-                np.linalg.matrix_power(drawn, int(multiple)).var(axis=0) + foreseen * (1 - foreseen) / visits
-            )
-            worst = max(worst, float((np.abs(seen - foreseen) / np.sqrt(np.maximum(spread, 1e-12))).max()))
-        chance = min(2 * float(special.ndtr(-worst)) * states * (states - 1) * len(multiples), 1.0)
-        if chance > REFUSED:
-            times = np.array([-1 / np.diag(_generator(one)) for one in drawn]) * lag
-            tail = (1 - CONFIDENCE) / 2
-            rates = _generator(usual) / lag
-            limits = np.quantile(times, [tail, 1 - tail], axis=0)
-            return MarkovModel(int(lag), chance, np.column_stack([-1 / np.diag(rates), *limits]), rates)
-    return None
+        for lag in 2 ** np.arange(max(int(np.log2(max(min(stays), 1))), 0) + 1):
+            own = counts if counts is not None and lag == 1 else counted(int(lag))
+            hops = own - np.diag(np.diag(own))
+            if sparse.csgraph.connected_components(hops >= 1, connection="strong")[0] > 1:
+                return None
+            # Rows of the transition matrix have Dirichlet's distribution; the prior is no hop at all.
+            drawn = np.random.default_rng(0).standard_gamma(own, size=(DRAWS, states, states))
+            drawn /= drawn.sum(axis=2, keepdims=True)
+            usual = own / own.sum(axis=1, keepdims=True)
+            worst = 0.0
+            # Up to the time that visits last: before, hardly anything hops, and any model passes.
+            multiples = 2 ** np.arange(1, max(int(np.log2(max(max(stays) / lag, 2))), 1) + 1)
+            for multiple in multiples:
+                later = counted(int(lag * multiple))
+                visits = later.sum(axis=1, keepdims=True)
+                if (visits < 1).any():
+                    continue
+                seen = later / visits
+                foreseen = np.linalg.matrix_power(usual, int(multiple))
+                spread = (
+                    np.linalg.matrix_power(drawn, int(multiple)).var(axis=0)
+                    + foreseen * (1 - foreseen) / visits
+                )
+                worst = max(
+                    worst, float((np.abs(seen - foreseen) / np.sqrt(np.maximum(spread, 1e-12))).max())
+                )
+            chance = min(2 * float(special.ndtr(-worst)) * states * (states - 1) * len(multiples), 1.0)
+            if chance > REFUSED:
+                times = np.array([-1 / np.diag(_generator(one)) for one in drawn]) * lag
+                tail = (1 - CONFIDENCE) / 2
+                rates = _generator(usual) / lag
+                limits = np.quantile(times, [tail, 1 - tail], axis=0)
+                return cls(int(lag), chance, np.column_stack([-1 / np.diag(rates), *limits]), rates)
+        return None
 
 
 def _generator(transition: np.ndarray) -> np.ndarray:
@@ -389,49 +388,48 @@ class Profile(NamedTuple):
     place: np.ndarray  #: (b,): middles of the bins that were visited
     height: np.ndarray  #: (b,)
     error: np.ndarray  #: (b,): standard errors, by independent visits
-    curvatures: (
-        np.ndarray
-    )  #: (k,): at the bottom of each state, per unit of the state squared; NaN where unknown
-    tops: (
-        np.ndarray
-    )  #: (k - 1, 4): above the lower neighbour, its error, above the upper neighbour, its error
+    curvatures: np.ndarray  #: (k,): at the bottom of each state, per square of its unit; NaN where unknown
+    tops: np.ndarray  #: (k - 1, 4): above the lower neighbour, its error, above the upper one, its error
 
-
-def profile_of(series: np.ndarray, runs: list[slice], path: np.ndarray, places: np.ndarray) -> Profile:
-    """The profile of a series ``(n,)`` between its quantiles; the states' places ``(k,)`` rise."""
-    low, high = np.quantile(series, [OUTSIDE, 1 - OUTSIDE])
-    counts, edges = np.histogram(series, bins=PROFILE_BINS, range=(float(low), float(high)))
-    bins = np.clip(np.searchsorted(edges, series, side="right") - 1, 0, PROFILE_BINS - 1)
-    inside = (series >= low) & (series <= high)
-    place, kept = (edges[1:] + edges[:-1]) / 2, np.flatnonzero(counts >= 2)
-    some = runs[:: -(-len(runs) // MOST_RUNS)]
-    independent = [
-        counts[one] / (2 * correlated_samples(((bins == one) & inside).astype(float), some)) for one in kept
-    ]
-    error = 1 / np.sqrt(np.maximum(independent, 1.0))
-    height = -np.log(counts[kept] / counts.max())
-    place = place[kept]
-    bottoms = [
-        int(np.argmin(np.where(np.abs(place - one) <= _reach(series, path, k), height, np.inf)))
-        for k, one in enumerate(places)
-    ]
-    curvatures = np.full(len(places), np.nan)
-    for k, bottom in enumerate(bottoms):
-        near = (height < height[bottom] + 1) & (np.abs(place - places[k]) <= 2 * _reach(series, path, k))
-        if near.sum() >= FEWEST_BINS:
-            curvatures[k] = 2 * np.polyfit(place[near] - place[bottom], height[near], 2, w=1 / error[near])[0]
-    tops = []
-    for first, second in pairwise(bottoms):
-        between = slice(min(first, second), max(first, second) + 1)
-        top = between.start + int(np.argmax(height[between]))
-        tops.append(
-            [
-                one
-                for end in (first, second)
-                for one in (height[top] - height[end], np.hypot(error[top], error[end]))
-            ]
-        )
-    return Profile(place, height, error, curvatures, np.array(tops).reshape(-1, 4))
+    @classmethod
+    def of(cls, series: np.ndarray, runs: list[slice], path: np.ndarray, places: np.ndarray) -> Profile:
+        """The profile of a series ``(n,)`` between its quantiles; the states' places ``(k,)`` rise."""
+        low, high = np.quantile(series, [OUTSIDE, 1 - OUTSIDE])
+        counts, edges = np.histogram(series, bins=PROFILE_BINS, range=(float(low), float(high)))
+        bins = np.clip(np.searchsorted(edges, series, side="right") - 1, 0, PROFILE_BINS - 1)
+        inside = (series >= low) & (series <= high)
+        place, kept = (edges[1:] + edges[:-1]) / 2, np.flatnonzero(counts >= 2)
+        some = runs[:: -(-len(runs) // MOST_RUNS)]
+        independent = [
+            counts[one] / (2 * correlated_samples(((bins == one) & inside).astype(float), some))
+            for one in kept
+        ]
+        error = 1 / np.sqrt(np.maximum(independent, 1.0))
+        height = -np.log(counts[kept] / counts.max())
+        place = place[kept]
+        bottoms = [
+            int(np.argmin(np.where(np.abs(place - one) <= _reach(series, path, k), height, np.inf)))
+            for k, one in enumerate(places)
+        ]
+        curvatures = np.full(len(places), np.nan)
+        for k, bottom in enumerate(bottoms):
+            near = (height < height[bottom] + 1) & (np.abs(place - places[k]) <= 2 * _reach(series, path, k))
+            if near.sum() >= FEWEST_BINS:
+                curvatures[k] = (
+                    2 * np.polyfit(place[near] - place[bottom], height[near], 2, w=1 / error[near])[0]
+                )
+        tops = []
+        for first, second in pairwise(bottoms):
+            between = slice(min(first, second), max(first, second) + 1)
+            top = between.start + int(np.argmax(height[between]))
+            tops.append(
+                [
+                    one
+                    for end in (first, second)
+                    for one in (height[top] - height[end], np.hypot(error[top], error[end]))
+                ]
+            )
+        return cls(place, height, error, curvatures, np.array(tops).reshape(-1, 4))
 
 
 def _reach(series: np.ndarray, path: np.ndarray, state: int) -> float:

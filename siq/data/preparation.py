@@ -22,8 +22,8 @@ from siq.data.recordings import (
     read_recordings,
     snapshot_pairs,
 )
+from siq.data.states import switching
 from siq.data.stationarity import background_of, correlated_samples, runs_of
-from siq.data.two_states import switching
 from siq.errors import InputError
 from siq.remarks import Remark
 

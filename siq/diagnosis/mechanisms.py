@@ -292,7 +292,7 @@ def added(
     )
 
 
-def build_candidate(
+def _build_candidate(
     model: Dynamics, mechanism: Mechanism, form: Form, assignment: Mapping[str, str]
 ) -> MechanismCandidate | None:
     """Build a mechanism into a model, for one assignment of names to roles; None where it changes nothing."""
@@ -590,7 +590,7 @@ def candidates_of(
                 continue
             for assignment in assignments(form, model, roles):
                 try:
-                    candidate = build_candidate(model, mechanism, form, assignment)
+                    candidate = _build_candidate(model, mechanism, form, assignment)
                 except FormulaError as error:
                     raise InputError(file, mechanism.name, error.fault, error.remedy) from None
                 if candidate is not None:

@@ -75,7 +75,7 @@ def velocity_names(positions: Sequence[str]) -> tuple[str, ...]:
     return names
 
 
-def seen_positions(plain: Dynamics) -> Dynamics:
+def _seen_positions(plain: Dynamics) -> Dynamics:
     """Dynamics of forces alone, with ``dx/dt = v`` and with positions for their outputs."""
     half = plain.dimension // 2
     symbols = plain.symbols
@@ -97,7 +97,7 @@ def smoothed_motion(data: Measurements, names: Sequence[str]) -> tuple[np.ndarra
             " out"
         )
     states = (*names, *velocity_names(names))
-    free = seen_positions(Dynamics(states, (sympy.S.Zero,) * len(states), Diffusion.identity(len(states))))
+    free = _seen_positions(Dynamics(states, (sympy.S.Zero,) * len(states), Diffusion.identity(len(states))))
     begins, velocity = data.begins, np.zeros_like(data.outputs)
     rate = (data.outputs[begins + 1] - data.outputs[begins]) / data.step[begins, None]
     velocity[begins] = rate
@@ -155,7 +155,7 @@ class ObservationModel:
         """Dynamics with the coefficients of a support as parameters, as they are measured."""
         plain = field_dynamics(self.library, support, values, diffusion=self.diffusion)
         if self.hidden:
-            return seen_positions(plain)
+            return _seen_positions(plain)
         if self.exposure is None:
             return plain
         # The states, and their running means, which are what is measured.
@@ -416,7 +416,7 @@ class _InertialModels:
         parameters = (*self._parameters, Parameter(friction, 0.0, fixed=given))
         v, rate = symbol(states[1]), symbol(friction)
         equations = (sympy.S.Zero, rate * (self._force - v) if given else self._force - rate * v)
-        return seen_positions(Dynamics(states, equations, Diffusion.identity(2), parameters=parameters))
+        return _seen_positions(Dynamics(states, equations, Diffusion.identity(2), parameters=parameters))
 
     def stiffness(self, values: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
         """``-F'`` where F falls through zero most steeply, and its standard error; zeros where nowhere."""

@@ -261,7 +261,7 @@ def _initial_networks(
 
 
 @dataclass(frozen=True)
-class TrainingState:
+class _TrainingState:
     """Everything that a training needs to go on from where it stands.
 
     Attributes
@@ -296,15 +296,15 @@ def start(
     options: TrainingOptions,
     diffusion: Diffusion,
     seeds: Sequence[np.random.SeedSequence],
-) -> TrainingState:
+) -> _TrainingState:
     """The state of a training before its first step."""
     generators = [np.random.default_rng(_child_seed(seed, 0)) for seed in seeds]
     networks = _initial_networks(data, options=options, diffusion=diffusion, generators=generators)
     zeros = tuple(torch.zeros_like(tensor) for tensor in networks.parameters())
-    return TrainingState(0, networks, zeros, zeros, pd.DataFrame(columns=list(HISTORY)))
+    return _TrainingState(0, networks, zeros, zeros, pd.DataFrame(columns=list(HISTORY)))
 
 
-def _failed_runs(state: TrainingState) -> dict[int, str]:
+def _failed_runs(state: _TrainingState) -> dict[int, str]:
     """Runs whose networks are of no use, with the reason in words."""
     failures = {}
     for run in range(state.networks.runs):
@@ -318,7 +318,7 @@ def _failed_runs(state: TrainingState) -> dict[int, str]:
 
 
 def train(
-    state: TrainingState,
+    state: _TrainingState,
     data: Sequence[TrainingData],
     *,
     options: TrainingOptions,
@@ -326,9 +326,9 @@ def train(
     device: torch.device | str = "cpu",
     log_every: int = 500,
     checkpoint_every: int = 1000,
-    checkpoint: Callable[[TrainingState], None] | None = None,
+    checkpoint: Callable[[_TrainingState], None] | None = None,
     finished: Callable[[int, Networks], bool] | None = None,
-) -> TrainingState:
+) -> _TrainingState:
     """Train from a state to the last step, or until it is finished.
 
     Parameters
@@ -350,7 +350,7 @@ def train(
 
     Returns
     -------
-    TrainingState
+    _TrainingState
         After ``options.steps`` steps, or when finished. Its history has one row a run and logged step:
         `training_loss` on the last batch, and on held-out pairs `held_out_loss`, the sum of `dynamics` and
         λ·`orthogonality`. A run whose loss is no longer finite keeps such rows and harms no other run.
@@ -371,9 +371,9 @@ def train(
     objective = _Objective(data, options=options, diffusion=networks.diffusion, device=device, dtype=dtype)
     rows = [state.history] if len(state.history) else []
 
-    def snapshot(step: int) -> TrainingState:
+    def snapshot(step: int) -> _TrainingState:
         moments = [optimizer.state[parameter] for parameter in parameters]
-        return TrainingState(
+        return _TrainingState(
             step=step,
             networks=move(networks, "cpu"),
             first_moments=tuple(moment["exp_avg"].detach().to("cpu", copy=True) for moment in moments),
@@ -460,7 +460,7 @@ class _Objective:
         return dynamics, orthogonality
 
 
-def _save_checkpoint(path: str | Path, state: TrainingState, *, fingerprint: str) -> None:
+def _save_checkpoint(path: str | Path, state: _TrainingState, *, fingerprint: str) -> None:
     """Write the state of a training, with a fingerprint of the data and options that it belongs to."""
     arrays = pack([at_rest(state.networks, run) for run in range(state.networks.runs)])
     for name, moments in (("first", state.first_moments), ("second", state.second_moments)):
@@ -471,7 +471,7 @@ def _save_checkpoint(path: str | Path, state: TrainingState, *, fingerprint: str
     write_archive(path, arrays)
 
 
-def _load_checkpoint(path: str | Path, *, fingerprint: str) -> TrainingState | None:
+def _load_checkpoint(path: str | Path, *, fingerprint: str) -> _TrainingState | None:
     """The state of an interrupted training, or None where there is none that can be continued.
 
     One of other data or options has another fingerprint and is passed over, and so is one that is damaged:
@@ -484,7 +484,7 @@ def _load_checkpoint(path: str | Path, *, fingerprint: str) -> TrainingState | N
         networks = side_by_side([unpack(arrays, run) for run in range(int(arrays["count"]))])
         count = len(networks.parameters())
         history = pd.DataFrame(arrays["history"], columns=list(HISTORY))
-        return TrainingState(
+        return _TrainingState(
             step=int(arrays["step"]),
             networks=networks,
             first_moments=tuple(torch.from_numpy(arrays[f"first{index}"]) for index in range(count)),
@@ -572,7 +572,7 @@ class Block:
     def _checkpoint(self, name: str) -> Path | None:
         return None if self.folder is None else self.folder / f"kept-{self.mark[:12]}-{name}.npz"
 
-    def _keep(self, attempt: int, state: TrainingState) -> None:
+    def _keep(self, attempt: int, state: _TrainingState) -> None:
         if (file := self._checkpoint(f"attempt{attempt}")) is not None:
             _save_checkpoint(file, state, fingerprint=self.mark)
 

@@ -104,13 +104,13 @@ class SymbolicDecomposition:
 def exact_decomposition(dynamics: Dynamics, quasipotential: sympy.Expr) -> SymbolicDecomposition:
     """The decomposition of known dynamics with a known U = 2V; g = f + D∇V. For scoring only."""
     potential = sympy.expand(quasipotential / 2)
-    downhill = downhill_formulas(dynamics.diffusion, [potential.diff(one) for one in dynamics.symbols])
+    downhill = _downhill_formulas(dynamics.diffusion, [potential.diff(one) for one in dynamics.symbols])
     circulatory = tuple(sympy.expand(f + v) for f, v in zip(dynamics.formulas, downhill, strict=True))
     flow = tuple(map(sympy.expand, dynamics.formulas))
     return SymbolicDecomposition(dynamics.symbols, potential, circulatory, flow)
 
 
-def downhill_formulas(diffusion: Diffusion, gradient: Sequence[sympy.Expr]) -> tuple[sympy.Expr, ...]:
+def _downhill_formulas(diffusion: Diffusion, gradient: Sequence[sympy.Expr]) -> tuple[sympy.Expr, ...]:
     """D∇V as formulas, from those of ∇V."""
     return tuple(
         sum((entry * slope for entry, slope in zip(row, gradient, strict=True)), sympy.S.Zero)

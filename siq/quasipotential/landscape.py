@@ -28,7 +28,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from siq.data.recordings import Recordings
-from siq.data.two_states import RecordStates
+from siq.data.states import RecordStates
 from siq.errors import Fault, NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
 from siq.quasipotential.certificate import Certificate

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from siq.data.two_states import DwellCount
+from siq.data.states import DwellCount
 from siq.errors import InputError
 from siq.numerics.files import whole_file
 from siq.quasipotential.certificate import Certificate

@@ -42,17 +42,17 @@ from scipy import sparse, special
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
+from siq.data.kinetics import continued_visits
 from siq.data.preparation import joined
 from siq.data.recordings import LONGEST_STEP, Recordings
-from siq.data.stationarity import correlated_samples, runs_of, usual_step
-from siq.data.two_states import (
+from siq.data.states import (
     BINS,
     SIGNIFICANCE,
     DwellCount,
     RecordStates,
-    continued_visits,
     switching,
 )
+from siq.data.stationarity import correlated_samples, runs_of, usual_step
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.inference.library import field_dynamics

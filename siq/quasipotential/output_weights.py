@@ -84,7 +84,7 @@ STEEPER = 1.2  # a paraboloid, until all paths leave the attractor
 
 
 @dataclass(frozen=True)
-class UnitBasis:
+class _UnitBasis:
     """Random tanh units ``tanh(y W + b)`` and ``|y|²`` of normalised states ``y = (x - μ)/σ``.
 
     Attributes
@@ -198,7 +198,7 @@ class OutputWeights:
         weights = generator.normal(size=(self.points.shape[1], units))
         biases = generator.uniform(-2, 2, units)
         mean, width = self.points.mean(axis=0), self.points.std(axis=0)
-        bases = [UnitBasis(one * weights, one * biases, mean, width) for one in SPREADS]
+        bases = [_UnitBasis(one * weights, one * biases, mean, width) for one in SPREADS]
         # Without noise the evenly spread pairs are enough.
         self._fit_field(bases, pairs, others, noisy=False)
         if self.field_error > NOISY_ERROR:
@@ -210,7 +210,7 @@ class OutputWeights:
 
     def _fit_field(
         self,
-        bases: Sequence[UnitBasis],
+        bases: Sequence[_UnitBasis],
         pairs: SnapshotPairs,
         held_out: SnapshotPairs,
         *,
@@ -221,7 +221,7 @@ class OutputWeights:
         self.field_error = np.inf
 
         def corrected(
-            basis: UnitBasis, problem: _LeastSquares, coefficients: np.ndarray, damping: float
+            basis: _UnitBasis, problem: _LeastSquares, coefficients: np.ndarray, damping: float
         ) -> np.ndarray:
             """Coefficients after deferred corrections of what the integrator is off by."""
             for _ in range(CORRECTIONS):
@@ -329,7 +329,7 @@ class OutputWeights:
             except NumericalFailure as failure:
                 logger.info("%s", failure)
                 return None
-            basis, basin = cast(UnitBasis, well.basis), portrait.basins[index]
+            basis, basin = cast(_UnitBasis, well.basis), portrait.basins[index]
             if not self._leaves(well.attractor, basis, well.coefficients):
                 return None
             saddle = well.saddle
@@ -417,7 +417,7 @@ class OutputWeights:
         biases = spread * generator.uniform(-2, 2, units)
         # Those whose slopes span all directions best come first.
         order = scipy.linalg.qr(weights * (1 - np.tanh(biases) ** 2), mode="r", pivoting=True)[1]
-        basis = UnitBasis(weights[:, order], biases[order], attractor, scale, flat=True)
+        basis = _UnitBasis(weights[:, order], biases[order], attractor, scale, flat=True)
         coefficients = np.zeros(basis.size)
         slope = self.jacobian(attractor[None])[0]
         square = 2 * self.diffusion.matrix @ np.diag(2 / scale**2)
@@ -444,7 +444,7 @@ class OutputWeights:
             level = float(basis.values(well.saddle[None])[0] @ coefficients)
         return replace(well, coefficients=coefficients, level=level, reach=WELL_REACH * level)
 
-    def _networks(self, basis: UnitBasis, weights: np.ndarray, points: np.ndarray) -> TrainedNetworks:
+    def _networks(self, basis: _UnitBasis, weights: np.ndarray, points: np.ndarray) -> TrainedNetworks:
         """V over units as a network, with one for g of the same units, fitted at points."""
         steepness, flow, of_units = float(weights[-1]), self.drift(points), basis.of_units(weights)
         circulatory = flow + self.diffusion.push(points, basis.gradients(points) @ weights)
@@ -462,7 +462,7 @@ class OutputWeights:
             diffusion=self.diffusion.matrix,
         )
 
-    def _leaves(self, attractor: np.ndarray, basis: UnitBasis, weights: np.ndarray) -> bool:
+    def _leaves(self, attractor: np.ndarray, basis: _UnitBasis, weights: np.ndarray) -> bool:
         """Whether paths of least action leave an attractor at which f comes to rest."""
         slope = self.jacobian(attractor[None])[0]
         curvature = basis.hessians(attractor[None])[0] @ weights
@@ -519,7 +519,7 @@ class _LeastSquares:
         return np.asarray((self.right.T * factors) @ self.left.T)
 
 
-def _mean_velocity(basis: UnitBasis, coefficients: np.ndarray, x0: np.ndarray, h: np.ndarray) -> np.ndarray:
+def _mean_velocity(basis: _UnitBasis, coefficients: np.ndarray, x0: np.ndarray, h: np.ndarray) -> np.ndarray:
     """(Φ_h(x0) - x0)/h by one step of the classical Runge–Kutta rule, shape ``(n, d)``."""
     with np.errstate(all="ignore"):  # f that was fitted to noise, undamped, may lead anywhere
         reached = runge_kutta_step(lambda x: (basis.design(x.T) @ coefficients).T, x0.T, h).T

@@ -219,7 +219,7 @@ def transitions(
             if isinstance(found, Dynamics) and path.converged:  # nothing about f is to be averaged
                 barrier, share = path.action, 0.0
         logger.info("barrier of U from attractor %d: %.5g, %.5g by the path", way.start, barrier, path.action)
-        spread, by_rivals = barrier_uncertainty(path, found)
+        spread, by_rivals = _barrier_uncertainty(path, found)
         if abs(by_rivals) > NOTEWORTHY_CHANGE * spread:
             remarks.append(Remark("quasipotential.barrier_by_alternative_terms", {"change": by_rivals}))
         found_ways.append(
@@ -242,7 +242,7 @@ def _barrier_by_formula(path: MinimumActionPath, well: Well) -> tuple[float, flo
     return float(barrier), float(formula[known[-1]] / barrier)
 
 
-def barrier_uncertainty(path: MinimumActionPath, found: AnyField) -> tuple[float, float]:
+def _barrier_uncertainty(path: MinimumActionPath, found: AnyField) -> tuple[float, float]:
     """Standard error of a barrier of U from that of f, to first order, and what alternative terms add."""
     if isinstance(found, Dynamics):
         return 0.0, 0.0

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from siq.data.two_states import RecordStates
+from siq.data.states import RecordStates
 from siq.numerics.text import MINUS, range_text, unit_text, value_text
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.rates import NoiseStrength

@@ -27,7 +27,7 @@ from markupsafe import Markup
 from siq.data.inspection import inspect
 from siq.data.preparation import joined
 from siq.data.recordings import Recordings
-from siq.data.two_states import RecordStates
+from siq.data.states import RecordStates
 from siq.numerics.text import number_text, unit_text
 from siq.report.formatting import environment, in_paragraphs
 from siq.report.summary import LandscapeSummary

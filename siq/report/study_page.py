@@ -21,7 +21,7 @@ import sympy
 import yaml
 from markupsafe import Markup
 
-from siq.data.two_states import RecordStates
+from siq.data.states import RecordStates
 from siq.inference.field_estimate import DiffusionSource, FieldEstimate
 from siq.numerics.text import range_text, unit_text, value_text
 from siq.quasipotential.formulas import SymbolicDecomposition

@@ -19,7 +19,7 @@ import pandas as pd
 from scipy.integrate import cumulative_trapezoid
 
 from siq.data.recordings import Recordings
-from siq.data.two_states import DwellCount
+from siq.data.states import DwellCount
 from siq.numerics.text import place_text, squared
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import Landscape

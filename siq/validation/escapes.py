@@ -51,7 +51,7 @@ class Neighbourhood:
 
 
 @dataclass(frozen=True)
-class EscapeTimes:
+class _EscapeTimes:
     """Simulated times of escape, which at weak noise are distributed exponentially."""
 
     times: np.ndarray  #: of those who escaped, ascending, shape (escapes,)
@@ -91,7 +91,7 @@ def simulate_escapes(
     walkers: int = 1000,
     step: float | None = None,
     confirm: bool = True,
-) -> EscapeTimes:
+) -> _EscapeTimes:
     """Follow walkers until they reach one of some neighbourhoods.
 
     Parameters
@@ -148,7 +148,7 @@ def simulate_escapes(
     lost = int((~np.isfinite(x).all(axis=0)).sum())  # what once is not finite stays so
     if lost:
         raise NumericalFailure(f"{lost} of {walkers} walkers run to infinity; take a smaller step")
-    return EscapeTimes(np.concatenate(times), np.concatenate(reached), x.shape[1], steps * step)
+    return _EscapeTimes(np.concatenate(times), np.concatenate(reached), x.shape[1], steps * step)
 
 
 def _settles(function: Field, x: np.ndarray, target: Neighbourhood, step: float, steps: int) -> np.ndarray:

@@ -54,7 +54,7 @@ Stop = Literal["boundary", "level", "everywhere"]
 
 
 @dataclass(frozen=True)
-class MeshQuasipotential:
+class _MeshQuasipotential:
     """V on the nodes of a rectangular mesh.
 
     The work ends where the boundary of the mesh is next, or a value above the level asked for, or no node is
@@ -429,7 +429,7 @@ def mesh_quasipotential(
     level: float | None = None,
     stop_at_boundary: bool = True,
     as_published: bool = False,
-) -> MeshQuasipotential:
+) -> _MeshQuasipotential:
     """V with respect to an attractor, or to a stable limit cycle, on a mesh.
 
     Parameters
@@ -542,7 +542,7 @@ def mesh_quasipotential(
     mesh = _Mesh(values, status, lowest, source, flow, roots, varies, reach, not as_published)
     stop, highest = _march(mesh, math.inf if level is None else level / unit, stop_at_boundary)
     known = np.where(mesh.status >= FRONT, unit * values, np.nan)
-    return MeshQuasipotential((axes[0], axes[1]), known, attractor, unit * highest, STOPS[stop], reach)
+    return _MeshQuasipotential((axes[0], axes[1]), known, attractor, unit * highest, STOPS[stop], reach)
 
 
 def mesh_potential(

@@ -30,7 +30,7 @@ TWO_METHODS = "least action of a chain of points, and Hamilton's equations"
 
 
 @dataclass(frozen=True, eq=False)
-class KnownBarrier:
+class _KnownBarrier:
     """How high U rises between two attractors, and how long it takes to leave the first."""
 
     start: np.ndarray  #: the attractor, shape (d,)
@@ -42,15 +42,15 @@ class KnownBarrier:
     how: str  #: how it is known
 
 
-def _computed(*states: tuple[float, float], value: float) -> KnownBarrier:
+def _computed(*states: tuple[float, float], value: float) -> _KnownBarrier:
     start, saddle, end = map(np.array, states)
-    return KnownBarrier(start, saddle, end, value, 1e-9, float("nan"), TWO_METHODS)
+    return _KnownBarrier(start, saddle, end, value, 1e-9, float("nan"), TWO_METHODS)
 
 
 _LOW, _PASS, _HIGH = (1.40491203, 2.80807973), (4.20080731, 4.00388242), (4.90395384, 4.06187119)
 _ON, _OFF, _EVEN = (2.61803399, 0.38196601), (0.38196601, 2.61803399), (1.21341166, 1.21341166)
 _UP, _DOWN = (0.81649658, 0.27216553), (-0.81649658, -0.27216553)
-DOUBLY_COMPUTED: Mapping[str, tuple[KnownBarrier, ...]] = {
+DOUBLY_COMPUTED: Mapping[str, tuple[_KnownBarrier, ...]] = {
     "maier-stein-5": (_computed((-1.0, 0.0), (0.0, 0.0), (1.0, 0.0), value=0.4830697094),),
     "maier-stein-10": (_computed((-1.0, 0.0), (0.0, 0.0), (1.0, 0.0), value=0.3400414034),),
     "consumer-resource": (
@@ -81,7 +81,7 @@ class ReferenceSystem:
     source: str  #: where it comes from
     dynamics: Dynamics  #: f, D and the domain
     quasipotential: sympy.Expr | None  #: U in the whole domain, up to a constant; None where nobody knows it
-    barriers: tuple[KnownBarrier, ...]  #: between attractors, known exactly or by two methods
+    barriers: tuple[_KnownBarrier, ...]  #: between attractors, known exactly or by two methods
 
 
 def reference_systems() -> dict[str, ReferenceSystem]:
@@ -268,7 +268,7 @@ def _exact(
             share = noise.at(places)[1, 0, 0] / noise.at(places)[0, 0, 0]
         prefactor = float(2 * np.pi / unstable * np.sqrt(top / bottom) * share)
         barriers.append(
-            KnownBarrier(start, saddle, end, float(levels[1] - levels[0]), 0.0, prefactor, "exact")
+            _KnownBarrier(start, saddle, end, float(levels[1] - levels[0]), 0.0, prefactor, "exact")
         )
     return ReferenceSystem(name, about, source, dynamics, quasipotential, tuple(barriers))
 
@@ -290,8 +290,8 @@ def _point_and_cycle() -> ReferenceSystem:
     origin, edge, circle = np.zeros(2), np.array([0.5, 0.0]), np.array([1.0, 0.0])
     how = "exact; any point of the circles"
     barriers = (
-        KnownBarrier(origin, edge, circle, value, 0.0, np.nan, how),
-        KnownBarrier(circle, edge, origin, beyond, 0.0, np.nan, how),
+        _KnownBarrier(origin, edge, circle, value, 0.0, np.nan, how),
+        _KnownBarrier(circle, edge, origin, beyond, 0.0, np.nan, how),
     )
     return ReferenceSystem(
         "point-and-cycle", "A stable point within a stable limit cycle, and an unstable cycle between them.",

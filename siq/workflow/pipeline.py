@@ -19,7 +19,7 @@ import pandas as pd
 
 from siq.data.preparation import in_stretches, joined, read_pairs, without_slow_drift
 from siq.data.recordings import Recordings, snapshot_pairs
-from siq.data.two_states import RecordStates
+from siq.data.states import RecordStates
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
 from siq.inference.identify import identify

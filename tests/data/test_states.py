@@ -10,10 +10,10 @@ import scipy.linalg
 from scipy.signal import lfilter
 
 from siq.data.inspection import inspect
-from siq.data.kinetics import markov_model
+from siq.data.kinetics import MarkovModel
 from siq.data.recordings import Recordings
+from siq.data.states import DwellCount, RecordStates, switching
 from siq.data.stationarity import runs_of
-from siq.data.two_states import DwellCount, RecordStates, switching
 from siq.remarks import Remark
 
 RATES = np.array([[-0.10, 0.06, 0.04], [0.10, -0.15, 0.05], [0.05, 0.10, -0.15]])
@@ -52,7 +52,7 @@ def test_intervals_of_stays_cover() -> None:
     for seed in range(40):
         path = chain(seed, RATES, 1500)
         runs = [slice(0, len(path))]
-        model = markov_model(path, runs, 3, None)
+        model = MarkovModel.of(path, runs, 3, None)
         assert model is not None and model.lag == 1
         modelled += [low <= one <= high for one, (_, low, high) in zip(truth, model.stays, strict=True)]
         # What is seen once a step hops less: its stays are those of the chain.

@@ -22,7 +22,7 @@ from siq.inference.library import IdentificationOptions, candidate_library
 from siq.inference.observation import ObservationModel, smoothed_motion, unbroken, velocity_names
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.rates import _covariance_axes
-from siq.quasipotential.transitions import barrier_uncertainty, ways_out
+from siq.quasipotential.transitions import _barrier_uncertainty, ways_out
 from siq.systems.diffusion import Diffusion
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
 from siq.workflow import pipeline
@@ -85,7 +85,7 @@ def test_barriers_of_the_identified_particle_hold() -> None:
     assert len(ways) == 2
     for way in ways:
         assert way.path is not None
-        error, _ = barrier_uncertainty(way.path, field)
+        error, _ = _barrier_uncertainty(way.path, field)
         assert abs(way.path.action - FRICTION / 2) < 3.5 * error < 0.1  # ΔU = 2γ ΔΦ
 
 

@@ -22,12 +22,12 @@ from siq.networks.networks import at_rest, dynamics_loss, orthogonality_loss
 from siq.networks.training import (
     HISTORY,
     TrainingData,
-    TrainingState,
     _Batches,
     _failed_runs,
     _load_checkpoint,
     _save_checkpoint,
     _slowest_part,
+    _TrainingState,
     prepare_data,
     start,
     train,
@@ -65,10 +65,10 @@ def trained(
     *,
     options: TrainingOptions = OPTIONS,
     diffusion: np.ndarray | None = None,
-    state: TrainingState | None = None,
-    checkpoint: Callable[[TrainingState], None] | None = None,
+    state: _TrainingState | None = None,
+    checkpoint: Callable[[_TrainingState], None] | None = None,
     checkpoint_every: int = 1000,
-) -> TrainingState:
+) -> _TrainingState:
     parts, seeds = [data(run, options) for run in runs], [SEEDS[run] for run in runs]
     state = state or start(
         parts,
@@ -82,7 +82,7 @@ def trained(
     )  # fmt: skip
 
 
-def assert_same_networks(left: TrainingState, right: TrainingState) -> None:
+def assert_same_networks(left: _TrainingState, right: _TrainingState) -> None:
     for one, other in zip(left.networks.parameters(), right.networks.parameters(), strict=True):
         assert torch.equal(one, other)
 
@@ -129,7 +129,7 @@ def test_an_interrupted_training_ends_as_the_uninterrupted_one_to_the_last_bit(
 
     path = tmp_path / "folder" / "checkpoint.npz"
 
-    def keep_and_die(state: TrainingState) -> None:
+    def keep_and_die(state: _TrainingState) -> None:
         _save_checkpoint(path, state, fingerprint="mine")
         raise Killed
 

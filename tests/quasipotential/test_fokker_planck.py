@@ -7,9 +7,10 @@ import pytest
 import sympy
 from scipy.integrate import cumulative_trapezoid
 
+from siq.data.kinetics import continued_visits
 from siq.data.recordings import Recordings
+from siq.data.states import DwellCount
 from siq.data.stationarity import runs_of
-from siq.data.two_states import DwellCount, continued_visits
 from siq.errors import NumericalFailure
 from siq.quasipotential.occupancy import _CellProcess, _core_of
 from siq.systems.diffusion import Diffusion

@@ -12,7 +12,7 @@ import pytest
 import sympy
 from known_systems import exact_field, maier_stein, portrait_of
 
-from siq.data.two_states import DwellCount
+from siq.data.states import DwellCount
 from siq.errors import InputError
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape, landscape_from_equations

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from siq.data.kinetics import continued_visits
 from siq.data.preparation import in_stretches
 from siq.data.recordings import Recordings
-from siq.data.two_states import SIGNIFICANCE, DwellCount, continued_visits
+from siq.data.states import SIGNIFICANCE, DwellCount
 from siq.inference.field_estimate import FieldEstimate, FlowMap
 from siq.inference.library import IdentificationOptions, field_library
 from siq.quasipotential.occupancy import _as_sampled, _CellProcess, _core_of, _cores_about, check_occupancy

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from siq.data.recordings import Recordings
-from siq.data.two_states import DwellCount
+from siq.data.states import DwellCount
 from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.quasipotential.occupancy import (
     OccupancyCheck,

@@ -23,7 +23,7 @@ from siq.data.recordings import SnapshotPairs
 from siq.networks.decomposition import TrainedNetworks, TrainingOptions
 from siq.networks.training import TrainingData, prepare_data
 from siq.numerics.integration import runge_kutta_step
-from siq.quasipotential.output_weights import OutputWeights, UnitBasis, formulas_by_well
+from siq.quasipotential.output_weights import OutputWeights, _UnitBasis, formulas_by_well
 from siq.quasipotential.refinement import RefinementOptions, _local_wells
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
 
@@ -147,7 +147,7 @@ def test_the_draw_decides_the_units_and_nothing_else_does() -> None:
 
 def test_flat_functions_have_no_slope_at_their_center_and_are_sums_of_the_units() -> None:
     draw = np.random.default_rng(4)
-    basis = UnitBasis(
+    basis = _UnitBasis(
         draw.normal(size=(2, 9)), draw.normal(size=9), np.ones(2), np.array([2.0, 0.5]), flat=True
     )
     assert basis.size == 8
@@ -163,7 +163,7 @@ def test_flat_functions_have_no_slope_at_their_center_and_are_sums_of_the_units(
 
 def test_derivatives_of_units_are_those_of_their_formula() -> None:
     draw = np.random.default_rng(3)
-    basis = UnitBasis(
+    basis = _UnitBasis(
         draw.normal(size=(2, 4)), draw.normal(size=4), np.array([0.3, -1.0]), np.array([2.0, 0.5])
     )
     coefficients, point = draw.normal(size=5), np.array([[0.7, -0.4]])

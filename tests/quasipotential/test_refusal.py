@@ -11,7 +11,7 @@ from told_landscapes import landscape, told
 import siq
 from siq.data.inspection import inspect
 from siq.data.recordings import Recordings
-from siq.data.two_states import RecordStates
+from siq.data.states import RecordStates
 from siq.inference.library import IdentificationOptions
 from siq.quasipotential.landscape import Landscape, NoLandscape
 from siq.report.landscape import answer_lines

@@ -25,7 +25,7 @@ from siq.quasipotential.refinement import RefinementOptions
 from siq.quasipotential.transitions import (
     Transition,
     _barrier_by_formula,
-    barrier_uncertainty,
+    _barrier_uncertainty,
     missing_diffusion,
     transitions,
     ways_out,
@@ -164,11 +164,11 @@ def test_standard_errors_follow_from_small_changes_of_f(name: str) -> None:
     for k, one in enumerate(slope):
         alone = np.zeros((len(slope), len(slope)))
         alone[k, k] = 1.0
-        spread, _ = barrier_uncertainty(way.path, replace(found, covariance=alone))
+        spread, _ = _barrier_uncertainty(way.path, replace(found, covariance=alone))
         assert spread == pytest.approx(abs(one), abs=2e-3 * largest)
     # Errors that go together, as those of coefficients do: only their signs tell whether they cancel.
     root = np.random.default_rng(0).normal(size=(len(slope), 3))
-    spread, _ = barrier_uncertainty(way.path, replace(found, covariance=root @ root.T))
+    spread, _ = _barrier_uncertainty(way.path, replace(found, covariance=root @ root.T))
     assert spread == pytest.approx(np.linalg.norm(slope @ root), rel=5e-3)
 
 
@@ -200,14 +200,14 @@ def test_a_barrier_of_a_known_f_has_no_error_and_one_twice_as_uncertain_twice_th
     known, (way, _) = SYSTEMS["archetype"], ways("archetype", with_formulas=True)
     assert way.path is not None
     errors = [
-        barrier_uncertainty(way.path, exact_field(known, 3, relative_error=error))[0]
+        _barrier_uncertainty(way.path, exact_field(known, 3, relative_error=error))[0]
         for error in (1e-3, 2e-3)
     ]
     assert way.standard_error == pytest.approx(errors[0])
     assert errors[1] == pytest.approx(2 * errors[0])
     exact = exact_field(known, 3)
     exact = replace(exact, covariance=np.zeros_like(exact.covariance))
-    assert barrier_uncertainty(way.path, exact) == (0, 0)
+    assert _barrier_uncertainty(way.path, exact) == (0, 0)
 
 
 def test_units_change_no_barrier_and_no_error() -> None:

@@ -21,7 +21,7 @@ from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_files import landscape_data, landscape_from_data
 from siq.quasipotential.refinement import RefinementOptions
-from siq.quasipotential.transitions import Transition, barrier_uncertainty
+from siq.quasipotential.transitions import Transition, _barrier_uncertainty
 from siq.report.plots import prediction
 from siq.report.plots.quasipotential import _on_plane, quasipotential_figure
 from siq.report.plots.wells import _joined
@@ -113,7 +113,7 @@ def test_the_band_of_one_state_is_that_of_the_barrier() -> None:
     band = shown.standard_error(x)
     assert band is not None
     top = np.interp(float(way.saddle.position[0]), x, band)
-    assert top == pytest.approx(barrier_uncertainty(way.path, field)[0], rel=1e-3)
+    assert top == pytest.approx(_barrier_uncertainty(way.path, field)[0], rel=1e-3)
     assert np.interp(float(found.attractors[deepest].position[0]), x, band) < 1e-3 * top
     assert summarise(landscape(2)).standard_error(x) is None
 

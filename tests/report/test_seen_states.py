@@ -8,7 +8,7 @@ import numpy as np
 from told_landscapes import NOISE, landscape, record_row, told
 
 from siq.data.kinetics import MarkovModel, Profile
-from siq.data.two_states import DwellCount, RecordStates
+from siq.data.states import DwellCount, RecordStates
 from siq.report.study_page import _states_table
 from siq.report.summary import summarise
 from siq.workflow.tables import as_table

@@ -10,7 +10,7 @@ from known_systems import KnownSystem, archetype, double_well
 from siq.errors import NumericalFailure
 from siq.quasipotential.rates import escape_rate
 from siq.systems.dynamics import Dynamics
-from siq.validation.escapes import EscapeTimes, Neighbourhood, simulate_escapes
+from siq.validation.escapes import Neighbourhood, _EscapeTimes, simulate_escapes
 
 
 def escapes_of(
@@ -22,7 +22,7 @@ def escapes_of(
     level: float = 0.1,
     seed: int = 0,
     **options: object,
-) -> EscapeTimes:
+) -> _EscapeTimes:
     target = Neighbourhood.about(known.dynamics, known.attractors[1 - which], level=level)
     return simulate_escapes(
         known.dynamics,
@@ -35,7 +35,7 @@ def escapes_of(
     )
 
 
-def agrees(found: EscapeTimes, expected: float, *, deviations: float = 3.0) -> bool:
+def agrees(found: _EscapeTimes, expected: float, *, deviations: float = 3.0) -> bool:
     return abs(found.mean - expected) < deviations * found.standard_error
 
 
@@ -98,10 +98,10 @@ def test_who_has_not_escaped_counts() -> None:
 
 
 def test_the_estimate_is_all_time_by_all_escapes() -> None:
-    found = EscapeTimes(np.array([1.0, 2.0, 3.0]), np.zeros(3, dtype=int), censored=2, longest=4.0)
+    found = _EscapeTimes(np.array([1.0, 2.0, 3.0]), np.zeros(3, dtype=int), censored=2, longest=4.0)
     assert found.mean == pytest.approx(14 / 3)
     assert found.standard_error == pytest.approx(14 / 3 / np.sqrt(3))
-    none = EscapeTimes(np.zeros(0), np.zeros(0, dtype=int), censored=5, longest=4.0)
+    none = _EscapeTimes(np.zeros(0), np.zeros(0, dtype=int), censored=5, longest=4.0)
     assert none.mean == none.standard_error == np.inf
 
 

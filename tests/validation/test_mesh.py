@@ -20,14 +20,14 @@ from siq.quasipotential.characteristics import adapted_fan
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
-from siq.validation.mesh import MeshQuasipotential, mesh_quasipotential
+from siq.validation.mesh import _MeshQuasipotential, mesh_quasipotential
 
 LEFT = np.array([[-2.0, 0.0], [-1.0, 1.0]])  # the left well of a system with its saddle at the origin
 
 
 def mesh_of(
     known: KnownSystem, count: int, *, which: int = 0, box: np.ndarray | None = None, **options: Any
-) -> MeshQuasipotential:
+) -> _MeshQuasipotential:
     attractor = known.attractors[which]
     return mesh_quasipotential(
         known.dynamics.drift,
@@ -40,11 +40,11 @@ def mesh_of(
     )
 
 
-def nodes_of(mesh: MeshQuasipotential) -> np.ndarray:
+def nodes_of(mesh: _MeshQuasipotential) -> np.ndarray:
     return np.stack(np.meshgrid(*mesh.axes, indexing="ij"), axis=-1)
 
 
-def errors(known: KnownSystem, mesh: MeshQuasipotential) -> np.ndarray:
+def errors(known: KnownSystem, mesh: _MeshQuasipotential) -> np.ndarray:
     """Of V at the nodes that were reached, as shares of the level."""
     x = nodes_of(mesh)[np.isfinite(mesh.values)]
     exact = potential_values(known, x) - potential_values(known, mesh.attractor[None])

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from siq.data.inspection import Inspection
-from siq.data.two_states import RecordStates
+from siq.data.states import RecordStates
 from siq.report.plots.style import (
     BLACK,
     BLUE,

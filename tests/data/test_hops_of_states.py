@@ -9,8 +9,8 @@ from scipy.signal import lfilter
 from siq.data.kinetics import continued_visits
 from siq.data.preparation import in_stretches, without_slow_drift
 from siq.data.recordings import Recordings
+from siq.data.states import DwellCount, switching
 from siq.data.stationarity import background_of, correlated_samples, relaxation_samples, runs_of, usual_step
-from siq.data.two_states import DwellCount, switching
 
 STEP, COUNT = 0.05, 20_000
 TIME = STEP * np.arange(COUNT)

@@ -39,14 +39,9 @@ from siq.data.kinetics import (
     MarkovModel,
     Profile,
     exponential,
-    markov_model,
     path_of,
-    profile_of,
     stationary,
     stays_of,
-)
-from siq.data.kinetics import (
-    continued_visits as continued_visits,
 )
 from siq.data.recordings import Recordings
 from siq.data.stationarity import (
@@ -376,44 +371,31 @@ def _plain(value: Any) -> Any:
 def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | None:
     """The states that the recordings show by themselves; None where they are too short to tell anything.
 
-        Every quantity is looked at by itself, and the one in which a single state is refused most clearly is
-        taken for levels and histogram; states are sought in up to three together. Where a background drifts
-        slowly, or recordings differ in their baselines, it is taken off.
+    Every quantity is looked at by itself, and the one in which a single state is refused most clearly is
+    taken for levels and histogram; states are sought in up to three together. Where a background drifts
+    slowly, or recordings differ in their baselines, it is taken off.
 
     Parameters
     ----------
-        recordings
-            What was measured.
-        rungs
-            Whether profile and Markov model are worked out, too.
+    recordings
+        What was measured.
+    rungs
+        Whether profile and Markov model are worked out, too.
 
     Examples
     --------
-        >>> import numpy as np
-        >>> from siq.data.correlation import markov_lag
-    from siq.data.kinetics import (
-        AVERAGING_TIME,
-        CONFIDENCE,
-        MarkovModel,
-        Profile,
-        continued_visits,
-        exponential,
-        markov_model,
-        path_of,
-        profile_of,
-        stationary,
-        stays_of,
-    )
-        >>> from siq.data.recordings import Recordings
-        >>> generator = np.random.default_rng(1)
-        >>> x = np.empty((20_000, 1))
-        >>> x[0] = 1.0
-        >>> for before in range(len(x) - 1):
-        ...     kick = np.sqrt(0.25 * 0.05) * generator.standard_normal()
-        ...     x[before + 1] = x[before] + 0.05 * (x[before] - x[before] ** 3) + kick
-        >>> found = switching(Recordings.from_arrays(0.05 * np.arange(len(x)), x, names=["x"]))
-        >>> found.supported, [round(level, 1) for level in found.levels]
-        (True, [-0.9, 0.8])
+    >>> import numpy as np
+    >>> from siq.data.correlation import markov_lag
+    >>> from siq.data.recordings import Recordings
+    >>> generator = np.random.default_rng(1)
+    >>> x = np.empty((20_000, 1))
+    >>> x[0] = 1.0
+    >>> for before in range(len(x) - 1):
+    ...     kick = np.sqrt(0.25 * 0.05) * generator.standard_normal()
+    ...     x[before + 1] = x[before] + 0.05 * (x[before] - x[before] ** 3) + kick
+    >>> found = switching(Recordings.from_arrays(0.05 * np.arange(len(x)), x, names=["x"]))
+    >>> found.supported, [round(level, 1) for level in found.levels]
+    (True, [-0.9, 0.8])
     """
     runs, generator = runs_of(recordings), np.random.default_rng(0)  # always the same surrogates
     tests: dict[int, tuple[float, ...]] = {}  # probability, less the depth, relaxation, the first test's
@@ -457,7 +439,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     # A valley that is deeper than a linear system's may be the floor of one flat well.
     pushed = tests[state][3] * (len(DEGREES) + 2) * len(tests) < SIGNIFICANCE
     supported = probability < SIGNIFICANCE and any(one.visits for one in counts)
-    profile = profile_of(flat[:, column], runs, path, places[:, column]) if supported else None
+    profile = Profile.of(flat[:, column], runs, path, places[:, column]) if supported else None
     if profile is not None and not pushed and wells == 1:
         supported = bool((profile.tops[:, ::2] > FALSE_WELL * profile.tops[:, 1::2]).all())
     step, lengths = usual_step(recordings), stays_of(path, runs, number)
@@ -477,7 +459,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         return replace(found, limit=Remark("data.few_hops", {"fewest": FEWEST_HOPS}))
     if sparse.csgraph.connected_components(found.hops, connection="strong")[0] > 1:
         return replace(found, limit=Remark("data.states_apart"))
-    model = markov_model(path, runs, number, expected)
+    model = MarkovModel.of(path, runs, number, expected)
     if model is None:
         return replace(found, limit=Remark("data.not_markov"))
     model = model._replace(lag=step * model.lag, stays=step * model.stays, rates=model.rates / step)
