@@ -17,6 +17,8 @@ CODES = {
     for file in (ROOT / "siq").rglob("*.py")
     if file.name != "remarks.py"
     for code in re.findall(r"\bRemark\(\s*\"([\w.]+)\"", file.read_text(encoding="utf-8"))
+} | {
+    f"inference.not_{claim}" for claim in ("one_system", "unchanged", "state_complete", "gaussian_increments")
 }
 
 

@@ -153,7 +153,12 @@ def test_every_figure_that_makes_sense_is_shown_once(tmp_path: Path, runs: int, 
     shown = [figure.alternative for section in content.sections for figure in section.figures]
     assert content.figure is not None
     shown.append(content.figure.alternative)
-    absent = {LEADING[1], "landscape_published", "sweep"}  # sweeps have tables
+    absent = {
+        LEADING[1],
+        "landscape_published",
+        "sweep",
+        "states",
+    }  # sweeps have tables, and no states were seen
     of_runs, of_networks = (
         {name for name, caption in FIGURES.items() if one in caption.get("only_with", ())}
         for one in ("runs", "networks")
