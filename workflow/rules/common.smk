@@ -35,7 +35,8 @@ def bad_input_told(refused=InputError):
         say_and_stop(error)
 
 
-if os.environ.pop(PARENT, None):  # ``siq`` has started this, and holds its standard input open
+# ``siq`` has started this, and holds its standard input open.
+if os.environ.pop(PARENT, None):
     end_with_parent()
 prepare_environment()
 
