@@ -8,9 +8,8 @@ import scipy.signal
 
 from benchmarks.hostile.kinds import kind, plain
 from benchmarks.hostile.records import (
+    FINE,
     FORGOTTEN,
-    STEP,
-    WITHIN,
     Law,
     Record,
     Scene,
@@ -18,8 +17,6 @@ from benchmarks.hostile.records import (
     relaxation,
     telegraph,
 )
-
-FINE = STEP / WITHIN
 
 
 @numba.njit(cache=True)

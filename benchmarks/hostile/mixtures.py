@@ -5,7 +5,24 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.hostile.kinds import kind, plain, several
-from benchmarks.hostile.records import Law, Record, Scene, double_wells, one_wells, relaxation, telegraph
+from benchmarks.hostile.records import (
+    Law,
+    Record,
+    Scene,
+    Series,
+    double_wells,
+    one_wells,
+    relaxation,
+    telegraph,
+)
+
+
+def _double_wells(
+    draw: np.random.Generator, scene: Scene, copies: int, strength: float, **flaw: Series
+) -> Record:
+    """A double well with a flaw (`double_wells`); without any it is the diffusion of the scene."""
+    law = Law.of(scene) if strength == 0 else None
+    return Record.sampled(scene, double_wells(draw, scene, copies, **flaw), law=law)
 
 
 @kind("one_system", "connected", twin=several)
@@ -115,8 +132,7 @@ def swinging_tilt(draw: np.random.Generator, strength: float, copies: int) -> Re
     def push(t: np.ndarray, draw: np.random.Generator) -> np.ndarray:
         return np.asarray(0.4 * strength * np.sin(2 * np.pi * t / period))
 
-    law = Law.of(scene) if strength == 0 else None
-    return Record.sampled(scene, double_wells(draw, scene, copies, push=push), law=law)
+    return _double_wells(draw, scene, copies, strength, push=push)
 
 
 @kind("unchanged", "state_complete", "record")
@@ -128,8 +144,7 @@ def slow_swing(draw: np.random.Generator, strength: float, copies: int) -> Recor
     def push(t: np.ndarray, draw: np.random.Generator) -> np.ndarray:
         return np.asarray(0.3 * strength * np.sin(2 * np.pi * t / period + phase))
 
-    law = Law.of(scene) if strength == 0 else None
-    return Record.sampled(scene, double_wells(draw, scene, copies, push=push), law=law)
+    return _double_wells(draw, scene, copies, strength, push=push)
 
 
 @kind("unchanged", "state_complete", "record")
@@ -141,8 +156,7 @@ def swinging_barrier(draw: np.random.Generator, strength: float, copies: int) ->
     def curvature(t: np.ndarray, draw: np.random.Generator) -> np.ndarray:
         return np.asarray(1 + 0.7 * strength * np.sin(2 * np.pi * t / period))
 
-    law = Law.of(scene) if strength == 0 else None
-    return Record.sampled(scene, double_wells(draw, scene, copies, curvature=curvature), law=law)
+    return _double_wells(draw, scene, copies, strength, curvature=curvature)
 
 
 @kind("unchanged", "state_complete", "gaussian_increments", "record")
@@ -154,8 +168,7 @@ def swinging_noise(draw: np.random.Generator, strength: float, copies: int) -> R
     def power(t: np.ndarray, draw: np.random.Generator) -> np.ndarray:
         return np.asarray(1 + 0.9 * strength * np.sin(2 * np.pi * t / period))
 
-    law = Law.of(scene) if strength == 0 else None
-    return Record.sampled(scene, double_wells(draw, scene, copies, power=power), law=law)
+    return _double_wells(draw, scene, copies, strength, power=power)
 
 
 @kind("unchanged", "one_system", "record")
@@ -166,8 +179,7 @@ def ramp_of_tilt(draw: np.random.Generator, strength: float, copies: int) -> Rec
     def push(t: np.ndarray, draw: np.random.Generator) -> np.ndarray:
         return np.asarray(0.35 * strength * (2 * t / t[-1] - 1))
 
-    law = Law.of(scene) if strength == 0 else None
-    return Record.sampled(scene, double_wells(draw, scene, copies, push=push), law=law)
+    return _double_wells(draw, scene, copies, strength, push=push)
 
 
 @kind("unchanged", "one_system", "gaussian_increments", "record")
@@ -178,8 +190,7 @@ def growing_noise(draw: np.random.Generator, strength: float, copies: int) -> Re
     def power(t: np.ndarray, draw: np.random.Generator) -> np.ndarray:
         return np.asarray(1 + 0.7 * strength * (2 * t / t[-1] - 1))
 
-    law = Law.of(scene) if strength == 0 else None
-    return Record.sampled(scene, double_wells(draw, scene, copies, power=power), law=law)
+    return _double_wells(draw, scene, copies, strength, power=power)
 
 
 @kind("unchanged", "one_system", "record")
@@ -190,8 +201,7 @@ def changed_midway(draw: np.random.Generator, strength: float, copies: int) -> R
     def curvature(t: np.ndarray, draw: np.random.Generator) -> np.ndarray:
         return np.where(t < t[-1] / 2, 1 + 0.3 * strength, 1 - 0.5 * strength)
 
-    law = Law.of(scene) if strength == 0 else None
-    return Record.sampled(scene, double_wells(draw, scene, copies, curvature=curvature), law=law)
+    return _double_wells(draw, scene, copies, strength, curvature=curvature)
 
 
 @kind("state_complete", "unchanged", "record")
@@ -203,8 +213,7 @@ def gate(draw: np.random.Generator, strength: float, copies: int) -> Record:
     def push(t: np.ndarray, draw: np.random.Generator) -> np.ndarray:
         return 0.35 * strength * telegraph(draw, t, stay)
 
-    law = Law.of(scene) if strength == 0 else None
-    return Record.sampled(scene, double_wells(draw, scene, copies, push=push), law=law)
+    return _double_wells(draw, scene, copies, strength, push=push)
 
 
 @kind("state_complete", "unchanged", "gaussian_increments", "record")
@@ -216,8 +225,7 @@ def bursts(draw: np.random.Generator, strength: float, copies: int) -> Record:
     def power(t: np.ndarray, draw: np.random.Generator) -> np.ndarray:
         return 1 + 0.9 * strength * telegraph(draw, t, stay)
 
-    law = Law.of(scene) if strength == 0 else None
-    return Record.sampled(scene, double_wells(draw, scene, copies, power=power), law=law)
+    return _double_wells(draw, scene, copies, strength, power=power)
 
 
 @kind("state_complete", "unchanged", "record")
@@ -229,8 +237,7 @@ def hidden_slow_variable(draw: np.random.Generator, strength: float, copies: int
     def push(t: np.ndarray, draw: np.random.Generator) -> np.ndarray:
         return 0.35 * strength * relaxation(draw, len(t), time)
 
-    law = Law.of(scene) if strength == 0 else None
-    return Record.sampled(scene, double_wells(draw, scene, copies, push=push), law=law)
+    return _double_wells(draw, scene, copies, strength, push=push)
 
 
 @kind("connected", "record", "prediction", twin=plain)

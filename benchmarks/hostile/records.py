@@ -19,6 +19,7 @@ from siq.data.recordings import Recordings
 
 STEP = 0.1  # between samples: a fifth of the time in which a well of depth 1/4 relaxes
 WITHIN = 10  # steps of Euler and Maruyama between samples
+FINE = STEP / WITHIN  # of these steps
 FORGOTTEN = 2_000  # of these before a recording begins
 SAMPLES = 20_000  # of all recordings of a case together: 20 hops and more
 
@@ -73,7 +74,7 @@ class Scene:
     @property
     def fine_times(self) -> np.ndarray:
         """Of the steps of the simulation, from the first sample to the last."""
-        return STEP / WITHIN * np.arange((self.samples - 1) * WITHIN + 1)
+        return FINE * np.arange((self.samples - 1) * WITHIN + 1)
 
 
 @dataclass(frozen=True)
@@ -195,13 +196,11 @@ def double_wells(
         pushed = scene.tilt + (np.zeros(len(t)) if push is None else push(t, draw))
         start = float(draw.choice([-1.0, 1.0]))
         noise = scene.intensity * parts[1]
-        paths.append(_wells(start, parts[0], pushed, noise, STEP / WITHIN, FORGOTTEN, draw))
+        paths.append(_wells(start, parts[0], pushed, noise, FINE, FORGOTTEN, draw))
     return paths
 
 
-def relaxation(
-    draw: np.random.Generator, count: int, time: float, *, step: float = STEP / WITHIN
-) -> np.ndarray:
+def relaxation(draw: np.random.Generator, count: int, time: float, *, step: float = FINE) -> np.ndarray:
     """A stationary Ornstein–Uhlenbeck process of unit variance, ``(count,)``, with a correlation time."""
     fade = np.exp(-step / time)
     noise = np.sqrt(1 - fade**2) * draw.standard_normal(count)

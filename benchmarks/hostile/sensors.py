@@ -151,26 +151,26 @@ def finer_grid(draw: np.random.Generator, strength: float, copies: int) -> Recor
     return Record(scene, made.seen, [one / times for one in made.times], made.states, made.law)
 
 
+def _hummed(draw: np.random.Generator, copies: int, size: float, periods: tuple[float, float]) -> Record:
+    """A sine upon the values, of a period in samples that is drawn between two."""
+
+    def sensor(scene: Scene) -> Sensor:
+        period = draw.uniform(*periods)
+        return lambda x: x + size * np.sin(2 * np.pi * np.arange(len(x)) / period)
+
+    return _seen(draw, copies, sensor)
+
+
 @kind("state_complete", "unchanged", "prediction", "gaussian_increments")
 def hum(draw: np.random.Generator, strength: float, copies: int) -> Record:
     """The hum of the mains upon the values, some samples long."""
-
-    def sensor(scene: Scene) -> Sensor:
-        period = draw.uniform(2.5, 12)
-        return lambda x: x + 0.6 * strength * np.sin(2 * np.pi * np.arange(len(x)) / period)
-
-    return _seen(draw, copies, sensor)
+    return _hummed(draw, copies, 0.6 * strength, (2.5, 12))
 
 
 @kind("state_complete", "unchanged", "prediction", "gaussian_increments")
 def aliased_hum(draw: np.random.Generator, strength: float, copies: int) -> Record:
     """A hum whose frequency is close to that of the samples, so that it looks slow."""
-
-    def sensor(scene: Scene) -> Sensor:
-        period = draw.uniform(40, 400)
-        return lambda x: x + 0.8 * strength * np.sin(2 * np.pi * np.arange(len(x)) / period)
-
-    return _seen(draw, copies, sensor)
+    return _hummed(draw, copies, 0.8 * strength, (40, 400))
 
 
 @kind("unchanged", "one_system", "state_complete", "prediction")

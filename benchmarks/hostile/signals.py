@@ -10,9 +10,8 @@ import scipy.stats
 
 from benchmarks.hostile.kinds import kind, plain
 from benchmarks.hostile.records import (
+    FINE,
     FORGOTTEN,
-    STEP,
-    WITHIN,
     Law,
     Record,
     Scene,
@@ -21,7 +20,6 @@ from benchmarks.hostile.records import (
     telegraph,
 )
 
-FINE = STEP / WITHIN
 NO_DIFFUSION = ("state_complete", "prediction", "gaussian_increments", "unchanged", "connected", "record")
 
 
