@@ -137,10 +137,8 @@ def _levels_of(series: np.ndarray, runs: list[slice], centre: np.ndarray) -> _Le
         used, fitted.state_probabilities, fitted.hidden_state_trajectories, strict=True
     ):
         weights[run], path[run] = own[:, order], np.argsort(order)[likeliest]
-    centre, spread = (
-        fitted.output_model.means[order] * scale + shift,
-        fitted.output_model.sigmas[order] * scale,
-    )
+    model = fitted.output_model
+    centre, spread = model.means[order] * scale + shift, model.sigmas[order] * scale
     return _Levels(centre, spread, weights, path, fitted.transition_counts[order][:, order])
 
 
@@ -355,13 +353,10 @@ class MarkovModel(NamedTuple):
                     continue
                 seen = later / visits
                 foreseen = np.linalg.matrix_power(usual, int(multiple))
-                spread = (
-                    np.linalg.matrix_power(drawn, int(multiple)).var(axis=0)
-                    + foreseen * (1 - foreseen) / visits
-                )
-                worst = max(
-                    worst, float((np.abs(seen - foreseen) / np.sqrt(np.maximum(spread, 1e-12))).max())
-                )
+                spread = np.linalg.matrix_power(drawn, int(multiple)).var(axis=0)
+                spread += foreseen * (1 - foreseen) / visits
+                off = np.abs(seen - foreseen) / np.sqrt(np.maximum(spread, 1e-12))
+                worst = max(worst, float(off.max()))
             chance = min(2 * float(special.ndtr(-worst)) * states * (states - 1) * len(multiples), 1.0)
             if chance > REFUSED:
                 times = np.array([-1 / np.diag(_generator(one)) for one in drawn]) * lag
@@ -375,11 +370,9 @@ class MarkovModel(NamedTuple):
 def _generator(transition: np.ndarray) -> np.ndarray:
     """log P, or ``P - 1`` where that is none of a Markov process."""
     found = np.asarray(scipy.linalg.logm(transition))
-    return (
-        found.real
-        if np.isrealobj(found) or np.abs(found.imag).max() < 1e-9
-        else transition - np.eye(len(transition))
-    )
+    if np.abs(found.imag).max() >= 1e-9:
+        return np.asarray(transition - np.eye(len(transition)))
+    return np.asarray(found.real)
 
 
 class Profile(NamedTuple):

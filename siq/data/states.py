@@ -29,6 +29,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic_core import to_jsonable_python
 from scipy import ndimage, sparse, special
 
 from siq.data.correlation import markov_lag
@@ -249,9 +250,8 @@ class RecordStates:
     time_unit: str | None
     supported: bool  #: whether the record supports several states at all
     probability: float  #: of so much with a single state over a drifting background, all tests counted
-    levels: tuple[
-        float, ...
-    ]  #: of each state, in the unit of the quantity, of the record less its background
+    #: of each state, in the unit of the quantity, of the record less its background
+    levels: tuple[float, ...]
     counts: tuple[DwellCount, ...]  #: how long each lasts
     edges: np.ndarray  #: (b + 1,): of the histogram of the state
     density: np.ndarray  #: (b,): per unit of the state
@@ -326,14 +326,12 @@ class RecordStates:
         return sentence(self.remark()) + limit if self.supported else ""
 
     def as_data(self) -> dict[str, Any]:
-        """As plain data, which `from_data` reads back."""
+        """As plain data, which `from_data` reads back; what is no number is None, as JSON has none."""
         kept = {name: value for name, value in vars(self).items() if name not in ("visits", "background")}
-        kept |= {"counts": [vars(one) for one in self.counts]}
         kept |= {
             name: None if (one := kept[name]) is None else one._asdict() for name in ("profile", "markov")
         }
-        kept |= {"limit": None if self.limit is None else self.limit.as_data()}
-        return {name: _plain(value) for name, value in kept.items()}
+        return dict(to_jsonable_python(kept, inf_nan_mode="null", fallback=lambda value: value.tolist()))
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any]) -> RecordStates:
@@ -357,17 +355,6 @@ def _array(values: Any) -> np.ndarray:
     return np.array(values, dtype=float)  # None is read as NaN
 
 
-def _plain(value: Any) -> Any:
-    """Arrays as lists, and what is no number as None, as JSON has neither."""
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, Mapping):
-        return {key: _plain(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
 def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | None:
     """The states that the recordings show by themselves; None where they are too short to tell anything.
 
@@ -385,7 +372,6 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     Examples
     --------
     >>> import numpy as np
-    >>> from siq.data.correlation import markov_lag
     >>> from siq.data.recordings import Recordings
     >>> generator = np.random.default_rng(1)
     >>> x = np.empty((20_000, 1))

@@ -67,12 +67,12 @@ def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigat
         monomials = generic_candidates(model, roles, degree=study.degree, named=candidates)
         candidates += [each for each in monomials if each.coordinate != "constant"]
     # No path that is never gone back tells whether a force depends on it.
-    moved = np.abs(x := first_states(model, data)).sum(axis=0)
-    turns = dict(zip(model.states, moved - np.abs(x.sum(axis=0)) > 2 * TURNED * moved, strict=True))
+    x, begins = first_states(model, data), data.first[:-1]
+    moved, net = np.abs(x).sum(axis=0), np.abs(np.add.reduceat(x, begins)).sum(axis=0)
+    turns = dict(zip(model.states, moved - net > 2 * TURNED * moved, strict=True))
     candidates = [each for each in candidates if not each.turning or turns[each.coordinate]]
     # The time since a recording was begun is no clock: what goes by it would begin anew with each of them.
-    begins = data.t[data.first[:-1]]
-    if len(begins) > 1 and np.ptp(begins) <= np.median(data.step[data.begins]):
+    if len(begins) > 1 and np.ptp(data.t[begins]) <= np.median(data.step[data.begins]):
         candidates = [
             replace(each, weight=min(each.weight, RARE)) if each.coordinate == "t" else each
             for each in candidates

@@ -167,12 +167,13 @@ class Remainder:
         return cls(before, after, share)
 
 
-def remaining_forces(fit: Fit, data: Measurements, remainder: Structure) -> list[Remark]:
+def remaining_forces(fit: Fit, data: Measurements, roles: Roles) -> list[Remark]:
     """What process noise stands in for: in each equation its size, how long it lasts, and where it shows.
 
     A force lasts as long as its autocorrelation, integrated over all lags; process noise proper lasts no
     longer than a sample. Sizes are those of the smoothed states, up to a fifth too small.
     """
+    remainder = _structure_of(data, fit, roles)
     rows, step = data.begins, data.step[data.begins]
     forces = -fit.linearisation.gap[rows] / step[:, None]
     signals = Grid(data, fit.substeps).at_samples(fit.model.lags(fit.model.values))

@@ -108,16 +108,10 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
         untried = sum(each.remark == BUDGET_SPENT for each in search.untried)
         stopped_by = investigation.account.stopped_by
         remarks.append(Remark("diagnosis.partial", {"untried": untried, "stopped_by": stopped_by}))
-    forced = (
-        search.fit
-        if described is None and named
-        else search.recalibrated
-        if described is None
-        else described.fit
-    )
+    forced = investigation.final if described is None else described.fit
     if verdict.mismatch and forced.has_process_noise and not investigation.process_noise:
-        structure = Remainder.of(context.data, forced, forced, context.roles).after
-        remarks += remaining_forces(forced, context.data, structure)
+        with suppress(*NUMERICAL_ERRORS):
+            remarks += remaining_forces(forced, context.data, context.roles)
     remarks += _experiment_to_tell(investigation)
     for name in context.study.varies:
         remarks.append(_variation_of(name, final, context.data.labels))
@@ -169,16 +163,16 @@ def _experiment_to_tell(investigation: Investigation) -> list[Remark]:
             for other in each.others.get("same", ())
             if other.candidate.name != name and other.fit.model.dimension == fit.model.dimension
         ]
-        if alike:
-            missed = np.nan_to_num(
-                data.outputs - simulated(fit, data, noise=fit.noise, substeps=fit.substeps)
-            )
-            outputs = missed.shape[1]
-            lasts = correlation_time_of(missed.ravel(), np.repeat(data.recording, outputs), outputs=outputs)
+        # Nobody can begin at a hidden state that a mechanism brings.
+        if alike and fit.model.dimension == investigation.context.model.dimension:
             plan = None
             with suppress(*NUMERICAL_ERRORS):
+                run = simulated(fit, data, noise=fit.noise, substeps=fit.substeps)
+                missed, outputs = np.nan_to_num(data.outputs - run), run.shape[1]
+                recording = np.repeat(data.recording, outputs)
                 plan = next_experiment(
-                    fit, [other.fit for other in alike], data, correlated=lasts,
+                    fit, [other.fit for other in alike], data,
+                    correlated=correlation_time_of(missed.ravel(), recording, outputs=outputs),
                     variance=np.maximum((missed**2).mean(axis=0), fit.noise.measurement),
                     enough=EXPECTED * investigation.context.study.search.least_log_odds,
                 )  # fmt: skip

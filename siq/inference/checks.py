@@ -44,8 +44,10 @@ COARSE_ROUNDING = 0.05  # of the rms step of a state: rounding to less than that
 STEP_ACCURACY = 0.05  # step times the norm of the Jacobian, per step of the integrator
 MAX_STEPS = 5000  # between two samples; what is faster than that between samples is not what was recorded
 RUNAWAY_WIDTHS = 1e3  # widths of the recorded states: so far off a prediction has run away
-# prediction, descent, one_system, unchanged, state_complete, gaussian_increments, times, record
-CHANCE_TESTS = 8
+CHANCE_TESTS = (  # of a certificate: those that chance can refuse
+    "prediction", "descent", "one_system", "unchanged", "state_complete", "gaussian_increments", "times",
+    "record",
+)  # fmt: skip
 COPIED = 12  # samples of a stretch that is sought a second time
 ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 UNPREDICTED = "f does not predict held-out recordings"
@@ -74,7 +76,7 @@ class PredictionLimits:
     @property
     def each(self) -> float:
         """Probability with which one of `CHANCE_TESTS` refuses what is right (Bonferroni)."""
-        return self.false_alarms / CHANCE_TESTS
+        return self.false_alarms / len(CHANCE_TESTS)
 
 
 def residual_noise(

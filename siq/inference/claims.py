@@ -117,9 +117,8 @@ class _Residuals:
             if run.stop - run.start > delay:
                 earlier = values[run][:-delay]
                 begin = earlier[:1] * fade  # as if it had been so before
-                found[run][delay:] = scipy.signal.lfilter([1 - fade], [1, -fade], earlier, axis=0, zi=begin)[
-                    0
-                ]
+                faded, _ = scipy.signal.lfilter([1 - fade], [1, -fade], earlier, axis=0, zi=begin)
+                found[run][delay:] = faded
         return found
 
     def probability(self, columns: np.ndarray, rest: np.ndarray) -> float:
@@ -321,7 +320,7 @@ def _state_complete(rest: _Residuals, limit: float) -> Verdict:
 
 
 def _gaussian(rest: _Residuals, recordings: Recordings, limit: float) -> Verdict:
-    chances: list[tuple[float, str, float]] = []
+    chances: list[tuple[float, str, float, str]] = []  # probability, kind, figure, and the state that repeats
     # A fourth cumulant k of a step changes the action of a path by its share k (2fh)²/(12 εh); what changes
     # barriers by less is harmless, and makes tails larger by 1 + k (z⁴ - 3z²)/24 (Edgeworth).
     noise, harmless = rest.noise, min(12 * HARMLESS_CHANGE / max(4 * rest.drift, 1e-300), 1.0)
@@ -330,10 +329,14 @@ def _gaussian(rest: _Residuals, recordings: Recordings, limit: float) -> Verdict
         return 2 * float(scipy.special.ndtr(-z)) * (1 + harmless * (z**4 - 3 * z**2) / 24) * noise.size
 
     largest = float(np.abs(noise).max())
-    chances.append((beyond(largest), "jump", largest))
+    chances.append((beyond(largest), "jump", largest, ""))
     count = int((np.abs(noise) > TAIL).sum())
-    chances.append((float(scipy.special.gammainc(count, beyond(TAIL))), "tails", count / beyond(TAIL)))
+    chances.append((float(scipy.special.gammainc(count, beyond(TAIL))), "tails", count / beyond(TAIL), ""))
     for column in np.flatnonzero(rest.noisy[: recordings.values.shape[1]]):
-        chances += repetitions(recordings, int(column))
-    chance, kind, value = min(chances)
+        name = recordings.titles[column]
+        chances += [(*one, name) for one in repetitions(recordings, int(column))]
+    chance, kind, value, state = min(chances)
+    if state:
+        told = sentence(Remark("inference.repeated", {"kind": kind, "value": value, "state": state}))
+        return Verdict.of_probability(chance * len(chances), limit, told)
     return _verdict("gaussian_increments", chance * len(chances), limit, kind=kind, value=value)

@@ -356,8 +356,10 @@ def with_variation(
 
 
 def without_variation(model: Dynamics) -> Dynamics:
-    """A model with the means of parameters that differ from recording to recording."""
+    """A model with the means of parameters that differ from recording to recording; any other as it is."""
     change = {symbol(each.name): sympy.S.Zero for each in model.inputs if each.name.startswith("_")}
+    if not change:
+        return model
     return replace(
         model,
         equations=tuple(each.xreplace(change) for each in model.equations),

@@ -487,9 +487,8 @@ def _passages_of(
     counts = np.zeros((len(portrait.attractors),) * 2, dtype=int)
     starts, ends = portrait.descents.paths[:, 0], portrait.descents.ends
     width = positive(np.ptp(portrait.box, axis=1))
-    nearest = cKDTree(starts / width).query(np.array([recordings.values[run.start] for run in runs]) / width)[
-        1
-    ]
+    begins = np.array([recordings.values[run.start] for run in runs])
+    _, nearest = cKDTree(starts / width).query(begins / width)
     for run, begin in zip(runs, nearest, strict=True):
         inside = visits[run]
         order = np.concatenate([[ends[begin]], inside[inside >= 0]])

@@ -223,10 +223,10 @@ class Provenance:
         return [f"{self.folder / path} is not as it was written; it is made again." for path in damaged]
 
     @classmethod
-    def mend(cls, *, planned: bool) -> None:
-        """Say what is damaged in ``results``, and set it aside unless that is only `planned`."""
+    def mend(cls, root: Path, *, planned: bool) -> None:
+        """Say what is damaged in folders below a root, and set it aside unless that is only planned."""
         for depth in ("*", "*/*"):
-            for file in Path("results").glob(f"{depth}/{PROVENANCE}"):
+            for file in root.glob(f"{depth}/{PROVENANCE}"):
                 for told in cls(file.parent).set_aside(remove=not planned):
                     print(told, file=sys.stderr)
 

@@ -109,7 +109,7 @@ def test_what_remains_has_the_size_and_the_time_of_the_force_that_is_not_known(l
     model = with_expectations(decaying(quadratic=0.0))
     data = _measurements_of(pd.concat(frames), model)
     fit, _ = recalibrate(model, data)
-    (remark,) = remaining_forces(fit, data, Remainder.of(data, fit, fit, roles_of(model)).after)
+    (remark,) = remaining_forces(fit, data, roles_of(model))
     values = remark.values
     assert values["state"] == "x" and values["size"] == pytest.approx(size, rel=0.25)
     if lasts:  # the integral of the autocorrelation over both sides

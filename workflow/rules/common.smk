@@ -35,8 +35,7 @@ def bad_input_told(refused=InputError):
         say_and_stop(error)
 
 
-# ``siq`` has started this, and holds its standard input open.
-if os.environ.pop(PARENT, None):
+if os.environ.pop(PARENT, None):  # `siq` has started this, and holds its input open
     end_with_parent()
 prepare_environment()
 
@@ -331,7 +330,8 @@ WARM = None
 
 # What is not as its job wrote it is made again, before anything is built upon it.
 with suppress(Timeout), LOCK:  # whoever has it is writing
-    Provenance.mend(planned=bool({"-n", "--dry-run", "--dryrun"} & set(sys.argv)))
+    PLANNED = bool({"-n", "--dry-run", "--dryrun"} & set(sys.argv))
+    Provenance.mend(Path("results"), planned=PLANNED)
 
 
 onstart:
