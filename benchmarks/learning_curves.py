@@ -76,7 +76,7 @@ class Run:
         x = self.data.held_out.x0
         self.points = x[representative_subset(x, distance=SPACING, generator=draw)]
         assert self.system.domain is not None
-        self.grid = _domain_grid(self.system.domain, points=GRID_POINTS)
+        _, self.grid = _domain_grid(self.system.domain, points=GRID_POINTS)
         self.exact = compile_formulas([load_exact(CARD)], self.system.symbols)(self.grid)[0]
 
     @staticmethod

@@ -3,15 +3,16 @@
     python -m benchmarks.published_settings train --folder results/published-settings --seconds 500
     .venv/bin/python -m benchmarks.published_settings score
 
-The study ``archetype3d-published``: two networks 3-50-50-50, batches of 5000 pairs and 5000 points, Adam with its decay,
-Runge's rule, 150,000 steps, fifty runs. On two cores that takes 217 h. `train` does all runs at once on one card, in single
-precision, and goes on from its checkpoint where it is called again. Pairs, their division and the first weights are those of
-the study; batches are drawn on the card. A whole step is one CUDA graph, compiled by torch; the loss is that of
-`siq.networks.networks`, which `tests/benchmarks/test_published_settings.py` compares with this one.
+The study ``archetype3d-published``: two networks 3-50-50-50, batches of 5000 pairs and 5000 points, Adam
+with its decay, Runge's rule, 150,000 steps, fifty runs. On two cores that takes 217 h. `train` does all runs
+at once on one card, in single precision, and goes on from its checkpoint where it is called again. Pairs,
+their division and the first weights are those of the study; batches are drawn on the card. A whole step is
+one CUDA graph, compiled by torch. The loss is that of `siq.networks.networks`, and a test compares the two.
 
-It keeps ``networks.npz`` (checkpoint), and ``curves.csv``: by run and step the published loss on held-out pairs, and the
-relative L2 error of U over Ω, for which alone the exact U is needed. `score` applies the published regression to the networks
-and writes ``benchmarks/published_settings.csv``, which is kept with the sources.
+`train` keeps ``state.npz`` (its checkpoint), ``networks.npz``, and ``curves.csv``: by run and step the
+published loss on held-out pairs, and the relative L2 error of U over Ω, for which alone the exact U is
+needed. `score` applies the published regression to the networks. It writes ``published_settings.csv``, a row
+a run, and ``published_settings_curves.csv``, which are kept with the sources.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ import argparse
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -30,19 +32,30 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from siq.data.recordings import snapshot_pairs
-from siq.networks.decomposition import TrainedNetworks, TrainingOptions
+from siq.networks.decomposition import (
+    TrainedNetworks,
+    TrainingOptions,
+    pack,
+    read_archive,
+    unpack,
+    write_archive,
+)
 from siq.networks.networks import at_rest, side_by_side
 from siq.networks.training import HELD_OUT_PAIRS, prepare_data, start
 from siq.numerics.randomness import Purpose, generator, seed_sequence
 from siq.systems.cards import load_exact, load_system
 from siq.systems.formulas import compile_formulas
-from siq.workflow.pipeline import draw_run
+from siq.workflow.pipeline import draw_run, regress_run
 from siq.workflow.study import load_study, settings_of
+from siq.workflow.tables import Method, Outcome, Step, StepResult
+from workflow.scoring import exact_answer, relative_error, score_run
 
 ROOT = Path(__file__).parents[1]
 STUDY = ROOT / "config" / "studies" / "archetype3d-published.yaml"
 CARD = ROOT / "config" / "systems" / "archetype3d.yaml"
 TABLE = Path(__file__).with_suffix(".csv")
+CURVES = TABLE.with_name("published_settings_curves.csv")
+LEVEL = 2.0  # of U: the wells, and as much again; the published regression sees no other states
 MARKS = (100, 200, 500, 1000, 2000, 3000, 5000, 7000, 10_000, 15_000, *range(20_000, 150_001, 5000))
 GRID_SIDE = 31  # points a side of the grid over Ω
 MULTIPLE = 4  # of a layer's width: rows that begin at multiples of 16 bytes are multiplied faster
@@ -94,17 +107,16 @@ def drawn(number: int) -> Data:
         return array[np.linspace(0, len(array) - 1, HELD_OUT_PAIRS).astype(int)]
 
     points = divided.representative.x0.astype(np.float32)
-    return Data(
-        table(divided.training), points, evenly(table(divided.held_out)), evenly(points), at_rest(state.networks, 0)
-    )  # fmt: skip
+    held_out, first = evenly(table(divided.held_out)), at_rest(state.networks, 0)
+    return Data(table(divided.training), points, held_out, evenly(points), first)
 
 
-def flattened(networks: TrainedNetworks | Sequence[TrainedNetworks]) -> tuple[Parameters, Parameters]:
-    """Weights and biases of several runs, with hidden layers of zeros up to a multiple; and what is not trained.
+def flattened(networks: Sequence[TrainedNetworks]) -> tuple[Parameters, Parameters]:
+    """Weights and biases of several runs, filled with zeros up to a multiple; and what is not trained.
 
     Weights that lead to and from an added unit are zero, hence so are their gradients: they stay zero.
     """
-    runs = side_by_side([networks] if isinstance(networks, TrainedNetworks) else networks)
+    runs = side_by_side(networks)
     tensors = []
     for stack in (runs.potential, runs.circulatory):
         for place, (weights, biases) in enumerate(stack):
@@ -125,8 +137,6 @@ def restored(parameters: Parameters, like: Sequence[TrainedNetworks]) -> list[Tr
             wide, shift = arrays.pop(0), arrays.pop(0)
             layers.append((wide[:, : weights.shape[1], : weights.shape[2]], shift[..., : biases.shape[2]]))
         stacks.append(tuple(layers))
-    from dataclasses import replace
-
     networks = replace(runs, potential=stacks[0], circulatory=stacks[1])
     return [at_rest(networks, run) for run in range(networks.runs)]
 
@@ -186,10 +196,8 @@ def loss(
     dynamics = (later_circulatory - later_gradient - observed).square().sum(dim=-1).mean(dim=-1)
     gradient, circulatory = gradient[:, count:], circulatory[:, count:]
     tiny = torch.finfo(gradient.dtype).tiny
-    lengths = (
-        gradient.square().sum(dim=-1).clamp_min(tiny).sqrt() * circulatory.square().sum(dim=-1).clamp_min(tiny).sqrt()
-    )
-    cosine = (gradient * circulatory).sum(dim=-1) / lengths
+    steep, swift = (each.square().sum(dim=-1).clamp_min(tiny).sqrt() for each in (gradient, circulatory))
+    cosine = (gradient * circulatory).sum(dim=-1) / (steep * swift)
     orthogonality = (torch.where(cosine < 0, asymmetry * cosine, cosine) * cosine).mean(dim=-1)
     return dynamics + weight * orthogonality
 
@@ -207,7 +215,9 @@ def potential(parameters: Parameters, fixed: Parameters, x: Tensor) -> Tensor:
 class Training:
     """All runs on one device; groups of runs go through the card on streams of their own."""
 
-    def __init__(self, data: Sequence[Data], *, options: TrainingOptions, step: float, group: int, device: str) -> None:
+    def __init__(
+        self, data: Sequence[Data], *, options: TrainingOptions, step: float, group: int, device: str
+    ) -> None:
         self.options, self.device = options, torch.device(device)
         self.first = [one.networks for one in data]
         self.groups = [slice(begin, begin + group) for begin in range(0, len(data), group)]
@@ -234,12 +244,14 @@ class Training:
             for name in ("held_out_pairs", "held_out_points")
         ]
 
-        told = self.told = {
+        told: dict[str, Any] = {
             "step": step, "weight": float(options.orthogonality_weight), "asymmetry": float(options.asymmetry)
         }  # fmt: skip
 
+        self.told = told
+
         def gradients(parameters: Parameters, fixed: Parameters, pairs: Tensor, points: Tensor) -> Parameters:
-            # Parts of a batch go side by side with the runs: a product over all of its rows keeps too few processors busy.
+            # Parts of a batch go side by side with the runs: products over all rows keep few processors busy.
             def parts(tensor: Tensor) -> Tensor:
                 return tensor[:, None].expand(-1, PARTS, -1, -1).reshape(-1, *tensor.shape[1:])
 
@@ -253,7 +265,9 @@ class Training:
 
             return torch.func.grad(total, argnums=tuple(range(len(parameters))))(*parameters)
 
-        self.gradients: Callable[..., Parameters] = torch.compile(gradients, dynamic=False) if on_card else gradients
+        self.gradients: Callable[..., Parameters] = (
+            torch.compile(gradients, dynamic=False) if on_card else gradients
+        )
         self.streams = [torch.cuda.Stream() for _ in self.groups] if on_card else []
 
     def batch(self) -> tuple[Tensor, Tensor]:
@@ -324,7 +338,9 @@ class Training:
                 moments = self.optimizer.state[parameter]
                 if not moments:
                     step = torch.zeros((), device=self.device, dtype=torch.float32)
-                    moments.update(step=step, exp_avg=parameter.data.clone(), exp_avg_sq=parameter.data.clone())
+                    moments.update(
+                        step=step, exp_avg=parameter.data.clone(), exp_avg_sq=parameter.data.clone()
+                    )
                 moments["exp_avg"].copy_(tensors[place + 1])
                 moments["exp_avg_sq"].copy_(tensors[place + 2])
                 moments["step"].copy_(self.done)
@@ -351,7 +367,15 @@ class Training:
         return pd.DataFrame(rows)
 
 
-def train(folder: Path, *, runs: int, seconds: float, groups: Sequence[int], device: str, steps: int | None) -> None:
+def domain_grid(domain: np.ndarray) -> np.ndarray:
+    """Points of a regular grid over Ω, shape ``(d, n)``."""
+    axes = [np.linspace(lower, upper, GRID_SIDE) for lower, upper in domain]
+    return np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")])
+
+
+def train(
+    folder: Path, *, runs: int, seconds: float, groups: Sequence[int], device: str, steps: int | None
+) -> None:
     """Train as far as the time goes."""
     began = time.perf_counter()
     folder.mkdir(parents=True, exist_ok=True)
@@ -364,14 +388,15 @@ def train(folder: Path, *, runs: int, seconds: float, groups: Sequence[int], dev
     with ProcessPoolExecutor() as pool:
         data = list(pool.map(drawn, range(runs)))
     print(f"drawn after {time.perf_counter() - began:.0f} s", flush=True)
-    axes = [np.linspace(*side, GRID_SIDE) for side in system.domain]
-    points = np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")])
+    points = domain_grid(system.domain)
     exact = compile_formulas([load_exact(CARD)], system.symbols)(points)[0]
     grid = torch.from_numpy(points.T.astype(np.float32)).to(device)
     level = torch.from_numpy(exact - exact.min()).to(device)
 
+    step = settings.sampling.pair_step
+
     def made(group: int) -> tuple[Training, Callable[[], None]]:
-        training = Training(data, options=options, step=settings.sampling.pair_step, group=group, device=device)
+        training = Training(data, options=options, step=step, group=group, device=device)
         return training, training.recorded()
 
     def wait() -> None:
@@ -387,7 +412,10 @@ def train(folder: Path, *, runs: int, seconds: float, groups: Sequence[int], dev
             advance()
         wait()
         times[group] = (time.perf_counter() - before) / 30
-        print(f"groups of {group}: {1e3 * times[group]:.2f} ms a step, {time.perf_counter() - began:.0f} s", flush=True)
+        print(
+            f"groups of {group}: {1e3 * times[group]:.2f} ms a step, {time.perf_counter() - began:.0f} s",
+            flush=True,
+        )
         del training, advance
     training, advance = made(min(times, key=times.__getitem__) if times else groups[0])
     tables = []
@@ -402,7 +430,7 @@ def train(folder: Path, *, runs: int, seconds: float, groups: Sequence[int], dev
 
     def keep() -> None:
         tensors = [tensor.cpu().numpy() for tensor in training.state()]
-        np.savez(folder / "new.npz", **{f"{place:04d}": tensor for place, tensor in enumerate(tensors)})
+        write_archive(folder / "new.npz", {f"{place:04d}": tensor for place, tensor in enumerate(tensors)})
         (folder / "new.npz").replace(kept)
         pd.concat(tables, ignore_index=True).to_csv(table, index=False)
 
@@ -429,10 +457,45 @@ def train(folder: Path, *, runs: int, seconds: float, groups: Sequence[int], dev
 
 def write_networks(path: Path, networks: Sequence[TrainedNetworks]) -> None:
     """Networks of all runs in single precision, as they were trained."""
-    from siq.networks.decomposition import pack, write_archive
-
     arrays = pack(networks)
     write_archive(path, {k: v.astype(np.float32) if v.dtype == np.float64 else v for k, v in arrays.items()})
+
+
+def scored(number: int, networks: TrainedNetworks) -> dict[str, object]:
+    """The networks of a run and their published regression against the exact U."""
+    system, exact = load_system(CARD), load_exact(CARD)
+    settings = settings_of(load_study(STUDY), system)
+    recordings = draw_run(settings, system, number=number).result
+    trained = StepResult(networks, Outcome(number, Step.TRAIN))
+    formulas = regress_run(settings, recordings, trained)
+    answer = exact_answer(CARD)
+    row: dict[str, object] = {"run": number, "regression": formulas.outcome.status.value}
+    if formulas.result is not None:
+        found = {str(Method.REGRESSION): formulas.result}
+        tables = score_run(settings, found, {}, networks, number=number, exact=answer)
+        row |= {name: tables["rrmse"].iloc[0][name] for name in ("rrmse", "support_correct")}
+    assert system.domain is not None
+    grid = domain_grid(system.domain)
+    true, level = compile_formulas([exact], system.symbols)(grid)[0], 2 * networks.potential_at(grid.T)
+    below = true - true.min() < LEVEL
+    return row | {
+        "error": relative_error(level, true),
+        "error_in_wells": relative_error(level[below], true[below]),
+    }
+
+
+def score(folder: Path) -> None:
+    """The two tables that are kept."""
+    archive = read_archive(folder / "networks.npz")
+    curves = pd.read_csv(folder / "curves.csv")
+    with np.load(folder / "state.npz", allow_pickle=False) as state:
+        steps = int(state["0000"])
+    rows = []
+    for number in range(int(archive["count"])):
+        rows.append({"steps": steps, **scored(number, unpack(archive, number))})
+        print(rows[-1], flush=True)
+    pd.DataFrame(rows).to_csv(TABLE, index=False, float_format="%.4g")
+    curves.to_csv(CURVES, index=False, float_format="%.4g")
 
 
 def main() -> None:
@@ -440,10 +503,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("what", choices=("train", "score"))
     parser.add_argument("--folder", type=Path, default=ROOT / "results" / "published-settings")
-    parser.add_argument("--seconds", type=float, default=1e9, help="after which training stops and keeps its state")
+    parser.add_argument(
+        "--seconds", type=float, default=1e9, help="after which training stops and keeps its state"
+    )
     parser.add_argument("--runs", type=int, default=50)
     parser.add_argument("--steps", type=int, help="instead of the study's 150,000")
-    parser.add_argument("--groups", type=int, nargs="+", default=[50], help="runs of a group; the fastest is taken")
+    parser.add_argument(
+        "--groups", type=int, nargs="+", default=[50], help="runs of a group; the fastest is taken"
+    )
     parser.add_argument("--device", default="cuda")
     asked = parser.parse_args()
     if asked.what == "train":
@@ -451,6 +518,8 @@ def main() -> None:
             asked.folder, runs=asked.runs, seconds=asked.seconds, groups=asked.groups, device=asked.device,
             steps=asked.steps,
         )  # fmt: skip
+    else:
+        score(asked.folder)
 
 
 if __name__ == "__main__":
