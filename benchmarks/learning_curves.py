@@ -46,6 +46,7 @@ from workflow.scoring import _domain_grid, relative_error
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "results" / "learning-curves"
+CARD_CURVES = Path(__file__).with_name("published_settings_curves.csv")
 FIGURE = ROOT / "docs" / "images" / "learning_curves.png"
 STUDIES, CARD = ROOT / "config" / "studies", ROOT / "config" / "systems" / "archetype3d.yaml"
 RUNS = 10
@@ -167,13 +168,18 @@ def draw() -> None:
     names = {"published.csv": "published training, one run", "ours.csv": "ours, ten runs, to output weights"}
     figure, looks = Figure(figsize=(10, 6), layout="constrained"), ("color", "linestyle", "marker")
     panels = figure.subplots(2, len(AXES), sharey="col").flat
+    card = pd.read_csv(CARD_CURVES)  # of trainings on a graphics card, of which only the steps compare
     for axes, ((x, below), (y, beside)) in zip(panels, product(TIMES.items(), AXES.items()), strict=True):
         for place, (file, name) in enumerate(names.items()):
             told: dict[str, Any] = dict(zip(looks, look(place), strict=True))
             for number, one in pd.read_csv(FOLDER / file).groupby("run"):
                 axes.loglog(one[x], one[y], markevery=[-1], label="" if number else name, **told)
+        if x == "step" and y in card:
+            for number, one in card.groupby("run"):
+                label = "" if number else "published training, fifty runs on a card"
+                axes.loglog(one[x], one[y], color="0.6", linestyle=":", linewidth=0.7, label=label, zorder=0)
         axes.set(xlabel=below, ylabel=beside)
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
+    figure.legend(*figure.axes[-3].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     figure.savefig(FIGURE, dpi=150)
 
 
