@@ -46,7 +46,7 @@ def plot_proof(scores: pd.DataFrame, *, strong: float = 100.0) -> Figure:
     """
     if scores.empty:
         return sentence_figure("There is no case to show.")
-    figure = Figure(figsize=(PAGE_WIDTH, 2.9))
+    figure = Figure(figsize=(PAGE_WIDTH, 3.2), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=[1.25, 1])
     _verdicts(left, scores)
     _named(right, scores[scores["kind"] == "mechanism"], strong)
@@ -73,7 +73,7 @@ def _verdicts(axes: Axes, scores: pd.DataFrame) -> None:
             color=GREEN,
             linewidth=1.6,
         )
-    axes.set_xticks(range(len(verdicts)), [each.replace(" ", "\n") for each in verdicts])
+    axes.set_xticks(range(len(verdicts)), verdicts, rotation=30, ha="right")
     axes.set_yticks(range(len(kinds)), kinds)
     axes.tick_params(length=0)
     axes.set_xlabel("verdict (the right one framed)")
@@ -104,9 +104,9 @@ def _named(axes: Axes, mechanisms: pd.DataFrame, strong: float) -> None:
     axes.set_xticks(range(len(labels)), labels, rotation=30, ha="right")
     axes.set_xlim(-0.5, len(labels) - 0.5)
     axes.set_ylim(-0.03, 1.03)
-    axes.set_xlabel(r"what the oracle gains, $\Delta\chi^2$ (dimensionless)")
+    axes.set_xlabel(r"$\Delta\chi^2$ that the oracle gains")
     axes.set_ylabel("share of mechanisms\nwithin the reported class")
-    axes.set_title("Mechanisms by signal-to-noise ratio")
+    axes.set_title("mechanisms, by noise")
     axes.legend(loc="lower right")
 
 
