@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -73,28 +74,19 @@ def schemas() -> None:
     assert spec is not None and spec.loader is not None
     written = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(written)
-    stale = [
-        name for name in written.MODELS if _text(f"workflow/schemas/{name}.schema.yaml") != written.text(name)
-    ]
+    files = {name: f"workflow/schemas/{name}.schema.yaml" for name in written.MODELS}
+    stale = [name for name, file in files.items() if _text(file) != written.text(name)]
     if stale:
         raise Missing(f"schemas of {', '.join(stale)} are stale; run `make schemas`")
 
 
 def packages() -> None:
-    """Packages: wheel and sdist build in an environment of their own, pass twine's check, and hold what they should."""
+    """Packages: wheel and sdist build, pass twine's check, and hold what they should."""
     with tempfile.TemporaryDirectory() as folder:
         python = Path(folder, "env", "bin", "python")
         _run(sys.executable, "-m", "venv", Path(folder, "env"), remedy="no environment could be made")
-        _run(
-            python,
-            "-m",
-            "pip",
-            "install",
-            "--quiet",
-            "build",
-            "twine",
-            remedy="build and twine cannot be had here",
-        )
+        tools = ("install", "--quiet", "build", "twine")
+        _run(python, "-m", "pip", *tools, remedy="build and twine cannot be had here")
         _run(python, "-m", "build", "--outdir", Path(folder, "dist"), remedy="wheel or sdist does not build")
         built = sorted(Path(folder, "dist").iterdir())
         _run(python, "-m", "twine", "check", "--strict", *built, remedy="twine refuses what was built")
@@ -117,7 +109,10 @@ def packages() -> None:
 
 def docs() -> None:
     """Documentation: it builds without a warning."""
-    _run("make", "docs", remedy="the documentation does not build")
+    with tempfile.TemporaryDirectory() as folder:
+        shutil.rmtree(ROOT / "docs" / "api", ignore_errors=True)
+        options = ("--fail-on-warning", "--keep-going", "--quiet", "-b", "html")
+        _run(sys.executable, "-m", "sphinx", *options, "docs", folder, remedy="the documentation has faults")
 
 
 def worktree() -> None:

@@ -1,4 +1,4 @@
-"""What surrounds the sources is fresh and complete: commands, schemas, workflows of CI, forms, papers of a release."""
+"""What surrounds the sources is complete: commands, schemas, workflows of CI, forms, papers of a release."""
 
 from __future__ import annotations
 

@@ -2,8 +2,8 @@
 
     .venv/bin/python docs/make/schemas.py     # or: make schemas
 
-Editors complete and check with them, and the catalogue of Snakemake workflows shows them. What a class checks across
-keys is in no schema: the classes decide.
+Editors complete and check with them, and the catalogue of Snakemake workflows shows them. What a class
+checks across keys is in no schema: the classes decide.
 """
 
 from __future__ import annotations
