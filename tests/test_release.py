@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import shutil
 import subprocess
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -108,6 +110,15 @@ def test_the_configuration_is_checked_by_the_class_that_the_schema_is_of() -> No
     for key, value in (("runs_per_training", 0), ("device", "gpu"), ("statistics", 3)):
         with pytest.raises(InputError, match=key):
             Studies({key: value}, configfiles=[])
+
+
+@pytest.mark.workflow
+def test_the_small_study_is_planned_from_a_folder_of_its_own(tmp_path: Path) -> None:
+    shutil.copytree(ROOT / ".test" / "config", tmp_path / "config")
+    command = [sys.executable, "-m", "snakemake", "-n", "--directory", str(tmp_path)]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert "results/two-wells/report.html" in run.stdout + run.stderr
 
 
 # Where the project is kept.
