@@ -200,6 +200,8 @@ def _of_field(record: FieldEstimate) -> dict[str, Any]:
 def summary(particle: Particle, found: Sequence[dict[str, Any]], best: float) -> str:
     """The lines of the table."""
     usable = [one for one in found if one.get("attractors") == 2]
+    if not usable:
+        return f"laboratories: {len(found)}, with two wells: 0"
     errors = np.array([one["barriers"] for one in usable], dtype=float) - particle.barrier
     stated = np.array([one["errors"] for one in usable], dtype=float)
     certified = np.array([bool(one.get("certified")) for one in usable])
