@@ -1,4 +1,5 @@
-# Two commands: `make statistics` and `make test`. Each target sets up .venv with the pinned versions first.
+# Two commands: `make statistics` and `make test`. Each target sets up .venv with the pinned versions first. What
+# stands behind `##` is what `make help` says of a target; tests/test_release.py asks for it.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -11,99 +12,104 @@ INSTALL := $(BIN)/python -m pip install --quiet --no-compile
 # It has to be written then: the imports of one process cost 12 s without any, 4 s with it, and there are hundreds.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: statistics examples test suite test-portable full untuned noise wheel test-pages newcomer laboratories coverage supports discrepancies \
-        hostile golden official docs docs-full lint format environment clean
+.DEFAULT_GOAL := help
 
-statistics: environment
+.PHONY: help statistics examples test suite test-portable full untuned noise wheel test-pages newcomer laboratories coverage supports discrepancies \
+        hostile golden official docs docs-full schemas release-check lint format environment clean
+
+help:  ## this list, which plain `make` prints, too
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
+
+statistics: environment  ## 50 runs of the paper's system, with their page: results/archetype3d/report.html
 	$(BIN)/snakemake --cores $(CORES) statistics
 
-examples: environment
+examples: environment  ## the two examples that come with their recordings
 	$(BIN)/snakemake --cores $(CORES) examples
 
-test: lint suite
+test: lint suite  ## lint, and every test that takes seconds: what CI asks first
 
-suite: environment
+suite: environment  ## the tests of `make test` without lint
 	$(BIN)/pytest --numprocesses logical --dist loadgroup --no-loadscope-reorder
 
 # Quick numerical tests as on a processor without AVX-512: sums are rounded otherwise there, and no answer may hang on
 # that. On other processors than those of x86 there is nothing to switch off.
 WITHOUT_AVX512 := NPY_DISABLE_CPU_FEATURES="X86_V4 AVX512_ICL AVX512_SPR" OPENBLAS_CORETYPE=Haswell \
                   ATEN_CPU_CAPABILITY=avx2 NUMBA_CPU_NAME=haswell
-test-portable: environment
+test-portable: environment  ## quick numerical tests as on a processor without AVX-512
 	test "$$(uname -m)" != x86_64 || $(WITHOUT_AVX512) $(BIN)/pytest -m "portable and not slow" \
 	  $$(grep --recursive --files-with-matches --include='*.py' mark.portable tests) \
 	  --numprocesses logical --dist loadgroup --no-loadscope-reorder
 
 # Everything: the tests of `make test` and the full-size checks, minutes each.
-full: environment lint
+full: environment lint  ## every test, the full-size checks included: minutes each
 	$(BIN)/pytest --numprocesses logical --dist loadgroup --no-loadscope-reorder -m "slow or not slow"
 
-untuned: environment
+untuned: environment  ## systems for which nothing was tuned, with networks
 	$(BIN)/pytest -m slow -s tests/slow/test_untuned_systems.py
 
-noise: environment
+noise: environment  ## statistics of the paper's system with noise, 50 runs
 	$(BIN)/pytest -m slow -s tests/slow/test_noise_statistics.py
 
 # The wheel, and a small problem solved with it where neither the sources nor an extra are at hand.
-wheel: environment
+wheel: environment  ## the wheel in dist/, installed and used elsewhere without extras
 	rm -rf build dist
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
 	PYTHON=$(BIN)/python .ci/check-wheel
 
 # Every kind of page in Chromium, on a desk and on a phone; skipped where there is no Chromium.
-test-pages: environment docs
+test-pages: environment docs  ## every kind of page in Chromium, on a desk and on a phone
 	$(BIN)/python -m pip install --quiet --constraint requirements/pinned.txt --editable '.[pages]'
 	$(BIN)/pytest -m pages tests/pages
 
 # A fresh environment, a wheel, recordings: how long until a certified barrier and until a verdict.
-newcomer: wheel
+newcomer: wheel  ## how long a newcomer waits for a certified barrier, and for a verdict
 	$(BIN)/python benchmarks/newcomer.py
 
 # Noisy, hopping records of simulated laboratories, a hundred of each, against the Cramér–Rao bounds of their
 # barriers and other methods: hours, and it goes on where it was stopped. `make laboratories SEEDS=5` for a look;
 # SFI_PYTHON=... names a Python that has StochasticForceInference.
 SEEDS ?= 100
-laboratories: environment
+laboratories: environment  ## simulated laboratories against their bounds and other methods: hours (SEEDS=5 for a look)
 	$(BIN)/python -m benchmarks.laboratories --seeds $(SEEDS) --cores $(CORES)
 
 # Whether standard errors cover at every ratio of sensor noise to random forces.
-coverage: environment
+coverage: environment  ## whether standard errors cover at every ratio of measurement to process noise
 	$(BIN)/python -m benchmarks.laboratories.coverage --seeds 200 --cores $(CORES)
 
 # Whether f has the true terms, and no others, in records that hold the evidence.
-supports: environment
+supports: environment  ## whether f has the true terms, and no others
 	$(BIN)/python -m benchmarks.laboratories.supports --seeds $(SEEDS) --cores $(CORES)
 
 # The diagnosis beside other methods on forty concealed cases, 60 s a case and method on one core: about an hour, and
 # it goes on where it was stopped.
-discrepancies: environment
+discrepancies: environment  ## the diagnosis beside other methods on forty concealed cases: an hour
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m benchmarks.discrepancies
 
 # Records of seventy kinds that nobody should certify, and honest ones that look alike: hours, and it goes on where it was
 # stopped. `make hostile HOSTILE='--seeds 0'` for a look; a fifth of the kinds runs with HOSTILE=--held-out alone.
 HOSTILE ?=
-hostile: environment
+hostile: environment  ## records that nobody should certify, and honest ones that look alike: hours
 	$(BIN)/python -m benchmarks.hostile --jobs $(CORES) $(HOSTILE)
 	$(BIN)/python -m benchmarks.hostile --jobs $(CORES) $(HOSTILE) --honest
 
 # What the code gives, against the tables in tests/golden: half an hour of one core. `make golden GROUP=equations` is one
 # group, `GOLDEN=--write` writes the tables, `GOLDEN='--results DIR'` names another folder of results.
 GROUP ?=
-golden: environment
+golden: environment  ## results against the tables in tests/golden: half an hour (GROUP=equations for a part)
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m benchmarks.golden $(GROUP) $(GOLDEN)
 
 # The official tests of public benchmarks: results/official/page.md, a table with published figures, and a
 # picture of each. Nothing is downloaded; `make official SIQ_RESOURCES=DIR` names the folder of their files.
-official: environment
+official: environment  ## official tests of public benchmarks (SIQ_RESOURCES=DIR has their files)
 	SIQ_RESOURCES=$(SIQ_RESOURCES) $(BIN)/snakemake --cores $(CORES) official
 
 # docs/_build/html/index.html: the pages and the reference. A warning is an error.
-docs: environment
+docs: environment  ## the documentation: docs/_build/html/index.html; a warning is an error
 	rm -rf docs/_build/html docs/api
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -b html docs docs/_build/html
 
 # The documentation from its beginnings: examples, notebooks and pictures are made anew, figures read from results.
-docs-full: environment
+docs-full: environment  ## examples, notebooks and pictures made anew, then the documentation
 	$(BIN)/python docs/make/gallery.py
 	$(BIN)/python docs/make/notebooks.py
 	$(BIN)/python docs/make/concepts.py
@@ -111,19 +117,27 @@ docs-full: environment
 	$(BIN)/python docs/make/figures.py
 	$(MAKE) docs
 
-lint: environment
+# Schemas of configuration for editors and for the catalogue of workflows, from the classes that check it.
+schemas: environment  ## workflow/schemas/, from the classes that check the configuration
+	$(BIN)/python docs/make/schemas.py
+
+# Version, changelog, citation, schemas, wheel and sdist, documentation, worktree. Nothing is published.
+release-check: environment  ## the checklist before a release, walked by a machine; nothing is published
+	$(BIN)/python .ci/release_check.py
+
+lint: environment  ## ruff, mypy, snakefmt, and Snakemake's own lint
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/snakefmt --check Snakefile workflow
 	$(BIN)/snakemake --lint
 
-format: environment
+format: environment  ## the sources, formatted
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 	$(BIN)/snakefmt Snakefile workflow
 
-environment: $(VENV)/installed
+environment: $(VENV)/installed  ## .venv with the pinned versions of everything; each target asks for it
 
 # The stamp is written last: an interrupted installation is begun again.
 $(VENV)/installed: pyproject.toml requirements/pinned.txt
@@ -137,5 +151,5 @@ $(VENV)/installed: pyproject.toml requirements/pinned.txt
 	$(INSTALL) --constraint requirements/pinned.txt --editable '.[dev]'
 	touch $@
 
-clean:
+clean:  ## removes .venv and what tools and builds have written, not results
 	rm -rf $(VENV) .snakemake .mypy_cache .ruff_cache .pytest_cache build dist docs/_build docs/api

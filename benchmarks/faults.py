@@ -120,8 +120,8 @@ def one_moment(seed: int, reference: dict[str, str | None], seconds: float, fold
     if (found := contents(folder)) != reference:
         other = [name for name in {*found, *reference} if found.get(name) != reference.get(name)]
         faults.append(f"these differ: {other}")
-    if left := [str(file) for file in (folder / "results").rglob(".partial-*")]:
-        faults.append(f"half a file: {left}")
+    if halves := [str(file) for file in (folder / "results").rglob(".partial-*")]:
+        faults.append(f"half a file: {halves}")
     name = "snakemake" if target != process.pid else "siq"
     return {"seed": seed, "signal": number.name, "to": name, "at": round(moment, 2), "faults": faults}
 

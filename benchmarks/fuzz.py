@@ -24,6 +24,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +78,7 @@ def corpus(folder: Path) -> dict[str, list[tuple[str, bytes]]]:
         (".dat", short.replace(",", " ").encode()),
         (".txt", short.encode("utf-16")),
     ]  # fmt: skip
-    arrays = {"t": table.iloc[:, 1].to_numpy(), "x": table.iloc[:, 2].to_numpy()}
+    arrays: dict[str, Any] = {"t": table.iloc[:, 1].to_numpy(), "x": table.iloc[:, 2].to_numpy()}
     for suffix, store in (
         (".parquet", lambda path: table.to_parquet(path)), (".npz", lambda path: np.savez(path, **arrays)),
         (".npy", lambda path: np.save(path, np.stack([*arrays.values()], axis=1))),
@@ -114,7 +115,9 @@ def readers(folder: Path) -> dict[str, Callable[[Path], Any]]:
     from workflow.files import read
     from workflow.published import load_published
 
-    dynamics = read_field(folder / "field.json").dynamics
+    field = read_field(folder / "field.json")
+    assert field is not None
+    dynamics = field.dynamics
 
     def card(path: Path) -> None:
         from siq.quasipotential.landscape_assembly import usable_system
@@ -138,8 +141,7 @@ def readers(folder: Path) -> dict[str, Callable[[Path], Any]]:
         "card": card, "study": study, "mismatch": load_mismatch_study, "published": load_published,
         "recordings": lambda path: inspect(path).text(), "answer": answer,
         "quasipotential": lambda path: read_landscape(path, dynamics=dynamics),
-        **{name: (lambda path, name=name: read(name, path)) for name in
-           ("field", "model", "landscape_outcome", "table")},
+        **{name: partial(read, name) for name in ("field", "model", "landscape_outcome", "table")},
     }  # fmt: skip
 
 

@@ -20,6 +20,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numba
 import numpy as np
@@ -136,7 +137,7 @@ def bound(particle: Particle) -> float:
     return float(np.sqrt(slopes @ np.linalg.solve(np.mean(each, axis=0), slopes)))
 
 
-def analysed(particle: Particle, seed: int) -> dict[str, object]:
+def analysed(particle: Particle, seed: int) -> dict[str, Any]:
     """What the analysis makes of one laboratory's records."""
     settings = PipelineSettings(identification=IdentificationOptions(hidden_velocities=True))
     recordings = recorded(particle, seed)
@@ -159,13 +160,13 @@ def analysed(particle: Particle, seed: int) -> dict[str, object]:
     }
 
 
-def only_barriers(particle: Particle, seed: int) -> dict[str, object]:
+def only_barriers(particle: Particle, seed: int) -> dict[str, Any]:
     """The same without formulas, certificate and times."""
     settings = PipelineSettings(identification=IdentificationOptions(hidden_velocities=True))
     recordings = in_stretches(without_slow_drift(recorded(particle, seed)))
     began = time.process_time()
     identified = pipeline.identify_run(settings, recordings, number=0)
-    record = identified.record
+    record = identified.result
     if record is None:
         return {"fault": [identified.outcome.reason], "seconds": time.process_time() - began}
     x = of_all_states(recordings, record, pair_step=None).values
@@ -186,26 +187,29 @@ def only_barriers(particle: Particle, seed: int) -> dict[str, object]:
     }
 
 
-def _of_field(record: FieldEstimate) -> dict[str, object]:
+def _of_field(record: FieldEstimate) -> dict[str, Any]:
+    assert record.prediction is not None and record.diagnosis is not None
     return {
         "terms": [record.library.names[term] for _, term in record.support[1:]],
-        "predicts": bool(record.prediction.passed),
+        "predicts": record.prediction.passed,
         "intensity": record.diagnosis.intensity,
         "intensity_error": record.diagnosis.intensity_error,
     }
 
 
-def summary(particle: Particle, found: Sequence[dict[str, object]], best: float) -> str:
+def summary(particle: Particle, found: Sequence[dict[str, Any]], best: float) -> str:
     """The lines of the table."""
     usable = [one for one in found if one.get("attractors") == 2]
+    if not usable:
+        return f"laboratories: {len(found)}, with two wells: 0"
     errors = np.array([one["barriers"] for one in usable], dtype=float) - particle.barrier
     stated = np.array([one["errors"] for one in usable], dtype=float)
     certified = np.array([bool(one.get("certified")) for one in usable])
     far = np.abs(errors) > FAR * stated
-    true = sum(sorted(one["terms"]) == ["v_x", "x", "x**3"] for one in usable)  # type: ignore[type-var, arg-type]
+    true = sum(sorted(one["terms"]) == ["v_x", "x", "x**3"] for one in usable)
     false = int(far[certified].any(axis=1).sum())
     false += sum(bool(one.get("certified")) for one in found if one.get("attractors") != 2)
-    noise = [(float(one["intensity"]) / particle.intensity - 1) for one in usable]  # type: ignore[arg-type]
+    noise = [one["intensity"] / particle.intensity - 1 for one in usable]
     return "\n".join(
         [
             f"laboratories: {len(found)}, with two wells: {len(usable)}",
@@ -225,8 +229,8 @@ def summary(particle: Particle, found: Sequence[dict[str, object]], best: float)
     )
 
 
-def _seconds(found: Sequence[dict[str, object]], *, asked: bool) -> float:
-    return float(np.median([one["seconds"] for one in found if ("certified" in one) == asked] or [np.nan]))  # type: ignore[arg-type]
+def _seconds(found: Sequence[dict[str, Any]], *, asked: bool) -> float:
+    return float(np.median([one["seconds"] for one in found if ("certified" in one) == asked] or [np.nan]))
 
 
 def main() -> None:

@@ -143,8 +143,8 @@ def line(name: str, kind: Kind, seed: int) -> str:
     began = time.process_time()
     try:
         landscape = Landscape.from_recordings(recordings, hidden_velocities=True)
-    except NoLandscape as error:
-        return f"| {name} | {error} |"
+    except NoLandscape as none:
+        return f"| {name} | {none} |"
     seconds = time.process_time() - began
     rows = landscape.barriers().dropna(subset=["end"])
     certified = landscape.certificate is not None and landscape.certificate.certified

@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import csv
 import logging
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -251,4 +250,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -28,9 +28,9 @@ from siq.data.recordings import Recordings, snapshot_pairs
 from siq.networks.decomposition import TrainingOptions
 from siq.systems.cards import load_exact, load_system
 from siq.systems.formulas import compile_formulas
-from siq.systems.simulation import simulate_snapshots
+from siq.systems.simulation import SimulationEntry, simulate_snapshots
 from siq.workflow.pipeline import Analysis, PipelineSettings, analyse
-from siq.workflow.study import Sampling, SimulationEntry, StateSpace
+from siq.workflow.study import Sampling, StateSpace
 from siq.workflow.tables import Method
 
 ROOT = Path(__file__).parents[1]

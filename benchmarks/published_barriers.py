@@ -33,6 +33,7 @@ if __name__ == "__main__":
         ours = way.barrier / 2
         print(f"from A{way.start + 1}: ours {ours:.8f}, published {published:g}, {published / ours - 1:+.1%}")
     first, second = found.transitions
+    assert first.rate is not None
     start, end = (one.position for one in found.attractors)
     target = Neighbourhood.about(system, end, level=DEEP * second.barrier / 2)
     inverse, logarithm, error = [], [], []

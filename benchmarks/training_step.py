@@ -13,6 +13,7 @@ os.environ["OMP_NUM_THREADS"] = "1"
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -33,7 +34,7 @@ def automatic_gradient(layers: tuple[Layer, ...], y: torch.Tensor) -> tuple[torc
     """Value and gradient of the network, the gradient by a second pass of automatic differentiation."""
     with torch.enable_grad():
         y = y if y.requires_grad else y.detach().requires_grad_()
-        value = networks_module._forward(layers, y)
+        value = networks_module._hidden(layers, y)[-1]
         (gradient,) = torch.autograd.grad(value.sum(), y, create_graph=True)
     return value, gradient
 
@@ -46,17 +47,17 @@ def main() -> None:
     pairs = snapshot_pairs(recordings, pair_step=0.01)
     published = load_study("config/studies/archetype3d-published.yaml").training
     ours = load_study("config/studies/archetype3d.yaml").training
+    assert published is not None and ours is not None
     by_hand = networks_module._value_and_gradient
 
     def milliseconds(options: TrainingOptions, steps: int, *, gradient: Gradient = by_hand) -> float:
         data = [prepare_data(pairs, options=options, generator=np.random.default_rng(0))]
         seeds = [np.random.SeedSequence(0)]
         state = start(data, options=options, diffusion=system.diffusion, seeds=seeds)
-        networks_module._value_and_gradient = gradient
-        state = train(state, data, options=replace(options, steps=3), seeds=seeds, log_every=10**9)
-        began = time.perf_counter()
-        train(state, data, options=replace(options, steps=3 + steps), seeds=seeds, log_every=10**9)
-        networks_module._value_and_gradient = by_hand
+        with patch.object(networks_module, "_value_and_gradient", gradient):
+            state = train(state, data, options=replace(options, steps=3), seeds=seeds, log_every=10**9)
+            began = time.perf_counter()
+            train(state, data, options=replace(options, steps=3 + steps), seeds=seeds, log_every=10**9)
         return 1e3 * (time.perf_counter() - began) / steps
 
     automatic = milliseconds(published, 10, gradient=automatic_gradient)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
+import ast
 import importlib.util
 import json
 import re
@@ -54,6 +56,49 @@ def test_paths_of_the_sources_exist(page: Path) -> None:
         )
     )
     assert not {path for path in named if "NAME" not in path and not (ROOT / path).exists()}
+
+
+def parser_of(script: Path) -> argparse.ArgumentParser:
+    """Its parser as far as its text shows it: imports of all benchmarks would take ten seconds."""
+    types = {"int": int, "float": float}
+    parser = argparse.ArgumentParser(prog=name_of(script), add_help=False)
+    for call in ast.walk(ast.parse(script.read_text(encoding="utf-8"))):
+        if not (isinstance(call, ast.Call) and getattr(call.func, "attr", "") == "add_argument"):
+            continue
+        given: dict[str, Any] = {}
+        for one in call.keywords:
+            if one.arg == "type":
+                given["type"] = types.get(getattr(one.value, "id", ""), str)
+            elif one.arg in ("action", "nargs", "required"):
+                given[one.arg] = ast.literal_eval(one.value)
+            elif one.arg == "choices" and isinstance(one.value, ast.Tuple | ast.List):
+                given["choices"] = ast.literal_eval(one.value)
+        parser.add_argument(*map(ast.literal_eval, call.args), **given)
+    return parser
+
+
+def test_commands_of_benchmarks_are_understood() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    makefile = re.sub(r"(?<!-)(?<=\s)\$\(\w+\)", "", re.sub(r"(--[\w-]+) \$\(\w+\)", r"\1 1", makefile))
+    named = set()
+    for text in (makefile, *(page.read_text(encoding="utf-8") for page in PAGES)):
+        named |= set(re.findall(r"python (?:-m )?((?:benchmarks|docs/make)[./][\w./]+)([^`#\n]*)", text))
+    assert len(named) > 20
+    for target, words in sorted(named):
+        path = ROOT / (target if target.endswith(".py") else target.replace(".", "/"))
+        script = next(
+            (one for one in (path, path.with_suffix(".py"), path / "__main__.py") if one.is_file()), None
+        )
+        assert script is not None, f"there is no {target}"
+        if "sys.argv[1" in (text := script.read_text(encoding="utf-8")):
+            continue  # takes what there is
+        if "add_argument" not in text:
+            assert set(words.split()) <= set(re.findall(r'"(--[\w-]+)" in sys.argv', text)), (target, words)
+            continue
+        try:
+            parser_of(script).parse_args(words.split())
+        except SystemExit:
+            pytest.fail(f"python {target}{words} is not understood")
 
 
 def test_docstrings_and_templates_name_what_there_is() -> None:

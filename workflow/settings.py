@@ -10,7 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, Field
 
 from siq.data.preparation import read_pairs
 from siq.errors import InputError, suggestion
@@ -31,9 +33,33 @@ from siq.workflow.study import (
 from workflow.places import BASE, config_path, named_file, names_in, needed_file
 from workflow.published import load_published
 
-WORKFLOW_KEYS = ("statistics", "device", "runs_per_training", "mismatch", "cases", "keys", "proof", "origin")
 NETWORKS = ("torch", "pysindy")
 """What a study that asks for networks needs beside the rest."""
+
+
+class Configuration(BaseModel):
+    """What belongs to no study: the keys of ``config/config.yaml``.
+
+    Attributes
+    ----------
+    statistics
+        The studies that are made if you name no target.
+    device
+        Where networks are trained: ``auto`` takes a GPU where there is one. No result depends on it beyond
+        the last bits.
+    runs_per_training
+        Runs that one job trains side by side: 1 suits a CPU, 50 a GPU.
+    mismatch
+        The studies that the target ``mismatch`` makes.
+    """
+
+    statistics: tuple[str, ...] = ("archetype3d",)
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    runs_per_training: Annotated[int, Field(ge=1)] = 1
+    mismatch: tuple[str, ...] = ("silverbox", "cascaded-tanks")
+
+
+WORKFLOW_KEYS = (*Configuration.model_fields, "cases", "keys", "proof", "origin")
 
 
 @dataclass(frozen=True)
@@ -191,15 +217,7 @@ class Studies(Mapping[str, CheckedStudy]):
 
     def __init__(self, config: Mapping[str, Any], *, configfiles: Sequence[str]) -> None:
         self._checked: dict[str, CheckedStudy] = {}
-        self._runs_per_training = config.get("runs_per_training", 1)
-        if not isinstance(self._runs_per_training, int) or self._runs_per_training < 1:
-            raise InputError(
-                "config/config.yaml",
-                "runs_per_training",
-                f"{self._runs_per_training!r} is not a number of runs",
-                "write 1 or more",
-            )
-        self._defaults = config.get("statistics", [])
+        self._common = validate(Document("config/config.yaml", dict(config), {}), Configuration)
         self._origin = config.get("origin")
         self._own: str | None = None
         if any(key not in WORKFLOW_KEYS for key in config):
@@ -234,7 +252,7 @@ class Studies(Mapping[str, CheckedStudy]):
             completed(study, system),
             document.file,
             system,
-            self._runs_per_training,
+            self._common.runs_per_training,
             self._origin,
             document.place(("recordings", "file")),
         )
@@ -245,7 +263,7 @@ class Studies(Mapping[str, CheckedStudy]):
 
     def default_names(self) -> list[str]:
         """The studies that ``statistics`` makes: the user's own, or those of the configuration."""
-        return [self._own] if self._own is not None else list(self._defaults)
+        return [self._own] if self._own is not None else list(self._common.statistics)
 
     def __getitem__(self, name: str) -> CheckedStudy:
         if name not in self._checked:

@@ -84,7 +84,7 @@ def _shares(axes: Axes, scores: pd.DataFrame, methods: list[str]) -> None:
     counts = summary_of(scores).groupby("method", sort=False).sum(numeric_only=True)
     for number, (what, of, label, colour, hatch) in enumerate(SHARES):
         for place, method in enumerate(methods):
-            count, total = int(counts.loc[method, what]), int(counts.loc[method, of])
+            count, total = int(counts[what][method]), int(counts[of][method])
             height = place + 0.2 * (number - 1.5)
             share = 100 * count / total if total else 0.0
             axes.barh(

@@ -89,7 +89,7 @@ def scored_case(case: CaseFiles, folder: Path, keys: Path, methods: Sequence[str
     true = true_case(comparison, key, truth, starts)
     errors = Errors(comparison, true)
     oracle, card = errors.of(true.model, None), errors.of(recalibrated(comparison), None)
-    common = {
+    common: dict[str, Any] = {
         "generator": case.generator,
         "case": case.name,
         "system": key.system,

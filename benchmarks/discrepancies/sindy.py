@@ -142,7 +142,7 @@ def said(model: Dynamics, equations: list[Equation], found: list[Found], exponen
     detected = [one.detected for one in found]
     if not any(detected):
         return Answer(evidence=evidence, values=values_of(model))
-    strongest = max(np.flatnonzero(detected), key=lambda k: found[k].evidence)
+    strongest = int(max(np.flatnonzero(detected), key=lambda k: found[k].evidence))
     coefficients, change = joint(equations, found)
     values = model.values
     values[list(model.free)] += change

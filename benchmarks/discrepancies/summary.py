@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -81,6 +82,7 @@ HEAD = (
 def text(found: pd.DataFrame) -> str:
     """As a table in Markdown."""
     lines = [HEAD, "|" + "---|" * (HEAD.count("|") - 1)]
+    one: Any
     for one in found.itertuples():
         label = GENERATORS[str(one.generator)]
         error = f"{number(one.error_ratio)} ({number(one.error_ratio_low)} to {number(one.error_ratio_high)})"

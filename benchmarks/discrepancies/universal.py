@@ -70,6 +70,11 @@ def universal(case: Comparison, seconds: float, report: Report) -> Answer:
 class Equations(torch.nn.Module):
     """The card's equations with a network in them, at states ``(segments, d)``."""
 
+    middle: torch.Tensor
+    width: torch.Tensor
+    size: torch.Tensor
+    values: torch.Tensor
+
     def __init__(self, fit: Fit, data: Measurements) -> None:
         super().__init__()
         model = fit.model

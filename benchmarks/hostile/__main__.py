@@ -68,7 +68,7 @@ def table(found: pd.DataFrame) -> pd.DataFrame:
         rows.append(
             {
                 "kind": name,
-                "family": FAMILIES[name],
+                "family": FAMILIES[str(name)],
                 "cases": len(hostile),
                 "certified": int(hostile.certified.sum()),
                 "false": int(hostile["false"].sum()),

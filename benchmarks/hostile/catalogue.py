@@ -7,6 +7,8 @@ import numpy as np
 from benchmarks.hostile import memories, mixtures, sensors, signals
 from benchmarks.hostile.kinds import KINDS
 
+__all__ = ["FAMILIES", "HELD_OUT", "KINDS", "KNOWN"]
+
 FAMILIES = {
     name: module.__name__.rsplit(".", 1)[-1]
     for module in (mixtures, memories, sensors, signals)

@@ -158,6 +158,7 @@ def claims_of(found: Landscape, record: Record) -> list[Claim]:
     if not getattr(found.certificate, "times_certified", True):
         return claims
     if noise is not None:
+        row: Any
         for row in found.dwell_times().itertuples():
             spread = float(np.hypot(row.data_error, row.law_error))
             times.append((row.attractor, row.mean_time, spread, "law"))
@@ -165,7 +166,7 @@ def claims_of(found: Landscape, record: Record) -> list[Claim]:
         others = [one for place, one in enumerate(wells) if place != well]
         if not others or not np.isfinite([mean, spread]).all():
             continue
-        end = min(others, key=lambda one, well=well: abs(one - wells[well]))
+        end = min(others, key=lambda one: abs(one - wells[well]))
         value, factor = mean / scene.pace, np.exp(INTERVAL * spread)
         claims.append(Claim(what, wells[well], end, value, value / factor, value * factor))
     return claims

@@ -100,12 +100,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         groups: dict[tuple[str, int], list[Task]] = {}
         for task in wanted:
             groups.setdefault((task.laboratory, task.seed), []).append(task)
+
+        def answered(group: list[Task]) -> list[tuple[Task, str]]:
+            return [(each, run(each, chosen.folder)) for each in group]
+
         began, done = time.perf_counter(), 0
         with ThreadPoolExecutor(chosen.cores) as pool:
-            running = [
-                pool.submit(lambda group=group: [(each, run(each, chosen.folder)) for each in group])
-                for group in groups.values()
-            ]
+            running = [pool.submit(answered, group) for group in groups.values()]
             for finished in as_completed(running):
                 done += 1
                 for task, fault in finished.result():

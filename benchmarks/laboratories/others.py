@@ -67,7 +67,8 @@ def least_squares(terms: np.ndarray, wanted: np.ndarray, weights: np.ndarray | N
 def kramers_moyal(laboratory: Laboratory, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Means and variances of the increments in bins of the states, with polynomials fitted through them."""
     x, rates = increments(laboratory, seen)
-    edges = [np.linspace(*np.quantile(each, [0.001, 0.999]), BINS + 1) for each in x.T]
+    low, high = np.quantile(x, [0.001, 0.999], axis=0)
+    edges = np.linspace(low, high, BINS + 1, axis=1)
     places = [
         np.clip(np.searchsorted(edge, each), 1, BINS) - 1 for edge, each in zip(edges, x.T, strict=True)
     ]

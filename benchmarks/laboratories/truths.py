@@ -124,13 +124,12 @@ def _by_quadrature(laboratory: Laboratory, attractor: float, saddle: float) -> t
         return float(quad(of, attractor, saddle, epsabs=0, epsrel=1e-11)[0])
 
     scale = float(laboratory.intensities[0]) if laboratory.diffusion_given else 1.0
-    by_force = [
-        integral(lambda x, each=each: -2 * monomial(each, np.array([x])) / noise(x)) for each in system.powers
-    ]
-    by_noise = [
-        integral(lambda x, each=each: 2 * force(x) * monomial(each, np.array([x])) / noise(x) ** 2)
-        for each in system.noise_powers
-    ]
+
+    def slope(powers: np.ndarray, of: Callable[[float], float]) -> float:
+        return integral(lambda x: monomial(powers, np.array([x])) * of(x))
+
+    by_force = [slope(each, lambda x: -2 / noise(x)) for each in system.powers]
+    by_noise = [slope(each, lambda x: 2 * force(x) / noise(x) ** 2) for each in system.noise_powers]
     if laboratory.diffusion_given:  # U for D = 1 knows nothing of a constant q
         by_noise = [0.0] * len(by_noise)
     return scale * integral(lambda x: -2 * force(x) / noise(x)), scale * np.array([*by_force, *by_noise])

@@ -151,9 +151,8 @@ def _quadratic(axes: Axes, field: np.ndarray, diffusion: np.ndarray, x: np.ndarr
     hessian = np.linalg.inv(solve_continuous_lyapunov(field, -2 * diffusion))
     u = np.einsum("iab,ij,jab->ab", np.array([x, y]), hessian, np.array([x, y]))
     shown = axes.contourf(x, y, u, np.linspace(0, 8, 17), cmap="Blues_r", extend="max")
-    axes.streamplot(
-        x, y, *np.einsum("ij,jab->iab", field, np.array([x, y])), color="0.85", linewidth=0.6, density=0.8
-    )
+    across, upwards = np.einsum("ij,jab->iab", field, np.array([x, y]))
+    axes.streamplot(x, y, across, upwards, color="0.85", linewidth=0.6, density=0.8)
     axes.figure.colorbar(shown, ax=axes, label="U")
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -24,7 +25,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 from remembering import STEP, double_wells  # noqa: E402  # the records of the tests
 
-CASES = {
+CASES: dict[str, dict[str, Any]] = {
     "white forces": {},
     "forces with a memory of 5 steps": {"memory": 5.0},
     "an exposure of 3 steps": {"exposure": 3.0},
@@ -33,7 +34,7 @@ CASES = {
 BLUE, BAND = "#3d5a80", "0.85"
 
 
-def inspected(given: dict[str, float]) -> siq.data.inspection.Inspection:
+def inspected(given: dict[str, Any]) -> siq.data.inspection.Inspection:
     """The inspection of one record."""
     values = double_wells(1, samples=10_000, **given)
     t = np.arange(values.shape[1]) * STEP
