@@ -588,10 +588,10 @@ def check_occupancy(
         missing = Remark("quasipotential.record_too_short_to_hop")
         return OccupancyCheck(missing=missing, passages=passages)
     # Each state's distribution during the visits to each well, on recordings that the parts did not see.
-    seen, variance, exposure = recordings.values, found.sensor_variance, found.exposure or 0.0
+    recorded, variance, exposure = recordings.values, found.sensor_variance, found.exposure or 0.0
     if measured is not None:  # at the samples that the filter used
         kept = recordings.recording + 1j * recordings.t
-        seen = measured.values[np.isin(measured.recording + 1j * measured.t, kept)]
+        recorded = measured.values[np.isin(measured.recording + 1j * measured.t, kept)]
     densities = []
     for well, *_ in times if processes else ():
         chosen = [np.flatnonzero(used & (visits == well)) for used, *_ in apart]
@@ -600,8 +600,8 @@ def check_occupancy(
             continue
         breaks = np.flatnonzero(np.diff(rows) > 1) + 1
         pieces = [slice(int(a), int(b)) for a, b in pairwise(np.concatenate([[0], breaks, [len(rows)]]))]
-        for state in range(seen.shape[1]):
-            x = seen[rows, state]
+        for state in range(recorded.shape[1]):
+            x = recorded[rows, state]
             blur = 0.0 if variance is None else float(np.sqrt(variance[state]))
             shown = {"blur": blur, "exposure": exposure}
             independent = len(x) / (2 * correlated_samples(x, pieces))
