@@ -66,9 +66,11 @@ SEEDS ?= 100
 laboratories: environment
 	$(BIN)/python -m benchmarks.laboratories --seeds $(SEEDS) --cores $(CORES)
 
-# Whether standard errors cover at every ratio of sensor noise to random forces.
+# Whether standard errors cover at every ratio of sensor noise to random forces, and the intervals of what a
+# user reads, in laboratories of all kinds.
 coverage: environment
 	$(BIN)/python -m benchmarks.laboratories.coverage --seeds 200 --cores $(CORES)
+	$(BIN)/python -m benchmarks.laboratories.coverage --landscapes --seeds 200
 
 # Whether f has the true terms, and no others, in records that hold the evidence.
 supports: environment
