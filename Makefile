@@ -72,9 +72,11 @@ SEEDS ?= 100
 laboratories: environment  ## simulated laboratories against their bounds and other methods: hours (SEEDS=5 for a look)
 	$(BIN)/python -m benchmarks.laboratories --seeds $(SEEDS) --cores $(CORES)
 
-# Whether standard errors cover at every ratio of sensor noise to random forces.
-coverage: environment  ## whether standard errors cover at every ratio of measurement to process noise
+# Whether standard errors cover at every ratio of sensor noise to random forces, and the intervals of what a
+# user reads, in laboratories of all kinds.
+coverage: environment  ## whether errors and intervals cover, in laboratories of all kinds
 	$(BIN)/python -m benchmarks.laboratories.coverage --seeds 200 --cores $(CORES)
+	$(BIN)/python -m benchmarks.laboratories.coverage --landscapes --seeds 200
 
 # Whether f has the true terms, and no others, in records that hold the evidence.
 supports: environment  ## whether f has the true terms, and no others

@@ -119,7 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     chosen = parser.parse_args(arguments)
     names = [name for name in KINDS if (name in HELD_OUT) == chosen.held_out]
     if chosen.kinds:
-        if chosen.held_out != all(name in HELD_OUT for name in chosen.kinds):
+        if any((name in HELD_OUT) != chosen.held_out for name in chosen.kinds):
             parser.error("a kind that is held out runs with --held-out, and others do not")
         names = chosen.kinds
     if chosen.list:

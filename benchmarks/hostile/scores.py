@@ -145,7 +145,7 @@ def claims_of(found: Landscape, record: Record) -> list[Claim]:
             continue
         height = way.barrier / noise.intensity
         error = np.hypot(
-            np.nan_to_num(way.standard_error) / noise.intensity,
+            np.nan_to_num(way.error) / noise.intensity,
             height * way.leverage * noise.standard_error / noise.intensity,
         )
         top = np.atleast_1d(way.place)

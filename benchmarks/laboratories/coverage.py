@@ -1,10 +1,16 @@
 """Do the estimator's standard errors cover, whatever the ratio of the two noises?
 
     python -m benchmarks.laboratories.coverage [--seeds 200] [--estimator NAME ...]
+    python -m benchmarks.laboratories.coverage --landscapes [--seeds 200]
 
 The ratio is R/(Qh): the variance of the sensor over that of the process noise within a step. A linear system
 and a double well, of which f has free coefficients, and both noises are unknown. The bar is 90 to 98 % of all
 coefficients within 1.96 of their standard errors. What has not converged counts as no fit.
+
+With ``--landscapes`` it is asked of what a user reads: coefficients of f, ε, positions of wells, barriers
+ΔU/ε and mean times, by their intervals of 68 and 95 %. Each seed is a laboratory of its own (`drawn`): tilted
+double wells of one state, or of two with a force that circulates, recorded coarsely or finely, with and
+without a noisy sensor, long enough for one passage from well to well or for forty.
 """
 
 from __future__ import annotations
@@ -13,7 +19,7 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,17 +29,26 @@ from pathlib import Path
 import numpy as np
 import sympy
 
+from benchmarks.hostile.records import Law
 from benchmarks.laboratories.bounds import OTHER_SEEDS, SUBSTEPS, inverse
 from benchmarks.laboratories.information import information
 from benchmarks.laboratories.models import Laboratory
 from benchmarks.laboratories.one import read, write
-from benchmarks.laboratories.records import generator, recorded
+from benchmarks.laboratories.records import crossings, generator, recorded, table
+from siq.data.preparation import in_stretches
+from siq.data.recordings import Recordings
+from siq.errors import InputError, NumericalFailure
 from siq.inference import maximum_likelihood
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
+from siq.quasipotential.landscape import Landscape
+from siq.quasipotential.landscape_assembly import find_landscape
+from siq.quasipotential.rates import NoiseStrength
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, symbol
+from siq.systems.phase_portrait import phase_portrait
+from siq.workflow import pipeline
 
 RATIOS = (0.01, 0.1, 1.0, 10.0, 100.0)
 START = 0.7  # of the true coefficients: where a fit begins
@@ -204,6 +219,133 @@ HEAD = (
 )
 
 
+DRAWN_WITH = 34  # the seed of all laboratories that are drawn
+MOST_SAMPLES = 30_000  # of all records of one
+FINE = 1e-3  # of the simulation: what its steps leave out of ε is two thousandths
+CONFIDENCES = {"68 %": 0.994458, "95 %": 1.959964}  # half widths in standard errors
+PASSAGES = {"1 to 10": (1, 10), "more": (11, 10**9)}  # seen from well to well
+Figure = tuple[str, float]
+"""What is asked, and by how many standard errors the answer is off."""
+
+
+def drawn(seed: int) -> Laboratory:
+    """A laboratory of its own: ``V = (x² - 1)²/4 - tilt x + y²/2``, ``f = -∇V + turn (V_y, -V_x)``."""
+    draw = np.random.default_rng([DRAWN_WITH, seed])
+    intensity, tilt = 0.5 / draw.uniform(1.7, 3.0), draw.uniform(-0.05, 0.05)
+    step, passages = 10 ** draw.uniform(-1.7, -0.7), 10 ** draw.uniform(0, 1.6)
+    records, turn = int(draw.choice([1, 4])), float(draw.choice([0.0, 0.0, 0.5, 1.5]))
+    sensor = float(draw.choice([0.0, 0.0, 0.1, 0.2]))
+    stay = np.sqrt(2) * np.pi * np.exp(0.5 / intensity)
+    samples = int(np.clip(passages * stay / step, 1_000, MOST_SAMPLES)) // records
+    slope = {(1, 0): 1.0, (3, 0): -1.0, (0, 0): tilt}  # -V_x
+    if turn:
+        circling = {powers: turn * value for powers, value in slope.items()}
+        drift: tuple[dict[tuple[int, ...], float], ...] = (
+            {**slope, (0, 1): turn}, {**circling, (0, 1): -1.0},
+        )  # fmt: skip
+    else:
+        drift = ({powers[:1]: value for powers, value in slope.items()},)
+    zero = (0,) * len(drift)
+    places = sorted(np.roots([-1.0, 0.0, 1.0, tilt]).real)
+    left, top, right = ((float(one), *zero[1:]) for one in places)
+    # f·∇V + |∇V|² vanishes, for what circulates is orthogonal to ∇V: U = 2V.
+    return Laboratory(
+        f"drawn-{seed}", "a tilted double well", ("x", "y")[: len(drift)], drift, {zero: intensity},
+        attractors=(left, right), saddles=(top,), records=records, samples=samples, step=step,
+        within=int(np.ceil(step / FINE)),
+        sensor_noise=(sensor,) * len(drift) if sensor else (),
+    )  # fmt: skip
+
+
+def landscape_figures(seed: int) -> dict[str, object]:
+    """Passages seen in a drawn laboratory, by how many standard errors each answer is off, and faults."""
+    laboratory = drawn(seed)
+    seen = recorded(laboratory, generator(laboratory, seed))
+    began = time.process_time()
+    found: dict[str, object] = {"passages": crossings(laboratory, seen), "figures": [], "fault": ""}
+    recordings = in_stretches(Recordings.from_frame(table(laboratory, seen)))
+    try:
+        identified = pipeline.identify_run(pipeline.PipelineSettings(), recordings, number=seed)
+        estimate = identified.result
+        if estimate is None or estimate.noise_strength is None:
+            return found | {"fault": identified.outcome.reason or "no process noise"}
+        portrait = phase_portrait(
+            estimate.dynamics, recordings.values[:: -(-len(recordings.t) // 2000)], seed=0
+        )
+        noise = NoiseStrength(*estimate.noise_strength, source="estimated")
+        landscape = find_landscape(estimate, portrait, wells=(), noise=noise)
+        found["figures"] = list(_figures(laboratory, landscape))
+    except (NumericalFailure, InputError, np.linalg.LinAlgError) as error:
+        found["fault"] = str(error)
+    return found | {"seconds": time.process_time() - began}
+
+
+def _figures(laboratory: Laboratory, landscape: Landscape) -> Iterator[Figure]:
+    estimate, noise = landscape.field_estimate, landscape.noise
+    assert estimate is not None and noise is not None
+    library, errors = estimate.library, estimate.standard_errors
+    for (place, powers), true in zip(laboratory.terms, laboratory.coefficients, strict=True):
+        symbols = zip(library.symbols, powers, strict=True)
+        column = library.terms.index(sympy.prod(one**power for one, power in symbols))
+        if errors[column, place] > 0:
+            yield "f", float((estimate.coefficients[column, place] - true) / errors[column, place])
+    true_noise = float(laboratory.intensities[0])
+    yield "ε", (noise.intensity - true_noise) / noise.standard_error
+    wells = np.array(laboratory.attractors)
+    heights = [2 * ((one[0] ** 2 - 1) ** 2 / 4 - laboratory.drift[0].get((0,) * len(one), 0.0) * one[0])
+               for one in (*laboratory.attractors, *laboratory.saddles)]  # fmt: skip
+    assert landscape.position_errors is not None
+    for place, one in enumerate(landscape.attractors):
+        away = np.linalg.norm(wells - one.position, axis=1)
+        own = int(away.argmin())
+        yield "position", float((one.position[0] - wells[own, 0]) / landscape.position_errors[place, 0])
+        for way in landscape.transitions:
+            if way.start != place or way.end is None or not np.isfinite(way.barrier):
+                continue
+            true = (heights[-1] - heights[own]) / true_noise
+            height = way.barrier / noise.intensity
+            parts = way.error / way.barrier, way.leverage * noise.standard_error / noise.intensity
+            yield "barrier", float((height - true) / (height * np.hypot(*parts)))
+            time_of = way.exit.mean_exit_time(noise)
+            if laboratory.dimension == 1 and time_of is not None:
+                grid = np.linspace(-2.5, 2.5, 5001)
+                force = sum(value * grid ** powers[0] for powers, value in laboratory.drift[0].items())
+                law = Law(grid, force, np.full(len(grid), true_noise))
+                spread = np.hypot(time_of.data_error, time_of.law_error)
+                true = law.time(float(wells[own, 0]), float(wells[1 - own, 0]))
+                yield "time", float(np.log(time_of.value / true) / spread)
+
+
+def landscape_table(found: dict[str, dict[str, object]]) -> str:
+    """How often intervals hold, by what is asked and the passages seen.
+
+    The figures of one laboratory err together.
+    """
+    lines = [
+        "| what | passages | laboratories | figures | 68 % | 95 % | rms z |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for what, (name, (low, high)) in product(("f", "ε", "position", "barrier", "time"), PASSAGES.items()):
+        each = [
+            [off for asked, off in one["figures"] if asked == what]  # type: ignore[attr-defined]
+            for one in found.values() if low <= one["passages"] <= high  # type: ignore[operator]
+        ]  # fmt: skip
+        z = np.array([off for one in each for off in one if off is not None])
+        shares = (
+            " | ".join(f"{(np.abs(z) <= half).mean():.0%}" for half in CONFIDENCES.values())
+            if len(z)
+            else " | "
+        )
+        size = f"{np.sqrt((z**2).mean()):.2f}" if len(z) else ""
+        lines.append(f"| {what} | {name} | {sum(map(bool, each))} | {len(z)} | {shares} | {size} |")
+    faults = [str(one["fault"]) for one in found.values() if one["fault"]]
+    never = sum(one["passages"] == 0 for one in found.values())
+    seconds = [one["seconds"] for one in found.values() if "seconds" in one]
+    lines.append(f"{len(found)} laboratories, {never} without a passage, {len(faults)} without a landscape")
+    lines.append(f"{np.median(seconds):.1f} s each" if seconds else "")
+    return "\n".join([*lines, *sorted(set(faults))])
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Estimate what is missing, and say what came out."""
     parser = argparse.ArgumentParser(prog="benchmarks.laboratories.coverage")
@@ -213,8 +355,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--estimator", nargs="+", default=list(ESTIMATORS), choices=list(ESTIMATORS))
     parser.add_argument("--cores", type=int, default=2)
     parser.add_argument("--folder", type=Path, default=Path("results/laboratories/coverage"))
+    parser.add_argument("--landscapes", action="store_true", help="intervals of what a user reads")
     chosen = parser.parse_args(arguments)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    if chosen.landscapes:
+        file = chosen.folder / "landscapes.json"
+        found = read(file)
+        for seed in range(chosen.seeds):
+            if str(seed) not in found:
+                found[str(seed)] = landscape_figures(seed)
+                write(file, found)
+        print(landscape_table({str(seed): found[str(seed)] for seed in range(chosen.seeds)}))
+        return
     print(HEAD, flush=True)
     with ProcessPoolExecutor(chosen.cores) as pool:
         for system, ratio, estimator in product(chosen.systems, chosen.ratios, chosen.estimator):

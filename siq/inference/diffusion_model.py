@@ -343,8 +343,16 @@ class ResidualLikelihood(_DiffusionLikelihood):
 def process_noise_increments(found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray) -> np.ndarray:
     """Residuals per root of time, with what the system forgot within the step put back: shape ``(n, d)``.
 
-    ``∫₀ʰ e^{Js} D e^{Jᵀs} ds`` is ``h e^{Jh/2} D e^{Jᵀh/2}`` but for the second order in Jh.
+    ``∫₀ʰ e^{Js} D e^{Jᵀs} ds`` is ``h e^{Jh/2} D e^{Jᵀh/2}`` but for the second order in Jh. Of coarse steps
+    it is the covariance of `siq.inference.field_estimate.FlowMap.moments`.
     """
+    if found.flow.coarse:
+        given = np.ascontiguousarray(pairs.x0.T), pairs.h, found.noise_rate
+        spread = found.flow.moments(found.dynamics.drift_of_components, *given)[1]
+        lost = ~np.isfinite(spread).all(axis=(1, 2))
+        spread[lost] = found.noise_rate * pairs.h[lost, None, None]
+        root = np.linalg.cholesky(found.noise_rate) @ np.linalg.inv(np.linalg.cholesky(spread))
+        return np.asarray(np.einsum("nij,nj->ni", root, rest))
     step = found.dynamics.jacobian(pairs.x0) * (found.flow.response_share * pairs.h)[:, None, None]
     if not (np.abs(step) <= MAX_RELAXATION).all():
         step = np.zeros_like(step)
@@ -360,7 +368,7 @@ def with_process_noise_rate(found: FieldEstimate, pairs: SnapshotPairs) -> Field
     inverted. What is left is of second order in the step, where the noise moves J itself. An Euler–Maruyama
     simulation forgets in steps of its own, and nothing within one.
     """
-    if found.noise_free or not len(pairs.h):
+    if found.noise_free or found.flow.coarse or not len(pairs.h):
         return found
     every = max(len(pairs.h) // AVERAGED_PAIRS, 1)
     step = found.dynamics.jacobian(pairs.x0[::every]) * pairs.h[::every, None, None]

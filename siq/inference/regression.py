@@ -31,7 +31,7 @@ from siq.data.recordings import Recordings, SnapshotPairs, parent_recordings
 from siq.data.stationarity import even_stretches, lagged_covariances, long_run_covariance
 from siq.errors import NumericalFailure
 from siq.inference.diffusion_model import ResidualLikelihood
-from siq.inference.field_estimate import NOISE_FREE, FieldEstimate, FlowMap
+from siq.inference.field_estimate import HARMLESS_BIAS, NOISE_FREE, FieldEstimate, FlowMap
 from siq.inference.library import CandidateLibrary, IdentificationOptions
 from siq.inference.selection import (
     LinearProblem,
@@ -166,13 +166,63 @@ class _PairRegression:
         """f(X0), shape ``(n, d)``."""
         return (self.matrix(values) @ self.theta).T
 
-    def flow(self, values: np.ndarray, *, tolerance: float, integrator_step: float | None = None) -> FlowMap:
-        """The map over a step that is accurate enough, see `FlowMap.of`."""
+    def flow(
+        self, values: np.ndarray, rate: np.ndarray | None, *, tolerance: float,
+        integrator_step: float | None = None,
+    ) -> FlowMap:  # fmt: skip
+        """The map over a step that is accurate enough, see `FlowMap.of`, for white noise of a rate.
+
+        It is coarse where the first order in h shifts the means of pairs by so much that a coefficient could
+        be off by more than is harmless: by ``√(Σ b² / variance)`` standard errors at most, of shifts b.
+        """
         matrix, some = self.matrix(values), slice(None, None, max(len(self.h) // FLOW_SAMPLE, 1))
-        return FlowMap.of(
-            lambda x: matrix @ self._terms(x), self.x0[:, some], self.h[some],
-            integrator_step=integrator_step, tolerance=tolerance,
-        )  # fmt: skip
+        x0, h = self.x0[:, some], self.h[some]
+        found = FlowMap.of(
+            lambda x: matrix @ self._terms(x), x0, h, integrator_step=integrator_step, tolerance=tolerance
+        )
+        if rate is None or found.euler or not np.linalg.eigvalsh(rate)[0] > NOISE_FREE * np.trace(rate):
+            return found
+        coarse = replace(found, coarse=True)
+        first, second = (self._shift(matrix, one, x0, h, rate) for one in (found, coarse))
+        squares = np.einsum("in,ij,jn->n", first - second, np.linalg.inv(rate), first - second) * h
+        usual = squares[np.isfinite(squares)]
+        far = len(self.h) / max(len(usual), 1) * float(usual.sum()) > HARMLESS_BIAS**2
+        return coarse if far else found
+
+    def _shift(
+        self, matrix: np.ndarray, flow: FlowMap, x0: np.ndarray, h: np.ndarray, rate: np.ndarray | None
+    ) -> np.ndarray:
+        """Mean velocity over a step less f(X0), of components ``(d, n)``."""
+
+        def field(x: np.ndarray) -> np.ndarray:
+            return matrix @ self._terms(x)
+
+        if flow.coarse and rate is not None:
+            return np.asarray((flow.moments(field, x0, h, rate)[0] - x0) / h - field(x0))
+        shift = (flow(field, x0, h) - x0) / h - field(x0)
+        if rate is not None and np.any(rate):
+            # Σ_jk (εD)_jk ∂²θ/∂x_j∂x_k of the active functions, shape (active, n).
+            second = self._second(x0).reshape(*rate.shape, len(self.active), -1)
+            curvature = np.einsum("ij,ijkn->kn", rate, second)
+            shift += flow.response_share * h / 2 * (matrix @ curvature)
+        return np.asarray(shift)
+
+    def noise_rate(
+        self, values: np.ndarray, flow: FlowMap, guess: np.ndarray, rest: np.ndarray
+    ) -> np.ndarray:
+        """εD where residuals have the covariance `rest` per time; by a guess, which it need not be near.
+
+        Of steps that are not coarse it is that of the residuals, see
+        `siq.inference.diffusion_model.with_process_noise_rate`.
+        """
+        if not flow.coarse:
+            return rest
+        matrix, some = self.matrix(values), slice(None, None, max(len(self.h) // FLOW_SAMPLE, 1))
+        h = self.h[some]
+        _, spread = flow.moments(lambda x: matrix @ self._terms(x), self.x0[:, some], h, guess)
+        seen = (spread / h[:, None, None])[np.isfinite(spread).all(axis=(1, 2))].mean(axis=0)
+        root = np.linalg.cholesky(guess) @ np.linalg.inv(np.linalg.cholesky(seen))
+        return np.asarray(root @ rest @ root.T)
 
     def corrected(
         self, values: np.ndarray, flow: FlowMap | None, noise_rate: np.ndarray | None
@@ -185,14 +235,7 @@ class _PairRegression:
         most = 10 * np.abs(quotient).max(axis=1, keepdims=True)
         for begin in range(0, len(self.h), CHUNK):  # small enough to stay in the processor's cache
             part = slice(begin, begin + CHUNK)
-            x0, h = self.x0[:, part], self.h[part]
-            moved = flow(lambda x: matrix @ self._terms(x), x0, h) - x0
-            correction = moved / h - matrix @ self.theta[:, part]
-            if noise_rate is not None and np.any(noise_rate):
-                # Σ_jk (εD)_jk ∂²θ/∂x_j∂x_k of the active functions, shape (active, n).
-                second = self._second(x0).reshape(*noise_rate.shape, len(self.active), -1)
-                curvature = np.einsum("ij,ijkn->kn", noise_rate, second)
-                correction += flow.response_share * h / 2 * (matrix @ curvature)
+            correction = self._shift(matrix, flow, self.x0[:, part], self.h[part], noise_rate)
             # A trial f may run away on a few pairs; one round without their correction does no harm.
             correction[:, ~(np.abs(correction) <= most).all(axis=0)] = 0.0
             quotient[:, part] -= correction
@@ -252,12 +295,12 @@ def _fit_everything(
         change = np.abs(solution - values.reshape(d, q).T * scale[:, None])
         settled = np.all(change <= 1e-13 * np.abs(solution).max(axis=0))
         values = (solution / scale[:, None]).T.ravel()
-        leftover = triangle[q:, q:]
-        rate = leftover.T @ leftover / n
-        ratio = regression.residual_ratio(rate)
+        rest = triangle[q:, q:].T @ triangle[q:, q:] / n
+        ratio = regression.residual_ratio(rest)
+        rate = rest if flow is None or rate is None else regression.noise_rate(values, flow, rate, rest)
         if flow is None or ratio > NOISE_FREE:
-            tolerance = 1e-10 if ratio < 1e-2 else 1e-6
-            flow = regression.flow(values, integrator_step=integrator_step, tolerance=tolerance)
+            tolerance, forced = 1e-10 if ratio < 1e-2 else 1e-6, rate if ratio > NOISE_FREE else None
+            flow = regression.flow(values, forced, integrator_step=integrator_step, tolerance=tolerance)
         elif settled:
             break
         if ratio > 0.1 and done >= 3:
@@ -354,30 +397,33 @@ def _fit_support(found: FieldEstimate, regression: _PairRegression) -> FieldEsti
     """Generalised least squares on a support, with flow, noise and covariance brought up to date."""
     d, n, active = found.library.dimension, len(regression.h), len(regression.active)
     values, rate, flow = found.values, found.noise_rate, found.flow
+    rest = rate
     if not flow.euler:
-        flow = regression.flow(values, tolerance=1e-11 if found.noise_free else 1e-6)
+        forced = None if found.noise_free else rate
+        flow = regression.flow(values, forced, tolerance=1e-11 if found.noise_free else 1e-6)
     for _ in range(CORRECTION_ROUNDS):
         velocity = regression.corrected(values, flow, rate)
         triangle = regression.triangle(velocity)
         # Where there is no noise only the relative weight of the components matters.
-        spread = rate if not found.noise_free else np.diag((velocity**2).mean(axis=0))
+        spread = rest if not found.noise_free else np.diag((velocity**2).mean(axis=0))
         solution, inverse, scale = regression.generalised(triangle[:, :active], triangle[:, active:], spread)
         change = (np.abs(solution - values) * scale).max() / (np.abs(solution) * scale).max()
         values = solution
         misfit = triangle[:, active:] - triangle[:, :active] @ regression.matrix(values).T
-        rate = misfit.T @ misfit / n
+        rest = misfit.T @ misfit / n
+        rate = regression.noise_rate(values, flow, rate, rest)
         if change < (1e-14 if found.noise_free else 1e-9):
             break
     covariance = inverse @ inverse.T
     if found.noise_free:
         # Columns were whitened by the size of the velocities: bring in the size of the residuals. They are
         # alike in neighbouring pairs and do not average out, hence the number of pairs.
-        covariance = covariance * (float(np.trace(np.linalg.solve(spread, rate))) / d) * n
+        covariance = covariance * (float(np.trace(np.linalg.solve(spread, rest))) / d) * n
     else:
         covariance = covariance * copies(regression.pairs)
     return found.with_values(
         found.support, values, covariance=covariance, noise_rate=rate,
-        residual_ratio=regression.residual_ratio(rate), flow=flow,
+        residual_ratio=regression.residual_ratio(rest), flow=flow,
     )  # fmt: skip
 
 
@@ -527,7 +573,7 @@ def _identify_by_instruments(
     for _ in range(2):
         moved = regression.corrected(values, flow, None) * h
         values = (solution @ (directions.T @ moved)).T.ravel()
-        flow = regression.flow(values, tolerance=1e-6)
+        flow = regression.flow(values, None, tolerance=1e-6)
     rest = moved - regression.predicted(values) * h
     variances = np.diag(pairs.long_run(rest) * copies(pairs))
     columns, goals = directions.T @ (regression.theta * pairs.h).T, directions.T @ moved
@@ -565,7 +611,7 @@ def _fit_by_instruments(
         rest = moved - regression.predicted(values) * h
         spread = pairs.long_run(rest)
         settled = flow is not None and (np.abs(values - previous) <= 1e-6 * np.abs(values)).all()
-        flow = regression.flow(values, tolerance=1e-6)
+        flow = regression.flow(values, None, tolerance=1e-6)
         if settled:
             break
     assert flow is not None

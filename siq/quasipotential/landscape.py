@@ -375,10 +375,10 @@ class Landscape:
         pandas.DataFrame
             Columns ``start end barrier standard_error``: attractors by their place in `attractors`, the end
             missing where the way leads out of the recorded region; ΔU in the unit of ε with its standard
-            error from the uncertainty of f, NaN where it is not known.
+            error, NaN where it is not known, which is that of every page (`Transition.error`).
         """
         types: dict[str, Any] = {"start": int, "end": "Int64", "barrier": float, "standard_error": float}
-        rows = [[getattr(way, name) for name in types] for way in self.transitions]
+        rows = [[way.start, way.end, way.barrier, way.error] for way in self.transitions]
         return pd.DataFrame(rows, columns=list(types)).astype(types)
 
     def dwell_times(self, *, noise: float | None = None) -> pd.DataFrame:

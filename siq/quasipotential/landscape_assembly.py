@@ -222,6 +222,9 @@ def _assembled(
 ) -> Landscape:
     """The landscape of what was found, with the heights of its attractors."""
     ends = portrait.descents.ends
+    left = None if certificate is None else certificate.tests.get("error")
+    if left is not None and np.isfinite(left.value):
+        ways = [replace(way, of_residual=left.value * abs(way.formula_share * way.barrier)) for way in ways]
     settled: tuple[Equilibrium | Cycle, ...] = (*portrait.attractors, *portrait.cycles)
     barriers = np.full((len(settled), len(settled)), np.inf)
     for way in ways:

@@ -92,7 +92,15 @@ WELL = (
 )
 TRANSITION = (
     _fields(PLAIN, "start", "end")
-    | _fields(NUMBER, "barrier", "formula_share", "standard_error", "by_rivals", noise_leverage="leverage")
+    | _fields(
+        NUMBER,
+        "barrier",
+        "formula_share",
+        "standard_error",
+        "by_rivals",
+        "of_residual",
+        noise_leverage="leverage",
+    )
     | _fields(REMARKS, "remarks")
 )
 LAW = _fields(KNOWN, "prefactor", "prefactor_error", "exponent", prefactor_covariance="covariance") | _fields(
@@ -200,7 +208,8 @@ def landscape_from_data(data: Mapping[str, Any], dynamics: Dynamics) -> Landscap
             turn = {} if one["turn"] is None else _read(one["turn"], TURN)
             rate = EscapeRate(one["minimum_action"], **_read(one, LAW), **turn)
         from_cycle = isinstance(attractors[one["start"]], Cycle)
-        way = Transition(saddle=saddle, path=path, rate=rate, from_cycle=from_cycle, **_read(one, TRANSITION))
+        own = _read({"of_residual": 0.0} | one, TRANSITION)
+        way = Transition(saddle=saddle, path=path, rate=rate, from_cycle=from_cycle, **own)
         transitions.append(way)
     errors = [one["standard_errors"] for one in wells]
     return Landscape(

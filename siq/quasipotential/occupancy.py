@@ -28,7 +28,11 @@ samples, and so the cores of the prediction are smaller by what a walk oversteps
 **Which error.** The same is computed for draws of f and ε from their distributions, with the cores where they
 are. n visits that ended in a time T were as likely as Poisson's law with the mean T/τ says, where τ is
 uncertain by these draws. The distribution of each state during the visits to a well is compared as Kolmogorov
-and Smirnov do, with as many samples as the correlation time leaves independent.
+and Smirnov do, with as many samples as the correlation time leaves independent. What is compared are the
+values as they were recorded: the state as a filter knows it follows from f, and is spread less than the
+state by what the filter does not know. So the prediction is ``π q`` convolved with the sensor's noise, once;
+the filter only says to which well a sample belongs. A mean over an exposure T lies about ``x + T f/4``, where
+x is the state in its middle, which f leads to and from alike, with a variance of ``εD T/12``.
 """
 
 from __future__ import annotations
@@ -99,9 +103,10 @@ _Cores = list[tuple[np.ndarray, np.ndarray, float]]
 class _CellProcess:
     """The Markov jump process between the cells of a box, of one or two states, that nothing leaves.
 
-    `points` are the centres of the n cells, ``(n, d)``, and `density` are the invariant probabilities,
-    ``(n,)``. For each core, `last` are the probabilities that it was the last of all that was visited, of
-    each cell, ``(n,)``; and `means` are the mean times from entering it until another one is entered.
+    `points` are the centres of the n cells, ``(n, d)``, `force` and `power` are f and the diagonal of εD
+    there, and `density` are the invariant probabilities, ``(n,)``. For each core, `last` are the
+    probabilities that it was the last of all that was visited, of each cell, ``(n,)``; and `means` are the
+    mean times from entering it until another one is entered.
     """
 
     def __init__(
@@ -156,6 +161,8 @@ class _CellProcess:
         if float((self.density[:, None] * np.abs(drift) * steps / tensor).sum(axis=0).max()) > COARSE:
             raise NumericalFailure("the noise is too weak for a grid: the wells are narrower than its cells")
         self.points = system.points(y)
+        self.force = dynamics.drift(self.points)
+        self.power = intensity * np.diagonal(dynamics.diffusion.at(self.points), axis1=1, axis2=2)
         core, wells = _core_of(cores, self.points), range(len(cores))
         if len(np.unique(core[core >= 0])) < len(wells):
             raise NumericalFailure("the core of a well is smaller than a cell of the grid")
@@ -186,9 +193,18 @@ class _CellProcess:
         found[free] = splu((sparse.diags(scale) @ inner).tocsc()).solve(scale * into)
         return np.clip(found, 0.0, 1.0)
 
-    def distribution(self, well: int, state: int, places: np.ndarray, blur: float = 0.0) -> np.ndarray:
-        """Distribution function of a state during visits to a well, blurred by measurement noise."""
-        at, group = np.unique(np.round(self.points[:, state], 12), return_inverse=True)
+    def distribution(
+        self, well: int, state: int, places: np.ndarray, *, blur: float = 0.0, exposure: float = 0.0
+    ) -> np.ndarray:
+        """Distribution function of a recorded state during visits to a well.
+
+        `blur` is the standard deviation of measurement noise, and each value a mean over an `exposure`.
+        """
+        points = self.points[:, state]
+        if exposure:
+            points = points + exposure / 4 * self.force[:, state]
+            blur = float(np.sqrt(blur**2 + exposure / 12 * self.density @ self.power[:, state]))
+        at, group = np.unique(np.round(points, 12), return_inverse=True)
         mass = np.bincount(group, weights=self.density * self.last[well])
         if len(at) > MOST_PLACES:
             mass, edges = np.histogram(at, bins=MOST_PLACES, weights=mass)
@@ -504,7 +520,7 @@ def check_occupancy(
     recordings: Recordings,
     parts: Sequence[tuple[FieldEstimate, np.ndarray]],
     *,
-    sensor: np.ndarray | None = None,
+    measured: Recordings | None = None,
     seed: int = 0,
 ) -> OccupancyCheck:
     """Hold what was identified against the record's own hops and histogram.
@@ -516,8 +532,8 @@ def check_occupancy(
     recordings, parts
         All of them; and estimates of f, each with a mask over labels of the recordings: of those that it was
         not fitted to, and is compared with.
-    sensor
-        Standard deviation of each state's sensor noise, shape ``(d,)``; None where there is none.
+    measured
+        The values as the sensors showed them, where `recordings` are states as a filter knows them.
     seed
         Decides the draws of f.
     """
@@ -572,6 +588,10 @@ def check_occupancy(
         missing = Remark("quasipotential.record_too_short_to_hop")
         return OccupancyCheck(missing=missing, passages=passages)
     # Each state's distribution during the visits to each well, on recordings that the parts did not see.
+    recorded, variance, exposure = recordings.values, found.sensor_variance, found.exposure or 0.0
+    if measured is not None:  # at the samples that the filter used
+        kept = recordings.recording + 1j * recordings.t
+        recorded = measured.values[np.isin(measured.recording + 1j * measured.t, kept)]
     densities = []
     for well, *_ in times if processes else ():
         chosen = [np.flatnonzero(used & (visits == well)) for used, *_ in apart]
@@ -580,17 +600,18 @@ def check_occupancy(
             continue
         breaks = np.flatnonzero(np.diff(rows) > 1) + 1
         pieces = [slice(int(a), int(b)) for a, b in pairwise(np.concatenate([[0], breaks, [len(rows)]]))]
-        for state in range(len(recordings.names)):
-            x = recordings.values[rows, state]
-            blur = 0.0 if sensor is None else float(sensor[state])
+        for state in range(recorded.shape[1]):
+            x = recorded[rows, state]
+            blur = 0.0 if variance is None else float(np.sqrt(variance[state]))
+            shown = {"blur": blur, "exposure": exposure}
             independent = len(x) / (2 * correlated_samples(x, pieces))
             if independent < MIN_INDEPENDENT_SAMPLES or not np.ptp(x) > 0:
                 continue
             places = np.quantile(x, np.linspace(0.005, 0.995, COMPARED_PLACES))
             counted = np.searchsorted(np.sort(x), places, side="right") / len(x)
-            whole_f, *drawn = (one.distribution(well, state, places, blur) for one in processes)
+            whole_f, *drawn = (one.distribution(well, state, places, **shown) for one in processes)
             predicted = sum(
-                len(own) / len(rows) * (process or processes[0]).distribution(well, state, places, blur)
+                len(own) / len(rows) * (process or processes[0]).distribution(well, state, places, **shown)
                 for own, (_, _, process) in zip(chosen, apart, strict=True)
             )
             distance = float(np.abs(counted - predicted).max())
@@ -598,7 +619,7 @@ def check_occupancy(
             # The mean distance of n samples is 0.87/√n: an error of the prediction is as if there were fewer.
             effective = 1 / (1 / independent + (error / MEAN_DISTANCE) ** 2)
             edges = np.linspace(x.min(), x.max(), BINS + 1)
-            share = np.diff(processes[0].distribution(well, state, edges, blur))
+            share = np.diff(processes[0].distribution(well, state, edges, **shown))
             width = edges[1] - edges[0]
             counts = np.histogram(x, bins=edges)[0] / (len(x) * width)
             probability = float(special.kolmogorov(distance * np.sqrt(effective)))

@@ -318,13 +318,12 @@ class RefinementContext:
         wells, found = refined.wells, self.found
         caustics = caustics_below(found.dynamics, wells, self.portrait, certificate.error, seed=self.number)
         # Hops and histogram of the record, compared with those that f predicts.
-        strength, variance = found.noise_strength, found.sensor_variance
+        strength = found.noise_strength
         try:
             record = check_occupancy(
                 found, self.portrait,
                 None if strength is None else NoiseStrength(*strength, source="estimated"),
-                self.recordings, self._halves(),
-                sensor=None if variance is None else np.sqrt(variance), seed=self.number,
+                self.recordings, self._halves(), measured=self.measured, seed=self.number,
             )  # fmt: skip
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             record = OccupancyCheck(missing=Remark("quasipotential.reason", {"reason": str(error)}))

@@ -65,6 +65,8 @@ class Transition:
         fails.
     leverage
         Relative standard error of ΔU/ε from an estimated D over that of ε.
+    of_residual
+        What the residual of V leaves open of the part of the barrier that the formula accounts for.
     remarks
         What is not known.
     """
@@ -81,6 +83,7 @@ class Transition:
     leverage: float = 1.0
     by_rivals: float = 0.0
     from_cycle: bool = False
+    of_residual: float = 0.0
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -106,10 +109,9 @@ class Transition:
 
     @property
     def error(self) -> float:
-        """Standard error of the barrier: from f, and by how much the formula and the path alone differ."""
-        if self.path is None:
-            return self.standard_error
-        return float(np.hypot(self.standard_error, self.barrier - self.by_rivals - self.path.action))
+        """Standard error of the barrier: from f, the residual of V, and how far formula and path differ."""
+        apart = 0.0 if self.path is None else self.barrier - self.by_rivals - self.path.action
+        return float(np.linalg.norm([self.standard_error, self.of_residual, apart]))
 
     @property
     def exit(self) -> EscapeRate:

@@ -297,7 +297,8 @@ def _report(landscape: Landscape) -> tuple[list[str], list[tuple[str, pd.DataFra
     written = certificate is not None or any(well is not None for well in landscape.wells)
     verdict = "U is not written as a formula."
     if written:
-        verdict = paragraphs("certificate.j2", certificate=certificate, texts=texts("certificate"))[-1]
+        stated = summary.stating(certificate)
+        verdict = paragraphs("certificate.j2", certificate=stated, texts=texts("certificate"))[-1]
     words = texts("tables")
     wells, _ = landscape_tables(summary)["wells"]
     tables = [] if wells.empty else [(words["wells"], wells)]

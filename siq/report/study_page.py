@@ -143,7 +143,7 @@ def study_page(
         help=texts("help"),
         words=texts("certificate"),
         answer=_answer(results, certified=certified),
-        certificate=certificate,
+        certificate=certificate if summary is None else summary.stating(certificate),
         lead=lead,
         figures=figures,
         certified=0 if rrmse is None else int(rrmse[rrmse["method"] == method]["certified"].sum()),

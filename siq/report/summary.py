@@ -21,6 +21,7 @@ from scipy.integrate import cumulative_trapezoid
 from siq.data.recordings import Recordings
 from siq.data.states import DwellCount
 from siq.numerics.text import place_text, squared
+from siq.quasipotential.certificate_tests import STATED_SIGMAS
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.occupancy import VisitTest
@@ -253,6 +254,14 @@ class LandscapeSummary:
         """So many values of a state, evenly over what is drawn."""
         low, high = self.box[place].tolist()
         return np.linspace(low, high, count)
+
+    def stating(self, certificate: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+        """A certificate that states no smaller error of U than barriers have, by their 95 % intervals."""
+        if certificate is None or certificate["stated_error"] is None:
+            return certificate
+        errors = [STATED_SIGMAS * way.error / abs(way.barrier) for way in self.ways if way.barrier]
+        known = [one for one in errors if math.isfinite(one)]
+        return {**certificate, "stated_error": max([certificate["stated_error"], *known])}
 
     @property
     def lowest_pass(self) -> np.ndarray:

@@ -11,6 +11,7 @@ import pytest
 from benchmarks.laboratories import summary
 from benchmarks.laboratories.__main__ import tasks
 from benchmarks.laboratories.bounds import bound, inverse
+from benchmarks.laboratories.coverage import CONFIDENCES, landscape_figures, landscape_table
 from benchmarks.laboratories.information import information, information_of_states
 from benchmarks.laboratories.models import LABORATORIES, Laboratory
 from benchmarks.laboratories.others import OTHERS
@@ -178,3 +179,15 @@ def test_a_run_is_resumed_seed_by_seed(tmp_path: Path, monkeypatch: pytest.Monke
     file.write_text(json.dumps(key), encoding="utf-8")
     (row,) = summary.summarised(tmp_path, ["hop", "trap"])
     assert row.records == 1
+
+
+def test_intervals_of_what_a_user_reads_hold_in_drawn_laboratories() -> None:
+    # Of one passage to eleven, with and without a noisy sensor; two of them sampled coarsely. The seeds are
+    # fixed; the benchmark counts over hundreds.
+    found = {str(seed): landscape_figures(seed) for seed in (0, 1, 3, 10)}
+    assert {name: one["fault"] for name, one in found.items() if one["fault"]} == {}
+    figures = [each for one in found.values() for each in one["figures"]]  # type: ignore[attr-defined]
+    assert {what for what, _ in figures} == {"f", "ε", "position", "barrier", "time"}
+    beyond = [(what, off) for what, off in figures if not abs(off) < CONFIDENCES["95 %"]]
+    assert len(beyond) < 5 and len(figures) > 24
+    assert "| barrier | 1 to 10 |" in landscape_table(found)

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from scipy.integrate import quad_vec
 from scipy.linalg import expm
+from scipy.special import exprel
 
 import siq
 from siq.data.recordings import snapshot_pairs
 from siq.inference.diffusion_model import with_process_noise_rate
+from siq.inference.field_estimate import FlowMap
 from siq.inference.library import IdentificationOptions, field_library
 from siq.inference.regression import identify_vector_field
 
@@ -52,6 +54,47 @@ def test_a_simulation_forgets_nothing_within_its_own_step() -> None:
     assert _forces(recordings, integrator_step=step)[0, 0] == pytest.approx(
         0.25, rel=4 * np.sqrt(2 / samples)
     )
+
+
+def _transition(step: float) -> tuple[np.ndarray, np.ndarray]:
+    """States, and the probabilities of all of them a step later, of ``dx = (x - x³) dt + √0.25 dW``."""
+    x = np.linspace(-2.5, 2.5, 501)
+    width, half = x[1] - x[0], 0.125
+    moved = ((x[1:] + x[:-1]) / 2 - ((x[1:] + x[:-1]) / 2) ** 3) * width / half
+    rates = np.diag(half / width**2 / exprel(-moved), 1) + np.diag(half / width**2 / exprel(moved), -1)
+    return x, expm(step * (rates - np.diag(rates.sum(axis=1))))
+
+
+@pytest.mark.parametrize("step", [0.1, 0.2, 0.4])
+def test_moments_of_a_coarse_step_are_those_of_the_transition_density(step: float) -> None:
+    x, later = _transition(step)
+    rows = np.arange(100, 401, 20)  # from -1.5 to 1.5
+    mean = later[rows] @ x
+    variance = later[rows] @ x**2 - mean**2
+    flow, starts = FlowMap(8), x[rows][None]
+    closed, spread = flow.moments(lambda x: x - x**3, starts, np.full(len(rows), step), np.array([[0.25]]))
+    # The law is skewed, and the normal one only closes what follows from it: of third order in the step.
+    np.testing.assert_allclose(closed[0], mean, atol=0.006 * np.sqrt(variance.min()))
+    np.testing.assert_allclose(spread[:, 0, 0], variance, rtol=0.004 + step**3)
+
+
+def test_a_well_that_relaxes_within_three_samples_has_its_own_terms() -> None:
+    # Rate 2 in the wells, 6 beyond: of first order in the step f had a term x⁵, and D depended on x.
+    step, pairs = 0.2, 20_000
+    x, later = _transition(step)
+    generator = np.random.default_rng(4)
+    whole = _transition(50.0)[1][250]
+    start = generator.choice(len(x), pairs, p=whole / whole.sum())
+    end = (generator.random(pairs)[:, None] > np.cumsum(later, axis=1)[start]).sum(axis=1)
+    found_at = np.stack([x[start], x[np.minimum(end, len(x) - 1)]], axis=1)[:, :, None]
+    recordings = siq.Recordings.from_arrays(np.array([0.0, step]), found_at, names=["x"])
+    options = IdentificationOptions(degree=5)
+    library, seen = field_library(["x"], options), snapshot_pairs(recordings)
+    found = with_process_noise_rate(identify_vector_field(library, seen, options=options), seen)
+    assert found.flow.coarse and [library.names[k] for _, k in found.support] == ["x", "x**3"]
+    errors = np.sqrt(np.diag(found.covariance))
+    assert (np.abs(found.values - [1.0, -1.0]) < 3 * errors).all()
+    assert found.noise_rate[0, 0] == pytest.approx(0.25, rel=4 * np.sqrt(2 / pairs))
 
 
 def _forces(recordings: siq.Recordings, *, integrator_step: float | None = None) -> np.ndarray:

@@ -26,8 +26,10 @@ from siq.quasipotential.formulas import read_model, write_model
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_files import read_landscape, write_landscape
+from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.refinement import RefinementOptions, _refined_decomposition, refine
 from siq.remarks import Remark, has_code
+from siq.report.summary import summarise
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 
@@ -87,6 +89,34 @@ def test_barriers_are_a_table_in_the_order_of_the_attractors() -> None:
     top, *bottoms = potential_values(known, places)
     np.testing.assert_allclose(table["barrier"], [2 * (top - bottom) for bottom in bottoms], rtol=1e-6)
     assert (table["standard_error"] > 0).all()
+
+
+def test_errors_of_u_of_barriers_and_of_times_are_one_propagation() -> None:
+    known, left = double_well(2), 0.02
+    tests = {"characteristics": Verdict(0.0, 1.0, True), "error": Verdict(left, 0.15, True)}
+    landscape = find_landscape(
+        exact_field(known, 3, relative_error=1e-3), portrait_of(known, 250, share=0.8),
+        options=RefinementOptions(degrees=(4,)), noise=NoiseStrength(0.1, 0.001),
+        certificate=Certificate(tests, left, ""),
+    )  # fmt: skip
+    assert landscape.noise is not None
+    for way, row in zip(landscape.transitions, landscape.barriers().itertuples(), strict=True):
+        # What the table says is what times rest on, and no less than the share of the formula's own error.
+        assert row.standard_error == way.error == way.exit.standard_error
+        assert way.error >= left * way.formula_share * way.barrier > 0
+        # U just below the saddle is as uncertain as the barrier is by f.
+        of_f = landscape.quasipotential_errors(way.uphill)
+        assert of_f[np.isfinite(of_f)][-1] == pytest.approx(way.standard_error, rel=0.05)
+        law = way.exit
+        time = law.mean_exit_time(landscape.noise)
+        assert time is not None and law.prefactor_error is not None
+        parts = (way.error / 0.1) ** 2 + law.prefactor_error**2 + 2 * law.covariance / 0.1
+        of_noise = way.barrier / 0.1 * way.leverage * 0.01
+        assert time.data_error == pytest.approx(np.sqrt(parts + of_noise**2), rel=1e-6)
+    stated = summarise(landscape).stating(Certificate(tests, left, "").as_data())
+    assert stated is not None
+    for way in landscape.transitions:
+        assert stated["stated_error"] >= 2 * way.error / way.barrier
 
 
 def test_u_is_known_over_the_wells_and_nowhere_else() -> None:

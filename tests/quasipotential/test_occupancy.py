@@ -78,6 +78,39 @@ def test_a_wrong_depth_is_refused(recorded: RECORDED) -> None:
     assert not verdict_of(found).passed
 
 
+@pytest.mark.parametrize("blur", [0.2, 0.4])
+def test_values_of_a_noisy_sensor_are_spread_as_state_and_noise(recorded: RECORDED, blur: float) -> None:
+    recordings, record, portrait, _ = recorded
+    noise = blur * np.random.default_rng(3).standard_normal(recordings.values.shape)
+    measured = replace(recordings, values=recordings.values + noise)
+    for size, passes in ((blur, True), (2.5 * blur, False)):
+        assert record.diagnosis is not None
+        known = replace(record, diagnosis=replace(record.diagnosis, measurement=np.array([size])))
+        parts = [(known, np.ones(RECORDS, dtype=bool))]
+        found = check_occupancy(
+            known, portrait, NoiseStrength(INTENSITY), recordings, parts, measured=measured
+        )
+        assert found.verdicts(false_alarms=0.05 / 8)["record"].passed == passes
+
+
+def test_means_over_an_exposure_are_spread_less_than_the_state(recorded: RECORDED) -> None:
+    recordings, record, portrait, _ = recorded
+    length, cores = 8, _cores_about(record.dynamics, portrait, INTENSITY)
+    process = _predicted_visits(record, portrait, NoiseStrength(INTENSITY), cores)[1][0]
+    places, x = np.linspace(-3, 3, 601), recordings.values[:, 0]
+
+    def spread(exposure: float) -> float:
+        weights = [process.density @ one for one in process.last]
+        each = [np.diff(process.distribution(well, 0, places, exposure=exposure)) for well in (0, 1)]
+        density = np.average(each, axis=0, weights=weights)
+        middle = (places[1:] + places[:-1]) / 2
+        return float(density @ middle**2 - (density @ middle) ** 2)
+
+    # The variance within the exposures is what their means lose.
+    lost = np.mean((x.reshape(-1, length) - x.reshape(-1, length).mean(axis=1, keepdims=True)) ** 2)
+    assert spread(0.0) - spread(length * STEP) == pytest.approx(lost, rel=0.1)
+
+
 def test_without_noise_there_is_no_test(recorded: RECORDED) -> None:
     recordings, record, portrait, held_out = recorded
     found = check_occupancy(record, portrait, None, recordings, [(record, held_out)])
