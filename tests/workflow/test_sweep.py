@@ -5,7 +5,8 @@ import pytest
 import sympy
 from pydantic import TypeAdapter
 
-from siq.errors import InputError
+from siq.errors import InputError, NumericalFailure
+from siq.quasipotential import transitions
 from siq.quasipotential.landscape import Landscape
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
@@ -137,8 +138,16 @@ def test_a_point_is_read_as_it_was_written(tmp_path):
     assert len(again.table) == 2 and len(again.ways) == 2
 
 
-def test_beside_a_limit_cycle_nobody_says_that_a_well_is_never_left():
-    """r' = r (r² - 1) (4 - r²), about a focus: an unstable cycle parts it from a stable one."""
+def no_path(*_, **__):
+    raise NumericalFailure("no path is looked for")
+
+
+def test_beside_a_limit_cycle_nobody_says_that_a_well_is_never_left(monkeypatch):
+    """r' = r (r² - 1) (4 - r²), about a focus: an unstable cycle parts it from a stable one.
+
+    That there is a way over it is known before its path is.
+    """
+    monkeypatch.setattr(transitions, "transition_path", no_path)
     r = x**2 + y**2
     ring = Dynamics.of(
         (x, y), (x * (r - a) * (4 - r) - y, y * (r - a) * (4 - r) + x), domain=[(-3, 3), (-3, 3)],
