@@ -422,7 +422,7 @@ class Noise:
         """A noise with the process noise multiplied."""
         return replace(self, process=self.process * factor)
 
-    @property
+    @cached_property
     def driven(self) -> np.ndarray:
         """Places of the states that process noise drives."""
         return np.flatnonzero(self.process > 0)
@@ -439,11 +439,11 @@ class Noise:
 
         Variances of the measurement that are known ``(m,)`` stay, and so does a process noise that is zero.
         """
-        outputs, driven = len(known), self.driven
-        process = np.zeros_like(self.process)
-        process[driven] = self.process[driven] * np.exp(vector[outputs : outputs + len(driven)])
-        logarithms = np.where(known, 0.0, vector[:outputs])
-        result = replace(self, measurement=self.measurement * np.exp(logarithms), process=process)
+        outputs, driven, factors = len(known), self.driven, np.exp(vector)
+        process = self.process.copy()
+        process[driven] *= factors[outputs : outputs + len(driven)]
+        measurement = np.where(known, self.measurement, self.measurement * factors[:outputs])
+        result = Noise(measurement, process, self.shape, self.field)
         if self.shape is None or len(self.shape) != 1 or len(driven) < 2:
             return result
         shape, change, inside = self.shape.copy(), np.eye(len(driven)), np.ix_(driven, driven)

@@ -134,8 +134,9 @@ def _estimate_noise(
         vector = _corrected(vector, everything, cost, ratio=count / len(rows), bounds=bounds)
     noise = start.moved(vector, known)
     gone = vector[outputs : outputs + len(driven)] <= np.log(NO_PROCESS_NOISE) + 1
-    noise.process[driven[gone]] = 0.0
-    return noise
+    process = noise.process.copy()
+    process[driven[gone]] = 0.0
+    return replace(noise, process=process)
 
 
 def _lowest(
