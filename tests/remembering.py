@@ -1,13 +1,38 @@
 """Records that remember: double wells and a trap with coloured forces, or seen through an exposure.
 
-Made with numpy alone: nothing here knows of the library that reads them.
+Made without the library: nothing here knows of what reads them.
 """
 
 from __future__ import annotations
 
+import numba
 import numpy as np
+import scipy.signal
 
 STEP = 0.01
+
+
+@numba.njit(cache=True)
+def _followed(
+    x: np.ndarray,
+    kicks: np.ndarray,
+    dt: float,
+    *,
+    force: np.ndarray,
+    keep: float,
+    white: float,
+    coloured: float,
+) -> np.ndarray:
+    """Every state in turn, of kicks ``(steps, states, traces)``; forces at random are white, or remember."""
+    path = np.empty_like(kicks)
+    for k in range(len(kicks)):
+        path[k] = x
+        for i in range(x.shape[0]):
+            for j in range(x.shape[1]):
+                drift = x[i, j] - x[i, j] ** 3 if i == 0 else -x[i, j]
+                x[i, j] += dt * (drift + force[i, j]) + white * kicks[k, i, j]
+                force[i, j] = keep * force[i, j] + coloured * kicks[k, i, j]
+    return path
 
 
 def double_wells(
@@ -53,18 +78,11 @@ def double_wells(
     spread = np.sqrt(intensity / (2 * memory * STEP)) if memory else 0.0
     force = spread * draw.standard_normal(x.shape)
     keep = np.exp(-1 / (memory * within)) if memory else 0.0
-    path = np.empty((samples * within, states, traces))
-    for k in range(-lead * within, len(path)):
-        if k >= 0:
-            path[k] = x
-        drift = -x
-        drift[0] = x[0] - x[0] ** 3
-        kick = draw.standard_normal(x.shape)
-        if memory:
-            x = x + dt * (drift + force)
-            force = keep * force + spread * np.sqrt(1 - keep**2) * kick
-        else:
-            x = x + dt * drift + np.sqrt(intensity * dt) * kick
+    kicks = draw.standard_normal(((lead + samples) * within, states, traces))
+    white = 0.0 if memory else np.sqrt(intensity * dt)
+    path = _followed(
+        x, kicks, dt, force=force, keep=keep, white=white, coloured=spread * np.sqrt(1 - keep**2)
+    )[lead * within :]
     return seen(path, exposure, within, sensor, draw)
 
 
@@ -75,10 +93,7 @@ def trap(seed: int, *, exposure: float, samples: int = 40_000, rate: float = 5.0
     dt = STEP / within
     keep = np.exp(-rate * dt)
     kicks = np.sqrt((1 - keep**2) / (2 * rate)) * draw.standard_normal(samples * within)
-    path = np.empty((len(kicks), 1, 1))
-    x = 0.0
-    for k, kick in enumerate(kicks):
-        path[k] = x = keep * x + kick
+    path = scipy.signal.lfilter([1.0], [1.0, -keep], kicks)[:, None, None]
     return seen(path, exposure, within, 0.0, draw)
 
 

@@ -12,6 +12,7 @@ import re
 import string
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Annotated, Literal
@@ -240,6 +241,7 @@ class _Dictionary(BaseModel):
     mechanisms: tuple[Mechanism, ...]
 
 
+@cache
 def standard_dictionary() -> tuple[Mechanism, ...]:
     """The mechanisms that come with the library."""
     with as_file(files("siq.diagnosis") / "mechanisms.yaml") as path:

@@ -71,7 +71,9 @@ class ClosedFunctions:
         return self._closed.functions.slopes(x, self._joined(signals), values)
 
     def _joined(self, signals: Signals) -> Signals:
-        return replace(signals, inputs=np.concatenate([signals.inputs, self._spread]))
+        places = len(signals.t) // self._spread.shape[1]  # at which the same intervals are looked at
+        spread = np.tile(self._spread, places)
+        return Signals(np.concatenate([signals.inputs, spread]), signals.delayed, signals.slopes, signals.t)
 
 
 class Columns(Protocol):
@@ -291,20 +293,32 @@ def _carried(
         state[place] = 0.0
         transition[:, place, place] = 0.0
 
-    def slopes(at: np.ndarray, node: int) -> tuple[np.ndarray, np.ndarray]:
-        by_state, by_parameter = drift.slopes(at, grid.signals(node, delays), values)
+    # All derivatives at once, or of so many substeps as are not too much to keep.
+    together = 1 if columns is not None else max(INTERVALS // max(count, 1), 1)
+    end_rate = None
+    for first in range(0, grid.substeps, together):
+        places: list[np.ndarray] = []
+        for part in range(first, min(first + together, grid.substeps)):
+            with np.errstate(all="ignore"):  # what runs away is seen by `Linearisation.finite`
+                # Within an interval only a delayed input jumps.
+                known = None if delays else end_rate
+                after, begin_rate, end_rate = _runge_kutta(drift, grid, values, state, part, delays, known)
+                middle = (state + after) / 2 + step / 8 * (begin_rate - end_rate)
+            places += [state, middle, after]
+            state = after
+        nodes = range(3 * first, 3 * first + len(places))
+        signals = [grid.signals(node, delays) for node in nodes]
+        at = np.concatenate(places, axis=1)
+        by_state, by_parameter = drift.slopes(at, Signals.joined(signals), values)
         if columns is not None:
-            by_parameter = np.concatenate([by_parameter, columns.rates(at, values, node)], axis=1)
-        return by_state.transpose(2, 0, 1), by_parameter.transpose(2, 0, 1)
-
-    for part in range(grid.substeps):
-        with np.errstate(all="ignore"):  # what runs away is seen by `Linearisation.finite`
-            after, begin_rate, end_rate = _runge_kutta(drift, grid, values, state, part, delays)
-            middle = (state + after) / 2 + step / 8 * (begin_rate - end_rate)
-        at = [slopes(place, 3 * part + node) for node, place in enumerate((state, middle, after))]
-        jacobians, forcings = (np.ascontiguousarray(np.stack(each)) for each in zip(*at, strict=True))
-        carry_linearly(step, jacobians, forcings, transition, response)
-        state = after
+            further = [columns.rates(x, values, node) for x, node in zip(places, nodes, strict=True)]
+            by_parameter = np.concatenate([by_parameter, np.concatenate(further, axis=2)], axis=1)
+        jacobians, forcings = (
+            np.ascontiguousarray(each.transpose(2, 0, 1)).reshape(len(places) // 3, 3, count, *each.shape[:2])
+            for each in (by_state, by_parameter)
+        )
+        for jacobian, forcing in zip(jacobians, forcings, strict=True):
+            carry_linearly(step, jacobian, forcing, transition, response)
     return state, transition, response
 
 
@@ -332,12 +346,12 @@ def substeps_needed(
 
 def _runge_kutta(
     drift: ParametricFunctions | ClosedFunctions, grid: Grid, values: np.ndarray, x: np.ndarray, part: int,
-    delays: tuple[tuple[int, float], ...],
+    delays: tuple[tuple[int, float], ...], first: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """State after a substep, and f at its begin and its end; the inputs differ from stage to stage."""
+    """State after a substep, and f at its begin (`first` where known) and end; inputs differ among stages."""
     rates, step = drift.rates, grid.step
     begin, middle, end = (grid.signals(3 * part + node, delays) for node in range(3))
-    k1 = rates(x, begin, values)
+    k1 = rates(x, begin, values) if first is None else first
     k2 = rates(x + step / 2 * k1, middle, values)
     k3 = rates(x + step / 2 * k2, middle, values)
     k4 = rates(x + step * k3, end, values)
@@ -408,7 +422,7 @@ class Noise:
         """A noise with the process noise multiplied."""
         return replace(self, process=self.process * factor)
 
-    @property
+    @cached_property
     def driven(self) -> np.ndarray:
         """Places of the states that process noise drives."""
         return np.flatnonzero(self.process > 0)
@@ -425,11 +439,11 @@ class Noise:
 
         Variances of the measurement that are known ``(m,)`` stay, and so does a process noise that is zero.
         """
-        outputs, driven = len(known), self.driven
-        process = np.zeros_like(self.process)
-        process[driven] = self.process[driven] * np.exp(vector[outputs : outputs + len(driven)])
-        logarithms = np.where(known, 0.0, vector[:outputs])
-        result = replace(self, measurement=self.measurement * np.exp(logarithms), process=process)
+        outputs, driven, factors = len(known), self.driven, np.exp(vector)
+        process = self.process.copy()
+        process[driven] *= factors[outputs : outputs + len(driven)]
+        measurement = np.where(known, self.measurement, self.measurement * factors[:outputs])
+        result = Noise(measurement, process, self.shape, self.field)
         if self.shape is None or len(self.shape) != 1 or len(driven) < 2:
             return result
         shape, change, inside = self.shape.copy(), np.eye(len(driven)), np.ix_(driven, driven)

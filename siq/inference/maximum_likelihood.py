@@ -43,6 +43,7 @@ PIECE = 500  # samples in one stretch, so that its unknown first state hardly ma
 MIN_ROUGHNESS_SHARE = 1e-4  # least measurement noise, as a share of what third differences show
 COARSE_SAMPLES = 8000  # whose noise is known to 2 %: enough to begin with
 LOGARITHM_STEP = 0.05  # numerical: of the logarithm of a variance, for differences of the likelihood
+SLOPE_STEP = 1e-3  # numerical: the same for its slope alone
 MAX_ERROR = 1.0  # standard error of a logarithm beyond which the likelihood is no parabola
 MIN_CURVATURE = 1.0  # along a logarithm, from which on its standard error is below one
 MAX_CORRECTION = 0.5  # of a logarithm, within which the likelihood is a parabola
@@ -133,15 +134,30 @@ def _estimate_noise(
         vector = _corrected(vector, everything, cost, ratio=count / len(rows), bounds=bounds)
     noise = start.moved(vector, known)
     gone = vector[outputs : outputs + len(driven)] <= np.log(NO_PROCESS_NOISE) + 1
-    noise.process[driven[gone]] = 0.0
-    return noise
+    process = noise.process.copy()
+    process[driven[gone]] = 0.0
+    return replace(noise, process=process)
 
 
 def _lowest(
     cost: Callable[[np.ndarray], float], begin: np.ndarray, bounds: Sequence[tuple[float, float]]
 ) -> np.ndarray:
+    _, upper = np.array(bounds).T
+    free = np.flatnonzero(np.ptp(bounds, axis=1))
+
+    def with_slope(vector: np.ndarray) -> tuple[float, np.ndarray]:
+        """The cost and its differences, backwards at an upper bound."""
+        value, slope = cost(vector), np.zeros(len(vector))
+        for place in free:
+            step, moved = SLOPE_STEP, vector.copy()
+            if vector[place] + step > upper[place]:
+                step = -step
+            moved[place] += step
+            slope[place] = (cost(moved) - value) / (moved[place] - vector[place])
+        return value, slope
+
     found = scipy.optimize.minimize(
-        cost, begin, method="L-BFGS-B", bounds=bounds, options={"maxiter": 12, "ftol": 1e-7, "eps": 1e-3}
+        with_slope, begin, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 12, "ftol": 1e-7}
     )
     return found.x if found.fun <= cost(begin) else begin
 

@@ -66,6 +66,7 @@ GUESS_ACCURACY = 1e-6  # numerical: of one step
 LONGEST_GUESS_STEP = 0.03  # or of the size of the cycle
 GUESS_REACH = 6.0  # what is so far away does not come back
 GUESS_ARRIVAL, GUESS_PASSED = 0.05, 0.3  # so close to the end one has arrived, or has passed it by
+GUESS_SPENT = 1e-3  # of its largest momentum: below, one has arrived somewhere, and goes where f leads
 MOST_GUESSES = 2  # of either kind that are tried
 ACTION_DIFFERENCE = 0.02  # share of the action by which two of them differ
 
@@ -378,7 +379,7 @@ def _hamiltonian_trajectories(problem: PathProblem, states: np.ndarray, momenta:
     def rates(z: np.ndarray) -> np.ndarray:
         return np.column_stack(problem.velocities(z[:, :d], z[:, d : 2 * d]))
 
-    z, alive = np.column_stack([states, momenta, np.zeros(n)]), np.arange(n)
+    z, alive, strongest = np.column_stack([states, momenta, np.zeros(n)]), np.arange(n), np.zeros(n)
     kept: list[np.ndarray] = [z.copy()]
     longest = LONGEST_GUESS_STEP * max(1.0, float(np.linalg.norm(np.ptp(states, axis=0))))
     steps = np.full(n, longest / np.linalg.norm(rates(z)[:, :d], axis=1).max())
@@ -392,7 +393,10 @@ def _hamiltonian_trajectories(problem: PathProblem, states: np.ndarray, momenta:
         taken = np.isfinite(moved).all(axis=1) & (relative <= 1)
         z[alive[taken]] = moved[taken]
         kept.append(z.copy())
-        alive = alive[np.linalg.norm(z[alive, :d] - states[alive], axis=1) < GUESS_REACH]
+        strength = np.linalg.norm(z[alive, d : 2 * d], axis=1)
+        strongest[alive] = np.maximum(strongest[alive], strength)
+        away = np.linalg.norm(z[alive, :d] - states[alive], axis=1)
+        alive = alive[(away < GUESS_REACH) & (strength > GUESS_SPENT * strongest[alive])]
         if not len(alive):
             break
     return np.stack(kept, axis=1)

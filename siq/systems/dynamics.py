@@ -43,6 +43,16 @@ class Signals:
     slopes: np.ndarray  #: (j, n): their time derivatives
     t: np.ndarray  #: (n,)
 
+    @classmethod
+    def joined(cls, several: Sequence[Signals]) -> Signals:
+        """Those at several sets of instants, one after the other."""
+        return cls(
+            *(
+                np.concatenate(each, axis=-1)
+                for each in zip(*(vars(one).values() for one in several), strict=True)
+            )
+        )
+
 
 # Operations of a tape, by the numbers that `siq.inference.trajectories` knows.
 _INVERT, _WHOLE_POWER, _POWER, _SQRT = 2, 3, 4, 5

@@ -273,6 +273,7 @@ def _compiled(
         modules=[{"integer_power": _integer_power}, "numpy"],
         printer=_ProductPrinter(),
         cse=common,
+        docstring_limit=0,  # to write the formulas out once more would take a third of the time
         # Renaming is slow, and needed only for names that the generated code may use itself.
         dummify=any(
             str(each) == "integer_power" or hasattr(np, str(each)) or hasattr(builtins, str(each))

@@ -110,6 +110,13 @@ def nothing(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
     return np.zeros_like(x)
 
 
+def among(*kept: str, **study: Any) -> dict[str, Any]:
+    """A study whose dictionary has these mechanisms and no others."""
+    without = [each.name for each in standard_dictionary() if each.name not in kept]
+    assert len(without) + len(kept) == len(standard_dictionary())
+    return {"held_out": ["r2"], "without": without} | study
+
+
 def said(diagnosis: Diagnosis) -> dict[str, Any]:
     return diagnosis.statement.as_data()
 
@@ -136,7 +143,8 @@ def test_a_noise_that_is_known_is_not_estimated(tmp_path: Path) -> None:
     # Of half the true size: then noise itself is more than the simulation explains.
     for factor, verdict in ((1.0, "no mismatch"), (0.5, "unexplained")):
         size = factor * 0.01 * table["x"].std()
-        diagnosis = solved(tmp_path, table, study={"held_out": ["r2"], "noise": {"x": float(size)}})
+        study = among("cubic stiffness", "quadratic drag", "process noise", noise={"x": float(size)})
+        diagnosis = solved(tmp_path, table, study=study)
         assert diagnosis.investigation.search.fit.noise.measurement == pytest.approx([size**2])
         assert said(diagnosis)["verdict"] == verdict
 
@@ -369,7 +377,8 @@ def test_a_bias_and_an_offset_of_the_sensor_are_one_class(tmp_path: Path) -> Non
 
 def test_units_and_order_change_nothing_but_numbers(tmp_path: Path) -> None:
     table = recordings_of(lambda x, v, t: -0.5 * np.abs(v) * v)
-    metres = solved(tmp_path, table)
+    study = among("quadratic drag", "cubic damping", "cubic stiffness", "process noise")
+    metres = solved(tmp_path, table, study=study)
     shuffled = pd.concat([part for _, part in list(table.groupby("recording"))[::-1]])
     shuffled["x"] *= 1000
     card = json.loads(json.dumps(CARD))
@@ -378,7 +387,7 @@ def test_units_and_order_change_nothing_but_numbers(tmp_path: Path) -> None:
         "v": {"unit": "mm/s", "domain": [-4e3, 4e3]},
     }
     card["equations"]["v"] = "(-k*x - d*v + 1000*u)/m"
-    millimetres = solved(tmp_path, shuffled, card=card)
+    millimetres = solved(tmp_path, shuffled, card=card, study=study)
     assert names(metres) == names(millimetres) == ["quadratic drag"]
     ours, theirs = (said(each)["mechanisms"][0]["parameters"]["c_1"] for each in (metres, millimetres))
     assert theirs["estimate"] == pytest.approx(ours["estimate"] / 1000, rel=1e-3)
@@ -426,9 +435,7 @@ def test_a_mechanism_that_overflows_ends_itself_and_not_the_diagnosis(tmp_path: 
         }
         for name, term in (("explosion", "c*exp(1000*x)"), ("chain", "c*exp(exp(30*x))"))
     ]
-    kept = {"cubic stiffness", "dry friction"}
-    without = [each.name for each in standard_dictionary() if each.name not in kept]
-    study = {"held_out": ["r2"], "mechanisms": further, "without": without}
+    study = among("cubic stiffness", "dry friction", mechanisms=further)
     diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: -0.6 * x**3), study=study)
     assert names(diagnosis) == ["cubic stiffness"]
     assert "explosion" in {each.mechanism for each in diagnosis.statement.not_fitted}
@@ -467,9 +474,7 @@ def test_a_candidate_whose_fit_fails_unforeseen_is_recorded_with_the_reason(
     # Nor what has no name, which would take the place of the failed one, and most of the time.
     for module in (investigation, naming):
         monkeypatch.setattr(module, "fit_unnamed_models", lambda *_: ())
-    kept = {"cubic stiffness", "quintic stiffness"}
-    without = [each.name for each in standard_dictionary() if each.name not in kept]
-    study = {"held_out": ["r2"], "without": without}
+    study = among("cubic stiffness", "quintic stiffness")
     diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: -0.6 * x**3), study=study)
     (failed,) = (each for each in diagnosis.statement.not_fitted if each.mechanism == "cubic stiffness")
     assert type(error).__name__ in failed.reason and str(error) in failed.reason

@@ -38,6 +38,7 @@ def dictionary() -> tuple[Mechanism, ...]:
     return standard_dictionary()
 
 
+@cache  # of homes, which are there once
 def candidates(model: Dynamics) -> Sequence[MechanismCandidate]:
     return candidates_of(model, roles_of(model), dictionary())
 
