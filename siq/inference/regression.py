@@ -26,6 +26,7 @@ from functools import cached_property, partial
 
 import numpy as np
 import scipy.linalg
+from scipy.special import erfc
 
 from siq.data.recordings import Recordings, SnapshotPairs, parent_recordings
 from siq.data.stationarity import even_stretches, lagged_covariances, long_run_covariance
@@ -55,6 +56,7 @@ INSTRUMENT_ROUNDS = 6  # the same with instruments
 WEIGHT_ROUNDS = 2  # of D by the residuals of f, and f by the weights of D: each changes the other by little
 CHUNK, WEIGHTED_CHUNK = 4096, 20_000  # pairs worked on together
 MIN_INSTRUMENT_CORRELATION = 0.1  # of a function that its instrument tells less well nothing is known
+FORGOTTEN = 1e-3  # chance with which samples that know nothing of each other still pass for a motion
 FLOW_SAMPLE = 500  # pairs by which the accuracy of the flow is judged
 
 
@@ -306,7 +308,25 @@ def _fit_everything(
         if ratio > 0.1 and done >= 3:
             break  # noise hides what further rounds would change
     assert flow is not None and rate is not None
+    if flow.coarse:
+        _refuse_forgotten(regression.pairs)
     return triangle, rate, ratio, flow
+
+
+def _refuse_forgotten(pairs: SnapshotPairs) -> None:
+    """Refuse pairs whose ends do not depend on their beginnings: any f that is fast enough made them.
+
+    Bartlett's test of the last canonical correlation ρ between beginnings and ends (Biometrika 34 (1947) 33):
+    of independent ones ``-n ln(1 - ρ²)`` has the law of χ² with one degree of freedom.
+    """
+    halves = [np.linalg.qr(x - x.mean(axis=0))[0] for x in (pairs.x0, pairs.xh)]
+    last = float(np.linalg.svd(halves[0].T @ halves[1], compute_uv=False)[-1])
+    count = len(pairs.h) / copies(pairs)
+    if erfc(np.sqrt(-count * np.log1p(-(min(last, 1 - 1e-12) ** 2)) / 2)) > FORGOTTEN:
+        raise NumericalFailure(
+            f"within a step the state forgets where it was (a correlation of {last:.2g} is left, chance makes"
+            f" {count**-0.5:.2g}), so that any fast f explains the recordings; record more often"
+        )
 
 
 def _evenly(count: int, most: int) -> np.ndarray:

@@ -10,6 +10,7 @@ from scipy.special import exprel
 
 import siq
 from siq.data.recordings import snapshot_pairs
+from siq.errors import NumericalFailure
 from siq.inference.diffusion_model import with_process_noise_rate
 from siq.inference.field_estimate import FlowMap
 from siq.inference.library import IdentificationOptions, field_library
@@ -95,6 +96,18 @@ def test_a_well_that_relaxes_within_three_samples_has_its_own_terms() -> None:
     errors = np.sqrt(np.diag(found.covariance))
     assert (np.abs(found.values - [1.0, -1.0]) < 3 * errors).all()
     assert found.noise_rate[0, 0] == pytest.approx(0.25, rel=4 * np.sqrt(2 / pairs))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_samples_that_know_nothing_of_each_other_are_no_motion(seed: int) -> None:
+    # Any fast f explains white noise: it was certified as one well, without a barrier or a time.
+    draw = np.random.default_rng(seed)
+    values = 2.0 + 3.0 * draw.standard_normal((1, 2000, 1))
+    recordings = siq.Recordings.from_arrays(0.1 * np.arange(2000), values, names=["x"])
+    options = IdentificationOptions(degree=3)
+    library = field_library(["x"], options)
+    with pytest.raises(NumericalFailure, match="forgets where it was"):
+        identify_vector_field(library, snapshot_pairs(recordings), options=options)
 
 
 def _forces(recordings: siq.Recordings, *, integrator_step: float | None = None) -> np.ndarray:
