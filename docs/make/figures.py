@@ -163,7 +163,7 @@ SOURCES: dict[str, tuple[str, Callable[[Path], Found], str]] = {
         archetype3d,
         "snakemake --cores 2 results/archetype3d-noise/report.html",
     ),
-    "resonator": ("resonator/tables", resonator, "snakemake --cores 2 results/resonator/report.html"),
+    "resonator": ("resonator/tables", resonator, "snakemake --cores 1 results/resonator/report.html"),
     "greenland_ice": ("greenland-ice/tables", greenland_ice, "siq run greenland-ice"),
     "neuromorphic_chip": ("neuromorphic-chip/tables", neuromorphic_chip, "siq run neuromorphic-chip"),
     "proof": ("proof/proof/tables", proof, "snakemake --cores 2 proof"),
