@@ -1,6 +1,7 @@
 """What agreement of the networks' own V with the refined one tells.
 
     .venv/bin/python benchmarks/agreement.py
+    .venv/bin/python benchmarks/agreement.py --recordings 2
 
 The refined V follows from the identified f, without networks. Here networks are trained on many recordings,
 as studies train them, which ends with output weights, and by steps of descent alone, most of them far too
@@ -12,6 +13,7 @@ import os
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
+import argparse
 import sys
 import time
 from collections import Counter
@@ -54,7 +56,6 @@ TRAININGS = {
         for steps in (3, 50, 400)
     },
 }
-RECORDINGS = 5  # sets of them, for each system
 WRONG = 0.05  # relative difference from the exact V, in the lowest states, above which V is wrong
 LOWEST = 0.75  # of the recorded states, by V, where one V stands for all
 SIMULATION = SimulationOptions(trajectories=60, pairs=20, pair_step=0.01, interval=0.1)
@@ -95,6 +96,9 @@ def judged(known: KnownSystem, training: TrainingOptions, number: int) -> list[s
 
 def main() -> None:
     """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--recordings", type=int, default=5, help="sets of them, for each system")
+    recordings = parser.parse_args().recordings
     torch.set_num_threads(1)
     began = time.perf_counter()
     print(f"| system | training | trainings | {' | '.join(COUNTED)} |")
@@ -103,7 +107,7 @@ def main() -> None:
     for name, known in SYSTEMS.items():
         for how, training in TRAININGS.items():
             counted: Counter[str] = Counter()
-            for number in range(RECORDINGS):
+            for number in range(recordings):
                 counted.update(["trainings", *judged(known, training, number)])
             total += counted
             row = " | ".join(str(counted[key]) for key in ("trainings", *COUNTED))

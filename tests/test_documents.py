@@ -178,6 +178,15 @@ def test_figures_are_read_from_tables(tmp_path: Path) -> None:
     found = figures.archetype3d(tables)
     assert set(found) == set(FIGURES["archetype3d"])
     assert found["rrmse_mean"] == "3.2·10⁻¹¹" and found["regression_right_terms"] == "0 of 1"
+    both = {"run": [0, 0], "method": ["refined", "randomised network"], "test": 2 * ["agreement"]}
+    pd.DataFrame(both | {"passed": [True, False]}).to_parquet(tables / "certificates.parquet")
+    of_u = {"region": 2 * ["U < 1.2e-08"], "covered": [1.0, 0.9871], "error": [0.001, 0.052]}
+    errors = pd.DataFrame({"run": [0, 1], "source": 2 * ["networks"], **of_u})
+    errors.to_parquet(tables / "landscape_errors.parquet")
+    assert figures.resonator(tables) == {
+        "runs": "1", "certified": "1 of 1", "agree": "1 of 1", "control_agrees": "0 of 1",
+        "networks_all": "0.026 (0.052)", "networks_all_covered": "98.7 %",
+    }  # fmt: skip
 
 
 def test_every_figure_says_where_it_comes_from() -> None:

@@ -14,6 +14,7 @@ import json
 import re
 import sys
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import pandas as pd
@@ -61,6 +62,41 @@ def archetype3d(tables: Path) -> Found:
     refined = scores[scores["method"] == "refined"]
     found["network_error"] = power(refined["network_error"].mean())
     return found | {"runs": str(len(refined))}
+
+
+SOURCES_OF_U = {
+    "local formulas": "refined",
+    "networks": "networks",
+    "regression, by well": "by_well",
+    "regression": "quartic",
+}
+REGIONS = {
+    "A1, ": "a",
+    "A2, ": "b",
+    "U < ": "all",
+    "barrier from A1": "barrier_a",
+    "barrier from A2": "barrier_b",
+}
+
+
+def resonator(tables: Path) -> Found:
+    """The 50 runs of that study: certificates, and U against characteristics of the exact f, mean (worst)."""
+    scores, tests = (pd.read_parquet(tables / f"{name}.parquet") for name in ("rrmse", "certificates"))
+    refined = scores[scores["method"] == "refined"]
+    found = {"runs": str(len(refined)), "certified": f"{int(refined['certified'].sum())} of {len(refined)}"}
+    for method, name in (("refined", "agree"), ("randomised network", "control_agrees")):
+        of = tests[(tests["method"] == method) & (tests["test"] == "agreement")]
+        found[name] = f"{int(of['passed'].sum())} of {len(of)}"
+    errors = pd.read_parquet(tables / "landscape_errors.parquet")
+    for (source, name), (begin, region) in product(SOURCES_OF_U.items(), REGIONS.items()):
+        of = errors[(errors["source"] == source) & errors["region"].str.startswith(begin)]
+        if len(of):
+            mean, worst = (
+                power(one) if one < 0.01 else f"{one:.2g}" for one in (of["error"].mean(), of["error"].max())
+            )
+            found[f"{name}_{region}"] = f"{mean} ({worst})"
+            found[f"{name}_{region}_covered"] = f"{100 * of['covered'].min():.1f} %"
+    return found
 
 
 def proof(tables: Path) -> Found:
@@ -127,6 +163,7 @@ SOURCES: dict[str, tuple[str, Callable[[Path], Found], str]] = {
         archetype3d,
         "snakemake --cores 2 results/archetype3d-noise/report.html",
     ),
+    "resonator": ("resonator/tables", resonator, "snakemake --cores 1 results/resonator/report.html"),
     "greenland_ice": ("greenland-ice/tables", greenland_ice, "siq run greenland-ice"),
     "neuromorphic_chip": ("neuromorphic-chip/tables", neuromorphic_chip, "siq run neuromorphic-chip"),
     "proof": ("proof/proof/tables", proof, "snakemake --cores 2 proof"),

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import time
@@ -66,6 +67,21 @@ def test_only_what_depends_on_a_change_runs_again(finished, tmp_path):
     assert steps == {"train", "regress", "refine"}
     threshold = would_run(project, study, change=lambda: project.write_study(runs=2, threshold=0.2))
     assert threshold == {"regress", "refine"}
+
+
+def test_a_training_without_a_check_goes_on_when_its_steps_are_raised(finished, tmp_path):
+    project = finished.copied(tmp_path / "project")
+    study, kept = project.path("study.yaml"), (DATA, "results/mini/runs/000/vector_field.json")
+    before, trained = project.modified(*kept), []
+    for steps in (4, 6):
+        project.write_study(runs=2, steps=steps)
+        checked = "check: {first: 120, attempts: 1}\n  output_weights: 200\n"
+        study.write_text(study.read_text().replace(checked, "check: null\n"))
+        project.make(NETWORKS)
+        log = project.path("results/mini/logs/000-000/train.log").read_text()
+        trained.append([int(step) for step in re.findall(r"step (\d+) of", log)])
+    assert trained == [[1, 2, 3, 4], [5, 6]]
+    assert project.modified(*kept) == before
 
 
 @pytest.mark.slow
