@@ -24,8 +24,9 @@ the valley is none of the floor of a flat well: it is told from none by the erro
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,7 +35,6 @@ from scipy import ndimage, sparse, special
 
 from siq.data.correlation import markov_lag
 from siq.data.kinetics import (
-    AVERAGING_TIME,
     CONFIDENCE,
     FALSE_WELL,
     MarkovModel,
@@ -109,12 +109,18 @@ class DwellCount:
         return float(2 * self.time / upper), float(2 * self.time / lower) if lower > 0 else float("inf")
 
 
-SURROGATES = 999  # for each state that is looked at: fewer could not be rare enough for all of them
-ENOUGH_DEEPER = 20  # as deep as the record: the probability is then known to a fifth
+SURROGATES, FEWEST_SURROGATES = 1999, 200
+ENOUGH_DEEPER = 10  # of the fewest, as deep as the record: a valley is then not rare
+AVERAGED_SHARES = (0.0, 0.25, 0.5, 1.0)  # of the relaxation time, over which samples are averaged
+FEWEST_POINTS = 16  # of a run, with a spectrum
 MOST_POINTS = 8192  # of a series that surrogates are made of
-BINS = 40  # of a histogram with a valley
+BINS = 40  # of a histogram, at most
+FEWEST_BINS = 10  # in which a valley can be seen
 DEGREES = (5, 9)  # of f in the test: two attractors that differ need more than a cubic, three more than that
 STRETCH_TIMES = 40  # local relaxation times: shorter ones bias f towards one state, longer ones let drifts in
+HOPS_TIMES = (
+    10  # correlation times, hops included: what is left of the first sample at the end is then nothing
+)
 FEWEST_STRETCHES, SHORTEST_TIMES = 6, 10  # for so many stretches they may be as short as ten of these
 LAG_SHARE = 0.1  # of the local relaxation time: over it a state hardly changes what pushes it
 PLACES_COMPARED = 25  # at which f is compared with itself, between the quantiles
@@ -172,56 +178,82 @@ def _pushed_apart(
     return largest, float(special.fdtrc(degree, freedom, max(largest, 0.0) ** 2 / degree))
 
 
-def _valley_between(
+def _valleys(
     values: np.ndarray,
+    recording: np.ndarray,
     runs: list[slice],
-    relaxation: float,
+    relaxations: Sequence[float],
     *,
-    averaged: bool,
-    generator: np.random.Generator | None,
-    surrogates: int = SURROGATES,
-) -> tuple[float, float]:
-    """Share of the samples in the lesser peak of the histogram, and its probability among surrogates.
+    generator: np.random.Generator,
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Valleys of the histograms of columns ``(n, d)``, against surrogates with random phases.
 
-    Samples apart, or else means over half a relaxation time (`averaged`), which hardly any noise blurs.
-    Surrogates have random phases from `generator`; None makes none. No more are drawn once `ENOUGH_DEEPER` of
-    them are as deep: then it is not rare (Besag and Clifford, Biometrika 78 (1991) 301).
+    Every column is looked at as it is, and as means over some shares of its relaxation time, in samples,
+    which hardly any noise blurs. Surrogates turn the phases of all columns alike, which keeps spectra and
+    cross-spectra.
+
+    Returns
+    -------
+    tuple
+        The probability of the rarest valley of all (Westfall and Young, 1993: the least of probabilities that
+        depend on each other is held against the same of each surrogate); the least probability of each column
+        alone, ``(d,)``; and the share of its samples in the lesser peak, ``(d,)``.
     """
-    width = max(int(AVERAGING_TIME * relaxation), 1) if averaged else 1
-    every = max(1 if averaged else int(relaxation / 4), -(-len(values) // MOST_POINTS), 1)
-    levelled = values.copy()
-    for run in runs:  # less a straight line in every stretch, the last of a run longer
-        count = max((run.stop - run.start) // max(int(STRETCH_TIMES * relaxation), 2), 1)
-        for rows in np.array_split(np.arange(run.start, run.stop), count):
-            line = np.vander(np.linspace(-1, 1, len(rows)), 2)
-            levelled[rows] -= line @ np.linalg.lstsq(line, values[rows], rcond=None)[0]
-        # What the sensor adds to each sample would fill the valley.
-        levelled[run] = ndimage.uniform_filter1d(levelled[run], width, mode="nearest")
-    parts = [levelled[run][::every] for run in runs if run.stop - run.start >= 4 * every]
+    every = -(-len(values) // MOST_POINTS)
+    spectra: list[list[np.ndarray]] = [[] for _ in runs]
+    for one, relaxation in zip(values.T, relaxations, strict=True):
+        levelled = one.copy()
+        # Shorter stretches would take the hops with them; slower drifts the surrogates have, too.
+        longest = max(STRETCH_TIMES * relaxation, HOPS_TIMES * correlated_samples(one, runs))
+        for first, last in pairwise(np.searchsorted(recording, np.arange(recording[-1] + 2))):
+            for rows in np.array_split(np.arange(first, last), max(int((last - first) / longest), 1)):
+                line = np.vander(np.linspace(-1, 1, len(rows)), 2)
+                levelled[rows] -= line @ np.linalg.lstsq(line, one[rows], rcond=None)[0]
+        for share in AVERAGED_SHARES:  # what the sensor adds to each sample would fill the valley
+            width = max(int(share * relaxation), 1)
+            for run, found in zip(runs, spectra, strict=True):
+                smooth = ndimage.uniform_filter1d(levelled[run], width, mode="nearest")[::every]
+                found.append(np.fft.rfft(smooth))
+    sizes = [len(range(run.start, run.stop, every)) for run in runs]
+    parts = [(np.array(one), size) for one, size in zip(spectra, sizes, strict=True) if size >= FEWEST_POINTS]
+    columns = values.shape[1]
     if not parts:
-        return 0.0, 1.0
-    seen = _valley(np.concatenate(parts))
-    if seen <= 0 or generator is None:
-        return seen, 1.0
-    spectra = [(np.fft.rfft(part), len(part)) for part in parts]
-    deeper = 0
-    for number in range(surrogates):
+        return 1.0, np.ones(columns), np.zeros(columns)
+    # Rice's rule for so many bins as independent samples fill; each width has those of its column.
+    bins = [
+        int(np.clip(2 * (len(values) / (2 * time)) ** (1 / 3), FEWEST_BINS, BINS))
+        for time in relaxations
+        for _ in AVERAGED_SHARES
+    ]
+    depths = []
+    for number in range(SURROGATES + 1):
         drawn = []
-        for spectrum, size in spectra:
-            turned = spectrum * np.exp(2j * np.pi * generator.random(len(spectrum)))
-            turned[0] = spectrum[0]
-            drawn.append(np.fft.irfft(turned, n=size))
-        deeper += _valley(np.concatenate(drawn)) >= seen
-        if deeper == ENOUGH_DEEPER:
-            return seen, deeper / (number + 1)
-    return seen, (1 + deeper) / (1 + surrogates)
+        for spectrum, size in parts:
+            turns = np.exp(2j * np.pi * generator.random(spectrum.shape[1]))
+            turns[0] = 1.0
+            drawn.append(np.fft.irfft(spectrum * turns if number else spectrum, n=size))
+        series = np.concatenate(drawn, axis=1)
+        depths.append([_valley(one, each) for one, each in zip(series, bins, strict=True)])
+        if (
+            number == FEWEST_SURROGATES
+            and (np.sum(depths[1:] >= np.array(depths[0]), axis=0) >= ENOUGH_DEEPER).all()
+        ):
+            break
+    depth = np.array(depths)
+    order = np.sort(depth, axis=0)
+    rarity = np.array(
+        [1 - np.searchsorted(a, b, side="left") / len(a) for a, b in zip(order.T, depth.T, strict=True)]
+    )
+    least = rarity.min(axis=0)
+    alone = rarity[:, 0].reshape(columns, -1).min(axis=1)
+    return float(np.mean(least <= least[0])), alone, depth[0].reshape(columns, -1)[:, 0]
 
 
-def _valley(series: np.ndarray) -> float:
+def _valley(series: np.ndarray, bins: int) -> float:
     low, high = np.quantile(series, [0.001, 0.999])
     if not high > low:
         return 0.0
-    share = np.histogram(series, bins=BINS, range=(float(low), float(high)))[0] / len(series)
+    share = np.histogram(series, bins=bins, range=(float(low), float(high)))[0] / len(series)
     above = np.maximum(share[:, None] - share, 0)  # bins by places of the valley
     left, right = np.tril(above.T, -1).sum(axis=1), np.triu(above.T, 1).sum(axis=1)
     return float(np.minimum(left, right).max())
@@ -384,26 +416,37 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     (True, [-0.9, 0.8])
     """
     runs, generator = runs_of(recordings), np.random.default_rng(0)  # always the same surrogates
-    tests: dict[int, tuple[float, ...]] = {}  # probability, less the depth, relaxation, the first test's
-    for place, one in enumerate(recordings.values.T):
-        relaxation = relaxation_samples(one, runs)
-        if relaxation is None:  # too short, or a column that runs on like a clock
-            continue
-        chance = min(_pushed_apart(one, runs, relaxation, degree=degree)[1] for degree in DEGREES)
-        valleys = [
-            _valley_between(
-                one, runs, relaxation, averaged=averaged, surrogates=SURROGATES * recordings.values.shape[1],
-                generator=None if chance < DECISIVE_P else generator,
-            ) for averaged in (False, True)
-        ]  # fmt: skip
-        tests[place] = (min(chance, *(rarity for _, rarity in valleys)), -valleys[0][0], relaxation, chance)
-    if not tests:
+    relaxations = {
+        place: time
+        for place, one in enumerate(recordings.values.T)
+        if (time := relaxation_samples(one, runs)) is not None  # too short, or it runs on like a clock
+    }
+    if not relaxations:
         return None
-    columns = sorted(sorted(tests, key=lambda place: tests[place][:2])[:MOST_COLUMNS])
-    state = min(tests, key=lambda place: tests[place][:2])
-    probability = min((len(DEGREES) + 2) * tests[state][0] * len(tests), 1.0)
+    tried = list(relaxations)
+    apart = np.array(
+        [
+            [_pushed_apart(recordings.values[:, place], runs, time, degree=degree) for degree in DEGREES]
+            for place, time in relaxations.items()
+        ]
+    )
+    pushed = apart[..., 1].min(axis=1)
+    chance = len(DEGREES) * len(tried) * float(pushed.min())
+    rarest, rarities, depths = 1.0, np.ones(len(tried)), np.zeros(len(tried))
+    if chance >= DECISIVE_P:
+        rarest, rarities, depths = _valleys(
+            recordings.values[:, tried],
+            recordings.recording,
+            runs,
+            list(relaxations.values()),
+            generator=generator,
+        )
+    kinds = 2 if apart[..., 0].any() else 1  # too few stretches make no test of the first kind
+    probability = min(kinds * min(chance, rarest), 1.0)
+    order = sorted(range(len(tried)), key=lambda one: (min(pushed[one], rarities[one]), -depths[one]))
+    columns, state = sorted(tried[one] for one in order[:MOST_COLUMNS]), tried[order[0]]
     values, column = recordings.values[:, columns], columns.index(state)
-    relaxation = min(tests[place][2] for place in columns)
+    relaxation = min(relaxations[place] for place in columns)
     background, offset = np.zeros_like(values), 0.0
     places, path, expected = np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None
     wells = 1
@@ -423,10 +466,10 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     counts = DwellCount.of_visits(recordings.t, path, runs, states=number)
     density, edges = np.histogram(flat[:, column], bins=BINS, density=True)
     # A valley that is deeper than a linear system's may be the floor of one flat well.
-    pushed = tests[state][3] * (len(DEGREES) + 2) * len(tests) < SIGNIFICANCE
+    wanted = kinds * len(DEGREES) * len(tried) * pushed[order[0]] >= SIGNIFICANCE
     supported = probability < SIGNIFICANCE and any(one.visits for one in counts)
     profile = Profile.of(flat[:, column], runs, path, places[:, column]) if supported else None
-    if profile is not None and not pushed and wells == 1:
+    if profile is not None and wanted and wells == 1:
         supported = bool((profile.tops[:, ::2] > FALSE_WELL * profile.tops[:, 1::2]).all())
     step, lengths = usual_step(recordings), stays_of(path, runs, number)
     found = RecordStates(
