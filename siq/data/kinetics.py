@@ -183,20 +183,17 @@ def path_of(
         return np.sort(alone[:, 0]) if len(alone) == states else evenly
 
     most = _first(runs, MOST_SAMPLES)
-    for states in range(max(len(alone), 2), MOST_STATES + 1):
+    # One level may hide among the wells of the density; with more, any motion is cut into pieces.
+    fewest = max(len(alone), 2)
+    for states in range(fewest, min(fewest + 1, MOST_STATES) + 1):
         if (levels := _levels_of(series, most, guess(states))) is None:
             break
         share, correlation = levels.left(series, most)
-        # With levels enough any motion is cut into pieces that look white; wells of the density are no such,
-        # nor are levels that the record hops to past others.
-        own = states == len(alone)
-        limit = SMOOTH if own else 2 * WHITE_CORRELATION
-        hops = levels.counts.sum() - np.trace(levels.counts)
-        past = np.abs(np.subtract.outer(np.arange(states), np.arange(states))) > 1
-        pieces = not own and states > 2 and levels.counts[past].sum() < WHITE_CORRELATION * hops
+        # With levels enough any motion is cut into pieces that look white; wells of the density are no such.
+        limit = SMOOTH if states == len(alone) else 2 * WHITE_CORRELATION
         if correlation > SMOOTH and states > max(len(alone), 2):
             break
-        if share < WHITE_CORRELATION and correlation < limit and not pieces:
+        if share < WHITE_CORRELATION and correlation < limit:
             levels = _levels_of(series, runs, levels.centre) or levels
             path, blurred = _without_blurred(levels.path, runs, states)
             return _places(values, levels.path, states), path, None if blurred else levels.counts, len(wells)

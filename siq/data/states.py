@@ -197,7 +197,8 @@ def _valleys(
     tuple
         The probability of the rarest valley of all (Westfall and Young, 1993: the least of probabilities that
         depend on each other is held against the same of each surrogate); the least probability of each column
-        alone, ``(d,)``; and the share of its samples in the lesser peak, ``(d,)``.
+        alone, ``(d,)``; and the largest share of its samples in a lesser
+        peak, ``(d,)``.
     """
     every = -(-len(values) // MOST_POINTS)
     spectra: list[list[np.ndarray]] = [[] for _ in runs]
@@ -246,7 +247,7 @@ def _valleys(
     )
     least = rarity.min(axis=0)
     alone = rarity[:, 0].reshape(columns, -1).min(axis=1)
-    return float(np.mean(least <= least[0])), alone, depth[0].reshape(columns, -1)[:, 0]
+    return float(np.mean(least <= least[0])), alone, depth[0].reshape(columns, -1).max(axis=1)
 
 
 def _valley(series: np.ndarray, bins: int) -> float:
@@ -301,6 +302,8 @@ class RecordStates:
     profile: Profile | None = None
     markov: MarkovModel | None = None  #: in the unit of time
     offset: float = 0.0  #: the range of the baselines of the recordings; 0 where these do not differ
+    #: (n,): the baseline of each sample's recording, less their mean; zero where these do not differ
+    baseline: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def of(cls, recordings: Recordings) -> RecordStates | None:
@@ -352,6 +355,13 @@ class RecordStates:
         }  # fmt: skip
         return Remark("data.record_hops", values)
 
+    def rest(self) -> Remark:
+        """What a record without several states shows: where it is nearly always."""
+        share = np.append(0, np.cumsum(self.density * np.diff(self.edges)))
+        low, high = np.interp([(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], share, self.edges)
+        values = {"state": self.state, "unit": self.unit, "low": float(low), "high": float(high)}
+        return Remark("data.record_rests", values)
+
     def sentence(self) -> str:
         """The same in a sentence; empty where only one state is supported."""
         limit = "" if self.limit is None else " " + sentence(self.limit)
@@ -359,7 +369,11 @@ class RecordStates:
 
     def as_data(self) -> dict[str, Any]:
         """As plain data, which `from_data` reads back; what is no number is None, as JSON has none."""
-        kept = {name: value for name, value in vars(self).items() if name not in ("visits", "background")}
+        kept = {
+            name: value
+            for name, value in vars(self).items()
+            if name not in ("visits", "background", "baseline")
+        }
         kept |= {
             name: None if (one := kept[name]) is None else one._asdict() for name in ("profile", "markov")
         }
@@ -443,11 +457,13 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         )
     kinds = 2 if apart[..., 0].any() else 1  # too few stretches make no test of the first kind
     probability = min(kinds * min(chance, rarest), 1.0)
-    order = sorted(range(len(tried)), key=lambda one: (min(pushed[one], rarities[one]), -depths[one]))
+    # Surrogates tell probabilities to a factor: of those of one size the deepest valley counts.
+    size = np.round(np.log10(np.maximum(np.minimum(pushed, rarities), np.finfo(float).tiny)))
+    order = sorted(range(len(tried)), key=lambda one: (size[one], -depths[one]))
     columns, state = sorted(tried[one] for one in order[:MOST_COLUMNS]), tried[order[0]]
     values, column = recordings.values[:, columns], columns.index(state)
     relaxation = min(relaxations[place] for place in columns)
-    background, offset = np.zeros_like(values), 0.0
+    background, baseline = np.zeros_like(values), np.zeros_like(values)
     places, path, expected = np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None
     wells = 1
     if probability >= SIGNIFICANCE:
@@ -459,7 +475,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         slow = np.array([background_of(recordings, one)[0] for one in (values - level).T]).T
         baseline = _baselines(recordings, values - level - slow)
         moved = slow + baseline - background
-        background, offset = slow + baseline, float(np.ptp(baseline[:, column]))
+        background = slow + baseline
         if (np.abs(moved).max(axis=0) <= SETTLED_BACKGROUND * (values - level).std(axis=0)).all():
             break
     flat, number = values - background, len(places)
@@ -476,7 +492,8 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         recordings.titles[state], recordings.units[state], recordings.time_unit, supported, probability,
         tuple(map(float, places[:, column])), counts, edges, density, path, background[:, column],
         int(supported), columns=tuple(recordings.titles[one] for one in columns), places=places,
-        exponential=tuple(map(exponential, lengths)), offset=offset,
+        exponential=tuple(map(exponential, lengths)), offset=float(np.ptp(baseline[:, column])),
+        baseline=baseline[:, column],
         stays=tuple(step * one for one in lengths), hops=_hops(path, runs, number),
     )  # fmt: skip
     if not rungs or not supported:

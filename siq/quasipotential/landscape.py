@@ -93,9 +93,10 @@ class NoLandscape(NumericalFailure):
 
 
 def sentences_without_landscape(reason: str, states: RecordStates | None) -> list[str]:
-    """What is known without a landscape, and why there is none."""
-    seen = "" if states is None else states.sentence()
-    missing = f"{'But no' if seen else 'No'} landscape was found: {reason}."
+    """What is known without a landscape, on which rung that is, and why there is none."""
+    rung = 0 if states is None else states.rung
+    missing = sentence(Remark("quasipotential.without_landscape", {"rung": rung, "reason": reason}))
+    seen = "" if states is None else states.sentence() or sentence(states.rest())
     return [seen, missing] if seen else [missing]
 
 
