@@ -16,10 +16,11 @@ increments over a lag on polynomials of the state in stretches of forty local re
 level of its own, which takes with it whatever drifts slowly. With the polynomial of the state,
 ``E[x(t + 2l) - x(t + l) | x(t)] = l·f(x(t))``, every difference f(b) - f(a) with a < b would be negative if a
 single state attracted. The largest of them in standard errors counts, with Scheffé's bound for having looked
-at all pairs. The second test asks for a valley of the histogram, deeper than in surrogates of the record with
-the same spectrum and random phases, which are what a linear system could have shown; it is not asked where
-the first one is beyond doubt. Several states are supported if one of the tests says so, a hop was seen, and
-the valley is none of the floor of a flat well: it is told from none by the errors of the profile.
+at all pairs. The second test asks for a valley of the histogram of any quantity, as it is or averaged, deeper
+than in surrogates of the record with the same spectra and random phases, which are what a linear system could
+have shown; quantities and averages are judged together. It is not asked where the first one is beyond doubt.
+Several states are supported if one of the tests says so, a hop was seen, and the valley is none of the floor of
+a flat well: it is told from none by the errors of the profile.
 """
 
 from __future__ import annotations

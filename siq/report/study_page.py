@@ -308,6 +308,8 @@ def _states_table(seen: RecordStates, summary: LandscapeSummary | None = None) -
             limits = range_text(row["markov_lowest"], row["markov_highest"])
             model = f"{value_text(row['markov_time'], digits=3)} ({limits})"
             cells[with_unit("mean stay, Markov model", time_unit)].append(model)
+            apart = row["markov_lowest"] > row["highest"] or row["markov_highest"] < row["lowest"]
+            cells["counted and model agree"].append("no" if apart else "within their intervals")
     same = summary is not None and len(summary.wells) == len(found) and len(summary.names) == 1
     if summary is not None and same:
         for well in sorted(summary.wells, key=lambda one: float(one.position[0])):
