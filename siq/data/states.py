@@ -19,15 +19,15 @@ single state attracted. The largest of them in standard errors counts, with Sche
 at all pairs. The second test asks for a valley of the histogram of any quantity, as it is or averaged, deeper
 than in surrogates of the record with the same spectra and random phases, which are what a linear system could
 have shown; quantities and averages are judged together. It is not asked where the first one is beyond doubt.
-Several states are supported if one of the tests says so, a hop was seen, and the valley is none of the floor of
-a flat well: it is told from none by the errors of the profile.
+Several states are supported if one of the tests says so, a hop was seen, and the valley is none of the
+floor of a flat well: it is told from none by the errors of the profile.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -110,10 +110,10 @@ class DwellCount:
         return float(2 * self.time / upper), float(2 * self.time / lower) if lower > 0 else float("inf")
 
 
-SURROGATES, FEWEST_SURROGATES = 1999, 200
+SURROGATES, FEWEST_SURROGATES = 999, 200
 ENOUGH_DEEPER = 10  # of the fewest, as deep as the record: a valley is then not rare
-AVERAGED_SHARES = (0.0, 0.25, 0.5, 1.0)  # of the relaxation time, over which samples are averaged
-FEWEST_POINTS = 16  # of a run, with a spectrum
+AVERAGED_SHARES = (0.0, 0.5, 1.0)  # of the relaxation time, over which samples are averaged
+FEWEST_POINTS = 4  # of a run, with a spectrum
 MOST_POINTS = 8192  # of a series that surrogates are made of
 BINS = 40  # of a histogram, at most
 FEWEST_BINS = 10  # in which a valley can be seen
@@ -181,7 +181,6 @@ def _pushed_apart(
 
 def _valleys(
     values: np.ndarray,
-    recording: np.ndarray,
     runs: list[slice],
     relaxations: Sequence[float],
     *,
@@ -204,17 +203,19 @@ def _valleys(
     every = -(-len(values) // MOST_POINTS)
     spectra: list[list[np.ndarray]] = [[] for _ in runs]
     for one, relaxation in zip(values.T, relaxations, strict=True):
+        # As it is, and less a straight line in every stretch, the last of a run longer: slow hops need the
+        # one, quick hops over a drift the other.
         levelled = one.copy()
-        # Shorter stretches would take the hops with them; slower drifts the surrogates have, too.
-        longest = max(STRETCH_TIMES * relaxation, HOPS_TIMES * correlated_samples(one, runs))
-        for first, last in pairwise(np.searchsorted(recording, np.arange(recording[-1] + 2))):
-            for rows in np.array_split(np.arange(first, last), max(int((last - first) / longest), 1)):
+        for run in runs:
+            count = max((run.stop - run.start) // max(int(STRETCH_TIMES * relaxation), 2), 1)
+            for rows in np.array_split(np.arange(run.start, run.stop), count):
                 line = np.vander(np.linspace(-1, 1, len(rows)), 2)
                 levelled[rows] -= line @ np.linalg.lstsq(line, one[rows], rcond=None)[0]
-        for share in AVERAGED_SHARES:  # what the sensor adds to each sample would fill the valley
+        for series, share in product((one - one.mean(), levelled), AVERAGED_SHARES):
+            # What the sensor adds to each sample would fill the valley.
             width = max(int(share * relaxation), 1)
             for run, found in zip(runs, spectra, strict=True):
-                smooth = ndimage.uniform_filter1d(levelled[run], width, mode="nearest")[::every]
+                smooth = ndimage.uniform_filter1d(series[run], width, mode="nearest")[::every]
                 found.append(np.fft.rfft(smooth))
     sizes = [len(range(run.start, run.stop, every)) for run in runs]
     parts = [(np.array(one), size) for one, size in zip(spectra, sizes, strict=True) if size >= FEWEST_POINTS]
@@ -225,7 +226,7 @@ def _valleys(
     bins = [
         int(np.clip(2 * (len(values) / (2 * time)) ** (1 / 3), FEWEST_BINS, BINS))
         for time in relaxations
-        for _ in AVERAGED_SHARES
+        for _ in range(2 * len(AVERAGED_SHARES))
     ]
     depths = []
     for number in range(SURROGATES + 1):
@@ -451,7 +452,6 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     if chance >= DECISIVE_P:
         rarest, rarities, depths = _valleys(
             recordings.values[:, tried],
-            recordings.recording,
             runs,
             list(relaxations.values()),
             generator=generator,

@@ -155,7 +155,5 @@ def test_baselines_of_recordings_that_hop_are_taken_off_and_said(scale: float) -
     )
     flat = without_background(recordings)
     assert "differ in their baselines" in flat.notes[-1]
-    taken = [
-        float((recordings.values - flat.values)[recordings.recording == one].mean()) for one in range(3)
-    ]
+    taken = [float((recordings.values - flat.values)[recordings.recording == one].mean()) for one in range(3)]
     np.testing.assert_allclose(np.diff(taken), scale * np.diff(offsets), atol=0.1 * scale)
