@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from siq.data.correlation import noise_floors
+from siq.data.correlation import markov_lag, noise_floors
 from siq.data.recordings import (
     SINGLE_RECORDING_REMEDY,
     Recordings,
@@ -182,10 +182,12 @@ def without_background(recordings: Recordings) -> Recordings:
     differ beyond chance; how others begin may be a part of what they show, and they come back as they are. So
     does a record without process noise, in which nothing but the system itself moves.
     """
-    floors = noise_floors(recordings)
+    single = len(recordings.labels) == 1
+    floors = noise_floors(recordings) if single else ()
     if floors is None or any(floor.process == 0 for floor in floors):
         return recordings
-    single = len(recordings.labels) == 1
+    if not single and not markov_lag(recordings).may_hop:
+        return recordings
     found = switching(recordings, rungs=False)
     hops = found is not None and found.supported
     flat, remarks = recordings.values.copy(), list(recordings.remarks)

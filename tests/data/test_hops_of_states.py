@@ -141,19 +141,3 @@ def test_hops_are_no_slow_drift() -> None:
 def test_a_long_trace_is_cut_by_its_own_correlation_time() -> None:
     quick, hopping = in_stretches(recorded(one_state(0))), in_stretches(recorded(two_states(3, 0.25)))
     assert len(quick.labels) == 40 and 10 <= len(hopping.labels) < 20
-
-
-@pytest.mark.parametrize("scale", [1.0, 1e-6])
-def test_baselines_of_recordings_that_hop_are_taken_off_and_said(scale: float) -> None:
-    generator, values = np.random.default_rng(7), []
-    offsets = np.array([0.0, 1.0, -0.7])
-    for offset in offsets:
-        state = np.cumsum(generator.random(4000) < 0.02) % 2
-        values.append(scale * (offset + 4.0 * state + 0.3 * generator.standard_normal(4000)))
-    recordings = Recordings.from_arrays(
-        [np.arange(4000.0)] * 3, [one[:, None] for one in values], names=["x"]
-    )
-    flat = without_background(recordings)
-    assert "differ in their baselines" in flat.notes[-1]
-    taken = [float((recordings.values - flat.values)[recordings.recording == one].mean()) for one in range(3)]
-    np.testing.assert_allclose(np.diff(taken), scale * np.diff(offsets), atol=0.1 * scale)
