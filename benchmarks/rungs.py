@@ -10,7 +10,7 @@ beyond claims what is not so.
 
 What climbs is a function of `siq.Recordings`. It returns an object with ``rung``, a whole number, and
 ``stays``: for each state, from the lowest first value to the highest, a mean stay with the ends of its
-interval of 95 %; or None where there is nothing.
+interval of 95 %; or None where there is nothing. `by_states` of this module is the climb up to rung 3.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -31,6 +31,7 @@ from benchmarks.hostile.catalogue import KINDS
 from benchmarks.hostile.records import STEP, Record, Scene, double_wells, one_wells
 from benchmarks.hostile.scores import counted
 from siq.data.recordings import Recordings
+from siq.data.states import RecordStates
 
 LONGER = 20  # times the record: what is counted there is true
 COLUMNS = ("laboratory", "seed", "true_rung", "rung", "states", "true_states", "covered", "stays", "fault")
@@ -156,6 +157,22 @@ LABORATORIES = {
         Laboratory("growing noise", 1, "the noise depends on time", _hostile("growing_noise", 0.9)),
     )
 }  # fmt: skip
+
+
+class _Climbed(NamedTuple):
+    rung: int
+    stays: list[tuple[float, float, float]]
+
+
+def by_states(recordings: Recordings) -> _Climbed | None:
+    """What the record supports by itself, up to rung 3: stays by the Markov model, or else as counted."""
+    found = RecordStates.of(recordings)
+    if found is None or not found.supported:
+        return None
+    names = ("mean_time", "lowest", "highest")
+    if found.markov is not None:
+        names = ("markov_time", "markov_lowest", "markov_highest")
+    return _Climbed(found.rung, list(found.dwell_times()[list(names)].itertuples(index=False, name=None)))
 
 
 def judged(laboratory: Laboratory, seed: int, climb: Callable[[Recordings], Any]) -> dict[str, Any]:

@@ -439,6 +439,7 @@ def _most_likely(parts: np.ndarray, empirical: np.ndarray, count: float) -> tupl
 
 
 MOST_DECIMALS = 12  # a double of size 1 has 15 to 16; what has as many as that was not rounded
+MIN_REPETITIONS = 4  # of the values of a label
 FEWEST_VALUES = 8  # distinct values below which their decimals say nothing
 FEWEST_LEVELS = 3  # of a digitiser; two are always a step apart
 LATTICE_BY_CHANCE, LATTICE_TOLERANCE = 1e-6, 0.05  # of levels: to lie on a lattice, and off it, in steps

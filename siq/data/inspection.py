@@ -16,6 +16,7 @@ import numpy as np
 
 from siq.data.correlation import (
     FEWEST_VALUES,
+    MIN_REPETITIONS,
     MarkovLag,
     NoiseFloor,
     decimals_of,
@@ -44,7 +45,6 @@ VISITED_SAMPLES = 10  # in a cell, from which something is known of it: a mean t
 SPARSE_COVERAGE = 0.3  # of the cells; less is a thin line, on which a formula knows nothing beside it
 SENSOR_SHARE = 0.02  # of the variance of a step, shared by neighbours: identification takes no more
 VALUES_SAMPLED = 2000  # looked at, for how many of them differ
-MIN_REPETITIONS = 4  # of the values of a label
 NEGLIGIBLE_ROUNDING = 1e-6  # of the range of a state
 COARSE_STEP = 0.5  # relaxation times: over a longer step most of what f does is forgotten
 

@@ -36,6 +36,7 @@ AVERAGING_TIME = 0.5  # of the local relaxation time: of samples, before wells a
 MOST_NODES = 4000  # samples at which the density is estimated
 FALSE_WELL = 3.5  # standard errors by which a well has to stand out: of the many saddles none does by chance
 LEAST_NEIGHBOURS = 16  # independent ones: a density is then known to a quarter
+NO_VARIANCE = 1e-6  # of columns that repeat each other
 LINKS = 24  # neighbours that a sample is linked with
 MOST_ITERATIONS = 200  # of a hidden Markov model
 DRAWS = 200  # of the transition matrix: ends of intervals are then known to a tenth of their width
@@ -55,6 +56,9 @@ def _wells_of(values: np.ndarray, relaxation: float) -> np.ndarray:
     scale = np.maximum(values.std(axis=0), np.finfo(float).tiny)
     every = -(-len(values) // MOST_NODES)
     nodes = (values[::every] - values.mean(axis=0)) / scale
+    # Along a ridge distances would grow as in one dimension: columns are scaled until none is correlated.
+    variance, turned = np.linalg.eigh(nodes.T @ nodes / len(nodes))
+    nodes = nodes @ turned / np.sqrt(np.maximum(variance, NO_VARIANCE))
     count, dimension = nodes.shape
     together = max(2 * relaxation / every, 1.0)
     independent = max((count / together) ** (4 / (4 + dimension)) / 4, LEAST_NEIGHBOURS)
@@ -62,7 +66,7 @@ def _wells_of(values: np.ndarray, relaxation: float) -> np.ndarray:
     if neighbours < LEAST_NEIGHBOURS:
         return np.median(values, axis=0)[None]
     distance, near = cKDTree(nodes).query(nodes, k=neighbours + 1)
-    density = -dimension * np.log(distance[:, -1])
+    density = -dimension * np.log(np.maximum(distance[:, -1], np.finfo(float).tiny))
     needed = FALSE_WELL * np.sqrt(2 * together / neighbours)
     linked = near[:, 1 :: max(neighbours // LINKS, 1)] if dimension == 1 else near[:, 1 : LINKS + 1]
     parent = np.full(count, -1)
@@ -169,8 +173,9 @@ def path_of(
     # Values of a counter or a digitiser have no nearest neighbours.
     steps = np.array([resolution_step(one) or 0.0 for one in values.T])
     draw = np.random.default_rng(0)
-    wells = _wells_of(smooth + steps * (draw.random(values.shape) - 0.5), relaxation)
-    alone = wells[:, [column]] if values.shape[1] == 1 else _wells_of(smooth[:, [column]], relaxation)
+    longest = [_remembered(one, runs, relaxation) for one in smooth.T]
+    wells = _wells_of(smooth + steps * (draw.random(values.shape) - 0.5), max(longest))
+    alone = wells[:, [column]] if values.shape[1] == 1 else _wells_of(smooth[:, [column]], longest[column])
 
     def guess(states: int) -> np.ndarray:
         low, high = np.quantile(series, [0.05, 0.95])
@@ -178,7 +183,9 @@ def path_of(
         return np.sort(alone[:, 0]) if len(alone) == states else evenly
 
     most = _first(runs, MOST_SAMPLES)
-    for states in range(max(len(alone), 2), MOST_STATES + 1):
+    # One level may hide among the wells of the density; with more, any motion is cut into pieces.
+    fewest = max(len(alone), 2)
+    for states in range(fewest, min(fewest + 1, MOST_STATES) + 1):
         if (levels := _levels_of(series, most, guess(states))) is None:
             break
         share, correlation = levels.left(series, most)
@@ -221,6 +228,16 @@ def path_of(
     core = np.where(distance[np.arange(len(near)), near] <= _medians(distance, near)[near], near, -1)
     places = _places(values, near, len(wells))
     return places, continued_visits(core, runs), None, len(wells)
+
+
+def _remembered(series: np.ndarray, runs: list[slice], relaxation: float) -> float:
+    """How long visits to a place are remembered, hops included, in samples: median over places."""
+    if not np.ptp(series) > 0:
+        return relaxation
+    bins = np.searchsorted(np.quantile(series, np.arange(0.1, 1.0, 0.1)), series)
+    some = runs[:: -(-len(runs) // MOST_RUNS)]
+    times = [correlated_samples((bins == one).astype(float), some) for one in np.unique(bins)]
+    return max(relaxation, float(np.median(times)))
 
 
 def _without_blurred(path: np.ndarray, runs: list[slice], states: int) -> tuple[np.ndarray, bool]:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from siq.data.correlation import noise_floors
+from siq.data.correlation import markov_lag, noise_floors
 from siq.data.recordings import (
     SINGLE_RECORDING_REMEDY,
     Recordings,
@@ -174,31 +174,32 @@ def joined(recordings: Recordings) -> Recordings:
     return replace(recordings, labels=tuple(labels), recording=(np.cumsum(begins) - 1)[recordings.recording])
 
 
-def without_slow_drift(recordings: Recordings) -> Recordings:
-    """A single long recording less what drifts slowly in it, which is remarked for each state.
+def without_background(recordings: Recordings) -> Recordings:
+    """Recordings less what is no property of the system, which is remarked for each quantity.
 
-    Of a record that supports two states the drift is what both levels have in common; of any other, what slow
-    cosines explain. Several recordings come back as they are: how they begin may be a part of what they show.
-    So does one without process noise, in which nothing but the system itself moves.
+    Of a single long recording that is slow drift: what all levels have in common where it supports several
+    states, otherwise what slow cosines explain. Of several that hop it is the baseline of each, where these
+    differ beyond chance; how others begin may be a part of what they show, and they come back as they are. So
+    does a record without process noise, in which nothing but the system itself moves.
     """
-    floors = noise_floors(recordings) if len(recordings.labels) == 1 else None
+    single = len(recordings.labels) == 1
+    floors = noise_floors(recordings) if single else ()
     if floors is None or any(floor.process == 0 for floor in floors):
         return recordings
+    if not single and not markov_lag(recordings).may_hop:
+        return recordings
     found = switching(recordings, rungs=False)
+    hops = found is not None and found.supported
     flat, remarks = recordings.values.copy(), list(recordings.remarks)
-    for state, values in enumerate(recordings.values.T):
-        background, _ = background_of(recordings, values)
-        if found is not None and found.supported and recordings.titles[state] == found.state:
-            background = found.background
+    for state, (title, values) in enumerate(zip(recordings.titles, recordings.values.T, strict=True)):
+        background = background_of(recordings, values)[0] if single else np.zeros(len(values))
+        if found is not None and hops and title == found.state:
+            background = found.background if single else found.baseline
         if not background.any():
             continue
         flat[:, state] -= background
-        told = {
-            "column": recordings.titles[state],
-            "range": float(np.ptp(background)),
-            "unit": recordings.units[state],
-        }
-        remarks.append(Remark("data.drift_taken_off", told))
+        told = {"column": title, "range": float(np.ptp(background)), "unit": recordings.units[state]}
+        remarks.append(Remark("data.drift_taken_off" if single else "data.baselines_taken_off", told))
     if len(remarks) == len(recordings.remarks):
         return recordings
     return replace(recordings, values=flat, remarks=tuple(remarks))

@@ -16,16 +16,18 @@ increments over a lag on polynomials of the state in stretches of forty local re
 level of its own, which takes with it whatever drifts slowly. With the polynomial of the state,
 ``E[x(t + 2l) - x(t + l) | x(t)] = l·f(x(t))``, every difference f(b) - f(a) with a < b would be negative if a
 single state attracted. The largest of them in standard errors counts, with Scheffé's bound for having looked
-at all pairs. The second test asks for a valley of the histogram, deeper than in surrogates of the record with
-the same spectrum and random phases, which are what a linear system could have shown; it is not asked where
-the first one is beyond doubt. Several states are supported if one of the tests says so, a hop was seen, and
-the valley is none of the floor of a flat well: it is told from none by the errors of the profile.
+at all pairs. The second test asks for a valley of the histogram of any quantity, as it is or averaged, deeper
+than in surrogates of the record with the same spectra and random phases, which are what a linear system could
+have shown; quantities and averages are judged together. It is not asked where the first one is beyond doubt.
+Several states are supported if one of the tests says so, a hop was seen, and the valley is none of the
+floor of a flat well: it is told from none by the errors of the profile.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,7 +36,6 @@ from scipy import ndimage, sparse, special
 
 from siq.data.correlation import markov_lag
 from siq.data.kinetics import (
-    AVERAGING_TIME,
     CONFIDENCE,
     FALSE_WELL,
     MarkovModel,
@@ -109,12 +110,18 @@ class DwellCount:
         return float(2 * self.time / upper), float(2 * self.time / lower) if lower > 0 else float("inf")
 
 
-SURROGATES = 999  # for each state that is looked at: fewer could not be rare enough for all of them
-ENOUGH_DEEPER = 20  # as deep as the record: the probability is then known to a fifth
+SURROGATES, FEWEST_SURROGATES = 999, 200
+ENOUGH_DEEPER = 10  # of the fewest, as deep as the record: a valley is then not rare
+AVERAGED_SHARES = (0.0, 0.5, 1.0)  # of the relaxation time, over which samples are averaged
+FEWEST_POINTS = 4  # of a run, with a spectrum
 MOST_POINTS = 8192  # of a series that surrogates are made of
-BINS = 40  # of a histogram with a valley
+BINS = 40  # of a histogram, at most
+FEWEST_BINS = 10  # in which a valley can be seen
 DEGREES = (5, 9)  # of f in the test: two attractors that differ need more than a cubic, three more than that
 STRETCH_TIMES = 40  # local relaxation times: shorter ones bias f towards one state, longer ones let drifts in
+HOPS_TIMES = (
+    10  # correlation times, hops included: what is left of the first sample at the end is then nothing
+)
 FEWEST_STRETCHES, SHORTEST_TIMES = 6, 10  # for so many stretches they may be as short as ten of these
 LAG_SHARE = 0.1  # of the local relaxation time: over it a state hardly changes what pushes it
 PLACES_COMPARED = 25  # at which f is compared with itself, between the quantiles
@@ -172,56 +179,84 @@ def _pushed_apart(
     return largest, float(special.fdtrc(degree, freedom, max(largest, 0.0) ** 2 / degree))
 
 
-def _valley_between(
+def _valleys(
     values: np.ndarray,
     runs: list[slice],
-    relaxation: float,
+    relaxations: Sequence[float],
     *,
-    averaged: bool,
-    generator: np.random.Generator | None,
-    surrogates: int = SURROGATES,
-) -> tuple[float, float]:
-    """Share of the samples in the lesser peak of the histogram, and its probability among surrogates.
+    generator: np.random.Generator,
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Valleys of the histograms of columns ``(n, d)``, against surrogates with random phases.
 
-    Samples apart, or else means over half a relaxation time (`averaged`), which hardly any noise blurs.
-    Surrogates have random phases from `generator`; None makes none. No more are drawn once `ENOUGH_DEEPER` of
-    them are as deep: then it is not rare (Besag and Clifford, Biometrika 78 (1991) 301).
+    Every column is looked at as it is, and as means over some shares of its relaxation time, in samples,
+    which hardly any noise blurs. Surrogates turn the phases of all columns alike, which keeps spectra and
+    cross-spectra.
+
+    Returns
+    -------
+    tuple
+        The probability of the rarest valley of all (Westfall and Young, 1993: the least of probabilities that
+        depend on each other is held against the same of each surrogate); the least probability of each column
+        alone, ``(d,)``; and the largest share of its samples in a lesser
+        peak, ``(d,)``.
     """
-    width = max(int(AVERAGING_TIME * relaxation), 1) if averaged else 1
-    every = max(1 if averaged else int(relaxation / 4), -(-len(values) // MOST_POINTS), 1)
-    levelled = values.copy()
-    for run in runs:  # less a straight line in every stretch, the last of a run longer
-        count = max((run.stop - run.start) // max(int(STRETCH_TIMES * relaxation), 2), 1)
-        for rows in np.array_split(np.arange(run.start, run.stop), count):
-            line = np.vander(np.linspace(-1, 1, len(rows)), 2)
-            levelled[rows] -= line @ np.linalg.lstsq(line, values[rows], rcond=None)[0]
-        # What the sensor adds to each sample would fill the valley.
-        levelled[run] = ndimage.uniform_filter1d(levelled[run], width, mode="nearest")
-    parts = [levelled[run][::every] for run in runs if run.stop - run.start >= 4 * every]
+    every = -(-len(values) // MOST_POINTS)
+    spectra: list[list[np.ndarray]] = [[] for _ in runs]
+    for one, relaxation in zip(values.T, relaxations, strict=True):
+        # As it is, and less a straight line in every stretch, the last of a run longer: slow hops need the
+        # one, quick hops over a drift the other.
+        levelled = one.copy()
+        for run in runs:
+            count = max((run.stop - run.start) // max(int(STRETCH_TIMES * relaxation), 2), 1)
+            for rows in np.array_split(np.arange(run.start, run.stop), count):
+                line = np.vander(np.linspace(-1, 1, len(rows)), 2)
+                levelled[rows] -= line @ np.linalg.lstsq(line, one[rows], rcond=None)[0]
+        for series, share in product((one - one.mean(), levelled), AVERAGED_SHARES):
+            # What the sensor adds to each sample would fill the valley.
+            width = max(int(share * relaxation), 1)
+            for run, found in zip(runs, spectra, strict=True):
+                smooth = ndimage.uniform_filter1d(series[run], width, mode="nearest")[::every]
+                found.append(np.fft.rfft(smooth))
+    sizes = [len(range(run.start, run.stop, every)) for run in runs]
+    parts = [(np.array(one), size) for one, size in zip(spectra, sizes, strict=True) if size >= FEWEST_POINTS]
+    columns = values.shape[1]
     if not parts:
-        return 0.0, 1.0
-    seen = _valley(np.concatenate(parts))
-    if seen <= 0 or generator is None:
-        return seen, 1.0
-    spectra = [(np.fft.rfft(part), len(part)) for part in parts]
-    deeper = 0
-    for number in range(surrogates):
+        return 1.0, np.ones(columns), np.zeros(columns)
+    # Rice's rule for so many bins as independent samples fill; each width has those of its column.
+    bins = [
+        int(np.clip(2 * (len(values) / (2 * time)) ** (1 / 3), FEWEST_BINS, BINS))
+        for time in relaxations
+        for _ in range(2 * len(AVERAGED_SHARES))
+    ]
+    depths = []
+    for number in range(SURROGATES + 1):
         drawn = []
-        for spectrum, size in spectra:
-            turned = spectrum * np.exp(2j * np.pi * generator.random(len(spectrum)))
-            turned[0] = spectrum[0]
-            drawn.append(np.fft.irfft(turned, n=size))
-        deeper += _valley(np.concatenate(drawn)) >= seen
-        if deeper == ENOUGH_DEEPER:
-            return seen, deeper / (number + 1)
-    return seen, (1 + deeper) / (1 + surrogates)
+        for spectrum, size in parts:
+            turns = np.exp(2j * np.pi * generator.random(spectrum.shape[1]))
+            turns[0] = 1.0
+            drawn.append(np.fft.irfft(spectrum * turns if number else spectrum, n=size))
+        series = np.concatenate(drawn, axis=1)
+        depths.append([_valley(one, each) for one, each in zip(series, bins, strict=True)])
+        if (
+            number == FEWEST_SURROGATES
+            and (np.sum(depths[1:] >= np.array(depths[0]), axis=0) >= ENOUGH_DEEPER).all()
+        ):
+            break
+    depth = np.array(depths)
+    order = np.sort(depth, axis=0)
+    rarity = np.array(
+        [1 - np.searchsorted(a, b, side="left") / len(a) for a, b in zip(order.T, depth.T, strict=True)]
+    )
+    least = rarity.min(axis=0)
+    alone = rarity[:, 0].reshape(columns, -1).min(axis=1)
+    return float(np.mean(least <= least[0])), alone, depth[0].reshape(columns, -1).max(axis=1)
 
 
-def _valley(series: np.ndarray) -> float:
+def _valley(series: np.ndarray, bins: int) -> float:
     low, high = np.quantile(series, [0.001, 0.999])
     if not high > low:
         return 0.0
-    share = np.histogram(series, bins=BINS, range=(float(low), float(high)))[0] / len(series)
+    share = np.histogram(series, bins=bins, range=(float(low), float(high)))[0] / len(series)
     above = np.maximum(share[:, None] - share, 0)  # bins by places of the valley
     left, right = np.tril(above.T, -1).sum(axis=1), np.triu(above.T, 1).sum(axis=1)
     return float(np.minimum(left, right).max())
@@ -269,6 +304,8 @@ class RecordStates:
     profile: Profile | None = None
     markov: MarkovModel | None = None  #: in the unit of time
     offset: float = 0.0  #: the range of the baselines of the recordings; 0 where these do not differ
+    #: (n,): the baseline of each sample's recording, less their mean; zero where these do not differ
+    baseline: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def of(cls, recordings: Recordings) -> RecordStates | None:
@@ -320,6 +357,13 @@ class RecordStates:
         }  # fmt: skip
         return Remark("data.record_hops", values)
 
+    def rest(self) -> Remark:
+        """What a record without several states shows: where it is nearly always."""
+        share = np.append(0, np.cumsum(self.density * np.diff(self.edges)))
+        low, high = np.interp([(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], share, self.edges)
+        values = {"state": self.state, "unit": self.unit, "low": float(low), "high": float(high)}
+        return Remark("data.record_rests", values)
+
     def sentence(self) -> str:
         """The same in a sentence; empty where only one state is supported."""
         limit = "" if self.limit is None else " " + sentence(self.limit)
@@ -327,7 +371,11 @@ class RecordStates:
 
     def as_data(self) -> dict[str, Any]:
         """As plain data, which `from_data` reads back; what is no number is None, as JSON has none."""
-        kept = {name: value for name, value in vars(self).items() if name not in ("visits", "background")}
+        kept = {
+            name: value
+            for name, value in vars(self).items()
+            if name not in ("visits", "background", "baseline")
+        }
         kept |= {
             name: None if (one := kept[name]) is None else one._asdict() for name in ("profile", "markov")
         }
@@ -384,27 +432,39 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     (True, [-0.9, 0.8])
     """
     runs, generator = runs_of(recordings), np.random.default_rng(0)  # always the same surrogates
-    tests: dict[int, tuple[float, ...]] = {}  # probability, less the depth, relaxation, the first test's
-    for place, one in enumerate(recordings.values.T):
-        relaxation = relaxation_samples(one, runs)
-        if relaxation is None:  # too short, or a column that runs on like a clock
-            continue
-        chance = min(_pushed_apart(one, runs, relaxation, degree=degree)[1] for degree in DEGREES)
-        valleys = [
-            _valley_between(
-                one, runs, relaxation, averaged=averaged, surrogates=SURROGATES * recordings.values.shape[1],
-                generator=None if chance < DECISIVE_P else generator,
-            ) for averaged in (False, True)
-        ]  # fmt: skip
-        tests[place] = (min(chance, *(rarity for _, rarity in valleys)), -valleys[0][0], relaxation, chance)
-    if not tests:
+    relaxations = {
+        place: time
+        for place, one in enumerate(recordings.values.T)
+        if (time := relaxation_samples(one, runs)) is not None  # too short, or it runs on like a clock
+    }
+    if not relaxations:
         return None
-    columns = sorted(sorted(tests, key=lambda place: tests[place][:2])[:MOST_COLUMNS])
-    state = min(tests, key=lambda place: tests[place][:2])
-    probability = min((len(DEGREES) + 2) * tests[state][0] * len(tests), 1.0)
+    tried = list(relaxations)
+    apart = np.array(
+        [
+            [_pushed_apart(recordings.values[:, place], runs, time, degree=degree) for degree in DEGREES]
+            for place, time in relaxations.items()
+        ]
+    )
+    pushed = apart[..., 1].min(axis=1)
+    chance = len(DEGREES) * len(tried) * float(pushed.min())
+    rarest, rarities, depths = 1.0, np.ones(len(tried)), np.zeros(len(tried))
+    if chance >= DECISIVE_P:
+        rarest, rarities, depths = _valleys(
+            recordings.values[:, tried],
+            runs,
+            list(relaxations.values()),
+            generator=generator,
+        )
+    kinds = 2 if apart[..., 0].any() else 1  # too few stretches make no test of the first kind
+    probability = min(kinds * min(chance, rarest), 1.0)
+    # Surrogates tell probabilities to a factor: of those of one size the deepest valley counts.
+    size = np.round(np.log10(np.maximum(np.minimum(pushed, rarities), np.finfo(float).tiny)))
+    order = sorted(range(len(tried)), key=lambda one: (size[one], -depths[one]))
+    columns, state = sorted(tried[one] for one in order[:MOST_COLUMNS]), tried[order[0]]
     values, column = recordings.values[:, columns], columns.index(state)
-    relaxation = min(tests[place][2] for place in columns)
-    background, offset = np.zeros_like(values), 0.0
+    relaxation = min(relaxations[place] for place in columns)
+    background, baseline = np.zeros_like(values), np.zeros_like(values)
     places, path, expected = np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None
     wells = 1
     if probability >= SIGNIFICANCE:
@@ -416,24 +476,25 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         slow = np.array([background_of(recordings, one)[0] for one in (values - level).T]).T
         baseline = _baselines(recordings, values - level - slow)
         moved = slow + baseline - background
-        background, offset = slow + baseline, float(np.ptp(baseline[:, column]))
+        background = slow + baseline
         if (np.abs(moved).max(axis=0) <= SETTLED_BACKGROUND * (values - level).std(axis=0)).all():
             break
     flat, number = values - background, len(places)
     counts = DwellCount.of_visits(recordings.t, path, runs, states=number)
     density, edges = np.histogram(flat[:, column], bins=BINS, density=True)
     # A valley that is deeper than a linear system's may be the floor of one flat well.
-    pushed = tests[state][3] * (len(DEGREES) + 2) * len(tests) < SIGNIFICANCE
+    wanted = kinds * len(DEGREES) * len(tried) * pushed[order[0]] >= SIGNIFICANCE
     supported = probability < SIGNIFICANCE and any(one.visits for one in counts)
     profile = Profile.of(flat[:, column], runs, path, places[:, column]) if supported else None
-    if profile is not None and not pushed and wells == 1:
+    if profile is not None and wanted and wells == 1:
         supported = bool((profile.tops[:, ::2] > FALSE_WELL * profile.tops[:, 1::2]).all())
     step, lengths = usual_step(recordings), stays_of(path, runs, number)
     found = RecordStates(
         recordings.titles[state], recordings.units[state], recordings.time_unit, supported, probability,
         tuple(map(float, places[:, column])), counts, edges, density, path, background[:, column],
         int(supported), columns=tuple(recordings.titles[one] for one in columns), places=places,
-        exponential=tuple(map(exponential, lengths)), offset=offset,
+        exponential=tuple(map(exponential, lengths)), offset=float(np.ptp(baseline[:, column])),
+        baseline=baseline[:, column],
         stays=tuple(step * one for one in lengths), hops=_hops(path, runs, number),
     )  # fmt: skip
     if not rungs or not supported:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +23,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from siq.data.correlation import FEWEST_VALUES, MIN_REPETITIONS
 from siq.data.formats import Column, open_columns
 from siq.data.layout import layout_of
 from siq.data.recordings import TABLE, Recordings
@@ -44,6 +46,7 @@ RESTART_SHARE = 0.1  # of the time that a recording took: where it starts over, 
 # Of the steps lead back in time where rows are shuffled: recordings of three samples, one after another, have
 # as many.
 SHUFFLED_SHARE = 1 / 3
+FEWEST_ON_A_LINE = 10  # steps: fewer may lie on one by themselves
 
 Fault = tuple[int, InputError]
 """The row, counted from 1, of the first cell of a column that cannot be used, and what is wrong there."""
@@ -122,7 +125,7 @@ def _checked(
     rows = _complete(file, rows, numbers, ["t", *layout.titles], gaps, remarks)
     rows = _in_order(rows, numbers, layout.recording is not None, remarks)
     check_times(file, numbers[0][rows.order], rows.recording, rows.labels, rows.order)
-    return Recordings(
+    found = Recordings(
         names=layout.names,
         units=tuple(found_units[1:]),
         labels=rows.labels,
@@ -132,6 +135,40 @@ def _checked(
         time_unit=found_units[0],
         headings=() if layout.titles == layout.names else layout.titles,
         remarks=tuple(remarks),
+    )
+    return found if columns is not None else _without_clocks_and_labels(found)
+
+
+def _without_clocks_and_labels(recordings: Recordings) -> Recordings:
+    """Recordings without columns that are no states: another clock, or a label of a few values.
+
+    A clock is a straight line in time in every recording, with one slope. Nobody named the columns, and the
+    last one stays.
+    """
+    elapsed, begins = np.diff(recordings.t), np.diff(recordings.recording) == 0
+    kept, remarks = [], []
+    for place, (title, x) in enumerate(zip(recordings.titles, recordings.values.T, strict=True)):
+        steps, different = np.diff(x)[begins], np.unique(x)
+        slope = float(steps @ elapsed[begins]) / max(float(elapsed[begins] @ elapsed[begins]), 1e-300)
+        off = np.abs(steps - slope * elapsed[begins]).max(initial=0.0)
+        exact = 1e-9 * max(
+            float(np.abs(different).max()), abs(slope) * float(elapsed[begins].max(initial=0.0))
+        )
+        if len(steps) > FEWEST_ON_A_LINE and slope and off <= exact:
+            remarks.append(Remark("data.clock_left_out", {"column": title}))
+        elif 2 <= len(different) < FEWEST_VALUES <= len(x) / MIN_REPETITIONS:
+            remarks.append(Remark("data.label_left_out", {"column": title, "values": len(different)}))
+        else:
+            kept.append(place)
+    if not remarks or not kept:
+        return recordings
+    return replace(
+        recordings,
+        names=tuple(recordings.names[place] for place in kept),
+        units=tuple(recordings.units[place] for place in kept),
+        headings=tuple(recordings.headings[place] for place in kept) if recordings.headings else (),
+        values=np.ascontiguousarray(recordings.values[:, kept]),
+        remarks=(*recordings.remarks, *remarks),
     )
 
 

@@ -93,9 +93,10 @@ class NoLandscape(NumericalFailure):
 
 
 def sentences_without_landscape(reason: str, states: RecordStates | None) -> list[str]:
-    """What is known without a landscape, and why there is none."""
-    seen = "" if states is None else states.sentence()
-    missing = f"{'But no' if seen else 'No'} landscape was found: {reason}."
+    """What is known without a landscape, on which rung that is, and why there is none."""
+    rung = 0 if states is None else states.rung
+    missing = sentence(Remark("quasipotential.without_landscape", {"rung": rung, "reason": reason}))
+    seen = "" if states is None else states.sentence() or sentence(states.rest())
     return [seen, missing] if seen else [missing]
 
 
@@ -401,9 +402,7 @@ class Landscape:
         ValueError
             When no noise is known.
         """
-        strength = self.noise if noise is None else NoiseStrength(noise)
-        if strength is None:
-            raise Fault("no noise is known, and how long a well lasts follows from it", "give 'noise'")
+        strength = self._strength(noise)
         times = [mean_residence_time(self.exits(index), strength) for index in range(len(self.attractors))]
         rows = [
             (index, *((np.nan,) * 3 if one is None else (one.value, one.data_error, one.law_error)))
@@ -411,17 +410,24 @@ class Landscape:
         ]
         return pd.DataFrame(rows, columns=["attractor", "mean_time", "data_error", "law_error"])
 
+    def _strength(self, noise: float | None) -> NoiseStrength:
+        """The noise that was given, or else that of the recordings."""
+        strength = self.noise if noise is None else NoiseStrength(noise)
+        if strength is None:
+            raise Fault("no noise is known, and how long a well lasts follows from it", "give 'noise'")
+        return strength
+
     def exits(self, well: int) -> list[EscapeRate]:
         """The laws of all ways out of a well, with their errors."""
         return [way.exit for way in self.transitions if way.start == well]
 
-    def escape_times(self, *, noise: float) -> pd.DataFrame:
+    def escape_times(self, *, noise: float | None = None) -> pd.DataFrame:
         """Mean times until noise has led from each attractor to the next, one row for every way out.
 
         Parameters
         ----------
         noise
-            ε of ``dx = f dt + √ε σ dW``, in the unit of U.
+            ε of ``dx = f dt + √ε σ dW``, in the unit of U; by default as the recordings show it.
 
         Returns
         -------
@@ -432,16 +438,17 @@ class Landscape:
         Raises
         ------
         ValueError
-            When D is the unit matrix although a state is but the derivative of another: no noise drives
-            ``dx/dt = v``, and the times follow from D.
+            When no noise is known; and when D is the unit matrix although a state is but the derivative of
+            another: no noise drives ``dx/dt = v``, and the times follow from D.
         """
+        strength = self._strength(noise).intensity
         if (missing := missing_diffusion(self.dynamics)) is not None:
             raise ValueError(missing)
         rows = []
         for way in self.transitions:
             time, note = np.nan, "; ".join(way.notes)
             try:
-                time = np.nan if way.rate is None else way.rate.mean_time(noise)
+                time = np.nan if way.rate is None else way.rate.mean_time(strength)
             except NumericalFailure as error:
                 note = str(error)
             rows.append((way.start, way.end, time, note))

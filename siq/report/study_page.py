@@ -31,8 +31,10 @@ from siq.report.formatting import (
     formula_mathml,
     matrix_mathml,
     paragraphs,
+    predicted_text,
     term_text,
     texts,
+    time_text,
     vector_mathml,
     with_unit,
 )
@@ -149,7 +151,9 @@ def study_page(
         certified=0 if rrmse is None else int(rrmse[rrmse["method"] == method]["certified"].sum()),
         refusals=list(dict(zip(refused["test"], refused["reason"], strict=True)).values()),
         landscape=landscape_tables(summary, noises),
-        states=None if results.seen is None or not results.seen.supported else _states_table(results.seen),
+        states=None
+        if results.seen is None or not results.seen.supported
+        else _states_table(results.seen, summary),
         formulas=_formulas(results),
         coefficients=_coefficients(results),
         record=record,
@@ -193,7 +197,7 @@ def study_page(
     )
 
 
-LEADING = ("quasipotential", "landscape")
+LEADING = ("quasipotential", "landscape", "states")
 """Figures that a page can open with, the best first."""
 
 
@@ -215,9 +219,15 @@ def _figures(
         for name in sorted(set(images) - set(told))
     }
     lead = next((name for name in LEADING if name in images), None)
+    own = lead == "states"  # a picture of the record, and of no U
     parts: dict[str, list[ReportFigure]] = defaultdict(list)
     for name, caption in told.items():
-        if name in images and name not in LEADING and all(known[one] for one in caption.get("only_with", ())):
+        if (
+            name in images
+            and name not in LEADING[:2]
+            and name != lead
+            and all(known[one] for one in caption.get("only_with", ()))
+        ):
             paper = f" In the paper: {caption['paper']}." if known["paper"] and "paper" in caption else ""
             figure = ReportFigure(
                 caption["text"] + paper, caption["text"], images[name], "png", results.vectors.get(name)
@@ -227,7 +237,7 @@ def _figures(
         return parts, None
     one = results.landscape is not None and len(results.landscape.names) == 1
     kind = ("one_equation" if one else "equations") if given else "one_state" if one else ""
-    text = captions["lead"][kind] if kind else told[lead]["text"]
+    text = captions["lead"][kind] if kind and not own else told[lead]["text"]
     return parts, ReportFigure(text, text, images[lead], "png", results.vectors.get(lead))
 
 
@@ -272,8 +282,11 @@ def answer_data(page: ReportContent, study: Study, results: StudyResults) -> dic
     }  # fmt: skip
 
 
-def _states_table(seen: RecordStates) -> pd.DataFrame:
-    """The states that a record shows by itself, a column for each, as the rungs answer them."""
+def _states_table(seen: RecordStates, summary: LandscapeSummary | None = None) -> pd.DataFrame:
+    """The states that a record shows by itself, a column for each, as the rungs answer them.
+
+    Wells of one quantity are those of f and D, where they are as many as the states.
+    """
     found, time_unit = seen.dwell_times(), seen.time_unit or "1"
     law = {True: "exponential", False: "not exponential"}
     tops = [] if seen.profile is None or len(seen.columns) > 1 else seen.profile.tops.tolist()
@@ -295,6 +308,18 @@ def _states_table(seen: RecordStates) -> pd.DataFrame:
             limits = range_text(row["markov_lowest"], row["markov_highest"])
             model = f"{value_text(row['markov_time'], digits=3)} ({limits})"
             cells[with_unit("mean stay, Markov model", time_unit)].append(model)
+            apart = row["markov_lowest"] > row["highest"] or row["markov_highest"] < row["lowest"]
+            cells["counted and model agree"].append("no" if apart else "within their intervals")
+    same = summary is not None and len(summary.wells) == len(found) and len(summary.names) == 1
+    if summary is not None and same:
+        for well in sorted(summary.wells, key=lambda one: float(one.position[0])):
+            ratio, error = well.relative_depth(summary.noise)
+            cells["place, f and D"].append(value_text(well.position[0], well.position_errors[0]))
+            cells["depth ΔU/ε, f and D"].append(value_text(ratio, error) if np.isfinite(ratio) else "")
+            visits = "" if well.visits is None else predicted_text(well.visits)
+            cells[with_unit("mean visit, f and D", time_unit)].append(
+                visits or time_text(well.time(summary.noise))
+            )
     names = [f"state {number + 1}" for number in range(len(found))]
     rows = [(name, *one) for name, one in cells.items()]
     return pd.DataFrame(rows, columns=["", *names])

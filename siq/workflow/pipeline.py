@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from siq.data.preparation import in_stretches, joined, read_pairs, without_slow_drift
+from siq.data.preparation import in_stretches, joined, read_pairs, without_background
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.data.states import RecordStates
 from siq.errors import NumericalFailure
@@ -57,7 +57,8 @@ def draw_run(
     """The trajectories of run `number`: of a system simulated, of recordings all in run 0, then resampled."""
     if isinstance(source, Recordings):
         hidden = settings.identification.hidden_velocities
-        source = in_stretches(without_slow_drift(source), hidden_velocities=hidden)
+        source = without_background(source) if settings.sampling.background else source
+        source = in_stretches(source, hidden_velocities=hidden)
         if number > 0:
             draw = generator(settings.seed, number, Purpose.RESAMPLE)
             source = source.resampled(generator=draw)
@@ -363,7 +364,8 @@ def analyse(
     settings = settings or PipelineSettings()
     networks, hidden = settings.training is not None, settings.identification.hidden_velocities
     settings = replace(settings, refinement=settings.refinement.with_routes(networks=networks))
-    recordings = in_stretches(without_slow_drift(recordings), hidden_velocities=hidden)
+    recordings = without_background(recordings) if settings.sampling.background else recordings
+    recordings = in_stretches(recordings, hidden_velocities=hidden)
     identified = identify_run(settings, recordings, number=number)
     trained, regressed, landscape = not_trained(number), None, None
     if networks:

@@ -179,6 +179,9 @@ class RecordingsOptions(BaseModel):
     integrator_step
         Step of the Euler–Maruyama simulation that made the recordings, where one did: its increments are
         those of a map, from which the continuous process is then found. Leave it out for measurements.
+    background
+        Whether slow drift of a single recording, and the baselines of several that hop and differ in them,
+        are taken off; what was taken off is noted.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -189,6 +192,7 @@ class RecordingsOptions(BaseModel):
     pair_step: Annotated[float, Field(gt=0)] | None = None
     diffusion: DiffusionEntry | None = None
     integrator_step: Annotated[float, Field(gt=0)] | None = None
+    background: bool = True
 
     @field_validator("states", mode="before")
     @classmethod
@@ -414,7 +418,7 @@ STRICT = ConfigDict(extra="forbid")
 
 @pydantic_dataclass(frozen=True, config=STRICT)
 class Sampling:
-    """How samples make pairs.
+    """How samples make pairs, and what is taken off them.
 
     Attributes
     ----------
@@ -422,10 +426,13 @@ class Sampling:
         Largest time between the two samples of a pair; left out, all neighbours are pairs.
     integrator_step
         Step of the Euler–Maruyama simulation that made the recordings; None where none did.
+    background
+        Whether slow drift, and the baselines of recordings that differ in them, are taken off.
     """
 
     pair_step: Annotated[float, Field(gt=0)] | None = None
     integrator_step: Annotated[float, Field(gt=0)] | None = None
+    background: bool = True
 
 
 @pydantic_dataclass(frozen=True, config=STRICT)
@@ -553,7 +560,7 @@ def settings_of(study: Study, system: Dynamics | None) -> PipelineSettings:
     """
     recordings, simulation, sampling = study.recordings, None, Sampling()
     if recordings is not None:
-        sampling = Sampling(recordings.pair_step, recordings.integrator_step)
+        sampling = Sampling(recordings.pair_step, recordings.integrator_step, recordings.background)
     elif system is not None and study.entrance == "trajectories":
         simulation = study.simulation.completed(system).options()
         noisy = simulation.noise_intensity > 0

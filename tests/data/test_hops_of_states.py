@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from siq.data.kinetics import continued_visits
-from siq.data.preparation import in_stretches, without_slow_drift
+from siq.data.preparation import in_stretches, without_background
 from siq.data.recordings import Recordings
 from siq.data.states import DwellCount, switching
 from siq.data.stationarity import background_of, correlated_samples, relaxation_samples, runs_of, usual_step
@@ -126,16 +126,16 @@ def test_a_record_that_is_too_short_says_nothing() -> None:
 
 def test_a_slow_drift_is_taken_off_and_said() -> None:
     drifting = recorded(one_state(2) + BACKGROUNDS["linear"])
-    flat = without_slow_drift(drifting)
+    flat = without_background(drifting)
     assert "drifts slowly" in flat.notes[-1]
     assert abs(np.polyfit(flat.t, flat.values[:, 0], 1)[0]) < 1e-3
     still = recorded(one_state(2))
-    assert without_slow_drift(still) is still
+    assert without_background(still) is still
 
 
 def test_hops_are_no_slow_drift() -> None:
     hopping = recorded(two_states(3, 0.25))
-    assert without_slow_drift(hopping) is hopping
+    assert without_background(hopping) is hopping
 
 
 def test_a_long_trace_is_cut_by_its_own_correlation_time() -> None:

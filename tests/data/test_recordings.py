@@ -427,3 +427,13 @@ def test_by_default_a_gap_is_no_pair_and_jitter_no_gap() -> None:
     values, recording = np.arange(16.0).reshape(8, 2), np.zeros(8, int)
     ours = dataclasses.replace(recordings(lengths=(8,)), t=t, values=values, recording=recording)
     np.testing.assert_array_equal(snapshot_pairs(ours).h.round(2), [0.1, 0.11, 0.09, 0.1, 0.1])
+
+
+def test_other_clocks_and_labels_are_no_states() -> None:
+    t, x = np.arange(60.0), np.random.default_rng(0).standard_normal(60)
+    table = pd.DataFrame({"t": t, "x": x, "age": 1000 - 10 * t, "state": (x > 0).astype(float)})
+    found = Recordings.of(table)
+    assert found.names == ("x",)
+    assert any("'age' runs along with the time" in note for note in found.notes)
+    assert any("'state' has only 2 different values" in note for note in found.notes)
+    assert Recordings.of(table[["t", "state"]]).names == ("state",)

@@ -11,6 +11,7 @@ from scipy.signal import lfilter
 
 from siq.data.inspection import inspect
 from siq.data.kinetics import MarkovModel
+from siq.data.preparation import without_background
 from siq.data.recordings import Recordings
 from siq.data.states import DwellCount, RecordStates, switching
 from siq.data.stationarity import runs_of
@@ -130,8 +131,14 @@ def test_baselines_that_differ_are_given_one_each() -> None:
     found = switching(together)
     assert found is not None and found.offset == pytest.approx(0.25, abs=0.05)
     assert "differ in their baselines" in found.sentence()
-    alike = switching(Recordings.from_arrays(np.arange(4000.0), x[:, :, None], names=names))
+    flat = without_background(together)
+    assert "differ in their baselines" in flat.notes[-1]
+    taken = (together.values - flat.values)[:, 0].reshape(4, -1)
+    np.testing.assert_allclose(taken.mean(axis=1), offsets - offsets.mean(), atol=0.02)
+    recordings = Recordings.from_arrays(np.arange(4000.0), x[:, :, None], names=names)
+    alike = switching(recordings)
     assert alike is not None and alike.offset == 0
+    assert without_background(recordings) is recordings
 
 
 def test_an_inspection_tells_the_rungs() -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import sympy
 from known_systems import (
@@ -140,6 +141,10 @@ def test_escape_times_follow_the_law_and_say_where_there_is_none() -> None:
     np.testing.assert_allclose(
         few["mean_time"] / many["mean_time"], np.exp(10 * barrier / barrier.min()), rtol=1e-3
     )
+    shown = replace(landscape, noise=NoiseStrength(barrier.min() / 10, source="estimated"))
+    pd.testing.assert_frame_equal(shown.escape_times(), many)
+    with pytest.raises(ValueError, match="no noise is known"):
+        replace(landscape, noise=None).escape_times()
     loud = landscape.escape_times(noise=2 * barrier.max())
     assert loud["mean_time"].isna().all() and loud["note"].str.contains("far below the barrier").all()
 
