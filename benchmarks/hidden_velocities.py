@@ -26,7 +26,7 @@ import numba
 import numpy as np
 import sympy
 
-from siq.data.preparation import in_stretches, without_slow_drift
+from siq.data.preparation import in_stretches, without_background
 from siq.data.recordings import Recordings
 from siq.inference.field_estimate import FieldEstimate
 from siq.inference.kalman_filter import Grid, Noise, linearise, whiten
@@ -163,7 +163,7 @@ def analysed(particle: Particle, seed: int) -> dict[str, Any]:
 def only_barriers(particle: Particle, seed: int) -> dict[str, Any]:
     """The same without formulas, certificate and times."""
     settings = PipelineSettings(identification=IdentificationOptions(hidden_velocities=True))
-    recordings = in_stretches(without_slow_drift(recorded(particle, seed)))
+    recordings = in_stretches(without_background(recorded(particle, seed)))
     began = time.process_time()
     identified = pipeline.identify_run(settings, recordings, number=0)
     record = identified.result

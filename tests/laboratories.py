@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -100,7 +101,7 @@ def write_studies(folder: Path) -> dict[str, Path]:
         By the name of the results, what to give to ``siq run``.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    options = {"duration": 2.0, "step": 0.02, "seed": 3}
+    options: dict[str, Any] = {"duration": 2.0, "step": 0.02, "seed": 3}
     tables = {
         "two-states": ring_downs(
             double_well, names=["x [um]", "y [um]"], box=[0.9, 0.6], recordings=120, **options

@@ -45,7 +45,9 @@ def simulated(
     speed = np.quantile(
         np.linalg.norm(
             known.dynamics.jacobian(
-                np.random.default_rng(0).uniform(*known.domain.T, (500, len(known.domain)))
+                np.random.default_rng(0).uniform(
+                    known.domain[:, 0], known.domain[:, 1], (500, len(known.domain))
+                )
             ),
             axis=(1, 2),
         ),
@@ -64,7 +66,7 @@ def simulated(
 
 def error_beside_mesh(known: KnownSystem, wells: Sequence[Well]) -> float:
     """Relative L2 error of V where the wells claim to hold, against the mesh of two states; the worst."""
-    x = np.random.default_rng(0).uniform(*known.domain.T, (20_000, 2))
+    x = np.random.default_rng(0).uniform(known.domain[:, 0], known.domain[:, 1], (20_000, 2))
     errors = []
     for well in wells:
         mesh = mesh_quasipotential(

@@ -237,12 +237,10 @@ def drawn(seed: int) -> Laboratory:
     sensor = float(draw.choice([0.0, 0.0, 0.1, 0.2]))
     stay = np.sqrt(2) * np.pi * np.exp(0.5 / intensity)
     samples = int(np.clip(passages * stay / step, 1_000, MOST_SAMPLES)) // records
-    slope = {(1, 0): 1.0, (3, 0): -1.0, (0, 0): tilt}  # -V_x
+    slope: dict[tuple[int, ...], float] = {(1, 0): 1.0, (3, 0): -1.0, (0, 0): tilt}  # -V_x
     if turn:
         circling = {powers: turn * value for powers, value in slope.items()}
-        drift: tuple[dict[tuple[int, ...], float], ...] = (
-            {**slope, (0, 1): turn}, {**circling, (0, 1): -1.0},
-        )  # fmt: skip
+        drift: tuple[dict[tuple[int, ...], float], ...] = (slope | {(0, 1): turn}, circling | {(0, 1): -1.0})
     else:
         drift = ({powers[:1]: value for powers, value in slope.items()},)
     zero = (0,) * len(drift)
@@ -309,7 +307,9 @@ def _figures(laboratory: Laboratory, landscape: Landscape) -> Iterator[Figure]:
             time_of = way.exit.mean_exit_time(noise)
             if laboratory.dimension == 1 and time_of is not None:
                 grid = np.linspace(-2.5, 2.5, 5001)
-                force = sum(value * grid ** powers[0] for powers, value in laboratory.drift[0].items())
+                force = np.sum(
+                    [value * grid ** powers[0] for powers, value in laboratory.drift[0].items()], axis=0
+                )
                 law = Law(grid, force, np.full(len(grid), true_noise))
                 spread = np.hypot(time_of.data_error, time_of.law_error)
                 true = law.time(float(wells[own, 0]), float(wells[1 - own, 0]))
@@ -340,7 +340,7 @@ def landscape_table(found: dict[str, dict[str, object]]) -> str:
         lines.append(f"| {what} | {name} | {sum(map(bool, each))} | {len(z)} | {shares} | {size} |")
     faults = [str(one["fault"]) for one in found.values() if one["fault"]]
     never = sum(one["passages"] == 0 for one in found.values())
-    seconds = [one["seconds"] for one in found.values() if "seconds" in one]
+    seconds = [float(str(one["seconds"])) for one in found.values() if "seconds" in one]
     lines.append(f"{len(found)} laboratories, {never} without a passage, {len(faults)} without a landscape")
     lines.append(f"{np.median(seconds):.1f} s each" if seconds else "")
     return "\n".join([*lines, *sorted(set(faults))])

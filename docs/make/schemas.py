@@ -22,7 +22,12 @@ from workflow.settings import Configuration
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "workflow" / "schemas"
-MODELS = {"config": Configuration, "study": Study, "system": SystemCard, "mismatch": MismatchStudy}
+MODELS: dict[str, type[BaseModel]] = {
+    "config": Configuration,
+    "study": Study,
+    "system": SystemCard,
+    "mismatch": MismatchStudy,
+}
 # `false` switches these off as null does, before the class looks at their types.
 SWITCHES = {("Study", "training"), ("Study", "landscape")}
 HEAD = "# Written by `make schemas` from `{}`.\n"
@@ -35,7 +40,7 @@ def schema(model: type[BaseModel]) -> dict[str, Any]:
     assert spec is not None and spec.loader is not None
     pages = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(pages)
-    written = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+    written: dict[str, Any] = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
     written |= model.model_json_schema(by_alias=True)
     classes = {one.__name__: one for one in _nested(model)}
     for name, part in [(model.__name__, written), *written.get("$defs", {}).items()]:
