@@ -199,7 +199,8 @@ def without_background(recordings: Recordings) -> Recordings:
             continue
         flat[:, state] -= background
         told = {"column": title, "range": float(np.ptp(background)), "unit": recordings.units[state]}
-        remarks.append(Remark("data.drift_taken_off" if single else "data.baselines_taken_off", told))
+        baseline = Remark("data.baselines_taken_off", told)
+        remarks.append(Remark("data.drift_taken_off", told) if single else baseline)
     if len(remarks) == len(recordings.remarks):
         return recordings
     return replace(recordings, values=flat, remarks=tuple(remarks))

@@ -38,6 +38,7 @@ from siq.systems.dynamics import Dynamics
 LOGGER = logging.getLogger(__name__)
 PROMISING_GAIN = 0.2  # of the best gain so far; a candidate that promises less is not fitted
 SHARPENED_GAIN = 0.6  # of the best gain, from which on jumps are sharpened: that gains up to a quarter
+ROUNDING = 1e-3  # numerical, of what counts as the same: optima are found to this at least
 BUDGET_FOR_FUNCTIONS = 0.4  # of the budget, for functions without a name: a choice
 Standing = Literal["same", "needless", "less"]
 
@@ -119,7 +120,10 @@ def _accepted(
     ]
     if not significant:
         return None
-    best = min(significant, key=lambda each: each.delta_bic)
+    # Of fits that are equal but for rounding what is likelier beforehand leads, or what is in an equation.
+    leads = min(each.delta_bic for each in significant) + ROUNDING * options.same
+    equal = [each for each in significant if each.delta_bic <= leads]
+    best = max(equal, key=lambda each: (each.candidate.weight, bool(each.candidate.equations)))
     if best.fit.has_process_noise:
         # What is left is no noise, and white errors mean little: of equals, what all recordings ask for.
         equals = [each for each in significant if each.delta_bic < best.delta_bic + options.same]

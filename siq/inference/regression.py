@@ -222,7 +222,10 @@ class _PairRegression:
         matrix, some = self.matrix(values), slice(None, None, max(len(self.h) // FLOW_SAMPLE, 1))
         h = self.h[some]
         _, spread = flow.moments(lambda x: matrix @ self._terms(x), self.x0[:, some], h, guess)
-        seen = (spread / h[:, None, None])[np.isfinite(spread).all(axis=(1, 2))].mean(axis=0)
+        kept = np.isfinite(spread).all(axis=(1, 2))
+        if not kept.any():  # a trial f that runs away everywhere
+            return rest
+        seen = (spread / h[:, None, None])[kept].mean(axis=0)
         root = np.linalg.cholesky(guess) @ np.linalg.inv(np.linalg.cholesky(seen))
         return np.asarray(root @ rest @ root.T)
 
