@@ -278,12 +278,25 @@ def test_of_equals_the_one_that_all_recordings_ask_for_where_white_errors_mean_l
 ) -> None:
     def trial(name: str, gain: float, p_cluster: float) -> FittedCandidate:
         fit = SimpleNamespace(has_process_noise=random_forces)
-        return FittedCandidate(SimpleNamespace(name=name, new=("c",)), fit, gain, 7.0 - gain, 0.0, p_cluster)
+        candidate = SimpleNamespace(name=name, new=("c",), weight=1.0, equations=("v",))
+        return FittedCandidate(candidate, fit, gain, 7.0 - gain, 0.0, p_cluster)
 
     trials = [trial("better", 331, 1e-9), trial("steadier", 325, 1e-49), trial("worse", 276, 1e-60)]
     found = _accepted(trials, 50, 1e-4, options=SearchOptions())
     assert found is not None and found.best.candidate.name == expected
     assert {each.candidate.name for each in found.others["same"]} == {"better", "steadier"} - {expected}
+
+
+def test_of_fits_that_are_equal_but_for_rounding_one_in_an_equation_leads() -> None:
+    def trial(name: str, gain: float, *equations: str) -> FittedCandidate:
+        fit = SimpleNamespace(has_process_noise=False)
+        candidate = SimpleNamespace(name=name, new=("c",), weight=1.0, equations=equations)
+        return FittedCandidate(candidate, fit, gain, 7.0 - gain, 0.0, 1e-9)
+
+    for rounding in (-1e-7, 1e-7):
+        trials = [trial("sensor", 331), trial("force", 331 + rounding, "v")]
+        found = _accepted(trials, 50, 1e-4, options=SearchOptions())
+        assert found is not None and found.best.candidate.name == "force"
 
 
 def test_nothing_is_missing_where_its_fit_only_found_better_parameters(decaying: Dynamics) -> None:
