@@ -48,7 +48,7 @@ from siq.systems.formulas import compile_formulas
 from siq.workflow.pipeline import draw_run, regress_run
 from siq.workflow.study import load_study, settings_of
 from siq.workflow.tables import Method, Outcome, Step, StepResult
-from workflow.scoring import exact_answer, relative_error, score_run
+from workflow.scoring import _domain_grid, exact_answer, relative_error, score_run
 
 ROOT = Path(__file__).parents[1]
 STUDY = ROOT / "config" / "studies" / "archetype3d-published.yaml"
@@ -57,7 +57,7 @@ TABLE = Path(__file__).with_suffix(".csv")
 CURVES = TABLE.with_name("published_settings_curves.csv")
 LEVEL = 2.0  # of U: the wells, and as much again; the published regression sees no other states
 MARKS = (100, 200, 500, 1000, 2000, 3000, 5000, 7000, 10_000, 15_000, *range(20_000, 150_001, 5000))
-GRID_SIDE = 31  # points a side of the grid over Ω
+GRID_POINTS = 31**3  # of the grid over Ω
 MULTIPLE = 4  # of a layer's width: rows that begin at multiples of 16 bytes are multiplied faster
 PARTS = 8  # of a batch
 
@@ -367,12 +367,6 @@ class Training:
         return pd.DataFrame(rows)
 
 
-def domain_grid(domain: np.ndarray) -> np.ndarray:
-    """Points of a regular grid over Ω, shape ``(d, n)``."""
-    axes = [np.linspace(lower, upper, GRID_SIDE) for lower, upper in domain]
-    return np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")])
-
-
 def train(
     folder: Path, *, runs: int, seconds: float, groups: Sequence[int], device: str, steps: int | None
 ) -> None:
@@ -388,7 +382,7 @@ def train(
     with ProcessPoolExecutor() as pool:
         data = list(pool.map(drawn, range(runs)))
     print(f"drawn after {time.perf_counter() - began:.0f} s", flush=True)
-    points = domain_grid(system.domain)
+    _, points = _domain_grid(system.domain, points=GRID_POINTS)
     exact = compile_formulas([load_exact(CARD)], system.symbols)(points)[0]
     grid = torch.from_numpy(points.T.astype(np.float32)).to(device)
     level = torch.from_numpy(exact - exact.min()).to(device)
@@ -475,7 +469,7 @@ def scored(number: int, networks: TrainedNetworks) -> dict[str, object]:
         tables = score_run(settings, found, {}, networks, number=number, exact=answer)
         row |= {name: tables["rrmse"].iloc[0][name] for name in ("rrmse", "support_correct")}
     assert system.domain is not None
-    grid = domain_grid(system.domain)
+    _, grid = _domain_grid(system.domain, points=GRID_POINTS)
     true, level = compile_formulas([exact], system.symbols)(grid)[0], 2 * networks.potential_at(grid.T)
     below = true - true.min() < LEVEL
     return row | {

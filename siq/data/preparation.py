@@ -98,14 +98,7 @@ def _checked_for_learning(
             for place, values in enumerate(recordings.values.T)
             if still[place]
         ]
-        recordings = replace(
-            recordings,
-            names=tuple(recordings.names[place] for place in kept),
-            units=tuple(recordings.units[place] for place in kept),
-            headings=tuple(recordings.headings[place] for place in kept) if recordings.headings else (),
-            values=np.ascontiguousarray(recordings.values[:, kept]),
-            remarks=(*recordings.remarks, *remarks),
-        )
+        recordings = recordings.of_states(kept, remarks)
     if len(recordings.labels) == 1 and not hidden_velocities:
         floors = noise_floors(recordings)
         if floors is not None and all(floor.process == 0 for floor in floors):

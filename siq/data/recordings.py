@@ -8,11 +8,11 @@ is refused with its row and column; rows are counted from 1 without the header.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -200,6 +200,17 @@ class Recordings:
         return cls(
             tuple(names), tuple(units or (None,) * len(names)), labels, recording, together,
             np.concatenate(parts), time_unit,
+        )  # fmt: skip
+
+    def of_states(self, places: Sequence[int] | np.ndarray, remarks: Iterable[Remark]) -> Recordings:
+        """These states alone, by their places, with what there is to say of the others."""
+
+        def kept(several: tuple[Any, ...]) -> tuple[Any, ...]:
+            return tuple(several[place] for place in places) if several else ()
+
+        return replace(
+            self, names=kept(self.names), units=kept(self.units), headings=kept(self.headings),
+            values=np.ascontiguousarray(self.values[:, places]), remarks=(*self.remarks, *remarks),
         )  # fmt: skip
 
     def select(self, indices: Sequence[int] | np.ndarray) -> Recordings:

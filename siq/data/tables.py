@@ -14,7 +14,6 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -162,14 +161,7 @@ def _without_clocks_and_labels(recordings: Recordings) -> Recordings:
             kept.append(place)
     if not remarks or not kept:
         return recordings
-    return replace(
-        recordings,
-        names=tuple(recordings.names[place] for place in kept),
-        units=tuple(recordings.units[place] for place in kept),
-        headings=tuple(recordings.headings[place] for place in kept) if recordings.headings else (),
-        values=np.ascontiguousarray(recordings.values[:, kept]),
-        remarks=(*recordings.remarks, *remarks),
-    )
+    return recordings.of_states(kept, remarks)
 
 
 def _parse_numbers(file: str, name: str, cells: Column) -> tuple[np.ndarray, str | None, Fault | None]:

@@ -74,8 +74,8 @@ def test_a_training_goes_on_where_it_stopped_and_added_units_stay_zero(
 def test_the_grid_covers_the_domain() -> None:
     system = load_system(published_settings.CARD)
     assert system.domain is not None
-    grid = published_settings.domain_grid(system.domain)
+    _, grid = published_settings._domain_grid(system.domain, points=published_settings.GRID_POINTS)
     assert np.array_equal(grid.min(axis=1), system.domain[:, 0])
     assert np.array_equal(grid.max(axis=1), system.domain[:, 1])
     exact = compile_formulas([load_exact(published_settings.CARD)], system.symbols)(grid)
-    assert exact.shape == (1, published_settings.GRID_SIDE**3)
+    assert exact.shape == (1, published_settings.GRID_POINTS)
