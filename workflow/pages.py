@@ -99,8 +99,7 @@ def figures(given: Given, settings: PipelineSettings) -> Any:
         refined = models.formulas(first).get(Method.REFINED)
         summary = summarise(stored, states, dynamics=dynamics, formula=refined)
         drawn |= report.leading_figures(summary, dynamics, states)
-        if dynamics.dimension > 2:
-            drawn["interactive.html"] = interactive_view(summary)
+        drawn["interactive.html"] = interactive_view(summary, solid=dynamics.dimension > 2)
     if settings.simulation is None and recorded is not None:
         folder.mkdir(parents=True, exist_ok=True)
         drawn |= inspection_drawn(recorded, folder=folder)
@@ -272,7 +271,7 @@ def equations_page(given: Given, settings: PipelineSettings) -> Any:
         certificate=None if certificate is None else certificate.as_data(),
         images=_files(folders, ".png"),
         vectors=_files(folders, ".svg"),
-        interactive=None if summary is None or system.dimension < 3 else interactive_view(summary),
+        interactive=None if summary is None else interactive_view(summary, solid=system.dimension > 2),
     )
     command, versions = given.options["command"], _versions(*PACKAGES)
     origin = Provenance(Path(given.outputs["html"]).parent).origin()

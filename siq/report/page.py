@@ -1,8 +1,9 @@
 """Pages: what a page is made from, how a template fills it, which figures it has, and how it becomes HTML.
 
 A page asks nothing of any other machine: style, figures, formulas and downloads stand in it. It has no
-scripts, but for the view of U that can be turned, where there is one: its data are U on a coarse grid in
-steps of one part in 250, wells, saddles and paths, which are read and never run.
+scripts, but for two views. One is of U, and can be turned: its data are U on a coarse grid in steps of one
+part in 250, wells, saddles and paths. The other shows mean times under the noise that the reader chooses.
+What they show is read and never run.
 
 `compose` fills a page from a template of text, in which ``page.section``, ``page.table`` and so on stand
 where they stand on the page. A section, a table or a figure without content is left out.
@@ -13,6 +14,7 @@ from __future__ import annotations
 import base64
 import datetime
 import json
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -28,8 +30,9 @@ from siq.data.inspection import inspect
 from siq.data.preparation import joined
 from siq.data.recordings import Recordings
 from siq.data.states import RecordStates
-from siq.numerics.text import number_text, unit_text
-from siq.report.formatting import environment, in_paragraphs
+from siq.numerics.text import number_text, unit_text, value_text
+from siq.quasipotential.rates import NoiseStrength
+from siq.report.formatting import environment, in_paragraphs, time_text, with_unit
 from siq.report.summary import LandscapeSummary
 
 if TYPE_CHECKING:
@@ -97,7 +100,7 @@ class ReportContent:
     figure: ReportFigure | None = None  #: what it looks like
     table: ReportTable | None = None  #: beside the figure
     figure_first: bool = False  #: whether the figure stands above the answer
-    interactive: Markup | None = None  #: a view that can be turned, with its script
+    interactive: Markup | None = None  #: views that a reader can change, with their scripts
     sections: Sequence[ReportSection] = ()  #: everything else
     language: str = "en"  #: language of the page, for hyphenation and screen readers
 
@@ -182,7 +185,7 @@ class _PageWriter:
 def compose(template: str, *, title: str, interactive: Markup | None = None, **values: Any) -> ReportContent:
     """Fill a page from a template of text, which reads `values` and has the writer as ``page``.
 
-    `interactive` is a view of U that can be turned.
+    `interactive` are the views that a reader can change.
     """
     writer = _PageWriter()
     environment().get_template(template).render(page=writer, **values)
@@ -356,15 +359,58 @@ MOST_STATES = 4  # a grid of more would be too coarse to show a well
 ABOVE, UNKNOWN = 254, 255
 PATH_POINTS = 80
 BANDS = 12  # of colours in a section
+HIGHEST_BARRIER, LOWEST_BARRIER = 20.0, 2.0  # in units of ε: where the slider of the noise ends
+NOISES = 40  # on the slider
 SURFACE = 0.9  # of the height of the lowest saddle: where the surface is at first, a bubble about each well
 
 
-def interactive_view(landscape: LandscapeSummary) -> Markup | None:
-    """A view of U that can be turned and cut; None of one state, and where U is known nowhere.
+def interactive_view(landscape: LandscapeSummary, *, solid: bool = True) -> Markup | None:
+    """What a reader can change: the noise, and, if `solid`, a view of U that can be turned and cut.
 
-    It is a ``<section>`` with its style, controls, data and script, to be put into a page once. Of more than
-    four states those are shown along which the wells lie apart, with the others held at the lowest saddle.
+    None where there is neither. Each is a ``<section>`` with its style, controls, data and script, to be put
+    into a page once. Of more than four states those are shown along which the wells lie apart, with the
+    others held at the lowest saddle; of one state, and where U is known nowhere, there is nothing to turn.
     """
+    views = [_times_view(landscape), _solid_view(landscape) if solid else None]
+    return Markup("\n").join(one for one in views if one is not None) or None
+
+
+def _times_view(landscape: LandscapeSummary) -> Markup | None:
+    """A slider for ε, with ΔU/ε and the mean time of every well; None where no time is known.
+
+    The strengths lie between those at which the lowest barrier is `HIGHEST_BARRIER` and `LOWEST_BARRIER`
+    noise strengths high. The noise of the system is among them if it is known, and the slider begins there.
+    """
+    depths = [one.depth for one in landscape.wells if 0 < one.depth < np.inf]
+    if not landscape.has_times or not depths:
+        return None
+    low, high = (min(depths) / height for height in (HIGHEST_BARRIER, LOWEST_BARRIER))
+    noise = landscape.noise or NoiseStrength(math.sqrt(low * high))
+    first = noise.intensity
+    even = np.geomspace(min(low, first), max(high, first), NOISES)
+    strengths = sorted({first, *(float(f"{one:.4g}") for one in even)})  # as they are shown
+    noises = [noise if one == first else NoiseStrength(one) for one in strengths]
+    wells = landscape.wells
+    rows = [
+        [
+            {"ratio": value_text(*well.relative_depth(noise)), "time": time_text(well.time(noise))}
+            for well in wells
+        ]
+        for noise in noises
+    ]
+    view = {
+        "data": {"noises": [value_text(one) for one in strengths], "rows": rows},
+        "first": strengths.index(first),
+        "known": landscape.noise is not None,
+        "noise": with_unit("noise strength ε", landscape.energy_unit),
+        "time": with_unit("lasts", landscape.time_unit),
+        "wells": [one.label for one in wells],
+    }
+    return Markup(render_template("times.html.j2", view))
+
+
+def _solid_view(landscape: LandscapeSummary) -> Markup | None:
+    """A view of U that can be turned and cut."""
     count = len(landscape.names)
     if count < 2:
         return None

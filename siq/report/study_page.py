@@ -74,7 +74,7 @@ class StudyResults:
     shown: Shown = (0, Method.REFINED)  #: the run and the method whose formulas are printed
     exact: SymbolicDecomposition | None = None  #: the exact formulas, where they are known
     record: FieldEstimate | None = None  #: f and D of the run that is shown, None where there is none
-    interactive: Markup | None = None  #: a view of U that can be turned, None where there is none
+    interactive: Markup | None = None  #: views that a reader can change, None without any
     inspection: Sequence[str] | None = None  #: of the recordings, line by line; None where simulated
     seen: RecordStates | None = None  #: the two states that they show by themselves
     system: Dynamics | None = None  #: f and D that were given as equations; None of recordings

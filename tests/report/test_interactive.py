@@ -1,10 +1,11 @@
-"""The view of U that can be turned and cut: its data, its size, and that it asks nothing of anybody."""
+"""Views that a reader can change, of U and of mean times: their data, and that they ask nothing of others."""
 
 from __future__ import annotations
 
 import base64
 import functools
 import json
+import math
 import re
 from dataclasses import replace
 
@@ -13,7 +14,9 @@ import pytest
 from known_systems import double_well, exact_field, portrait_of
 
 from siq.quasipotential.landscape_assembly import find_landscape
+from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.refinement import RefinementOptions
+from siq.report.formatting import time_text
 from siq.report.page import UNKNOWN, interactive_view
 from siq.report.summary import LandscapeSummary, summarise
 
@@ -27,8 +30,9 @@ def landscape(dimension: int) -> LandscapeSummary:
     return summarise(found)
 
 
-def data_of(view: str) -> dict:
-    return json.loads(re.search(r'<script type="application/json">(.*?)</script>', view, re.S)[1])
+def data_of(view: str, section: str = "view") -> dict:
+    shown = view[view.index(f'id="{section}"') :]
+    return json.loads(re.search(r'<script type="application/json">(.*?)</script>', shown, re.S)[1])
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -56,7 +60,7 @@ def test_it_is_small_and_whole() -> None:
         assert word not in view
     assert "<noscript>" in view and view.count("<canvas") == view.count('role="img" aria-label=') == 2
     # Every control has its label.
-    assert view.count("<label>") == len(re.findall(r'<input[^>]*type="range"|<select', view))
+    assert len(re.findall("<label[> ]", view)) == len(re.findall(r'<input[^>]*type="range"|<select', view))
 
 
 def test_a_state_with_a_hostile_name_ends_no_element() -> None:
@@ -66,9 +70,44 @@ def test_a_state_with_a_hostile_name_ends_no_element() -> None:
     assert data_of(view)["names"][0] == name
 
 
-def test_there_is_none_of_one_state_and_of_nothing() -> None:
-    assert interactive_view(landscape(1)) is None
-    assert interactive_view(replace(landscape(3), formulas=())) is None
+def test_there_is_nothing_to_turn_of_one_state_and_of_nothing() -> None:
+    for one in (landscape(1), replace(landscape(3), formulas=())):
+        assert 'id="view"' not in (interactive_view(one) or "")
+
+
+def kramers(well: float, strength: float) -> float:
+    """The mean time in a well of ``V = (x² - 1)²/4 + x/10`` over its only saddle."""
+    saddle = np.sort(np.roots([1, 0, -1, 0.1]).real)[1]
+    bottom, top = ((x**2 - 1) ** 2 / 4 + x / 10 for x in (well, saddle))
+    return (
+        2
+        * math.pi
+        / math.sqrt((3 * well**2 - 1) * (1 - 3 * saddle**2))
+        * math.exp(2 * (top - bottom) / strength)
+    )
+
+
+@pytest.mark.parametrize("noise", [None, NoiseStrength(0.1, 0.01)])
+def test_the_slider_shows_the_law_at_every_noise(noise: NoiseStrength | None) -> None:
+    summary = replace(landscape(1), noise=noise)
+    view = interactive_view(summary)
+    assert view is not None
+    data, barrier = data_of(view, "noise"), min(one.depth for one in summary.wells)
+    strengths = [float(one) for one in data["noises"]]
+    assert barrier / strengths[0] == pytest.approx(20, rel=0.06)
+    assert barrier / strengths[-1] == pytest.approx(2, rel=0.06)
+    first = int(re.search(r'type="range"[^>]*value="(\d+)"', view)[1])
+    assert noise is None or strengths[first] == noise.intensity
+    for strength, row in zip(strengths[::7], data["rows"][::7], strict=True):
+        for well, cells in zip(summary.wells, row, strict=True):
+            mean = well.time(NoiseStrength(strength))
+            assert cells["time"] == time_text(mean)
+            if mean is not None and noise is None:
+                assert mean.value == pytest.approx(kramers(well.position[0], strength), rel=1e-3)
+
+
+def test_without_a_law_there_is_no_slider() -> None:
+    assert interactive_view(replace(landscape(1), ways=())) is None
 
 
 def test_of_many_states_four_are_shown_and_the_others_held_at_the_saddle() -> None:
