@@ -3,7 +3,7 @@
 A page asks nothing of any other machine: style, figures, formulas and downloads stand in it. It has no
 scripts, but for two views. One is of U, and can be turned: its data are U on a coarse grid in steps of one
 part in 250, wells, saddles and paths. The other shows mean times under the noise that the reader chooses.
-What they show is read and never run.
+Where there is one, tables can be sorted, too. What stands in the page is read and never run.
 
 `compose` fills a page from a template of text, in which ``page.section``, ``page.table`` and so on stand
 where they stand on the page. A section, a table or a figure without content is left out.

@@ -6,8 +6,14 @@ import base64
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pandas as pd
 import pytest
 from looked_at import SMALLEST_TEXT, Seen, look_at
+
+from siq import Landscape, reference_systems
+from siq.report.page import ReportContent, ReportTable, interactive_view, render_report
+from siq.report.summary import summarise
 
 pytestmark = pytest.mark.pages
 
@@ -51,6 +57,32 @@ def test_the_first_screen_answers(browser: Any, made_pages: dict[str, Path], kin
 def test_the_first_screen_gives_the_verdict(browser: Any, made_pages: dict[str, Path], kind: str) -> None:
     said = look_at(browser, made_pages[kind], width=DESK).first_screen.lower()
     assert "held out" in said or "held-out" in said
+
+
+def test_the_slider_changes_the_times_and_a_heading_sorts(browser: Any, tmp_path: Path) -> None:
+    well = pd.DataFrame({"well": ["A", "C", "B"], "lasts": ["1750 ± 280", "(2.0 ± 0.1) × 10⁵", "0.3"]})
+    summary = summarise(
+        Landscape.from_equations(reference_systems()["double-well"].dynamics), np.zeros((0, 1))
+    )
+    content = ReportContent("t", table=ReportTable("wells", well), interactive=interactive_view(summary))
+    (tmp_path / "page.html").write_text(render_report(content), encoding="utf-8")
+    page = browser.new_page()
+    page.goto((tmp_path / "page.html").as_uri())
+
+    def texts(place: str) -> list[str]:
+        return page.eval_on_selector_all(place, "all => all.map(one => one.textContent)")
+
+    before = texts("[data-part=ratio]")
+    page.focus("#noise input")
+    page.keyboard.press("ArrowLeft")
+    assert all(
+        float(one) > float(other) for one, other in zip(texts("[data-part=ratio]"), before, strict=True)
+    )
+    for sort, wells in (("ascending", "BAC"), ("descending", "CAB")):
+        page.click("#table-1 th:nth-child(2) button")
+        assert page.get_attribute("#table-1 th:nth-child(2)", "aria-sort") == sort
+        assert "".join(texts("#table-1 td:first-child")) == wells
+    page.close()
 
 
 def test_bad_pages_are_seen(browser: Any, tmp_path: Path) -> None:
