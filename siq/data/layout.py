@@ -47,6 +47,9 @@ TIME_UNITS = _words(
     "ns us µs μs ms s sec secs second seconds min minute minutes h hr hrs hour hours d day days yr year years"
 )
 
+_UNITS_AS_TITLES = frozenset(unit for unit in TIME_UNITS if len(unit) > 3)  # min is as often a minimum
+EVEN = 0.01  # share of the steps of a nameless clock that may be others: gaps, and where recordings begin
+
 # Symbols of units, longest first; those after a prefix may also stand alone.
 _PREFIX = "(?:da|[YZEPTGMkhdcmuµμnpfazy])?"
 _PREFIXED = "mol|Ohm|ohm|rad|bar|cal|cd|Hz|Pa|Wb|lm|lx|sr|Da|eV|px|Ω|m|s|g|A|K|N|J|W|V|C|F|H|T|S|L|l|M|B"
@@ -91,8 +94,8 @@ def read_heading(heading: str) -> _Heading:
 
     Examples
     --------
-    >>> [tuple(read_heading(text)) for text in ("bead x (µm)", "x(t)", "time_ms")]
-    [('bead x', 'µm'), ('x', None), ('time', 'ms')]
+    >>> [tuple(read_heading(text)) for text in ("bead x (µm)", "x(t)", "time_ms", "year")]
+    [('bead x', 'µm'), ('x', None), ('time', 'ms'), ('year', 'year')]
     """
     text = heading.strip()
     if match := re.fullmatch(r"(.*?)\s*\[\s*(.*?)\s*\]", text):
@@ -110,7 +113,7 @@ def read_heading(heading: str) -> _Heading:
         and _is_time(match[1])
     ):
         return _Heading(match[1], match[2])
-    return _Heading(text, None)
+    return _Heading(text, text if text.casefold() in _UNITS_AS_TITLES else None)
 
 
 def usable_name(title: str) -> str:
@@ -131,7 +134,7 @@ def usable_name(title: str) -> str:
 
 def _is_time(title: str) -> bool:
     """Whether a column of this title is the time."""
-    return _plain(title) in TIME_NAMES
+    return _plain(title) in TIME_NAMES or title.casefold() in _UNITS_AS_TITLES
 
 
 def _plain(title: str) -> str:
@@ -188,7 +191,7 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
             named = source.headings[place] if plain[place] else None
             remarks.append(Remark("data.column_counts_rows", {"column": named, "place": place + 1}))
     free = [place for place in free if place not in dropped]
-    time = _time_column(file, source.headings, parts, free, remarks)
+    time = _time_column(file, source, parts, free, remarks)
     free.remove(time)
     recording = _label_column(source, parts, free, remarks)
     if columns is None:
@@ -243,13 +246,25 @@ def _is_second_time(source: ColumnFile, parts: list[_Heading], place: int) -> bo
     return values is None or bool((np.diff(values) > 0).mean() > 0.5)
 
 
+def _runs_evenly(values: np.ndarray | None) -> bool:
+    """Whether numbers rise by one step nearly always, as nothing that is measured does."""
+    if values is None or len(values) < 3:
+        return False
+    steps = np.diff(values)
+    usual = np.median(steps)
+    return bool(usual > 0 and (np.abs(steps - usual) > EVEN * usual).mean() <= EVEN)
+
+
 def _time_column(
-    file: str, headings: Sequence[str], parts: list[_Heading], free: list[int], remarks: list[Remark]
+    file: str, source: ColumnFile, parts: list[_Heading], free: list[int], remarks: list[Remark]
 ) -> int:
+    """The column ``t``; else the only one called like a time; else the only one that rises evenly."""
     found = [place for place in free if parts[place].title == "t"]
     if found:
         return found[0]
     found = [place for place in free if _may_be_time(parts[place])]
+    if not found:
+        found = [place for place in free if _runs_evenly(_numbers(source, place))]
     if len(found) > 1:
         # "T" is a temperature rather than a time.
         found = [place for place in found if parts[place].title != "T"]
@@ -257,7 +272,7 @@ def _time_column(
         remarks.append(Remark("data.time_column", {"column": parts[found[0]].title}))
         return found[0]
     if found:
-        names = " and ".join(f"'{headings[place].strip()}'" for place in found)
+        names = " and ".join(f"'{source.headings[place].strip()}'" for place in found)
         raise InputError(file, "", f"the columns {names} all look like the time", "call the right one 't'")
     raise InputError(file, "", "the column 't' is missing", "add the time of every sample as a column 't'")
 

@@ -118,8 +118,9 @@ class PhasePortrait:
             return Remark("systems.no_stable_equilibrium") if alone else None
         values: dict[str, object] = {"share": None if alone else self.unsettled, "kind": None}
         if (ends := self.recurrence) is not None:
-            period = ends.cycle.period if ends.cycle else None
-            values |= {"kind": ends.kind, "period": period, "exponent": ends.exponent}
+            values["kind"] = ends.kind
+            values |= {"exponent": ends.exponent} if ends.kind == "chaos" else {}
+            values |= {"period": ends.cycle.period} if ends.cycle else {}
         return Remark("systems.unsettled", values)
 
 

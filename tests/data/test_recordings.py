@@ -19,6 +19,7 @@ from siq.data.recordings import (
     write_recordings,
 )
 from siq.errors import InputError
+from siq.remarks import has_code
 
 
 def recordings(seed: int = 0, lengths: tuple[int, ...] = (3, 1, 5, 2)) -> Recordings:
@@ -203,6 +204,21 @@ def test_units_come_from_names_metadata_and_cells(tmp_path: Path) -> None:
         assert read.values.tolist() == [[1, 1.5], [2, 0.2]]
     assert read_recordings(csv, units={"z": "m"}).units == ("µm", "mm", None)
     assert "card has ms" in refusal(csv, units={"t": "ms"}).fault
+
+
+@pytest.mark.parametrize(
+    ("heading", "unit"), [("year", "year"), ("Hours", "Hours"), ("frame", None), ("kyr b2k", None)]
+)
+def test_a_clock_is_known_by_its_unit_or_by_its_even_steps(
+    tmp_path: Path, heading: str, unit: str | None
+) -> None:
+    rows = [(10.0 * k + 30 * (k > 7), np.sin(k)) for k in range(400)]  # with a gap
+    path = tmp_path / "clock.csv"
+    path.write_text(f"x,{heading}\n" + "".join(f"{x},{t}\n" for t, x in rows), encoding="utf-8")
+    read = read_recordings(path)
+    assert read.names == ("x",) and read.t[:2].tolist() == [0, 10]
+    assert (read.time_unit is None) == (unit is None)
+    assert has_code(read.remarks, "data.time_column")
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import sympy
@@ -108,6 +110,13 @@ def test_the_phase_portrait_names_chaos() -> None:
     assert "neither on an equilibrium nor on a cycle: aperiodic motion, as of chaos" in sentence(fault)
 
 
+def test_a_cycle_in_recordings_is_told_by_numbers_that_can_be_stored() -> None:
+    oscillator = Dynamics.of((x, y), (y, (1 - x**2) * y - x))
+    fault = phase_portrait(oscillator, np.random.default_rng(0).uniform(-2, 2, (60, 2))).fault()
+    assert fault is not None and "limit cycle of period 6.663" in sentence(fault)
+    json.dumps(fault.as_data(), allow_nan=False)
+
+
 def test_what_comes_to_rest_slowly_is_none() -> None:
     slow = Dynamics.of((x, y), (-(x**3), -(y**3)))
     found = found_of(slow, np.array([[1e-3, 1e-3]]), np.array([[-1.0, 1.0]] * 2))
@@ -119,7 +128,5 @@ def test_what_comes_to_rest_slowly_is_none() -> None:
     [("aperiodic", "aperiodic motion"), ("none", "neither rest nor return"), (None, "another attractor")],
 )
 def test_what_is_not_known_of_the_unsettled_is_said(kind: str | None, words: str) -> None:
-    said = sentence(
-        Remark("systems.unsettled", {"share": 0.25, "kind": kind, "period": None, "exponent": 1.0})
-    )
+    said = sentence(Remark("systems.unsettled", {"share": 0.25, "kind": kind}))
     assert said.startswith("25% of the recorded states lead to no equilibrium: ") and said.endswith(words)
