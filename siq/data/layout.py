@@ -47,7 +47,9 @@ TIME_UNITS = _words(
     "ns us µs μs ms s sec secs second seconds min minute minutes h hr hrs hour hours d day days yr year years"
 )
 
-_UNITS_AS_TITLES = frozenset(unit for unit in TIME_UNITS if len(unit) > 3)  # min is as often a minimum
+_UNITS_AS_TITLES = TIME_UNITS - _words(
+    "ns us µs μs ms s min h hr d yr"
+)  # these are called so for other reasons
 EVEN = 0.01  # share of the steps of a nameless clock that may be others: gaps, and where recordings begin
 
 # Symbols of units, longest first; those after a prefix may also stand alone.
