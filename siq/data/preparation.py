@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -45,7 +46,7 @@ def read_pairs(
     states: Sequence[str] | None,
     units: Mapping[str, str] | None,
     pair_step: float | None,
-    hidden_velocities: bool = False,
+    hidden_velocities: bool | Literal["auto"] = False,
 ) -> tuple[Recordings, SnapshotPairs]:
     """Read recordings that something is to be learned from, and their pairs.
 
@@ -57,6 +58,7 @@ def read_pairs(
         See `snapshot_pairs`.
     hidden_velocities
         Whether they are positions: these are smooth, however strong the process noise on velocities is.
+        ``"auto"``: where one of them `goes_to_and_fro`.
 
     Raises
     ------
@@ -82,7 +84,7 @@ def read_pairs(
 
 
 def _checked_for_learning(
-    recordings: Recordings, *, file: str, chosen: bool, hidden_velocities: bool = False
+    recordings: Recordings, *, file: str, chosen: bool, hidden_velocities: bool | Literal["auto"] = False
 ) -> Recordings:
     """Refuse what nothing can be learned from; leave out columns that never change, unless `chosen`."""
     still = np.ptp(recordings.values, axis=0) == 0
@@ -99,11 +101,31 @@ def _checked_for_learning(
             if still[place]
         ]
         recordings = recordings.of_states(kept, remarks)
-    if len(recordings.labels) == 1 and not hidden_velocities:
-        floors = noise_floors(recordings)
-        if floors is not None and all(floor.process == 0 for floor in floors):
-            raise InputError(file, "", SINGLE_RECORDING, SINGLE_RECORDING_REMEDY)
+    smooth = hidden_velocities is not True and _shows_no_process_noise(recordings)
+    if smooth and len(recordings.labels) == 1 and not (hidden_velocities and goes_to_and_fro(recordings)):
+        raise InputError(file, "", SINGLE_RECORDING, SINGLE_RECORDING_REMEDY)
     return replace(recordings, remarks=(*recordings.remarks, *unusual(recordings)))
+
+
+def _shows_no_process_noise(recordings: Recordings) -> bool:
+    floors = noise_floors(recordings)
+    return floors is not None and all(floor.process == 0 for floor in floors)
+
+
+def goes_to_and_fro(recordings: Recordings) -> bool:
+    """Whether one recorded state without process noise turns back, more than once, by a third of its range.
+
+    A force on the state alone moves it one way only; what turns back has a velocity, or is driven.
+    """
+    if len(recordings.names) > 1 or not _shows_no_process_noise(recordings):
+        return False
+    x = recordings.values[:, 0]
+    low, high = x.min() + np.ptp(x) * np.array([1 / 3, 2 / 3])
+    for run in runs_of(joined(recordings)):
+        side = np.where(x[run] > high, 1, np.where(x[run] < low, -1, 0))
+        if (np.diff(side[side != 0]) != 0).sum() > 1:
+            return True
+    return False
 
 
 def unusual(recordings: Recordings) -> list[Remark]:
@@ -121,7 +143,7 @@ def unusual(recordings: Recordings) -> list[Remark]:
     return found
 
 
-def in_stretches(recordings: Recordings, *, hidden_velocities: bool = False) -> Recordings:
+def in_stretches(recordings: Recordings, *, hidden_velocities: bool | Literal["auto"] = False) -> Recordings:
     """Cut a recording that is the only one into stretches, of which some can be held out, or drawn again.
 
     Stretches are ten correlation times long, hops included, where this makes between ten and forty of them.
@@ -132,8 +154,8 @@ def in_stretches(recordings: Recordings, *, hidden_velocities: bool = False) -> 
     count = len(recordings.t)
     if len(recordings.labels) > 1 or count < 2 * FEWEST_STRETCHES:
         return recordings
-    floors = noise_floors(recordings)
-    if floors is not None and all(floor.process == 0 for floor in floors) and not hidden_velocities:
+    smooth = hidden_velocities is not True and _shows_no_process_noise(recordings)
+    if smooth and not (hidden_velocities and goes_to_and_fro(recordings)):
         return recordings
     runs = runs_of(recordings)
     longest = max(correlated_samples(column, runs) for column in recordings.values.T)

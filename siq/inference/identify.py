@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from siq.data.correlation import MarkovLag, markov_lag
-from siq.data.preparation import joined
+from siq.data.preparation import goes_to_and_fro, joined
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.checks import (
@@ -102,7 +102,8 @@ def identify(
         term significant.
     observation
         How samples show the states. By default as measurement noise and correlations in the recordings say;
-        with hidden velocities where the options ask for them.
+        with hidden velocities where the options ask for them, or leave it open and f of the position alone
+        is refuted by its inertia.
     draw
         Gives the generator for a purpose: for held-out recordings, and for resampling.
     diffusion, units
@@ -119,7 +120,9 @@ def identify(
     NumericalFailure
         When there is no f, with the reason, and what would help.
     """
-    hidden = options.hidden_velocities if observation == "auto" else observation.hidden
+    hidden = options.hidden_velocities is True if observation == "auto" else observation.hidden
+    if library is not None or observation != "auto":  # which say whether velocities are states
+        options = replace(options, hidden_velocities=hidden)
     if library is None:
         names = recordings.names
         library = field_library((*names, *velocity_names(names)) if hidden else names, options)
@@ -130,6 +133,14 @@ def identify(
         limits or PredictionLimits(),
     )  # fmt: skip
     try:
+        if options.hidden_velocities == "auto" and goes_to_and_fro(recordings):
+            by_velocities = case.with_velocities()
+            if by_velocities is None:
+                raise NumericalFailure(
+                    "the recording turns back as no force on the state alone would make it, and with the"
+                    " velocity as a state f does not pass its test"
+                )
+            return by_velocities
         if observation == "auto":
             found = case.identified()
         elif hidden:
@@ -149,6 +160,8 @@ def identify(
             # A position alone is refused where its recordings are correlated since it has inertia.
             advice = case.advice(hidden=False)
             if advice is not None:
+                if (by_velocities := case.with_velocities()) is not None:
+                    return by_velocities
                 reason = "; ".join(one for one in (found.prediction.reason, advice) if one)
                 found = replace(found, prediction=replace(found.prediction, passed=False, reason=reason))
         return found
@@ -158,6 +171,8 @@ def identify(
         if (repeated := repeated_text(recordings, limit=case.limits.each)) is not None:
             reason = f"{reason}; {repeated}"
         advice = case.advice(hidden=hidden)
+        if not hidden and advice is not None and (by_velocities := case.with_velocities()) is not None:
+            return by_velocities
         raise NumericalFailure(reason if advice is None else f"{reason}; {advice}") from error
 
 
@@ -402,6 +417,20 @@ class _Case:
         fault = found.diagnosis.fault(self.recordings.names)
         return replace(found, prediction=check_prediction(noise_fault=fault, limits=self.limits, **figures))
 
+    def with_velocities(self) -> FieldEstimate | None:
+        """f with the velocity as a further state; None where it was not to be tried, or fails its test."""
+        if self.options.hidden_velocities != "auto" or self.given is not None:
+            return None
+        try:
+            found = identify(
+                self.recordings, options=replace(self.options, hidden_velocities=True), draw=self.draw,
+                units=self.units, pair_step=self.pair_step, integrator_step=self.integrator_step,
+                limits=self.limits,
+            )  # fmt: skip
+        except (NumericalFailure, np.linalg.LinAlgError):
+            return None
+        return found if found.prediction is not None and found.prediction.passed else None
+
     def advice(self, *, hidden: bool) -> str | None:
         """Advice where a recorded position has inertia, or hidden velocities are not needed."""
         if len(self.recordings.names) != 1:
@@ -417,6 +446,10 @@ class _Case:
             return said
         if hidden:
             return f"{said}: leave 'identification.hidden_velocities' out, the position alone is the state"
+        if self.options.hidden_velocities == "auto" and self.given is None:
+            return (
+                f"{said}: with the velocity as a state that was not recorded, f does not pass its test either"
+            )
         return (
             f"{said}: set 'identification.hidden_velocities: true', in Python hidden_velocities=True, and the"
             " velocity is a state that was not recorded"

@@ -12,7 +12,7 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import sympy
@@ -293,7 +293,8 @@ class IdentificationOptions:
         Most pairs used where the data carry no noise; with noise all are.
     hidden_velocities
         Whether the recorded states are positions whose velocities were not recorded. These are states then,
-        too, called ``v_x`` for a position x, and f says how forces change them.
+        too, called ``v_x`` for a position x, and f says how forces change them. ``"auto"``: where one
+        position was recorded, its inertia is seen, and f of the position alone is refuted.
     """
 
     degree: Annotated[int, Field(ge=1, le=12)] = 5
@@ -301,7 +302,7 @@ class IdentificationOptions:
     false_terms: Annotated[float, Field(gt=0, lt=0.5)] = 0.02
     precision: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7
     pairs: Annotated[int, Field(ge=100)] = 8_000
-    hidden_velocities: bool = False
+    hidden_velocities: bool | Literal["auto"] = "auto"
 
 
 def field_library(states: Sequence[str], options: IdentificationOptions) -> CandidateLibrary:

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -215,7 +215,7 @@ class Landscape:
         recordings: str | Path | Recordings | pd.DataFrame,
         settings: PipelineSettings | None = None,
         *,
-        hidden_velocities: bool = False,
+        hidden_velocities: bool | Literal["auto"] = "auto",
     ) -> Landscape:
         r"""The landscape that recordings show: f identified, V refined and certified, transitions found.
 
@@ -228,8 +228,8 @@ class Landscape:
             Of all steps; see `siq.workflow.pipeline.PipelineSettings`. By default V comes from f alone,
             without networks.
         hidden_velocities
-            Whether the recorded states are positions whose velocities were not recorded, as
-            ``identification.hidden_velocities`` of the settings.
+            Whether the recorded states are positions whose velocities were not recorded; by default as
+            ``identification.hidden_velocities`` of the settings says.
 
         Raises
         ------

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -106,10 +106,12 @@ def identify_run(
     if recordings is None:
         reason = "the run has no trajectories"
         return StepResult(None, Outcome(number, Step.IDENTIFY, Status.SKIPPED, reason))
-    named = zip(recordings.names, recordings.units, strict=True)
+    named, options = zip(recordings.names, recordings.units, strict=True), settings.identification
+    if settings.training is not None:  # networks know recorded states only
+        options = replace(options, hidden_velocities=False)
     try:
         found = identify(
-            recordings, options=settings.identification, limits=settings.certificate,
+            recordings, options=options, limits=settings.certificate,
             draw=partial(generator, settings.seed, number), diffusion=settings.space.noise(recordings.names),
             units=[unit or settings.space.unit(name) or None for name, unit in named],
             pair_step=settings.sampling.pair_step, integrator_step=settings.sampling.integrator_step,
@@ -386,12 +388,13 @@ def landscape_from_recordings(
     recordings: str | Path | Recordings | pd.DataFrame,
     settings: PipelineSettings | None = None,
     *,
-    hidden_velocities: bool = False,
+    hidden_velocities: bool | Literal["auto"] = "auto",
 ) -> Landscape:
     """The landscape that recordings show; see `siq.Landscape.from_recordings`."""
     settings, trajectories = settings or PipelineSettings(), Recordings.of(recordings)
-    if hidden_velocities:
-        settings = replace(settings, identification=replace(settings.identification, hidden_velocities=True))
+    if hidden_velocities != "auto":
+        identification = replace(settings.identification, hidden_velocities=hidden_velocities)
+        settings = replace(settings, identification=identification)
     analysis = analyse(trajectories, settings)
     found = None if analysis.landscape is None else analysis.landscape.result
     certified = found is not None and found.certificate is not None and found.certificate.certified

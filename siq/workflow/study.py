@@ -303,7 +303,9 @@ class Study(BaseModel):
             raise Fault("the study names no data", "add 'system: NAME' or 'recordings: {file: ...}'")
         if self.system is not None and self.recordings is not None and self.recordings.diffusion is not None:
             raise Fault("the diffusion is the system's", "remove 'recordings.diffusion'")
-        if self.identification.hidden_velocities and (self.recordings is None or self.training is not None):
+        if self.identification.hidden_velocities is True and (
+            self.recordings is None or self.training is not None
+        ):
             raise Fault(
                 "'identification.hidden_velocities' is of recordings, and networks know recorded states only",
                 "remove it, or give 'recordings' and leave 'training' out",
@@ -405,7 +407,7 @@ def check_states(study: Study, states: Sequence[str], *, file: str) -> None:
         ("regression", study.regression.functions),
     ):
         try:
-            hidden = step == "identification" and study.identification.hidden_velocities
+            hidden = step == "identification" and study.identification.hidden_velocities is True
             known = (*states, *velocity_names(states)) if hidden else states
             candidate_library(known, degree=1, further=functions)
         except FormulaError as error:
@@ -528,7 +530,7 @@ class PipelineSettings:
     invariant: tuple[Annotated[float, Field(gt=0)], ...] = ()
 
     def __post_init__(self) -> None:
-        if self.training is not None and self.identification.hidden_velocities:
+        if self.training is not None and self.identification.hidden_velocities is True:
             raise Fault(
                 "networks know recorded states only, and velocities are hidden", "leave 'training' out"
             )

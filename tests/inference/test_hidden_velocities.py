@@ -155,9 +155,12 @@ def test_one_record_of_smooth_positions_is_enough(tmp_path: Path) -> None:
     assert floors is not None and floors[0].process == 0
     path = tmp_path / "particle.parquet"
     write_recordings(path, recordings)
-    alone, hidden = (
-        PipelineSettings(identification=IdentificationOptions(hidden_velocities=key)) for key in (False, True)
+    alone, hidden, auto = (
+        PipelineSettings(identification=IdentificationOptions(hidden_velocities=key))
+        for key in (False, True, "auto")
     )
+    seen = pipeline.draw_run(auto, source_of(path, auto), number=0).result
+    assert seen is not None and len(seen.labels) >= FEWEST_STRETCHES
     with pytest.raises(InputError, match="positions of something that has inertia, set 'identification"):
         source_of(path, alone)
     drawn = pipeline.draw_run(hidden, source_of(path, hidden), number=0).result

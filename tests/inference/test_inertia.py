@@ -62,8 +62,14 @@ def test_it_is_of_one_position() -> None:
         inertia_test(two)
 
 
-def test_a_position_alone_is_refused_and_the_option_named() -> None:
+def test_a_position_with_inertia_gets_a_velocity() -> None:
     settings = PipelineSettings(identification=IdentificationOptions(degree=3))
+    done = pipeline.identify_run(settings, particle(1, records=4)[0], number=0)
+    assert done.outcome.status is Status.OK and done.result is not None and done.result.hidden_velocities
+
+
+def test_a_position_alone_is_refused_and_the_option_named() -> None:
+    settings = PipelineSettings(identification=IdentificationOptions(degree=3, hidden_velocities=False))
     done = pipeline.identify_run(settings, particle(1, records=4)[0], number=0)
     assert done.outcome.status in (Status.WARNING, Status.FAILED)
     assert "identification.hidden_velocities: true" in done.outcome.reason

@@ -20,13 +20,13 @@ X, Y = sympy.symbols("x y", real=True)
 def turning(scale: float = 1.0) -> siq.Dynamics:
     """f = -∇V + g with V = 1 - cos x + y²/2 and g at right angles to ∇V; x and y are measured in a scale.
 
-    Noise is in units of the states, so that V is the same number.
+    Noise is in units of the states, so that V is the same number. The domain holds one well, and its way out.
     """
     x, y = X / scale, Y / scale
     force = (-sympy.sin(x) + y, -y - sympy.sin(x))
     return siq.Dynamics.of(
         (X, Y), tuple(scale * one for one in force), diffusion=[[scale**2, 0], [0, scale**2]],
-        domain=[(-2.8 * scale, 9 * scale), (-2 * scale, 2 * scale)],
+        domain=[(-3.8 * scale, 2.8 * scale), (-2 * scale, 2 * scale)],
     )  # fmt: skip
 
 
