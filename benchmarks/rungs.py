@@ -175,7 +175,8 @@ def by_states(recordings: Recordings) -> _Climbed | None:
     names = ("mean_time", "lowest", "highest")
     if found.markov is not None:
         names = ("markov_time", "markov_lowest", "markov_highest")
-    return _Climbed(found.rung, list(found.dwell_times()[list(names)].itertuples(index=False, name=None)))
+    stays = found.dwell_times()[list(names)].iloc[np.argsort(found.places[:, 0])]
+    return _Climbed(found.rung, list(stays.itertuples(index=False, name=None)))
 
 
 def by_ladder(recordings: Recordings) -> _Climbed | None:

@@ -103,7 +103,8 @@ class _Levels(NamedTuple):
     def left(self, series: np.ndarray, runs: list[slice]) -> tuple[float, float]:
         """What levels leave of a series: its share of the covariance of neighbours, and their correlation."""
         known, mean = self.path >= 0, float(series.mean())
-        moved, rest = (np.where(known, series - one, 0.0) for one in (mean, self.weights @ self.centre))
+        own = self.weights.T @ series / np.maximum(self.weights.sum(axis=0), 1e-300)
+        moved, rest = (np.where(known, series - one, 0.0) for one in (mean, self.weights @ own))
         whole, left = (sum(float(one[run][:-1] @ one[run][1:]) for run in runs) for one in (moved, rest))
         return left / max(whole, 1e-300), left / max(float(rest @ rest), 1e-300)
 
@@ -177,29 +178,38 @@ def path_of(
     draw = np.random.default_rng(0)
     longest = [_remembered(one, runs, relaxation) for one in smooth.T]
     wells = _wells_of(smooth + steps * (draw.random(values.shape) - 0.5), max(longest))
-    alone = wells[:, [column]] if values.shape[1] == 1 else _wells_of(smooth[:, [column]], longest[column])
+    several = values.shape[1] > 1
+    each = [_wells_of(smooth[:, [k]], longest[k]) for k in range(len(longest))] if several else [wells]
+    alone = each[column]
 
-    def guess(states: int) -> np.ndarray:
-        low, high = np.quantile(series, [0.05, 0.95])
+    def guess(states: int, place: int = column) -> np.ndarray:
+        low, high = np.quantile(values[:, place], [0.05, 0.95])
         evenly = np.linspace(low, high, states)
-        return np.sort(alone[:, 0]) if len(alone) == states else evenly
+        return np.sort(each[place][:, 0]) if len(each[place]) == states else evenly
 
     most = _first(runs, MOST_SAMPLES)
-    # One level may hide among the wells of the density; with more, any motion is cut into pieces.
-    fewest = max(len(alone), 2)
-    for states in range(fewest, min(fewest + 1, MOST_STATES) + 1):
-        if (levels := _levels_of(series, most, guess(states))) is None:
-            break
-        share, correlation = levels.left(series, most)
-        # With levels enough any motion is cut into pieces that look white; wells of the density are no such.
-        limit = SMOOTH if states == len(alone) else 2 * WHITE_CORRELATION
-        if correlation > SMOOTH and states > max(len(alone), 2):
-            break
-        if share < WHITE_CORRELATION and correlation < limit:
-            levels = _levels_of(series, runs, levels.centre) or levels
-            path, blurred = _without_blurred(levels.path, runs, states)
-            found = None if blurred else levels.counts
-            return _places(values, levels.path, states), path, found, len(wells), True
+    for place in sorted(range(len(each)), key=lambda one: one != column):
+        one = values[:, place]
+        # One level may hide among the wells of the density; with more, any motion is cut into pieces.
+        fewest = max(len(each[place]), 2)
+        for states in range(fewest, min(fewest + 1, MOST_STATES) + 1):
+            if (levels := _levels_of(one, most, guess(states, place))) is None:
+                break
+            share, correlation = levels.left(one, most)
+            # With levels enough any motion is cut into pieces that look white; wells of the density are none.
+            limit = SMOOTH if states == len(each[place]) else 2 * WHITE_CORRELATION
+            if correlation > SMOOTH and states > fewest:
+                break
+            others = [levels.left(other, most) for other in np.delete(values, place, axis=1).T]
+            white = all(part < WHITE_CORRELATION or rest < 2 * WHITE_CORRELATION for part, rest in others)
+            if white and share < WHITE_CORRELATION and correlation < limit:
+                levels = _levels_of(one, runs, levels.centre) or levels
+                places = _places(values, levels.path, states)
+                order = np.argsort(places[:, column])
+                whole = np.where(levels.path >= 0, np.argsort(order)[levels.path], -1)
+                path, blurred = _without_blurred(whole, runs, states)
+                counts = None if blurred else levels.counts[order][:, order]
+                return places[order], path, counts, len(wells), True
     if len(wells) <= max(len(alone), 2):
         states = max(len(alone), 2)
         means: list[np.ndarray] = []

@@ -120,6 +120,20 @@ def identify(
         When there is no f, with the reason, and what would help.
     """
     hidden = options.hidden_velocities if observation == "auto" else observation.hidden
+
+    def with_velocity() -> FieldEstimate | None:
+        """The same with a velocity that was not recorded, where that predicts held-out recordings."""
+        moving = replace(options, hidden_velocities=True)
+        try:
+            found = identify(
+                recordings, options=moving, draw=draw, units=units, pair_step=pair_step,
+                integrator_step=integrator_step, limits=limits,
+            )  # fmt: skip
+        except (NumericalFailure, np.linalg.LinAlgError):
+            return None
+        return found if found.prediction is not None and found.prediction.passed else None
+
+    own = library is None and observation == "auto" and diffusion is None  # nothing was said of the states
     if library is None:
         names = recordings.names
         library = field_library((*names, *velocity_names(names)) if hidden else names, options)
@@ -149,6 +163,8 @@ def identify(
             # A position alone is refused where its recordings are correlated since it has inertia.
             advice = case.advice(hidden=False)
             if advice is not None:
+                if own and (moving := with_velocity()) is not None:
+                    return moving
                 reason = "; ".join(one for one in (found.prediction.reason, advice) if one)
                 found = replace(found, prediction=replace(found.prediction, passed=False, reason=reason))
         return found
@@ -158,6 +174,8 @@ def identify(
         if (repeated := repeated_text(recordings, limit=case.limits.each)) is not None:
             reason = f"{reason}; {repeated}"
         advice = case.advice(hidden=hidden)
+        if own and not hidden and advice is not None and (moving := with_velocity()) is not None:
+            return moving
         raise NumericalFailure(reason if advice is None else f"{reason}; {advice}") from error
 
 
