@@ -192,8 +192,8 @@ def by_ladder(recordings: Recordings) -> _Climbed | None:
     stays = []
     for well in order:
         one = visits.get(int(well))
-        predicted, error = (np.nan, np.inf) if one is None else (one.predicted, one.error)
-        factor = np.exp(DEVIATIONS * error)
+        predicted, spread = (np.nan, np.inf) if one is None else (one.predicted, one.error)
+        factor = np.exp(DEVIATIONS * spread)
         stays.append((predicted, predicted / factor, predicted * factor))
     return _Climbed(found.rung, stays)
 

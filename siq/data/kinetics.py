@@ -178,8 +178,7 @@ def path_of(
     draw = np.random.default_rng(0)
     longest = [_remembered(one, runs, relaxation) for one in smooth.T]
     wells = _wells_of(smooth + steps * (draw.random(values.shape) - 0.5), max(longest))
-    several = values.shape[1] > 1
-    each = [_wells_of(smooth[:, [k]], longest[k]) for k in range(len(longest))] if several else [wells]
+    each = [wells] if len(longest) == 1 else [_wells_of(smooth[:, [k]], one) for k, one in enumerate(longest)]
     alone = each[column]
 
     def guess(states: int, place: int = column) -> np.ndarray:
@@ -209,7 +208,7 @@ def path_of(
                 whole = np.where(levels.path >= 0, np.argsort(order)[levels.path], -1)
                 path, blurred = _without_blurred(whole, runs, states)
                 counts = None if blurred else levels.counts[order][:, order]
-                return places[order], path, counts, len(wells), True
+                return places[order], path, counts, len(wells), correlation < 2 * WHITE_CORRELATION
     if len(wells) <= max(len(alone), 2):
         states = max(len(alone), 2)
         means: list[np.ndarray] = []

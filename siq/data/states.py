@@ -217,7 +217,11 @@ def _valleys(
                 smooth = ndimage.uniform_filter1d(series[run], width, mode="nearest")[::every]
                 found.append(np.fft.rfft(smooth))
     sizes = [len(range(run.start, run.stop, every)) for run in runs]
-    parts = [(np.array(one), size) for one, size in zip(spectra, sizes, strict=True) if size >= FEWEST_POINTS]
+    parts = {  # runs of one size are turned together, (m, c, f): there may be thousands
+        size: np.array([one for one, each in zip(spectra, sizes, strict=True) if each == size])
+        for size in dict.fromkeys(sizes)
+        if size >= FEWEST_POINTS
+    }
     columns = values.shape[1]
     if not parts:
         return 1.0, np.ones(columns), np.zeros(columns)
@@ -230,10 +234,11 @@ def _valleys(
     depths = []
     for number in range(SURROGATES + 1):
         drawn = []
-        for spectrum, size in parts:
-            turns = np.exp(2j * np.pi * generator.random(spectrum.shape[1]))
-            turns[0] = 1.0
-            drawn.append(np.fft.irfft(spectrum * turns if number else spectrum, n=size))
+        for size, spectrum in parts.items():
+            turns = np.exp(2j * np.pi * generator.random((len(spectrum), 1, spectrum.shape[2])))
+            turns[..., 0] = 1.0
+            whole = np.fft.irfft(spectrum * turns if number else spectrum, n=size)
+            drawn.append(whole.transpose(1, 0, 2).reshape(len(bins), -1))
         series = np.concatenate(drawn, axis=1)
         depths.append([_valley(one, each) for one, each in zip(series, bins, strict=True)])
         if (
