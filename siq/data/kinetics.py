@@ -26,7 +26,7 @@ from scipy import ndimage, sparse, special
 from scipy.spatial import cKDTree
 
 from siq.data.correlation import resolution_step
-from siq.data.stationarity import WHITE_CORRELATION, correlated_samples
+from siq.data.stationarity import MOST_RUNS, WHITE_CORRELATION, correlated_samples
 from siq.numerics.randomness import positive
 
 MOST_STATES = 6  # looked for
@@ -43,12 +43,13 @@ DRAWS = 200  # of the transition matrix: ends of intervals are then known to a t
 REFUSED = 0.01  # probability with which a Markov process is refused at a lag
 CONFIDENCE = 0.95
 PROFILE_BINS = 40
-MOST_RUNS = 200  # without a gap, from which a correlation time is found
 OUTSIDE = 0.001  # of the samples on either side: a few outliers would make the rest one bin
 FEWEST_BINS = 4  # a parabola through three knows no error
 FEWEST_STAYS = 10  # from which their distribution is told
-# Of Kolmogorov's statistic for exponential times whose mean is estimated (Stephens, JASA 69 (1974) 730).
-STEPHENS = 1.308  # at one per cent
+FORGOTTEN_STAYS = 4  # after so many of the longest a Markov process hardly knows where it began
+# Standard errors by which a shape of 2 is away from that of exponential stays: refused at one per cent
+# nine times in ten.
+REGULAR = 2.58 + 1.28
 
 
 def _wells_of(values: np.ndarray, relaxation: float) -> np.ndarray:
@@ -102,7 +103,8 @@ class _Levels(NamedTuple):
     def left(self, series: np.ndarray, runs: list[slice]) -> tuple[float, float]:
         """What levels leave of a series: its share of the covariance of neighbours, and their correlation."""
         known, mean = self.path >= 0, float(series.mean())
-        moved, rest = (np.where(known, series - one, 0.0) for one in (mean, self.weights @ self.centre))
+        own = self.weights.T @ series / np.maximum(self.weights.sum(axis=0), 1e-300)
+        moved, rest = (np.where(known, series - one, 0.0) for one in (mean, self.weights @ own))
         whole, left = (sum(float(one[run][:-1] @ one[run][1:]) for run in runs) for one in (moved, rest))
         return left / max(whole, 1e-300), left / max(float(rest @ rest), 1e-300)
 
@@ -148,8 +150,8 @@ def _levels_of(series: np.ndarray, runs: list[slice], centre: np.ndarray) -> _Le
 
 def path_of(
     values: np.ndarray, runs: list[slice], relaxation: float, *, column: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, int]:
-    """Places of the states ``(k, d)``, the path ``(n,)``, expected transitions, and wells of the density.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, int, bool]:
+    """Places of the states ``(k, d)``, the path ``(n,)``, expected transitions, wells, and whether levels.
 
     Parameters
     ----------
@@ -163,7 +165,8 @@ def path_of(
     -------
     tuple
         The path is -1 before a state was reached. Transitions between samples ``(k, k)`` are those of a
-        hidden Markov model, None where the path goes from core to core.
+        hidden Markov model, None where the path goes from core to core. Wells are those of the density.
+        Levels have nothing but white noise about them.
     """
     series = values[:, column]
     width = max(int(AVERAGING_TIME * relaxation), 1)
@@ -175,28 +178,37 @@ def path_of(
     draw = np.random.default_rng(0)
     longest = [_remembered(one, runs, relaxation) for one in smooth.T]
     wells = _wells_of(smooth + steps * (draw.random(values.shape) - 0.5), max(longest))
-    alone = wells[:, [column]] if values.shape[1] == 1 else _wells_of(smooth[:, [column]], longest[column])
+    each = [wells] if len(longest) == 1 else [_wells_of(smooth[:, [k]], one) for k, one in enumerate(longest)]
+    alone = each[column]
 
-    def guess(states: int) -> np.ndarray:
-        low, high = np.quantile(series, [0.05, 0.95])
+    def guess(states: int, place: int = column) -> np.ndarray:
+        low, high = np.quantile(values[:, place], [0.05, 0.95])
         evenly = np.linspace(low, high, states)
-        return np.sort(alone[:, 0]) if len(alone) == states else evenly
+        return np.sort(each[place][:, 0]) if len(each[place]) == states else evenly
 
     most = _first(runs, MOST_SAMPLES)
-    # One level may hide among the wells of the density; with more, any motion is cut into pieces.
-    fewest = max(len(alone), 2)
-    for states in range(fewest, min(fewest + 1, MOST_STATES) + 1):
-        if (levels := _levels_of(series, most, guess(states))) is None:
-            break
-        share, correlation = levels.left(series, most)
-        # With levels enough any motion is cut into pieces that look white; wells of the density are no such.
-        limit = SMOOTH if states == len(alone) else 2 * WHITE_CORRELATION
-        if correlation > SMOOTH and states > max(len(alone), 2):
-            break
-        if share < WHITE_CORRELATION and correlation < limit:
-            levels = _levels_of(series, runs, levels.centre) or levels
-            path, blurred = _without_blurred(levels.path, runs, states)
-            return _places(values, levels.path, states), path, None if blurred else levels.counts, len(wells)
+    for place in sorted(range(len(each)), key=lambda one: one != column):
+        one = values[:, place]
+        # One level may hide among the wells of the density; with more, any motion is cut into pieces.
+        fewest = max(len(each[place]), 2)
+        for states in range(fewest, min(fewest + 1, MOST_STATES) + 1):
+            if (levels := _levels_of(one, most, guess(states, place))) is None:
+                break
+            share, correlation = levels.left(one, most)
+            # With levels enough any motion is cut into pieces that look white; wells of the density are none.
+            limit = SMOOTH if states == len(each[place]) else 2 * WHITE_CORRELATION
+            if correlation > SMOOTH and states > fewest:
+                break
+            others = [levels.left(other, most) for other in np.delete(values, place, axis=1).T]
+            white = all(part < WHITE_CORRELATION or rest < 2 * WHITE_CORRELATION for part, rest in others)
+            if white and share < WHITE_CORRELATION and correlation < limit:
+                levels = _levels_of(one, runs, levels.centre) or levels
+                places = _places(values, levels.path, states)
+                order = np.argsort(places[:, column])
+                whole = np.where(levels.path >= 0, np.argsort(order)[levels.path], -1)
+                path, blurred = _without_blurred(whole, runs, states)
+                counts = None if blurred else levels.counts[order][:, order]
+                return places[order], path, counts, len(wells), correlation < 2 * WHITE_CORRELATION
     if len(wells) <= max(len(alone), 2):
         states = max(len(alone), 2)
         means: list[np.ndarray] = []
@@ -208,7 +220,7 @@ def path_of(
                 rows.append(slice(first, first + len(begins)))
                 means.append(series[begins[:, None] + np.arange(width)].mean(axis=1))
         if not means or not np.ptp(guess(states)) > 0:
-            return np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None, len(wells)
+            return np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None, len(wells), False
         levels = _levels_of(np.concatenate(means), rows, guess(states))
         centre = guess(states) if levels is None else levels.centre
         distance = np.abs(series[:, None] - centre)
@@ -221,13 +233,13 @@ def path_of(
         core[(core == states - 1) & (series < centre[-1])] = -1
         places = _places(values, near, states)
         places[:, column] = centre
-        return places, continued_visits(core, runs), None, len(wells)
+        return places, continued_visits(core, runs), None, len(wells), False
     wells = wells[np.argsort(wells[:, column])]
     distance = np.linalg.norm((values[:, None] - wells) / positive(values.std(axis=0)), axis=2)
     near = distance.argmin(axis=1)
     core = np.where(distance[np.arange(len(near)), near] <= _medians(distance, near)[near], near, -1)
     places = _places(values, near, len(wells))
-    return places, continued_visits(core, runs), None, len(wells)
+    return places, continued_visits(core, runs), None, len(wells), False
 
 
 def _remembered(series: np.ndarray, runs: list[slice], relaxation: float) -> float:
@@ -241,21 +253,28 @@ def _remembered(series: np.ndarray, runs: list[slice], relaxation: float) -> flo
 
 
 def _without_blurred(path: np.ndarray, runs: list[slice], states: int) -> tuple[np.ndarray, bool]:
-    """The path without visits of a single sample, where these are more than hops within a sample explain."""
-    for stays in stays_of(path, runs, states):
+    """The path without single samples on the way from one state to another, in states with too many of these.
+
+    A sample that averages over a hop is taken for a state between. There are too many of them where visits of
+    one sample are more than the law of the longer ones explains.
+    """
+    blurred = np.zeros(states, dtype=bool)
+    for state, stays in enumerate(stays_of(path, runs, states)):
         longer = stays[stays > 1]
         if len(longer) < FEWEST_STAYS:
             continue
         ended = 1 / float((longer - 1).mean())  # of a geometric law, after each sample
         expected = len(longer) * ended / max(1 - ended, 1e-9)
-        if (stays == 1).sum() > expected + FALSE_WELL * np.sqrt(expected * (1 + expected / len(longer))):
-            break
-    else:
+        error = np.sqrt(expected * (1 + expected / len(longer)))
+        blurred[state] = (stays == 1).sum() > expected + FALSE_WELL * error
+    if not blurred.any():
         return path, False
     core = np.full(len(path), -1)
     for run in runs:
-        lasts = np.diff(path[run]) == 0
-        core[run] = np.where(np.append(lasts, False) | np.append(False, lasts), path[run], -1)
+        part = path[run]
+        before, after = np.append(part[:1], part[:-1]), np.append(part[1:], part[-1:])
+        passed = blurred[part] & (before != part) & (after != part) & (before != after)
+        core[run] = np.where(passed, -1, part)
     return continued_visits(core, runs), True
 
 
@@ -306,20 +325,50 @@ def stays_of(path: np.ndarray, runs: list[slice], states: int) -> list[np.ndarra
     return [np.concatenate(one) if one else np.zeros(0) for one in found]
 
 
-def exponential(stays: np.ndarray) -> bool | None:
-    """Whether stays, in samples, are spread as exponential times; None of too few to tell.
+def _memoryless(path: np.ndarray, runs: list[slice], states: int, dead: int) -> np.ndarray:
+    """Whether a state that has lasted so many samples is left as often, however long it has lasted since.
 
-    The shortest one is the dead time, and is taken off; a stay may have ended at any time within its last
-    step.
+    The exits after each age ``a`` beyond the dead time are held against one rate for all ages, in the
+    direction of ``log a``: the score test of exponential times against those of Weibull, whose shape it is.
+    Visits that a run cuts count with the ages that were seen of them.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(k, 3)``: score, its variance, and exits, of each state. An error of the shape is one over the root
+        of the variance; shapes above 1, where the score is positive, are of regular stays.
     """
-    if len(stays) < FEWEST_STAYS:
-        return None
-    draw = np.random.default_rng(0)
-    times = np.sort(stays - stays.min() + draw.random(len(stays)))
-    count = len(times)
-    law = -np.expm1(-times / times.mean())
-    distance = max((np.arange(1, count + 1) / count - law).max(), (law - np.arange(count) / count).max())
-    return bool((distance - 0.2 / count) * (np.sqrt(count) + 0.26 + 0.5 / np.sqrt(count)) < STEPHENS)
+    found = np.zeros((states, 3))
+    longest = max(run.stop - run.start for run in runs) + 1
+    exits, risk = np.zeros((states, longest)), np.zeros((states, longest))
+    for run in runs:
+        part = path[run]
+        turns = np.flatnonzero(np.diff(part)) + 1
+        lengths, visited = np.diff(np.append(turns, len(part))), part[turns]
+        seen = np.arange(len(turns)) < len(turns) - 1
+        np.add.at(exits, (visited[seen], lengths[seen]), 1)
+        np.add.at(risk, (visited, lengths - ~seen), 1)
+    risk = np.cumsum(risk[:, ::-1], axis=1)[:, ::-1]
+    age = np.log(np.arange(1, longest - dead))
+    for state, (ended, under) in enumerate(zip(exits[:, dead + 1 :], risk[:, dead + 1 :], strict=True)):
+        if not ended.sum() or not len(age):
+            continue
+        rate, mean = ended.sum() / under.sum(), float(under @ age) / under.sum()
+        variance = rate * (1 - rate) * float(under @ (age - mean) ** 2)
+        found[state] = (ended - rate * under) @ (age - mean), variance, ended.sum()
+    return found
+
+
+def exponential(path: np.ndarray, runs: list[slice], states: int, dead: int) -> tuple[bool | None, ...]:
+    """Whether stays beyond a dead time, in samples, are spread as exponential times; None of too few."""
+    return tuple(
+        None if ended < FEWEST_STAYS or not variance > 0 else _chance(score, variance) > REFUSED
+        for score, variance, ended in _memoryless(path, runs, states, dead)
+    )
+
+
+def _chance(score: float, variance: float) -> float:
+    return 2 * float(special.ndtr(-abs(score) / np.sqrt(variance)))
 
 
 class MarkovModel(NamedTuple):
@@ -351,7 +400,14 @@ class MarkovModel(NamedTuple):
             found = model.count_matrix
             return np.asarray(found.toarray() if sparse.issparse(found) else found) / lag
 
-        for lag in 2 ** np.arange(max(int(np.log2(max(min(stays), 1))), 0) + 1):
+        for lag in 2 ** np.arange(max(int(np.log2(max(min(stays) / 2, 1))), 0) + 1):
+            scores = _memoryless(path, runs, states, int(lag) - 1)
+            tested = scores[scores[:, 1] > 0]
+            if tested[:, 1].sum() < REGULAR**2:
+                return None
+            aged = min(_chance(*one) for one in (tested[:, :2].sum(axis=0), *tested[:, :2]))
+            if aged * (len(tested) + 1) <= REFUSED:
+                continue
             own = counts if counts is not None and lag == 1 else counted(int(lag))
             hops = own - np.diag(np.diag(own))
             if sparse.csgraph.connected_components(hops >= 1, connection="strong")[0] > 1:
@@ -361,8 +417,8 @@ class MarkovModel(NamedTuple):
             drawn /= drawn.sum(axis=2, keepdims=True)
             usual = own / own.sum(axis=1, keepdims=True)
             worst = 0.0
-            # Up to the time that visits last: before, hardly anything hops, and any model passes.
-            multiples = 2 ** np.arange(1, max(int(np.log2(max(max(stays) / lag, 2))), 1) + 1)
+            # Beyond the time that visits last: before, hardly anything hops, and any model passes.
+            multiples = 2 ** np.arange(1, int(np.log2(max(FORGOTTEN_STAYS * max(stays) / lag, 2))) + 1)
             for multiple in multiples:
                 later = counted(int(lag * multiple))
                 visits = later.sum(axis=1, keepdims=True)
@@ -446,19 +502,3 @@ def _reach(series: np.ndarray, path: np.ndarray, state: int) -> float:
     """How far a state spreads about its place."""
     inside = series[path == state]
     return float(inside.std()) if len(inside) else 0.0
-
-
-def stationary(path: np.ndarray, runs: list[slice], states: int) -> bool:
-    """Whether both halves of a record spend the same share of time in each state, within their errors."""
-    known = np.flatnonzero(path >= 0)
-    halves = known[: len(known) // 2], known[len(known) // 2 :]
-    for state in range(states):
-        rest = np.zeros(len(path))
-        shares = [float((path[half] == state).mean()) if len(half) else 0.0 for half in halves]
-        for half, share in zip(halves, shares, strict=True):
-            rest[half] = (path[half] == state) - share
-        some = runs[:: -(-len(runs) // MOST_RUNS)]
-        error = 2 * float(rest.std()) * np.sqrt(2 * correlated_samples(rest, some) / max(len(known), 1))
-        if abs(shares[1] - shares[0]) > float(special.ndtri(1 - REFUSED / states / 2)) * error:
-            return False
-    return True

@@ -42,13 +42,13 @@ from siq.data.kinetics import (
     Profile,
     exponential,
     path_of,
-    stationary,
     stays_of,
 )
 from siq.data.recordings import Recordings
 from siq.data.stationarity import (
     MOST_STRETCHES,
     background_of,
+    change_of,
     correlated_samples,
     relaxation_samples,
     runs_of,
@@ -193,9 +193,10 @@ def _valleys(
     Returns
     -------
     tuple
-        The probability of the rarest valley of all (Westfall and Young, 1993: the least of probabilities that
-        depend on each other is held against the same of each surrogate); the least probability of each column
-        alone, ``(d,)``; and the largest share of its samples in a lesser
+        The probability of the rarest valley of all, or of as rare ones in all columns together (Westfall and
+        Young, 1993: the least of probabilities that depend on each other is held against the same of each
+        surrogate); the least probability of each column alone, ``(d,)``; and the largest share of its samples
+        in a lesser
         peak, ``(d,)``.
     """
     every = -(-len(values) // MOST_POINTS)
@@ -216,7 +217,11 @@ def _valleys(
                 smooth = ndimage.uniform_filter1d(series[run], width, mode="nearest")[::every]
                 found.append(np.fft.rfft(smooth))
     sizes = [len(range(run.start, run.stop, every)) for run in runs]
-    parts = [(np.array(one), size) for one, size in zip(spectra, sizes, strict=True) if size >= FEWEST_POINTS]
+    parts = {  # runs of one size are turned together, (m, c, f): there may be thousands
+        size: np.array([one for one, each in zip(spectra, sizes, strict=True) if each == size])
+        for size in dict.fromkeys(sizes)
+        if size >= FEWEST_POINTS
+    }
     columns = values.shape[1]
     if not parts:
         return 1.0, np.ones(columns), np.zeros(columns)
@@ -229,10 +234,11 @@ def _valleys(
     depths = []
     for number in range(SURROGATES + 1):
         drawn = []
-        for spectrum, size in parts:
-            turns = np.exp(2j * np.pi * generator.random(spectrum.shape[1]))
-            turns[0] = 1.0
-            drawn.append(np.fft.irfft(spectrum * turns if number else spectrum, n=size))
+        for size, spectrum in parts.items():
+            turns = np.exp(2j * np.pi * generator.random((len(spectrum), 1, spectrum.shape[2])))
+            turns[..., 0] = 1.0
+            whole = np.fft.irfft(spectrum * turns if number else spectrum, n=size)
+            drawn.append(whole.transpose(1, 0, 2).reshape(len(bins), -1))
         series = np.concatenate(drawn, axis=1)
         depths.append([_valley(one, each) for one, each in zip(series, bins, strict=True)])
         if (
@@ -241,13 +247,17 @@ def _valleys(
         ):
             break
     depth = np.array(depths)
-    order = np.sort(depth, axis=0)
-    rarity = np.array(
-        [1 - np.searchsorted(a, b, side="left") / len(a) for a, b in zip(order.T, depth.T, strict=True)]
-    )
-    least = rarity.min(axis=0)
-    alone = rarity[:, 0].reshape(columns, -1).min(axis=1)
-    return float(np.mean(least <= least[0])), alone, depth[0].reshape(columns, -1).max(axis=1)
+
+    def rarity(extremes: np.ndarray) -> np.ndarray:
+        """Of each row ``(n, k)``, the share of rows as extreme."""
+        ranks = [np.searchsorted(np.sort(one), one, side="left") for one in extremes.T]
+        return 1 - np.array(ranks).T / len(extremes)
+
+    alone = rarity(depth).reshape(len(depth), columns, -1).min(axis=2)
+    # One quantity may show the states, or all of them a little (Fisher's sum).
+    either = np.column_stack([-np.log(alone.min(axis=1)), -np.log(alone).sum(axis=1)])
+    least = rarity(either).min(axis=1)
+    return float(np.mean(least <= least[0])), alone[0], depth[0].reshape(columns, -1).max(axis=1)
 
 
 def _valley(series: np.ndarray, bins: int) -> float:
@@ -344,6 +354,8 @@ class RecordStates:
 
     def remark(self) -> Remark:
         """The same as a remark."""
+        model = [] if self.markov is None else self.markov.stays.tolist()
+        apart = any(high < one.limits[0] for (_, _, high), one in zip(model, self.counts, strict=False))
         values = {
             "columns": self.columns or (self.state,), "unit": self.unit, "time_unit": self.time_unit,
             "places": self.places.tolist() or [[one] for one in self.levels], "levels": self.levels,
@@ -351,7 +363,7 @@ class RecordStates:
             "limits": [one.limits for one in self.counts], "visits": [one.visits for one in self.counts],
             "rung": self.rung, "lag": None if self.markov is None else self.markov.lag,
             "tops": [] if self.profile is None or len(self.columns) > 1 else self.profile.tops.tolist(),
-            "offset": self.offset,
+            "offset": self.offset, "missed": model if apart else [],
         }  # fmt: skip
         return Remark("data.record_hops", values)
 
@@ -464,12 +476,12 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     relaxation = min(relaxations[place] for place in columns)
     background, baseline = np.zeros_like(values), np.zeros_like(values)
     places, path, expected = np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None
-    wells = 1
+    wells, levels = 1, False
     if probability >= SIGNIFICANCE:
         background[:, column] = background_of(recordings, values[:, column])[0]
     for _ in range(MOST_PASSES if probability < SIGNIFICANCE else 0):
         flat = values - background
-        places, path, expected, wells = path_of(flat, runs, relaxation, column=column)
+        places, path, expected, wells, levels = path_of(flat, runs, relaxation, column=column)
         level = np.where(path[:, None] >= 0, places[path], np.median(flat, axis=0))
         slow = np.array([background_of(recordings, one)[0] for one in (values - level).T]).T
         baseline = _baselines(recordings, values - level - slow)
@@ -491,14 +503,18 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         recordings.titles[state], recordings.units[state], recordings.time_unit, supported, probability,
         tuple(map(float, places[:, column])), counts, edges, density, path, background[:, column],
         int(supported), columns=tuple(recordings.titles[one] for one in columns), places=places,
-        exponential=tuple(map(exponential, lengths)), offset=float(np.ptp(baseline[:, column])),
+        exponential=exponential(path, runs, number, 0 if levels else int(np.ceil(relaxation))),
+        offset=float(np.ptp(baseline[:, column])),
         baseline=baseline[:, column],
         stays=tuple(step * one for one in lengths), hops=_hops(path, runs, number),
     )  # fmt: skip
     if not rungs or not supported:
         return found
-    if not stationary(path, runs, number):
-        return replace(found, limit=Remark("data.not_stationary"))
+    if (period := change_of(recordings, flat[:, column], path)) is not None:
+        known = step * period if np.isfinite(period) else None
+        return replace(
+            found, limit=Remark("data.not_stationary", {"period": known, "unit": recordings.time_unit})
+        )
     found = replace(found, rung=2, profile=profile)
     if min(one.visits for one in counts) < FEWEST_HOPS:
         return replace(found, limit=Remark("data.few_hops", {"fewest": FEWEST_HOPS}))
@@ -508,7 +524,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     if model is None:
         return replace(found, limit=Remark("data.not_markov"))
     model = model._replace(lag=step * model.lag, stays=step * model.stays, rates=model.rates / step)
-    return replace(found, rung=3, markov=model)
+    return replace(found, rung=3, markov=model, limit=Remark("data.levels_alone") if levels else None)
 
 
 def _hops(path: np.ndarray, runs: list[slice], states: int) -> np.ndarray:

@@ -17,6 +17,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from scipy import ndimage, special
 
 from siq.data.recordings import LONGEST_STEP, Recordings
 
@@ -26,7 +27,11 @@ SHORTEST_TIME = 0.5  # of a sample: shorter correlations are not told from none
 WHITE_CORRELATION = 0.05  # of the variance: a correlation of neighbours below is none
 STEP_TOLERANCE = 0.01  # of a step: stretches end where a step differs by more
 MOST_STRETCHES = 4000  # looked at
+MOST_RUNS = 200  # without a gap, from which a correlation time is found
 MOST_HALF_PERIODS = 8  # of the background in a record: what returns more often is part of the system
+NEIGHBOURS = 10  # frequencies on either side with which one is compared
+HARMLESS_LINE = 0.01  # of the variance: it changes -log p by a hundredth
+FALSE_CHANGE_RATE = 0.01  # probability with which a stationary record is said to change
 FALSE_DRIFT_RATE = 1e-3  # probability with which a record without a background is said to have one
 
 
@@ -127,6 +132,60 @@ def correlated_samples(values: np.ndarray, runs: list[slice]) -> float:
     ends = np.flatnonzero(pairs <= 0)
     kept = np.minimum.accumulate(pairs[: ends[0] if len(ends) else len(pairs)])
     return max(float(kept.sum()) - 0.5, 0.5)
+
+
+def change_of(recordings: Recordings, values: np.ndarray, path: np.ndarray) -> float | None:
+    """The period with which states change, in samples; infinite where they do slowly, None where not at all.
+
+    The state at each sample, `path` ``(n,)`` with -1 where it is not known, the distance of the `values`
+    ``(n,)`` from the mean of their state, and its square are asked for a straight line, in the course of all
+    recordings and of each, and for a frequency that stands out from its neighbours: with power P there and
+    L at these, ``P/L`` has the F distribution in any stationary process whose spectrum is smooth.
+    """
+    inside = (path[:, None] == np.arange(path.max() + 1)).astype(float)
+    shares = np.maximum(inside.sum(axis=0), 1.0)
+    rest = values - inside @ (inside.T @ values / shares)
+    square = rest**2 - inside @ (inside.T @ rest**2 / shares)
+    known = path >= 0
+    series = np.where(
+        known[:, None], np.column_stack([inside - inside[known].mean(axis=0), rest, square]), 0.0
+    )
+    series = series[:, np.ptp(series, axis=0) > 0]
+    bounds = np.searchsorted(recordings.recording, np.arange(len(recordings.labels) + 1))
+    parts = [slice(int(a), int(b)) for a, b in pairwise(bounds) if b > a]
+    lines = [np.linspace(-1, 1, len(path))]
+    if len(parts) > 1:
+        lines.append(np.concatenate([np.linspace(-1, 1, one.stop - one.start) for one in parts]))
+    runs = runs_of(recordings)
+    some = runs[:: -(-len(runs) // MOST_RUNS)]
+    for line in lines:
+        line = np.where(known, line - line[known].mean(), 0.0)
+        for one in series.T:
+            slope = float(line @ one / (line @ line))
+            left = one - slope * line
+            together = 2 * correlated_samples(left, some)
+            error = left.std() * np.sqrt(together / float(line @ line))
+            freedom = max(known.sum() / together - 2, 1.0)
+            chance = 2 * float(special.stdtr(freedom, -abs(slope) / max(error, 1e-300)))
+            if chance * len(lines) * series.shape[1] < FALSE_CHANGE_RATE / 2:
+                return np.inf
+    longest = max(one.stop - one.start for one in parts)
+    used = [one for one in parts if one.stop - one.start > 4 * NEIGHBOURS]
+    window = np.ones(2 * NEIGHBOURS + 1)
+    window[NEIGHBOURS - 1 : NEIGHBOURS + 2] = 0.0
+    frequencies = np.arange(NEIGHBOURS + 1, longest // 2 - NEIGHBOURS)
+    for one in series.T:
+        if not used or not len(frequencies):
+            break
+        power = np.sum([np.abs(np.fft.rfft(one[part], n=longest)) ** 2 for part in used], axis=0)
+        level = ndimage.correlate1d(power, window / window.sum(), mode="nearest")
+        ratio = (power / np.maximum(level, 1e-300))[frequencies]
+        ratio[(power - level)[frequencies] < HARMLESS_LINE * power[1:].sum()] = 0.0
+        freedom = 2 * len(used) * window.sum()
+        chance = float(special.fdtrc(2 * len(used), freedom, ratio.max()))
+        if chance * len(frequencies) * series.shape[1] < FALSE_CHANGE_RATE / 2:
+            return float(longest / frequencies[ratio.argmax()])
+    return None
 
 
 def background_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, int]:

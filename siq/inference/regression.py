@@ -226,6 +226,8 @@ class _PairRegression:
         if not kept.any():  # a trial f that runs away everywhere
             return rest
         seen = (spread / h[:, None, None])[kept].mean(axis=0)
+        if not np.linalg.eigvalsh(seen)[0] > 0:  # likewise
+            return rest
         root = np.linalg.cholesky(guess) @ np.linalg.inv(np.linalg.cholesky(seen))
         return np.asarray(root @ rest @ root.T)
 

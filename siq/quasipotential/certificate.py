@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from siq.data.recordings import SnapshotPairs
+from siq.data.states import RecordStates
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import AnyField, Verdict
 from siq.networks.decomposition import AnyNetworks, NetworksByWell
@@ -49,6 +50,11 @@ from siq.systems.formulas import compile_formulas
 from siq.systems.phase_portrait import PhasePortrait, RecordedRegion
 
 OF_TIMES = ("times",)  # what answers on times rest on, and nothing else does
+# What f and D rest on: the record, and no formula of V.
+OF_DYNAMICS = (
+    "prediction", "one_system", "unchanged", "state_complete", "gaussian_increments", "existence", "record",
+)  # fmt: skip
+BY_RECORD = ("data.not_stationary", "data.levels_alone")  # remarks of states of which there are no f and D
 INDEPENDENT = ("characteristics",)  # tests of V that share nothing with a fit of V but f and D
 GO_WITHOUT = "or do without them: 'refinement: {routes: [local]}'"
 ALONE = f"only one of the two routes that the study names led to V; train other networks, {GO_WITHOUT}"
@@ -99,6 +105,28 @@ class Certificate:
     def times_certified(self) -> bool:
         """Whether times are: the record could have shown that they are wrong, and did not."""
         return self.certified and all(self.tests[name].passed for name in OF_TIMES if name in self.tests)
+
+    @staticmethod
+    def rung(certificate: Certificate | None, seen: RecordStates | None, *, hidden: bool = False) -> int:
+        """The rung of the ladder of answers that a record supports, from 0 of one state to 6 of formulas.
+
+        Up to 3 it is that of the states that the record shows by itself. With f and D that passed every test
+        against the record it is 4, or 5 where they have a `hidden` state; with all formulas certified,
+        times between states included, 6. Of a record that changes, or jumps between levels, it is no more
+        than that of its states, whatever was certified.
+        """
+        own = 0 if seen is None else seen.rung
+        apart = seen is not None and seen.limit is not None and seen.limit.code in BY_RECORD
+        if certificate is None or apart or "prediction" not in certificate.tests:
+            return own
+        tests = certificate.tests
+        if not all(tests[name].passed for name in OF_DYNAMICS if name in tests):
+            return own
+        if "times" in tests and tests["times"].tested and not tests["times"].passed:
+            return own
+        if hidden:
+            return 5
+        return 6 if certificate.times_certified else 4
 
     def with_tests(self, tests: Mapping[str, Verdict]) -> Certificate:
         """With further tests; the reason says which of them refused it, or could not be made."""

@@ -90,12 +90,15 @@ class NoLandscape(NumericalFailure):
     ) -> None:
         super().__init__(" ".join(sentences_without_landscape(reason, states)))
         self.reason, self.states, self.dynamics = reason, states, dynamics
+        self.rung = Certificate.rung(None, states)
 
 
 def sentences_without_landscape(reason: str, states: RecordStates | None) -> list[str]:
     """What is known without a landscape, on which rung that is, and why there is none."""
-    rung = 0 if states is None else states.rung
-    missing = sentence(Remark("quasipotential.without_landscape", {"rung": rung, "reason": reason}))
+    rung = Certificate.rung(None, states)
+    told = rung == 3 and states is not None and states.limit is not None  # why, without any f
+    values = {"rung": rung, "reason": "" if told else reason}
+    missing = sentence(Remark("quasipotential.without_landscape", values))
     seen = "" if states is None else states.sentence() or sentence(states.rest())
     return [seen, missing] if seen else [missing]
 
@@ -184,8 +187,8 @@ class Landscape:
         Mean residence times as counted on the recordings and as f and D say; empty where this was not
         compared.
     recorded_states
-        The two states between which the recordings hop by themselves, without any formula; None where
-        nothing is known of them, or several wells are certified.
+        The states between which the recordings hop by themselves, without any formula; None where nothing is
+        known of them.
     given
         Whether f was given as equations: the region is their domain then, and nothing of f is uncertain.
     parting
@@ -308,6 +311,12 @@ class Landscape:
     def seen(self) -> RecordStates | None:
         """Another name of `recorded_states`."""
         return self.recorded_states
+
+    @property
+    def rung(self) -> int:
+        """The rung of the ladder of answers, see `siq.quasipotential.certificate.Certificate.rung`."""
+        hidden = self.field_estimate is not None and self.field_estimate.hidden_velocities
+        return Certificate.rung(self.certificate, self.recorded_states, hidden=hidden)
 
     @property
     def cycles(self) -> tuple[Cycle, ...]:

@@ -292,8 +292,7 @@ def landscape_html(landscape: Landscape) -> str:
 def _report(landscape: Landscape) -> tuple[list[str], list[tuple[str, pd.DataFrame]]]:
     summary = summarise(landscape)
     certificate = None if landscape.certificate is None else landscape.certificate.as_data()
-    certified = certificate is not None and bool(certificate["certified"])
-    answer, *further = answer_lines(summary, seen=landscape.seen, certified=certified)
+    answer, *further = answer_lines(summary, seen=landscape.seen, certified=landscape.rung == 6)
     written = certificate is not None or any(well is not None for well in landscape.wells)
     verdict = "U is not written as a formula."
     if written:

@@ -24,6 +24,7 @@ from markupsafe import Markup
 from siq.data.states import RecordStates
 from siq.inference.field_estimate import DiffusionSource, FieldEstimate
 from siq.numerics.text import range_text, unit_text, value_text
+from siq.quasipotential.certificate import Certificate
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import sentences_without_landscape
 from siq.quasipotential.wells import Well
@@ -80,6 +81,14 @@ class StudyResults:
     system: Dynamics | None = None  #: f and D that were given as equations; None of recordings
     certificate: Mapping[str, Any] | None = None  #: of the formulas of these
 
+    @property
+    def rung(self) -> int:
+        """Of the ladder of answers, see `siq.quasipotential.certificate.Certificate.rung`."""
+        found = self.certificates.get(str(self.shown[1]))
+        certificate = Certificate.from_data(found) if found and found.get("tests") else None
+        hidden = self.record is not None and self.record.hidden_velocities
+        return Certificate.rung(certificate, self.seen, hidden=hidden)
+
     def table(self, name: str) -> pd.DataFrame | None:
         """A table that has rows, None otherwise."""
         found = self.tables.get(name)
@@ -111,7 +120,6 @@ def study_page(
     (run, method), summary, given = results.shown, results.landscape, results.system
     several, beside_paper = study.runs > 1, study.published is not None
     certificate = results.certificates.get(str(method))
-    certified = certificate is not None and bool(certificate["certified"])
     noises = () if study.landscape is None else study.landscape.noise_intensities
     headings, table = texts("help")["headings"], results.table
     record, compared, landscape = table("record"), table("beside_equations"), table("landscape")
@@ -144,7 +152,7 @@ def study_page(
         origin=origin,
         help=texts("help"),
         words=texts("certificate"),
-        answer=_answer(results, certified=certified),
+        answer=_answer(results),
         certificate=certificate if summary is None else summary.stating(certificate),
         lead=lead,
         figures=figures,
@@ -241,7 +249,7 @@ def _figures(
     return parts, ReportFigure(text, text, images[lead], "png", results.vectors.get(lead))
 
 
-def _answer(results: StudyResults, *, certified: bool) -> list[str]:
+def _answer(results: StudyResults) -> list[str]:
     """The sentence, and what has to be known of it."""
     summary, outcomes = results.landscape, results.tables["outcomes"].fillna({"reason": ""})
     if results.system is not None and summary is None:
@@ -254,7 +262,7 @@ def _answer(results: StudyResults, *, certified: bool) -> list[str]:
         )
         return sentences_without_landscape(reason, results.seen)
     assert summary is not None
-    return answer_lines(summary, seen=results.seen, certified=certified)
+    return answer_lines(summary, seen=results.seen, certified=results.rung == 6)
 
 
 def answer_data(page: ReportContent, study: Study, results: StudyResults) -> dict[str, Any]:
@@ -278,6 +286,7 @@ def answer_data(page: ReportContent, study: Study, results: StudyResults) -> dic
     return {
         "title": page.title, "sentence": page.answer[0], "certified": how, "formulas": formulas,
         "runs": study.runs, "failed": failed,
+        "rung": results.rung,
         "states": len(results.seen.counts) if results.seen is not None and results.seen.supported else 0,
     }  # fmt: skip
 

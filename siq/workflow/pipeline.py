@@ -397,9 +397,7 @@ def landscape_from_recordings(
         settings = replace(settings, identification=identification)
     analysis = analyse(trajectories, settings)
     found = None if analysis.landscape is None else analysis.landscape.result
-    certified = found is not None and found.certificate is not None and found.certificate.certified
-    whole = certified and found is not None and len(found.attractors) > 1
-    seen = None if whole else RecordStates.of(joined(trajectories))
+    seen = RecordStates.of(joined(trajectories))
     if found is None:
         raise NoLandscape(why_no_landscape(analysis.outcomes), seen, analysis.dynamics)
     return replace(found, recorded_states=seen)

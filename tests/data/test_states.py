@@ -105,8 +105,23 @@ def states_of_noise(path: np.ndarray) -> RecordStates:
 def test_a_record_whose_stays_change_ends_on_the_first_rung() -> None:
     pair = np.array([[-0.1, 0.1], [0.02, -0.02]])
     found = states_of_noise(np.concatenate([chain(2, pair, 4000), chain(3, pair[::-1, ::-1], 4000)]))
-    assert found.rung == 1 and found.limit == Remark("data.not_stationary")
+    assert found.rung == 1 and found.limit == Remark("data.not_stationary", {"period": None, "unit": None})
     assert found.profile is None and found.markov is None
+
+
+def test_a_record_that_swings_ends_on_the_first_rung_with_its_period() -> None:
+    path = chain(4, np.array([[-0.02, 0.02], [0.02, -0.02]]), 4000)
+    swing = 0.05 * np.sin(2 * np.pi * np.arange(len(path)) / 25)
+    found = found_in(path + swing + 0.1 * noise(5, len(path)))
+    assert found.rung == 1 and found.limit is not None
+    assert found.limit.values["period"] == pytest.approx(25, rel=0.02)
+
+
+def test_stays_that_are_too_regular_make_no_markov_model() -> None:
+    lengths = np.ceil(np.random.default_rng(6).gamma(6, 15, 80)).astype(int)
+    found = states_of_noise(np.repeat(np.arange(80) % 2, lengths))
+    assert found.rung == 2 and found.limit == Remark("data.not_markov")
+    assert found.exponential == (False, False)
 
 
 def test_hops_that_depend_on_what_was_not_recorded_end_on_the_second_rung() -> None:
