@@ -418,7 +418,8 @@ def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) ->
 def parents_of(recordings: Recordings, recording: np.ndarray) -> tuple[np.ndarray, float]:
     """Of pairs from these recordings, ``(n,)``, those that each is from or a copy of; and the mean of copies.
 
-    A pair that stands m times counts with weight m, but has only one residual: variances grow by the mean of m.
+    A pair that stands m times counts with weight m, but has only one residual: variances grow by the
+    mean of m.
     """
     parents = parent_recordings(recordings.labels)
     among = np.unique(recording)
