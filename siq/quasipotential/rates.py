@@ -37,16 +37,14 @@ relative error of E[τ] has three parts: that from f; ΔU/ε times the relative 
 estimated and the path runs along one state (`EscapeRate.leverage`); and that of the law itself. A well
 is left over every one of its saddles, and the rates add.
 
-**Correction.** For a constant D and ``f = -D∇V`` the next order is Laplace's: with U₂, U₃ and U₄ the
-derivatives of U, C = U₂⁻¹, and
+**Correction.** For a constant D and ``f = -D∇V`` the next order is Laplace's, with C = (∇²U)⁻¹ and
 
-    c(x) = -⅛ U₄_iikk + ⅛ U₃_iik U₃_jjk + ¹⁄₁₂ U₃_ijk U₃_ijk    (all indices contracted by C),
+    c = -⅛ ∇⁴U_iikk + ⅛ ∇³U_iik ∇³U_jjk + ¹⁄₁₂ ∇³U_ijk ∇³U_ijk    (indices contracted by C):
 
-E[τ] gains ``exp(ε (c(A) - c(S)))``. In one state that is exact to this order, and what is left is about ε/ΔU
-of it. In several states λ changes to the same order, by what couples the unstable direction of S to others:
-then the error is as large as the correction. Where f is not of this kind its antisymmetric share s takes as
-much of the correction away, and leaves ``s ε/ΔU`` as the error. Without a correction the law is off by 0.28
-ε/ΔU for a cubic V, 0.375 for a quartic, 0.5 for a cosine.
+E[τ] gains ``exp(ε (c(A) - c(S)))``, 0.28 ε/ΔU for a cubic V, 0.375 for a quartic, 0.5 for a cosine. In one
+state that is exact, and what is left is about ε/ΔU of it. In several λ changes to the same order, by what
+couples the unstable direction of S to others: the error is as large as the correction. Where f is not of this
+kind its antisymmetric share s takes as much of the correction away, and leaves ``s ε/ΔU``.
 
 References
 ----------
