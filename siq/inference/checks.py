@@ -308,7 +308,8 @@ def unexplained_probability(
         probability = scipy.special.chdtrc(count, explained / variance)
     else:
         left = (len(rest) if freedom is None else freedom) - count
-        ratio = (explained / count) / (((rest**2).sum(axis=0) - explained) / left)
+        with np.errstate(divide="ignore"):  # where columns explain everything
+            ratio = (explained / count) / (((rest**2).sum(axis=0) - explained) / left)
         probability = scipy.special.fdtrc(count, left, ratio)
     return float(min(probability.min() * rest.shape[1], 1.0))
 

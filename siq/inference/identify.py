@@ -159,7 +159,7 @@ def identify(
         reason, claim = str(error) if failed else SINGULAR, error.claim if failed else ""
         rounding = rounding_text(recordings, coarse=True)
         reason = reason if rounding is None else f"{reason}; mind that {rounding}"
-        if (repeated := repeated_text(recordings, limit=case.limits.each)) is not None:
+        if not claim and (repeated := repeated_text(recordings, limit=case.limits.each)) is not None:
             reason, claim = (
                 f"{repeated}; {reason}",
                 "gaussian_increments",

@@ -224,9 +224,9 @@ class _PairRegression:
         h = self.h[some]
         _, spread = flow.moments(lambda x: matrix @ self._terms(x), self.x0[:, some], h, guess)
         kept = np.isfinite(spread).all(axis=(1, 2))
-        if not kept.any():  # a trial f that runs away everywhere
+        seen = (spread / h[:, None, None])[kept].mean(axis=0) if kept.any() else np.zeros_like(guess)
+        if not np.linalg.eigvalsh(seen)[0] > 0:  # a trial f that runs away
             return rest
-        seen = (spread / h[:, None, None])[kept].mean(axis=0)
         root = np.linalg.cholesky(guess) @ np.linalg.inv(np.linalg.cholesky(seen))
         return np.asarray(root @ rest @ root.T)
 
@@ -298,13 +298,13 @@ def _fit_everything(
         if flow is None or ratio > NOISE_FREE:
             tolerance, forced = 1e-10 if ratio < 1e-2 else 1e-6, rate if ratio > NOISE_FREE else None
             flow = regression.flow(values, forced, integrator_step=integrator_step, tolerance=tolerance)
+            if flow.coarse:
+                _refuse_forgotten(regression.pairs)
         elif settled:
             break
         if ratio > 0.1 and done >= 3:
             break  # noise hides what further rounds would change
     assert flow is not None and rate is not None
-    if flow.coarse:
-        _refuse_forgotten(regression.pairs)
     return triangle, rate, ratio, flow
 
 
