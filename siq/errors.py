@@ -71,7 +71,16 @@ class NumericalFailure(ArithmeticError):
 
     Not the user's file but the numbers are at fault; the message says what happened. A run that fails so
     is kept in every table as failed. Compare `InputError`.
+
+    Parameters
+    ----------
+    claim
+        Which claim on the recordings fails, by its name in a certificate, where that is the reason.
     """
+
+    def __init__(self, *told: object, claim: str = "") -> None:
+        super().__init__(*told)
+        self.claim = claim
 
 
 class MissingExtra(ImportError):

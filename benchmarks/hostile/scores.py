@@ -121,7 +121,8 @@ def answer(recordings: Recordings) -> tuple[Landscape | None, Score]:
         score.codes = [name for name, verdict in certificate.tests.items() if not verdict.passed]
         reasons = [certificate.reason, *reasons]
     elif identified is None:
-        score.codes = ["no_dynamics"]
+        refused = [one.details["claim"] for one in analysis.outcomes if "claim" in one.details]
+        score.codes = ["no_dynamics", *refused]
     if landscape is None:
         score.codes.append("no_landscape")
     if identified is not None and identified.diagnosis is not None:

@@ -1,7 +1,7 @@
 """Do the estimator's standard errors cover, whatever the ratio of the two noises?
 
     python -m benchmarks.laboratories.coverage [--seeds 200] [--estimator NAME ...]
-    python -m benchmarks.laboratories.coverage --landscapes [--seeds 200]
+    python -m benchmarks.laboratories.coverage --landscapes [--first 0] [--seeds 200]
 
 The ratio is R/(Qh): the variance of the sensor over that of the process noise within a step. A linear system
 and a double well, of which f has free coefficients, and both noises are unknown. The bar is 90 to 98 % of all
@@ -10,7 +10,8 @@ coefficients within 1.96 of their standard errors. What has not converged counts
 With ``--landscapes`` it is asked of what a user reads: coefficients of f, ε, positions of wells, barriers
 ΔU/ε and mean times, by their intervals of 68 and 95 %. Each seed is a laboratory of its own (`drawn`): tilted
 double wells of one state, or of two with a force that circulates, recorded coarsely or finely, with and
-without a noisy sensor, long enough for one passage from well to well or for forty.
+without a noisy sensor, long enough for one passage from well to well or for forty. Parts that begin at
+another seed may be made side by side: each has a file, and the table is of all that are in the folder.
 """
 
 from __future__ import annotations
@@ -350,6 +351,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Estimate what is missing, and say what came out."""
     parser = argparse.ArgumentParser(prog="benchmarks.laboratories.coverage")
     parser.add_argument("--seeds", type=int, default=200)
+    parser.add_argument("--first", type=int, default=0, help="the first seed, of landscapes")
     parser.add_argument("--ratios", type=float, nargs="+", default=list(RATIOS))
     parser.add_argument("--systems", nargs="+", default=list(SYSTEMS), choices=list(SYSTEMS))
     parser.add_argument("--estimator", nargs="+", default=list(ESTIMATORS), choices=list(ESTIMATORS))
@@ -359,13 +361,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     chosen = parser.parse_args(arguments)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     if chosen.landscapes:
-        file = chosen.folder / "landscapes.json"
+        file = chosen.folder / f"landscapes-{chosen.first}.json"
         found = read(file)
-        for seed in range(chosen.seeds):
+        for seed in range(chosen.first, chosen.seeds):
             if str(seed) not in found:
                 found[str(seed)] = landscape_figures(seed)
                 write(file, found)
-        print(landscape_table({str(seed): found[str(seed)] for seed in range(chosen.seeds)}))
+        parts = [read(each) for each in sorted(chosen.folder.glob("landscapes*.json"))]
+        print(landscape_table({seed: one for part in parts for seed, one in part.items()}))
         return
     print(HEAD, flush=True)
     with ProcessPoolExecutor(chosen.cores) as pool:

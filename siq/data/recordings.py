@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -290,10 +290,12 @@ class SnapshotPairs:
     xh: np.ndarray  #: (n, d): the later state
     h: np.ndarray  #: (n,): the time between the two
     recording: np.ndarray  #: (n,): the index of the recording that the pair is from
+    copies: float = field(default=1.0, kw_only=True)  #: how often a pair stands there, in the mean over pairs
 
     def take(self, rows: np.ndarray) -> SnapshotPairs:
         """Some of the pairs, by their indices or by a mask."""
-        return SnapshotPairs(self.x0[rows], self.xh[rows], self.h[rows], self.recording[rows])
+        parts = self.x0[rows], self.xh[rows], self.h[rows], self.recording[rows]
+        return SnapshotPairs(*parts, copies=self.copies)
 
 
 def read_recordings(
@@ -408,12 +410,20 @@ def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) ->
     if not keep.any():
         limit = "" if pair_step is None else f" that are at most pair_step = {pair_step} apart"
         raise ValueError(f"no recording has two consecutive samples{limit}")
-    return SnapshotPairs(
-        x0=recordings.values[:-1][keep],
-        xh=recordings.values[1:][keep],
-        h=gap[keep],
-        recording=parent_recordings(recordings.labels)[recording[:-1][keep]],
-    )
+    parents, copies = parents_of(recordings, recording[:-1][keep])
+    x0, xh = recordings.values[:-1][keep], recordings.values[1:][keep]
+    return SnapshotPairs(x0, xh, gap[keep], parents, copies=copies)
+
+
+def parents_of(recordings: Recordings, recording: np.ndarray) -> tuple[np.ndarray, float]:
+    """Of pairs from these recordings, ``(n,)``, those that each is from or a copy of; and the mean of copies.
+
+    A pair that stands m times counts with weight m, but has only one residual: variances grow by the
+    mean of m.
+    """
+    parents = parent_recordings(recordings.labels)
+    among = np.unique(recording)
+    return parents[recording], float(np.bincount(parents[among])[parents[recording]].mean())
 
 
 @lru_cache(maxsize=16)

@@ -28,7 +28,7 @@ from siq.data.correlation import decimals_of, resolution_step, rounding_error
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.inference.diffusion_model import process_noise_increments
 from siq.inference.field_estimate import HARMLESS_BIAS, NOISE_FREE, FieldEstimate, NoiseDiagnosis, Verdict
-from siq.inference.regression import LaggedPairs, copies, refit, residuals, weighted_triangle
+from siq.inference.regression import LaggedPairs, refit, residuals, weighted_triangle
 from siq.numerics.integration import runge_kutta_step
 from siq.numerics.randomness import positive
 from siq.remarks import Remark, sentence
@@ -308,7 +308,8 @@ def unexplained_probability(
         probability = scipy.special.chdtrc(count, explained / variance)
     else:
         left = (len(rest) if freedom is None else freedom) - count
-        ratio = (explained / count) / (((rest**2).sum(axis=0) - explained) / left)
+        with np.errstate(divide="ignore"):  # where columns explain everything
+            ratio = (explained / count) / (((rest**2).sum(axis=0) - explained) / left)
         probability = scipy.special.fdtrc(count, left, ratio)
     return float(min(probability.min() * rest.shape[1], 1.0))
 
@@ -322,11 +323,9 @@ def mean_residual_probability(found: FieldEstimate, pairs: SnapshotPairs, *, see
     library, inflation = found.library, 1 + (len(pairs.h) / seen if seen else 0.0)
     if isinstance(pairs, LaggedPairs):
         rest = residuals(found, pairs)
-        spread = np.diag(found.noise_rate) * float(np.median(pairs.h)) * copies(pairs)
+        spread = np.diag(found.noise_rate) * float(np.median(pairs.h)) * pairs.copies
         return unexplained_probability(pairs.directions(library), rest, variance=spread, inflation=inflation)
-    # Copies of resampled recordings would count as evidence that there is not.
-    _, single = np.unique(np.column_stack([pairs.x0, pairs.xh]), axis=0, return_index=True)
-    pairs = pairs.take(single)
+    inflation *= pairs.copies  # copies of resampled recordings are no evidence
     if not found.diffusion.constant:
         triangle = weighted_triangle(found, pairs, None, of_rest=True)[0]
         freedom = len(pairs.h) * library.dimension

@@ -35,6 +35,7 @@ from siq.inference.checks import (
     residual_noise,
     rounding_text,
 )
+from siq.inference.claims import check_claims
 from siq.inference.diffusion_model import (
     ResidualLikelihood,
     check_units,
@@ -77,6 +78,7 @@ SUSPECT_SCORE = -1.0  # standard errors of the correlation of neighbouring resid
 SENSOR_SHARE = 0.1  # of what means move by: a search finds its way down to no sensor noise, but not up
 MIN_SHARE, MAX_SHARE = 1e-3, 0.45  # of the residuals' variance: a sensor's share that a fit begins with
 WHOLE_STEP_TOLERANCE = 0.05  # of an exposure, as exactly as residuals show it of some thousand samples
+SINGULAR = "the recordings do not determine f; record more, or more often"
 PREDICTED_RECORDINGS = 200  # held-out ones that are predicted: enough for a median
 
 
@@ -166,14 +168,16 @@ def identify(
                 found = replace(found, prediction=replace(found.prediction, passed=False, reason=reason))
         return found
     except (NumericalFailure, np.linalg.LinAlgError) as error:
+        failed = isinstance(error, NumericalFailure)
+        reason, claim = str(error) if failed else SINGULAR, error.claim if failed else ""
         rounding = rounding_text(recordings, coarse=True)
-        reason = str(error) if rounding is None else f"{error}; mind that {rounding}"
-        if (repeated := repeated_text(recordings, limit=case.limits.each)) is not None:
-            reason = f"{reason}; {repeated}"
+        reason = reason if rounding is None else f"{reason}; mind that {rounding}"
+        if not claim and (repeated := repeated_text(recordings, limit=case.limits.each)) is not None:
+            reason, claim = f"{repeated}; {reason}", "gaussian_increments"  # a cause, and what follows
         advice = case.advice(hidden=hidden)
         if not hidden and advice is not None and (by_velocities := case.with_velocities()) is not None:
             return by_velocities
-        raise NumericalFailure(reason if advice is None else f"{reason}; {advice}") from error
+        raise NumericalFailure(reason if advice is None else f"{reason}; {advice}", claim=claim) from error
 
 
 @dataclass
@@ -236,7 +240,14 @@ class _Case:
             again = self.by_likelihood(ObservationModel(self.library, found.diffusion), noise)
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             if ((score < -SIGNIFICANT_SCORE) & (correlation < -HARMLESS_CORRELATION)).any():
-                raise NumericalFailure(f"the sensor is noisy, and f with it is not found: {error}") from None
+                reason, claim = (
+                    f"the sensor is noisy, and f with it is not found: {error}",
+                    "gaussian_increments",
+                )
+                tests = check_claims(found, self.recordings, self.recordings, false_alarms=self.limits.each)
+                if tests[claim].passed:
+                    raise NumericalFailure(reason) from None
+                raise NumericalFailure(f"{tests[claim].reason}; {reason}", claim=claim) from None
             return None
         assert again.diagnosis is not None and again.diagnosis.sensor_evidence is not None
         return self.finished(again) if again.diagnosis.sensor_evidence > 1 else None

@@ -28,7 +28,7 @@ import numpy as np
 import scipy.linalg
 from scipy.special import erfc
 
-from siq.data.recordings import Recordings, SnapshotPairs, parent_recordings
+from siq.data.recordings import Recordings, SnapshotPairs, parents_of
 from siq.data.stationarity import even_stretches, lagged_covariances, long_run_covariance
 from siq.errors import NumericalFailure
 from siq.inference.diffusion_model import ResidualLikelihood
@@ -107,8 +107,9 @@ def lagged_pairs(recordings: Recordings, lag: int) -> LaggedPairs:
         )
     now = at + lag
     x, t = recordings.values, recordings.t
-    recording = parent_recordings(recordings.labels)[recordings.recording[now]]
-    return LaggedPairs(x[now], x[now + 1], t[now + 1] - t[now], recording, x[at], stretches.number[now], lag)
+    parents, copies = parents_of(recordings, recordings.recording[now])
+    own = x[at], stretches.number[now], lag
+    return LaggedPairs(x[now], x[now + 1], t[now + 1] - t[now], parents, *own, copies=copies)
 
 
 def coarse_pairs(recordings: Recordings, lag: int, *, lost: float) -> SnapshotPairs:
@@ -125,8 +126,8 @@ def coarse_pairs(recordings: Recordings, lag: int, *, lost: float) -> SnapshotPa
     at = at[(np.arange(len(at)) - begins[which]) % lag == 0]
     x, t = recordings.values, recordings.t
     h = np.maximum(t[at + lag] - t[at] - lost, 0.5 * stretches.step)
-    recording = parent_recordings(recordings.labels)[recordings.recording[at]]
-    return SnapshotPairs(x[at], x[at + lag], h, recording)
+    parents, copies = parents_of(recordings, recordings.recording[at])
+    return SnapshotPairs(x[at], x[at + lag], h, parents, copies=copies)
 
 
 def lost_time(found: FieldEstimate, given: LaggedPairs) -> float:
@@ -223,10 +224,8 @@ class _PairRegression:
         h = self.h[some]
         _, spread = flow.moments(lambda x: matrix @ self._terms(x), self.x0[:, some], h, guess)
         kept = np.isfinite(spread).all(axis=(1, 2))
-        if not kept.any():  # a trial f that runs away everywhere
-            return rest
-        seen = (spread / h[:, None, None])[kept].mean(axis=0)
-        if not np.linalg.eigvalsh(seen)[0] > 0:  # likewise
+        seen = (spread / h[:, None, None])[kept].mean(axis=0) if kept.any() else np.zeros_like(guess)
+        if not np.linalg.eigvalsh(seen)[0] > 0:  # a trial f that runs away
             return rest
         root = np.linalg.cholesky(guess) @ np.linalg.inv(np.linalg.cholesky(seen))
         return np.asarray(root @ rest @ root.T)
@@ -279,15 +278,6 @@ class _PairRegression:
         return inverse @ (whiten @ goals.T).ravel(), inverse, scale
 
 
-def copies(pairs: SnapshotPairs) -> float:
-    """Factor by which copies of resampled recordings make pairs look more than they are: 1 without any.
-
-    A pair that stands m times counts with weight m, but has only one residual: variances grow by Σm²/Σm.
-    """
-    _, counts = np.unique(np.column_stack([pairs.x0, pairs.xh]), axis=0, return_counts=True)
-    return float((counts**2).sum() / counts.sum())
-
-
 def _fit_everything(
     regression: _PairRegression, *, integrator_step: float | None
 ) -> tuple[np.ndarray, np.ndarray, float, FlowMap]:
@@ -308,13 +298,13 @@ def _fit_everything(
         if flow is None or ratio > NOISE_FREE:
             tolerance, forced = 1e-10 if ratio < 1e-2 else 1e-6, rate if ratio > NOISE_FREE else None
             flow = regression.flow(values, forced, integrator_step=integrator_step, tolerance=tolerance)
+            if flow.coarse:
+                _refuse_forgotten(regression.pairs)
         elif settled:
             break
         if ratio > 0.1 and done >= 3:
             break  # noise hides what further rounds would change
     assert flow is not None and rate is not None
-    if flow.coarse:
-        _refuse_forgotten(regression.pairs)
     return triangle, rate, ratio, flow
 
 
@@ -326,11 +316,12 @@ def _refuse_forgotten(pairs: SnapshotPairs) -> None:
     """
     halves = [np.linalg.qr(x - x.mean(axis=0))[0] for x in (pairs.x0, pairs.xh)]
     last = float(np.linalg.svd(halves[0].T @ halves[1], compute_uv=False)[-1])
-    count = len(pairs.h) / copies(pairs)
+    count = len(pairs.h) / pairs.copies
     if erfc(np.sqrt(-count * np.log1p(-(min(last, 1 - 1e-12) ** 2)) / 2)) > FORGOTTEN:
         raise NumericalFailure(
             f"within a step the state forgets where it was (a correlation of {last:.2g} is left, chance makes"
-            f" {count**-0.5:.2g}), so that any fast f explains the recordings; record more often"
+            f" {count**-0.5:.2g}), so that any fast f explains the recordings; record more often",
+            claim="prediction",
         )
 
 
@@ -395,7 +386,7 @@ def identify_vector_field(
     triangle, rate, ratio, flow = _fit_everything(regression, integrator_step=integrator_step)
     noise_free = ratio < NOISE_FREE
     critical = critical_values(library, false_terms=options.false_terms)
-    samples = len(pairs.h) / (1.0 if noise_free else copies(pairs))
+    samples = len(pairs.h) / (1.0 if noise_free else pairs.copies)
     problems = LinearProblem.of_components(triangle, samples=samples, critical=critical)
     choose = partial(strong_terms, precision=options.precision) if noise_free else best_support
     chosen, noise = chosen_terms(problems, library, choose), Diffusion.identity(library.dimension)
@@ -445,7 +436,7 @@ def _fit_support(found: FieldEstimate, regression: _PairRegression) -> FieldEsti
         # alike in neighbouring pairs and do not average out, hence the number of pairs.
         covariance = covariance * (float(np.trace(np.linalg.solve(spread, rest))) / d) * n
     else:
-        covariance = covariance * copies(regression.pairs)
+        covariance = covariance * regression.pairs.copies
     return found.with_values(
         found.support, values, covariance=covariance, noise_rate=rate,
         residual_ratio=regression.residual_ratio(rest), flow=flow,
@@ -468,7 +459,7 @@ def refit(found: FieldEstimate, pairs: SnapshotPairs) -> FieldEstimate:
         values = np.linalg.lstsq(triangle[:, :-1] / scale, triangle[:, -1], rcond=None)[0] / scale
         found = found.with_values(found.support, values)
     inverse = np.linalg.pinv(triangle[:, :-1] / scale) / scale[:, None]
-    return replace(found, covariance=intensity * copies(pairs) * inverse @ inverse.T)
+    return replace(found, covariance=intensity * pairs.copies * inverse @ inverse.T)
 
 
 def residuals(found: FieldEstimate, pairs: SnapshotPairs) -> np.ndarray:
@@ -493,7 +484,7 @@ def with_stability(
     blocks = blocks_of(pairs.recording[order])
     parts = triangles((regression.theta.T * weight)[order], (velocity * weight)[order], blocks)
     critical = critical_values(found.library, false_terms=options.false_terms)
-    samples = len(pairs.h) / copies(pairs)
+    samples = len(pairs.h) / pairs.copies
     problems_of = partial(LinearProblem.of_components, samples=samples, critical=critical)
     return replace(found, stability=stability(parts, problems_of, found.support, generator=generator))
 
@@ -540,7 +531,7 @@ def _identify_weighted(found: FieldEstimate, pairs: SnapshotPairs, *, false_term
     library, (triangle, intensity) = found.library, weighted_triangle(found, pairs, None)
     critical = np.tile(critical_values(library, false_terms=false_terms), library.dimension)
     everything = all_coefficients(range(library.dimension), library.size)
-    variance = intensity * copies(pairs)
+    variance = intensity * pairs.copies
     problem = LinearProblem(triangle[:, :-1], triangle[:, -1], variance, critical, everything)
     support = chosen_terms([problem], library)
     start = np.linalg.lstsq(triangle[:, problem.places(support)], triangle[:, -1], rcond=None)[0]
@@ -600,7 +591,7 @@ def _identify_by_instruments(
         values = (solution @ (directions.T @ moved)).T.ravel()
         flow = regression.flow(values, None, tolerance=1e-6)
     rest = moved - regression.predicted(values) * h
-    variances = np.diag(pairs.long_run(rest) * copies(pairs))
+    variances = np.diag(pairs.long_run(rest) * pairs.copies)
     columns, goals = directions.T @ (regression.theta * pairs.h).T, directions.T @ moved
     critical = critical_values(library, false_terms=options.false_terms)
     problems = [
@@ -641,7 +632,7 @@ def _fit_by_instruments(
             break
     assert flow is not None
     size, rate = positive(((pairs.xh - pairs.x0) ** 2).mean(axis=0)), spread / float(np.median(pairs.h))
-    ratio, covariance = np.sqrt(((rest**2).mean(axis=0) / size).mean()), inverse @ inverse.T * copies(pairs)
+    ratio, covariance = np.sqrt(((rest**2).mean(axis=0) / size).mean()), inverse @ inverse.T * pairs.copies
     support = regression.support
     return FieldEstimate.on_support(
         regression.library, support, values, covariance, rate, float(ratio), flow, diffusion

@@ -103,9 +103,12 @@ TRANSITION = (
     )
     | _fields(REMARKS, "remarks")
 )
-LAW = _fields(KNOWN, "prefactor", "prefactor_error", "exponent", prefactor_covariance="covariance") | _fields(
-    REMARKS, law_remarks="remarks"
+LAW = (
+    _fields(KNOWN, "prefactor", "prefactor_error", "exponent", prefactor_covariance="covariance")
+    | _fields(PLAIN, "correction", "unknown")
+    | _fields(REMARKS, law_remarks="remarks")
 )
+OLDER_LAW = {"correction": 0.0, "unknown": 1.0}  # of files from before there was one
 TURN = _fields(PLAIN, own="loss", beyond="loss_beyond", exact="particle")
 WAY = _fields(PLAIN, minimum_action="action") | _fields(ARRAY, "downhill", uphill="points")
 PATH = (
@@ -206,7 +209,7 @@ def landscape_from_data(data: Mapping[str, Any], dynamics: Dynamics) -> Landscap
             path = MinimumActionPath(**_read(one, WAY), **_read(one["path"], PATH))
         if one["prefactor"] is not None:
             turn = {} if one["turn"] is None else _read(one["turn"], TURN)
-            rate = EscapeRate(one["minimum_action"], **_read(one, LAW), **turn)
+            rate = EscapeRate(one["minimum_action"], **_read(OLDER_LAW | one, LAW), **turn)
         from_cycle = isinstance(attractors[one["start"]], Cycle)
         own = _read({"of_residual": 0.0} | one, TRANSITION)
         way = Transition(saddle=saddle, path=path, rate=rate, from_cycle=from_cycle, **own)

