@@ -198,8 +198,8 @@ def main(chosen: Sequence[str]) -> None:
     pairs = product(range(RUNS), range(len(ABLATIONS)))
     if chosen:
         pairs = product([int(chosen[0])], map(int, chosen[1:]))
-    before, warm = kept(), False
-    seconds = {(one.ablation, one.run): one.cpu_seconds for one in before.itertuples()}
+    before: list[Any] = kept().to_dict("records")
+    seconds, warm = {(one["ablation"], one["run"]): one["cpu_seconds"] for one in before}, False
     for number, place in pairs:
         ablation = ABLATIONS[place]
         if (ablation.name, number) in seconds:
