@@ -363,7 +363,7 @@ def test_paths_that_run_away_are_infinite() -> None:
 def test_a_minimum_beside_the_attractor_does_not_count_for_as_long_as_paths_rest_there(
     known: KnownSystem, shift: float
 ) -> None:
-    """V moved as a whole, as noise does it: the bound is of the size of the shift, and no multiple of time."""
+    """V moved as a whole, as by noise: the bound is of the size of the shift, and no multiple of time."""
     attractor = portrait_of(known, 300, share=0.6).attractors[-1]
     x = right_well(known) if len(known.attractors) == 2 else uniform_points(known, 150)
     moved = Candidate(
