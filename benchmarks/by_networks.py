@@ -91,7 +91,7 @@ def table(name: str) -> None:
     compared = [each for each in agreements if each["passed"]]
     print(f"{len(runs)} runs, the networks' U agrees in {len(compared)}")
     for each in agreements:
-        print("  difference {value}, explained {limit}: {reason}".format(**each))
+        print(f"  difference {each['value']}, explained {each['limit']:.3f} {each['reason']}")
     refused = sum(not one["agreement"]["passed"] for one in controls if one)
     print(f"the control is refused in {refused} of {len(controls)}")
     for key in runs[0]["seconds"]:
@@ -100,15 +100,15 @@ def table(name: str) -> None:
     columns = ["rrmse", "network_error", "stated_error", "support_correct", "certified"]
     print(errors.groupby("method")[columns].agg(["mean", "max"]).T.to_string())
     rows = pd.DataFrame([row for one in runs for row in one["coefficients"]])
+    rows = rows[rows["component"].str.match("U|g_")]
     exact = rows[rows["exact"].fillna(0) != 0]
     exact = exact.assign(off=(exact["estimate"] / exact["exact"] - 1).abs())
     groups = exact.groupby(["method", "component", "term"], sort=False)["off"]
     told = groups.agg(rms=lambda off: np.sqrt((off**2).mean()), worst="max")
     print((100 * told).round(2).to_string())
     right = (rows["estimate"] != 0) == (rows["exact"] != 0)
-    known = rows["component"].str.match("U|g_") & ((rows["component"] != "U") | (rows["term"] != "1"))
-    letters = rows["component"].str[0]
-    by_run = right[known].groupby([rows["method"], letters, rows["run"]]).all()
+    right |= (rows["component"] == "U") & (rows["term"] == "1")  # which follows from the others
+    by_run = right.groupby([rows["method"], rows["component"].str[0], rows["run"]]).all()
     print(by_run.groupby(level=[0, 1]).agg(["sum", "size"]).to_string())
 
 
