@@ -54,8 +54,10 @@ def made(name: str, number: int) -> dict[str, Any]:
     refined = refine_run(settings, recordings, identified, trained, regressed)
     spent.append(time.process_time())
     scores = score_run(
-        settings, {**refined.formulas}, {**refined.certificates}, trained.result,
-        number=number, system=system, exact=exact_answer(card),
+        settings,
+        {str(method): found for method, found in refined.formulas.items()},
+        {str(method): told for method, told in refined.certificates.items()},
+        trained.result, number=number, system=system, exact=exact_answer(card),
     )  # fmt: skip
     steps = ("identify", "train", "regress", "refine", "score")
     return {

@@ -161,8 +161,8 @@ class _Batches:
         pairs = [_table(run.held_out)[evenly(len(run.held_out.h))] for run in self.data]
         rows = [run.representative_rows[evenly(len(run.representative_rows))] for run in self.data]
         points = [torch.from_numpy(run.training.x0[some]) for run, some in zip(self.data, rows, strict=True)]
-        kind = {"device": self.device, "dtype": self.dtype}
-        return torch.stack(pairs).to(**kind), torch.stack(points).to(**kind)
+        kind = (self.device, self.dtype)
+        return torch.stack(pairs).to(*kind), torch.stack(points).to(*kind)
 
     def _draw(self, chunk: int) -> Tensor:
         """Rows of a chunk of steps, shape ``(runs, steps, pairs + points)``."""
