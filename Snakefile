@@ -34,7 +34,7 @@ localrules:
 rule statistics:
     default_target: True
     input:
-        expand("results/{study}/report.html", study=statistics_studies()),
+        expand("results/{study}/report.html", study=STUDIES.default_names()),
 
 
 rule examples:

@@ -1,11 +1,13 @@
 """What of a short training makes the difference: one setting at a time is put back, on ten seeds.
 
     .venv/bin/python -m benchmarks.ablations
+    .venv/bin/python -m benchmarks.ablations 3 17
     .venv/bin/python -m benchmarks.ablations --table
 
 The paper's system in three dimensions, runs 0 to 9 of the study ``archetype3d``; every training is a cold
-start. A row goes into ``results/ablations.csv`` as soon as it has ended, and one that is there is not made
-again. ``--table`` prints the table of ``docs/how-the-method-works.md`` from what there is.
+start. Numbers are those of a run and of the ablations to be made of it, for processes side by side. A
+row goes into the folder ``results/ablations``, or that of ``$OUT``, as soon as it has ended, and one that is
+there is not made again. ``--table`` prints the table of ``docs/how-the-method-works.md`` from what there is.
 
 Asked is what output weights say at the first check: that V is right, on a false branch, or nowhere. Then the
 training goes on as in a study. What it ends with is compared with the exact U, which no training sees, and
@@ -18,10 +20,11 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import product
+from pathlib import Path
 from typing import Any, Literal
 
 import pandas as pd
@@ -38,7 +41,7 @@ from siq.quasipotential.refinement import RefinementContext
 from siq.workflow.pipeline import identify_run, regress_run
 from siq.workflow.tables import Outcome, Step, StepResult
 
-TABLE = ROOT / "results" / "ablations.csv"
+TABLES = Path(os.environ.get("OUT", ROOT / "results")) / "ablations"
 WRONG = 0.05  # relative error of U above which V is wrong, whatever anything says of it
 
 
@@ -69,7 +72,6 @@ ABLATIONS = (
     *(Ablation(f"`{name}: {value}`", {name: value}) for name, value in SINGLE),
     Ablation("`normalise_on: pairs` and `potential_gain: 1`", PAPERS_START),
 )
-FIRST = 6  # ablations that are made on all seeds before the others begin
 
 
 class Watched(OutputWeights):
@@ -159,9 +161,15 @@ def row(ablation: Ablation, number: int, *, seconds: float) -> dict[str, Any]:
     return told | judged(networks, told["error"] > WRONG)
 
 
+def kept() -> pd.DataFrame:
+    """All rows that there are."""
+    tables = [pd.read_csv(path, keep_default_na=False) for path in sorted(TABLES.glob("*.csv"))]
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame({"ablation": [], "run": []})
+
+
 def table() -> str:
     """All rows that there are, one line an ablation."""
-    made = pd.read_csv(TABLE, keep_default_na=False)
+    made = kept()
     lines = [
         "| put back | seeds | first check: right, false, nowhere | error of U, median | worst | CPU s |"
         " agrees | wrong | of these agree | certified |",
@@ -180,21 +188,29 @@ def table() -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
+def main(chosen: Sequence[str]) -> None:
     """Measure what is not there yet, or print the table."""
-    if "--table" in sys.argv:
+    if chosen == ["--table"]:
         print(table())
         return
     torch.set_num_threads(1)
-    made: list[Any] = pd.read_csv(TABLE, keep_default_na=False).to_dict("records") if TABLE.exists() else []
-    done = {(one["ablation"], one["run"]): one["cpu_seconds"] for one in made}
-    networks_of(AS_USUAL, judge(0)[0], seconds=0)  # what a first training imports is not to count
-    for number, ablation in [*product(range(RUNS), ABLATIONS[:FIRST]), *product(range(RUNS), ABLATIONS)]:
-        if (ablation.name, number) not in done:
-            made.append(row(ablation, number, seconds=done.get((AS_USUAL.name, number), 0.0)))
-            done[ablation.name, number] = made[-1]["cpu_seconds"]
-            pd.DataFrame(made).to_csv(TABLE, index=False)
+    TABLES.mkdir(parents=True, exist_ok=True)
+    pairs = product(range(RUNS), range(len(ABLATIONS)))
+    if chosen:
+        pairs = product([int(chosen[0])], map(int, chosen[1:]))
+    before: list[Any] = kept().to_dict("records")
+    seconds, warm = {(one["ablation"], one["run"]): one["cpu_seconds"] for one in before}, False
+    for number, place in pairs:
+        ablation = ABLATIONS[place]
+        if (ablation.name, number) in seconds:
+            continue
+        if not warm:  # what a first training imports is not to count
+            networks_of(AS_USUAL, judge(number)[0], seconds=0)
+            warm = True
+        made = row(ablation, number, seconds=seconds.get((AS_USUAL.name, number), 0.0))
+        seconds[ablation.name, number] = made["cpu_seconds"]
+        pd.DataFrame([made]).to_csv(TABLES / f"{number}-{place:02d}.csv", index=False)
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

@@ -1,7 +1,7 @@
 """What agreement of the networks' own V with the refined one tells.
 
     .venv/bin/python benchmarks/agreement.py
-    .venv/bin/python benchmarks/agreement.py --recordings 2
+    .venv/bin/python benchmarks/agreement.py --recordings 2 --system linear
 
 The refined V follows from the identified f, without networks. Here networks are trained on many recordings,
 as studies train them, which ends with output weights, and by steps of descent alone, most of them far too
@@ -98,17 +98,18 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--recordings", type=int, default=5, help="sets of them, for each system")
-    recordings = parser.parse_args().recordings
+    parser.add_argument("--system", choices=SYSTEMS, help="one of the systems alone")
+    asked = parser.parse_args()
     torch.set_num_threads(1)
     began = time.perf_counter()
     print(f"| system | training | trainings | {' | '.join(COUNTED)} |")
     print("|---|---|---|" + "---|" * len(COUNTED))
     total: Counter[str] = Counter()
-    for name, known in SYSTEMS.items():
+    for name in [asked.system] if asked.system else SYSTEMS:
         for how, training in TRAININGS.items():
             counted: Counter[str] = Counter()
-            for number in range(recordings):
-                counted.update(["trainings", *judged(known, training, number)])
+            for number in range(asked.recordings):
+                counted.update(["trainings", *judged(SYSTEMS[name], training, number)])
             total += counted
             row = " | ".join(str(counted[key]) for key in ("trainings", *COUNTED))
             print(f"| {name} | {how} | {row} |", flush=True)

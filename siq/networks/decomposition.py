@@ -88,9 +88,6 @@ class TrainingOptions:
     thinning_distance
         r, the distance between representative points, in the units of the states. Left out: a tenth of
         each state's standard deviation, whatever the units.
-    slowest_share
-        Share of the representative points that train, those where the observed velocities are slowest.
-        Below 1 the networks learn the surroundings of the attractors and leave the fast region far out.
     normalise_on
         The points from which μ, σ, η_v and η_g are estimated. ``pairs``: all training pairs, as the paper
         does. ``representative``: the evenly spread ones. Trajectories crowd at attractors, where f is
@@ -125,7 +122,6 @@ class TrainingOptions:
     relative_dynamics: bool = True
     slow_speed: Annotated[float, Field(gt=0)] | None = None
     thinning_distance: Annotated[float, Field(gt=0)] | None = None
-    slowest_share: Annotated[float, Field(gt=0, le=1)] = 1.0
     normalise_on: Literal["pairs", "representative"] = "representative"
     potential_from: Literal["speed", "descent"] = "speed"
     potential_gain: Annotated[float, Field(gt=0)] = 3.0
@@ -136,10 +132,9 @@ class TrainingOptions:
         """Options of a training that comes after `number` trainings that failed.
 
         What failed once is likelier to succeed in another way than once more: every second training has a λ
-        ten times as large, starts V as steep as f descends, leaves out the faster half of the states, and,
-        where the pairs are free of noise, judges each by its own speed. Which of the two ways a system
-        needs is known of none beforehand: the first fails where f turns much faster than it descends, the
-        second where V is to be steep.
+        ten times as large, starts V as steep as f descends, and, where the pairs are free of noise, judges
+        each by its own speed. Which of the two ways a system needs is known of none beforehand: the first
+        fails where f turns much faster than it descends, the second where V is to be steep.
         """
         if number % 2 == 0:
             return self
@@ -148,7 +143,6 @@ class TrainingOptions:
             orthogonality_weight=10 * self.orthogonality_weight,
             potential_from="descent",
             potential_gain=1.0,
-            slowest_share=0.5 * self.slowest_share,
             slow_speed=(self.slow_speed or 0.1) if self.matching == "symmetric" else self.slow_speed,
         )
 

@@ -121,18 +121,6 @@ def prepare_data(
     return TrainingData(training, held_out, rows)
 
 
-def _slowest_part(data: TrainingData, share: float) -> TrainingData:
-    """Representative points without the fastest ones: a share of them stays, and at least a few do."""
-    if share >= 1:
-        return data
-    # Far out f is often many times faster than about the attractors, and none of what is asked there matters
-    # to the wells. Speeds are measured in standard deviations of the states.
-    pairs = data.representative
-    speed = np.linalg.norm((pairs.xh - pairs.x0) / pairs.h[:, None] / data.training.x0.std(axis=0), axis=1)
-    count = max(int(np.ceil(share * len(speed))), min(FEWEST_REPRESENTATIVE, len(speed)))
-    return replace(data, representative_rows=np.sort(data.representative_rows[np.argsort(speed)[:count]]))
-
-
 class _Batches:
     """Random batches of every run, drawn from its seed and the number of the step.
 
@@ -171,14 +159,10 @@ class _Batches:
             return np.linspace(0, count - 1, HELD_OUT_PAIRS).astype(int)
 
         pairs = [_table(run.held_out)[evenly(len(run.held_out.h))] for run in self.data]
-        points = [
-            torch.from_numpy(run.training.x0[run.representative_rows[evenly(len(run.representative_rows))]])
-            for run in self.data
-        ]
-        pairs_of_runs, points_of_runs = (
-            torch.stack(each).to(self.device, self.dtype) for each in (pairs, points)
-        )
-        return pairs_of_runs, points_of_runs
+        rows = [run.representative_rows[evenly(len(run.representative_rows))] for run in self.data]
+        points = [torch.from_numpy(run.training.x0[some]) for run, some in zip(self.data, rows, strict=True)]
+        kind = (self.device, self.dtype)
+        return torch.stack(pairs).to(*kind), torch.stack(points).to(*kind)
 
     def _draw(self, chunk: int) -> Tensor:
         """Rows of a chunk of steps, shape ``(runs, steps, pairs + points)``."""
@@ -580,7 +564,7 @@ class Block:
         options = self.options.attempt(attempt)
         purpose = Purpose.TRAINING if attempt == 0 else f"{Purpose.TRAINING} {attempt}"
         seeds = [seed_sequence(self.seed, run, purpose) for run in runs]
-        data = [_slowest_part(self.data[run], options.slowest_share) for run in runs]
+        data = [self.data[run] for run in runs]
         file = self._checkpoint(f"attempt{attempt}")
         state = None if file is None else _load_checkpoint(file, fingerprint=self.mark)
         if state is None or state.step > options.steps:  # of a training that was given more steps

@@ -26,7 +26,10 @@ The error of a V with ``R = ∇V·(f + D∇V)``, V* being the true one and both 
 ``dx/dt = f + 2D∇V`` up to x costs the action ``V(x) - ∫R dt``, so that V*(x) is not more; and along the true
 minimum action path Young's inequality gives ``V*(x) ≥ V(x) - ∫R dt``. The first integral can be computed.
 Where residuals are small the two paths are close, and ∫∣R∣ dt over the first, with a factor for safety,
-bounds the error.
+bounds the error. Where V is lowest elsewhere than at the attractor A, paths begin at rest elsewhere, and R
+does not vanish there: that integral grows for as long as they are followed. From any state b on, a path shows
+that ``V*(x) ≤ V*(b) + V(x) - V(b) - ∫R dt``, so that ``V*(b) + ∣V(b) - V(A)∣`` with ∫∣R∣ dt from b on bounds
+the error as well, V*(b) being that of the Hessian at A. The least of these bounds counts.
 """
 
 from __future__ import annotations
@@ -142,19 +145,28 @@ class Candidate:
         dynamics, generator = dynamics_of(found), np.random.default_rng(seed)
         rows = generator.choice(len(self.points), min(ERROR_POINTS, len(self.points)), replace=False)
         x = self.points[rows]
-        places = np.concatenate([self.points, [one.position for one in self.attractors]])
+        attractors = np.array([one.position for one in self.attractors])
+        places, bottoms = np.concatenate([self.points, attractors]), self.values(attractors)
+        hessians = np.array([hessian_at(dynamics, one) for one in attractors])
+
+        def beginning(b: np.ndarray) -> np.ndarray:
+            """V*(b) + ∣V(b) - V(A)∣, by the attractor A for which that is least."""
+            offsets = b[:, None] - attractors
+            expected = np.einsum("nki,kij,nkj->nk", offsets, hessians, offsets) / 2
+            deviation = np.abs(self.values(b)[:, None] - bottoms)
+            return np.asarray((expected + deviation).min(axis=1, keepdims=True))
+
         integral = _residual_integral(
-            self.gradients, dynamics, x,
+            self.gradients, dynamics, x, beginning=beginning,
             box=np.stack([places.min(axis=0), places.max(axis=0)], axis=1),
             slowest=min(-one.eigenvalues.real.max() for one in self.attractors),
             fastest=fastest_rate(dynamics, x, np.ptp(x, axis=0)),
         )  # fmt: skip
         values = self.values(x)
-        lowest = min(float(self.values(one.position[None])[0]) for one in self.attractors)
         reached = np.isfinite(integral)
         if reached.mean() < 0.9:
             return np.inf
-        size = np.linalg.norm(values[reached] - lowest)
+        size = np.linalg.norm(values[reached] - bottoms.min())
         error = SAFETY_FACTOR * float(np.linalg.norm(integral[reached]) / size) if size > 0 else np.inf
         return max(error + STATED_SIGMAS * self.relative_error, MIN_ERROR)
 
@@ -264,14 +276,15 @@ def _check_branch(
 
 
 def _residual_integral(
-    gradient: Function, dynamics: Dynamics, x: np.ndarray, *, box: np.ndarray, slowest: float, fastest: float
-) -> np.ndarray:
+    gradient: Function, dynamics: Dynamics, x: np.ndarray, *, box: np.ndarray, slowest: float, fastest: float,
+    beginning: Function | None = None,
+) -> np.ndarray:  # fmt: skip
     """∫∣∇V·(f + D∇V)∣ dt along the ascending paths to points ``(n, d)``, infinite where one runs away."""
     total, _, lost = ascending_integrals(
         gradient, dynamics, x,
         lambda _, slope, flow, push: np.abs((slope * (flow + push)).sum(axis=1))[:, None],
         middle=box.mean(axis=1), width=box[:, 1] - box[:, 0], slowest=slowest, fastest=fastest,
-        fewest_steps=MIN_PATH_STEPS,
+        fewest_steps=MIN_PATH_STEPS, beginning=beginning,
     )  # fmt: skip
     return np.where(lost, np.inf, total[:, 0])
 

@@ -566,6 +566,7 @@ def ascending_integrals(
     slowest: float,
     fastest: float,
     fewest_steps: int = MIN_PATH_STEPS,
+    beginning: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Integrals over time along the paths ``dx/dt = f + 2D∇V`` that end at points, by Heun's rule.
 
@@ -579,6 +580,9 @@ def ascending_integrals(
         Of the box of the states, shape ``(d,)``: a path that leaves it by `RUNAWAY_WIDTHS` has run away.
     slowest, fastest, fewest_steps
         Rates, and a number of steps, that set how long, and how finely, the paths are followed back.
+    beginning
+        Of points ``(n, d)``: ``(n, 1)`` to be added where a path begins there. Integrals are then the least
+        that they come to, wherever a path begins.
 
     Returns
     -------
@@ -596,6 +600,7 @@ def ascending_integrals(
         return -(flow + 2 * push), (points, slope, flow, push)
 
     beginnings, running, lost = x.copy(), np.arange(len(x)), np.zeros(len(x), dtype=bool)
+    least = np.full((len(x), 1), np.inf)
     with np.errstate(over="ignore", invalid="ignore"):
         velocity, parts = terms(x)
         before = integrand(*parts)
@@ -611,9 +616,11 @@ def ascending_integrals(
             velocity, parts = terms(x)
             after = integrand(*parts)
             total[running] += step / 2 * (before + after)
+            if beginning is not None:
+                least[running] = np.fmin(least[running], total[running] + beginning(x))
             before = after
     beginnings[running] = x
-    return total, beginnings, lost
+    return np.minimum(total, least), beginnings, lost
 
 
 def _potential_slopes(

@@ -26,7 +26,6 @@ from siq.networks.training import (
     _failed_runs,
     _load_checkpoint,
     _save_checkpoint,
-    _slowest_part,
     _TrainingState,
     prepare_data,
     start,
@@ -416,20 +415,3 @@ def test_a_slow_speed_makes_training_the_same_in_any_units() -> None:
         state = train(state, part, options=own, seeds=[SEEDS[0]], log_every=20)
         losses.append(float(state.history["held_out_loss"].iloc[-1]))
     assert losses[1] == pytest.approx(losses[0], rel=1e-6)
-
-
-def test_the_slowest_part_leaves_out_the_fastest_points_in_any_units() -> None:
-    whole = data(0)
-    part = _slowest_part(whole, 0.5)
-    speed = np.linalg.norm((whole.training.xh - whole.training.x0) / whole.training.x0.std(axis=0), axis=1)
-    kept, dropped = (
-        part.representative_rows,
-        np.setdiff1d(whole.representative_rows, part.representative_rows),
-    )
-    assert len(kept) == pytest.approx(len(whole.representative_rows) / 2, abs=1)
-    assert speed[kept].max() <= speed[dropped].min()
-    assert _slowest_part(whole, 1.0) is whole
-    units = np.array([1e-3, 50.0])
-    scaled = dataclasses.replace(whole.training, x0=whole.training.x0 * units, xh=whole.training.xh * units)
-    again = _slowest_part(dataclasses.replace(whole, training=scaled), 0.5)
-    np.testing.assert_array_equal(again.representative_rows, kept)

@@ -358,6 +358,24 @@ def test_paths_that_run_away_are_infinite() -> None:
     assert not np.isfinite(found).any()
 
 
+@pytest.mark.parametrize("known", [linear_system(2), archetype(3)], ids=["linear", "archetype"])
+@pytest.mark.parametrize("shift", [0.003, 0.03, 0.1])
+def test_a_minimum_beside_the_attractor_does_not_count_for_as_long_as_paths_rest_there(
+    known: KnownSystem, shift: float
+) -> None:
+    """V moved as a whole, as by noise: the bound is of the size of the shift, and no multiple of time."""
+    attractor = portrait_of(known, 300, share=0.6).attractors[-1]
+    x = right_well(known) if len(known.attractors) == 2 else uniform_points(known, 150)
+    moved = Candidate(
+        lambda at: potential_values(known, at - shift), lambda at: potential_gradient(known, at - shift),
+        lambda at: at, None, x, [attractor],
+    )  # fmt: skip
+    exact = potential_values(known, x) - potential_values(known, attractor.position[None])
+    error = moved.values(x) - moved.values(attractor.position[None]) - exact
+    true = np.linalg.norm(error) / np.linalg.norm(exact)
+    assert true < moved.stated_error(exact_field(known, 3)) < 8 * true
+
+
 def test_other_units_give_the_same_bound() -> None:
     known, units = maier_stein(1), np.array([1e-3, 50.0])
     x = right_well(known)

@@ -48,9 +48,7 @@ def test_recordings_become_a_page_in_the_folder_in_which_one_works(tmp_path: Pat
     (work / "config" / "config.yaml").write_text("samples: samples.tsv\n")
     (data / "wells.csv").write_text(two_wells())
     (data / "study.yaml").write_text("name: wells\nrecordings: {file: wells.csv}\n")
-    done = siq(
-        work, "run", "../my data/study.yaml", "--cores", "2", "--", "--max-jobs-per-timespan", "100/1s"
-    )
+    done = siq(work, "run", "../my data/study.yaml", "--cores", "2")
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "The page to read: results/wells/report.html"
     assert (work / "results" / "wells" / "report.html").is_file()
@@ -88,7 +86,7 @@ def test_a_run_without_a_formula_is_no_success(tmp_path: Path) -> None:
     """Growth without a stable state: there is a page, a sentence and a code, by the workflow itself, too."""
     rows = [f"r{k},{i / 20},{(k - 4.5) * 1.025**i!r}" for k in range(10) for i in range(60)]
     (tmp_path / "growth.csv").write_text("\n".join(["recording,t,x", *rows]) + "\n")
-    done = siq(tmp_path, "run", "growth.csv", "--cores", "2", "--", "--max-jobs-per-timespan", "100/1s")
+    done = siq(tmp_path, "run", "growth.csv", "--cores", "2")
     assert done.returncode == 3, done.stderr
     assert "No formula was found" in done.stderr + done.stdout
     again = siq(tmp_path, "run", "growth.csv")

@@ -62,10 +62,6 @@ def study_of(wildcards):
     return STUDIES[wildcards.study]
 
 
-def statistics_studies():
-    return STUDIES.default_names()
-
-
 def task(name):
     """Params of a rule: its task, whose version says when results may change, and the options that it depends on."""
     params = {"task": name, "version": versions()[name]}
@@ -335,6 +331,8 @@ with suppress(Timeout), LOCK:  # whoever has it is writing
 
 
 onstart:
+    # With a limit each job leaves a timer that wakes the scheduler while any job waits (pull request 3744).
+    workflow.scheduler.job_rate_limiter = None
     try:
         LOCK.acquire()
     except Timeout:
