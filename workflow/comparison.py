@@ -23,12 +23,14 @@ from siq.inference.field_estimate import read_field
 from siq.networks.decomposition import AnyNetworks, NetworksByWell
 from siq.numerics.integration import heun_step
 from siq.numerics.randomness import Purpose, generator
-from siq.quasipotential.cell_density import CELLS, SampledPotential, shares_by_rates
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.invariant_density import (
+    CELLS,
+    SampledPotential,
     StationaryDensity,
     marginal_density,
     normalisation_bessel,
+    shares_by_rates,
 )
 from siq.quasipotential.landscape import Landscape, NoLandscape
 from siq.quasipotential.landscape_assembly import EquationSettings, landscape_from_equations
