@@ -52,6 +52,7 @@ LEAST_NOISE = 1e-9  # numerical: of the strongest noise; where it is weaker it i
 STEEP = 700.0  # of z: beyond, exp overflows, and B has its limits
 CORE_SHARE = 0.5  # of U at the next saddle: a core lies well within its well
 COARSER = 0.5  # as many cells along each state: enough for how much a number changes
+WIDER = 0.75  # as many cells: by which the error of those is told, where three states leave no coarser ones
 QUANTILES = (0.025, 0.975)  # of an interval
 
 
@@ -84,6 +85,12 @@ class ReactiveFlow(NamedTuple):
         """Mean time from entering A, after B, until B is entered."""
         return 1 / self.rate if self.rate > 0 else np.inf
 
+    @property
+    def progress(self) -> Callable[[np.ndarray], np.ndarray]:
+        """The logarithm of the committor, of components ``(d, ...)``; in A as low as where it is lowest."""
+        lowest = self.committor[self.committor > 0].min()
+        return self.process.interpolated(np.log(np.maximum(self.committor, lowest)))
+
 
 class Dissipation(NamedTuple):
     """Production of entropy per unit of time, in units of Boltzmann's constant.
@@ -92,7 +99,7 @@ class Dissipation(NamedTuple):
     ----------
     value, lower, upper
         Σ̇, and its 95 % interval: by the uncertainty of f and ε where these were estimated, and of given ones
-        by how much it changes with cells half as wide.
+        the error of the cells.
     points, density
         Middles of the cells, ``(n, d)``, and where in them it is made, per unit of the states, ``(n,)``.
     """
@@ -260,7 +267,7 @@ class CellProcess:
         inverse, steps, corner = self._system.inverse, self._steps, self._corner
 
         def function(x: np.ndarray) -> np.ndarray:
-            y = np.tensordot(inverse, x, axes=1)
+            y = (inverse @ x.reshape(len(x), -1)).reshape(x.shape)
             wide = (slice(None), *(None,) * (x.ndim - 1))
             index = (y - corner[wide]) / steps[wide] - 0.5
             return np.asarray(ndimage.map_coordinates(whole, index, order=1, mode="nearest"))
@@ -380,16 +387,16 @@ def dissipation(
     process = CellProcess(dynamics, intensity, box, cells=cells)
     density = process.dissipation()
     value = float(density.sum() * process.volume)
-    count = round(COARSER * (cells or CELLS[dynamics.dimension]))
+    count = round(WIDER * (cells or CELLS[dynamics.dimension]))
     others = [(dynamics, intensity), *draws]
     coarse, *drawn = (
         one.dissipation().sum() * one.volume
         for one in (CellProcess(each, strength, box, cells=count) for each, strength in others)
     )
     if not drawn:
-        return Dissipation(
-            value, value - abs(value - coarse), value + abs(value - coarse), process.points, density
-        )
+        # The error is of second order in the width of cells, for narrow ones: twice what that says.
+        error = 2 * abs(value - coarse) / (WIDER**-2 - 1)
+        return Dissipation(value, max(value - error, 0.0), value + error, process.points, density)
     low, high = np.quantile(drawn, QUANTILES)
     mean, lower, upper = (max(value - one + coarse, 0.0) for one in (np.mean(drawn), high, low))
     share = mean / value if value > 0 else 1.0
