@@ -53,7 +53,7 @@ def prepared(ratio: float) -> tuple[Dynamics, float, list[Neighbourhood], float]
 def repeated(ratio: float, seeds: range) -> pd.DataFrame:
     """A row for each seed."""
     dynamics, intensity, cores, exact = prepared(ratio)
-    progress = CellProcess(dynamics, intensity, BOX).between(*cores).progress
+    progress = CellProcess(dynamics, intensity, BOX).between(cores[0], cores[1:]).progress
     rows = []
     for seed in seeds:
         begin = time.process_time()

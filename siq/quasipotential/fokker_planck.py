@@ -110,6 +110,45 @@ class Dissipation(NamedTuple):
     points: np.ndarray
     density: np.ndarray
 
+    @classmethod
+    def of(
+        cls,
+        dynamics: Dynamics,
+        intensity: float,
+        box: np.ndarray,
+        *,
+        draws: Sequence[tuple[Dynamics, float]] = (),
+        cells: int | None = None,
+    ) -> Dissipation:
+        """Σ̇ in a box.
+
+        Parameters
+        ----------
+        dynamics, intensity, box, cells
+            As `CellProcess` takes them.
+        draws
+            f, D and ε drawn from the distribution of their estimates. An error of f is taken for a current,
+            and adds to Σ̇ in the mean. The draws say by how much: their distribution about the estimate
+            mirrors that of the estimate about the truth (the basic bootstrap).
+        """
+        process = CellProcess(dynamics, intensity, box, cells=cells)
+        density = process.dissipation()
+        value = float(density.sum() * process.volume)
+        count = round(WIDER * (cells or CELLS[dynamics.dimension]))
+        others = [(dynamics, intensity), *draws]
+        coarse, *drawn = (
+            one.dissipation().sum() * one.volume
+            for one in (CellProcess(each, strength, box, cells=count) for each, strength in others)
+        )
+        if not drawn:
+            # The error is of second order in the width of cells, for narrow ones: twice what that says.
+            error = 2 * abs(value - coarse) / (WIDER**-2 - 1)
+            return cls(value, max(value - error, 0.0), value + error, process.points, density)
+        low, high = np.quantile(drawn, QUANTILES)
+        mean, lower, upper = (max(value - one + coarse, 0.0) for one in (np.mean(drawn), high, low))
+        share = mean / value if value > 0 else 1.0
+        return cls(mean, lower, upper, process.points, share * density)
+
 
 class CellProcess:
     """The Markov jump process between the cells of a box, of one to three states, that nothing leaves.
@@ -219,9 +258,9 @@ class CellProcess:
         found[free] = _factorised((sparse.diags(scale) @ inner).tocsc(), len(self._shape))(scale * into)
         return found
 
-    def between(self, start: Neighbourhood, end: Neighbourhood) -> ReactiveFlow:
-        """All that goes from one neighbourhood to another, disjoint one."""
-        first, last = self.inside(start), self.inside(end)
+    def between(self, start: Neighbourhood, ends: Sequence[Neighbourhood]) -> ReactiveFlow:
+        """All that goes from one neighbourhood to one of some others, which are disjoint from it."""
+        first, last = self.inside(start), np.any([self.inside(one) for one in ends], axis=0)
         if (first & last).any():
             raise NumericalFailure("the two sets have cells in common")
         given = np.where(last, 1.0, np.where(first, 0.0, np.nan))
@@ -363,41 +402,3 @@ def cores_about(
         lowest = float(np.einsum("ni,ij,nj->n", away, hessian, away).min())
         cores.append(Neighbourhood(one.position, hessian, min(intensity, CORE_SHARE * lowest) / 2))
     return cores
-
-
-def dissipation(
-    dynamics: Dynamics,
-    intensity: float,
-    box: np.ndarray,
-    *,
-    draws: Sequence[tuple[Dynamics, float]] = (),
-    cells: int | None = None,
-) -> Dissipation:
-    """Σ̇ in a box, with its interval.
-
-    Parameters
-    ----------
-    dynamics, intensity, box, cells
-        As `CellProcess` takes them.
-    draws
-        f, D and ε drawn from the distribution of their estimates. An error of f is taken for a current, and
-        adds to Σ̇ in the mean. The draws say by how much: of their distribution about the estimate that of
-        the estimate about the truth is the mirror image (the basic bootstrap).
-    """
-    process = CellProcess(dynamics, intensity, box, cells=cells)
-    density = process.dissipation()
-    value = float(density.sum() * process.volume)
-    count = round(WIDER * (cells or CELLS[dynamics.dimension]))
-    others = [(dynamics, intensity), *draws]
-    coarse, *drawn = (
-        one.dissipation().sum() * one.volume
-        for one in (CellProcess(each, strength, box, cells=count) for each, strength in others)
-    )
-    if not drawn:
-        # The error is of second order in the width of cells, for narrow ones: twice what that says.
-        error = 2 * abs(value - coarse) / (WIDER**-2 - 1)
-        return Dissipation(value, max(value - error, 0.0), value + error, process.points, density)
-    low, high = np.quantile(drawn, QUANTILES)
-    mean, lower, upper = (max(value - one + coarse, 0.0) for one in (np.mean(drawn), high, low))
-    share = mean / value if value > 0 else 1.0
-    return Dissipation(mean, lower, upper, process.points, share * density)

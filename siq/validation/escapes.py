@@ -194,7 +194,7 @@ def _settles(function: Field, x: np.ndarray, target: Neighbourhood, step: float,
     return settled
 
 
-class SplitTime(NamedTuple):
+class _SplitTime(NamedTuple):
     """A mean time by splitting: ``value`` with its relative standard error and its 95 % interval.
 
     `probability` is p, that of reaching another neighbourhood from Σ before coming back.
@@ -216,7 +216,7 @@ def split_escapes(
     progress: Callable[[np.ndarray], np.ndarray],
     generator: np.random.Generator,
     step: float | None = None,
-) -> SplitTime:
+) -> _SplitTime:
     """The mean time from the middle of one neighbourhood until one of some others is reached, by splitting.
 
     Parameters
@@ -243,7 +243,8 @@ def split_escapes(
     centers = np.stack([start.center, *(one.center for one in targets)])
     rates = np.linalg.eigvals(dynamics.jacobian(centers))
     slowest = float(np.abs(rates[0].real).min())
-    lowest, top = (float(progress(one[:, None])[0]) for one in (centers[0], centers[1]))
+    along = progress(centers.T)
+    lowest, top = float(along[0]), float(along[1:].max())
     if step is None:
         share = min(STEP, np.sqrt(STEP_ERROR / (HEUN * max(top - lowest, 1.0))))
         step = share / float(np.abs(rates).max())
@@ -289,7 +290,7 @@ def split_escapes(
     error = float(np.hypot(of_chance, times.std() / times.mean() / np.sqrt(len(times))))
     value = mean / chance / (1 + of_chance**2)  # the mean of 1/p is above 1 over the mean of p
     reach = np.exp(special.stdtrit(RUNS - 1, 0.975) * error)
-    return SplitTime(value, error, float(value / reach), float(value * reach), chance)
+    return _SplitTime(float(value), error, float(value / reach), float(value * reach), chance)
 
 
 def _at_sigma(
