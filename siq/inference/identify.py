@@ -31,7 +31,7 @@ from siq.inference.checks import (
     mean_residual_probability,
     neighbour_correlations,
     prediction_errors,
-    repeated_text,
+    repetitions,
     residual_noise,
     rounding_text,
 )
@@ -70,7 +70,7 @@ from siq.inference.regression import (
     with_stability,
 )
 from siq.numerics.randomness import Purpose
-from siq.remarks import Remark
+from siq.remarks import Remark, sentence
 from siq.systems.diffusion import Diffusion
 
 SUSPECT_SCORE = -1.0  # standard errors of the correlation of neighbouring residuals
@@ -155,8 +155,12 @@ def identify(
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         rounding = rounding_text(recordings, coarse=True)
         reason = str(error) if rounding is None else f"{error}; mind that {rounding}"
-        if (repeated := repeated_text(recordings, limit=case.limits.each)) is not None:
-            reason = f"{reason}; {repeated}"
+        for column, name in enumerate(recordings.titles):
+            chance, kind, share = min(repetitions(recordings, column), default=(1.0, "", 0.0))
+            if chance < case.limits.each:
+                values = {"kind": kind, "value": share, "state": name}
+                reason = f"{reason}; {sentence(Remark('inference.repeated', values))}"
+                break
         advice = case.advice(hidden=hidden)
         raise NumericalFailure(reason if advice is None else f"{reason}; {advice}") from error
 
