@@ -232,7 +232,21 @@ class CellProcess:
         self.dynamics, self.intensity = dynamics, intensity
         self.points, self.volume = system.points(y), float(steps.prod())
         self._system, self._places, self._shape = system, places, (count,) * dimension
-        self._corner, self._steps = sides[:, 0], steps
+        self._box, self._corner, self._steps = box, sides[:, 0], steps
+
+    def mean_time(self, start: Neighbourhood, ends: Sequence[Neighbourhood]) -> tuple[float, float]:
+        """Mean time from the middle of one neighbourhood until one of some others is reached, and its error.
+
+        ln τ is extrapolated to cells of no width, from these and wider ones: it is off by the square of that.
+        The error, a relative one, is the square of what this adds, as the next power of the width is.
+        """
+        wide = CellProcess(self.dynamics, self.intensity, self._box, cells=round(WIDER * self._shape[0]))
+        own, other = (
+            float(np.log(one.interpolated(one.mean_times(ends))(start.center[:, None])[0]))
+            for one in (self, wide)
+        )
+        added = (own - other) / (WIDER**-2 - 1)
+        return float(np.exp(own + added)), added**2
 
     def inside(self, part: Neighbourhood) -> np.ndarray:
         """Mask of the cells in a neighbourhood, shape ``(n,)``; NumericalFailure where there is none."""

@@ -51,6 +51,8 @@ LONGEST_SETTLING = 30.0  # in units of the slowest relaxation time
 RUNS = 16  # of splitting: their spread is then known to a fifth
 WALKERS = 300  # in all runs together, for each factor e of p: thrice what a relative variance of 1 % takes
 LEAST_WALKERS = 100  # in each run
+ASKED_ERROR, AIMED_ERROR = 0.1, 0.075  # relative, of E[τ]: at most, and what more walkers are to bring
+MOST_MORE = 10.0  # times as many walkers
 REPLACED = 0.1  # of the walkers of a run in one turn
 FINENESS = 0.1  # of ln p between two levels of progress
 MOST_LEVELS = 250
@@ -280,14 +282,21 @@ def split_escapes(
         return np.where(np.isinf(found), np.where(found > 0, count, -2), inner).astype(int)
 
     walkers = max(int(np.ceil(WALKERS * (top - first) / RUNS)), LEAST_WALKERS)
-    x, times = _at_sigma(advance, levels, start.center, RUNS * walkers, count)
-    mean = float(times.mean()) * step
-    chances = _split(advance, levels, x, count, walkers, generator)
-    chance = float(chances.mean())
-    if not chance > 0:
-        raise NumericalFailure("no walker reaches another neighbourhood; another coordinate may lead there")
-    of_chance = float(chances.std(ddof=1) / chance / np.sqrt(RUNS))
-    error = float(np.hypot(of_chance, times.std() / times.mean() / np.sqrt(len(times))))
+    for last in (False, True):
+        x, times = _at_sigma(advance, levels, start.center, RUNS * walkers, count)
+        mean = float(times.mean()) * step
+        chances = _split(advance, levels, x, count, walkers, generator)
+        chance = float(chances.mean())
+        if not chance > 0:
+            raise NumericalFailure(
+                "no walker reaches another neighbourhood; another coordinate may lead there"
+            )
+        of_chance = float(chances.std(ddof=1) / chance / np.sqrt(RUNS))
+        error = float(np.hypot(of_chance, times.std() / times.mean() / np.sqrt(len(times))))
+        if error <= ASKED_ERROR or last:
+            break
+        # Another time with as many as this asks for; were the first kept, chance would decide what counts.
+        walkers = int(walkers * min((error / AIMED_ERROR) ** 2, MOST_MORE))
     value = mean / chance / (1 + of_chance**2)  # the mean of 1/p is above 1 over the mean of p
     reach = np.exp(special.stdtrit(RUNS - 1, 0.975) * error)
     return _SplitTime(float(value), error, float(value / reach), float(value * reach), chance)
