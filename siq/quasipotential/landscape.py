@@ -69,10 +69,14 @@ class LandscapeOptions:
     noise_intensities
         ε of √ε dW for which mean escape times are given, in the units of U, and held against a simulation
         where there is a card.
+    verify_times
+        Whether these times are checked by a simulation that splits (`siq.Landscape.verify_times`): seconds
+        a well where ΔU/ε is 5, some ten where it is 20.
     """
 
     compare_below: Annotated[float, Field(gt=0)] | None = None
     noise_intensities: tuple[Annotated[float, Field(gt=0)], ...] = ()
+    verify_times: bool = False
 
 
 class NoLandscape(NumericalFailure):
@@ -195,6 +199,8 @@ class Landscape:
         Whether f was given as equations: the region is their domain then, and nothing of f is uncertain.
     parting
         Unstable cycles, which part wells.
+    checked_times
+        What `verify_times` said, with a column ``noise``; None where nobody asked for it.
     """
 
     dynamics: Dynamics
@@ -213,6 +219,7 @@ class Landscape:
     recorded_states: RecordStates | None = None
     given: bool = False
     parting: tuple[Cycle, ...] = ()
+    checked_times: pd.DataFrame | None = None
 
     @classmethod
     def from_recordings(
@@ -528,6 +535,24 @@ class Landscape:
             rows.append((index, *laws.loc[index, ["mean_time", "law_error"]], *operator, *check[:4]))
         columns = "attractor law law_error operator operator_error check relative_error lower upper"
         return pd.DataFrame(rows, columns=columns.split())
+
+    def with_checked_times(self, options: LandscapeOptions | None, *, seed: int = 0) -> Landscape:
+        """The same with its times checked, where the options ask for that; a remark where that fails.
+
+        ε are those of the options, or else as the recordings show it.
+        """
+        if options is None or not options.verify_times:
+            return self
+        known = () if self.noise is None else (self.noise.intensity,)
+        tables, remarks = [], list(self.remarks)
+        for intensity in options.noise_intensities or known:
+            try:
+                tables.append(self.verify_times(noise=intensity, seed=seed).assign(noise=intensity))
+            except (NumericalFailure, np.linalg.LinAlgError) as error:
+                values = {"noise": intensity, "reason": str(error)}
+                remarks.append(Remark("quasipotential.times_not_checked", values))
+        checked = pd.concat(tables, ignore_index=True) if tables else None
+        return replace(self, checked_times=checked, remarks=tuple(remarks))
 
     def _cores(self, intensity: float) -> list[Neighbourhood]:
         """The core of each attractor."""

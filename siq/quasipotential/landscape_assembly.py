@@ -166,10 +166,11 @@ def landscape_from_equations(
         remarks += caustics_below(system, sought, portrait, certificate.error, seed=seed)
     wells += [None] * len(portrait.cycles)
     noises = settings.landscape.noise_intensities
-    return _assembled(
+    found = _assembled(
         system, portrait, wells, transitions(system, ways, wells), remarks, certificate=certificate,
         noise=NoiseStrength(noises[0]) if noises else None,
     )  # fmt: skip
+    return found.with_checked_times(settings.landscape, seed=settings.seed)
 
 
 def usable_system(system: str | Path | Dynamics) -> Dynamics:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
+import pandas as pd
 import pytest
 import sympy
 
 from benchmarks.splitting import prepared
-from siq.quasipotential.landscape import Landscape
+from siq.quasipotential.landscape import Landscape, LandscapeOptions
 from siq.quasipotential.landscape_assembly import landscape_from_equations
+from siq.quasipotential.landscape_files import landscape_data, landscape_from_data
+from siq.remarks import Remark, sentence
 from siq.systems.dynamics import Dynamics
 from siq.validation.escapes import split_escapes
 
@@ -69,3 +74,17 @@ def test_noise_on_one_state_is_split_along_paths() -> None:
     table = landscape_from_equations(system, formulas=False).verify_times(noise=0.2)
     assert table["operator"].isna().all()
     assert np.log(table["check"] / table["law"]).abs().max() < 0.5  # the law is off by a third or so
+
+
+def test_a_study_may_ask_for_checked_times_and_finds_them_in_file_and_report(landscape: Landscape) -> None:
+    asked = LandscapeOptions(noise_intensities=(0.2,), verify_times=True)
+    found = landscape.with_checked_times(asked)
+    table = found.checked_times
+    assert table is not None and table["noise"].tolist() == [0.2, 0.2]
+    data = json.loads(json.dumps(landscape_data(found), allow_nan=False))
+    stored = landscape_from_data(data, landscape.dynamics).checked_times
+    pd.testing.assert_frame_equal(stored, table, check_dtype=False)
+    assert "by three ways" in found.report() and "simulated" in found.report()
+    assert landscape.with_checked_times(LandscapeOptions()).checked_times is None
+    text = sentence(Remark("quasipotential.times_not_checked", {"noise": 0.2, "reason": "no path"}))
+    assert text == "the times for ε = 0.2 were not checked: no path"
