@@ -121,3 +121,21 @@ def test_sets_that_meet_are_refused() -> None:
     process = CellProcess(Dynamics.of((x,), (-x,)), 0.5, np.array([[-2.0, 2.0]]))
     with pytest.raises(NumericalFailure, match="in common"):
         process.between(about(0.0), [about(0.05)])
+
+
+def test_what_errors_of_f_feign_is_taken_out() -> None:
+    """A system at rest, of which a rotation of 0.3 ± 0.3 was estimated, and one that turns, 2 ± 0.1.
+
+    Σ̇ = 2 ω²; an estimate of it by ω + δ is too high by 2 ⟨δ²⟩ in the mean.
+    """
+    generator, box = np.random.default_rng(1), np.array([[-2.5, 2.5]] * 2)
+
+    def turning(rate: float) -> Dynamics:
+        return Dynamics.of((x, y), (-x + rate * y, -y - rate * x))
+
+    for rate, error in ((0.3, 0.3), (2.0, 0.1)):
+        draws = [(turning(rate + error * one), 0.5) for one in generator.standard_normal(40)]
+        found = Dissipation.of(turning(rate), 0.5, box, draws=draws, cells=60)
+        spread = 2 * np.array([one.formulas[0].coeff(y) for one, _ in draws], dtype=float) ** 2
+        assert found.value == pytest.approx(max(4 * rate**2 - spread.mean(), 0.0), abs=0.03)
+        assert (found.lower == 0) == (rate < 1) and found.upper > found.value
