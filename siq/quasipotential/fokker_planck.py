@@ -294,7 +294,8 @@ class CellProcess:
     def dissipation(self) -> np.ndarray:
         """Where entropy is produced, per unit of time and of the states: shape ``(n,)``."""
         current = self._current(sparse.diags(self.density) @ self.rates)
-        speed = current * self.volume / np.maximum(self.density, np.finfo(float).tiny)[:, None]
+        known = self.density > np.finfo(float).eps * self.density.max()  # the others are rounding
+        speed = np.where(known, self.volume / np.where(known, self.density, 1.0), 0.0)[:, None] * current
         squares = self.dynamics.diffusion.squared_speed(self.points, speed)
         return np.asarray(2 / self.intensity * squares * self.density / self.volume)
 
@@ -412,7 +413,7 @@ def cores_about(
     for place, one in enumerate(attractors):
         hessian = hessian_at(dynamics, one.position)
         others = [other.position for other in (*attractors, *saddles[place]) if other is not one]
-        away = np.array(others) - one.position
-        lowest = float(np.einsum("ni,ij,nj->n", away, hessian, away).min())
+        away = np.reshape(others, (-1, dynamics.dimension)) - one.position
+        lowest = float(np.einsum("ni,ij,nj->n", away, hessian, away).min(initial=np.inf))
         cores.append(Neighbourhood(one.position, hessian, min(intensity, CORE_SHARE * lowest) / 2))
     return cores

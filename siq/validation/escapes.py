@@ -58,7 +58,7 @@ FINENESS = 0.1  # of ln p between two levels of progress
 MOST_LEVELS = 250
 CYCLES = 2  # from Σ to Σ that count of each walker, and as many before
 PILOTS, PILOT_TIME = 200, 2.0  # walkers, and relaxation times, after which half of them have been at Σ
-STEP_ERROR = 0.01  # of the mean time, by the step
+STEP_ERROR = 0.0025  # of the mean time, by the step
 HEUN = 0.25  # ln E[τ] is off by this times ΔU/ε (h/τ)², as the variance of a linear system is
 
 
@@ -197,16 +197,33 @@ def _settles(function: Field, x: np.ndarray, target: Neighbourhood, step: float,
 
 
 class _SplitTime(NamedTuple):
-    """A mean time by splitting: ``value`` with its relative standard error and its 95 % interval.
+    """A mean time by splitting, its relative standard error, its 95 % interval, and of what it was made.
 
-    `probability` is p, that of reaching another neighbourhood from Σ before coming back.
+    `cycles` and `chances` are, for each run, the mean time from Σ to Σ and p.
     """
 
     value: float
     relative_error: float
     lower: float
     upper: float
-    probability: float
+    cycles: np.ndarray
+    chances: np.ndarray
+
+    @classmethod
+    def of(cls, cycles: np.ndarray, chances: np.ndarray) -> _SplitTime:
+        """Of all runs together; NumericalFailure where none has reached another neighbourhood."""
+        if not chances.any():
+            raise NumericalFailure(
+                "no walker reaches another neighbourhood; another coordinate may lead there"
+            )
+        of_cycle, of_chance = (
+            float(one.std(ddof=1) / one.mean() / np.sqrt(len(one))) for one in (cycles, chances)
+        )
+        error = float(np.hypot(of_cycle, of_chance))
+        # The mean of 1/p is above 1 over the mean of p.
+        value = float(cycles.mean() / chances.mean() / (1 + of_chance**2))
+        reach = float(np.exp(special.stdtrit(len(chances) - 1, 0.975) * error))
+        return cls(value, error, value / reach, value * reach, cycles, chances)
 
 
 def split_escapes(
@@ -218,6 +235,7 @@ def split_escapes(
     progress: Callable[[np.ndarray], np.ndarray],
     generator: np.random.Generator,
     step: float | None = None,
+    runs: int = RUNS,
 ) -> _SplitTime:
     """The mean time from the middle of one neighbourhood until one of some others is reached, by splitting.
 
@@ -234,8 +252,10 @@ def split_escapes(
     generator
         Source of the noise.
     step
-        Step h; by default what lets E[τ] be off by a hundredth where noise is additive. Elsewhere Heun's rule
+        Step h; by default what lets E[τ] be off by 0.3 % where noise is additive. Elsewhere Heun's rule
         is of order one.
+    runs
+        Independent ones, whose spread tells the error.
 
     Raises
     ------
@@ -272,6 +292,8 @@ def split_escapes(
         x = advance(x)
         highest = np.maximum(highest, heights(x))
     first = min(float(np.median(highest)), top - 1.0)
+    if not np.isfinite(first):
+        raise NumericalFailure("walkers hardly leave where they start; take a smaller neighbourhood")
     count = int(np.clip(np.ceil((top - first) / FINENESS), 1, MOST_LEVELS))
 
     def levels(x: np.ndarray) -> np.ndarray:
@@ -282,24 +304,17 @@ def split_escapes(
         return np.where(np.isinf(found), np.where(found > 0, count, -2), inner).astype(int)
 
     walkers = max(int(np.ceil(WALKERS * (top - first) / RUNS)), LEAST_WALKERS)
-    for last in (False, True):
-        x, times = _at_sigma(advance, levels, start.center, RUNS * walkers, count)
-        mean = float(times.mean()) * step
+
+    def result(walkers: int) -> _SplitTime:
+        x, cycles = _at_sigma(advance, levels, start.center, runs * walkers, count)
         chances = _split(advance, levels, x, count, walkers, generator)
-        chance = float(chances.mean())
-        if not chance > 0:
-            raise NumericalFailure(
-                "no walker reaches another neighbourhood; another coordinate may lead there"
-            )
-        of_chance = float(chances.std(ddof=1) / chance / np.sqrt(RUNS))
-        error = float(np.hypot(of_chance, times.std() / times.mean() / np.sqrt(len(times))))
-        if error <= ASKED_ERROR or last:
-            break
-        # Another time with as many as this asks for; were the first kept, chance would decide what counts.
-        walkers = int(walkers * min((error / AIMED_ERROR) ** 2, MOST_MORE))
-    value = mean / chance / (1 + of_chance**2)  # the mean of 1/p is above 1 over the mean of p
-    reach = np.exp(special.stdtrit(RUNS - 1, 0.975) * error)
-    return _SplitTime(float(value), error, float(value / reach), float(value * reach), chance)
+        return _SplitTime.of(step * cycles.reshape(runs, -1).mean(axis=1), chances)
+
+    found = result(walkers)
+    if found.relative_error <= ASKED_ERROR:
+        return found
+    # Once more with as many as this asks for; were the first kept, chance would decide what counts.
+    return result(int(walkers * min((found.relative_error / AIMED_ERROR) ** 2, MOST_MORE)))
 
 
 def _at_sigma(
