@@ -23,12 +23,13 @@ from siq.inference.field_estimate import read_field
 from siq.networks.decomposition import AnyNetworks, NetworksByWell
 from siq.numerics.integration import heun_step
 from siq.numerics.randomness import Purpose, generator
-from siq.quasipotential.cell_density import CELLS, SampledPotential, shares_by_rates
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.invariant_density import (
+    SampledPotential,
     StationaryDensity,
     marginal_density,
     normalisation_bessel,
+    shares_by_rates,
 )
 from siq.quasipotential.landscape import Landscape, NoLandscape
 from siq.quasipotential.landscape_assembly import EquationSettings, landscape_from_equations
@@ -37,7 +38,6 @@ from siq.quasipotential.landscape_comparison import (
     ReferenceLandscape,
     compare_estimate,
     compare_landscape,
-    compare_mesh,
     compare_overall,
     differences,
     reference_landscape,
@@ -142,7 +142,7 @@ def run_landscape_errors(
         for source, potential in sources.items():
             tables.append(_rows(number, source, compare_estimate(reference, potential, below=below)))
     if np.isfinite(reference.mesh).any():
-        tables.append(_rows(NONE_OF_OURS, "mesh", compare_mesh(reference, below=below)))
+        tables.append(_rows(NONE_OF_OURS, "mesh", reference.compare_mesh(below=below)))
     formulas_of_others = published_potentials(
         published, [sympy.Symbol(name, real=True) for name in settings.space.names or ()],
         draws=DRAWS, generator=generator(settings.seed, Purpose.ROUNDING),
@@ -398,7 +398,7 @@ def _of_wells(landscape: Landscape, system: Dynamics) -> AtIntensity:
     assert potential is not None
     identified, count = potential.wells[0].dynamics, len(potential.wells)
     fine = SampledPotential.of(potential, system.box)
-    coarse = SampledPotential.of(potential, system.box, cells=CELLS[system.dimension] // 2)
+    coarse = SampledPotential.of(potential, system.box, cells=len(fine.values) // 2)
     lowest = coarse.lowest_possible(identified)
     laws = [(way.start, way.end, way.barrier, way.exit.prefactor) for way in landscape.transitions]
 

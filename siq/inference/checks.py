@@ -268,15 +268,6 @@ def repetitions(recordings: Recordings, column: int) -> list[tuple[float, str, f
     return [*found, (chance, "copied", count / max(len(begins), 1))]
 
 
-def repeated_text(recordings: Recordings, *, limit: float) -> str | None:
-    """What repeats itself in a recording more often than chance lets it with a probability, in words."""
-    for column, name in enumerate(recordings.titles):
-        chance, kind, share = min(repetitions(recordings, column), default=(1.0, "", 0.0))
-        if chance < limit:
-            return sentence(Remark("inference.repeated", {"kind": kind, "value": share, "state": name}))
-    return None
-
-
 def unexplained_probability(
     columns: np.ndarray,
     rest: np.ndarray,

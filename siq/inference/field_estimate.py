@@ -29,6 +29,7 @@ from siq.errors import Fault, InputError, NumericalFailure
 from siq.inference.library import CandidateLibrary, IdentificationOptions, field_dynamics, field_library
 from siq.numerics.files import whole_file
 from siq.numerics.integration import runge_kutta_step
+from siq.numerics.randomness import normal_draws
 from siq.remarks import Remark, sentence
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -538,6 +539,20 @@ class FieldEstimate:
         bias, spread = self.alternatives
         numbers = generator.standard_normal((count, len(spread)))
         return np.asarray(bias + np.tensordot(numbers, spread, axes=1))
+
+    def drawn(self, generator: np.random.Generator) -> Dynamics:
+        """f and D drawn from their distributions, further terms of f and the terms of D(x) included."""
+        coefficients = np.zeros_like(self.coefficients)
+        own = normal_draws(self.values, self.covariance, 1, generator=generator)[0]
+        coefficients[self.support[:, 1], self.support[:, 0]] = own
+        coefficients += self.drawn_alternatives(1, generator=generator)[0]
+        support = np.argwhere(coefficients.T != 0)
+        diffusion = self.diffusion
+        if self.noise is not None:
+            entries = normal_draws(self.noise.values, self.noise.covariance, 1, generator=generator)[0]
+            diffusion = replace(self.noise, values=entries).diffusion(self.intensity)
+        values = coefficients[support[:, 1], support[:, 0]]
+        return field_dynamics(self.library, support, values, diffusion=diffusion)
 
     def variance(self, slopes: np.ndarray, *, of_mean: bool = False) -> np.ndarray:
         """Variance of what follows from f to first order, by its coefficients and by which terms there are.

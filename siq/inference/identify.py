@@ -31,7 +31,7 @@ from siq.inference.checks import (
     mean_residual_probability,
     neighbour_correlations,
     prediction_errors,
-    repeated_text,
+    repetitions,
     residual_noise,
     rounding_text,
 )
@@ -71,7 +71,7 @@ from siq.inference.regression import (
     with_stability,
 )
 from siq.numerics.randomness import Purpose
-from siq.remarks import Remark
+from siq.remarks import Remark, sentence
 from siq.systems.diffusion import Diffusion
 
 SUSPECT_SCORE = -1.0  # standard errors of the correlation of neighbouring residuals
@@ -172,8 +172,13 @@ def identify(
         reason, claim = str(error) if failed else SINGULAR, error.claim if failed else ""
         rounding = rounding_text(recordings, coarse=True)
         reason = reason if rounding is None else f"{reason}; mind that {rounding}"
-        if not claim and (repeated := repeated_text(recordings, limit=case.limits.each)) is not None:
-            reason, claim = f"{repeated}; {reason}", "gaussian_increments"  # a cause, and what follows
+        for column, name in enumerate(() if claim else recordings.titles):
+            chance, kind, share = min(repetitions(recordings, column), default=(1.0, "", 0.0))
+            if chance < case.limits.each:  # a cause, and what follows
+                values = {"kind": kind, "value": share, "state": name}
+                reason = f"{sentence(Remark('inference.repeated', values))}; {reason}"
+                claim = "gaussian_increments"
+                break
         advice = case.advice(hidden=hidden)
         if not hidden and advice is not None and (by_velocities := case.with_velocities()) is not None:
             return by_velocities

@@ -216,18 +216,6 @@ def _candidate_library(
     return CandidateLibrary(states, symbols, tuple(terms), *arrays)
 
 
-def joint_library(
-    of_field: CandidateLibrary, *, degree: int, potential_degree: int, further: Sequence[str] = ()
-) -> CandidateLibrary:
-    """A library for V that also holds all of f's; V may use those functions of f that are no monomials."""
-    plain = [term.is_polynomial(*of_field.symbols) for term in of_field.terms]
-    highest = max(degree, *(of_field.total_degree(k) for k in range(of_field.size)))
-    named = (name for name, one in zip(of_field.names, plain, strict=True) if not one)
-    others = tuple(dict.fromkeys((*further, *named)))
-    states = of_field.states
-    return candidate_library(states, degree=highest, potential_degree=potential_degree, further=others)
-
-
 def monomial_exponents(dimension: int, degree: int) -> list[tuple[int, ...]]:
     """Exponents of all monomials up to a total degree, by degree and then as a dictionary would."""
     return [

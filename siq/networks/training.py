@@ -267,13 +267,6 @@ class _TrainingState:
     history: pd.DataFrame
 
 
-def choose_device(wish: str) -> torch.device:
-    """``auto`` is the first accelerator where there is one, otherwise the CPU; else as named."""
-    if wish == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    return torch.device(wish)
-
-
 def start(
     data: Sequence[TrainingData],
     *,

@@ -16,7 +16,7 @@ A `Landscape` is data with answers. `siq.quasipotential.landscape_assembly` find
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -26,6 +26,7 @@ import numpy as np
 import pandas as pd
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as pydantic_dataclass
+from scipy.spatial import cKDTree
 
 from siq.data.recordings import Recordings
 from siq.data.states import RecordStates
@@ -33,6 +34,7 @@ from siq.errors import Fault, NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
 from siq.quasipotential.certificate import Certificate
 from siq.quasipotential.characteristics import potential_errors
+from siq.quasipotential.fokker_planck import CellProcess, Dissipation, ReactiveFlow, cores_about
 from siq.quasipotential.occupancy import VisitTest
 from siq.quasipotential.rates import EscapeRate, NoiseStrength, mean_residence_time
 from siq.quasipotential.transitions import Transition, missing_diffusion
@@ -40,7 +42,8 @@ from siq.quasipotential.wells import Well
 from siq.remarks import Remark, sentence
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
-from siq.systems.equilibria import Equilibrium
+from siq.systems.equilibria import Equilibrium, hessian_at
+from siq.validation.escapes import Neighbourhood, split_escapes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -49,6 +52,8 @@ if TYPE_CHECKING:
     from siq.workflow.pipeline import PipelineSettings
 
 MOST_WELLS = 6  # of which all trees can be counted
+DISSIPATION_DRAWS = 40  # of an estimated f: the ends of a 95 % interval are then two of them
+MARGIN = 0.15  # of the states that were seen, on each side: there the density ends
 LEVEL_TOLERANCE = 1e-6  # numerical, of the level of a well: two values of U are one
 
 
@@ -64,10 +69,14 @@ class LandscapeOptions:
     noise_intensities
         ε of √ε dW for which mean escape times are given, in the units of U, and held against a simulation
         where there is a card.
+    verify_times
+        Whether these times are checked by a simulation that splits (`siq.Landscape.verify_times`): seconds
+        a well where ΔU/ε is 5, some ten where it is 20.
     """
 
     compare_below: Annotated[float, Field(gt=0)] | None = None
     noise_intensities: tuple[Annotated[float, Field(gt=0)], ...] = ()
+    verify_times: bool = False
 
 
 class NoLandscape(NumericalFailure):
@@ -193,6 +202,8 @@ class Landscape:
         Whether f was given as equations: the region is their domain then, and nothing of f is uncertain.
     parting
         Unstable cycles, which part wells.
+    checked_times
+        What `verify_times` said, with a column ``noise``; None where nobody asked for it.
     """
 
     dynamics: Dynamics
@@ -211,6 +222,7 @@ class Landscape:
     recorded_states: RecordStates | None = None
     given: bool = False
     parting: tuple[Cycle, ...] = ()
+    checked_times: pd.DataFrame | None = None
 
     @classmethod
     def from_recordings(
@@ -429,6 +441,164 @@ class Landscape:
     def exits(self, well: int) -> list[EscapeRate]:
         """The laws of all ways out of a well, with their errors."""
         return [way.exit for way in self.transitions if way.start == well]
+
+    def committor(self, start: int, end: int, *, noise: float | None = None) -> ReactiveFlow:
+        """The probability of reaching one attractor before another, and what goes between them.
+
+        Parameters
+        ----------
+        start, end
+            Attractors by their place in `attractors`: points, in one to three states.
+        noise
+            ε, in the unit of U; by default as the recordings show it.
+
+        Returns
+        -------
+        ReactiveFlow
+            Committor, reactive density, current and rate on cells (`siq.quasipotential.fokker_planck`), for
+            this ε and not for small ones only.
+
+        Raises
+        ------
+        NumericalFailure
+            When cells are no way to it: more than three states, noise on some states only, or wells that are
+            narrower than cells.
+        """
+        strength = self._strength(noise).intensity
+        cores = self._cores(strength)
+        return CellProcess(self.dynamics, strength, self._box).between(cores[start], [cores[end]])
+
+    def dissipation(self, *, noise: float | None = None, seed: int = 0) -> Dissipation:
+        """The production of entropy in the stationary state, and where it is made.
+
+        Parameters
+        ----------
+        noise
+            ε, in the unit of U; by default as the recordings show it.
+        seed
+            Decides the draws of an estimated f.
+
+        Returns
+        -------
+        Dissipation
+            ``Σ̇ = (2/ε) ∫ u·D⁻¹u π dx`` (`siq.quasipotential.fokker_planck`) per unit of time with its 95 %
+            interval. Of an estimated f it begins at zero where the record does not tell it from one with
+            detailed balance, and says then what Σ̇ is at most.
+
+        Raises
+        ------
+        NumericalFailure
+            As for `committor`.
+        """
+        strength, found = self._strength(noise), self.field_estimate
+        generator, draws = np.random.default_rng(seed), list[tuple[Dynamics, float]]()
+        share = strength.standard_error / strength.intensity
+        for _ in range(0 if found is None else DISSIPATION_DRAWS):
+            drawn = found.drawn(generator) if found is not None else self.dynamics
+            draws.append((drawn, strength.intensity * float(np.exp(share * generator.standard_normal()))))
+        return Dissipation.of(self.dynamics, strength.intensity, self._box, draws=draws)
+
+    def verify_times(self, *, noise: float | None = None, seed: int = 0) -> pd.DataFrame:
+        """Mean residence times by the law, by the operator, and checked by a simulation that splits.
+
+        Parameters
+        ----------
+        noise
+            ε, in the unit of U; by default as the recordings show it.
+        seed
+            Decides the noise of the simulation.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One row for every attractor, times from it until the neighbourhood of another one is reached:
+            ``attractor``; ``law`` and its relative ``law_error``, as `dwell_times` has them; ``operator``,
+            which holds for any ε, and its relative ``operator_error``, NaN beyond three states and where
+            wells are narrower than cells; ``check`` with its ``relative_error`` and its 95 % interval ``lower
+            upper``. The check assumes neither (`siq.validation.escapes.split_escapes`), and takes seconds a
+            well at ΔU/ε = 5, ten at 20. It has no rows where there is but one attractor.
+
+        Raises
+        ------
+        ValueError
+            When no noise is known.
+        NumericalFailure
+            When there are limit cycles among the attractors, or the simulation fails.
+        """
+        strength = self._strength(noise)
+        intensity, rows = strength.intensity, []
+        cores, laws = self._cores(intensity), self.dwell_times(noise=noise)
+        for index, core in enumerate(cores if len(cores) > 1 else ()):
+            others = [one for one in cores if one is not core]
+            operator = (np.nan, np.nan)
+            try:
+                process = CellProcess(self.dynamics, intensity, self._box)
+                progress = process.between(core, others).progress
+                operator = process.mean_time(core, others)
+            except (NumericalFailure, np.linalg.LinAlgError, RuntimeError):
+                progress = self._along_paths(index, intensity)
+            check = split_escapes(
+                self.dynamics, core, others, intensity=intensity, progress=progress,
+                generator=np.random.default_rng([seed, index]),
+            )  # fmt: skip
+            rows.append((index, *laws.loc[index, ["mean_time", "law_error"]], *operator, *check[:4]))
+        columns = "attractor law law_error operator operator_error check relative_error lower upper"
+        return pd.DataFrame(rows, columns=columns.split())
+
+    def with_checked_times(self, options: LandscapeOptions | None, *, seed: int = 0) -> Landscape:
+        """The same with its times checked, where the options ask for that; a remark where that fails.
+
+        ε are those of the options, or else as the recordings show it.
+        """
+        if options is None or not options.verify_times:
+            return self
+        known = () if self.noise is None else (self.noise.intensity,)
+        tables, remarks = [], list(self.remarks)
+        for intensity in options.noise_intensities or known:
+            try:
+                tables.append(self.verify_times(noise=intensity, seed=seed).assign(noise=intensity))
+            except (NumericalFailure, np.linalg.LinAlgError) as error:
+                values = {"noise": intensity, "reason": str(error)}
+                remarks.append(Remark("quasipotential.times_not_checked", values))
+        checked = pd.concat(tables, ignore_index=True) if tables else None
+        return replace(self, checked_times=checked, remarks=tuple(remarks))
+
+    def _cores(self, intensity: float) -> list[Neighbourhood]:
+        """The core of each attractor."""
+        points = [one for one in self.attractors if isinstance(one, Equilibrium)]
+        if self.cycles:
+            raise NumericalFailure("one of the attractors is a limit cycle, and no core is known about it")
+        saddles = [[way.saddle for way in self.transitions if way.start == k] for k in range(len(points))]
+        return cores_about(self.dynamics, points, saddles, intensity)
+
+    @property
+    def _box(self) -> np.ndarray:
+        """Where the density is: the domain, or the states that V was found from and their surroundings."""
+        limits = self.dynamics.limits
+        if np.isfinite(limits).all():
+            return limits
+        places = [*(one.position[None] for one in self.attractors), *(way.uphill for way in self.transitions)]
+        points = np.concatenate([*places, *(one.points for one in self.wells if one is not None)])
+        low, high = points.min(axis=0), points.max(axis=0)
+        return np.stack([low - MARGIN * (high - low), high + MARGIN * (high - low)], axis=1)
+
+    def _along_paths(self, well: int, intensity: float) -> Callable[[np.ndarray], np.ndarray]:
+        """Progress by U/ε at the nearest state of the paths out of a well; beyond the saddle by one more."""
+        ways = [way for way in self.transitions if way.start == well and way.path is not None]
+        if not ways:
+            raise NumericalFailure("no path leads out of the well, along which a simulation could be split")
+        states, values = [], []
+        for way in ways:
+            assert way.path is not None
+            down = way.downhill
+            states += [way.path.points, down]
+            values += [way.path.values / intensity]
+            values += [way.path.action / intensity + np.linspace(0, 1, len(down))]
+        points, along = np.concatenate(states), np.concatenate(values)
+        # Near is what the noise about the attractor makes so.
+        root = np.linalg.cholesky(hessian_at(self.dynamics, self.attractors[well].position))
+        tree = cKDTree(points @ root)
+        return lambda x: np.asarray(along[tree.query(x.T @ root)[1]])
 
     def escape_times(self, *, noise: float | None = None) -> pd.DataFrame:
         """Mean times until noise has led from each attractor to the next, one row for every way out.

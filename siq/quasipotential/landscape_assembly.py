@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import sympy
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
@@ -34,12 +35,13 @@ from siq.systems.cards import load_system
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, hessian_at, spread_evenly, unreached_states
+from siq.systems.formulas import FormulaError, compile_formulas, formulas_in_time
 from siq.systems.phase_portrait import MOST_SEARCHED, PhasePortrait, phase_portrait
-from siq.systems.simulation import fault_over_domain
 
 ATTRACTOR_MATCH_TOLERANCE = 1e-6  # of the recorded box: one attractor, from different starts
 STATES_ALONG_PATH = 300  # from the neighbourhood of which further descents start
 PATH_NEIGHBOURHOOD = (0.02, 0.05, 0.1)  # of the extent of the well: how far from the path
+TRIED_STATES = 400  # of the domain, at which equations must have a value
 UNSEEN_STATES = 1024  # of the domain, and of the box of each well, that no fit sees
 
 
@@ -164,10 +166,11 @@ def landscape_from_equations(
         remarks += caustics_below(system, sought, portrait, certificate.error, seed=seed)
     wells += [None] * len(portrait.cycles)
     noises = settings.landscape.noise_intensities
-    return _assembled(
+    found = _assembled(
         system, portrait, wells, transitions(system, ways, wells), remarks, certificate=certificate,
         noise=NoiseStrength(noises[0]) if noises else None,
     )  # fmt: skip
+    return found.with_checked_times(settings.landscape, seed=settings.seed)
 
 
 def usable_system(system: str | Path | Dynamics) -> Dynamics:
@@ -204,9 +207,35 @@ def fault_for_landscape(system: Dynamics, *, directly: bool) -> tuple[tuple[str,
         what = f"the noise does not reach {' and '.join(still)}, neither directly nor by way of other states"
         remedy = f"let it act on {still[0]} or on a state in its equation, or leave it out"
         return ("diffusion",), what, remedy
-    if (found := fault_over_domain(system)) is not None:
+    if (found := _fault_over_domain(system)) is not None:
         remedy = "choose a domain in which it has a value"
         return ("equations", found[0]), f"the equation {found[1]}", remedy
+    return None
+
+
+def _fault_over_domain(dynamics: Dynamics) -> tuple[str, str] | None:
+    """A state whose equation has no value somewhere in the domain, with what is wrong; None for none.
+
+    States at random and the corners tell what overflows; a divisor that changes its sign between them is zero
+    somewhere, though no state of a sample meets it.
+    """
+    low, high = dynamics.box.T
+    x = np.random.default_rng(0).uniform(low, high, size=(TRIED_STATES, dynamics.dimension))
+    x = np.concatenate([x, low[None], high[None]])
+    with np.errstate(all="ignore"):
+        try:
+            with formulas_in_time("the derivatives"):
+                flow, slopes = dynamics.drift(x), dynamics.jacobian(x)
+                dynamics.hessian(x[:1])  # on which paths and series depend
+        except FormulaError as error:
+            raise error.at(dynamics.name or "the system", "equations") from None
+        for index, (name, formula) in enumerate(zip(dynamics.states, dynamics.formulas, strict=True)):
+            bases = [one.base for one in formula.atoms(sympy.Pow) if one.exp.is_negative]
+            divisors = compile_formulas(bases, dynamics.symbols)(np.ascontiguousarray(x.T))
+            if any(values.min() <= 0 <= values.max() for values in divisors):
+                return name, "divides by zero within the domain"
+            if not (np.isfinite(flow[:, index]).all() and np.isfinite(slopes[:, index]).all()):
+                return name, "is too large for a number, or not defined, in a part of the domain"
     return None
 
 

@@ -91,6 +91,15 @@ class ReferenceLandscape:
         tops = self.heights + self.barriers
         return float(OVERALL_LEVEL * tops[np.isfinite(tops)].max(initial=0.0))
 
+    def compare_mesh(self, *, below: float | None) -> list[dict[str, object]]:
+        """Its own mesh against its characteristics, and its barriers against the least action."""
+        errors = np.abs(self.mesh_barriers / self.barriers - 1)
+        overall = compare_overall(self.values, self.mesh_values, below or self.level)
+        barriers = [
+            _row(f"barrier from A{index + 1}", 1, 1.0, float(one)) for index, one in enumerate(errors)
+        ]
+        return [overall, *barriers]
+
     @classmethod
     def missing(cls, dimension: int, reason: str) -> ReferenceLandscape:
         """An empty reference, with the reason why there is none."""
@@ -249,14 +258,6 @@ def compare_landscape(
         error = float(abs(lowest / reference.barriers[index] - 1))
         rows.append(_row(f"barrier from A{index + 1}", 1, float(np.isfinite(error)), error))
     return rows
-
-
-def compare_mesh(reference: ReferenceLandscape, *, below: float | None) -> list[dict[str, object]]:
-    """The reference's own mesh against its characteristics, and its barriers against the least action."""
-    errors = np.abs(reference.mesh_barriers / reference.barriers - 1)
-    overall = compare_overall(reference.values, reference.mesh_values, below or reference.level)
-    barriers = [_row(f"barrier from A{index + 1}", 1, 1.0, float(one)) for index, one in enumerate(errors)]
-    return [overall, *barriers]
 
 
 def compare_overall(

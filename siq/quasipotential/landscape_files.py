@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from siq.data.states import DwellCount
 from siq.errors import InputError
@@ -153,6 +154,8 @@ def landscape_data(landscape: Landscape) -> dict[str, Any]:
         ],
         "remarks": REMARKS[0](landscape.remarks),
     }
+    if (checked := landscape.checked_times) is not None:
+        data["checked_times"] = {name: list(map(_number, checked[name])) for name in checked.columns}
     if landscape.given:  # no other file could hold its certificate
         data |= {"given": True, "certificate": None if certificate is None else certificate.as_data()}
         parting = [_written(one, CYCLE) for one in landscape.parting]
@@ -236,6 +239,7 @@ def landscape_from_data(data: Mapping[str, Any], dynamics: Dynamics) -> Landscap
         ),
         given=bool(data.get("given")),
         parting=parting,
+        checked_times=pd.DataFrame(data["checked_times"], dtype=float) if "checked_times" in data else None,
     )  # fmt: skip
 
 

@@ -4,14 +4,8 @@ f and D are learned from what happens within single steps. Mean residence times 
 are spread about them, are other figures of the same record, which no fit saw; on recordings that were held
 out they share no sample with it either. A prediction that misses them is wrong, whatever its own tests say.
 
-**Operator.** For ``dx = f dt + √ε σ dW`` in one or two states, ``L u = f·∇u + (ε/2) D:∇∇u`` on a box that
-nothing leaves becomes a Markov jump process between cells. The flux between neighbours is Scharfetter and
-Gummel's,
-
-    J = (a/h) [B(-z) p_left - B(z) p_right],    a = (ε/2) D,  z = (f - a') h/a,  B(z) = z/(eᶻ - 1),
-
-which is exact for constant coefficients, keeps densities positive, and knows no smallness of ε. Where D has
-mixed terms, diagonal neighbours take them (Kushner), in coordinates in which the mean D is the unit matrix.
+**Operator.** In one or two states times and densities follow from the Fokker–Planck operator on cells
+(`siq.quasipotential.fokker_planck`), whatever ε is.
 
 **Which time.** A visit to a well begins where the record enters the core of an attractor, and ends where it
 enters another one's: everything between the cores is part of the visit. A core is where
@@ -39,11 +33,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
+from itertools import pairwise
 
 import numpy as np
 from scipy import sparse, special
-from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from siq.data.kinetics import continued_visits
@@ -59,31 +52,22 @@ from siq.data.states import (
 from siq.data.stationarity import correlated_samples, runs_of, usual_step
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate, Verdict
-from siq.inference.library import field_dynamics
-from siq.numerics.randomness import normal_draws, positive
+from siq.numerics.randomness import positive
 from siq.numerics.text import place_text
-from siq.quasipotential.characteristics import Function, ScaledSystem
+from siq.quasipotential.fokker_planck import CELLS, COARSER, CellProcess, cores_about
 from siq.quasipotential.rates import NoiseStrength, mean_residence_time
 from siq.quasipotential.transitions import transitions, ways_out
 from siq.remarks import Remark, sentence
 from siq.systems.dynamics import Dynamics
-from siq.systems.equilibria import hessian_at
 from siq.systems.phase_portrait import PhasePortrait
-
-CELLS = {1: 2000, 2: 120}  # along each state: visits of a double well are then good to 1e-4 and 1e-2
-COARSE = 1.0  # z between neighbours, in the mean over the density: beyond, wells are narrower than cells
-RESTART_RATE = 1e-9  # of the fastest rate
-LEAST_NOISE = 1e-9  # numerical: of the strongest noise; where it is weaker it is none
-STEEP = 700.0  # of z: beyond, exp overflows, and B has its limits
+from siq.validation.escapes import Neighbourhood
 
 OVERSHOOT = 0.5826  # derived: -ζ(1/2)/√(2π)
 SMALLEST_CORE = 0.2  # of a core's radius: of steps as long as the core no such correction is known
-CORE_SHARE = 0.5  # of U at the next saddle: a core lies well within its well
 # Of the recorded box on each side, beyond which the operator lets nothing go. None where a formula of D(x),
 # continued beyond what was recorded, is no longer positive.
 MARGINS = (0.15, 0.0)
 DRAWS = {1: 24, 2: 8}  # of f, by the number of states: an error is then known to a sixth, or a quarter
-COARSER = 0.5  # as many cells along each state: enough for how much a time changes
 MOST_PLACES = 400  # cells of a sheared grid all have places of their own, and are put together
 
 NO_HOP_PROBABILITY = 0.01  # below it, no hop at all contradicts the prediction
@@ -96,17 +80,12 @@ USUAL_GAPS = 0.9  # quantile of the times between samples
 LEAST_POWER = 10.0  # the factor of a time: a record that would not have shown it tests no times (a choice)
 
 
-_Cores = list[tuple[np.ndarray, np.ndarray, float]]
-"""A, M and a level for each well: its core is where ``(x - A)ᵀ M (x - A)``, about U, is below the level."""
+class _VisitProcess(CellProcess):
+    """The process between cells with the visits to the cores of wells.
 
-
-class _CellProcess:
-    """The Markov jump process between the cells of a box, of one or two states, that nothing leaves.
-
-    `points` are the centres of the n cells, ``(n, d)``, `force` and `power` are f and the diagonal of εD
-    there, and `density` are the invariant probabilities, ``(n,)``. For each core, `last` are the
-    probabilities that it was the last of all that was visited, of each cell, ``(n,)``; and `means` are the
-    mean times from entering it until another one is entered.
+    `force` and `power` are f and the diagonal of εD in the cells. For each core, `last` are the probabilities
+    that it was the last of all that was visited, of each cell, ``(n,)``; and `means` are the mean times from
+    entering it until another one is entered.
     """
 
     def __init__(
@@ -114,84 +93,33 @@ class _CellProcess:
         dynamics: Dynamics,
         intensity: float,
         box: np.ndarray,
-        cores: _Cores,
+        cores: Sequence[Neighbourhood],
         *,
         cells: int | None = None,
     ) -> None:
-        dimension = dynamics.dimension
+        super().__init__(dynamics, intensity, box, cells=cells)
         self._given = (intensity, box, cores, cells)
-        if dimension not in CELLS:
-            raise NumericalFailure("the Fokker–Planck operator is solved for one and two states only")
-        count = cells or CELLS[dimension]
-        # A unit lower triangular change of states after which D has no mixed terms in the middle.
-        # With mixed terms it is the parallelogram's hull that is covered. A D(x) that was learned may be
-        # no covariance far from recordings: cells where that is so are left out.
-        shear, matrix = np.eye(dimension), dynamics.diffusion.at(box.mean(axis=1)[None])[0]
-        if dimension == 2 and abs(matrix[0, 1]) > 1e-12 * np.sqrt(matrix[0, 0] * matrix[1, 1]):
-            shear[1, 0] = matrix[0, 1] / matrix[0, 0]
-        system = ScaledSystem(dynamics, np.zeros(dimension), shear, unit=1.0)
-        corners = system.scaled(np.array(list(product(*box))))
-        sides = np.stack([corners.min(axis=0), corners.max(axis=0)], axis=1)
-        axes = [low + (high - low) * (np.arange(count) + 0.5) / count for low, high in sides]
-        steps = (sides[:, 1] - sides[:, 0]) / count
-        y = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dimension)
-        strengths = np.linalg.eigvalsh(system.noise.at(y))
-        floor = LEAST_NOISE * float(strengths.max())
-
-        def noise(points: np.ndarray) -> np.ndarray:
-            matrices = system.noise.at(points)
-            levels, vectors = np.linalg.eigh(matrices)
-            if not (levels >= floor).all():  # nothing is weaker than the floor
-                matrices = np.einsum("nik,nk,njk->nij", vectors, np.maximum(levels, floor), vectors)
-            return 0.5 * intensity * matrices
-
-        places = np.flatnonzero(strengths[:, 0] > floor)
-        if not len(places):
-            raise NumericalFailure(
-                "the noise does not reach every state: no Fokker–Planck operator is solved"
-            )
-        # The generator of the largest set of usable cells that are connected.
-        inner = _rates(system.force, noise, y, steps, count)[places][:, places]
-        _, piece = sparse.csgraph.connected_components(inner, directed=True, connection="strong")
-        largest = piece == np.argmax(np.bincount(piece))
-        places, inner = places[largest], inner[largest][:, largest]
-        rates = (inner - sparse.diags(np.asarray(inner.sum(axis=1)).ravel())).tocsr()
-        y, self.density = y[places], _invariant_density(rates)
-        tensor, drift = np.diagonal(noise(y), axis1=1, axis2=2), system.force(y)
-        if float((self.density[:, None] * np.abs(drift) * steps / tensor).sum(axis=0).max()) > COARSE:
-            raise NumericalFailure("the noise is too weak for a grid: the wells are narrower than its cells")
-        self.points = system.points(y)
         self.force = dynamics.drift(self.points)
         self.power = intensity * np.diagonal(dynamics.diffusion.at(self.points), axis1=1, axis2=2)
         core, wells = _core_of(cores, self.points), range(len(cores))
         if len(np.unique(core[core >= 0])) < len(wells):
             raise NumericalFailure("the core of a well is smaller than a cell of the grid")
-        self.last = [self._last_visited(rates, core, well) for well in wells]
+        own = (np.where(core < 0, np.nan, core == well) for well in wells)
+        self.last = [np.clip(self.solved(given, backwards=True), 0.0, 1.0) for given in own]
         self.means = np.full(len(cores), np.inf)
         for well, last in enumerate(self.last):
-            own = self.density * last
-            flow = float(own @ (rates @ ((core >= 0) & (core != well)).astype(float)))
+            spent = self.density * last
+            flow = float(spent @ (self.rates @ ((core >= 0) & (core != well)).astype(float)))
             if flow > 0:
-                self.means[well] = own.sum() / flow
+                self.means[well] = spent.sum() / flow
 
-    def of(self, dynamics: Dynamics) -> _CellProcess | None:
+    def of(self, dynamics: Dynamics) -> _VisitProcess | None:
         """The same of another f; None where that has none."""
         intensity, box, cores, cells = self._given
         try:
-            return _CellProcess(dynamics, intensity, box, cores, cells=cells)
+            return _VisitProcess(dynamics, intensity, box, cores, cells=cells)
         except (NumericalFailure, np.linalg.LinAlgError, RuntimeError, ValueError):
             return None
-
-    def _last_visited(self, rates: sparse.csr_matrix, core: np.ndarray, which: int) -> np.ndarray:
-        found = (core == which).astype(float)
-        free = np.flatnonzero(core < 0)
-        # Of the reversed process only ratios count: π_j L_ji, row by row.
-        flows = (sparse.diags(np.maximum(self.density, np.finfo(float).tiny)) @ rates).T.tocsr()
-        inner = flows[free][:, free]
-        scale = 1 / np.maximum(-inner.diagonal(), np.finfo(float).tiny)
-        into = -(flows[free] @ found)
-        found[free] = splu((sparse.diags(scale) @ inner).tocsc()).solve(scale * into)
-        return np.clip(found, 0.0, 1.0)
 
     def distribution(
         self, well: int, state: int, places: np.ndarray, *, blur: float = 0.0, exposure: float = 0.0
@@ -213,104 +141,36 @@ class _CellProcess:
         return np.asarray(special.ndtr((places[:, None] - at) / spread) @ (mass / mass.sum()))
 
 
-def _rates(
-    force: Function, noise: Function, y: np.ndarray, steps: np.ndarray, count: int
-) -> sparse.csr_matrix:
-    """Rates between neighbouring cells, without those that lead out of a cell on the diagonal."""
-    pairs: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    dimension = y.shape[1]
-    index = np.arange(len(y)).reshape((count,) * dimension)
-    for axis in range(dimension):
-        left = np.take(index, np.arange(count - 1), axis=axis).ravel()
-        right = np.take(index, np.arange(1, count), axis=axis).ravel()
-        h = steps[axis]
-        face = (y[left] + y[right]) / 2
-        tensor = noise(face)
-        spread = tensor[:, axis, axis]
-        slope = (noise(y[right])[:, axis, axis] - noise(y[left])[:, axis, axis]) / h
-        drift = force(face)[:, axis] - slope
-        if dimension == 2:
-            other = 1 - axis
-            move = np.zeros(2)
-            move[other] = steps[other] / 2
-            # What the other direction's mixed term carries along this one: ∂(a_xy)/∂y.
-            drift = drift - (noise(face + move) - noise(face - move))[:, 0, 1] / steps[other]
-            spread = spread - np.abs(tensor[:, 0, 1]) * h / steps[other]
-        spread = np.maximum(spread, 1e-9 * tensor[:, axis, axis])
-        z = np.clip(drift * h / spread, -STEEP, STEEP)
-        ways = ((left, right, -z), (right, left, z))  # B = 1/exprel
-        pairs += [(one, other, spread / h**2 / special.exprel(own)) for one, other, own in ways]
-    if dimension == 2:
-        for sign in (1, -1):
-            low = index[:-1, :-1] if sign > 0 else index[:-1, 1:]
-            high = index[1:, 1:] if sign > 0 else index[1:, :-1]
-            start, end = low.ravel(), high.ravel()
-            mixed = np.maximum(sign * noise((y[start] + y[end]) / 2)[:, 0, 1], 0) / np.prod(steps)
-            used = mixed > 0
-            pairs += [(start[used], end[used], mixed[used]), (end[used], start[used], mixed[used])]
-    rows, columns, values = (np.concatenate(part) for part in zip(*pairs, strict=True))
-    return sparse.csr_matrix((values, (rows, columns)), shape=(len(y), len(y)))
-
-
-def _invariant_density(rates: sparse.csr_matrix) -> np.ndarray:
-    """Probabilities with ``π L = 0``: that of a busy cell set to one, the others follow from it."""
-    transposed = rates.T.tocsc()
-    size = transposed.shape[0]
-    # A process that rarely starts anew, anywhere, says which cell is busy; of one that is not, the ratio of
-    # all others to it would have to be found.
-    anew = RESTART_RATE * float(-rates.diagonal().min())
-    started = splu((transposed - anew * sparse.identity(size)).tocsc()).solve(np.full(size, -anew / size))
-    fixed = int(np.argmax(started))
-    free = np.delete(np.arange(size), fixed)
-    right = -np.asarray(transposed[free][:, [fixed]].todense()).ravel()
-    found = np.ones(size)
-    found[free] = splu(transposed[free][:, free].tocsc()).solve(right)
-    if not np.isfinite(found).all() or found.min() < -1e-6 * found.max():
-        raise NumericalFailure(
-            "the invariant density was not found: the noise is too weak for this box; use the barriers"
-        )
-    found = np.maximum(found, 0.0)
-    return np.asarray(found / found.sum())
-
-
-def _as_sampled(cores: _Cores, dynamics: Dynamics, intensity: float, step: float) -> _Cores:
+def _as_sampled(
+    cores: Sequence[Neighbourhood], dynamics: Dynamics, intensity: float, step: float
+) -> list[Neighbourhood]:
     """Cores that a state meets all the time as often as it is seen in these at samples a step apart."""
     # A random walk meets a boundary as Brownian motion meets one that lies OVERSHOOT standard deviations
     # of a step farther on (Chernoff; Siegmund, Sequential Analysis, 1985), √(ε h tr(MD)/d) in the metric.
     found = []
-    for place, hessian, level in cores:
-        spread = np.trace(hessian @ dynamics.diffusion.at(place[None])[0]) / len(place)
-        radius = np.sqrt(level) - OVERSHOOT * np.sqrt(intensity * step * max(float(spread), 0.0))
-        found.append((place, hessian, max(radius, SMALLEST_CORE * np.sqrt(level)) ** 2))
+    for core in cores:
+        spread = np.trace(core.hessian @ dynamics.diffusion.at(core.center[None])[0]) / len(core.center)
+        whole = np.sqrt(2 * core.level)
+        radius = whole - OVERSHOOT * np.sqrt(intensity * step * max(float(spread), 0.0))
+        found.append(replace(core, level=max(radius, SMALLEST_CORE * whole) ** 2 / 2))
     return found
 
 
-def _core_of(cores: _Cores, points: np.ndarray) -> np.ndarray:
+def _core_of(cores: Sequence[Neighbourhood], points: np.ndarray) -> np.ndarray:
     """The core of each point ``(n, d)``, -1 between them: shape ``(n,)``."""
-    heights = [
-        np.einsum("ni,ij,nj->n", points - attractor, hessian, points - attractor) / level
-        for attractor, hessian, level in cores
-    ]
+    heights = [one.height(points.T) for one in cores]
     nearest = np.argmin([*heights, np.full(len(points), np.nextafter(1, 2))], axis=0)
     return np.where(nearest < len(cores), nearest, -1)
 
 
-def _cores_about(dynamics: Dynamics, portrait: PhasePortrait, intensity: float) -> _Cores:
-    """The core of each attractor: U below ε, or below half of what it is at the next saddle or attractor."""
-    attractors = np.array([one.position for one in portrait.attractors])
-    cores = []
-    for place, attractor in enumerate(attractors):
-        hessian = hessian_at(dynamics, attractor)
-        others = [*np.delete(attractors, place, axis=0), *(one.position for one in portrait.saddles[place])]
-        away = np.array(others) - attractor
-        lowest = float(np.einsum("ni,ij,nj->n", away, hessian, away).min())
-        cores.append((attractor, hessian, min(intensity, CORE_SHARE * lowest)))
-    return cores
-
-
 def _predicted_visits(
-    found: FieldEstimate, portrait: PhasePortrait, noise: NoiseStrength, cores: _Cores, *, seed: int = 0
-) -> tuple[list[tuple[int, float, float]], list[_CellProcess], Remark]:
+    found: FieldEstimate,
+    portrait: PhasePortrait,
+    noise: NoiseStrength,
+    cores: Sequence[Neighbourhood],
+    *,
+    seed: int = 0,
+) -> tuple[list[tuple[int, float, float]], list[_VisitProcess], Remark]:
     """Well, mean time of visits and its relative error by f, D and ε, core to core, where that is known.
 
     It is by the operator of f and of draws of it, which is returned too, or else by the law; and what is not
@@ -318,17 +178,17 @@ def _predicted_visits(
     """
     reasons: list[str] = []
     dynamics, width = found.dynamics, portrait.box[:, 1] - portrait.box[:, 0]
-    for margin in MARGINS if dynamics.dimension in CELLS else ():
+    for margin in MARGINS if dynamics.dimension in DRAWS else ():
         cells = CELLS[dynamics.dimension]
         box = portrait.box + margin * np.stack([-width, width], axis=1)
         try:
-            processes = [_CellProcess(dynamics, noise.intensity, box, cores, cells=cells)]
+            processes = [_VisitProcess(dynamics, noise.intensity, box, cores, cells=cells)]
             generator = np.random.default_rng(seed)
             for _ in range(DRAWS[dynamics.dimension]):
-                drawn = _drawn_system(found, generator=generator)
+                drawn = found.drawn(generator)
                 strength = float(np.exp(noise.standard_error / noise.intensity * generator.standard_normal()))
                 coarse = round(COARSER * cells)
-                processes.append(_CellProcess(drawn, noise.intensity * strength, box, cores, cells=coarse))
+                processes.append(_VisitProcess(drawn, noise.intensity * strength, box, cores, cells=coarse))
         except (NumericalFailure, np.linalg.LinAlgError, RuntimeError, ValueError) as error:
             reasons.append(str(error))
             continue
@@ -345,22 +205,6 @@ def _predicted_visits(
         else:
             times.append((well, mean_time.value, mean_time.error))
     return times, [], Remark("quasipotential.no_dwell_time", {"reasons": reasons, "places": places})
-
-
-def _drawn_system(found: FieldEstimate, *, generator: np.random.Generator) -> Dynamics:
-    """f and D drawn from their distributions, further terms of f and the terms of D(x) included."""
-    coefficients = np.zeros_like(found.coefficients)
-    own = normal_draws(found.values, found.covariance, 1, generator=generator)[0]
-    coefficients[found.support[:, 1], found.support[:, 0]] = own
-    coefficients += found.drawn_alternatives(1, generator=generator)[0]
-    support = np.argwhere(coefficients.T != 0)
-    diffusion = found.diffusion
-    if found.noise is not None:
-        terms = found.noise
-        entries = normal_draws(terms.values, terms.covariance, 1, generator=generator)[0]
-        diffusion = replace(terms, values=entries).diffusion(found.intensity)
-    values = coefficients[support[:, 1], support[:, 0]]
-    return field_dynamics(found.library, support, values, diffusion=diffusion)
 
 
 @dataclass(frozen=True)
@@ -489,7 +333,7 @@ class OccupancyCheck:
 
 
 def _passages_of(
-    portrait: PhasePortrait, recordings: Recordings, cores: _Cores
+    portrait: PhasePortrait, recordings: Recordings, cores: Sequence[Neighbourhood]
 ) -> tuple[tuple[int, ...], ...]:
     """How often a record went from one well into the core of another.
 
@@ -550,19 +394,19 @@ def check_occupancy(
         return OccupancyCheck(missing=Remark("quasipotential.hops_unseen", values), unseen=seen)
     if noise is None:
         return OccupancyCheck(missing=Remark("quasipotential.record_of_unknown_noise"))
-    cores = _cores_about(found.dynamics, portrait, noise.intensity)
+    cores = cores_about(found.dynamics, portrait.attractors, portrait.saddles, noise.intensity)
     runs, whole_runs = runs_of(recordings), runs_of(joined(recordings))
     visits = continued_visits(_core_of(cores, recordings.values), whole_runs)
     passages = _passages_of(portrait, joined(recordings), cores)
     states = len(portrait.attractors)
     whole = DwellCount.of_visits(recordings.t, visits, whole_runs, states=states)
-    if found.dynamics.dimension not in CELLS and not any(one.visits for one in whole):
+    if found.dynamics.dimension not in DRAWS and not any(one.visits for one in whole):
         return OccupancyCheck(missing=Remark("quasipotential.record_without_hops"), passages=passages)
     sampled = _as_sampled(cores, found.dynamics, noise.intensity, usual_step(recordings))
     times, processes, unknown = _predicted_visits(found, portrait, noise, sampled, seed=seed)
     method = "operator" if processes else "law"
     # What each part foresees of the recordings that it did not see. A law of three states and more has all.
-    apart: list[tuple[np.ndarray, tuple[DwellCount, ...], _CellProcess | None]] = []
+    apart: list[tuple[np.ndarray, tuple[DwellCount, ...], _VisitProcess | None]] = []
     for fit, mask in parts:
         used = [run for run in runs if mask[recordings.recording[run.start]]]
         process = processes[0].of(fit.dynamics) if processes and fit is not found else None

@@ -24,7 +24,7 @@ from siq.errors import NumericalFailure
 from siq.inference.claims import check_claims
 from siq.inference.field_estimate import FieldEstimate
 from siq.inference.kalman_identification import filtered_recordings
-from siq.inference.library import CandidateLibrary, joint_library
+from siq.inference.library import CandidateLibrary, candidate_library
 from siq.inference.regression import coarse_pairs, lagged_pairs, refit
 from siq.networks.decomposition import AnyNetworks, shuffled
 from siq.numerics.randomness import Purpose, generator
@@ -122,16 +122,21 @@ class Refined:
 
 
 def _formula_library(found: FieldEstimate, options: RefinementOptions) -> CandidateLibrary:
-    """The functions in which one formula of V is sought for the whole region.
+    """The functions in which one formula of V is sought for the whole region: all of f's are among them.
 
     No polynomial V has a higher degree than f has, and one: of ``∇V·(f + D∇V) = 0`` the highest powers would
     be those of ``∇V·D∇V``, which cannot vanish where D is regular. A quartic is the least that has two wells.
     """
-    degree = options.formula_degree
+    own, degree = found.library, options.formula_degree
     if degree is None:
-        highest = max(found.library.total_degree(term) for _, term in found.support)
-        degree = affordable_degree(found.library.dimension, max(4, highest + 1))
-    return joint_library(found.library, degree=degree, potential_degree=degree, further=options.functions)
+        highest = max(own.total_degree(term) for _, term in found.support)
+        degree = affordable_degree(own.dimension, max(4, highest + 1))
+    named = (
+        name for name, term in zip(own.names, own.terms, strict=True) if not term.is_polynomial(*own.symbols)
+    )
+    further = tuple(dict.fromkeys((*options.functions, *named)))  # V may use those that are no monomials
+    whole = max(degree, *(own.total_degree(k) for k in range(own.size)))
+    return candidate_library(own.states, degree=whole, potential_degree=degree, further=further)
 
 
 def refine(

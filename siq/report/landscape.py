@@ -59,16 +59,19 @@ def landscape_tables(
 
     ``wells`` have a column each, and as numbers a row; ``exits`` are the ways out of every well,
     ``equilibria`` all states at which f vanishes, with the eigenvalues of f there, ``cycles`` the unstable
-    ones. ``times`` are how long each well lasts under the noise strengths ε.
+    ones. ``times`` are how long each well lasts under the noise strengths ε, and ``checked`` the same by the
+    law, by the operator and by a simulation, where that was asked for.
     """
     if summary is None or not summary.wells:
-        return dict.fromkeys(("wells", "exits", "equilibria", "cycles", "times"), (pd.DataFrame(), None))
+        names = ("wells", "exits", "equilibria", "cycles", "times", "checked")
+        return dict.fromkeys(names, (pd.DataFrame(), None))
     return {
         "wells": _wells_table(summary),
         "exits": _exits_table(summary),
         "equilibria": (_equilibria_table(summary), None),
         "cycles": (_cycles_table(summary), None),
         "times": (_times_table(summary, noises if summary.has_times else ()), None),
+        "checked": (_checked_table(summary), summary.checked_times),
     }
 
 
@@ -212,6 +215,26 @@ def _times_table(summary: LandscapeSummary, noises: Sequence[float]) -> pd.DataF
     return pd.DataFrame(rows)
 
 
+def _checked_table(summary: LandscapeSummary) -> pd.DataFrame:
+    rows, checked = [], summary.checked_times
+    for one in () if checked is None else checked.to_dict("records"):
+        times = {
+            "by the law": (one["law"], one["law"] * one["law_error"]),
+            "by the operator": (one["operator"], one["operator"] * one["operator_error"]),
+            "simulated": (one["check"], one["check"] * one["relative_error"]),
+        }
+        rows.append(
+            {"stable state": well_name(int(one["attractor"]))}
+            | {with_unit("noise strength ε", summary.energy_unit): value_text(one["noise"])}
+            | {
+                with_unit(name, summary.time_unit): value_text(value, error) if math.isfinite(value) else ""
+                for name, (value, error) in times.items()
+            }
+            | {"95 % interval of the simulation": range_text(one["lower"], one["upper"])}
+        )
+    return pd.DataFrame(rows)
+
+
 def in_words(table: pd.DataFrame) -> pd.DataFrame:
     """A table with headings in words, without columns that say nothing."""
     return table.dropna(axis=1, how="all").rename(columns=lambda name: name.replace("_", " "))
@@ -299,11 +322,13 @@ def _report(landscape: Landscape) -> tuple[list[str], list[tuple[str, pd.DataFra
         stated = summary.stating(certificate)
         verdict = paragraphs("certificate.j2", certificate=stated, texts=texts("certificate"))[-1]
     words = texts("tables")
-    wells, _ = landscape_tables(summary)["wells"]
+    found = landscape_tables(summary)
+    wells, checked = found["wells"][0], found["checked"][0]
     tables = [] if wells.empty else [(words["wells"], wells)]
     if landscape.transitions:
         ways = landscape.barriers().rename(columns={"start": "from", "end": "to"})
         for end in ("from", "to"):
             ways[end] = [None if pd.isna(well) else well_name(int(well)) for well in ways[end]]
         tables.append((words["exits"], ways))
+    tables += [] if checked.empty else [(words["checked"], checked)]
     return [answer, verdict, *further], tables

@@ -135,6 +135,7 @@ class LandscapeSummary:
     equilibria: tuple[_EquilibriumSummary, ...] = ()  #: all of them, in the order in which they were found
     #: How large each state becomes, shape (d,); of states of one unit, how large any does.
     size: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    checked_times: pd.DataFrame | None = None  #: `siq.Landscape.verify_times` for each ε, where asked for
 
     @property
     def energy_unit(self) -> str:
@@ -380,6 +381,7 @@ def summarise(
         ways=ways,
         noise=landscape.noise,
         given=landscape.given,
+        checked_times=landscape.checked_times,
         run=run,
         remarks=tuple(map(sentence, landscape.remarks)),
         unstable_cycles=landscape.parting,

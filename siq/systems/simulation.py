@@ -30,7 +30,6 @@ from siq.numerics.integration import euler_maruyama_step, runge_kutta_step
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import find_equilibria
-from siq.systems.formulas import FormulaError, compile_formulas, formulas_in_time
 
 TRAJECTORIES = 1000  # enough for every state of a box in three dimensions, and simulated in seconds
 STATES = 400  # of the domain, at which rates are asked for
@@ -266,32 +265,6 @@ def _rates(dynamics: Dynamics) -> tuple[float, float]:
     ]
     slowest = min(relaxing, default=float(np.quantile(sizes, 1 - FASTEST)))
     return fastest, max(slowest, 1e-6 * fastest)
-
-
-def fault_over_domain(dynamics: Dynamics) -> tuple[str, str] | None:
-    """A state whose equation has no value somewhere in the domain, with what is wrong; None for none.
-
-    States at random and the corners tell what overflows; a divisor that changes its sign between them is zero
-    somewhere, though no state of a sample meets it.
-    """
-    low, high = dynamics.box.T
-    x = np.random.default_rng(0).uniform(low, high, size=(STATES, dynamics.dimension))
-    x = np.concatenate([x, low[None], high[None]])
-    with np.errstate(all="ignore"):
-        try:
-            with formulas_in_time("the derivatives"):
-                flow, slopes = dynamics.drift(x), dynamics.jacobian(x)
-                dynamics.hessian(x[:1])  # on which paths and series depend
-        except FormulaError as error:
-            raise error.at(dynamics.name or "the system", "equations") from None
-        for index, (name, formula) in enumerate(zip(dynamics.states, dynamics.formulas, strict=True)):
-            bases = [one.base for one in formula.atoms(sympy.Pow) if one.exp.is_negative]
-            divisors = compile_formulas(bases, dynamics.symbols)(np.ascontiguousarray(x.T))
-            if any(values.min() <= 0 <= values.max() for values in divisors):
-                return name, "divides by zero within the domain"
-            if not (np.isfinite(flow[:, index]).all() and np.isfinite(slopes[:, index]).all()):
-                return name, "is too large for a number, or not defined, in a part of the domain"
-    return None
 
 
 def _round_down(value: float) -> float:

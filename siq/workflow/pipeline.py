@@ -305,7 +305,7 @@ def landscape_of_run(
         found = find_landscape(
             record, portrait, wells=wells if wells or not seek_wells else None, certificate=certificate,
             options=settings.refinement, noise=_noise_strength(settings, record), seed=number,
-        )  # fmt: skip
+        ).with_checked_times(settings.landscape, seed=number)  # fmt: skip
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         return StepResult(None, Outcome(number, Step.LANDSCAPE, Status.FAILED, str(error)))
     whole = found.global_quasipotential is not None and not found.notes

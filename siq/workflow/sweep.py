@@ -24,7 +24,7 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 from siq.errors import InputError, NumericalFailure, suggestion
 from siq.numerics.files import read_document, validate
 from siq.numerics.randomness import Purpose, generator
-from siq.quasipotential.cell_density import shares_by_rates
+from siq.quasipotential.invariant_density import shares_by_rates
 from siq.quasipotential.landscape import NoLandscape
 from siq.quasipotential.landscape_assembly import EquationSettings, landscape_from_equations, usable_system
 from siq.quasipotential.rates import EscapeRate, NoiseStrength, mean_residence_time

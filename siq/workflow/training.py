@@ -19,7 +19,7 @@ from siq.data.recordings import Recordings, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
 from siq.networks.decomposition import AnyNetworks, TrainingOptions
-from siq.networks.training import Block, Check, TrainingData, choose_device, prepare_data
+from siq.networks.training import Block, Check, TrainingData, prepare_data
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.output_weights import OutputWeights
 from siq.systems.diffusion import Diffusion
@@ -55,9 +55,13 @@ def train_block(
         return results, [], as_table("training", [])
     diffusion = _diffusion(settings, runs, data)
     ready, faults = _checks(settings, runs, data, diffusion)
+    import torch  # which takes seconds
+
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
     block = Block(
         data, ready, options=settings.training, diffusion=diffusion, seed=settings.seed, folder=folder,
-        mark=f"{_fingerprint(settings, runs, data)} {version}", device=choose_device(device), faults=faults,
+        mark=f"{_fingerprint(settings, runs, data)} {version}", device=torch.device(device), faults=faults,
     )  # fmt: skip
     block.train()
     for number in data:

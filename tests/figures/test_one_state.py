@@ -11,8 +11,7 @@ import pytest
 from known_systems import double_well, exact_field, portrait_of
 from matplotlib.figure import Figure
 
-from siq.quasipotential.cell_density import SampledPotential
-from siq.quasipotential.invariant_density import StationaryDensity
+from siq.quasipotential.invariant_density import SampledPotential, StationaryDensity
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_comparison import reference_landscape

@@ -15,7 +15,7 @@ from known_wells import matched, stationary
 
 from siq.errors import NumericalFailure
 from siq.numerics.integration import heun_step
-from siq.quasipotential.cell_density import (
+from siq.quasipotential.invariant_density import (
     SampledPotential,
     shares_by_rates,
 )

@@ -12,9 +12,10 @@ from siq.data.recordings import Recordings
 from siq.data.states import DwellCount
 from siq.data.stationarity import runs_of
 from siq.errors import NumericalFailure
-from siq.quasipotential.occupancy import _CellProcess, _core_of
+from siq.quasipotential.occupancy import _core_of, _VisitProcess
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
+from siq.validation.escapes import Neighbourhood
 
 pytestmark = pytest.mark.portable
 
@@ -25,7 +26,7 @@ BOX = np.array([[-2.0, 2.0]])
 HALF = 0.1  # width of a core
 
 
-CORES = [(well, np.eye(1), HALF**2) for well in WELLS[:, None]]
+CORES = [Neighbourhood(well, np.eye(1), HALF**2 / 2) for well in WELLS[:, None]]
 
 
 @pytest.mark.parametrize("intensity", [0.05, 0.15, 0.4])
@@ -33,7 +34,7 @@ CORES = [(well, np.eye(1), HALF**2) for well in WELLS[:, None]]
 def test_one_state_by_quadrature(intensity: float, graded: bool) -> None:
     graded_noise = Diffusion.of_formulas((x,), (((1 + x**2 / 2) ** 2,),))
     system = TILTED.with_diffusion(graded_noise) if graded else TILTED
-    process = _CellProcess(system, intensity, BOX, CORES)
+    process = _VisitProcess(system, intensity, BOX, CORES)
     grid = np.linspace(*BOX[0], 200_001)
     spread = (1 + grid**2 / 2) ** 2 if graded else np.ones_like(grid)
     force = 2 * (grid - grid**3 + 0.1) / (intensity * spread)
@@ -53,21 +54,21 @@ def test_cells_where_a_formula_of_the_noise_is_none_are_left_out() -> None:
     """D = 1 - x² on a wider box: Jacobi's process, with the density (1 - x²)^(1/ε - 1)."""
     system = Dynamics(("x",), (-x,), Diffusion.of_formulas((x,), ((1 - x**2,),)))
     intensity = 0.4
-    process = _CellProcess(system, intensity, BOX, [])
+    process = _VisitProcess(system, intensity, BOX, [])
     place = process.points[:, 0]
     assert np.abs(place).max() < 1 and np.abs(place).max() > 0.99
     expected = (1 - place**2) ** (1 / intensity - 1)
     assert process.density == pytest.approx(expected / expected.sum(), rel=1e-3, abs=1e-6)
     beyond = system.with_diffusion(Diffusion.of_formulas((x,), ((x**2 - 9,),)))
     with pytest.raises(NumericalFailure, match="does not reach every state"):
-        _CellProcess(beyond, intensity, BOX, [])
+        _VisitProcess(beyond, intensity, BOX, [])
 
 
 @pytest.mark.parametrize("mixed", [0.0, 0.5])
 def test_two_states_with_mixed_noise_have_the_density_of_a_linear_system(mixed: float) -> None:
     matrix = np.array([[1.0, mixed], [mixed, 1.0]])
     system = Dynamics(("x", "y"), (-x, -y), Diffusion(matrix))
-    process = _CellProcess(system, 0.5, np.array([[-2.5, 2.5], [-2.5, 2.5]]), [], cells=80)
+    process = _VisitProcess(system, 0.5, np.array([[-2.5, 2.5], [-2.5, 2.5]]), [], cells=80)
     covariance = np.cov(process.points.T, aweights=process.density)
     assert np.abs(covariance - 0.25 * matrix).max() < 0.005
 
@@ -82,11 +83,11 @@ def test_two_states_against_a_simulation() -> None:
         seen[k] = state
         kick = np.sqrt(intensity * step) * generator.standard_normal(state.shape)
         state = state + step * system.drift(state) + kick
-    about = [(well, 2 * np.eye(2), 0.4) for well in np.array([[-1.0, 0.0], [1.0, 0.0]])]
+    about = [Neighbourhood(well, 2 * np.eye(2), 0.2) for well in np.array([[-1.0, 0.0], [1.0, 0.0]])]
     recordings = Recordings.from_arrays(step * np.arange(steps), seen.transpose(1, 0, 2), names=["x", "y"])
     visits = continued_visits(_core_of(about, recordings.values), runs_of(recordings))
     counts = DwellCount.of_visits(recordings.t, visits, runs_of(recordings))
-    process = _CellProcess(system, intensity, np.array([[-2.4, 2.4], [-2.2, 2.2]]), about, cells=100)
+    process = _VisitProcess(system, intensity, np.array([[-2.4, 2.4], [-2.2, 2.2]]), about, cells=100)
     for well, count in enumerate(counts):
         error = np.hypot(count.relative_error, 0.03)  # of the simulation's own step, and of the cells
         assert process.means[well] == pytest.approx(count.mean, rel=3 * error)
@@ -94,10 +95,10 @@ def test_two_states_against_a_simulation() -> None:
 
 def test_noise_that_is_too_weak_is_refused() -> None:
     with pytest.raises(NumericalFailure, match="too weak"):
-        _CellProcess(TILTED, 1e-9, BOX, [])
+        _VisitProcess(TILTED, 1e-9, BOX, [])
 
 
 def test_noise_that_does_not_reach_a_state_is_refused() -> None:
     system = Dynamics(("x", "y"), (y, x - x**3 - y), Diffusion(np.diag([0.0, 1.0])))
     with pytest.raises(NumericalFailure, match="does not reach"):
-        _CellProcess(system, 0.1, np.array([[-2.0, 2.0], [-2.0, 2.0]]), [])
+        _VisitProcess(system, 0.1, np.array([[-2.0, 2.0], [-2.0, 2.0]]), [])

@@ -11,7 +11,8 @@ from siq.data.recordings import Recordings
 from siq.data.states import SIGNIFICANCE, DwellCount
 from siq.inference.field_estimate import FieldEstimate, FlowMap
 from siq.inference.library import IdentificationOptions, field_library
-from siq.quasipotential.occupancy import _as_sampled, _CellProcess, _core_of, _cores_about, check_occupancy
+from siq.quasipotential.fokker_planck import cores_about
+from siq.quasipotential.occupancy import _as_sampled, _core_of, _VisitProcess, check_occupancy
 from siq.quasipotential.rates import NoiseStrength
 from siq.remarks import sentence
 from siq.systems.diffusion import Diffusion
@@ -55,14 +56,14 @@ def record(
 def test_visits_are_foreseen_as_samples_show_them(intensity: float, step: float) -> None:
     dynamics = wells()
     portrait = phase_portrait(dynamics, np.linspace(-1.6, 1.6, 100)[:, None], seed=0)
-    cores = _cores_about(dynamics, portrait, intensity)
+    cores = cores_about(dynamics, portrait.attractors, portrait.saddles, intensity)
     values = record(intensity, step, 800, recordings=400, substeps=10)
     runs = [slice(start, start + 800) for start in range(0, values.size, 800)]
     visits = continued_visits(_core_of(cores, values.reshape(-1, 1)), runs)
     counts = DwellCount.of_visits(np.tile(step * np.arange(800), 400), visits, runs)
     counted = sum(one.time for one in counts) / sum(one.visits for one in counts)
     always, sampled = (
-        _CellProcess(dynamics, intensity, np.array([[-3.5, 3.5]]), one).means[0]
+        _VisitProcess(dynamics, intensity, np.array([[-3.5, 3.5]]), one).means[0]
         for one in (cores, _as_sampled(cores, dynamics, intensity, step))
     )
     assert sampled == pytest.approx(counted, rel=0.04)

@@ -10,10 +10,10 @@ import pytest
 from siq.data.recordings import Recordings
 from siq.data.states import DwellCount
 from siq.inference.field_estimate import FieldEstimate, Verdict
+from siq.quasipotential.fokker_planck import cores_about
 from siq.quasipotential.occupancy import (
     OccupancyCheck,
     _core_of,
-    _cores_about,
     _predicted_visits,
     _probability_of,
     check_occupancy,
@@ -95,7 +95,7 @@ def test_values_of_a_noisy_sensor_are_spread_as_state_and_noise(recorded: RECORD
 
 def test_means_over_an_exposure_are_spread_less_than_the_state(recorded: RECORDED) -> None:
     recordings, record, portrait, _ = recorded
-    length, cores = 8, _cores_about(record.dynamics, portrait, INTENSITY)
+    length, cores = 8, cores_about(record.dynamics, portrait.attractors, portrait.saddles, INTENSITY)
     process = _predicted_visits(record, portrait, NoiseStrength(INTENSITY), cores)[1][0]
     places, x = np.linspace(-3, 3, 601), recordings.values[:, 0]
 
@@ -159,7 +159,7 @@ def test_a_few_hops_do_not_test_a_time(recorded: RECORDED) -> None:
 
 def test_cores_keep_clear_of_the_saddle(recorded: RECORDED) -> None:
     _, record, portrait, _ = recorded
-    cores = _cores_about(record.dynamics, portrait, 10.0)
+    cores = cores_about(record.dynamics, portrait.attractors, portrait.saddles, 10.0)
     places = np.array([[0.0], [-1.0], [1.0], [-0.7]])
     found = _core_of(cores, places).tolist()
     assert found[0] == -1 and set(found[1:3]) == {0, 1}
@@ -168,7 +168,7 @@ def test_cores_keep_clear_of_the_saddle(recorded: RECORDED) -> None:
 def test_a_distribution_function_rises_from_nothing_to_all(recorded: RECORDED) -> None:
     _, record, portrait, _ = recorded
     noise = NoiseStrength(INTENSITY)
-    cores = _cores_about(record.dynamics, portrait, INTENSITY)
+    cores = cores_about(record.dynamics, portrait.attractors, portrait.saddles, INTENSITY)
     _, processes, _ = _predicted_visits(record, portrait, noise, cores)
     along = processes[0].distribution(0, 0, np.linspace(-3, 3, 50), blur=0.1)
     assert along[0] < 1e-6 and along[-1] > 1 - 1e-6 and (np.diff(along) >= -1e-12).all()

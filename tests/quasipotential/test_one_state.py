@@ -14,8 +14,7 @@ from known_systems import KnownSystem, double_well, exact_field, portrait_of, po
 from scipy.integrate import solve_ivp
 
 from siq.data.recordings import Recordings
-from siq.quasipotential.cell_density import SampledPotential
-from siq.quasipotential.invariant_density import marginal_density
+from siq.quasipotential.invariant_density import SampledPotential, marginal_density
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_comparison import reference_landscape

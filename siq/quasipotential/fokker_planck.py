@@ -1,0 +1,419 @@
+"""The Fokker–Planck operator on cells: density, committors, reactive currents, mean times, dissipation.
+
+For ``dx = f dt + √ε σ dW`` in one to three states, ``L u = f·∇u + (ε/2) D:∇∇u`` on a box that nothing leaves
+becomes a Markov jump process between cells. The flux between neighbours is Scharfetter and Gummel's,
+
+    J = (a/h) [B(-z) p_left - B(z) p_right],    a = (ε/2) D,  z = (f - a') h/a,  B(z) = z/(eᶻ - 1),
+
+which is exact for constant coefficients, keeps densities positive, and knows no smallness of ε. It is done in
+coordinates in which the D in the middle is diagonal. Where D has mixed terms elsewhere, diagonal neighbours
+take them (Kushner), in two states.
+
+All the rest are solutions with this one L. With the invariant density π, two sets A and B and ``L q = 0``
+between them, q⁺ = 0 in A and 1 in B, is the *committor*, the probability to reach B before A; q⁻, of the
+reversed process ``π L`` and 1 in A, is that of having come from A last. Of all that goes from A to B
+
+    density π q⁺ q⁻,    current of i to j ``π_i q⁻_i L_ij q⁺_j`` less that of j to i,    rate F/∫ π q⁻,
+
+F being the current that leaves A (E. Vanden-Eijnden, Lect. Notes Phys. 703 (2006) 453). A mean time τ to B
+solves ``L τ = -1`` outside of B.
+
+The *dissipation*, the production of entropy per unit of time in units of Boltzmann's constant, is
+
+    Σ̇ = (2/ε) ∫ u·D⁻¹u π dx,    u = J/π = f - (ε/2) ∇·(Dπ)/π,
+
+J being the stationary current. As ε → 0, u is the g of ``f = -D∇V + g``; where ∇·g = 0 it is g for any ε. It
+vanishes where there is detailed balance, and there only (U. Seifert, Rep. Prog. Phys. 75 (2012) 126001).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage, sparse, special
+from scipy.sparse.linalg import splu
+
+from siq.errors import NumericalFailure
+from siq.numerics.randomness import positive
+from siq.quasipotential.characteristics import Function, ScaledSystem
+from siq.systems.cycles import Cycle
+from siq.systems.dynamics import Dynamics
+from siq.systems.equilibria import Equilibrium, hessian_at
+from siq.validation.escapes import Neighbourhood
+
+# Along each state: visits of a double well are then good to 1e-4 and 1e-2; of three states as is affordable.
+CELLS = {1: 2000, 2: 120, 3: 28}
+COARSE = 1.0  # z between neighbours, in the mean over the density: beyond, wells are narrower than cells
+RESTART_RATE = 1e-9  # of the fastest rate
+LEAST_NOISE = 1e-9  # numerical: of the strongest noise; where it is weaker it is none
+STEEP = 700.0  # of z: beyond, exp overflows, and B has its limits
+CORE_SHARE = 0.5  # of U at the next saddle: a core lies well within its well
+COARSER = 0.5  # as many cells along each state: enough for how much a number changes
+WIDER = 0.75  # as many cells: by which the error of those is told, where three states leave no coarser ones
+QUANTILES = (0.025, 0.975)  # of an interval
+
+
+class ReactiveFlow(NamedTuple):
+    """What goes from a set A to a set B, in the cells of `process`.
+
+    Attributes
+    ----------
+    process
+        The cells: their middles are `process.points`, shape ``(n, d)``.
+    committor
+        Probability to reach B before A, shape ``(n,)``.
+    density
+        Of states on their way from A to B, per unit of the states, shape ``(n,)``: its integral is the share
+        of time spent so.
+    current
+        Net current of what is on its way, ``(n, d)``: per unit of time and of what is across.
+    rate
+        Of transitions per unit of time that A was the last of both.
+    """
+
+    process: CellProcess
+    committor: np.ndarray
+    density: np.ndarray
+    current: np.ndarray
+    rate: float
+
+    @property
+    def mean_time(self) -> float:
+        """Mean time from entering A, after B, until B is entered."""
+        return 1 / self.rate if self.rate > 0 else np.inf
+
+    @property
+    def progress(self) -> Callable[[np.ndarray], np.ndarray]:
+        """The logarithm of the committor, of components ``(d, ...)``; in A as low as where it is lowest."""
+        lowest = self.committor[self.committor > 0].min()
+        return self.process.interpolated(np.log(np.maximum(self.committor, lowest)))
+
+
+class Dissipation(NamedTuple):
+    """Production of entropy per unit of time, in units of Boltzmann's constant.
+
+    Attributes
+    ----------
+    value, lower, upper
+        Σ̇, and its 95 % interval: by the uncertainty of f and ε where these were estimated, and of given ones
+        the error of the cells.
+    points, density
+        Middles of the cells, ``(n, d)``, and where in them it is made, per unit of the states, ``(n,)``.
+    """
+
+    value: float
+    lower: float
+    upper: float
+    points: np.ndarray
+    density: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        dynamics: Dynamics,
+        intensity: float,
+        box: np.ndarray,
+        *,
+        draws: Sequence[tuple[Dynamics, float]] = (),
+        cells: int | None = None,
+    ) -> Dissipation:
+        """Σ̇ in a box.
+
+        Parameters
+        ----------
+        dynamics, intensity, box, cells
+            As `CellProcess` takes them.
+        draws
+            f, D and ε drawn from the distribution of their estimates. An error of f is taken for a current,
+            and adds to Σ̇ in the mean. The draws say by how much: their distribution about the estimate
+            mirrors that of the estimate about the truth (the basic bootstrap).
+        """
+        process = CellProcess(dynamics, intensity, box, cells=cells)
+        density = process.dissipation()
+        value = float(density.sum() * process.volume)
+        count = round(WIDER * (cells or CELLS[dynamics.dimension]))
+        others = [(dynamics, intensity), *draws]
+        coarse, *drawn = (
+            one.dissipation().sum() * one.volume
+            for one in (CellProcess(each, strength, box, cells=count) for each, strength in others)
+        )
+        if not drawn:
+            # The error is of second order in the width of cells, for narrow ones: twice what that says.
+            error = 2 * abs(value - coarse) / (WIDER**-2 - 1)
+            return cls(value, max(value - error, 0.0), value + error, process.points, density)
+        low, high = np.quantile(drawn, QUANTILES)
+        mean, lower, upper = (max(value - one + coarse, 0.0) for one in (np.mean(drawn), high, low))
+        share = mean / value if value > 0 else 1.0
+        return cls(mean, lower, upper, process.points, share * density)
+
+
+class CellProcess:
+    """The Markov jump process between the cells of a box, of one to three states, that nothing leaves.
+
+    Parameters
+    ----------
+    dynamics, intensity
+        f and D, and ε, in the unit of U.
+    box
+        Shape ``(d, 2)``; it should hold all of the density.
+    cells
+        Along each state.
+
+    Attributes
+    ----------
+    points
+        Middles of the n cells, shape ``(n, d)``.
+    volume
+        Of a cell, in the product of the states' units.
+    density
+        Invariant probabilities, shape ``(n,)``, 1 in total.
+    rates
+        L, shape ``(n, n)``.
+
+    Raises
+    ------
+    NumericalFailure
+        When there are more than three states, noise does not reach every state, or it is too weak for cells.
+    """
+
+    def __init__(
+        self, dynamics: Dynamics, intensity: float, box: np.ndarray, *, cells: int | None = None
+    ) -> None:
+        dimension = dynamics.dimension
+        if dimension not in CELLS:
+            raise NumericalFailure("the Fokker–Planck operator is solved for three states at most")
+        count = cells or CELLS[dimension]
+        # A unit lower triangular change of states after which D has no mixed terms in the middle. With mixed
+        # terms it is the parallelogram's hull that is covered. A D(x) that was learned may be no covariance
+        # far from recordings: cells where that is so are left out.
+        shear, matrix = np.eye(dimension), dynamics.diffusion.at(box.mean(axis=1)[None])[0]
+        unit = np.sqrt(positive(np.diag(matrix)))
+        if np.abs(np.tril(matrix / np.outer(unit, unit), -1)).max() > 1e-12:
+            root = np.linalg.cholesky(matrix)
+            shear = root / np.diag(root)
+        system = ScaledSystem(dynamics, np.zeros(dimension), shear, unit=1.0)
+        corners = system.scaled(np.array(list(product(*box))))
+        sides = np.stack([corners.min(axis=0), corners.max(axis=0)], axis=1)
+        axes = [low + (high - low) * (np.arange(count) + 0.5) / count for low, high in sides]
+        steps = (sides[:, 1] - sides[:, 0]) / count
+        y = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dimension)
+        matrices = system.noise.at(y)
+        strengths = np.linalg.eigvalsh(matrices)
+        floor = LEAST_NOISE * float(strengths.max())
+        off = matrices[:, *np.triu_indices(dimension, 1)]
+        if dimension > 2 and np.abs(off).max() > 1e-9 * strengths.max():
+            raise NumericalFailure("of three states, D has to be of one form everywhere for cells")
+
+        def noise(points: np.ndarray) -> np.ndarray:
+            matrices = system.noise.at(points)
+            levels, vectors = np.linalg.eigh(matrices)
+            if not (levels >= floor).all():  # nothing is weaker than the floor
+                matrices = np.einsum("nik,nk,njk->nij", vectors, np.maximum(levels, floor), vectors)
+            return 0.5 * intensity * matrices
+
+        places = np.flatnonzero(strengths[:, 0] > floor)
+        if not len(places):
+            raise NumericalFailure(
+                "the noise does not reach every state: no Fokker–Planck operator is solved"
+            )
+        # The generator of the largest set of usable cells that are connected.
+        inner = _rates(system.force, noise, y, steps, count)[places][:, places]
+        _, piece = sparse.csgraph.connected_components(inner, directed=True, connection="strong")
+        largest = piece == np.argmax(np.bincount(piece))
+        places, inner = places[largest], inner[largest][:, largest]
+        self.rates = (inner - sparse.diags(np.asarray(inner.sum(axis=1)).ravel())).tocsr()
+        y, self.density = y[places], _invariant_density(self.rates, dimension)
+        tensor, drift = np.diagonal(noise(y), axis1=1, axis2=2), system.force(y)
+        if float((self.density[:, None] * np.abs(drift) * steps / tensor).sum(axis=0).max()) > COARSE:
+            raise NumericalFailure("the noise is too weak for a grid: the wells are narrower than its cells")
+        self.dynamics, self.intensity = dynamics, intensity
+        self.points, self.volume = system.points(y), float(steps.prod())
+        self._system, self._places, self._shape = system, places, (count,) * dimension
+        self._box, self._corner, self._steps = box, sides[:, 0], steps
+
+    def mean_time(self, start: Neighbourhood, ends: Sequence[Neighbourhood]) -> tuple[float, float]:
+        """Mean time from the middle of one neighbourhood until one of some others is reached, and its error.
+
+        ln τ is extrapolated to cells of no width, from these and wider ones: it is off by the square of that.
+        The error, a relative one, is the square of what this adds, as the next power of the width is.
+        """
+        wide = CellProcess(self.dynamics, self.intensity, self._box, cells=round(WIDER * self._shape[0]))
+        own, other = (
+            float(np.log(one.interpolated(one.mean_times(ends))(start.center[:, None])[0]))
+            for one in (self, wide)
+        )
+        added = (own - other) / (WIDER**-2 - 1)
+        return float(np.exp(own + added)), added**2
+
+    def inside(self, part: Neighbourhood) -> np.ndarray:
+        """Mask of the cells in a neighbourhood, shape ``(n,)``; NumericalFailure where there is none."""
+        found = part.height(self.points.T) <= 1
+        if not found.any():
+            raise NumericalFailure("the core of a well is smaller than a cell of the grid")
+        return np.asarray(found)
+
+    def solved(self, given: np.ndarray, *, source: float = 0.0, backwards: bool = False) -> np.ndarray:
+        """u with ``L u = -source`` in the cells in which none is given, NaN: shape ``(n,)``.
+
+        `backwards` takes the reversed process, of which u has no source.
+        """
+        free = np.flatnonzero(np.isnan(given))
+        found = np.nan_to_num(given, nan=0.0)
+        operator = self.rates
+        if backwards:  # of the reversed process only ratios count: π_j L_ji, row by row
+            weights = sparse.diags(np.maximum(self.density, np.finfo(float).tiny))
+            operator = (weights @ operator).T.tocsr()
+        inner = operator[free][:, free]
+        scale = 1 / np.maximum(-inner.diagonal(), np.finfo(float).tiny)
+        into = -(operator[free] @ found) - source
+        found[free] = _factorised((sparse.diags(scale) @ inner).tocsc(), len(self._shape))(scale * into)
+        return found
+
+    def between(self, start: Neighbourhood, ends: Sequence[Neighbourhood]) -> ReactiveFlow:
+        """All that goes from one neighbourhood to one of some others, which are disjoint from it."""
+        first, last = self.inside(start), np.any([self.inside(one) for one in ends], axis=0)
+        if (first & last).any():
+            raise NumericalFailure("the two sets have cells in common")
+        given = np.where(last, 1.0, np.where(first, 0.0, np.nan))
+        forward = np.clip(self.solved(given), 0.0, 1.0)
+        back = np.clip(self.solved(1 - given, backwards=True), 0.0, 1.0)
+        flows = sparse.diags(self.density * back) @ self.rates @ sparse.diags(forward)
+        spent = float(self.density @ back)
+        leaving = float((self.density * first) @ (self.rates @ forward))
+        density = self.density * forward * back / self.volume
+        return ReactiveFlow(self, forward, density, self._current(flows), leaving / spent)
+
+    def mean_times(self, ends: Sequence[Neighbourhood]) -> np.ndarray:
+        """Mean time until one of some neighbourhoods is reached, from each cell: shape ``(n,)``."""
+        reached = np.any([self.inside(one) for one in ends], axis=0)
+        return self.solved(np.where(reached, 0.0, np.nan), source=1.0)
+
+    def dissipation(self) -> np.ndarray:
+        """Where entropy is produced, per unit of time and of the states: shape ``(n,)``."""
+        current = self._current(sparse.diags(self.density) @ self.rates)
+        known = self.density > np.finfo(float).eps * self.density.max()  # the others are rounding
+        speed = np.where(known, self.volume / np.where(known, self.density, 1.0), 0.0)[:, None] * current
+        squares = self.dynamics.diffusion.squared_speed(self.points, speed)
+        return np.asarray(2 / self.intensity * squares * self.density / self.volume)
+
+    def _current(self, flows: sparse.spmatrix) -> np.ndarray:
+        """The current in the middle of cells, of flows from cell to cell: shape ``(n, d)``."""
+        net = flows - flows.T  # each cell takes half of what passes its faces
+        total = np.asarray(net.sum(axis=1)).ravel()
+        return np.asarray((net @ self.points - total[:, None] * self.points) / (2 * self.volume))
+
+    def interpolated(self, values: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        """A function of components ``(d, ...)`` that has these values ``(n,)`` in the cells, linear between.
+
+        Outside of the box, and in cells that are left out, it has the value of the nearest cell.
+        """
+        whole = np.full(self._shape, np.nan).ravel()
+        whole[self._places] = values
+        whole = whole.reshape(self._shape)
+        if np.isnan(whole).any():
+            nearest = ndimage.distance_transform_edt(
+                np.isnan(whole), return_distances=False, return_indices=True
+            )
+            whole = whole[tuple(nearest)]
+        inverse, steps, corner = self._system.inverse, self._steps, self._corner
+
+        def function(x: np.ndarray) -> np.ndarray:
+            y = (inverse @ x.reshape(len(x), -1)).reshape(x.shape)
+            wide = (slice(None), *(None,) * (x.ndim - 1))
+            index = (y - corner[wide]) / steps[wide] - 0.5
+            return np.asarray(ndimage.map_coordinates(whole, index, order=1, mode="nearest"))
+
+        return function
+
+
+def _rates(
+    force: Function, noise: Function, y: np.ndarray, steps: np.ndarray, count: int
+) -> sparse.csr_matrix:
+    """Rates between neighbouring cells, without those that lead out of a cell on the diagonal."""
+    pairs: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    dimension = y.shape[1]
+    index = np.arange(len(y)).reshape((count,) * dimension)
+    for axis in range(dimension):
+        left = np.take(index, np.arange(count - 1), axis=axis).ravel()
+        right = np.take(index, np.arange(1, count), axis=axis).ravel()
+        h = steps[axis]
+        face = (y[left] + y[right]) / 2
+        tensor = noise(face)
+        spread = tensor[:, axis, axis]
+        slope = (noise(y[right])[:, axis, axis] - noise(y[left])[:, axis, axis]) / h
+        drift = force(face)[:, axis] - slope
+        if dimension == 2:
+            other = 1 - axis
+            move = np.zeros(2)
+            move[other] = steps[other] / 2
+            # What the other direction's mixed term carries along this one: ∂(a_xy)/∂y.
+            drift = drift - (noise(face + move) - noise(face - move))[:, 0, 1] / steps[other]
+            spread = spread - np.abs(tensor[:, 0, 1]) * h / steps[other]
+        spread = np.maximum(spread, 1e-9 * tensor[:, axis, axis])
+        z = np.clip(drift * h / spread, -STEEP, STEEP)
+        ways = ((left, right, -z), (right, left, z))  # B = 1/exprel
+        pairs += [(one, other, spread / h**2 / special.exprel(own)) for one, other, own in ways]
+    if dimension == 2:
+        for sign in (1, -1):
+            low = index[:-1, :-1] if sign > 0 else index[:-1, 1:]
+            high = index[1:, 1:] if sign > 0 else index[1:, :-1]
+            start, end = low.ravel(), high.ravel()
+            mixed = np.maximum(sign * noise((y[start] + y[end]) / 2)[:, 0, 1], 0) / np.prod(steps)
+            used = mixed > 0
+            pairs += [(start[used], end[used], mixed[used]), (end[used], start[used], mixed[used])]
+    rows, columns, values = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    return sparse.csr_matrix((values, (rows, columns)), shape=(len(y), len(y)))
+
+
+def _factorised(matrix: sparse.csc_matrix, dimension: int) -> Callable[[np.ndarray], np.ndarray]:
+    """The solution for right sides; of three states in an order that keeps factors of neighbours small."""
+    if dimension < 3:
+        return splu(matrix).solve
+    return splu(
+        matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    ).solve
+
+
+def _invariant_density(rates: sparse.csr_matrix, dimension: int) -> np.ndarray:
+    """Probabilities with ``π L = 0``: that of a busy cell set to one, the others follow from it."""
+    transposed = rates.T.tocsc()
+    size = transposed.shape[0]
+    # A process that rarely starts anew, anywhere, says which cell is busy; of one that is not, the ratio of
+    # all others to it would have to be found.
+    anew = RESTART_RATE * float(-rates.diagonal().min())
+    renewed = (transposed - anew * sparse.identity(size)).tocsc()
+    started = _factorised(renewed, dimension)(np.full(size, -anew / size))
+    fixed = int(np.argmax(started))
+    free = np.delete(np.arange(size), fixed)
+    right = -np.asarray(transposed[free][:, [fixed]].todense()).ravel()
+    found = np.ones(size)
+    found[free] = _factorised(transposed[free][:, free].tocsc(), dimension)(right)
+    if not np.isfinite(found).all() or found.min() < -1e-6 * found.max():
+        raise NumericalFailure(
+            "the invariant density was not found: the noise is too weak for this box; use the barriers"
+        )
+    found = np.maximum(found, 0.0)
+    return np.asarray(found / found.sum())
+
+
+def cores_about(
+    dynamics: Dynamics,
+    attractors: Sequence[Equilibrium],
+    saddles: Sequence[Sequence[Equilibrium | Cycle]],
+    intensity: float,
+) -> list[Neighbourhood]:
+    """The core of each attractor: U below ε, or below half of what it is at the next saddle or attractor.
+
+    `saddles` are those about each of them.
+    """
+    cores = []
+    for place, one in enumerate(attractors):
+        hessian = hessian_at(dynamics, one.position)
+        others = [other.position for other in (*attractors, *saddles[place]) if other is not one]
+        away = np.reshape(others, (-1, dynamics.dimension)) - one.position
+        lowest = float(np.einsum("ni,ij,nj->n", away, hessian, away).min(initial=np.inf))
+        cores.append(Neighbourhood(one.position, hessian, min(intensity, CORE_SHARE * lowest) / 2))
+    return cores
