@@ -168,8 +168,7 @@ def identify(
                 found = replace(found, prediction=replace(found.prediction, passed=False, reason=reason))
         return found
     except (NumericalFailure, np.linalg.LinAlgError) as error:
-        failed = isinstance(error, NumericalFailure)
-        reason, claim = str(error) if failed else SINGULAR, error.claim if failed else ""
+        reason, claim = (str(error), error.claim) if isinstance(error, NumericalFailure) else (SINGULAR, "")
         rounding = rounding_text(recordings, coarse=True)
         reason = reason if rounding is None else f"{reason}; mind that {rounding}"
         for column, name in enumerate(() if claim else recordings.titles):
