@@ -40,8 +40,29 @@ def answer_lines(
 
     `seen` are the two states that the recordings show without any formula.
     """
-    return paragraphs(
-        "answer.j2", s=summary, seen="" if seen is None else seen.sentence(), certified=certified
+    elsewhere = seen is not None and not certified and _stays_elsewhere(summary, seen)
+    said = "" if seen is None else seen.sentence()
+    return paragraphs("answer.j2", s=summary, seen=said, certified=certified, elsewhere=elsewhere)
+
+
+def _stays_elsewhere(summary: LandscapeSummary, seen: RecordStates) -> bool:
+    """Whether the record has other states than the wells: more, fewer, or off by half of what parts them."""
+    if not seen.supported or summary.cycles:
+        return False
+    if len(seen.levels) != len(summary.wells):
+        return True
+    if not len(seen.places) or not set(seen.columns) <= set(summary.names):
+        return False
+    columns = [summary.names.index(name) for name in seen.columns]
+    size = np.ptp(seen.places, axis=0)
+    wells, states = (
+        rows / np.where(size > 0, size, np.inf)
+        for rows in (np.array([well.position for well in summary.wells])[:, columns], seen.places)
+    )
+    apart = np.linalg.norm(states[:, None] - states, axis=2)
+    off = np.linalg.norm(wells[:, None] - states, axis=2)
+    return bool(
+        len(set(off.argmin(axis=1))) < len(wells) or off.min(axis=1).max() > apart[apart > 0].min() / 2
     )
 
 

@@ -8,7 +8,7 @@ import pytest
 from siq.report.page import ReportContent
 from siq.report.study_page import StudyResults, answer_data
 from siq.workflow.study import Study
-from siq.workflow.tables import as_table
+from siq.workflow.tables import Method, as_table
 
 
 def answer(certified: list[bool], *, failed: list[int] | None = None):
@@ -20,7 +20,7 @@ def answer(certified: list[bool], *, failed: list[int] | None = None):
         for run in range(len(certified))
     ]
     tables = {"rrmse": as_table("rrmse", rows), "outcomes": as_table("outcomes", outcomes)}
-    results = StudyResults(tables, Path("tables"), images={}, vectors={})
+    results = StudyResults(tables, Path("tables"), images={}, vectors={}, shown=(None, Method.REFINED))
     study = Study.model_validate({"name": "mine", "runs": len(certified), "recordings": {"file": "mine.csv"}})
     return answer_data(ReportContent("A study", ["Two wells."]), study, results)
 
@@ -35,5 +35,5 @@ def test_how_many_runs_are_certified_is_one_word(certified, said):
 def test_the_file_says_what_a_terminal_needs():
     assert json.loads(json.dumps(answer([True, False], failed=[1]))) == {
         "title": "A study", "sentence": "Two wells.", "certified": "some", "formulas": 0, "runs": 2,
-        "failed": 1, "states": 0,
+        "failed": 1, "rung": 0, "states": 0,
     }  # fmt: skip
