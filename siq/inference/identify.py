@@ -155,8 +155,8 @@ def identify(
                 found = replace(found, prediction=replace(found.prediction, passed=False, reason=reason))
         return found
     except (NumericalFailure, np.linalg.LinAlgError) as error:
-        failed = isinstance(error, NumericalFailure)
-        reason, claim = str(error) if failed else SINGULAR, error.claim if failed else ""
+        singular = isinstance(error, np.linalg.LinAlgError)
+        reason, claim = SINGULAR if singular else str(error), getattr(error, "claim", "")
         rounding = rounding_text(recordings, coarse=True)
         reason = reason if rounding is None else f"{reason}; mind that {rounding}"
         if not claim and (repeated := repeated_text(recordings, limit=case.limits.each)) is not None:
