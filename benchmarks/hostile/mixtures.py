@@ -113,7 +113,7 @@ def two_clocks(draw: np.random.Generator, strength: float, copies: int) -> Recor
     return Record(scene, made.seen, times, made.states, made.law)
 
 
-@kind("one_system", "unchanged")
+@kind("one_system", "unchanged", twin=several)
 def mirrored(draw: np.random.Generator, strength: float, copies: int) -> Record:
     """A tilted double well, to which its recordings were added once more with the other sign."""
     scene = Scene.drawn(draw, recordings=(2, 4))
