@@ -71,7 +71,6 @@ def _withdrawn(found: Investigation) -> Investigation:
             verdict=found.quiet_verdict,
             search=replace(found.search, found=(), fit=recalibrated),
             log_odds=(),
-            convincing=False,
             remarks=(*found.remarks, Remark("diagnosis.refuted", {"names": " and ".join(names)})),
             account=budget.account(),
         )
@@ -266,8 +265,8 @@ def solve_case(
         shown = held_out_runs(found, case.kept)
         named = found.verdict.names and not found.process_noise
         # Tests of somebody else may be among the recordings held out, and decide nothing.
-        change, idle = shown.errors.change("without", "augmented"), found.remainder.share <= 0
-        if named and not case.settings.tests and (change == "worse" or (idle and change != "better")):
+        worse = shown.errors.change("without", "augmented") == "worse"
+        if named and not case.settings.tests and worse:
             found = _withdrawn(found)
             shown = held_out_runs(found, case.kept)
         statement = statement_of(found, shown)

@@ -16,7 +16,7 @@ from pydantic_core import to_jsonable_python
 
 from siq.diagnosis.evidence import BUDGET_SPENT, NotFitted
 from siq.diagnosis.holdout import HeldOutErrors
-from siq.diagnosis.mechanisms import GENERIC, MECHANISM, PROCESS_NOISE, Kind
+from siq.diagnosis.mechanisms import MECHANISM, PROCESS_NOISE, Kind
 from siq.diagnosis.search import Standing
 from siq.diagnosis.study import MismatchVerdict
 from siq.inference.budget import UNLIMITED, Account
@@ -149,7 +149,7 @@ class StatedTerm:
     def alternative_names(self, standing: Standing) -> list[str]:
         """Names of alternatives, each once; their labels where the name alone is the mechanism's own."""
         names = (
-            each.label if each.name in (self.name, GENERIC) else each.name
+            each.label if each.name == self.name else each.name
             for each in self.rivals
             if each.standing == standing
         )

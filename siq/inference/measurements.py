@@ -147,6 +147,17 @@ class Measurements:
             courses=tuple(self.courses[place] for place in chosen),
         )
 
+    def followed_by(self, other: Measurements) -> Measurements:
+        """These recordings and those of another, which were measured alike."""
+        return replace(
+            self,
+            labels=(*self.labels, *other.labels),
+            first=np.concatenate([self.first, self.first[-1] + other.first[1:]]),
+            t=np.concatenate([self.t, other.t]),
+            outputs=np.concatenate([self.outputs, other.outputs]),
+            courses=(*self.courses, *other.courses),
+        )
+
     def until(self, rows: np.ndarray) -> Measurements:
         """The first so many rows of each recording, shape ``(recordings,)``; the inputs stay whole."""
         return self._part(

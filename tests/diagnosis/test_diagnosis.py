@@ -341,9 +341,7 @@ def test_what_a_name_leaves_is_described_and_no_sample_of_a_test_chooses_it(
     ) -> Investigation:
         first = replace(whole, found=whole.found[:1], fit=whole.found[0].best.fit)
         named = MismatchVerdict.MISSING_PHYSICS
-        return Investigation(
-            context, first, left[0], named, whole.recalibrated, log_odds=(9.0,), convincing=True
-        )
+        return Investigation(context, first, left[0], named, whole.recalibrated, log_odds=(9.0,))
 
     # Forecasts would name both.
     monkeypatch.setattr(investigation, "named_by_forecasts", lambda *_: (None, ()))
