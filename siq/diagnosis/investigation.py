@@ -189,9 +189,9 @@ class HeldOutRuns:
         Whether the recordings are others than those that were learned from, rather than a later part.
     described
         The model of what has no name that is part of the new card, since it makes predictions better.
-    mended
-        Whether parameters that have shifted make the prediction better, bring it down to the noise, or leave
-        only noise when they are fitted to all recordings: those to learn from may not tell all of them.
+    together
+        Whether parameters that have shifted, and predict no better, leave only noise when they are fitted to
+        all recordings: those to learn from may not tell all of them.
     """
 
     before: np.ndarray
@@ -202,7 +202,7 @@ class HeldOutRuns:
     errors: HeldOutErrors
     independent: bool = True
     described: AugmentedModel | None = None
-    mended: bool = False
+    together: bool = False
 
 
 def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRuns:
@@ -308,10 +308,8 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         spread=None if unit == "1" else float(np.sqrt(spread[0])),
         unit=unit,
     )
-    change, mended = errors.change("before", "recalibrated"), False
-    if investigation.verdict is MismatchVerdict.PARAMETER_SHIFT and not errors.at_noise("before"):
-        to_noise = change == "same" and errors.at_noise("recalibrated")
-        mended = change == "better" or to_noise or _one_set_of_parameters(investigation, data)
+    shifted = investigation.verdict is MismatchVerdict.PARAMETER_SHIFT
+    unmended = not errors.at_noise("before") and errors.change("before", "recalibrated") != "better"
     return HeldOutRuns(
         before=before,
         recalibrated=refitted,
@@ -321,7 +319,7 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         errors=errors,
         independent=not set(learned.labels) & set(data.labels),
         described=described,
-        mended=mended or change == "better",
+        together=shifted and unmended and _one_set_of_parameters(investigation, data),
     )
 
 

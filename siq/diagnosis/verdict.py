@@ -102,11 +102,12 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
         if most and (nearly or (certain and change != "worse")):
             verdict, left = MismatchVerdict.MISSING_PHYSICS, rest.after
     elif verdict is MismatchVerdict.PARAMETER_SHIFT:
-        if shown.mended and errors_seen.change("before", "recalibrated") != "better":
-            if not errors_seen.at_noise("recalibrated"):
-                remarks.append(Remark("diagnosis.one_set_of_parameters"))
-        elif not shown.mended:
-            seen = not errors_seen.at_noise("before")
+        # Other parameters have to mend it, by more than chance or down to the noise, or leave only noise.
+        seen, change = not errors_seen.at_noise("before"), errors_seen.change("before", "recalibrated")
+        to_noise = seen and change == "same" and errors_seen.at_noise("recalibrated")
+        if shown.together and not to_noise:
+            remarks.append(Remark("diagnosis.one_set_of_parameters"))
+        elif not (change == "better" or to_noise):
             verdict = MismatchVerdict.UNEXPLAINED if seen else MismatchVerdict.NO_MISMATCH
             remarks.append(Remark("diagnosis.shift_mends_nothing", {"seen": seen}))
     if investigation.account.partial:
