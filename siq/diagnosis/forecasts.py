@@ -491,15 +491,12 @@ class _Rung:
         Of its family, against all other explanations together.
     flat_log_odds
         The same, if all mechanisms are as likely beforehand, with a name or without.
-    gain
-        Mean logarithm of the density gained by recordings left out.
     """
 
     accepted: AcceptedMechanism
     horizons: tuple[Horizon, ...]
     log_odds: float
     flat_log_odds: float
-    gain: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -664,9 +661,7 @@ def _next_rung(
         "needless": (),
         "less": tuple(each for label, each in known.items() if label not in alike),
     }
-    return _Rung(
-        AcceptedMechanism(best, others), tuple(leader.horizons), log_odds, flat_log_odds, leader.gain
-    )
+    return _Rung(AcceptedMechanism(best, others), tuple(leader.horizons), log_odds, flat_log_odds)
 
 
 def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], tuple[NotFitted, ...]]:

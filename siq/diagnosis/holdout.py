@@ -141,6 +141,14 @@ class HeldOutErrors:
         before = 1.0 if without is None else min(without, 1.0)
         return (before - self.augmented) / max(before - self.floor, 1e-300)
 
+    @property
+    def takes_most(self) -> bool:
+        """Whether names take more than they leave of the squared errors, beyond the sensors' noise."""
+        before, after = self.error("without"), self.augmented if self.named is None else self.named
+        if before is None or after is None:
+            return after is not None
+        return before**2 - after**2 >= after**2 - (self.noise_floor or 0.0) ** 2
+
     def at_noise(self, run: Run, *, random: bool = False) -> bool:
         """Whether an error is that of measurement noise alone, or with the error of the model at random.
 

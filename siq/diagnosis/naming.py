@@ -232,10 +232,8 @@ def _judge_mechanisms(whole: Search, left: Sequence[Remainder], context: FitCont
 
 def _not_certain(search: Search, log_odds: float, context: FitContext) -> Remark:
     names = " and ".join(each.best.candidate.name for each in search.found)
-    needed = float(np.exp(context.study.search.least_log_odds))
-    return Remark(
-        "diagnosis.not_certain", {"names": names, "odds": float(np.exp(log_odds)), "needed": needed}
-    )
+    odds, needed = (float(np.exp(each)) for each in (log_odds, context.study.search.least_log_odds))
+    return Remark("diagnosis.not_certain", {"names": names, "odds": odds, "needed": needed})
 
 
 def decide_naming(whole: Search, left: Sequence[Remainder], context: FitContext) -> Investigation:
@@ -290,10 +288,8 @@ def _one_cause_or_two(decision: Investigation, context: FitContext) -> Investiga
     LOGGER.info("two causes, one with a name, over one without: log-odds %.1f", log_odds)
     if log_odds >= context.study.search.least_log_odds:
         return decision
-    remarks, verdict = (
-        (*decision.remarks, _not_certain(search, log_odds, context)),
-        MismatchVerdict.UNEXPLAINED,
-    )
+    verdict, remark = MismatchVerdict.UNEXPLAINED, _not_certain(search, log_odds, context)
+    remarks = (*decision.remarks, remark)
     return replace(decision, verdict=verdict, models=models, remarks=remarks, too_faint=True)
 
 

@@ -171,7 +171,7 @@ class Description:
     too_faint
         Whether the mechanisms explain enough, and a function without a name is nearly as likely.
     misleading
-        Whether the mechanisms are not named since recordings held out are predicted worse with them.
+        Whether the mechanisms are not named since recordings held out do not bear them out.
     """
 
     share_described: float
