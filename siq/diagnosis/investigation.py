@@ -18,7 +18,7 @@ from siq.diagnosis.holdout import (
     preferred_recalibration,
     simulated,
 )
-from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
+from siq.diagnosis.mechanisms import MECHANISM, MechanismCandidate, candidates_of
 from siq.diagnosis.naming import Investigation, decide_naming, named_by_forecasts
 from siq.diagnosis.residual_structure import (
     RANDOM_RESIDUALS,
@@ -241,7 +241,7 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         fitted_alike = best_of(*(fit for fit, _ in refits), recalibrated, card)
         recalibrated = preferred_recalibration(card, refits, learned, noise=noise)
     plain = best_of(investigation.exact, search.fit, *(each.fit for each in investigation.finals))
-    # Where the likeliest leaves nothing but the sensors' noise, evidence rules the others out.
+    # Where the likeliest leaves nothing but the sensors' noise, evidence rules other functions out.
     models, weakest = investigation.models, -np.inf
     if models and not models[0].fit.has_process_noise:
         weakest = models[0].log_evidence - study.search.least_log_odds
@@ -249,7 +249,8 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         (model, fit)
         for model in models
         for fit in (model.fit, model.exact)
-        if fit is not None and model.log_evidence >= weakest
+        if fit is not None
+        and (model.log_evidence >= weakest or model.parts[0].candidate.kind == MECHANISM)
     ]
     named = investigation.verdict.names
     judges = [place for place, label in enumerate(data.labels) if label not in study.tests]
