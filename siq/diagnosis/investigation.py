@@ -249,8 +249,7 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         (model, fit)
         for model in models
         for fit in (model.fit, model.exact)
-        if fit is not None
-        and (model.log_evidence >= weakest or model.parts[0].candidate.kind == MECHANISM)
+        if fit is not None and (model.log_evidence >= weakest or model.parts[0].candidate.kind == MECHANISM)
     ]
     named = investigation.verdict.names
     judges = [place for place, label in enumerate(data.labels) if label not in study.tests]
