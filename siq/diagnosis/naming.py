@@ -34,7 +34,7 @@ from siq.diagnosis.evidence import (
 )
 from siq.diagnosis.forecasts import Horizon, climb
 from siq.diagnosis.mechanisms import MECHANISM, MechanismCandidate
-from siq.diagnosis.residual_structure import Remainder
+from siq.diagnosis.residual_structure import Remainder, has_structure
 from siq.diagnosis.screening import linearised_with, portions
 from siq.diagnosis.search import FitContext, Search
 from siq.diagnosis.study import MismatchVerdict
@@ -277,10 +277,9 @@ def _one_cause_or_two(decision: Investigation, context: FitContext) -> Investiga
     A second cause that has no name is in both, so that its probability cancels.
     """
     search, data, unnamed = decision.search, context.data, context.study.search.unnamed
-    models = fit_unnamed_models(search, context)
-    alone = [each for each in models if all(part.candidate.kind != MECHANISM for part in each.parts)]
-    both = decision.models[0]
-    if not alone or alone[0].fit.has_process_noise:
+    models = fit_unnamed_models(search, context, most=1)
+    alone, both = [each for each in models if each.parts[0].candidate.kind != MECHANISM], decision.models[0]
+    if not alone or has_structure(alone[0].fit, data):
         return decision
     with_names, without = log_evidences([both.fit, alone[0].fit], data)
     chosen = len(search.found) * np.log(len(context.candidates)) + both.cost

@@ -195,7 +195,8 @@ def test_a_name_that_leaves_something_has_to_be_likelier_than_one_cause_without_
         return SimpleNamespace(parts=(part,), fit=SimpleNamespace(has_process_noise=forced), cost=cost)
 
     alone = [model(MECHANISM, False, 0.0), model("curve", forced, 0.0)]
-    monkeypatch.setattr(naming, "fit_unnamed_models", lambda *_: tuple(alone))
+    monkeypatch.setattr(naming, "fit_unnamed_models", lambda *_, **__: tuple(alone))
+    monkeypatch.setattr(naming, "has_structure", lambda fit, _: fit.has_process_noise)
     monkeypatch.setattr(naming, "log_evidences", lambda *_: [ahead, 0.0])
     found = SimpleNamespace(best=SimpleNamespace(candidate=SimpleNamespace(name="dry friction")))
     context = SimpleNamespace(data=None, study=MismatchStudy(), candidates=range(10))
