@@ -190,8 +190,7 @@ class HeldOutRuns:
     described
         The model of what has no name that is part of the new card, since it makes predictions better.
     together
-        Whether parameters that have shifted, and predict no better, leave only noise when they are fitted to
-        all recordings: those to learn from may not tell all of them.
+        Whether shifted parameters that predict no better leave only noise when all recordings are fitted.
     """
 
     before: np.ndarray
@@ -325,8 +324,7 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
 
 def _one_set_of_parameters(investigation: Investigation, data: Measurements) -> bool:
     """Whether all recordings together leave nothing but noise with other parameters."""
-    context = investigation.context
-    both = context.data.followed_by(data)
+    both = (context := investigation.context).data.followed_by(data)
     try:
         fit, still = recalibrate(context.model, both, budget=context.budget)
         left = Remainder.of(both, fit, fit, context.roles)

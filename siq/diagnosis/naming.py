@@ -8,9 +8,8 @@ evenly on a logarithmic scale. A name takes the odds that keep wrong names as ra
 **Where process noise stands in** for what is missing, forecasts are asked first (`siq.diagnosis.forecasts`),
 and tests with these odds only where they name nothing.
 
-**One cause or two.** A name that leaves something says that two things are missing. Where a function explains
-what it leaves down to the noise, a function alone may explain all of it. The name then has to be part of an
-explanation that is likelier than any without it, by the odds that a name takes.
+**One cause or two.** A name that leaves something says that two things are missing. Where one without a name
+leaves nothing, name and rest together have to be likelier, by the odds that a name takes.
 """
 
 from __future__ import annotations
@@ -272,10 +271,7 @@ def _with_models(decision: Investigation, whole: Search, context: FitContext) ->
 
 
 def _one_cause_or_two(decision: Investigation, context: FitContext) -> Investigation:
-    """A decision, without its names where one cause without a name explains as well what needs two with them.
-
-    A second cause that has no name is in both, so that its probability cancels.
-    """
+    """A decision, without its names where one cause explains what needs two with them."""
     search, data, unnamed = decision.search, context.data, context.study.search.unnamed
     models = fit_unnamed_models(search, context, most=1)
     alone, both = [each for each in models if each.parts[0].candidate.kind != MECHANISM], decision.models[0]
@@ -287,8 +283,8 @@ def _one_cause_or_two(decision: Investigation, context: FitContext) -> Investiga
     LOGGER.info("two causes, one with a name, over one without: log-odds %.1f", log_odds)
     if log_odds >= context.study.search.least_log_odds:
         return decision
-    verdict, remark = MismatchVerdict.UNEXPLAINED, _not_certain(search, log_odds, context)
-    remarks = (*decision.remarks, remark)
+    verdict, remarks = MismatchVerdict.UNEXPLAINED, decision.remarks
+    remarks += (_not_certain(search, log_odds, context),)
     return replace(decision, verdict=verdict, models=models, remarks=remarks, too_faint=True)
 
 

@@ -426,8 +426,7 @@ def fit_unnamed_models(
 ) -> tuple[AugmentedModel, ...]:
     """Models of what is missing, the likeliest first; none where none is likelier than the simulation alone.
 
-    Mechanisms that a search found are one of the models. At most so many functions are put on top of each
-    other.
+    Mechanisms that a search found are one of the models; at most so many functions stand on each other.
     """
     base, data = search.recalibrated, context.data
     models = _with_function((), base, context)

@@ -94,11 +94,11 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
         rest = Remainder.of(context.data, described.fit, described.fit, context.roles)
         change = errors_seen.change("without", "augmented")
         most = errors_seen.augmented is not None and errors_seen.augmented**2 < 0.5  # of the spread's square
-        nearly = change == "better" and errors_seen.share_gained >= NEARLY_ALL
         to_noise = not (rest.doubtful or described.fit.has_process_noise)
         # Evidence is enough where it is certain, and recordings held out do not speak against it.
         certain = to_noise and described.log_evidence >= context.study.search.least_log_odds
-        nearly = nearly and (errors_seen.at_noise("augmented", random=True) or not rest.doubtful)
+        nearly = not rest.doubtful or errors_seen.at_noise("augmented", random=True)
+        nearly = nearly and change == "better" and errors_seen.share_gained >= NEARLY_ALL
         if most and (nearly or (certain and change != "worse")):
             verdict, left = MismatchVerdict.MISSING_PHYSICS, rest.after
     elif verdict is MismatchVerdict.PARAMETER_SHIFT:

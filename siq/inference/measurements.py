@@ -149,14 +149,9 @@ class Measurements:
 
     def followed_by(self, other: Measurements) -> Measurements:
         """These recordings and those of another, which were measured alike."""
-        return replace(
-            self,
-            labels=(*self.labels, *other.labels),
-            first=np.concatenate([self.first, self.first[-1] + other.first[1:]]),
-            t=np.concatenate([self.t, other.t]),
-            outputs=np.concatenate([self.outputs, other.outputs]),
-            courses=(*self.courses, *other.courses),
-        )
+        first, t = np.append(self.first, self.first[-1] + other.first[1:]), np.append(self.t, other.t)
+        joined = replace(self, labels=self.labels + other.labels, courses=self.courses + other.courses)
+        return replace(joined, first=first, t=t, outputs=np.concatenate([self.outputs, other.outputs]))
 
     def until(self, rows: np.ndarray) -> Measurements:
         """The first so many rows of each recording, shape ``(recordings,)``; the inputs stay whole."""
