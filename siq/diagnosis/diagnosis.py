@@ -2,7 +2,7 @@
 
 A mechanism may explain the recordings that it was found in, and nothing else: it stands in for something that
 goes on differently elsewhere. Where the simulation with it predicts recordings held out worse than without
-it, by more than appears by chance, it keeps no name.
+it, by more than appears by chance, or is off by most of what it was off by, it keeps no name.
 """
 
 from __future__ import annotations
@@ -71,7 +71,6 @@ def _withdrawn(found: Investigation) -> Investigation:
             verdict=found.quiet_verdict,
             search=replace(found.search, found=(), fit=recalibrated),
             log_odds=(),
-            convincing=False,
             remarks=(*found.remarks, Remark("diagnosis.refuted", {"names": " and ".join(names)})),
             account=budget.account(),
         )
@@ -266,8 +265,9 @@ def solve_case(
         shown = held_out_runs(found, case.kept)
         named = found.verdict.names and not found.process_noise
         # Tests of somebody else may be among the recordings held out, and decide nothing.
-        change, idle = shown.errors.change("without", "augmented"), found.remainder.share <= 0
-        if named and not case.settings.tests and (change == "worse" or (idle and change != "better")):
+        incomplete = found.remainder.doubtful or found.search.fit.has_process_noise
+        worse = shown.errors.change("without", "augmented") == "worse"
+        if named and not case.settings.tests and (worse or (incomplete and not shown.errors.takes_most)):
             found = _withdrawn(found)
             shown = held_out_runs(found, case.kept)
         statement = statement_of(found, shown)

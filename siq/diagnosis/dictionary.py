@@ -1,8 +1,8 @@
 """The dictionary of mechanisms, and which states, inputs and parameters may take part in each.
 
 Mechanisms are written for roles - a position, a velocity, the two quadratures of a rotating frame, a
-population, a level, a store - and roles are read off equations and units, never off names. A system of mere
-numbers is described by generic monomials only.
+population, a level, a store - and roles are read off equations and units, never off names. In a system of
+mere numbers functions without a name describe what is missing: a power of a state is no physics.
 """
 
 from __future__ import annotations
@@ -347,11 +347,6 @@ class Roles:
     cascades: tuple[tuple[str, str], ...] = ()
     stores: tuple[str, ...] = ()
     states: tuple[str, ...] = ()
-
-    @property
-    def physical(self) -> bool:
-        """Whether any state has a role for which mechanisms have names."""
-        return bool(self.motions or self.speeds or self.amplitudes or self.populations or self.levels)
 
 
 def roles_of(model: Dynamics) -> Roles:

@@ -491,15 +491,12 @@ class _Rung:
         Of its family, against all other explanations together.
     flat_log_odds
         The same, if all mechanisms are as likely beforehand, with a name or without.
-    gain
-        Mean logarithm of the density gained by recordings left out.
     """
 
     accepted: AcceptedMechanism
     horizons: tuple[Horizon, ...]
     log_odds: float
     flat_log_odds: float
-    gain: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -664,17 +661,16 @@ def _next_rung(
         "needless": (),
         "less": tuple(each for label, each in known.items() if label not in alike),
     }
-    return _Rung(
-        AcceptedMechanism(best, others), tuple(leader.horizons), log_odds, flat_log_odds, leader.gain
-    )
+    return _Rung(AcceptedMechanism(best, others), tuple(leader.horizons), log_odds, flat_log_odds)
 
 
 def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], tuple[NotFitted, ...]]:
     """Mechanisms one on top of the other, as long as the next is likelier than what has no name.
 
-    A mechanism may take over a part of an error of the model, above all on top of others. So the last one
-    also has to make free runs of parts left out typically better than without it, or it is taken back, and
-    then the one before it is the last.
+    A mechanism may take over a part of an error of the model, above all on top of others, and most causes
+    that have no name look a little like one that has. So the last one has to take more than it leaves of what
+    free runs of parts left out are off by, beyond the sensors' noise, or it is taken back, and then the one
+    before it is the last.
 
     Returned are also the fits of the simulation alone, empty where it cannot be fitted, and what could not be
     judged.
@@ -703,23 +699,24 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], tu
     except (*NUMERICAL_ERRORS, BudgetSpent) as error:
         LOGGER.info("forecasts end: %s", error)
 
-    def errors(number: int) -> tuple[float, ...] | None:
-        """Of free runs of parts left out, with the first so many mechanisms, by blocks."""
+    def errors(number: int) -> np.ndarray | None:
+        """Squares of free runs of parts left out, with the first so many mechanisms, by blocks."""
         best = [each.accepted.best for each in found[:number]]
         squares = errors_left_out(
             best[-1].fit if best else alone[0].fit, context.data, noise=alone[0].fit.noise,
             candidates=[each.candidate for each in best], budget=budget,
         )  # fmt: skip
-        return None if squares is None else in_blocks(squares)
+        return None if squares is None else np.array(in_blocks(squares))
 
     with budget.exempt():
         last = errors(len(found)) if found else None
         while found:
             before = errors(len(found) - 1)
-            if last is not None and (
-                before is None or typically_better(before, last, least=-np.log(NEARLY_ALL))
-            ):
-                break
+            if last is not None:
+                noise = horizons[0].fit.noise.measurement / np.nanvar(context.data.outputs, axis=0)
+                # b - a > a - s² of errors b before and a after, and the sensors' noise s.
+                if before is None or typically_better(before + noise.mean(), 2 * last):
+                    break
             LOGGER.info("%s makes no free run better", found[-1].accepted.best.candidate.label)
             found, last = found[:-1], before
     return alone, found, tuple(untried.values())

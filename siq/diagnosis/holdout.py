@@ -141,6 +141,14 @@ class HeldOutErrors:
         before = 1.0 if without is None else min(without, 1.0)
         return (before - self.augmented) / max(before - self.floor, 1e-300)
 
+    @property
+    def takes_most(self) -> bool:
+        """Whether names take more than they leave of the squared errors, beyond the sensors' noise."""
+        before, after = self.error("without"), self.augmented if self.named is None else self.named
+        if before is None or after is None:
+            return after is not None
+        return before**2 - after**2 >= after**2 - (self.noise_floor or 0.0) ** 2
+
     def at_noise(self, run: Run, *, random: bool = False) -> bool:
         """Whether an error is that of measurement noise alone, or with the error of the model at random.
 
@@ -153,7 +161,9 @@ class HeldOutErrors:
         return error * (1 - tolerance) <= floor
 
 
-def _change_between(first: tuple[float, ...] | None, second: tuple[float, ...] | None) -> Change:
+def _change_between(
+    first: Sequence[float] | np.ndarray | None, second: Sequence[float] | np.ndarray | None
+) -> Change:
     """Whether the second of two simulations is better, by mean squared errors of the same blocks of samples.
 
     They are None where the simulation ran away.
@@ -241,16 +251,14 @@ def errors_left_out(
     return None if refits is None else np.concatenate([squares for _, squares in refits])
 
 
-def typically_better(before: tuple[float, ...], after: tuple[float, ...], *, least: float = 0.0) -> bool:
+def typically_better(before: Sequence[float] | np.ndarray, after: Sequence[float] | np.ndarray) -> bool:
     """Whether errors of blocks fall, and not only in one in which a saddle point multiplies them.
 
-    Other than `_change_between` this asks for the typical ratio of errors, not for that of their sums; its
-    logarithm has to exceed the least that counts.
+    Other than `_change_between` this asks for the typical ratio of errors, not for that of their sums.
     """
     falls = np.log(np.maximum(before, np.finfo(float).tiny) / np.maximum(after, np.finfo(float).tiny))
     chance = scipy.stats.ttest_1samp(falls, 0.0, alternative="greater").pvalue
-    known = falls.mean() > least and chance < CHANGE_BY_CHANCE
-    return bool(known) and _change_between(before, after) != "worse"
+    return bool(chance < CHANGE_BY_CHANCE) and _change_between(before, after) != "worse"
 
 
 def preferred_recalibration(

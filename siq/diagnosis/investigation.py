@@ -18,7 +18,7 @@ from siq.diagnosis.holdout import (
     preferred_recalibration,
     simulated,
 )
-from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of, generic_candidates
+from siq.diagnosis.mechanisms import MECHANISM, MechanismCandidate, candidates_of
 from siq.diagnosis.naming import Investigation, decide_naming, named_by_forecasts
 from siq.diagnosis.residual_structure import (
     RANDOM_RESIDUALS,
@@ -63,9 +63,6 @@ def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigat
     model = with_expectations(case.system)
     roles = roles_of(model)
     candidates = candidates_of(model, roles, dictionary)
-    if study.generic if study.generic is not None else not roles.physical:
-        monomials = generic_candidates(model, roles, degree=study.degree, named=candidates)
-        candidates += [each for each in monomials if each.coordinate != "constant"]
     # No path that is never gone back tells whether a force depends on it.
     x, begins = first_states(model, data), data.first[:-1]
     moved, net = np.abs(x).sum(axis=0), np.abs(np.add.reduceat(x, begins)).sum(axis=0)
@@ -192,6 +189,8 @@ class HeldOutRuns:
         Whether the recordings are others than those that were learned from, rather than a later part.
     described
         The model of what has no name that is part of the new card, since it makes predictions better.
+    together
+        Whether shifted parameters that predict no better leave only noise when all recordings are fitted.
     """
 
     before: np.ndarray
@@ -202,6 +201,7 @@ class HeldOutRuns:
     errors: HeldOutErrors
     independent: bool = True
     described: AugmentedModel | None = None
+    together: bool = False
 
 
 def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRuns:
@@ -240,8 +240,15 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         fitted_alike = best_of(*(fit for fit, _ in refits), recalibrated, card)
         recalibrated = preferred_recalibration(card, refits, learned, noise=noise)
     plain = best_of(investigation.exact, search.fit, *(each.fit for each in investigation.finals))
+    # Where the likeliest leaves nothing but the sensors' noise, evidence rules other functions out.
+    models, weakest = investigation.models, -np.inf
+    if models and not models[0].fit.has_process_noise:
+        weakest = models[0].log_evidence - study.search.least_log_odds
     choices = [
-        (model, fit) for model in investigation.models for fit in (model.fit, model.exact) if fit is not None
+        (model, fit)
+        for model in models
+        for fit in (model.fit, model.exact)
+        if fit is not None and (model.log_evidence >= weakest or model.parts[0].candidate.kind == MECHANISM)
     ]
     named = investigation.verdict.names
     judges = [place for place, label in enumerate(data.labels) if label not in study.tests]
@@ -292,23 +299,39 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     noise_floor, *_, floor = [float(np.sqrt(np.mean(each / spread))) for each in (*floors, floors[-1])]
     unit = units_of(fit.model).get(str(fit.model.outputs[0][1]), "1") if len(spread) == 1 else "1"
     rungs = [errors_of(each.best.fit, data) for each in search.found[:-1]] if named else []
+    errors = HeldOutErrors.of(
+        squares,
+        noise_floor=noise_floor,
+        floor=floor,
+        rungs=tuple(None if each is None else float(np.sqrt(each.mean())) for each in rungs),
+        spread=None if unit == "1" else float(np.sqrt(spread[0])),
+        unit=unit,
+    )
+    shifted = investigation.verdict is MismatchVerdict.PARAMETER_SHIFT
+    unmended = not errors.at_noise("before") and errors.change("before", "recalibrated") != "better"
     return HeldOutRuns(
         before=before,
         recalibrated=refitted,
         augmented=augmented,
         recalibration=recalibrated,
         fit=fit,
-        errors=HeldOutErrors.of(
-            squares,
-            noise_floor=noise_floor,
-            floor=floor,
-            rungs=tuple(None if each is None else float(np.sqrt(each.mean())) for each in rungs),
-            spread=None if unit == "1" else float(np.sqrt(spread[0])),
-            unit=unit,
-        ),
+        errors=errors,
         independent=not set(learned.labels) & set(data.labels),
         described=described,
+        together=shifted and unmended and _one_set_of_parameters(investigation, data),
     )
+
+
+def _one_set_of_parameters(investigation: Investigation, data: Measurements) -> bool:
+    """Whether all recordings together leave nothing but noise with other parameters."""
+    both = (context := investigation.context).data.followed_by(data)
+    try:
+        fit, still = recalibrate(context.model, both, budget=context.budget)
+        left = Remainder.of(both, fit, fit, context.roles)
+    except NumericalFailure:
+        return False
+    rounded = explained_by_quantisation(both, still, context.roles, budget=context.budget)
+    return not (fit.has_process_noise or left.structured) or rounded is not None
 
 
 def _spread_of_free_runs(fit: Fit, learned: Measurements, roles: Roles) -> np.ndarray:

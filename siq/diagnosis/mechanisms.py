@@ -11,8 +11,7 @@ range, is read off them.
 Where a simulation has a free damping rate, linear damping is another value of it: no recording can tell the
 two apart, and a mechanism of that kind would only stand in the way of the parameter. To first order a
 mechanism adds the derivatives of f and h by its amplitudes; it is something new where these are linearly
-independent, as functions of states, inputs and time, of the derivatives by the free parameters. Generic
-monomials become candidates of the same kind, for systems whose states have no roles.
+independent, as functions of states, inputs and time, of the derivatives by the free parameters.
 """
 
 from __future__ import annotations
@@ -566,7 +565,6 @@ def _without_amplitudes(
     return _labelled(left, model)
 
 
-GENERIC = "generic monomial"
 PROCESS_NOISE = "process noise"
 
 
@@ -613,55 +611,3 @@ def candidates_of(
             label = f"{label} ({filled if by_roles[label, filled] == 1 else formulas})"
         result.append(replace(each, label=label))
     return result
-
-
-def generic_candidates(
-    model: Dynamics, roles: Roles, *, degree: int, named: Sequence[MechanismCandidate] = ()
-) -> list[MechanismCandidate]:
-    """Monomials of the states up to a degree in every equation that says more than a definition.
-
-    Those that the simulation's own parameters can do are left out, and so are those that have a name.
-
-    Parameters
-    ----------
-    model, roles
-        The simulation.
-    degree
-        Highest degree.
-    named
-        Candidates of the dictionary.
-    """
-    states = [symbol(name) for name in model.states]
-    found = []
-    for place, name in enumerate(model.states):
-        if name not in roles.states:
-            continue
-        for powers in itertools.product(range(degree + 1), repeat=len(states)):
-            if sum(powers) > degree:
-                continue
-            monomial = sympy.prod([s**p for s, p in zip(states, powers, strict=True)])
-            (new,) = fresh_names("c", 1, model.names)
-            units = {f"_{k}": unit for k, unit in enumerate(model.units)}
-            per = "*".join(f"_{k}**{power}" for k, power in enumerate(powers) if power)
-            unit = unit_of(f"_{place}/_t" + (f"/({per})" if per else ""), {**units, "_t": model.time_unit})
-            among = ", ".join(s for s, p in zip(model.states, powers, strict=True) if p)
-            found.append(
-                added(
-                    model, {name: symbol(new) * monomial}, {}, [Parameter(new, 0.0, unit)],
-                    name=GENERIC, label=f"{GENERIC} {monomial} in {name}", coordinate=among or "constant",
-                    family=GENERIC,
-                )
-            )  # fmt: skip
-    have_names = {_added_square(each) for each in named} - {None}
-    found = [each for each in found if _added_square(each) not in have_names]
-    return [each for each in _beyond_parameters(model, found) if each is not None]
-
-
-def _added_square(candidate: MechanismCandidate) -> tuple[str, sympy.Expr] | None:
-    """Where and what a candidate of one term adds, whatever its sign; None for any other."""
-    if candidate.shapes or len(candidate.amplitudes) != 1 or len(candidate.changes) != 1:
-        return None
-    place, formula = candidate.changes[0]
-    if candidate.equations != (place,):
-        return None  # it changes what is measured
-    return place, formula.diff(symbol(candidate.amplitudes[0])) ** 2

@@ -7,6 +7,9 @@ evenly on a logarithmic scale. A name takes the odds that keep wrong names as ra
 
 **Where process noise stands in** for what is missing, forecasts are asked first (`siq.diagnosis.forecasts`),
 and tests with these odds only where they name nothing.
+
+**One cause or two.** A name that leaves something says that two things are missing. Where one without a name
+leaves nothing, name and rest together have to be likelier, by the odds that a name takes.
 """
 
 from __future__ import annotations
@@ -24,12 +27,13 @@ from siq.diagnosis.evidence import (
     averaged_evidence,
     correlation_time_of,
     evidence_of_function,
+    log_evidences,
     orthonormal,
     sizes_of_effects,
 )
 from siq.diagnosis.forecasts import Horizon, climb
-from siq.diagnosis.mechanisms import MechanismCandidate
-from siq.diagnosis.residual_structure import Remainder
+from siq.diagnosis.mechanisms import MECHANISM, MechanismCandidate
+from siq.diagnosis.residual_structure import Remainder, has_structure
 from siq.diagnosis.screening import linearised_with, portions
 from siq.diagnosis.search import FitContext, Search
 from siq.diagnosis.study import MismatchVerdict
@@ -142,9 +146,8 @@ class Investigation:
         p-value of the test that the parameters of the card are the true ones.
     log_odds
         For each mechanism, that it is this rather than a function without a name, as a logarithm.
-    convincing
-        Whether the mechanisms leave nothing, or foresee recordings better than all else; where they leave
-        nothing the odds have to be for them as well before they are named.
+    too_faint
+        Whether what was found explains enough, and is not named since a function is nearly as likely.
     remarks
         Reservations.
     models
@@ -166,7 +169,7 @@ class Investigation:
     least_squares: Fit
     p_shift: float = float("nan")
     log_odds: tuple[float, ...] = ()
-    convincing: bool = False
+    too_faint: bool = False
     remarks: tuple[Remark, ...] = ()
     models: tuple[AugmentedModel, ...] = ()
     exact: Fit | None = None
@@ -179,11 +182,6 @@ class Investigation:
     def process_noise(self) -> bool:
         """Whether process noise is all that is missing."""
         return self.verdict.names and not self.search.found
-
-    @property
-    def too_faint(self) -> bool:
-        """Whether what was found explains enough, and is not named since a function is nearly as likely."""
-        return self.verdict is MismatchVerdict.UNEXPLAINED and not self.withdrawn and self.convincing
 
     @property
     def final(self) -> Fit:
@@ -222,18 +220,19 @@ def _judge_mechanisms(whole: Search, left: Sequence[Remainder], context: FitCont
     odds = tuple(_log_odds(whole, len(every), [place], context) for place in every)
     together = odds[0] if len(odds) == 1 else _log_odds(whole, len(every), every, context)
     least = min(*odds, together)
-    remarks = []
-    if convinces and not least >= options.least_log_odds:
-        names = " and ".join(each.best.candidate.name for each in search.found)
-        needed = float(np.exp(options.least_log_odds))
-        values = {"names": names, "odds": float(np.exp(least)), "needed": needed}
-        remarks.append(Remark("diagnosis.not_certain", values))
-    named = convinces and least >= options.least_log_odds
-    verdict = MismatchVerdict.MISSING_PHYSICS if named else MismatchVerdict.UNEXPLAINED
+    certain = least >= options.least_log_odds
+    remarks = (_not_certain(search, least, context),) if convinces and not certain else ()
+    verdict = MismatchVerdict.MISSING_PHYSICS if convinces and certain else MismatchVerdict.UNEXPLAINED
     return Investigation(
         context, search, left[-1], verdict, whole.recalibrated,
-        log_odds=odds, convincing=convinces, remarks=tuple(remarks),
+        log_odds=odds, too_faint=convinces and not certain, remarks=remarks,
     )  # fmt: skip
+
+
+def _not_certain(search: Search, log_odds: float, context: FitContext) -> Remark:
+    names = " and ".join(each.best.candidate.name for each in search.found)
+    odds, needed = (float(np.exp(each)) for each in (log_odds, context.study.search.least_log_odds))
+    return Remark("diagnosis.not_certain", {"names": names, "odds": odds, "needed": needed})
 
 
 def decide_naming(whole: Search, left: Sequence[Remainder], context: FitContext) -> Investigation:
@@ -259,12 +258,34 @@ def _with_models(decision: Investigation, whole: Search, context: FitContext) ->
     if len(whole.found) > len(search.found) or decision.remainder.doubtful or search.fit.has_process_noise:
         models = fit_models_of_remainder(search, whole, context)
         decision = replace(decision, models=models)
+        if models and not models[0].fit.has_process_noise:
+            decision = _one_cause_or_two(decision, context)
+            if not decision.verdict.names:
+                return decision
     with context.budget.exempt():
         exact = exact_fit(search.fit, context.data, context.budget)
     if exact is not None:
         remarks = (*decision.remarks, Remark("diagnosis.least_squares"))
         decision = replace(decision, exact=exact, remarks=remarks)
     return decision
+
+
+def _one_cause_or_two(decision: Investigation, context: FitContext) -> Investigation:
+    """A decision, without its names where one cause explains what needs two with them."""
+    search, data, unnamed = decision.search, context.data, context.study.search.unnamed
+    models = fit_unnamed_models(search, context, most=1)
+    alone, both = [each for each in models if each.parts[0].candidate.kind != MECHANISM], decision.models[0]
+    if not alone or has_structure(alone[0].fit, data):
+        return decision
+    with_names, without = log_evidences([both.fit, alone[0].fit], data)
+    chosen = len(search.found) * np.log(len(context.candidates)) + both.cost
+    log_odds = with_names - chosen + np.log1p(-unnamed) - (without - alone[0].cost)
+    LOGGER.info("two causes, one with a name, over one without: log-odds %.1f", log_odds)
+    if log_odds >= context.study.search.least_log_odds:
+        return decision
+    verdict, remarks = MismatchVerdict.UNEXPLAINED, decision.remarks
+    remarks += (_not_certain(search, log_odds, context),)
+    return replace(decision, verdict=verdict, models=models, remarks=remarks, too_faint=True)
 
 
 def named_by_forecasts(
@@ -301,7 +322,7 @@ def named_by_forecasts(
         values = {"left": 1 - left.share, "doubtful": left.doubtful, "p": left.after.p_value, "unnamed": True}
         remarks.append(Remark("diagnosis.remainder", values))
     decision = Investigation(
-        context, search, left, MismatchVerdict.MISSING_PHYSICS, least_squares, convincing=True,
+        context, search, left, MismatchVerdict.MISSING_PHYSICS, least_squares,
         log_odds=tuple(each.log_odds for each in rungs), remarks=tuple(remarks),
         recalibrations=recalibrations, finals=rungs[-1].horizons,
     )  # fmt: skip

@@ -16,7 +16,7 @@ from pydantic_core import to_jsonable_python
 
 from siq.diagnosis.evidence import BUDGET_SPENT, NotFitted
 from siq.diagnosis.holdout import HeldOutErrors
-from siq.diagnosis.mechanisms import GENERIC, MECHANISM, PROCESS_NOISE, Kind
+from siq.diagnosis.mechanisms import MECHANISM, PROCESS_NOISE, Kind
 from siq.diagnosis.search import Standing
 from siq.diagnosis.study import MismatchVerdict
 from siq.inference.budget import UNLIMITED, Account
@@ -149,7 +149,7 @@ class StatedTerm:
     def alternative_names(self, standing: Standing) -> list[str]:
         """Names of alternatives, each once; their labels where the name alone is the mechanism's own."""
         names = (
-            each.label if each.name in (self.name, GENERIC) else each.name
+            each.label if each.name == self.name else each.name
             for each in self.rivals
             if each.standing == standing
         )
@@ -171,7 +171,7 @@ class Description:
     too_faint
         Whether the mechanisms explain enough, and a function without a name is nearly as likely.
     misleading
-        Whether the mechanisms are not named since recordings held out are predicted worse with them.
+        Whether the mechanisms are not named since recordings held out do not bear them out.
     """
 
     share_described: float

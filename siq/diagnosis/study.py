@@ -137,11 +137,8 @@ class MismatchStudy(BaseModel):
         Further entries of the dictionary; one of a known name replaces it.
     without
         Names of entries that are not to be used.
-    generic
-        Whether a monomial without a name counts as physics; by default only in systems whose states have no
-        roles for which mechanisms have names.
     degree
-        Highest degree of these monomials.
+        Highest degree of formulas that describe what has no name.
     search
         What counts as found.
     budget
@@ -159,7 +156,6 @@ class MismatchStudy(BaseModel):
     varies: tuple[str, ...] = ()
     mechanisms: tuple[Mechanism, ...] = ()
     without: tuple[str, ...] = ()
-    generic: bool | None = None
     degree: Annotated[int, Field(ge=1, le=5)] = 3
     search: SearchOptions = SearchOptions()
     budget: Allowance = Allowance()

@@ -421,10 +421,12 @@ def _memory_forms() -> Iterator[Form]:
 MEMORY_FORMS = tuple(_memory_forms())
 
 
-def fit_unnamed_models(search: Search, context: FitContext) -> tuple[AugmentedModel, ...]:
+def fit_unnamed_models(
+    search: Search, context: FitContext, *, most: int = DESCRIBED_MOST
+) -> tuple[AugmentedModel, ...]:
     """Models of what is missing, the likeliest first; none where none is likelier than the simulation alone.
 
-    Mechanisms that a search found are one of the models.
+    Mechanisms that a search found are one of the models; at most so many functions stand on each other.
     """
     base, data = search.recalibrated, context.data
     models = _with_function((), base, context)
@@ -438,7 +440,7 @@ def fit_unnamed_models(search: Search, context: FitContext) -> tuple[AugmentedMo
     if (
         best is not None
         and best.fit.model.dimension == base.model.dimension
-        and len(best.parts) < DESCRIBED_MOST
+        and len(best.parts) < most
         and has_structure(best.fit, data)
     ):
         models += _with_function(best.parts, best.fit, context)

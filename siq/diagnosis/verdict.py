@@ -92,16 +92,22 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
         # A model that leaves no more than sensor and randomness do, and not most of the recordings, is an
         # explanation, though it has no name.
         rest = Remainder.of(context.data, described.fit, described.fit, context.roles)
-        gained = errors_seen.change("without", "augmented") == "better"
+        change = errors_seen.change("without", "augmented")
         most = errors_seen.augmented is not None and errors_seen.augmented**2 < 0.5  # of the spread's square
-        nearly = gained and most and errors_seen.share_gained >= NEARLY_ALL
-        if nearly and (errors_seen.at_noise("augmented", random=True) or not rest.doubtful):
+        to_noise = not (rest.doubtful or described.fit.has_process_noise)
+        # Evidence is enough where it is certain, and recordings held out do not speak against it.
+        certain = to_noise and described.log_evidence >= context.study.search.least_log_odds
+        nearly = not rest.doubtful or errors_seen.at_noise("augmented", random=True)
+        nearly = nearly and change == "better" and errors_seen.share_gained >= NEARLY_ALL
+        if most and (nearly or (certain and change != "worse")):
             verdict, left = MismatchVerdict.MISSING_PHYSICS, rest.after
     elif verdict is MismatchVerdict.PARAMETER_SHIFT:
-        # Other parameters have to mend it, by more than chance or down to the noise.
+        # Other parameters have to mend it, by more than chance or down to the noise, or leave only noise.
         seen, change = not errors_seen.at_noise("before"), errors_seen.change("before", "recalibrated")
         to_noise = seen and change == "same" and errors_seen.at_noise("recalibrated")
-        if not (change == "better" or to_noise):
+        if shown.together and not to_noise:
+            remarks.append(Remark("diagnosis.one_set_of_parameters"))
+        elif not (change == "better" or to_noise):
             verdict = MismatchVerdict.UNEXPLAINED if seen else MismatchVerdict.NO_MISMATCH
             remarks.append(Remark("diagnosis.shift_mends_nothing", {"seen": seen}))
     if investigation.account.partial:

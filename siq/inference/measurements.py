@@ -147,6 +147,12 @@ class Measurements:
             courses=tuple(self.courses[place] for place in chosen),
         )
 
+    def followed_by(self, other: Measurements) -> Measurements:
+        """These recordings and those of another, which were measured alike."""
+        first, t = np.append(self.first, self.first[-1] + other.first[1:]), np.append(self.t, other.t)
+        joined = replace(self, labels=self.labels + other.labels, courses=self.courses + other.courses)
+        return replace(joined, first=first, t=t, outputs=np.concatenate([self.outputs, other.outputs]))
+
     def until(self, rows: np.ndarray) -> Measurements:
         """The first so many rows of each recording, shape ``(recordings,)``; the inputs stay whole."""
         return self._part(

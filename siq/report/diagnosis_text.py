@@ -8,7 +8,7 @@ from functools import cache
 from typing import Any
 
 from siq.diagnosis.holdout import HeldOutErrors
-from siq.diagnosis.mechanisms import GENERIC, PROCESS_NOISE
+from siq.diagnosis.mechanisms import PROCESS_NOISE
 from siq.diagnosis.residual_structure import DOUBTFUL
 from siq.diagnosis.statement import Recalibrated, Statement
 from siq.numerics.text import (
@@ -28,7 +28,7 @@ SENTENCE_END = "¶"
 def _templates() -> Any:
     """The macros of the templates, each of which writes sentences."""
     made = environment()
-    made.globals |= {"GENERIC": GENERIC, "PROCESS_NOISE": PROCESS_NOISE, "DOUBTFUL": DOUBTFUL}
+    made.globals |= {"PROCESS_NOISE": PROCESS_NOISE, "DOUBTFUL": DOUBTFUL}
     made.globals |= {"SMALLEST_SHARE": SMALLEST_SHARE}
     further: dict[str, Any] = {
         "p_equation": p_equation,

@@ -341,9 +341,7 @@ def test_what_a_name_leaves_is_described_and_no_sample_of_a_test_chooses_it(
     ) -> Investigation:
         first = replace(whole, found=whole.found[:1], fit=whole.found[0].best.fit)
         named = MismatchVerdict.MISSING_PHYSICS
-        return Investigation(
-            context, first, left[0], named, whole.recalibrated, log_odds=(9.0,), convincing=True
-        )
+        return Investigation(context, first, left[0], named, whole.recalibrated, log_odds=(9.0,))
 
     # Forecasts would name both.
     monkeypatch.setattr(investigation, "named_by_forecasts", lambda *_: (None, ()))
@@ -519,7 +517,7 @@ def test_a_name_that_misleads_on_recordings_held_out_is_withdrawn(tmp_path: Path
     assert verdict["verdict"] == "unexplained" and names(diagnosis) == []
     assert verdict["description"]["misleading"] and verdict["description"]["by"][0]["name"] == "constant bias"
     assert "looks like a constant bias in the equation of v" in verdict["sentence"]
-    assert "but recordings held out are predicted worse with that" in verdict["sentence"]
+    assert "but recordings held out do not bear that out" in verdict["sentence"]
     assert any("stands in for something else" in line for line in verdict["words"]["left"])
     # Nothing that was found is put into the card that would make it worse.
     assert verdict["described"] == [] and verdict["fit"]["before"] < verdict["fit"]["augmented"]

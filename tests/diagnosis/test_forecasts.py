@@ -227,7 +227,7 @@ def test_damping_is_named_beside_forces_that_last() -> None:
     (found,) = rungs
     best = found.accepted.best
     assert (best.candidate.name, best.candidate.family) == ("linear damping", "resistance to motion")
-    assert found.log_odds >= context.study.search.least_log_odds and found.gain > 0
+    assert found.log_odds >= context.study.search.least_log_odds
     assert len(alone) == len(found.horizons) >= 2
     c = next(each for each in best.fit.model.parameters if each.name in best.candidate.amplitudes)
     assert c.value == pytest.approx(0.15, rel=0.3)
@@ -292,8 +292,6 @@ def same_as_before(found: _Rung | None) -> None:
     assert found is not None
     assert found.accepted.best.candidate.label == damped().accepted.best.candidate.label
     assert found.log_odds == pytest.approx(damped().log_odds, rel=1e-3)
-    # Over fits of the simulation alone, which settle up to a tolerance.
-    assert found.gain == pytest.approx(damped().gain, rel=0.05)
 
 
 def kicked_decays(count: int = 4, samples: int = 60) -> Measurements:

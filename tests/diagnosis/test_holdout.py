@@ -142,3 +142,23 @@ def test_noises_of_a_fit_foresee_how_far_free_runs_are_off(tau: float) -> None:
     # A correlation over half of the time in which the force is forgotten makes it too much.
     low, high = (0.7, 1.4) if tau == 0 else (1.0, 2.5)
     assert low < foreseen[0] / np.mean(off**2) < high
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "floor", "most"),
+    [
+        (1.0, 0.7, 0.1, True),
+        (1.0, 0.72, 0.1, False),
+        (1.0, 0.72, 0.5, True),
+        (None, 9.0, 0.1, True),
+        (1.0, None, 0.1, False),
+    ],
+)
+def test_a_name_takes_more_than_it_leaves_beyond_the_noise(
+    before: float | None, after: float | None, floor: float, most: bool
+) -> None:
+    """A square of 1 falls to 0.49, which is less than half; or to 0.5184, of which 0.25 are noise."""
+    assert HeldOutErrors(before, before, augmented=after, noise_floor=floor).takes_most is most
+    # What describes the rest is not credited to the name.
+    if after is not None:
+        assert HeldOutErrors(before, before, augmented=0.0, named=after, noise_floor=floor).takes_most is most

@@ -7,7 +7,7 @@ import pytest
 import sympy
 
 from siq.diagnosis.dictionary import _read_dictionary, dictionary_of, roles_of, standard_dictionary, unit_of
-from siq.diagnosis.mechanisms import candidates_of, generic_candidates
+from siq.diagnosis.mechanisms import candidates_of
 from siq.errors import InputError
 from siq.numerics.files import Document, validate
 from siq.systems.cards import SystemCard, build_system, load_system
@@ -59,7 +59,7 @@ def test_a_position_and_its_velocity(oscillator: Dynamics) -> None:
     roles = roles_of(oscillator)
     assert roles.motions == (("q", "w"),)
     assert roles.states == ("w",)
-    assert not roles.amplitudes and not roles.populations and roles.physical
+    assert not roles.amplitudes and not roles.populations
 
 
 def test_two_quadratures_in_a_rotating_frame() -> None:
@@ -98,15 +98,6 @@ def test_populations_and_levels() -> None:
         {"states": states("h", "g"), "equations": {"h": "-sqrt(Max(h, 0)) + 1", "g": "1 - sqrt(Max(g, 0))"}}
     )
     assert roles_of(apart).cascades == ()
-
-
-def test_a_system_without_roles_is_described_by_monomials() -> None:
-    model = model_of({"states": states("x", "y"), "equations": {"x": "x - x**3 + y", "y": "-y + x + 1"}})
-    roles = roles_of(model)
-    assert not roles.physical
-    found = generic_candidates(model, roles, degree=2)
-    assert len(found) == 2 * 6
-    assert {each.label for each in found} >= {"generic monomial x*y in y"}
 
 
 def test_names_of_the_card_are_not_taken_twice(oscillator: Dynamics) -> None:

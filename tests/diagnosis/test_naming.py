@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 
 from siq.data.recordings import Recordings
+from siq.diagnosis import naming
 from siq.diagnosis.evidence import correlation_time_of
 from siq.diagnosis.holdout import errors_left_out, predicts_better
-from siq.diagnosis.naming import _MissingEffect
+from siq.diagnosis.mechanisms import MECHANISM
+from siq.diagnosis.naming import Investigation, _MissingEffect, _one_cause_or_two
+from siq.diagnosis.study import MismatchStudy, MismatchVerdict
 from siq.diagnosis.unnamed_models import _runs_freely
 from siq.inference.kalman_filter import Whitened
 from siq.inference.measurements import Measurements, cross_validation_folds, measurements
@@ -176,3 +179,33 @@ def test_a_model_is_adopted_that_foresees_better(
     draw = np.random.default_rng(1)
     before, after = (None if size is None else squares(draw, size) for size in (without, model))
     assert predicts_better(before, after, limit=before.mean() if certain else 0.0) is adopted
+
+
+@pytest.mark.parametrize(
+    ("ahead", "forced", "named"),
+    [(20.0, False, True), (5.0, False, False), (-9.0, False, False), (-9.0, True, True)],
+)
+def test_a_name_that_leaves_something_has_to_be_likelier_than_one_cause_without_a_name(
+    ahead: float, forced: bool, named: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ten mechanisms and a cost of 2 take log(10) + 2, and odds of 19 to 1 another 2.9; 0.1 have no name."""
+
+    def model(kind: str, forced: bool, cost: float) -> SimpleNamespace:
+        part = SimpleNamespace(candidate=SimpleNamespace(kind=kind))
+        return SimpleNamespace(parts=(part,), fit=SimpleNamespace(has_process_noise=forced), cost=cost)
+
+    alone = [model(MECHANISM, False, 0.0), model("curve", forced, 0.0)]
+    monkeypatch.setattr(naming, "fit_unnamed_models", lambda *_, **__: tuple(alone))
+    monkeypatch.setattr(naming, "has_structure", lambda fit, _: fit.has_process_noise)
+    monkeypatch.setattr(naming, "log_evidences", lambda *_: [ahead, 0.0])
+    found = SimpleNamespace(best=SimpleNamespace(candidate=SimpleNamespace(name="dry friction")))
+    context = SimpleNamespace(data=None, study=MismatchStudy(), candidates=range(10))
+    decision = Investigation(
+        context, SimpleNamespace(found=(found,)), None, MismatchVerdict.MISSING_PHYSICS, None,
+        models=(model("curve", False, 2.0),),
+    )  # fmt: skip
+    after = _one_cause_or_two(decision, context)
+    assert (after is decision) == named and after.verdict.names == named
+    if not named:
+        assert [each.code for each in after.remarks] == ["diagnosis.not_certain"] and after.too_faint
+        assert after.models == tuple(alone)

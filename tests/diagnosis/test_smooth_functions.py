@@ -222,7 +222,7 @@ def test_what_depends_on_two_coordinates_gets_a_surface(tmp_path: Path) -> None:
     # Names that act on a state, in the place of all.
     kept = {"linear coupling", "nonlinear coupling", "quadratic drag", "cubic damping", "constant bias"}
     without = [each.name for each in standard_dictionary() if each.name not in {*kept, "process noise"}]
-    case = ForeignCase(CARD, table_of(t, noisy), {"generic": False, "without": without}).read(tmp_path)
+    case = ForeignCase(CARD, table_of(t, noisy), {"without": without}).read(tmp_path)
     verdict = solve_case(case).statement.as_data()
     assert verdict["outcome"] == "modelled"
     (part,) = verdict["described"]

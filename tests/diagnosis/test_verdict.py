@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
 import sympy
+from scipy.integrate import solve_ivp
 
+import siq
 from siq.diagnosis.dictionary import roles_of
 from siq.diagnosis.holdout import HeldOutErrors
 from siq.diagnosis.investigation import HeldOutRuns
@@ -73,3 +77,28 @@ def test_parameters_have_shifted_only_where_that_mends_the_simulation(
         verdict is not MismatchVerdict.PARAMETER_SHIFT
     )
     assert ("do not mend it" in statement.sentence) == (verdict is MismatchVerdict.UNEXPLAINED)
+    statement = statement_of(found, replace(runs, together=True))
+    assert statement.verdict is MismatchVerdict.PARAMETER_SHIFT
+
+
+@pytest.mark.parametrize("law", ["-x**3", "-x**3 + 0.5*x**2"])
+def test_parameters_that_the_recordings_to_learn_from_do_not_tell_have_shifted(law: str) -> None:
+    """Small swings do not tell c, and the one held out is large: the error is no physics that is missing."""
+    draw, t = np.random.default_rng(5), np.arange(0, 4, 0.1)
+    x, k, c = sympy.symbols("x k c", real=True)
+    added = sympy.lambdify(x, 2 * sympy.sympify(law, {"x": x}))
+    parts = []
+    for label, begin in (("a", 0.1), ("b", -0.1), ("c", 0.05), ("large", 2.0)):
+        run = solve_ivp(lambda _, y: -1.3 * y + added(y), (0, 4), [begin], t_eval=t, rtol=1e-9)
+        parts.append(
+            pd.DataFrame({"recording": label, "t": t, "x": run.y[0] + 0.002 * draw.normal(size=len(t))})
+        )
+    model = Dynamics(
+        ("x",), (-k * x - c * x**3,), Diffusion.identity(1), outputs=(("x", x),),
+        parameters=(Parameter("k", 1.0), Parameter("c", 1.9)),
+    )  # fmt: skip
+    found = siq.diagnose(model, pd.concat(parts), settings=MismatchStudy(held_out=("large",)))
+    codes = [each.code for each in found.statement.remarks]
+    shifted = law == "-x**3"
+    assert found.verdict is (MismatchVerdict.PARAMETER_SHIFT if shifted else MismatchVerdict.UNEXPLAINED)
+    assert ("diagnosis.one_set_of_parameters" in codes) == shifted

@@ -226,11 +226,11 @@ ABSENT = [
 ]
 
 
-def _generic_monomial(rng: np.random.Generator) -> Effect:
+def _monomial_term(rng: np.random.Generator) -> Effect:
     equation, exponents = ABSENT[int(rng.integers(len(ABSENT)))]
     i, j, k = exponents
     return Effect(
-        "generic monomial",
+        "monomial",
         (equation,),
         tuple(name for name, power in zip(ARCHETYPE3D.states, exponents, strict=True) if power),
         _signed(rng),
@@ -241,11 +241,11 @@ def _generic_monomial(rng: np.random.Generator) -> Effect:
 
 ARCHETYPE3D_CATALOGUE = Catalogue(
     {
-        "generic monomial": _generic_monomial,
         "constant bias": lambda rng: constant_bias(str(rng.choice(ARCHETYPE3D.states)))(rng),
     },
     process_noise("x", "y", "z"),
     {
+        "monomial": _monomial_term,
         "periodic potential": _fixed(
             "periodic potential",
             ("x",),
