@@ -53,6 +53,7 @@ STEEP = 700.0  # of z: beyond, exp overflows, and B has its limits
 CORE_SHARE = 0.5  # of U at the next saddle: a core lies well within its well
 COARSER = 0.5  # as many cells along each state: enough for how much a number changes
 WIDER = 0.75  # as many cells: by which the error of those is told, where three states leave no coarser ones
+NO_CURRENT = 1e-12  # numerical: of what Σ̇ would be if all of f were a current
 QUANTILES = (0.025, 0.975)  # of an interval
 
 
@@ -99,7 +100,8 @@ class Dissipation(NamedTuple):
     ----------
     value, lower, upper
         Σ̇, and its 95 % interval: by the uncertainty of f and ε where these were estimated, and of given ones
-        the error of the cells.
+        the error of the cells. Not a number stands above where the terms of an estimated f leave no current,
+        whatever their coefficients are: then nothing is known of other terms.
     points, density
         Middles of the cells, ``(n, d)``, and where in them it is made, per unit of the states, ``(n,)``.
     """
@@ -146,6 +148,10 @@ class Dissipation(NamedTuple):
             return cls(value, max(value - error, 0.0), value + error, process.points, density)
         low, high = np.quantile(drawn, QUANTILES)
         mean, lower, upper = (max(value - one + coarse, 0.0) for one in (np.mean(drawn), high, low))
+        # Terms of f that leave no current whatever their coefficients are say nothing of others.
+        f = dynamics.diffusion.squared_speed(process.points, dynamics.drift(process.points))
+        if max(drawn) < NO_CURRENT * 2 / intensity * float(process.density @ f):
+            mean, lower, upper = 0.0, 0.0, np.nan
         share = mean / value if value > 0 else 1.0
         return cls(mean, lower, upper, process.points, share * density)
 

@@ -483,7 +483,8 @@ class Landscape:
         Dissipation
             ``Σ̇ = (2/ε) ∫ u·D⁻¹u π dx`` (`siq.quasipotential.fokker_planck`) per unit of time with its 95 %
             interval. Of an estimated f it begins at zero where the record does not tell it from one with
-            detailed balance, and says then what Σ̇ is at most.
+            detailed balance. Σ̇ is then at most what stands above, as far as the terms of f go; not a number
+            stands there where none of these can make a current.
 
         Raises
         ------

@@ -57,7 +57,9 @@ REPLACED = 0.1  # of the walkers of a run in one turn
 FINENESS = 0.1  # of ln p between two levels of progress
 MOST_LEVELS = 250
 CYCLES = 2  # from Σ to Σ that count of each walker, and as many before
-PILOTS, PILOT_TIME = 200, 2.0  # walkers, and relaxation times, after which half of them have been at Σ
+# Walkers, relaxation times, and the share of these that have been at Σ by then. One who comes from Σ has then
+# forgotten from which side: where Σ is close to A, states there are correlated over many returns.
+PILOTS, PILOT_TIME, PILOT_SHARE = 400, 2.0, 0.2
 STEP_ERROR = 0.0025  # of the mean time, by the step
 HEUN = 0.25  # ln E[τ] is off by this times ΔU/ε (h/τ)², as the variance of a linear system is
 
@@ -285,13 +287,13 @@ def split_escapes(
         reached = np.any([one.height(x) <= 1 for one in targets], axis=0)
         return np.where(reached, np.inf, found)
 
-    # Σ lies where half of all walkers have been after a short time.
+    # Σ lies where few walkers have been after a short time.
     x = np.repeat(start.center[:, None], PILOTS, axis=1)
     highest = np.full(PILOTS, -np.inf)
     for _ in range(int(np.ceil(PILOT_TIME / slowest / step))):
         x = advance(x)
         highest = np.maximum(highest, heights(x))
-    first = min(float(np.median(highest)), top - 1.0)
+    first = min(float(np.quantile(highest, 1 - PILOT_SHARE, method="nearest")), top - 1.0)
     if not np.isfinite(first):
         raise NumericalFailure("walkers hardly leave where they start; take a smaller neighbourhood")
     count = int(np.clip(np.ceil((top - first) / FINENESS), 1, MOST_LEVELS))

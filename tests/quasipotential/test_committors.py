@@ -139,3 +139,9 @@ def test_what_errors_of_f_feign_is_taken_out() -> None:
         spread = 2 * np.array([one.formulas[0].coeff(y) for one, _ in draws], dtype=float) ** 2
         assert found.value == pytest.approx(max(4 * rate**2 - spread.mean(), 0.0), abs=0.03)
         assert (found.lower == 0) == (rate < 1) and found.upper > found.value
+
+
+def test_terms_without_a_current_set_no_upper_limit() -> None:
+    draws = [(Dynamics.of((x, y), (-rate * x, -y)), 0.5) for rate in (0.9, 1.0, 1.1)]
+    found = Dissipation.of(draws[1][0], 0.5, np.array([[-2.5, 2.5]] * 2), draws=draws, cells=60)
+    assert found.value == found.lower == 0 and np.isnan(found.upper)
