@@ -29,7 +29,7 @@ STEP_TOLERANCE = 0.01  # of a step: stretches end where a step differs by more
 MOST_STRETCHES = 4000  # looked at
 MOST_RUNS = 200  # without a gap, from which a correlation time is found
 MOST_HALF_PERIODS = 8  # of the background in a record: what returns more often is part of the system
-NEIGHBOURS = 10  # frequencies on either side with which one is compared
+NEIGHBOURS, FEWEST_NEIGHBOURS = 10, 3  # frequencies on either side to compare one with, of all recordings
 HARMLESS_LINE = 0.01  # of the variance: it changes -log p by a hundredth
 FALSE_CHANGE_RATE = 0.01  # probability with which a stationary record is said to change
 FALSE_DRIFT_RATE = 1e-3  # probability with which a record without a background is said to have one
@@ -172,9 +172,10 @@ def change_of(recordings: Recordings, values: np.ndarray, path: np.ndarray) -> f
     longest = max(one.stop - one.start for one in parts)
     used = [one for one in parts if one.stop - one.start > 4 * NEIGHBOURS]
     # At half the distance of independent frequencies, so that none falls between two of them.
-    window = np.ones(4 * NEIGHBOURS + 1)
-    window[2 * NEIGHBOURS - 3 : 2 * NEIGHBOURS + 4] = 0.0
-    frequencies = np.arange(2 * NEIGHBOURS + 1, longest - 2 * NEIGHBOURS)
+    near = 2 * max(-(-NEIGHBOURS // max(len(used), 1)), FEWEST_NEIGHBOURS)
+    window = np.ones(2 * near + 1)
+    window[near - 3 : near + 4] = 0.0
+    frequencies = np.arange(near + 1, longest - near)
     if not used or not len(frequencies):
         return None
     # Each octave is as likely to hold a line, which may be any of its frequencies.
