@@ -59,7 +59,6 @@ def test_a_refusal_carries_the_states_of_the_record() -> None:
     said = str(refused.value)
     assert said.startswith("The record has two states of x")
     assert "samples closer together" in said and said.endswith("rests on no formula.")
-    assert said.count(refused.value.reason) == 1
 
 
 def test_a_landscape_that_misses_the_states_says_so_as_the_page_does() -> None:
