@@ -166,7 +166,7 @@ def path_of(
     tuple
         The path is -1 before a state was reached. Transitions between samples ``(k, k)`` are those of a
         hidden Markov model, None where the path goes from core to core. Wells are those of the density.
-        Levels have nothing but white noise about them.
+        Levels are nearly all that neighbouring samples share.
     """
     series = values[:, column]
     width = max(int(AVERAGING_TIME * relaxation), 1)
@@ -208,7 +208,7 @@ def path_of(
                 whole = np.where(levels.path >= 0, np.argsort(order)[levels.path], -1)
                 path, blurred = _without_blurred(whole, runs, states)
                 counts = None if blurred else levels.counts[order][:, order]
-                return places[order], path, counts, len(wells), correlation < 2 * WHITE_CORRELATION
+                return places[order], path, counts, len(wells), True
     if len(wells) <= max(len(alone), 2):
         states = max(len(alone), 2)
         means: list[np.ndarray] = []

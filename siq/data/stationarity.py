@@ -29,7 +29,7 @@ STEP_TOLERANCE = 0.01  # of a step: stretches end where a step differs by more
 MOST_STRETCHES = 4000  # looked at
 MOST_RUNS = 200  # without a gap, from which a correlation time is found
 MOST_HALF_PERIODS = 8  # of the background in a record: what returns more often is part of the system
-NEIGHBOURS = 10  # frequencies on either side with which one is compared
+NEIGHBOURS, FEWEST_NEIGHBOURS = 10, 3  # frequencies on either side to compare one with, of all recordings
 HARMLESS_LINE = 0.01  # of the variance: it changes -log p by a hundredth
 FALSE_CHANGE_RATE = 0.01  # probability with which a stationary record is said to change
 FALSE_DRIFT_RATE = 1e-3  # probability with which a record without a background is said to have one
@@ -171,20 +171,23 @@ def change_of(recordings: Recordings, values: np.ndarray, path: np.ndarray) -> f
                 return np.inf
     longest = max(one.stop - one.start for one in parts)
     used = [one for one in parts if one.stop - one.start > 4 * NEIGHBOURS]
-    window = np.ones(2 * NEIGHBOURS + 1)
-    window[NEIGHBOURS - 1 : NEIGHBOURS + 2] = 0.0
-    frequencies = np.arange(NEIGHBOURS + 1, longest // 2 - NEIGHBOURS)
+    # At half the distance of independent frequencies, so that none falls between two of them.
+    near = 2 * max(-(-NEIGHBOURS // max(len(used), 1)), FEWEST_NEIGHBOURS)
+    window = np.ones(2 * near + 1)
+    window[near - 3 : near + 4] = 0.0
+    frequencies = np.arange(near + 1, longest - near)
+    if not used or not len(frequencies):
+        return None
+    # Each octave is as likely to hold a line, which may be any of its frequencies.
+    price = np.log2(2 * frequencies[-1] / frequencies[0]) * frequencies * series.shape[1]
     for one in series.T:
-        if not used or not len(frequencies):
-            break
-        power = np.sum([np.abs(np.fft.rfft(one[part], n=longest)) ** 2 for part in used], axis=0)
+        power = np.sum([np.abs(np.fft.rfft(one[part], n=2 * longest)) ** 2 for part in used], axis=0)
         level = ndimage.correlate1d(power, window / window.sum(), mode="nearest")
-        ratio = (power / np.maximum(level, 1e-300))[frequencies]
-        ratio[(power - level)[frequencies] < HARMLESS_LINE * power[1:].sum()] = 0.0
-        freedom = 2 * len(used) * window.sum()
-        chance = float(special.fdtrc(2 * len(used), freedom, ratio.max()))
-        if chance * len(frequencies) * series.shape[1] < FALSE_CHANGE_RATE / 2:
-            return float(longest / frequencies[ratio.argmax()])
+        ratio = power / np.maximum(level, 1e-300)
+        ratio[2 * (power - level) < HARMLESS_LINE * power[1:].sum()] = 0.0
+        chance = price * special.fdtrc(2 * len(used), len(used) * window.sum(), ratio[frequencies])
+        if chance.min() < FALSE_CHANGE_RATE / 2:
+            return float(2 * longest / frequencies[chance.argmin()])
     return None
 
 

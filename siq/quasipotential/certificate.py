@@ -54,7 +54,6 @@ OF_TIMES = ("times",)  # what answers on times rest on, and nothing else does
 OF_DYNAMICS = (
     "prediction", "one_system", "unchanged", "state_complete", "gaussian_increments", "existence", "record",
 )  # fmt: skip
-BY_RECORD = ("data.not_stationary", "data.levels_alone")  # remarks of states of which there are no f and D
 INDEPENDENT = ("characteristics",)  # tests of V that share nothing with a fit of V but f and D
 GO_WITHOUT = "or do without them: 'refinement: {routes: [local]}'"
 ALONE = f"only one of the two routes that the study names led to V; train other networks, {GO_WITHOUT}"
@@ -112,11 +111,11 @@ class Certificate:
 
         Up to 3 it is that of the states that the record shows by itself. With f and D that passed every test
         against the record it is 4, or 5 where they have a `hidden` state; with all formulas certified,
-        times between states included, 6. Of a record that changes, or jumps between levels, it is no more
-        than that of its states, whatever was certified.
+        times between states included, 6. Of a record that changes it is no more than that of its states,
+        whatever was certified.
         """
         own = 0 if seen is None else seen.rung
-        apart = seen is not None and seen.limit is not None and seen.limit.code in BY_RECORD
+        apart = seen is not None and seen.limit is not None and seen.limit.code == "data.not_stationary"
         if certificate is None or apart or "prediction" not in certificate.tests:
             return own
         tests = certificate.tests

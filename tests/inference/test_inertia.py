@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from particles import particle
 
 from siq.data.recordings import Recordings
 from siq.errors import NumericalFailure
+from siq.inference.identify import identify
 from siq.inference.library import IdentificationOptions
 from siq.inference.observation import inertia_test
+from siq.numerics.randomness import generator
+from siq.systems.diffusion import Diffusion
 from siq.workflow import pipeline
 from siq.workflow.pipeline import PipelineSettings
-from siq.workflow.tables import Status
 
 
 def overdamped(seed: int, *, step: float, samples: int = 1_000) -> Recordings:
@@ -66,6 +70,7 @@ def test_a_position_with_inertia_gets_a_velocity() -> None:
     settings = PipelineSettings(identification=IdentificationOptions(degree=3))
     done = pipeline.identify_run(settings, particle(1, records=4)[0], number=0)
     assert done.outcome.status is Status.OK and done.result is not None and done.result.hidden_velocities
+    assert "velocities were not recorded" in done.outcome.reason
 
 
 def test_a_position_alone_is_refused_and_the_option_named() -> None:
@@ -74,6 +79,18 @@ def test_a_position_alone_is_refused_and_the_option_named() -> None:
     assert done.outcome.status in (Status.WARNING, Status.FAILED)
     assert "identification.hidden_velocities: true" in done.outcome.reason
     assert "has inertia" in done.outcome.reason
+
+
+def test_where_d_of_the_position_is_given_the_option_is_named() -> None:
+    recordings, draw = particle(1, records=4)[0], partial(generator, 0, 0)
+    try:
+        found = identify(
+            recordings, options=IdentificationOptions(degree=3), draw=draw, diffusion=Diffusion.identity(1)
+        )
+        said = found.prediction.reason if found.prediction is not None else ""
+    except NumericalFailure as error:
+        said = str(error)
+    assert "has inertia" in said and "identification.hidden_velocities: true" in said
 
 
 def test_velocities_of_a_position_without_inertia_are_refused_and_the_option_named() -> None:
