@@ -17,6 +17,7 @@ from siq.numerics.randomness import generator
 from siq.systems.diffusion import Diffusion
 from siq.workflow import pipeline
 from siq.workflow.pipeline import PipelineSettings
+from siq.workflow.tables import Status
 
 
 def overdamped(seed: int, *, step: float, samples: int = 1_000) -> Recordings:
