@@ -17,7 +17,7 @@ import numpy as np
 
 from siq.quasipotential.landscape_assembly import EquationSettings, landscape_from_equations
 from siq.systems.cards import load_system
-from siq.validation.escapes import Neighbourhood, simulate_escapes
+from siq.systems.escapes import Neighbourhood, simulate_escapes
 
 CARD = Path(__file__).parents[1] / "config" / "systems" / "consumer-resource.yaml"
 PUBLISHED = (0.007056, 0.00092975)  # Φ of the saddle from (1.4049, 2.8081) and from (4.9040, 4.0619)

@@ -20,7 +20,7 @@ from scipy.integrate import cumulative_trapezoid
 from siq.quasipotential.fokker_planck import CellProcess, cores_about
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import find_equilibria
-from siq.validation.escapes import RUNS, Neighbourhood, split_escapes
+from siq.systems.escapes import RUNS, Neighbourhood, split_escapes
 
 BOX = np.array([[-2.0, 2.0]])
 AT_ONCE = 20  # repetitions

@@ -46,9 +46,9 @@ from siq.quasipotential.landscape_files import landscape_from_data, read_landsca
 from siq.quasipotential.transitions import Transition
 from siq.remarks import sentence
 from siq.systems.dynamics import Dynamics
+from siq.systems.escapes import Neighbourhood, simulate_escapes
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
 from siq.systems.simulation import simulate_stationary
-from siq.validation.escapes import Neighbourhood, simulate_escapes
 from siq.validation.mesh import mesh_potential
 from siq.workflow.study import PipelineSettings
 from siq.workflow.tables import Method, as_table

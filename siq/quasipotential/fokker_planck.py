@@ -42,7 +42,7 @@ from siq.quasipotential.characteristics import Function, ScaledSystem
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, hessian_at
-from siq.validation.escapes import Neighbourhood
+from siq.systems.escapes import Neighbourhood
 
 # Along each state: visits of a double well are then good to 1e-4 and 1e-2; of three states as is affordable.
 CELLS = {1: 2000, 2: 120, 3: 28}

@@ -43,7 +43,7 @@ from siq.remarks import Remark, sentence
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, hessian_at
-from siq.validation.escapes import Neighbourhood, split_escapes
+from siq.systems.escapes import Neighbourhood, split_escapes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -516,7 +516,7 @@ class Landscape:
             ``attractor``; ``law`` and its relative ``law_error``, as `dwell_times` has them; ``operator``,
             which holds for any ε, and its relative ``operator_error``, NaN beyond three states and where
             wells are narrower than cells; ``check`` with its ``relative_error`` and its 95 % interval ``lower
-            upper``. The check assumes neither (`siq.validation.escapes.split_escapes`), and takes seconds a
+            upper``. The check assumes neither (`siq.systems.escapes.split_escapes`), and takes seconds a
             well at ΔU/ε = 5, ten at 20. It has no rows where there is but one attractor.
 
         Raises

@@ -59,8 +59,8 @@ from siq.quasipotential.rates import NoiseStrength, mean_residence_time
 from siq.quasipotential.transitions import transitions, ways_out
 from siq.remarks import Remark, sentence
 from siq.systems.dynamics import Dynamics
+from siq.systems.escapes import Neighbourhood
 from siq.systems.phase_portrait import PhasePortrait
-from siq.validation.escapes import Neighbourhood
 
 OVERSHOOT = 0.5826  # derived: -ζ(1/2)/√(2π)
 SMALLEST_CORE = 0.2  # of a core's radius: of steps as long as the core no such correction is known

@@ -1,1 +1,1 @@
-"""Validation by methods that share no code with those they check: meshes, escapes, known systems."""
+"""Validation by methods that share no code with those they check: meshes, known systems."""

@@ -9,7 +9,7 @@ from benchmarks.hostile.scores import scored
 
 # Chosen for what they are, and for a short computing time: a minute and a half together.
 REFUSED = (
-    "joined_levels", "swinging_tilt", "gate", "growing_noise", "force_with_memory", "hidden_velocity",
+    "joined_levels", "swinging_tilt", "gate", "growing_noise", "force_with_memory",
     "relaxation_oscillator", "lost_buffers", "square_wave", "resets", "growing_oscillation",
     "levy_noise_in_wells",
 )  # fmt: skip

@@ -63,9 +63,12 @@ def test_intervals_of_stays_cover() -> None:
     assert np.mean(counted) > 0.9 and np.mean(modelled) > 0.88
 
 
-@pytest.mark.parametrize("power", [1, 3])
-def test_one_well_is_never_two(power: int) -> None:
-    step, seeds = 0.05, 20
+@pytest.mark.parametrize(
+    ("power", "seeds"),
+    [(1, 8), (3, 8), *(pytest.param(power, 40, marks=pytest.mark.slow) for power in (1, 3))],
+)
+def test_one_well_is_never_two(power: int, seeds: int) -> None:
+    step = 0.05
     kicks = np.sqrt(0.5 * step) * np.random.default_rng(power).standard_normal((4000, seeds))
     x = np.zeros((4000, seeds))
     for k in range(1, len(x)):

@@ -11,7 +11,7 @@ from scipy.linalg import solve_continuous_lyapunov
 from siq.errors import NumericalFailure
 from siq.quasipotential.fokker_planck import CellProcess, Dissipation
 from siq.systems.dynamics import Dynamics
-from siq.validation.escapes import Neighbourhood
+from siq.systems.escapes import Neighbourhood
 
 pytestmark = pytest.mark.portable
 

@@ -14,7 +14,7 @@ from siq.quasipotential.rates import (
     escape_rate,
 )
 from siq.systems.dynamics import Dynamics
-from siq.validation.escapes import Neighbourhood, simulate_escapes
+from siq.systems.escapes import Neighbourhood, simulate_escapes
 
 X, V, Y, W = sympy.symbols("x v y w", real=True)
 

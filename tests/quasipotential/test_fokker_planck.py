@@ -15,7 +15,7 @@ from siq.errors import NumericalFailure
 from siq.quasipotential.occupancy import _core_of, _VisitProcess
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
-from siq.validation.escapes import Neighbourhood
+from siq.systems.escapes import Neighbourhood
 
 pytestmark = pytest.mark.portable
 

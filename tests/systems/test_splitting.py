@@ -15,7 +15,7 @@ from siq.quasipotential.landscape_assembly import landscape_from_equations
 from siq.quasipotential.landscape_files import landscape_data, landscape_from_data
 from siq.remarks import Remark, sentence
 from siq.systems.dynamics import Dynamics
-from siq.validation.escapes import split_escapes
+from siq.systems.escapes import split_escapes
 
 pytestmark = pytest.mark.portable
 

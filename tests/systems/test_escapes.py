@@ -10,7 +10,7 @@ from known_systems import KnownSystem, archetype, double_well
 from siq.errors import NumericalFailure
 from siq.quasipotential.rates import escape_rate
 from siq.systems.dynamics import Dynamics
-from siq.validation.escapes import Neighbourhood, _EscapeTimes, simulate_escapes
+from siq.systems.escapes import Neighbourhood, _EscapeTimes, simulate_escapes
 
 
 def escapes_of(
