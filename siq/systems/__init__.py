@@ -1,1 +1,1 @@
-"""Systems: drift and noise as one object, from cards to simulations, escapes, equilibria, cycles and bifurcations."""
+"""Systems: drift and noise as one object, from cards to simulations, escapes, cycles and bifurcations."""
