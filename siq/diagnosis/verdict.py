@@ -118,8 +118,8 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
     if verdict.mismatch and forced.has_process_noise and not investigation.process_noise:
         with suppress(*NUMERICAL_ERRORS):
             remarks += remaining_forces(forced, context.data, context.roles)
-    if described is None or investigation.verdict.names:  # what has no name is no mechanism to be told apart
-        remarks += _experiment_to_tell(investigation)
+    # What has no name is no mechanism to be told apart from others.
+    remarks += _experiment_to_tell(investigation) if described is None or investigation.verdict.names else []
     for name in context.study.varies:
         remarks.append(_variation_of(name, final, context.data.labels))
     if kept and errors:

@@ -390,11 +390,10 @@ def _times_view(landscape: LandscapeSummary) -> Markup | None:
     even = np.geomspace(min(low, first), max(high, first), NOISES)
     strengths = sorted({first, *(float(f"{one:.4g}") for one in even)})  # as they are shown
     noises = [noise if one == first else NoiseStrength(one) for one in strengths]
-    wells = landscape.wells
     rows = [
         [
             {"ratio": value_text(*well.relative_depth(noise)), "time": time_text(well.time(noise))}
-            for well in wells
+            for well in landscape.wells
         ]
         for noise in noises
     ]
@@ -404,7 +403,7 @@ def _times_view(landscape: LandscapeSummary) -> Markup | None:
         "known": landscape.noise is not None,
         "noise": with_unit("noise strength ε", landscape.energy_unit),
         "time": with_unit("lasts", landscape.time_unit),
-        "wells": [one.label for one in wells],
+        "wells": [one.label for one in landscape.wells],
     }
     return Markup(render_template("times.html.j2", view))
 

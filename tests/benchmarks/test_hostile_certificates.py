@@ -11,7 +11,6 @@ from benchmarks.hostile.scores import scored
 REFUSED = (
     "joined_levels", "swinging_tilt", "gate", "growing_noise", "force_with_memory",
     "relaxation_oscillator", "lost_buffers", "square_wave", "resets", "growing_oscillation",
-    "levy_noise_in_wells",
 )  # fmt: skip
 NAMED = ("held_values", "held_gaps", "quantised")  # values that repeat themselves are no copies of recordings
 HONEST = ("gate", "swinging_tilt", "two_offsets", "growing_noise")

@@ -210,6 +210,7 @@ def two_bumps(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     )
 
 
+@pytest.mark.slow
 def test_what_depends_on_two_coordinates_gets_a_surface(tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     t = np.arange(0, 6, 0.1)
