@@ -135,7 +135,7 @@ def identify(
         limits or PredictionLimits(),
     )  # fmt: skip
     try:
-        if options.hidden_velocities == "auto" and goes_to_and_fro(recordings):
+        if options.hidden_velocities == "auto" and diffusion is None and goes_to_and_fro(recordings):
             by_velocities = case.with_velocities()
             if by_velocities is None:
                 raise NumericalFailure(
