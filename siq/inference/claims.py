@@ -59,6 +59,9 @@ FASTEST_PERIOD = 2  # samples
 FEWEST_OF_SPECTRUM = 10  # pairs of a run whose spectrum is asked for
 SHORTEST_MEMORY, MEMORY_GROWTH, LONGEST_MEMORY = 4, 2.0, 1 / 30  # samples; a ratio; of all samples
 OVERLAP = 0.02  # quantile between which, and one minus it, recordings share states
+SLIGHT_EXCESS = (
+    0.25  # of the standard deviation of what all recordings explain: it hardly moves a probability
+)
 RANK = 1e-8  # numerical: of the squares of a column, what is left of it by chance
 TAIL = 3.0  # standard deviations: beyond are 2.7 in 1000
 HARMLESS_CHANGE = 0.01  # of a barrier
@@ -206,6 +209,10 @@ def _one_system(rest: _Residuals, labels: Sequence[str], limit: float) -> Verdic
     if len(numbers) < 2:
         return Verdict(0.0, -float(np.log10(limit)), True)
     enough = [place for place, own in enumerate(rows) if len(own) >= FEWEST_PAIRS]
+    # What a recording explains by its own states is larger than chance makes it where it is short.
+    columns = rest.states
+    if _kendall_excess(rest.states[:, 1:], rows) > SLIGHT_EXCESS * np.sqrt(2 * len(rows) * columns.shape[1]):
+        columns = columns[:, :1]
     # What each explains by itself, of the mean and of the variance; then again without the worst.
     noise, power, apart, order, least = rest.noise, rest.power, list[int](), list[int](), 1.0
     while len(apart) <= len(numbers) // 2:
@@ -213,7 +220,7 @@ def _one_system(rest: _Residuals, labels: Sequence[str], limit: float) -> Verdic
         for place, own in enumerate(rows):
             if place in apart or len(own) <= rest.states.shape[1]:
                 continue
-            mean = _explained(rest.states[own], noise[own], rest.basis[own])
+            mean = _explained(columns[own], noise[own], rest.basis[own])
             sums = (sums[0] + mean[0], sums[1] + mean[1])
             if place in enough:
                 variance = _explained(rest.states[own, :1], power[own], rest.basis[own])
@@ -228,10 +235,10 @@ def _one_system(rest: _Residuals, labels: Sequence[str], limit: float) -> Verdic
         if 3 * single >= limit:
             break
         apart.append(min(chances, key=lambda place: chances[place]))
-        columns = rest.without(rest.states * (index == apart[-1])[:, None])
+        worst = rest.without(rest.states * (index == apart[-1])[:, None])
         noise, power = (
             one - basis @ (basis.T @ one)
-            for one, basis in ((noise, _orthonormal(columns)), (power, _orthonormal(columns[:, :1])))
+            for one, basis in ((noise, _orthonormal(worst)), (power, _orthonormal(worst[:, :1])))
         )
     if least >= limit and len(enough) > 1:
         # Recordings are compared with those that share states with them, and these with others.
@@ -249,6 +256,22 @@ def _one_system(rest: _Residuals, labels: Sequence[str], limit: float) -> Verdic
             return Verdict.not_tested(sentence(Remark("inference.no_common_states", values)))
     names = [labels[numbers[place]] for place in apart or order[:3]]
     return _verdict("one_system", least, limit, names=names[:3], count=len(names))
+
+
+def _kendall_excess(states: np.ndarray, rows: Sequence[np.ndarray]) -> float:
+    """By how much squares that states of the same recording explain of its noise exceed their mean, in all.
+
+    A state follows its own noise, so that a regression on n of them, of the correlation ρ from one to the
+    next, is off by -(1 + 3ρ)/n (Kendall 1954), which is ``(1 + 3ρ)/√(n (1 - ρ²))`` of its standard errors.
+    """
+    excess = 0.0
+    for own in rows:
+        x = states[own]
+        around = ((x - x.mean(axis=0)) ** 2).sum(axis=0)
+        apart = (np.diff(x, axis=0) ** 2).sum(axis=0) / positive(2 * around)
+        slow = np.clip(1 - apart, 0.0, 1.0 - 1e-9)
+        excess += float(((1 + 3 * slow) ** 2 / (len(own) * (1 - slow**2))).sum())
+    return excess
 
 
 def _explained(columns: np.ndarray, rest: np.ndarray, basis: np.ndarray) -> tuple[int, np.ndarray]:
