@@ -59,9 +59,7 @@ FASTEST_PERIOD = 2  # samples
 FEWEST_OF_SPECTRUM = 10  # pairs of a run whose spectrum is asked for
 SHORTEST_MEMORY, MEMORY_GROWTH, LONGEST_MEMORY = 4, 2.0, 1 / 30  # samples; a ratio; of all samples
 OVERLAP = 0.02  # quantile between which, and one minus it, recordings share states
-SLIGHT_EXCESS = (
-    0.25  # of the standard deviation of what all recordings explain: it hardly moves a probability
-)
+SLIGHT_EXCESS = 0.25  # of the standard deviation of what all recordings explain: 1/160 becomes 1/80
 RANK = 1e-8  # numerical: of the squares of a column, what is left of it by chance
 TAIL = 3.0  # standard deviations: beyond are 2.7 in 1000
 HARMLESS_CHANGE = 0.01  # of a barrier

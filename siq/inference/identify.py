@@ -134,15 +134,14 @@ def identify(
         recordings, library, options, draw, diffusion, units or recordings.units, pair_step, integrator_step,
         limits or PredictionLimits(),
     )  # fmt: skip
+    if options.hidden_velocities == "auto" and diffusion is None and goes_to_and_fro(recordings):
+        if (by_velocities := case.with_velocities()) is None:
+            raise NumericalFailure(
+                "the recording turns back as no force on the state alone would make it, and with the velocity"
+                " as a state f does not pass its test; record what else moves, or drives it"
+            )
+        return by_velocities
     try:
-        if options.hidden_velocities == "auto" and diffusion is None and goes_to_and_fro(recordings):
-            by_velocities = case.with_velocities()
-            if by_velocities is None:
-                raise NumericalFailure(
-                    "the recording turns back as no force on the state alone would make it, and with the"
-                    " velocity as a state f does not pass its test"
-                )
-            return by_velocities
         if observation == "auto":
             found = case.identified()
         elif hidden:
@@ -244,10 +243,8 @@ class _Case:
             again = self.by_likelihood(ObservationModel(self.library, found.diffusion), noise)
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             if ((score < -SIGNIFICANT_SCORE) & (correlation < -HARMLESS_CORRELATION)).any():
-                reason, claim = (
-                    f"the sensor is noisy, and f with it is not found: {error}",
-                    "gaussian_increments",
-                )
+                reason = f"the sensor is noisy, and f with it is not found: {error}"
+                claim = "gaussian_increments"
                 tests = check_claims(found, self.recordings, self.recordings, false_alarms=self.limits.each)
                 if tests[claim].passed:
                     raise NumericalFailure(reason) from None
@@ -463,7 +460,7 @@ class _Case:
             return f"{said}: leave 'identification.hidden_velocities' out, the position alone is the state"
         if self.options.hidden_velocities == "auto" and self.given is None:
             return (
-                f"{said}: with the velocity as a state that was not recorded, f does not pass its test either"
+                f"{said}: with the velocity as a state f does not pass its test either; record the velocity"
             )
         return (
             f"{said}: set 'identification.hidden_velocities: true', in Python hidden_velocities=True, and the"
