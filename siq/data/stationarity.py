@@ -28,6 +28,7 @@ WHITE_CORRELATION = 0.05  # of the variance: a correlation of neighbours below i
 STEP_TOLERANCE = 0.01  # of a step: stretches end where a step differs by more
 MOST_STRETCHES = 4000  # looked at
 MOST_RUNS = 200  # without a gap, from which a correlation time is found
+BRIDGED = 0.1  # of the correlation time: so long a gap hides two hops in one case of a hundred
 MOST_HALF_PERIODS = 8  # of the background in a record: what returns more often is part of the system
 NEIGHBOURS, FEWEST_NEIGHBOURS = 10, 3  # frequencies on either side to compare one with, of all recordings
 HARMLESS_LINE = 0.01  # of the variance: it changes -log p by a hundredth
@@ -53,6 +54,21 @@ def runs_of(recordings: Recordings, *, longest: float | None = None) -> list[sli
         broken |= np.diff(recordings.t) > longest * (1 + 1e-6)
     bounds = np.concatenate([[0], np.flatnonzero(broken) + 1, [len(recordings.t)]])
     return [slice(int(a), int(b)) for a, b in pairwise(bounds) if b > a]
+
+
+def bridged_runs(recordings: Recordings) -> list[slice]:
+    """Rows of one recording without a gap longer than what the record remembers, each a slice.
+
+    That is the least local relaxation time (`relaxation_samples`), or `BRIDGED` of the correlation time. What
+    lasts longer, such as a visit to a state or a drift, is not ended by samples that are missing; increments
+    are, and want `runs_of`.
+    """
+    whole, longest = runs_of(recordings, longest=np.inf), []
+    some = whole[:: -(-len(whole) // MOST_RUNS)]
+    for one in recordings.values.T:
+        relaxation = relaxation_samples(one, whole) or 0.0
+        longest.append(max(relaxation, BRIDGED * correlated_samples(one, some), LONGEST_STEP))
+    return runs_of(recordings, longest=min(longest) * usual_step(recordings))
 
 
 def stretches_of(runs: list[slice], length: int, *, most: int | None = None) -> np.ndarray:
@@ -156,7 +172,7 @@ def change_of(recordings: Recordings, values: np.ndarray, path: np.ndarray) -> f
     lines = [np.linspace(-1, 1, len(path))]
     if len(parts) > 1:
         lines.append(np.concatenate([np.linspace(-1, 1, one.stop - one.start) for one in parts]))
-    runs = runs_of(recordings)
+    runs = bridged_runs(recordings)
     some = runs[:: -(-len(runs) // MOST_RUNS)]
     for line in lines:
         line = np.where(known, line - line[known].mean(), 0.0)
@@ -198,7 +214,7 @@ def background_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarra
     the drift ``(n,)``, less its mean over the record, and how many half periods the fastest cosine has in a
     recording; both are zero where none is seen.
     """
-    runs, counts = runs_of(recordings), np.bincount(recordings.recording)
+    runs, counts = bridged_runs(recordings), np.bincount(recordings.recording)
     best, found = 0.0, (np.zeros(len(values)), 0)
     spread = float(np.var(values))
     if spread <= 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -103,6 +104,28 @@ def test_three_states_in_two_dimensions() -> None:
 
 def states_of_noise(path: np.ndarray) -> RecordStates:
     return found_in(path + 0.1 * noise(5, len(path)))
+
+
+@pytest.mark.parametrize("separation", [4.0, 0.0], ids=["levels", "double well"])
+def test_missing_samples_end_no_visit(separation: float) -> None:
+    """A tenth of the samples is missing here and there; states, hops and stays in time are as with them."""
+    if separation:
+        values = separation * chain(3, np.array([[-0.01, 0.01], [0.02, -0.02]]), 5000) + noise(3, 5000)
+    else:
+        values, kicks = np.ones(40_000), np.sqrt(0.25 * 0.05) * noise(5, 40_000)
+        for k in range(len(values) - 1):
+            values[k + 1] = values[k] + 0.05 * (values[k] - values[k] ** 3) + kicks[k]
+    whole, kept = recorded(values), np.random.default_rng(6).random(len(values)) > 0.1
+    some = replace(whole, t=whole.t[kept], values=whole.values[kept], recording=whole.recording[kept])
+    expected, found = switching(whole), switching(some)
+    assert expected is not None and found is not None and expected.supported and found.supported
+    assert found.rung == expected.rung and len(found.visits) == kept.sum()
+    assert np.mean(found.visits == expected.visits[kept]) > 0.98
+    for one, other in zip(found.counts, expected.counts, strict=True):
+        assert one.visits == pytest.approx(other.visits, rel=0.1)
+        assert one.time == pytest.approx(other.time, rel=0.02)
+    stays = [[np.mean(one) for one in each.stays] for each in (found, expected)]
+    assert stays[0] == pytest.approx(stays[1], rel=0.12)
 
 
 def test_a_record_whose_stays_change_ends_on_the_first_rung() -> None:
