@@ -21,7 +21,7 @@ from scipy import ndimage, special
 
 from siq.data.recordings import LONGEST_STEP, Recordings
 
-SHORTEST_STRETCH = 48  # samples of the shortest stretch looked at
+SHORTEST_STRETCH = 12  # samples of the shortest stretch looked at
 SETTLED_GROWTH = 1.3  # with twice the length a walk's correlation lasts twice as long, a relaxation's as long
 SHORTEST_TIME = 0.5  # of a sample: shorter correlations are not told from none
 WHITE_CORRELATION = 0.05  # of the variance: a correlation of neighbours below is none
