@@ -22,6 +22,7 @@ from scipy import ndimage, special
 from siq.data.recordings import LONGEST_STEP, Recordings
 
 SHORTEST_STRETCH = 12  # samples of the shortest stretch looked at
+SHORTEST_RUN = 96  # samples, of which at least one run has as many: fewer tell no relaxation
 SETTLED_GROWTH = 1.3  # with twice the length a walk's correlation lasts twice as long, a relaxation's as long
 SHORTEST_TIME = 0.5  # of a sample: shorter correlations are not told from none
 WHITE_CORRELATION = 0.05  # of the variance: a correlation of neighbours below is none
@@ -83,7 +84,7 @@ def relaxation_samples(values: np.ndarray, runs: list[slice]) -> float | None:
     """The local relaxation time in samples; None where no stretch is long enough to tell."""
     length, longest = SHORTEST_STRETCH, max((run.stop - run.start for run in runs), default=0)
     times = []
-    while length <= longest:
+    while length <= longest and longest >= SHORTEST_RUN:
         if (time := _correlated(values, stretches_of(runs, length, most=MOST_STRETCHES), length)) is not None:
             times.append(max(time, SHORTEST_TIME))
         length *= 2

@@ -15,7 +15,7 @@ from siq.data.kinetics import MarkovModel
 from siq.data.preparation import without_background
 from siq.data.recordings import Recordings
 from siq.data.states import DwellCount, RecordStates, switching
-from siq.data.stationarity import runs_of
+from siq.data.stationarity import relaxation_samples, runs_of
 from siq.remarks import Remark
 
 RATES = np.array([[-0.10, 0.06, 0.04], [0.10, -0.15, 0.05], [0.05, 0.10, -0.15]])
@@ -126,6 +126,22 @@ def test_missing_samples_end_no_visit(separation: float) -> None:
         assert one.time == pytest.approx(other.time, rel=0.02)
     stays = [[np.mean(one) for one in each.stays] for each in (found, expected)]
     assert stays[0] == pytest.approx(stays[1], rel=0.12)
+
+
+def test_wells_that_mix_slowly_stand_apart_and_a_quick_relaxation_among_hops_is_seen() -> None:
+    """Over a cosine samples relax within two of them, and it takes thousands to have been in all wells."""
+    generator, step = np.random.default_rng(77), 0.005
+    x, values = 0.0, np.empty(30_000)
+    kicks = 0.7 * np.sqrt(step) * generator.standard_normal((len(values), 4))
+    for k, some in enumerate(kicks):
+        for kick in some:
+            x += kick - step * (1.1 * np.pi * np.sin(2 * np.pi * x) + 0.3 * x)
+        values[k] = x
+    assert 1 < (relaxation_samples(values, [slice(0, len(values))]) or 0) < 5  # 2.3 in a well
+    found = found_in(values)
+    assert found.supported and len(found.levels) >= 3
+    assert np.abs(np.array(found.levels) - np.round(found.levels)).max() < 0.1
+    assert np.diff(np.round(found.levels)) == pytest.approx(1)
 
 
 def test_a_record_whose_stays_change_ends_on_the_first_rung() -> None:
