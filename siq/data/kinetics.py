@@ -91,6 +91,29 @@ def _wells_of(values: np.ndarray, relaxation: float) -> np.ndarray:
     return places[np.lexsort(places.T[::-1])]
 
 
+def _wells_apart(values: np.ndarray, runs: list[slice], wells: np.ndarray) -> np.ndarray:
+    """Wells ``(k, 1)`` of a series ``(n, 1)``, without those that no valley tells from their neighbours."""
+    while len(wells) > 1:
+        path, _ = _path_between(values, runs, wells)
+        profile = Profile.of(values[:, 0], runs, path, wells[:, 0])
+        depth, error = profile.tops[:, ::2], profile.tops[:, 1::2]
+        least = (depth / error).min(axis=1)
+        place = int(least.argmin())
+        if least[place] > FALSE_WELL:
+            break
+        lower = place if depth[place, 0] < depth[place, 1] else place + 1
+        wells = np.delete(wells, lower, axis=0)
+    return wells
+
+
+def _path_between(values: np.ndarray, runs: list[slice], wells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The path ``(n,)`` from core to core of wells ``(k, d)``, and the median of what is nearest to each."""
+    distance = np.linalg.norm((values[:, None] - wells) / positive(values.std(axis=0)), axis=2)
+    near = distance.argmin(axis=1)
+    core = np.where(distance[np.arange(len(near)), near] <= _medians(distance, near)[near], near, -1)
+    return continued_visits(core, runs), _places(values, near, len(wells))
+
+
 class _Levels(NamedTuple):
     """A hidden Markov model of normal distributions about levels."""
 
@@ -177,7 +200,12 @@ def path_of(
     steps = np.array([resolution_step(one) or 0.0 for one in values.T])
     draw = np.random.default_rng(0)
     longest = [_remembered(one, runs, relaxation) for one in smooth.T]
-    wells = _wells_of(smooth + steps * (draw.random(values.shape) - 0.5), max(longest))
+    spread_out = smooth + steps * (draw.random(values.shape) - 0.5)
+    wells = _wells_of(spread_out, max(longest))
+    if len(longest) == 1:
+        # What hops from well to well for long before it is anywhere else knows a valley by all its passages.
+        fine = _wells_apart(smooth, runs, _wells_of(spread_out, relaxation))
+        wells = fine if len(wells) < len(fine) <= MOST_STATES else wells
     each = [wells] if len(longest) == 1 else [_wells_of(smooth[:, [k]], one) for k, one in enumerate(longest)]
     alone = each[column]
 
@@ -234,12 +262,8 @@ def path_of(
         places = _places(values, near, states)
         places[:, column] = centre
         return places, continued_visits(core, runs), None, len(wells), False
-    wells = wells[np.argsort(wells[:, column])]
-    distance = np.linalg.norm((values[:, None] - wells) / positive(values.std(axis=0)), axis=2)
-    near = distance.argmin(axis=1)
-    core = np.where(distance[np.arange(len(near)), near] <= _medians(distance, near)[near], near, -1)
-    places = _places(values, near, len(wells))
-    return places, continued_visits(core, runs), None, len(wells), False
+    path, places = _path_between(values, runs, wells[np.argsort(wells[:, column])])
+    return places, path, None, len(wells), False
 
 
 def _remembered(series: np.ndarray, runs: list[slice], relaxation: float) -> float:

@@ -48,10 +48,10 @@ from siq.data.recordings import Recordings
 from siq.data.stationarity import (
     MOST_STRETCHES,
     background_of,
+    bridged_runs,
     change_of,
     correlated_samples,
     relaxation_samples,
-    runs_of,
     stretches_of,
     usual_step,
 )
@@ -441,7 +441,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     >>> found.supported, [round(level, 1) for level in found.levels]
     (True, [-0.9, 0.8])
     """
-    runs, generator = runs_of(recordings), np.random.default_rng(0)  # always the same surrogates
+    runs, generator = bridged_runs(recordings), np.random.default_rng(0)  # always the same surrogates
     relaxations = {
         place: time
         for place, one in enumerate(recordings.values.T)
@@ -498,7 +498,9 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     profile = Profile.of(flat[:, column], runs, path, places[:, column]) if supported else None
     if profile is not None and wanted and wells == 1:
         supported = bool((profile.tops[:, ::2] > FALSE_WELL * profile.tops[:, 1::2]).all())
-    step, lengths = usual_step(recordings), stays_of(path, runs, number)
+    lengths = stays_of(path, runs, number)
+    steps = np.concatenate([np.diff(recordings.t[run]) for run in runs])  # with what is missing in between
+    step = float(steps.mean()) if len(steps) else usual_step(recordings)
     found = RecordStates(
         recordings.titles[state], recordings.units[state], recordings.time_unit, supported, probability,
         tuple(map(float, places[:, column])), counts, edges, density, path, background[:, column],
@@ -543,11 +545,11 @@ def _baselines(recordings: Recordings, rest: np.ndarray) -> np.ndarray:
     found = np.zeros_like(rest)
     if number < 2:
         return found
-    counts = np.bincount(labels, minlength=number)
+    counts, runs = np.bincount(labels, minlength=number), bridged_runs(recordings)
     for place, one in enumerate(rest.T):
         means = np.bincount(labels, weights=one, minlength=number) / np.maximum(counts, 1)
         inside = one - means[labels]
-        error = inside.var() * 2 * correlated_samples(inside, runs_of(recordings)) / np.maximum(counts, 1)
+        error = inside.var() * 2 * correlated_samples(inside, runs) / np.maximum(counts, 1)
         centre = np.average(means, weights=counts)
         squares = float((((means - centre) ** 2)[counts > 0] / np.maximum(error[counts > 0], 1e-300)).sum())
         if special.chdtrc((counts > 0).sum() - 1, squares) < FALSE_OFFSET_RATE:

@@ -21,13 +21,15 @@ from scipy import ndimage, special
 
 from siq.data.recordings import LONGEST_STEP, Recordings
 
-SHORTEST_STRETCH = 48  # samples of the shortest stretch looked at
+SHORTEST_STRETCH = 12  # samples of the shortest stretch looked at
+SHORTEST_RUN = 96  # samples, of which at least one run has as many: fewer tell no relaxation
 SETTLED_GROWTH = 1.3  # with twice the length a walk's correlation lasts twice as long, a relaxation's as long
 SHORTEST_TIME = 0.5  # of a sample: shorter correlations are not told from none
 WHITE_CORRELATION = 0.05  # of the variance: a correlation of neighbours below is none
 STEP_TOLERANCE = 0.01  # of a step: stretches end where a step differs by more
 MOST_STRETCHES = 4000  # looked at
 MOST_RUNS = 200  # without a gap, from which a correlation time is found
+BRIDGED = 0.1  # of the correlation time: so long a gap hides two hops in one case of a hundred
 MOST_HALF_PERIODS = 8  # of the background in a record: what returns more often is part of the system
 NEIGHBOURS, FEWEST_NEIGHBOURS = 10, 3  # frequencies on either side to compare one with, of all recordings
 HARMLESS_LINE = 0.01  # of the variance: it changes -log p by a hundredth
@@ -55,6 +57,21 @@ def runs_of(recordings: Recordings, *, longest: float | None = None) -> list[sli
     return [slice(int(a), int(b)) for a, b in pairwise(bounds) if b > a]
 
 
+def bridged_runs(recordings: Recordings) -> list[slice]:
+    """Rows of one recording without a gap longer than what the record remembers, each a slice.
+
+    That is the least local relaxation time (`relaxation_samples`), or `BRIDGED` of the correlation time. What
+    lasts longer, such as a visit to a state or a drift, is not ended by samples that are missing; increments
+    are, and want `runs_of`.
+    """
+    whole, longest = runs_of(recordings, longest=np.inf), []
+    some = whole[:: -(-len(whole) // MOST_RUNS)]
+    for one in recordings.values.T:
+        relaxation = relaxation_samples(one, whole) or 0.0
+        longest.append(max(relaxation, BRIDGED * correlated_samples(one, some), LONGEST_STEP))
+    return runs_of(recordings, longest=min(longest) * usual_step(recordings))
+
+
 def stretches_of(runs: list[slice], length: int, *, most: int | None = None) -> np.ndarray:
     """First rows of stretches of so many samples in a run, one behind the other; about `most` of them."""
     found = np.concatenate(
@@ -67,7 +84,7 @@ def relaxation_samples(values: np.ndarray, runs: list[slice]) -> float | None:
     """The local relaxation time in samples; None where no stretch is long enough to tell."""
     length, longest = SHORTEST_STRETCH, max((run.stop - run.start for run in runs), default=0)
     times = []
-    while length <= longest:
+    while length <= longest and longest >= SHORTEST_RUN:
         if (time := _correlated(values, stretches_of(runs, length, most=MOST_STRETCHES), length)) is not None:
             times.append(max(time, SHORTEST_TIME))
         length *= 2
@@ -156,7 +173,7 @@ def change_of(recordings: Recordings, values: np.ndarray, path: np.ndarray) -> f
     lines = [np.linspace(-1, 1, len(path))]
     if len(parts) > 1:
         lines.append(np.concatenate([np.linspace(-1, 1, one.stop - one.start) for one in parts]))
-    runs = runs_of(recordings)
+    runs = bridged_runs(recordings)
     some = runs[:: -(-len(runs) // MOST_RUNS)]
     for line in lines:
         line = np.where(known, line - line[known].mean(), 0.0)
@@ -198,7 +215,7 @@ def background_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarra
     the drift ``(n,)``, less its mean over the record, and how many half periods the fastest cosine has in a
     recording; both are zero where none is seen.
     """
-    runs, counts = runs_of(recordings), np.bincount(recordings.recording)
+    runs, counts = bridged_runs(recordings), np.bincount(recordings.recording)
     best, found = 0.0, (np.zeros(len(values)), 0)
     spread = float(np.var(values))
     if spread <= 0:

@@ -25,7 +25,7 @@ from siq.diagnosis.residual_structure import Remainder
 from siq.diagnosis.search import Search
 from siq.diagnosis.statement import Location, StatedTerm, Statement
 from siq.diagnosis.study import Comparison, MismatchStudy, MismatchVerdict, comparison_of
-from siq.diagnosis.unnamed_models import fit_unnamed_models
+from siq.diagnosis.unnamed_models import AugmentedModel, fit_unnamed_models
 from siq.diagnosis.verdict import statement_of
 from siq.errors import InputError, NumericalFailure
 from siq.inference.budget import Budget
@@ -77,6 +77,14 @@ def _withdrawn(found: Investigation) -> Investigation:
     return replace(
         found, verdict=MismatchVerdict.UNEXPLAINED, models=models, withdrawn=True, account=budget.account()
     )
+
+
+def _is_what_was_found(described: AugmentedModel | None, search: Search) -> bool:
+    """Whether a model without a name, the best where it was not fitted, is the equation of one mechanism."""
+    if described is None or len(search.found) != 1 or len(described.parts) != 1:
+        return False
+    (part,), mechanism = described.parts, search.found[0].best.candidate
+    return mechanism.terms == part.candidate.terms and not {*mechanism.shapes, *part.candidate.shapes}
 
 
 @dataclass(frozen=True, repr=False)
@@ -269,6 +277,10 @@ def solve_case(
         worse = shown.errors.change("without", "augmented") == "worse"
         if named and not case.settings.tests and (worse or (incomplete and not shown.errors.takes_most)):
             found = _withdrawn(found)
+            shown = held_out_runs(found, case.kept)
+        elif found.too_faint and _is_what_was_found(shown.described, found.search):
+            verdict, remark = MismatchVerdict.MISSING_PHYSICS, Remark("diagnosis.same_formula")
+            found = replace(found, verdict=verdict, models=(), too_faint=False, remarks=(remark,))
             shown = held_out_runs(found, case.kept)
         statement = statement_of(found, shown)
     except InputError:

@@ -271,16 +271,13 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
         may_choose, (model, fit) = data.select(judges), choices[best]
         alone = [errors_of(each, may_choose) for each in ((plain,) if named else (card, fitted_alike))]
         least = min((each for each in alone if each is not None), key=np.mean, default=None)
-        limit = mean_error(least if model.fit.has_process_noise else alone[-1])
-        if named or model.log_evidence < study.search.least_log_odds:
-            limit = 0.0
+        certain = not named and model.log_evidence >= study.search.least_log_odds
+        limit = mean_error(least if model.fit.has_process_noise else alone[-1]) if certain else 0.0
         adopted = predicts_better(least, errors_of(fit, may_choose), limit=limit)
     elif choices:
         adopted = predicts_better(left_out(plain if named else search.recalibrated), foreseen[best])
-    fit = plain if named or not choices else choices[best][1]
-    described = None
-    if adopted:
-        described, fit = choices[best]
+    fit = choices[best][1] if adopted or (choices and not named) else plain
+    described = choices[best][0] if adopted else None
     before, refitted, augmented = (run(each, data) for each in (card, recalibrated, fit))
     squares = {
         "before": squared_errors(before, data),

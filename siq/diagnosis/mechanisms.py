@@ -192,6 +192,12 @@ class MechanismCandidate:
         """All new parameters, in the order of the model's."""
         return tuple(p.name for p in self.model.parameters if p.name in {*self.amplitudes, *self.shapes})
 
+    @property
+    def terms(self) -> frozenset[tuple[str, sympy.Expr]]:
+        """What is added to which equation for each amplitude, whatever the signs of these."""
+        units = {(n, f.diff(symbol(one))) for n, f in self.changes for one in self.amplitudes}
+        return frozenset((n, -unit if unit.could_extract_minus_sign() else unit) for n, unit in units if unit)
+
     def begun(self, base: Dynamics, known: Mapping[str, float]) -> Dynamics:
         """Its model with values to begin with: those of a simulation, no effect, and what else is known."""
         values = {each.name: each.value for each in base.parameters}
@@ -329,13 +335,10 @@ def _build_candidate(
     for name, formula in model.outputs:
         known.setdefault(name, known.get(str(formula), "1"))
     units = {role: known.get(name, "1") for role, name in assignment.items()} | {"T": model.time_unit}
+    shapes = {name: entry.shape for name, entry in form.parameters.items() if entry.shape is not None}
+    fixed = {name for name, shape in shapes.items() if shape.lattice_of is not None}
     parameters = tuple(
-        Parameter(
-            fresh[name],
-            0.0,
-            unit_of(entry.unit, units),
-            fixed=entry.shape is not None and entry.shape.lattice_of is not None,
-        )
+        Parameter(fresh[name], 0.0, unit_of(entry.unit, units), fixed=name in fixed)
         for name, entry in form.parameters.items()
     )
     further = tuple((fresh[name], parse(entry.equation)) for name, entry in form.states.items())
@@ -349,7 +352,17 @@ def _build_candidate(
         equations=(*equations.values(), *(formula for _, formula in further)),
         outputs=tuple(outputs.items()),
     )
-    shapes = {name: entry.shape for name, entry in form.parameters.items() if entry.shape is not None}
+    recorded = ("lattice_of", "top_of", "bottom_of")
+    searches = [  # with the system's own names in their formulas
+        shape.model_copy(
+            update={
+                key: assignment[text] if key in recorded else str(parse_formula(text, names))
+                for key, text in shape.model_dump().items()
+                if isinstance(text, str)
+            }
+        )
+        for shape in shapes.values()
+    ]
     candidate = MechanismCandidate(
         name=mechanism.name,
         label="",
@@ -359,7 +372,7 @@ def _build_candidate(
         positive=frozenset(
             fresh[name] for name, entry in form.parameters.items() if entry.sign == "positive"
         ),
-        searches=tuple(_in_names(shape, names, assignment) for shape in shapes.values()),
+        searches=tuple(searches),
         scales=tuple(parse(entry.scale) for entry in form.states.values()),
         begins=tuple(parse(entry.begin) for entry in form.states.values()),
         equations=(),
@@ -407,17 +420,6 @@ def _rate_of(formula: sympy.Expr, model: Dynamics) -> sympy.Expr:
     """Time derivative of a formula of states along the equations, inputs being held."""
     along = zip(model.states, model.equations, strict=True)
     return formula.diff(TIME) + sum(formula.diff(symbol(name)) * equation for name, equation in along)
-
-
-def _in_names(shape: Shape, names: Mapping[str, sympy.Expr], assignment: Mapping[str, str]) -> Shape:
-    """A search with the system's own names in its formulas."""
-    given = {key: text for key, text in shape.model_dump().items() if isinstance(text, str)}
-    recorded = ("lattice_of", "top_of", "bottom_of")
-    own = {
-        key: assignment[text] if key in recorded else str(parse_formula(text, names))
-        for key, text in given.items()
-    }
-    return shape.model_copy(update=own)
 
 
 def _labelled(candidate: MechanismCandidate, model: Dynamics) -> MechanismCandidate:

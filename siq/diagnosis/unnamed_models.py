@@ -299,15 +299,10 @@ def _formulas(
         place = replace(place, knots=knots.get((place.targets, place.words), likely.term.knots))
         candidate = replace(candidate, place=place, log_cost=cost)
         # A sum of x²v and xv² is the same function, whichever coordinate comes first.
-        monomials = frozenset(
-            (name, formula.diff(symbol(amplitude)))
-            for name, formula in candidate.changes
-            for amplitude in candidate.amplitudes
-        )
-        if monomials not in done:
+        if candidate.terms not in done:
             parts = _fitted_term(candidate, likely.level, fit, context)
             models += [AugmentedModel((*before, each), each.fit) for each in parts]
-        done.add(monomials)
+        done.add(candidate.terms)
     return models
 
 

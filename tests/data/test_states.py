@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from siq.data.kinetics import MarkovModel
 from siq.data.preparation import without_background
 from siq.data.recordings import Recordings
 from siq.data.states import DwellCount, RecordStates, switching
-from siq.data.stationarity import runs_of
+from siq.data.stationarity import relaxation_samples, runs_of
 from siq.remarks import Remark
 
 RATES = np.array([[-0.10, 0.06, 0.04], [0.10, -0.15, 0.05], [0.05, 0.10, -0.15]])
@@ -103,6 +104,44 @@ def test_three_states_in_two_dimensions() -> None:
 
 def states_of_noise(path: np.ndarray) -> RecordStates:
     return found_in(path + 0.1 * noise(5, len(path)))
+
+
+@pytest.mark.parametrize("separation", [4.0, 0.0], ids=["levels", "double well"])
+def test_missing_samples_end_no_visit(separation: float) -> None:
+    """A tenth of the samples is missing here and there; states, hops and stays in time are as with them."""
+    if separation:
+        values = separation * chain(3, np.array([[-0.01, 0.01], [0.02, -0.02]]), 5000) + noise(3, 5000)
+    else:
+        values, kicks = np.ones(40_000), np.sqrt(0.25 * 0.05) * noise(5, 40_000)
+        for k in range(len(values) - 1):
+            values[k + 1] = values[k] + 0.05 * (values[k] - values[k] ** 3) + kicks[k]
+    whole, kept = recorded(values), np.random.default_rng(6).random(len(values)) > 0.1
+    some = replace(whole, t=whole.t[kept], values=whole.values[kept], recording=whole.recording[kept])
+    expected, found = switching(whole), switching(some)
+    assert expected is not None and found is not None and expected.supported and found.supported
+    assert found.rung == expected.rung and len(found.visits) == kept.sum()
+    assert np.mean(found.visits == expected.visits[kept]) > 0.98
+    for one, other in zip(found.counts, expected.counts, strict=True):
+        assert one.visits == pytest.approx(other.visits, rel=0.1)
+        assert one.time == pytest.approx(other.time, rel=0.02)
+    stays = [[np.mean(one) for one in each.stays] for each in (found, expected)]
+    assert stays[0] == pytest.approx(stays[1], rel=0.12)
+
+
+def test_wells_that_mix_slowly_stand_apart_and_a_quick_relaxation_among_hops_is_seen() -> None:
+    """Over a cosine samples relax within two of them, and it takes thousands to have been in all wells."""
+    generator, step = np.random.default_rng(77), 0.005
+    x, values = 0.0, np.empty(30_000)
+    kicks = 0.7 * np.sqrt(step) * generator.standard_normal((len(values), 4))
+    for k, some in enumerate(kicks):
+        for kick in some:
+            x += kick - step * (1.1 * np.pi * np.sin(2 * np.pi * x) + 0.3 * x)
+        values[k] = x
+    assert 1 < (relaxation_samples(values, [slice(0, len(values))]) or 0) < 5  # 2.3 in a well
+    found = found_in(values)
+    assert found.supported and len(found.levels) >= 3
+    assert np.abs(np.array(found.levels) - np.round(found.levels)).max() < 0.1
+    assert np.diff(np.round(found.levels)) == pytest.approx(1)
 
 
 def test_a_record_whose_stays_change_ends_on_the_first_rung() -> None:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import sympy
 
+from siq.diagnosis.diagnosis import _is_what_was_found
+from siq.diagnosis.dictionary import roles_of, standard_dictionary
 from siq.diagnosis.evidence import averaged_evidence, evidence_of_function, smooth_prior
-from siq.diagnosis.mechanisms import fresh_names
+from siq.diagnosis.mechanisms import candidates_of, fresh_names
 from siq.diagnosis.study import SearchOptions
 from siq.diagnosis.terms import Place, _powers, _simplest, _with_formula
 from siq.systems.diffusion import Diffusion
@@ -97,6 +102,26 @@ def test_a_formula_without_its_first_coordinate_is_one_of_the_second() -> None:
     assert [first for _, first, _ in terms] == [1, 2]
     both, _ = _simplest(place("t", "v"), [(t * w, 1, 1)])
     assert both.words == ("t", "v")
+
+
+def test_a_formula_without_a_name_is_the_mechanism_that_adds_the_same_equation() -> None:
+    """Names and signs of parameters are no difference; another state, another power, or a shape are."""
+    every = candidates_of(OSCILLATOR, roles_of(OSCILLATOR), standard_dictionary())
+    bias, drag = (
+        next(each for each in every if each.name == name and each.equations == ("v",))
+        for name in ("constant bias", "linear damping")
+    )
+    powers = _powers(place("v"), degree=2)
+    constant, linear, quadratic = (_with_formula(OSCILLATOR, place("v"), [each]) for each in powers[:3])
+    assert constant.terms == bias.terms and linear.terms == drag.terms
+    assert len({each.terms for each in (constant, linear, quadratic)}) == 3
+    elsewhere = replace(place("v"), equations=(("x", sympy.Integer(1)),))
+    assert _with_formula(OSCILLATOR, elsewhere, powers[:1]).terms != bias.terms
+    part, found = (SimpleNamespace(candidate=each) for each in (constant, bias))
+    search = SimpleNamespace(found=(SimpleNamespace(best=found),))
+    assert _is_what_was_found(SimpleNamespace(parts=(part,)), search)  # type: ignore[arg-type]
+    assert not _is_what_was_found(SimpleNamespace(parts=(part, part)), search)  # type: ignore[arg-type]
+    assert not _is_what_was_found(None, search)  # type: ignore[arg-type]
 
 
 def test_new_names_are_new() -> None:
