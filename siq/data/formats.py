@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 Column: TypeAlias = "pa.Array | pa.ChunkedArray"
 
+FEWEST_UNNAMED = 10  # rows, below which no column without a heading can be told for the clock
 SAMPLED_LINES = 200  # of a table, from which its separator and decimal mark are recognised
 SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".xlsb", ".ods")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)", re.IGNORECASE)
@@ -45,6 +46,7 @@ _NUMERIC = re.compile(f"{_NUMBER.pattern}|{_DECIMAL_COMMA.pattern}", re.IGNORECA
 _GROUPED = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d+")
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", "|": "vertical bars", " ": "spaces"}
 _COMMENTS = ("#", "%", "//")
+_END_OF_HEADER, LARGEST_HEADER = b"***End_of_Header***", 20_000  # of LabVIEW's tables; bytes of the largest
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,8 @@ def _reading(file: str, kind: str) -> Iterator[None]:
 def _open_text(file: str) -> ColumnFile:
     """Recognise how a table of text is written: encoding, comments, headings, units, separator, decimals."""
     content, remarks = _in_utf8(file, Path(file).read_bytes())
-    begin, comments, separator = 0, [], ""
+    header = content[:LARGEST_HEADER].rfind(_END_OF_HEADER)
+    begin, comments, separator = 0 if header < 0 else _after_line(content, header), [], ""
     while begin < len(content):
         end = _after_line(content, begin)
         line = content[begin:end].decode("utf-8", errors="ignore").strip()
@@ -169,8 +172,13 @@ def _open_text(file: str) -> ColumnFile:
     separator = separator or _separator(lines)
     headings, rows = _split(lines[0], separator), [_split(line, separator) for line in lines[1:]]
     if all(map(_NUMERIC.fullmatch, headings)):
-        above = _split(comments[-1], separator) if comments else []
-        if len(above) != len(headings):
+        # Of several comments the last one with a word for each column.
+        split = (_split(comment, separator) for comment in reversed(comments))
+        above = next((cells for cells in split if len(cells) == len(headings)), [])
+        if not above and len(headings) > 1 and len(rows) >= FEWEST_UNNAMED:
+            above = [f"column {number}" for number in range(1, len(headings) + 1)]
+            remarks.append(Remark("data.no_headings", {}))
+        if not above:
             example = ",".join(["t", *"xyzuvw"][: len(headings)])
             fault = "the first line holds numbers where the headings should stand"
             remedy = f"add a first line that names the columns, such as {example}"
@@ -178,6 +186,10 @@ def _open_text(file: str) -> ColumnFile:
         headings, rows = above, [headings, *rows]
     else:
         begin = _after_line(content, begin)
+    commented = header >= 0 and headings[-1].strip() == "Comment"  # of which most rows have no cell
+    if commented:
+        headings = headings[:-1]
+        rows = [row[: len(headings)] for row in rows]
     units: list[str | None] = [None] * len(headings)
     if rows and (found := _line_of_units(rows[0], len(headings))) is not None:
         units, rows, begin = found, rows[1:], _after_line(content, begin)
@@ -189,6 +201,9 @@ def _open_text(file: str) -> ColumnFile:
     body, marks = content[begin:], tuple(mark.encode() for mark in _COMMENTS)
     if any(b"\n" + mark in body or body.startswith(mark) for mark in marks):
         body = b"\n".join(line for line in body.splitlines() if not line.startswith(marks))
+    if commented:
+        cell = separator.encode()
+        body = b"\n".join(cell.join(line.split(cell)[: len(headings)]) for line in body.splitlines())
     if separator == " ":
         body, separator = b"\n".join(b"\t".join(line.split()) for line in body.splitlines()), "\t"
     labels = [place for place, heading in enumerate(headings) if read_heading(heading).is_label]
@@ -407,6 +422,10 @@ def _open_numpy(file: str) -> ColumnFile:
         kept = np.load(file, allow_pickle=False)
         fields = kept.dtype.names if isinstance(kept, np.ndarray) else tuple(kept.files)
         columns = {name: kept[name] for name in fields or ()}
+    remarks: tuple[Remark, ...] = ()
+    if not columns and kept.ndim == 2 and kept.shape[1] > 1 and len(kept) >= FEWEST_UNNAMED:
+        columns = {f"column {number}": one for number, one in enumerate(kept.T, start=1)}
+        remarks = (Remark("data.no_headings", {}),)
     if not columns:
         remedy = "write numpy.savez(file, t=..., x=...), or a table with headings"
         raise InputError(file, "", "it is one array without names for its columns", remedy)
@@ -415,7 +434,7 @@ def _open_numpy(file: str) -> ColumnFile:
     def load(positions: Sequence[int]) -> list[Column]:
         return _vectors(file, {names[position]: columns[names[position]] for position in positions})
 
-    return ColumnFile(names, (None,) * len(names), load)
+    return ColumnFile(names, (None,) * len(names), load, remarks=remarks)
 
 
 READERS: dict[str, Callable[[str], ColumnFile]] = {
@@ -424,6 +443,7 @@ READERS: dict[str, Callable[[str], ColumnFile]] = {
     ".tsv": _open_text,
     ".txt": _open_text,
     ".dat": _open_text,
+    ".lvm": _open_text,
     ".h5": _open_hdf5,
     ".hdf5": _open_hdf5,
     ".mat": _open_matlab,

@@ -35,7 +35,7 @@ RESERVED = _words("sin cos tan exp log sqrt tanh atan Abs sign Max Min pi record
 
 TIME_NAMES = _words(
     "t time times zeit temps tiempo tempo timestamp timestamps datetime date elapsed elapsedtime clock"
-    " clocktime uhrzeit seconds"
+    " clocktime uhrzeit seconds xvalue"
 )
 LABEL_NAMES = _words(
     "recording recordings record run runs trial trials id rec experiment measurement series trajectory traj"

@@ -40,6 +40,18 @@ READ: dict[str, tuple[str, str | bytes, tuple[str, ...], list[list[float]], str]
     "a line sep=;": ("a.csv", "sep=;\nt;x\n0;1,5\n1;2\n", ("x",), [[1.5], [2]], "semicolons"),
     "comments above": ("a.csv", "# a logger, 7\n" * 3000 + "t,x\n0,1\n1,2\n", ("x",), [[1], [2]], ""),
     "numpy.savetxt": ("a.txt", "# t x y\n0 1 3\n1 2 4\n", ("x", "y"), [[1, 3], [2, 4]], "spaces"),
+    "savetxt, units below": (
+        "a.txt", "# t x\n# units: s V\n0 1\n1 2\n", ("x",), [[1], [2]], "separated by spaces",
+    ),
+    "no headings": (
+        "a.csv", "".join(f"{k},{k * k}\n" for k in range(12)), ("column_2",), [[k * k] for k in range(12)],
+        "called by their numbers; name them in a first line",
+    ),
+    "LabVIEW": (
+        "a.lvm", "LabVIEW Measurement\nSeparator\tTab\n***End_of_Header***\t\n\nChannels\t1\nSamples\t2\n"
+        "***End_of_Header***\t\t\nX_Value\tVoltage\tComment\n0\t1\n1\t2\n", ("Voltage",), [[1], [2]],
+        "'X_Value' is the time",
+    ),
     "a line of units": ("a.csv", "Time,X\n[s],[µm]\n0,1\n1,2\n", ("X",), [[1], [2]], "read as the units"),
     "other words": ("a.csv", "run,Time,x\nA,0,1\nA,1,2\n", ("x",), [[1], [2]], "'run' says which recording"),
     "a time in ms": ("a.csv", "time_ms,x\n0,1\n1,2\n", ("x",), [[1], [2]], "'time' is the time"),
@@ -97,6 +109,9 @@ REFUSED: dict[str, tuple[str, str | bytes, str, str]] = {
         "a.csv", "t,x\n0,1\n1,\n2,\n3,\n4,5\n", "missing (empty or NaN), as in 2 more", "remove",
     ),
     "no common row": ("a.csv", "t,x,y\n0,1,\n1,,2\n2,3,\n", "no row has a value in every", "interpolate"),
+    "no headings, and no clock": (
+        "a.csv", "3,1\n1,2\n" * 6, "the column 't' is missing", "the time of every sample",
+    ),
     "no time": ("a.csv", "x,y\n1,2\n2,3\n", "the column 't' is missing", "the time of every sample"),
     "two clocks": (
         "a.csv", "time,Time (ms),x\n0,0,1\n1,9,2\n", "'time' and 'Time (ms)' all look", "call the right",
