@@ -19,11 +19,11 @@ than an order of magnitude, and `valid` is False. A well that has ended, as at a
 
     dx = (Σ_k c_k xᵏ + t Σ_k d_k xᵏ) dt + √Q dW + measurement noise
 
-by the likelihood of the record, and goes on with it to later times. About a fold every f is of second order in
-x, with a constant that moves; the third order and a slope that moves allow for what is farther away, and how
-much of them is believed is left to their evidence. The distribution of the estimates is drawn from, and for
-each draw the Fokker–Planck equation in f(x, t) is solved from the last state on, absorbed beyond the saddle. So
-it needs no law of small noise, and holds where the barrier is low and where the well has ended.
+by the likelihood of the record, and goes on with it to later times. About a fold every f is of second order
+in x, with a constant that moves; the third order and a slope that moves allow for what is farther away, and
+how much of them is believed is left to their evidence. The distribution of the estimates is drawn from, and
+for each draw the Fokker–Planck equation in f(x, t) is solved from the last state on, absorbed beyond the
+saddle. So it needs no law of small noise, and holds where the barrier is low and where the well has ended.
 
 References
 ----------
@@ -265,12 +265,15 @@ class EarlyWarning(NamedTuple):
         That the state has been left by later times: ``time probability lower upper``. The probability is the
         mean over all that the record leaves open, and the interval holds 90 % of that.
     falling
-        The probability that the barrier is lower at the end of the record than at its begin.
+        The probability that the barrier is lower at the end of the record than at its begin; draws without a
+        saddle near the record at either count half.
     weights
         Of the equations that were averaged over, by how many powers of x they have, and how many of them
         change in time.
     remarks
         Which presuppositions the record contradicts.
+    time_unit
+        That of the record, None where it does not say.
     """
 
     state: str
@@ -279,6 +282,7 @@ class EarlyWarning(NamedTuple):
     falling: float
     weights: dict[tuple[int, int], float]
     remarks: tuple[Remark, ...]
+    time_unit: str | None
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -289,7 +293,7 @@ class EarlyWarning(NamedTuple):
         """Barrier and mean time along the record, and the probability afterwards."""
         from siq.report.plots.sweep import plot_early_warning
 
-        return plot_early_warning(self.course, self.probability)
+        return plot_early_warning(self.course, self.probability, state=self.state, time_unit=self.time_unit)
 
 
 def early_warning(
@@ -388,18 +392,17 @@ def early_warning(
     # Not interpolated between draws, of which some have no saddle, and so an infinite barrier.
     middles, lower, upper = np.quantile(stated, [0.5, *ends], axis=2, method="inverted_cdf")
     course = pd.DataFrame({"time": end + moments * unit})
-    for k, (name, short, scale) in enumerate(
-        [("barrier_over_noise", "barrier", 1.0), ("mean_time", "mean_time", unit)]
-    ):
-        course[name], course[f"{short}_lower"] = middles[:, k] * scale, lower[:, k] * scale
-        course[f"{short}_upper"] = upper[:, k] * scale
+    for k, (name, scale) in enumerate([("barrier", 1.0), ("mean_time", unit)]):
+        course["barrier_over_noise" if k == 0 else name] = middles[:, k] * scale
+        course[f"{name}_lower"], course[f"{name}_upper"] = lower[:, k] * scale, upper[:, k] * scale
     low, high = np.quantile(left, ends, axis=1)
     probability = pd.DataFrame(
         {"time": end + times * unit, "probability": left.mean(axis=1), "lower": low, "upper": high}
     )
     rest = whiten(fit.linearisation, data, fit.noise).innovations
-    falling = float(np.mean(stated[-1, 0] < stated[0, 0]))
-    return EarlyWarning(state, course, probability, falling, weights, _contradictions(rest, x, t))
+    falling = float(np.mean(stated[-1, 0] < stated[0, 0]) + np.mean(stated[-1, 0] == stated[0, 0]) / 2)
+    remarks = _contradictions(rest, x, t)
+    return EarlyWarning(state, course, probability, falling, weights, remarks, recordings.time_unit)
 
 
 def _drawn(
