@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from siq.workflow.pipeline import PipelineSettings
     from siq.workflow.study import Study, load_study
     from siq.workflow.sweep import Sweep, sweep
-    from siq.workflow.tipping import EarlyWarning, early_warning, probability_of_tipping
+    from siq.workflow.tipping import early_warning, probability_of_tipping
 
     __version__: str
 
@@ -48,7 +48,6 @@ __all__ = [
     "Diagnosis",
     "Diffusion",
     "Dynamics",
-    "EarlyWarning",
     "EquationSettings",
     "Formula",
     "InputError",
@@ -119,7 +118,7 @@ _NAMES = {
     "siq.workflow.pipeline": "PipelineSettings",
     "siq.workflow.study": "Study load_study",
     "siq.workflow.sweep": "Sweep sweep",
-    "siq.workflow.tipping": "EarlyWarning early_warning probability_of_tipping",
+    "siq.workflow.tipping": "early_warning probability_of_tipping",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 

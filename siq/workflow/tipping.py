@@ -250,7 +250,7 @@ def _interpolated(table: pd.DataFrame, column: str, value: np.ndarray) -> np.nda
     return np.asarray(PchipInterpolator(table["value"], table[column])(value))
 
 
-class EarlyWarning(NamedTuple):
+class _EarlyWarning(NamedTuple):
     """What a record that drifts tells of the barrier of its state, and of when it will be left.
 
     Attributes
@@ -302,7 +302,7 @@ def early_warning(
     until: float,
     state: str | None = None,
     seed: int = 0,
-) -> EarlyWarning:
+) -> _EarlyWarning:
     """How soon will a state be left, by a record of it that drifts?
 
     Parameters
@@ -319,7 +319,7 @@ def early_warning(
 
     Returns
     -------
-    EarlyWarning
+    _EarlyWarning
         Its `remarks` say where the record contradicts what is presupposed: that the state is one number and
         has no memory, and that f changes evenly in time and goes on so.
 
@@ -402,7 +402,7 @@ def early_warning(
     rest = whiten(fit.linearisation, data, fit.noise).innovations
     falling = float(np.mean(stated[-1, 0] < stated[0, 0]) + np.mean(stated[-1, 0] == stated[0, 0]) / 2)
     remarks = _contradictions(rest, x, t)
-    return EarlyWarning(state, course, probability, falling, weights, remarks, recordings.time_unit)
+    return _EarlyWarning(state, course, probability, falling, weights, remarks, recordings.time_unit)
 
 
 def _drawn(

@@ -90,7 +90,7 @@ def test_conditioning_on_zeros_is_the_fit_without_these_terms():
 
 
 @pytest.fixture(scope="module")
-def nearing() -> siq.EarlyWarning:
+def nearing() -> tipping._EarlyWarning:
     """A fold that nears: ΔU/ε = 8/3 a^1.5/Q from 10.7 to 4.9."""
     a = np.linspace(1.0, 0.6, 12_000)
     record = recorded(lambda x, a: a - x * x, a, noise=0.25, step=0.05, start=1.0, seed=5)

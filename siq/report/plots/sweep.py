@@ -113,7 +113,7 @@ def plot_early_warning(
     Parameters
     ----------
     course, probability
-        As `siq.EarlyWarning` has them.
+        As `siq.early_warning` gives them.
     state, time_unit
         Name of the column, and the unit of its time.
 
