@@ -1,7 +1,7 @@
 """How good is `siq.early_warning` on records of laboratories that drift towards a fold, and on some that do not?
 
-Four kinds: the normal form of a fold, a double well that is tilted, the same two without a drift, and May's
-grazed pasture, whose f is none of the polynomials that are fitted. The barrier at the begin and at the end of
+Five kinds: the normal form of a fold, a double well that is tilted, the same two without a drift, and two whose
+f is none of the polynomials that are fitted, May's grazed pasture and the lake of the gallery. The barrier at the begin and at the end of
 the record, its length, and how far ahead is asked are drawn for each; a record that tips before its end is
 drawn anew, with all of that. What is true is solved from the equation of the laboratory on cells of its own.
 
@@ -30,7 +30,7 @@ from scipy.linalg import solve_banded
 import siq
 from siq.workflow import tipping
 
-KINDS = ("fold", "tilted", "steady", "grazing")
+KINDS = ("fold", "tilted", "steady", "grazing", "lake")
 BEGIN, END = (6.0, 14.0), (2.5, 6.0)  # ΔU/ε
 LENGTH, AHEAD = (500.0, 2000.0), (0.1, 0.5)  # relaxation times; and of the record
 SAMPLE, SUBSTEPS = 0.1, 4  # relaxation times; steps of the simulation
@@ -61,6 +61,14 @@ def family(kind: str, odd: bool) -> tuple[Callable, np.ndarray, np.ndarray, floa
         roots = [np.sort(np.roots([-1, 0, 1, one]).real) for one in a]
         wells, saddles = (np.array([each[k] for each in roots]) for k in (0, 1))
         return lambda x, a: a + x - x**3, a, wells, saddles, 0.8
+    if kind == "lake":
+        a = np.linspace(0.5, 0.66, 400)
+        places = np.linspace(0.3, 1.2, 200_001)  # the inflow at which each is at rest turns at the fold
+        rest = places - places**8 / (1 + places**8)
+        top = int(rest.argmax())
+        wells = np.interp(a, rest[:top], places[:top])
+        saddles = np.interp(-a, -rest[top:], places[top:])
+        return lambda x, a: a - x + x**8 / (1 + x**8), a, wells, saddles, 1.3
     a = np.linspace(1.9, 2.6, 400)
     roots = [np.sort(np.roots([-0.1, 1, -0.1 - one, 1]).real) for one in a]
     wells, saddles = (np.array([each[k] for each in roots]) for k in (2, 1))

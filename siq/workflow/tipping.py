@@ -265,8 +265,8 @@ class _EarlyWarning(NamedTuple):
         That the state has been left by later times: ``time probability lower upper``. The probability is the
         mean over all that the record leaves open, and the interval holds 90 % of that.
     falling
-        The probability that the barrier is lower at the end of the record than at its begin; draws without a
-        saddle near the record at either count half.
+        The probability that the barrier is lower at the end of the record than at its begin; where a draw
+        has no saddle near the record at either, that the state relaxes more slowly.
     weights
         Of the equations that were averaged over, by how many powers of x they have, and how many of them
         change in time.
@@ -387,7 +387,7 @@ def early_warning(
     nearest = [np.abs(t - one) <= np.ptp(t) / MOMENTS for one in moments]
     stated = np.array(
         [process.frozen(one, float(x[near].mean())) for one, near in zip(moments, nearest, strict=True)]
-    )  # (moments, 2, draws)
+    )  # (moments, 3, draws)
     ends = [(1 - LEVEL) / 2, (1 + LEVEL) / 2]
     # Not interpolated between draws, of which some have no saddle, and so an infinite barrier.
     middles, lower, upper = np.quantile(stated, [0.5, *ends], axis=2, method="inverted_cdf")
@@ -400,7 +400,8 @@ def early_warning(
         {"time": end + times * unit, "probability": left.mean(axis=1), "lower": low, "upper": high}
     )
     rest = whiten(fit.linearisation, data, fit.noise).innovations
-    falling = float(np.mean(stated[-1, 0] < stated[0, 0]) + np.mean(stated[-1, 0] == stated[0, 0]) / 2)
+    falls, slows = stated[-1, 0] < stated[0, 0], stated[-1, 2] < stated[0, 2]
+    falling = float(np.where(np.isinf(stated[[0, -1], 0]).all(axis=0), slows, falls).mean())
     remarks = _contradictions(rest, x, t)
     return _EarlyWarning(state, course, probability, falling, weights, remarks, recordings.time_unit)
 
@@ -513,7 +514,10 @@ class _DrawnProcess:
         return np.where(inside, solved.reshape(u.shape), 0.0)
 
     def frozen(self, t: float, start: float) -> np.ndarray:
-        """ΔU/ε and the mean time until a state near `start` is left, if f stays as it is; ``(2, draws)``."""
+        """ΔU/ε, the mean time until a state near `start` is left, and the rate of relaxation; ``(3, draws)``.
+
+        All of them if f stays as it is.
+        """
         u, first = self.heights(t), np.full(len(self.draws), np.abs(self.x - start).argmin())
         well = self.bottom(u, first)
         lower, upper, barrier = self.rims(u, well)
@@ -521,7 +525,11 @@ class _DrawnProcess:
         begin = np.where(at_end, first, well)[:, None] == self.cells
         inside = (self.cells > lower[:, None]) & (self.cells < upper[:, None])
         time = self._solved(u, inside, 1.0 * begin, dt=np.inf).sum(axis=1)
-        return np.stack([barrier, np.where((time >= 0) & (time < LONGEST), time, np.inf)])
+        near = np.clip(well + np.array([[-1], [0], [1]]), 0, self.cells[-1])
+        curvature = np.diff(u[self.draws, near], n=2, axis=0)[0] / (self.x[1] - self.x[0]) ** 2
+        return np.stack(
+            [barrier, np.where((time >= 0) & (time < LONGEST), time, np.inf), self.noise / 2 * curvature]
+        )
 
     def left_by(self, times: np.ndarray, start: float) -> np.ndarray:
         """The probability of each draw that the state has been left by times from 0 on, ``(n, draws)``.
