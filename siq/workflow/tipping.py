@@ -377,7 +377,7 @@ def early_warning(
         raise NumericalFailure(fit.fault or "the record shows no noise that drives the state")
     generator = np.random.default_rng(seed)
     _, noise_error, covariance = noise_uncertainty(fit, data)
-    coefficients, weights = _drawn(fit.model.values, covariance, float(-t.min()), generator)
+    coefficients, weights = _drawn(fit.model.values, covariance, generator)
     noise = fit.noise.process[0] * np.exp(min(noise_error[0], 1.0) * generator.normal(size=DRAWS))
     width = np.ptp(x)
     process = _DrawnProcess(np.linspace(x.min() - width, x.max() + width, CELLS), coefficients, noise)
@@ -407,17 +407,19 @@ def early_warning(
 
 
 def _drawn(
-    values: np.ndarray, covariance: np.ndarray, independent: float, generator: np.random.Generator
+    values: np.ndarray, covariance: np.ndarray, generator: np.random.Generator
 ) -> tuple[np.ndarray, dict[tuple[int, int], float]]:
     """Coefficients drawn from their distribution ``(draws, p)``, and the weights of the families in it.
 
     The likelihood of a fit is normal in its coefficients. So those of an equation without some of them are
-    what it is where these are zero, and its evidence is, up to what all have in common,
+    what it is where these are zero, and what it is worth is, up to what all have in common,
 
-        ``ln w = -½ zᵀ C_zz⁻¹ z - ½ k ln n``
+        ``ln w = -½ zᵀ C_zz⁻¹ z - k``
 
-    with the estimates z that are left out, k that are kept, and n relaxation times (G. Schwarz, Ann. Stat. 6
-    (1978) 461).
+    with the estimates z that are left out and k that are kept (H. Akaike, IEEE Trans. Autom. Control 19
+    (1974) 716). None of the equations is the true one. And ``½ k ln n`` would expect coefficients as large as
+    a single relaxation shows, where an f that bends over the distance to the saddle has such as are within
+    their errors: the barrier would seem to be known.
     """
     found = []
     for orders, moving in FAMILIES:
@@ -427,7 +429,7 @@ def _drawn(
         mean = values[kept] - values[out] @ gain
         spread = covariance[np.ix_(kept, kept)] - covariance[np.ix_(kept, out)] @ gain
         misfit = float(values[out] @ np.linalg.solve(covariance[np.ix_(out, out)], values[out]))
-        found.append((kept, mean, spread, -0.5 * misfit - 0.5 * len(kept) * np.log(max(independent, 1.0))))
+        found.append((kept, mean, spread, -0.5 * misfit - len(kept)))
     weights = scipy.special.softmax([one[3] for one in found])
     family = generator.choice(len(found), size=DRAWS, p=weights)
     drawn = np.zeros((DRAWS, len(values)))

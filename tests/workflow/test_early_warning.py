@@ -81,10 +81,12 @@ def test_conditioning_on_zeros_is_the_fit_without_these_terms():
     columns, target = draw.normal(size=(400, 6)), draw.normal(size=400)
     covariance = np.linalg.inv(columns.T @ columns)
     whole = covariance @ columns.T @ target
-    coefficients, weights = tipping._drawn(whole, covariance, 400.0, draw)
+    coefficients, weights = tipping._drawn(whole, covariance, draw)
     small = coefficients[(coefficients[:, [3, 5]] == 0).all(axis=1)][:, [0, 1, 2, 4]]
     alone, *_ = np.linalg.lstsq(columns[:, [0, 1, 2, 4]], target, rcond=None)
-    assert weights[3, 1] > 0.8 and sum(weights.values()) == pytest.approx(1)
+    order, slope = (abs(whole[k]) / np.sqrt(covariance[k, k]) for k in (3, 5))
+    assert weights[4, 1] / weights[4, 2] == pytest.approx(np.exp(1 - slope**2 / 2))
+    assert weights[3, 2] / weights[4, 2] == pytest.approx(np.exp(1 - order**2 / 2))
     assert small.mean(axis=0) == pytest.approx(alone, abs=5 * 0.05 / np.sqrt(len(small)))
     assert small.std(axis=0) == pytest.approx(0.05, rel=0.25)
 

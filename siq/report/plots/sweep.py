@@ -29,6 +29,7 @@ from siq.report.summary import well_name
 
 BIFURCATIONS = {"fold": "o", "Hopf": "s", "branch point": "D"}
 PANEL = 2.2  # inches
+BEYOND = 1e30  # for infinite ends of intervals, which go on beyond the panel
 CURVES = {"fold": "-", "Hopf": "--"}
 CURVE = "white"
 OUTLINED = (withStroke(linewidth=2.4, foreground=BLACK),)  # seen on the dark and on the bright end of a map
@@ -128,23 +129,19 @@ def plot_early_warning(
     columns = ("barrier_over_noise", "mean_time", "probability")
     for axes, table, name in zip(panels, (course, course, probability), columns, strict=True):
         short = {"barrier_over_noise": "barrier_", "mean_time": "mean_time_", "probability": ""}[name]
-        lower, upper = (table[f"{short}{end}"] for end in ("lower", "upper"))
+        lower, upper = (table[f"{short}{end}"].clip(upper=BEYOND) for end in ("lower", "upper"))
         colour = VERMILLION if name == "probability" else BLUE
-        known = pd.concat([lower, table[name], upper])
-        most = known[np.isfinite(known)].max()
-        axes.fill_between(
-            table["time"], lower, upper.clip(upper=1e3 * most), color=colour, alpha=0.2, linewidth=0
-        )
+        axes.fill_between(table["time"], lower, upper, color=colour, alpha=0.2, linewidth=0)
         axes.plot(table["time"], table[name], color=colour)
         axes.axvline(course["time"].iloc[-1], color=GREY, linewidth=0.5, linestyle=":")
-        if name == "barrier_over_noise":
-            axes.set_ylim(0, 1.05 * table[name][np.isfinite(table[name])].max() * 1.5)
-        elif name == "mean_time":
-            finite = table[name][np.isfinite(table[name])]
-            axes.set_yscale("log")
-            axes.set_ylim(max(lower.min() / 2, 1e-3 * finite.min()), 30 * finite.max())
-        else:
+        finite = table[name][np.isfinite(table[name])]
+        if name == "probability":
             axes.set_ylim(0, 1)
+        elif name == "mean_time":
+            axes.set_yscale("log")
+            axes.set_ylim(lower.min() / 2, 30 * finite.max() if len(finite) else 1e3 * lower.min())
+        else:
+            axes.set_ylim(0, 1.5 * finite.max() if len(finite) else 2 * lower.min())
     panels[0].set_ylabel(f"barrier of {state} ΔU/ε")
     panels[1].set_ylabel("mean time" + (f" {unit_label(time_unit)}" if time_unit else ""))
     panels[2].set_ylabel("probability\nof having left")
