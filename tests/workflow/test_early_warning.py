@@ -91,6 +91,20 @@ def test_conditioning_on_zeros_is_the_fit_without_these_terms():
     assert small.std(axis=0) == pytest.approx(0.05, rel=0.25)
 
 
+def test_a_finite_record_seems_to_be_held_more_strongly_than_it_is():
+    """A linear state for 300 relaxation times: a rate alone would be off by ``4/300``."""
+    draw = np.random.default_rng(4)
+    t = np.arange(-3000, 0) * 0.1
+    values = np.array([0, -1.0, 0, 0, 0, 0])
+    rounds = [
+        tipping._bias(values, 2.0, t, 3 * draw.normal(size=len(t)), np.array([0]), draw) for _ in range(5)
+    ]
+    found = np.mean(rounds, axis=0)
+    # Over a normal density the slope of c₃x³ is 3c₃ in the mean.
+    assert -0.1 < found[1] + 3 * found[3] < -4 / 300 / 2
+    assert abs(found[0]) < 0.02 and abs(found[2]) < 0.01
+
+
 @pytest.fixture(scope="module")
 def nearing() -> tipping._EarlyWarning:
     """A fold that nears: ΔU/ε = 8/3 a^1.5/Q from 10.7 to 4.9."""
