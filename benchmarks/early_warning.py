@@ -1,9 +1,10 @@
-"""How good is `siq.early_warning` on records of laboratories that drift towards a fold, and on some that do not?
+"""How good is `siq.early_warning` on laboratories that drift towards a fold, and on some that do not?
 
-Five kinds: the normal form of a fold, a double well that is tilted, the same two without a drift, and two whose
-f is none of the polynomials that are fitted, May's grazed pasture and the lake of the gallery. The barrier at the begin and at the end of
-the record, its length, and how far ahead is asked are drawn for each; a record that tips before its end is
-drawn anew, with all of that. What is true is solved from the equation of the laboratory on cells of its own.
+Five kinds: the normal form of a fold, a double well that is tilted, the same two without a drift, and two
+whose f is none of the polynomials that are fitted, May's grazed pasture and the lake of the gallery. The
+barrier at the begin and at the end of the record, its length, and how far ahead is asked are drawn for each; a
+record that tips before its end is drawn anew, with all of that. What is true is solved from the equation of
+the laboratory on cells of its own.
 
     python -m benchmarks.early_warning --kind fold --first 0 --count 25 --out results/early-warning/fold.csv
     python -m benchmarks.early_warning --summary results/early-warning
@@ -16,6 +17,7 @@ the record with nothing that changes in time.
 from __future__ import annotations
 
 import argparse
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -35,6 +37,10 @@ BEGIN, END = (6.0, 14.0), (2.5, 6.0)  # ΔU/ε
 LENGTH, AHEAD = (500.0, 2000.0), (0.1, 0.5)  # relaxation times; and of the record
 SAMPLE, SUBSTEPS = 0.1, 4  # relaxation times; steps of the simulation
 CELLS, STEPS = 1200, 600
+COMPARED = {
+    "first_barrier": "begin", "last_barrier": "end", "last_mean_time": "mean_time", "window_barrier": "end",
+    "window_mean_time": "mean_time",
+}  # fmt: skip
 
 
 class Laboratory(NamedTuple):
@@ -109,7 +115,7 @@ def made(kind: str, seed: int) -> Laboratory:
 
 
 def truth(lab: Laboratory, tipped: float) -> tuple[np.ndarray, float]:
-    """Probabilities that it has tipped by dates evenly spread ahead; and the mean time at the record's end."""
+    """Probabilities that it has tipped by dates evenly spread ahead; and the mean time at the end."""
     well = lab.x[-1]
     side = np.sign(tipped - np.median(lab.x))
     wall = np.median(lab.x) - side * 2 * np.ptp(lab.x)
@@ -127,7 +133,7 @@ def truth(lab: Laboratory, tipped: float) -> tuple[np.ndarray, float]:
     p = 1.0 * (np.arange(CELLS) == np.abs(x - well).argmin())
     frozen = solve_banded((1, 1), bands(lab.t[-1], 0.0, 1.0), p).sum()
     left = [0.0]
-    for one, other in zip(times[:-1], times[1:], strict=True):
+    for one, other in itertools.pairwise(times):
         p = solve_banded((1, 1), bands((one + other) / 2, 1.0, other - one), p)
         left.append(1 - p.sum())
     return np.array(left)[:: STEPS // tipping.DATES], float(frozen)
@@ -182,24 +188,23 @@ def summary(rows: pd.DataFrame) -> None:
     """Coverage, errors and areas under the curve."""
     slack = 1e-3  # of a probability: the cells
     for kind, some in [*rows.groupby("kind"), ("all", rows)]:
-        held = [
-            ((some[f"lower_{k}"] - slack <= some[f"truth_{k}"]) & (some[f"truth_{k}"] <= some[f"upper_{k}"] + slack))
-            for k in range(3)
-        ]  # fmt: skip
+        below = [some[f"truth_{k}"] < some[f"lower_{k}"] - slack for k in range(3)]
+        above = [some[f"truth_{k}"] > some[f"upper_{k}"] + slack for k in range(3)]
+        held = [~one & ~other for one, other in zip(below, above, strict=True)]
         print(f"{kind}: {len(some)} laboratories")
-        print("  P covered", *(f"{one.mean():.2f}" for one in held), "over, under",
-              *(f"{one:.2f}" for one in ((some.truth_2 < some.lower_2 - slack).mean(), (some.truth_2 > some.upper_2 + slack).mean())))  # fmt: skip
-        for name, truth in (("first_barrier", "begin"), ("last_barrier", "end"), ("last_mean_time", "mean_time"),
-                            ("window_barrier", "end"), ("window_mean_time", "mean_time")):  # fmt: skip
+        print("  P covered", *(f"{one.mean():.2f}" for one in held), end="; ")
+        print(f"at last true below {below[2].mean():.2f}, above {above[2].mean():.2f}")
+        for name, truth in COMPARED.items():
             covered = (some[f"{name}_lower"] <= some[truth]) & (some[truth] <= some[f"{name}_upper"])
             value = some[f"{name}_over_noise" if "barrier" in name else name]
             error = np.sqrt(np.mean(np.minimum(np.abs(np.log(value / some[truth])), 10) ** 2))
             print(f"  {name} covered {covered.mean():.2f}, rms of ln {error:.2f}")
         error, window = ((some[one] - some.truth_2) for one in ("probability_2", "window_probability"))
         covered = (some.window_lower - slack <= some.truth_2) & (some.truth_2 <= some.window_upper + slack)
-        print(f"  rms error of P {np.sqrt((error**2).mean()):.3f}, of the window {np.sqrt((window**2).mean()):.3f}"
-              f" (covered {covered.mean():.2f}); mean P {some.probability_2.mean():.3f}, true {some.truth_2.mean():.3f},"
-              f" remarks {dict(some.remarks.value_counts())}")  # fmt: skip
+        print(f"  rms error of P {np.sqrt((error**2).mean()):.3f}", end=", ")
+        print(f"of the window {np.sqrt((window**2).mean()):.3f} (covered {covered.mean():.2f})")
+        print(f"  mean P {some.probability_2.mean():.3f}, true {some.truth_2.mean():.3f}", end=", ")
+        print(f"remarks {dict(some.remarks.value_counts())}")
     for label, scores in (("drifts", ("falling", "variance", "correlation")),
                           ("tips", ("probability_2", "falling", "variance", "correlation"))):  # fmt: skip
         print(label, {one: round(area(rows[one], rows[label]), 3) for one in scores})
@@ -207,7 +212,7 @@ def summary(rows: pd.DataFrame) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("--kind", choices=("fold", "tilted", "steady", "grazing"))
+    parser.add_argument("--kind", choices=("fold", "tilted", "steady", "grazing", "lake"))
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--count", type=int, default=1)
     parser.add_argument("--out", type=str)
