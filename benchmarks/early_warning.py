@@ -2,8 +2,8 @@
 
 Five kinds: the normal form of a fold, a double well that is tilted, the same two without a drift, and two
 whose f is none of the polynomials that are fitted, May's grazed pasture and the lake of the gallery. The
-barrier at the begin and at the end of the record, its length, and how far ahead is asked are drawn for each; a
-record that tips before its end is drawn anew, with all of that. What is true is solved from the equation of
+barrier at the begin and at the end of the record, its length, and how far ahead is asked are drawn for each;
+a record that tips before its end is drawn anew, with all of that. What is true is solved from the equation of
 the laboratory on cells of its own.
 
     python -m benchmarks.early_warning --kind fold --first 0 --count 25 --out results/early-warning/fold.csv
