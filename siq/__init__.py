@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from siq.workflow.pipeline import PipelineSettings
     from siq.workflow.study import Study, load_study
     from siq.workflow.sweep import Sweep, sweep
-    from siq.workflow.tipping import probability_of_tipping
+    from siq.workflow.tipping import early_warning, probability_of_tipping
 
     __version__: str
 
@@ -66,6 +66,7 @@ __all__ = [
     "TrainingOptions",
     "candidate_library",
     "diagnose",
+    "early_warning",
     "inspect",
     "load_study",
     "load_system",
@@ -117,7 +118,7 @@ _NAMES = {
     "siq.workflow.pipeline": "PipelineSettings",
     "siq.workflow.study": "Study load_study",
     "siq.workflow.sweep": "Sweep sweep",
-    "siq.workflow.tipping": "probability_of_tipping",
+    "siq.workflow.tipping": "early_warning probability_of_tipping",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 

@@ -44,6 +44,7 @@ UPWARDS: frozenset[tuple[str, str]] = frozenset(
         ("siq.quasipotential.landscape", "siq.report.plots.quasipotential"),
         ("siq.quasipotential.landscape", "siq.workflow.pipeline"),
         ("siq.workflow.sweep", "siq.report.plots.sweep"),
+        ("siq.workflow.tipping", "siq.report.plots.sweep"),
     }
 )
 

@@ -49,6 +49,7 @@ def _computed(*states: tuple[float, float], value: float) -> _KnownBarrier:
 
 _LOW, _PASS, _HIGH = (1.40491203, 2.80807973), (4.20080731, 4.00388242), (4.90395384, 4.06187119)
 _ON, _OFF, _EVEN = (2.61803399, 0.38196601), (0.38196601, 2.61803399), (1.21341166, 1.21341166)
+_NORTH, _SOUTH = (0.0, 1.73205081), (0.0, -1.73205081)
 _UP, _DOWN = (0.81649658, 0.27216553), (-0.81649658, -0.27216553)
 DOUBLY_COMPUTED: Mapping[str, tuple[_KnownBarrier, ...]] = {
     "maier-stein-5": (_computed((-1.0, 0.0), (0.0, 0.0), (1.0, 0.0), value=0.4830697094),),
@@ -60,6 +61,10 @@ DOUBLY_COMPUTED: Mapping[str, tuple[_KnownBarrier, ...]] = {
     "fitzhugh-nagumo": (
         _computed(_UP, (0.0, 0.0), _DOWN, value=0.1788869290),
         _computed(_DOWN, (0.0, 0.0), _UP, value=0.1788869290),
+    ),
+    "two-competitors": (
+        _computed(_NORTH, (1.5, 0.0), _SOUTH, value=1.4272291280),
+        _computed(_SOUTH, (-1.5, 0.0), _NORTH, value=1.4272291280),
     ),
     "toggle": (
         _computed(_ON, _EVEN, _OFF, value=0.1767588206),
@@ -73,7 +78,7 @@ X, Y, Z, V = sympy.symbols("x y z v", real=True)
 
 
 @dataclass(frozen=True)
-class ReferenceSystem:
+class _ReferenceSystem:
     """A system, and what is known of its landscape."""
 
     name: str
@@ -84,7 +89,7 @@ class ReferenceSystem:
     barriers: tuple[_KnownBarrier, ...]  #: between attractors, known exactly or by two methods
 
 
-def reference_systems() -> dict[str, ReferenceSystem]:
+def reference_systems() -> dict[str, _ReferenceSystem]:
     """Every system whose landscape is known exactly, or was computed by two methods, by name.
 
     Returns
@@ -112,6 +117,8 @@ def reference_systems() -> dict[str, ReferenceSystem]:
         sympy.Rational(*each) for each in ((154, 100), (1014, 100), (476, 1000), (112509, 1000000))
     )
     eaten = X**2 * Y / (1 + X**2)
+    east, north = X - 4, Y - 5
+    inside = 1 - east**2 - north**2
     place, friction = (X**2 - 1) ** 2 / 4 - X / 10, half
     units = sympy.symbols("x:10", real=True)
     wells = sum(((s**2 - 1) ** 2 / 4 for s in units), nothing)
@@ -190,6 +197,27 @@ def reference_systems() -> dict[str, ReferenceSystem]:
             ),
         ),
         _computed_twice(
+            "two-competitors",
+            "Two signed amplitudes that suppress each other: each way leads over a saddle of its own.",
+            "the third example of Moore et al., The R Journal 8, 19 (2016)",
+            Dynamics.of(
+                (X, Y),
+                tuple(each * (rate - X**2 - X * Y - Y**2) for each, rate in ((X, 9 * half**2), (Y, 3))),
+                domain=[(-3, 3)] * 2,
+            ),
+        ),
+        _exact(
+            "cycle",
+            "A stable limit cycle about an unstable point.",
+            "the second example of Moore et al., The R Journal 8, 19 (2016)",
+            Dynamics.of(
+                (X, Y),
+                (tenth * 2 * east * inside - north, tenth * 2 * north * inside + east),
+                domain=[(2, 6), (3, 7)],
+            ),
+            tenth * inside**2,
+        ),
+        _computed_twice(
             "toggle",
             "Two genes that switch each other off, with D = 1.",
             "Gardner, Cantor and Collins, Nature 403, 339 (2000)",
@@ -237,7 +265,7 @@ def _exact(
     dynamics: Dynamics,
     quasipotential: sympy.Expr,
     ways: Sequence[Sequence[Sequence[float]]] = (),
-) -> ReferenceSystem:
+) -> _ReferenceSystem:
     """A system whose U is a formula; ways are attractor, saddle and the attractor behind it, about where."""
     symbols, noise, barriers = dynamics.symbols, dynamics.diffusion, []
     second = compile_formulas([quasipotential.diff(a, b) for a in symbols for b in symbols], symbols)
@@ -270,15 +298,15 @@ def _exact(
         barriers.append(
             _KnownBarrier(start, saddle, end, float(levels[1] - levels[0]), 0.0, prefactor, "exact")
         )
-    return ReferenceSystem(name, about, source, dynamics, quasipotential, tuple(barriers))
+    return _ReferenceSystem(name, about, source, dynamics, quasipotential, tuple(barriers))
 
 
-def _computed_twice(name: str, about: str, source: str, dynamics: Dynamics) -> ReferenceSystem:
+def _computed_twice(name: str, about: str, source: str, dynamics: Dynamics) -> _ReferenceSystem:
     """A system of which nobody knows a formula of U, and two methods the barriers."""
-    return ReferenceSystem(name, about, source, dynamics, None, DOUBLY_COMPUTED[name])
+    return _ReferenceSystem(name, about, source, dynamics, None, DOUBLY_COMPUTED[name])
 
 
-def _point_and_cycle() -> ReferenceSystem:
+def _point_and_cycle() -> _ReferenceSystem:
     """Rings about a stable point: V' = r(r² - a²)(r² - b²) with a turn."""
     inner, outer, turns = sympy.Rational(1, 4), sympy.S.One, 2
     square = X**2 + Y**2
@@ -293,7 +321,7 @@ def _point_and_cycle() -> ReferenceSystem:
         _KnownBarrier(origin, edge, circle, value, 0.0, np.nan, how),
         _KnownBarrier(circle, edge, origin, beyond, 0.0, np.nan, how),
     )
-    return ReferenceSystem(
+    return _ReferenceSystem(
         "point-and-cycle", "A stable point within a stable limit cycle, and an unstable cycle between them.",
         "V' = r(r² - a²)(r² - b²) with a turn", dynamics, 2 * half, barriers,
     )  # fmt: skip

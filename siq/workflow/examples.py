@@ -20,13 +20,9 @@ from siq.numerics.files import whole_file
 from siq.systems.cards import check_title
 from siq.version import DISTRIBUTION
 
+STUDIES = (".yaml", ".yml")  # what files end in that are studies, and no recordings
 GENERATED = Path(".snakemake", "siq")
 """Where studies lie that were written for a file of recordings: no result, and of use to nobody else."""
-
-
-def is_study(path: Path) -> bool:
-    """Whether a file is a study, and no recordings."""
-    return path.suffix.lower() in (".yaml", ".yml")
 
 
 def name_for(path: Path) -> str:
@@ -64,7 +60,7 @@ def init_study(path: Path, *, output: Path | None = None, replace: bool = False)
     By default it is named as the recordings, in the folder in which you are. Fails with `InputError` when the
     recordings cannot be used, or the study is there already and is not to be replaced.
     """
-    if is_study(path):
+    if path.suffix.lower() in STUDIES:
         raise InputError(path, "", "this is a study already", f"run it by: siq run {path}")
     found = inspect_recordings(path)
     study = Path(f"{name_for(path)}.yaml") if output is None else output

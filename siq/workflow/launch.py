@@ -24,7 +24,7 @@ from typing import IO, Any, TextIO
 from siq.errors import InputError, MissingExtra, suggestion
 from siq.numerics.files import CARD, case_folders, given_path, read_document
 from siq.workflow.answers import Exit, answer_of_page
-from siq.workflow.examples import is_study, name_for, own_path, write_generated
+from siq.workflow.examples import STUDIES, name_for, own_path, write_generated
 
 MARK = "\x1e"
 """Begins a line that is an event, as the logger plugin of the workflow writes them."""
@@ -338,7 +338,7 @@ def run_study(given: str, asked: Request) -> Exit:
             given, "", f"this is a case of a simulation and its recordings, since it has {CARD}",
             f"compare them by: siq diagnose {given}",
         )  # fmt: skip
-    elif is_study(path):
+    elif path.suffix.lower() in STUDIES:
         from siq.workflow.study import load_study  # here, so that a fault of the line is told at once
 
         data = read_document(path).data

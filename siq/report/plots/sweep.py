@@ -1,4 +1,4 @@
-"""A control parameter: where wells begin and end, how deep they are, how long they last."""
+"""A control parameter, or a drift: where wells begin and end, how deep they are, how long they last."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ from matplotlib.patheffects import withStroke
 
 from siq.report.plots.style import (
     BLACK,
+    BLUE,
     COLUMN_WIDTH,
     GREY,
+    VERMILLION,
     axis_label,
     drawn_in_style,
     energy_label,
@@ -27,6 +29,7 @@ from siq.report.summary import well_name
 
 BIFURCATIONS = {"fold": "o", "Hopf": "s", "branch point": "D"}
 PANEL = 2.2  # inches
+BEYOND = 1e30  # for infinite ends of intervals, which go on beyond the panel
 CURVES = {"fold": "-", "Hopf": "--"}
 CURVE = "white"
 OUTLINED = (withStroke(linewidth=2.4, foreground=BLACK),)  # seen on the dark and on the bright end of a map
@@ -99,6 +102,50 @@ def plot_sweep(
         rows[1 + columns.index("mean_time")].set_yscale("log")
     rows[-1].set_xlabel(axis_label(parameters[0], units.get(parameters[0], "1")))
     figure.legend(handles=_handles(table, branches, bifurcations), loc="outside upper center", ncols=3)
+    return figure
+
+
+@drawn_in_style
+def plot_early_warning(
+    course: pd.DataFrame, probability: pd.DataFrame, *, state: str, time_unit: str | None = None
+) -> Figure:
+    """Draw an early warning.
+
+    Parameters
+    ----------
+    course, probability
+        As `siq.early_warning` gives them.
+    state, time_unit
+        Name of the column, and the unit of its time.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Barrier over noise and mean time along the record, and the probability of having left the state
+        afterwards, each with its 90 % interval; an interval without an upper end goes on beyond the panel.
+    """
+    figure = Figure(figsize=(COLUMN_WIDTH, 3 * PANEL))
+    panels = figure.subplots(3, 1, sharex=True)
+    columns = ("barrier_over_noise", "mean_time", "probability")
+    for axes, table, name in zip(panels, (course, course, probability), columns, strict=True):
+        short = {"barrier_over_noise": "barrier_", "mean_time": "mean_time_", "probability": ""}[name]
+        lower, upper = (table[f"{short}{end}"].clip(upper=BEYOND) for end in ("lower", "upper"))
+        colour = VERMILLION if name == "probability" else BLUE
+        axes.fill_between(table["time"], lower, upper, color=colour, alpha=0.2, linewidth=0)
+        axes.plot(table["time"], table[name], color=colour)
+        axes.axvline(course["time"].iloc[-1], color=GREY, linewidth=0.5, linestyle=":")
+        finite = table[name][np.isfinite(table[name])]
+        if name == "probability":
+            axes.set_ylim(0, 1)
+        elif name == "mean_time":
+            axes.set_yscale("log")
+            axes.set_ylim(lower.min() / 2, 30 * finite.max() if len(finite) else 1e3 * lower.min())
+        else:
+            axes.set_ylim(0, 1.5 * finite.max() if len(finite) else 2 * lower.min())
+    panels[0].set_ylabel(f"barrier of {state} ΔU/ε")
+    panels[1].set_ylabel("mean time" + (f" {unit_label(time_unit)}" if time_unit else ""))
+    panels[2].set_ylabel("probability\nof having left")
+    panels[2].set_xlabel(axis_label("time", time_unit or "1"))
     return figure
 
 
