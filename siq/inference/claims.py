@@ -82,7 +82,7 @@ class _Residuals:
             rest, force = (np.einsum("nij,nj->ni", whitening, one) for one in (rest, force))
         moved = np.sqrt(((pairs.xh - pairs.x0) ** 2 / pairs.h[:, None]).mean(axis=0))
         self.noisy = np.sqrt((rest**2).mean(axis=0)) > NOISELESS * moved
-        if found.hidden_velocities:  # there is one innovation for each position
+        if found.hidden_states:  # there is one innovation for each position
             self.noisy[found.library.dimension // 2 :] = False
         shares = (force**2).mean(axis=0)[self.noisy] / (rest**2).mean(axis=0)[self.noisy]
         self.drift = float(shares.max(initial=0.0))  # of the squares of steps, over that of the noise

@@ -502,9 +502,15 @@ class FieldEstimate:
         return noise.measurement**2
 
     @property
-    def hidden_velocities(self) -> bool:
-        """Whether half of the states are velocities that were not recorded."""
+    def hidden_states(self) -> bool:
+        """Whether half of the states were not recorded: velocities, or a slow force."""
         return self.diagnosis is not None and len(self.diagnosis.measurement) * 2 == self.library.dimension
+
+    @property
+    def slow_force(self) -> bool:
+        """Whether a slow force was not recorded: it acts beside f of the state, as velocities do not."""
+        first = self.support[self.support[:, 0] == 0, 1]
+        return self.hidden_states and (self.noise_rate[0, 0] > 0 or len(first) > 1)
 
     @property
     def exposure(self) -> float | None:

@@ -54,6 +54,7 @@ from siq.inference.field_estimate import (
 from siq.inference.kalman_filter import Noise
 from siq.inference.kalman_identification import (
     filtered_recordings,
+    held_out_gain,
     held_out_innovations,
     identify_by_likelihood,
 )
@@ -157,6 +158,8 @@ def identify(
                 raise NumericalFailure("the recordings are no means over that exposure")
             found = seen
         assert found.prediction is not None
+        if not hidden and (by_force := case.with_slow_force(found)) is not None:
+            return by_force
         if not hidden and (found.memory is not None or not found.prediction.passed):
             # A position alone is refused where its recordings are correlated since it has inertia.
             advice = case.advice(hidden=False)
@@ -180,6 +183,8 @@ def identify(
         advice = case.advice(hidden=hidden)
         if not hidden and advice is not None and (by_velocities := case.with_velocities()) is not None:
             return by_velocities
+        if not hidden and not claim and (by_force := case.with_slow_force()) is not None:
+            return by_force
         raise NumericalFailure(reason if advice is None else f"{reason}; {advice}", claim=claim) from error
 
 
@@ -282,7 +287,7 @@ class _Case:
         assert noise is not None and noise.measurement_error is not None
         forced = bool(found.noise_rate.any())
         different = len({unit for unit in self.units if unit}) > 1
-        if found.hidden_velocities and not forced and different:
+        if found.hidden_states and not forced and different:
             raise NumericalFailure(
                 "no process noise is seen that would show D, and the positions have different units, so that"
                 " no unit matrix can stand for it; scale them to one unit"
@@ -290,7 +295,15 @@ class _Case:
         sizes = zip(noise.measurement, self.recordings.titles, strict=True)
         sensors = [{"size": float(size), "state": name} for size, name in sizes]
         remarks = [Remark("inference.measurement_noise", {"sensors": sensors})]
-        if found.hidden_velocities:
+        if found.slow_force:
+            time, error = -1 / found.values[-1], float(np.sqrt(found.covariance[-1, -1]))
+            values = {
+                "state": self.recordings.titles[0], "name": found.library.states[1], "time": time,
+                "error": error * time**2, "unit": self.recordings.time_unit or "", "sensors": sensors,
+                "noise": bool(found.noise_rate[1, 1]),
+            }  # fmt: skip
+            remarks, source = [Remark("inference.slow_force", values)], DiffusionSource.ESTIMATED
+        elif found.hidden_states:
             remarks = [Remark("inference.hidden_velocities", {"sensors": sensors, "process_noise": forced})]
             source = DiffusionSource.OF_VELOCITIES if forced else DiffusionSource.UNIT_OF_VELOCITIES
         else:
@@ -442,6 +455,42 @@ class _Case:
         except (NumericalFailure, np.linalg.LinAlgError):
             return None
         return found if found.prediction is not None and found.prediction.passed else None
+
+    def with_slow_force(self, alone: FieldEstimate | None = None) -> FieldEstimate | None:
+        """f with a slow force on the one recorded state; None where none is needed, or it does not do.
+
+        It is tried where f `alone` is refuted by the past, which tells more of the next sample than the state
+        does; or where there is none. It has to take that away, and to foresee recordings that were held out
+        better than f alone.
+        """
+        if self.options.hidden_velocities != "auto" or self.given is not None or self.integrator_step:
+            return None
+        if len(self.recordings.names) != 1 or (alone is not None and alone.noise_free):
+            return None
+        if alone is None:
+            if not markov_lag(joined(self.recordings)).remembers:
+                return None
+        elif self._forgets(alone):
+            return None
+        names = (*self.recordings.names, f"force_{self.recordings.names[0]}")
+        library = field_library(names, self.options)
+        view = ObservationModel(library, Diffusion.identity(2), hidden=True, slow_force=True)
+        try:
+            found = self.finished(self.by_likelihood(view))
+            assert found.prediction is not None
+            better = held_out_gain(found, self.training, self.held_out, pair_step=self.pair_step) > 0
+            return found if better and found.prediction.passed and self._forgets(found) else None
+        except (NumericalFailure, np.linalg.LinAlgError):
+            return None
+
+    def _forgets(self, found: FieldEstimate) -> bool:
+        """Whether the past tells nothing more of the next sample than the state does."""
+        states = self.recordings
+        if found.sensor_variance is not None or found.hidden_states:
+            states = filtered_recordings(found, states, pair_step=self.pair_step)
+        limit = self.limits.each
+        claims = check_claims(found, states, self.recordings, pair_step=self.pair_step, false_alarms=limit)
+        return claims["state_complete"].passed
 
     def advice(self, *, hidden: bool) -> str | None:
         """Advice where a recorded position has inertia, or hidden velocities are not needed."""

@@ -18,12 +18,13 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from scipy.special import ndtr, ndtri
 
 from siq.data.recordings import Recordings, parent_recordings
 from siq.data.stationarity import runs_of
 from siq.errors import NumericalFailure
 from siq.inference.checks import correlations_between, unexplained_probability
-from siq.inference.diffusion_model import InnovationLikelihood
+from siq.inference.diffusion_model import InnovationLikelihood, constant_noise
 from siq.inference.field_estimate import FieldEstimate, FlowMap, NoiseDiagnosis
 from siq.inference.kalman_filter import Grid, Noise, Whitened, linearise, whiten
 from siq.inference.maximum_likelihood import Fit, fit_by_filter, noise_uncertainty
@@ -47,9 +48,10 @@ from siq.systems.dynamics import Dynamics
 LAGS = (1, 2, 3)  # steps over which innovations are compared: what is correlated at all is so over these
 DIFFUSION_ROUNDS = 2  # of D by the trajectories of f, and f by the weights of D
 LIBRARY_ROUNDS = 8  # of the fit of a whole library, which only chooses terms
+SENSOR_BEGIN = 1e-3  # of what a sample moves by, squared
 NO_SENSOR_NOISE = 1e-6  # of a sensor's variance: as good as none
 MAX_NUMBERS = 4e8  # of the derivatives by all coefficients at all samples: 3 GB
-KNOWN_EQUATIONS = 2.0  # with hidden velocities half hold by definition: no false term comes into them
+SHORTEST_FORCE, LONGEST_FORCE = 4, 1 / 30  # steps; of a record: correlation times that a search begins with
 
 
 def identify_by_likelihood(
@@ -91,14 +93,20 @@ def identify_by_likelihood(
             f"{len(everything)} coefficients and {len(data.t)} samples with measurement noise are too much"
             " for the memory; lower identification.degree, or name the functions of f"
         )
-    if hidden:
+    begins = []
+    if observation.slow_force:
+        begins = _forced(observation, data)
+    elif hidden:
         x, noise = smoothed_motion(data, library.states[: d // 2])
         if not noise.process.any():
             raise NumericalFailure("no force is seen: the positions move evenly; record longer")
+        begins = [(np.zeros(len(everything)), x, noise)]
     else:
         assert noise is not None
-        x, noise = observation.states(data), observation.noise(replace(noise, shape=np.eye(d)[None]))
-    whole = _fit_library(observation.model(everything, np.zeros(len(everything))), data, x, noise)
+        noise = observation.noise(replace(noise, shape=np.eye(d)[None]))
+        begins = [(np.zeros(len(everything)), observation.states(data), noise)]
+    wholes = [_fit_library(observation.model(everything, one), data, *rest) for one, *rest in begins]
+    whole = max(wholes, key=lambda one: one.log_likelihood)
     likelihood = None if hidden else InnovationLikelihood(library.symbols, whole, data)
     chance = 1.0 if likelihood is None else likelihood.constant_probability()
     by_state = chance < false_terms and bool(whole.noise.process.any())
@@ -107,8 +115,9 @@ def identify_by_likelihood(
         formula, sensor, _ = likelihood.selected(false_terms=false_terms, probability=chance)
         noise = observation.noise(Noise(sensor, np.ones(d), field=formula.diffusion(1.0)))
         whole = _fit_library(whole.model, data, whole.linearised_at, noise)
-    share = min(KNOWN_EQUATIONS * false_terms, 0.5) if hidden else false_terms
-    critical = np.tile(critical_values(library, false_terms=share), len(everything) // library.size)
+    # What holds by definition brings no false term: the others share their probability.
+    chance = ndtr(-critical_values(library, false_terms=false_terms)[everything[:, 1]])
+    critical = -ndtri(chance * min(false_terms, 0.5) / (2 * chance.sum()))
     white = whiten(whole.linearisation, data, whole.noise)
     last = white.solve()[0] if whole.converged else 0.0
     goal = white.innovations + white.columns @ (whole.model.values - last)
@@ -134,6 +143,8 @@ def identify_by_likelihood(
     if by_state:
         found = _with_formula(observation, support, fit, data, false_terms=false_terms, probability=chance)
     else:
+        if observation.slow_force and not fit.noise.process[0]:
+            raise NumericalFailure("the slow force is all the noise that there is")
         if hidden:  # the search for intensities ends at the least that it tries; of ring-downs there are none
             fit = drop_insignificant_process_noise(fit, data) or fit
         else:
@@ -149,6 +160,24 @@ def identify_by_likelihood(
     shares = np.append(np.ones(len(observation.definitions)), shares)
     average = model_average([problem], support, library)
     return replace(found, alternatives=average, stability=shares)
+
+
+def _forced(observation: ObservationModel, data: Measurements) -> list[tuple[np.ndarray, np.ndarray, Noise]]:
+    """Coefficients ``(p,)``, states and noise to begin with, for some correlation times of a slow force.
+
+    The likelihood has a maximum where the force is white noise, and others. To begin with it moves the state
+    as much within its correlation time as the white noise does.
+    """
+    moved, step = moved_by(data)
+    rate, x = moved[0] / step, observation.states(data)
+    longest = len(data.t) / len(data.labels) * len(np.unique(parent_recordings(data.labels))) * LONGEST_FORCE
+    count = max(int(np.log2(max(longest / SHORTEST_FORCE, 1.0)) / 2) + 1, 1)
+    found = []
+    for time in SHORTEST_FORCE * step * 4.0 ** np.arange(count):
+        values = np.zeros(len(observation.everything))
+        values[-1] = -1 / time
+        found.append((values, x, Noise(SENSOR_BEGIN * moved, np.array([rate, rate / time**2]))))
+    return found
 
 
 def _fit_library(model: Dynamics, data: Measurements, x: np.ndarray, noise: Noise) -> Fit:
@@ -172,7 +201,12 @@ def _estimate(
     intensity, sensor = fit.noise.intensity, fit.noise.measurement
     rate = (intensity[0] if len(intensity) == 1 else intensity[data.begins].mean(axis=0))[:d, :d]
     moved, step = moved_by(data)
-    strength, evidence, driven = 0.0, None, slice(observation.hidden_states, d)
+    strength, evidence, driven, constant = 0.0, None, slice(observation.hidden_states, d), None
+    if observation.slow_force:
+        driven, constant = slice(0, d), constant_noise(library.symbols, rate, samples=len(data.t))
+        entries = np.diag(constant.covariance).copy()
+        entries[constant.places[:, 0] == constant.places[:, 1]] = (np.diag(rate) * process_error) ** 2
+        constant = replace(constant, covariance=np.diag(entries))
     if observation.hidden:
         # The part of D that acts on velocities has the determinant 1.
         force, matrix = rate[driven, driven], np.zeros((d, d))
@@ -180,7 +214,8 @@ def _estimate(
         matrix[driven, driven] = (force + force.T) / 2 / strength if force.any() else np.eye(len(force))
         diffusion = Diffusion(matrix)
         # What is not foreseen from a sample to the next: twice the sensor's noise, and what noise makes of v.
-        ratio = float(np.sqrt(((2 * sensor + np.diag(force) * step**3 / 3) / moved).mean()))
+        here, there = np.split(np.diag(rate), 2)
+        ratio = float(np.sqrt(((2 * sensor + here * step + there * step**3 / 3) / moved).mean()))
     else:
         strength = diffusion.intensity(rate) if diffusion.constant else 0.0
         ratio = float(np.sqrt(((np.diag(rate) * step + 2 * sensor) / positive(moved)).mean()))
@@ -206,7 +241,7 @@ def _estimate(
         diagnosis = replace(diagnosis, kind="coloured")
     return FieldEstimate.on_support(
         library, np.concatenate([known, support]), np.append(np.ones(len(known)), fit.model.values), whole,
-        rate, ratio, FlowMap(fit.substeps), diffusion, diagnosis=diagnosis,
+        rate, ratio, FlowMap(fit.substeps), diffusion, diagnosis=diagnosis, constant_noise=constant,
     )  # fmt: skip
 
 
@@ -294,11 +329,41 @@ def held_out_innovations(
     return probability, float(rest @ rest) / freedom / (fit.sum_of_squares / fit.degrees_of_freedom)
 
 
+def held_out_gain(
+    found: FieldEstimate, training: Recordings, unseen: Recordings, *, pair_step: float | None = None
+) -> float:
+    """Log-likelihood of unseen recordings with a slow force over that without, both fitted to training ones.
+
+    Without it f has the same functions of the state.
+    """
+    forced = ObservationModel.of(found)
+    own, other = (forced.measured(each, pair_step) for each in (training, unseen))
+    support, values = forced.unknown(found)
+    model, noise = forced.model(support, values), forced.noise_of(found)
+    of_state = tuple(model.parameters[place] for place in np.flatnonzero(support[:, 0] == 0))
+    without = (model.equations[0] - model.symbols[1],)
+    alone = Dynamics(model.states[:1], without, Diffusion.identity(1), parameters=of_state)
+    views = (
+        (forced, model, noise),
+        (
+            ObservationModel(found.library, alone.diffusion),
+            alone,
+            replace(noise, process=noise.process[:1], shape=None),
+        ),
+    )
+    likelihoods = []
+    for view, begin, level in views:
+        fit = fit_by_filter(begin, own, x=view.states(own), noise=level)
+        follow = _follow(view, other, fit.model, noise=fit.noise, substeps=fit.substeps)
+        likelihoods.append(follow.log_likelihood)
+    return likelihoods[0] - likelihoods[1]
+
+
 def of_all_states(
     recordings: Recordings, found: FieldEstimate, *, pair_step: float | None = None
 ) -> Recordings:
     """The recordings, with the velocities of an estimate that were not recorded among their states."""
-    hidden = found.hidden_velocities
+    hidden = found.hidden_states
     return filtered_recordings(found, recordings, pair_step=pair_step) if hidden else recordings
 
 
