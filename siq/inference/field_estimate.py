@@ -632,8 +632,16 @@ class FieldEstimate:
 
     @property
     def standard_errors(self) -> np.ndarray:
-        """Shape ``(q, d)``: standard error of each coefficient, zero where there is no term."""
-        return _spread_out(self.library, self.support, np.sqrt(np.diag(self.covariance)))
+        """Shape ``(q, d)``: standard error of each coefficient, zero where there is no term.
+
+        What other terms leave open is a part of it: a term that was chosen for its size is smaller in the
+        mean over supports, and one that took the place of another might not be there.
+        """
+        variance = np.diag(self.covariance).copy()
+        if self.alternatives is not None:
+            (components, terms), (bias, spread) = self.support.T, self.alternatives
+            variance += bias[terms, components] ** 2 + (spread[:, terms, components] ** 2).sum(axis=0)
+        return _spread_out(self.library, self.support, np.sqrt(variance))
 
 
 def _spread_out(library: CandidateLibrary, support: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -656,7 +664,7 @@ def write_field(path: str | Path, estimate: FieldEstimate, options: Identificati
     """Write an estimate whole or not at all, as `vector_field.json` is documented."""
     library, average = estimate.library, estimate.alternatives
     shares = [None] * len(estimate.support) if estimate.stability is None else estimate.stability.tolist()
-    errors = np.sqrt(np.diag(estimate.covariance))
+    errors = estimate.standard_errors[estimate.support[:, 1], estimate.support[:, 0]]
     terms = zip(estimate.support, estimate.values, errors, shares, strict=True)
     data = {
         "states": list(library.states),

@@ -40,6 +40,7 @@ from siq.inference.diffusion_model import (
     ResidualLikelihood,
     check_units,
     constant_noise,
+    error_of_strength,
     estimated_diffusion,
     with_process_noise_rate,
 )
@@ -390,7 +391,11 @@ class _Case:
 
         def diagnosed(found: FieldEstimate, source: DiffusionSource) -> FieldEstimate:
             noise = residual_noise(found, self.recordings, pair_step=self.pair_step)
-            return replace(found, diagnosis=replace(noise, diffusion=source, pairs=count))
+            noise = replace(noise, diffusion=source, pairs=count)
+            if noise.kind == "process":
+                error = noise.intensity * error_of_strength(found, everything)
+                noise = replace(noise, intensity_error=error)
+            return replace(found, diagnosis=noise)
 
         if self.given is not None:
             given = with_given_noise(found, everything, self.given, false_terms=false_terms)

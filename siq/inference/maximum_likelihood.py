@@ -232,10 +232,13 @@ def noise_uncertainty(fit: Fit, data: Measurements) -> tuple[np.ndarray, np.ndar
     inside = [place for place, seen in zip(places, told, strict=True) if seen]
     covariance = fit.covariance
     if inside:
-        of_noise = np.linalg.pinv(curvature[np.ix_(told, told)], hermitian=True)
-        errors[inside] = np.sqrt(np.maximum(np.diag(of_noise), 0.0))
         ends = [[whiten(line, data, moved((one, step))).solve()[0] for step in (h, -h)] for one in inside]
         slope = np.stack([(up - down) / (2 * h) for up, down in ends], axis=1)
+        # The parameters follow the noise, and what they take over is not told of it.
+        followed = slope.T @ np.linalg.pinv(covariance, hermitian=True) @ slope
+        levels, ways = np.linalg.eigh(curvature[np.ix_(told, told)] - followed)
+        of_noise = (ways / np.maximum(levels, 1 / MAX_ERROR**2)) @ ways.T
+        errors[inside] = np.sqrt(np.diag(of_noise))
         covariance = covariance + slope @ of_noise @ slope.T
     process = np.zeros_like(fit.noise.process)
     process[driven] = errors[outputs : outputs + len(driven)]
