@@ -507,10 +507,11 @@ class FieldEstimate:
         return self.diagnosis is not None and len(self.diagnosis.measurement) * 2 == self.library.dimension
 
     @property
-    def slow_force(self) -> bool:
-        """Whether a slow force was not recorded: it acts beside f of the state, as velocities do not."""
-        first = self.support[self.support[:, 0] == 0, 1]
-        return self.hidden_states and (self.noise_rate[0, 0] > 0 or len(first) > 1)
+    def slow_force(self) -> float:
+        """The factor of a slow force that was not recorded in ``dx/dt``; zero where there is none."""
+        if not self.hidden_states or not self.noise_rate[0, 0] > 0:
+            return 0.0
+        return float(self.coefficients[self.library.terms.index(self.library.symbols[1]), 0])
 
     @property
     def exposure(self) -> float | None:

@@ -13,6 +13,7 @@ constant one cannot be held; else the unit matrix. Last, f is tested on held-out
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -297,10 +298,10 @@ class _Case:
         sensors = [{"size": float(size), "state": name} for size, name in sizes]
         remarks = [Remark("inference.measurement_noise", {"sensors": sensors})]
         if found.slow_force:
-            time, error = -1 / found.values[-1], float(np.sqrt(found.covariance[-1, -1]))
+            time, slope = float(-1 / found.values[-1]), float(np.sqrt(found.covariance[-1, -1]))
             values = {
                 "state": self.recordings.titles[0], "name": found.library.states[1], "time": time,
-                "error": error * time**2, "unit": self.recordings.time_unit or "", "sensors": sensors,
+                "error": slope * time**2, "unit": self.recordings.time_unit or "", "sensors": sensors,
                 "noise": bool(found.noise_rate[1, 1]),
             }  # fmt: skip
             remarks, source = [Remark("inference.slow_force", values)], DiffusionSource.ESTIMATED
@@ -393,8 +394,8 @@ class _Case:
             noise = residual_noise(found, self.recordings, pair_step=self.pair_step)
             noise = replace(noise, diffusion=source, pairs=count)
             if noise.kind == "process":
-                error = noise.intensity * error_of_strength(found, everything)
-                noise = replace(noise, intensity_error=error)
+                share = error_of_strength(found, everything)
+                noise = replace(noise, intensity_error=noise.intensity * share)
             return replace(found, diagnosis=noise)
 
         if self.given is not None:
@@ -479,14 +480,15 @@ class _Case:
             return None
         names = (*self.recordings.names, f"force_{self.recordings.names[0]}")
         library = field_library(names, self.options)
-        view = ObservationModel(library, Diffusion.identity(2), hidden=True, slow_force=True)
-        try:
-            found = self.finished(self.by_likelihood(view))
-            assert found.prediction is not None
-            better = held_out_gain(found, self.training, self.held_out, pair_step=self.pair_step) > 0
-            return found if better and found.prediction.passed and self._forgets(found) else None
-        except (NumericalFailure, np.linalg.LinAlgError):
-            return None
+        view = ObservationModel(library, Diffusion.identity(2), hidden=True, slow_force=1.0)
+        for follows in (False, True):
+            with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
+                found = self.finished(self.by_likelihood(replace(view, follows=follows)))
+                assert found.prediction is not None
+                gain = held_out_gain(found, self.training, self.held_out, pair_step=self.pair_step)
+                if gain > 0 and found.prediction.passed and self._forgets(found):
+                    return found
+        return None
 
     def _forgets(self, found: FieldEstimate) -> bool:
         """Whether the past tells nothing more of the next sample than the state does."""

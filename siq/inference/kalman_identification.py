@@ -24,7 +24,7 @@ from siq.data.recordings import Recordings, parent_recordings
 from siq.data.stationarity import runs_of
 from siq.errors import NumericalFailure
 from siq.inference.checks import correlations_between, unexplained_probability
-from siq.inference.diffusion_model import InnovationLikelihood, constant_noise
+from siq.inference.diffusion_model import InnovationLikelihood
 from siq.inference.field_estimate import FieldEstimate, FlowMap, NoiseDiagnosis
 from siq.inference.kalman_filter import Grid, Noise, Whitened, linearise, whiten
 from siq.inference.maximum_likelihood import Fit, fit_by_filter, noise_uncertainty
@@ -105,7 +105,7 @@ def identify_by_likelihood(
         assert noise is not None
         noise = observation.noise(replace(noise, shape=np.eye(d)[None]))
         begins = [(np.zeros(len(everything)), observation.states(data), noise)]
-    wholes = [_fit_library(observation.model(everything, one), data, *rest) for one, *rest in begins]
+    wholes = [_fit_library(observation.model(everything, one), data, x, noise) for one, x, noise in begins]
     whole = max(wholes, key=lambda one: one.log_likelihood)
     likelihood = None if hidden else InnovationLikelihood(library.symbols, whole, data)
     chance = 1.0 if likelihood is None else likelihood.constant_probability()
@@ -143,8 +143,8 @@ def identify_by_likelihood(
     if by_state:
         found = _with_formula(observation, support, fit, data, false_terms=false_terms, probability=chance)
     else:
-        if observation.slow_force and not fit.noise.process[0]:
-            raise NumericalFailure("the slow force is all the noise that there is")
+        if observation.slow_force and not (fit.noise.process[0] and fit.model.values[-1] < 0):
+            raise NumericalFailure("the slow force is all the noise that there is, or grows")
         if hidden:  # the search for intensities ends at the least that it tries; of ring-downs there are none
             fit = drop_insignificant_process_noise(fit, data) or fit
         else:
@@ -159,6 +159,10 @@ def identify_by_likelihood(
     shares = stability(parts, lambda triangle: [problem_of(triangle)], support, generator=generator)
     shares = np.append(np.ones(len(observation.definitions)), shares)
     average = model_average([problem], support, library)
+    if observation.slow_force:  # in the unit of the estimate
+        of_state = library.terms.index(library.symbols[0])
+        average[0][of_state, 1] /= found.slow_force
+        average[1][:, of_state, 1] /= found.slow_force
     return replace(found, alternatives=average, stability=shares)
 
 
@@ -195,18 +199,17 @@ def _estimate(
     sensor_error: np.ndarray,
     process_error: np.ndarray,
     covariance: np.ndarray,
+    joint: np.ndarray | None = None,
 ) -> FieldEstimate:
     """The estimate of a fit whose noise has known errors; see `noise_uncertainty`."""
     library, diffusion, d = observation.library, observation.diffusion, observation.library.dimension
     intensity, sensor = fit.noise.intensity, fit.noise.measurement
     rate = (intensity[0] if len(intensity) == 1 else intensity[data.begins].mean(axis=0))[:d, :d]
     moved, step = moved_by(data)
-    strength, evidence, driven, constant = 0.0, None, slice(observation.hidden_states, d), None
-    if observation.slow_force:
-        driven, constant = slice(0, d), constant_noise(library.symbols, rate, samples=len(data.t))
-        entries = np.diag(constant.covariance).copy()
-        entries[constant.places[:, 0] == constant.places[:, 1]] = (np.diag(rate) * process_error) ** 2
-        constant = replace(constant, covariance=np.diag(entries))
+    strength, evidence, driven = 0.0, None, slice(observation.hidden_states, d)
+    values, known = fit.model.values, observation.definitions
+    whole, held = np.zeros((len(known) + len(support),) * 2), np.ones(len(known))
+    whole[len(known) :, len(known) :] = covariance
     if observation.hidden:
         # The part of D that acts on velocities has the determinant 1.
         force, matrix = rate[driven, driven], np.zeros((d, d))
@@ -224,9 +227,24 @@ def _estimate(
         likelihood = partial(fit.linearisation.log_likelihood, data.first, data.step)
         base = max(likelihood(without.scaled(factor)) for factor in factors)
         evidence = 2 * (likelihood(fit.noise) - base)
-    known = observation.definitions
-    whole = np.zeros((len(known) + len(support),) * 2)
-    whole[len(known) :, len(known) :] = covariance
+    if observation.slow_force and joint is not None:
+        # Its unit is such that noise moves it as it moves the state: D is known then, and the size of the
+        # force a coefficient. Without noise of its own, such that it follows the state.
+        on_state, on_force = np.diag(rate)
+        size = float(np.sqrt(on_force / on_state)) if on_force else -float(values[-1])
+        follows = (support[:, 0] == 1) & (support[:, 1] != support[-1, 1])
+        values, held = np.where(follows, values / size, values), np.array([size])
+        slopes = np.zeros((len(whole), len(joint)))
+        slopes[1:, :-2] = np.diag(np.where(follows, 1 / size, 1.0))
+        if on_force:
+            slopes[:, -1] = np.append(size, np.where(follows, -values, 0.0)) / 2
+            slopes[:, -2] = -slopes[:, -1]
+        whole = slopes @ joint @ slopes.T
+        rate, diffusion = (
+            np.diag([on_state, on_state if on_force else 0.0]),
+            Diffusion(np.diag([1.0, float(on_force > 0)])),
+        )
+        strength, driven = float(on_state), slice(0, 1)
     correlation, score = _strongest_correlation(whiten(fit.linearisation, data, fit.noise), data)
     error = strength * float(np.sqrt((process_error[driven] ** 2).sum())) / len(process_error[driven])
     deviation = np.sqrt(sensor)
@@ -240,8 +258,8 @@ def _estimate(
     if diagnosis.correlated:
         diagnosis = replace(diagnosis, kind="coloured")
     return FieldEstimate.on_support(
-        library, np.concatenate([known, support]), np.append(np.ones(len(known)), fit.model.values), whole,
-        rate, ratio, FlowMap(fit.substeps), diffusion, diagnosis=diagnosis, constant_noise=constant,
+        library, np.concatenate([known, support]), np.append(held, values), whole,
+        rate, ratio, FlowMap(fit.substeps), diffusion, diagnosis=diagnosis,
     )  # fmt: skip
 
 
@@ -341,7 +359,7 @@ def held_out_gain(
     support, values = forced.unknown(found)
     model, noise = forced.model(support, values), forced.noise_of(found)
     of_state = tuple(model.parameters[place] for place in np.flatnonzero(support[:, 0] == 0))
-    without = (model.equations[0] - model.symbols[1],)
+    without = (model.equations[0] - found.slow_force * model.symbols[1],)
     alone = Dynamics(model.states[:1], without, Diffusion.identity(1), parameters=of_state)
     views = (
         (forced, model, noise),
@@ -397,6 +415,7 @@ def filtered_recordings(
 
     time = bracketed(seen.time_unit or "1")
     per_time = [None if unit is None else f"{bracketed(unit)}/{time}" for unit in seen.units]
+    per_time = list(seen.units) if observation.slow_force else per_time
     headings = (*seen.titles, *found.library.states[count:]) if seen.headings else ()
     units = (*seen.units, *per_time)
     return replace(seen, names=found.library.states, units=units, headings=headings, values=states)

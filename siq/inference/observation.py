@@ -120,19 +120,23 @@ class ObservationModel:
     """The relation of samples to the states of f.
 
     A sample may be a mean over an exposure. Where velocities are hidden they are the second half of the
-    states, and samples show nothing of them. What is hidden may be a `slow_force` instead.
+    states, and samples show nothing of them. What is hidden may be a slow force instead, which is added to
+    ``dx/dt`` times a factor that is known, `slow_force`; it may follow the state, or has noise alone.
     """
 
     library: CandidateLibrary
     diffusion: Diffusion
     exposure: float | None = None
     hidden: bool = False
-    slow_force: bool = False
+    slow_force: float = 0.0
+    follows: bool = False
 
     @classmethod
     def of(cls, found: FieldEstimate) -> ObservationModel:
         """The one that an estimate was made with."""
-        return cls(found.library, found.diffusion, found.exposure, found.hidden_states, found.slow_force)
+        library, slow = found.library, found.slow_force
+        follows = bool(slow) and found.coefficients[library.terms.index(library.symbols[0]), 1] != 0
+        return cls(library, found.diffusion, found.exposure, found.hidden_states, slow, follows)
 
     @property
     def hidden_states(self) -> int:
@@ -146,7 +150,8 @@ class ObservationModel:
             return all_coefficients(range(self.hidden_states, self.library.dimension), self.library.size)
         (x, z), terms = self.library.symbols, self.library.terms
         of_state = [(0, k) for k, term in enumerate(terms) if z not in term.free_symbols]
-        return np.array([*of_state, (1, terms.index(x)), (1, terms.index(z))])
+        of_force = [(1, terms.index(one)) for one in ((x, z) if self.follows else (z,))]
+        return np.array([*of_state, *of_force])
 
     @property
     def definitions(self) -> np.ndarray:
@@ -165,7 +170,7 @@ class ObservationModel:
         plain = field_dynamics(self.library, support, values, diffusion=self.diffusion)
         if self.slow_force:
             z = plain.symbols[1]
-            forced = (plain.equations[0] + z, plain.equations[1])
+            forced = (plain.equations[0] + self.slow_force * z, plain.equations[1])
             return replace(plain, equations=forced, outputs=plain.outputs[:1])
         if self.hidden:
             return _seen_positions(plain)
