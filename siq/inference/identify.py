@@ -160,8 +160,6 @@ def identify(
                 raise NumericalFailure("the recordings are no means over that exposure")
             found = seen
         assert found.prediction is not None
-        if not hidden and (by_force := case.with_slow_force(found)) is not None:
-            return by_force
         if not hidden and (found.memory is not None or not found.prediction.passed):
             # A position alone is refused where its recordings are correlated since it has inertia.
             advice = case.advice(hidden=False)
@@ -170,7 +168,8 @@ def identify(
                     return by_velocities
                 reason = "; ".join(one for one in (found.prediction.reason, advice) if one)
                 found = replace(found, prediction=replace(found.prediction, passed=False, reason=reason))
-        return found
+        by_force = None if hidden else case.with_slow_force(found)
+        return by_force or found
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         reason, claim = (str(error), error.claim) if isinstance(error, NumericalFailure) else (SINGULAR, "")
         rounding = rounding_text(recordings, coarse=True)
@@ -465,9 +464,10 @@ class _Case:
     def with_slow_force(self, alone: FieldEstimate | None = None) -> FieldEstimate | None:
         """f with a slow force on the one recorded state; None where none is needed, or it does not do.
 
-        It is tried where f `alone` is refuted by the past, which tells more of the next sample than the state
-        does; or where there is none. It has to take that away, and to foresee recordings that were held out
-        better than f alone.
+        It is tried where f `alone` fails its test or is refuted by the past, which tells more of the next
+        sample than the state does; or where there is none. It has to take that away, and to foresee
+        recordings that were held out better than f alone. First the force has noise alone, then it follows
+        the state.
         """
         if self.options.hidden_velocities != "auto" or self.given is not None or self.integrator_step:
             return None
@@ -476,7 +476,7 @@ class _Case:
         if alone is None:
             if not markov_lag(joined(self.recordings)).remembers:
                 return None
-        elif self._forgets(alone):
+        elif alone.prediction is not None and alone.prediction.passed and self._forgets(alone):
             return None
         names = (*self.recordings.names, f"force_{self.recordings.names[0]}")
         library = field_library(names, self.options)
