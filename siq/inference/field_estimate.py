@@ -106,8 +106,8 @@ class FlowMap:
 
         def rates(mean: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             known = np.nan_to_num(spread, posinf=0.0, neginf=0.0)
-            try:
-                root = np.linalg.cholesky(known + least)
+            try:  # of one state a factor is a root, which takes a tenth of the time
+                root = np.sqrt(np.maximum(known + least, 0)) if d == 1 else np.linalg.cholesky(known + least)
             except np.linalg.LinAlgError:  # of a trial f
                 levels, vectors = np.linalg.eigh(known)
                 root = vectors * np.sqrt(np.maximum(levels, 0.0))[:, None, :]
