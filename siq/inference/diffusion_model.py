@@ -366,18 +366,6 @@ def process_noise_increments(found: FieldEstimate, pairs: SnapshotPairs, rest: n
     return np.asarray((back @ rest[:, :, None])[:, :, 0] / np.sqrt(pairs.h)[:, None])
 
 
-def error_of_strength(found: FieldEstimate, pairs: SnapshotPairs) -> float:
-    """Standard error of ``ln ε`` by residuals of pairs: that of their variance, and that of what f forgets.
-
-    The variance of n residuals of d states has the relative standard error ``√(2/nd)``. A step h multiplies
-    it by about ``exp(h tr J/d)``, which is known as well as the divergence of f is.
-    """
-    library, d, (components, terms) = found.library, found.library.dimension, found.support.T
-    means = (library.evaluate(pairs.x0) * pairs.h[:, None]).mean(axis=0)
-    forgotten = means @ library.derivatives[:, components, terms] * 2 * found.flow.response_share / d
-    return float(np.sqrt(2 / (len(pairs.h) * d) + forgotten @ found.covariance @ forgotten))
-
-
 def with_process_noise_rate(found: FieldEstimate, pairs: SnapshotPairs) -> FieldEstimate:
     """An estimate by pairs whose `noise_rate` is that of the process noise and no longer that of residuals.
 

@@ -41,7 +41,6 @@ from siq.inference.diffusion_model import (
     ResidualLikelihood,
     check_units,
     constant_noise,
-    error_of_strength,
     estimated_diffusion,
     with_process_noise_rate,
 )
@@ -56,7 +55,6 @@ from siq.inference.field_estimate import (
 from siq.inference.kalman_filter import Noise
 from siq.inference.kalman_identification import (
     filtered_recordings,
-    held_out_gain,
     held_out_innovations,
     identify_by_likelihood,
 )
@@ -393,7 +391,7 @@ class _Case:
             noise = residual_noise(found, self.recordings, pair_step=self.pair_step)
             noise = replace(noise, diffusion=source, pairs=count)
             if noise.kind == "process":
-                share = error_of_strength(found, everything)
+                share = found.error_of_strength(everything.x0, everything.h)
                 noise = replace(noise, intensity_error=noise.intensity * share)
             return replace(found, diagnosis=noise)
 
@@ -485,7 +483,9 @@ class _Case:
             with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
                 found = self.finished(self.by_likelihood(replace(view, follows=follows)))
                 assert found.prediction is not None
-                gain = held_out_gain(found, self.training, self.held_out, pair_step=self.pair_step)
+                gain = ObservationModel.of(found).gain(
+                    found, self.training, self.held_out, pair_step=self.pair_step
+                )
                 if gain > 0 and found.prediction.passed and self._forgets(found):
                     return found
         return None

@@ -305,17 +305,6 @@ def _strongest_correlation(white: Whitened, data: Measurements) -> tuple[float, 
     return float(correlation), float(score)
 
 
-def _follow(
-    observation: ObservationModel, data: Measurements, model: Dynamics, *, noise: Noise, substeps: int
-) -> Fit:
-    """The filter along recordings, with f and both noises as they are."""
-    still = replace(model, parameters=tuple(replace(each, fixed=True) for each in model.parameters))
-    return fit_by_filter(
-        still, data, x=observation.states(data), noise=noise, estimate_process=False, estimate_sensor=False,
-        substeps=substeps,
-    )  # fmt: skip
-
-
 def held_out_innovations(
     found: FieldEstimate, training: Recordings, unseen: Recordings, *, pair_step: float | None = None
 ) -> tuple[float, float]:
@@ -330,7 +319,7 @@ def held_out_innovations(
     own, other = (observation.measured(each, pair_step) for each in (training, unseen))
     begin = observation.states(own)
     fit = observation.fitted(support, values, own, noise=observation.noise_of(found), x=begin)
-    follow = _follow(observation, other, fit.model, noise=fit.noise, substeps=fit.substeps)
+    follow = observation.followed(other, fit.model, noise=fit.noise, substeps=fit.substeps)
     everything = observation.everything
     values = np.zeros(len(everything))
     values[[everything.tolist().index(one) for one in support.tolist()]] = fit.model.values
@@ -345,36 +334,6 @@ def held_out_innovations(
         white.columns, rest[:, None], freedom=freedom, inflation=1 + freedom / fit.degrees_of_freedom
     )
     return probability, float(rest @ rest) / freedom / (fit.sum_of_squares / fit.degrees_of_freedom)
-
-
-def held_out_gain(
-    found: FieldEstimate, training: Recordings, unseen: Recordings, *, pair_step: float | None = None
-) -> float:
-    """Log-likelihood of unseen recordings with a slow force over that without, both fitted to training ones.
-
-    Without it f has the same functions of the state.
-    """
-    forced = ObservationModel.of(found)
-    own, other = (forced.measured(each, pair_step) for each in (training, unseen))
-    support, values = forced.unknown(found)
-    model, noise = forced.model(support, values), forced.noise_of(found)
-    of_state = tuple(model.parameters[place] for place in np.flatnonzero(support[:, 0] == 0))
-    without = (model.equations[0] - found.slow_force * model.symbols[1],)
-    alone = Dynamics(model.states[:1], without, Diffusion.identity(1), parameters=of_state)
-    views = (
-        (forced, model, noise),
-        (
-            ObservationModel(found.library, alone.diffusion),
-            alone,
-            replace(noise, process=noise.process[:1], shape=None),
-        ),
-    )
-    likelihoods = []
-    for view, begin, level in views:
-        fit = fit_by_filter(begin, own, x=view.states(own), noise=level)
-        follow = _follow(view, other, fit.model, noise=fit.noise, substeps=fit.substeps)
-        likelihoods.append(follow.log_likelihood)
-    return likelihoods[0] - likelihoods[1]
 
 
 def of_all_states(
@@ -397,7 +356,7 @@ def filtered_recordings(
     data = observation.measured(recordings, pair_step)
     count = observation.library.dimension - observation.hidden_states
     model, noise = observation.model(*observation.unknown(found)), observation.noise_of(found)
-    follow = _follow(observation, data, model, noise=noise, substeps=found.flow.steps)
+    follow = observation.followed(data, model, noise=noise, substeps=found.flow.steps)
     runs, every = runs_of(recordings, longest=pair_step), observation.every(recordings)
     rows = np.concatenate([np.arange(run.start, run.stop, every) for run in runs])
     states = follow.linearised_at[~np.isnan(data.outputs).all(axis=1)]

@@ -250,6 +250,38 @@ class ObservationModel:
             )
         return fit
 
+    def followed(self, data: Measurements, model: Dynamics, *, noise: Noise, substeps: int) -> Fit:
+        """The filter along recordings, with f and both noises as they are."""
+        still = replace(model, parameters=tuple(replace(each, fixed=True) for each in model.parameters))
+        return fit_by_filter(
+            still, data, x=self.states(data), noise=noise, estimate_process=False, estimate_sensor=False,
+            substeps=substeps,
+        )  # fmt: skip
+
+    def gain(
+        self, found: FieldEstimate, training: Recordings, unseen: Recordings, *, pair_step: float | None
+    ) -> float:
+        """Log-likelihood of unseen recordings with a slow force, over that without, both fitted to others.
+
+        Without it f has the same functions of the state.
+        """
+        support, values = self.unknown(found)
+        model, noise = self.model(support, values), self.noise_of(found)
+        without = model.equations[0] - self.slow_force * model.symbols[1]
+        of_state = tuple(model.parameters[place] for place in np.flatnonzero(support[:, 0] == 0))
+        alone = Dynamics(model.states[:1], (without,), Diffusion.identity(1), parameters=of_state)
+        views = (
+            (self, model, noise),
+            (replace(self, hidden=False, slow_force=0.0), alone, Noise(noise.measurement, noise.process[:1])),
+        )
+        likelihoods = []
+        for view, begin, level in views:
+            own, other = (view.measured(each, pair_step) for each in (training, unseen))
+            fit = fit_by_filter(begin, own, x=view.states(own), noise=level)
+            follow = view.followed(other, fit.model, noise=fit.noise, substeps=fit.substeps)
+            likelihoods.append(follow.log_likelihood)
+        return likelihoods[0] - likelihoods[1]
+
 
 def moved_by(data: Measurements) -> tuple[np.ndarray, float]:
     """Mean square of what each output moves by from a measured sample to the next, and the mean time.
