@@ -209,7 +209,8 @@ def _gaussian_force(found: FieldEstimate, pairs: SnapshotPairs, limit: float) ->
     """Whether a slow force that was not recorded is spread as noise spreads it, and no gate with two values.
 
     The fourth cumulant of n values with the correlations ρ_k has the variance ``24/n Σ_k ρ_k⁴`` where they
-    are Gaussian (Isserlis). Of a gate it is -2, of which a filter that knows the share r of the variance sees r².
+    are Gaussian (Isserlis). Of a gate it is -2, of which a filter that knows the share r of the variance
+    sees r².
     """
     force, time = pairs.x0[:, 1] - pairs.x0[:, 1].mean(), -1 / found.values[-1]
     seen = float((force**2).mean())
