@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
+from benchmarks.hostile.records import relaxation, telegraph
 from benchmarks.slow_forces import STEP, WITHIN, _simulated
 from siq.data.preparation import in_stretches
 from siq.data.recordings import Recordings
+from siq.inference.claims import _gaussian_force
 from siq.inference.field_estimate import read_field, write_field
 from siq.inference.kalman_identification import filtered_recordings
 from siq.inference.library import IdentificationOptions
@@ -58,3 +63,24 @@ def test_it_is_not_sought_where_hidden_states_are_switched_off() -> None:
     options = IdentificationOptions(degree=3, hidden_velocities=False)
     found = identify_run(PipelineSettings(identification=options), in_stretches(recordings), number=0).result
     assert found is not None and found.library.states == ("x",)
+
+
+@pytest.mark.parametrize(
+    ("kind", "share", "passed", "tested"),
+    [
+        ("noise", 1.0, True, True),
+        ("gate", 1.0, False, True),
+        ("gate", 0.6, False, True),
+        ("noise", 0.1, False, False),
+    ],
+)
+def test_a_gate_is_no_noise(kind: str, share: float, passed: bool, tested: bool) -> None:
+    """Of a force of unit variance a filter knows a share; what it does not know is left out of it."""
+    draw = np.random.default_rng(3)
+    times = STEP * np.arange(COUNT)
+    force = relaxation(draw, COUNT, TIME, step=STEP) if kind == "noise" else telegraph(draw, times, 2 * TIME)
+    known = share * force + np.sqrt(share * (1 - share)) * relaxation(draw, COUNT, TIME, step=STEP)
+    states = Recordings.from_arrays([times], [np.column_stack([force, known])], names=["x", "force_x"])
+    found: Any = SimpleNamespace(values=np.array([-1 / TIME]), noise_rate=2 / TIME * np.eye(2))
+    verdict = _gaussian_force(found, states, 1 / 160)
+    assert (verdict.passed, verdict.tested) == (passed, tested)
