@@ -141,8 +141,12 @@ def claims_of(found: Landscape, record: Record) -> list[Claim]:
 
     claims, noise, diffusion = [], found.noise, found.dynamics.diffusion
     wells = [place(one.position) for one in found.attractors]
+    estimate = found.field_estimate
+    # In the plane of a state and a slow force a barrier is no ``-log p`` of the state alone:
+    # `benchmarks.slow_forces` holds it against equations.
+    of_plane = estimate is not None and bool(getattr(estimate, "slow_force", 0.0))
     for way in found.transitions:
-        if noise is None or not np.isfinite(way.barrier):
+        if noise is None or not np.isfinite(way.barrier) or of_plane:
             continue
         height = way.barrier / noise.intensity
         error = np.hypot(

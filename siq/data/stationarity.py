@@ -131,12 +131,12 @@ def correlated_samples(values: np.ndarray, runs: list[slice]) -> float:
     longest = max(run.stop - run.start for run in runs)
     width = 1 << int(2 * longest - 1).bit_length()
     centred = values - values.mean()
-    products, counts = np.zeros(longest), np.zeros(longest)
+    power, counts = np.zeros(width // 2 + 1), np.zeros(longest)
     for run in runs:
-        part, size = centred[run], run.stop - run.start
-        power = np.abs(np.fft.rfft(part, n=width)) ** 2
-        products[:size] += np.fft.irfft(power, n=width)[:size]
+        size = run.stop - run.start
+        power += np.abs(np.fft.rfft(centred[run], n=width)) ** 2
         counts[:size] += np.arange(size, 0, -1)
+    products = np.fft.irfft(power, n=width)[:longest]
     # Beyond half of a run a mean is of hardly any samples.
     usable = max(longest // 2, 1)
     correlation = products[:usable] / np.maximum(counts[:usable], 1)

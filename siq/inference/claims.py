@@ -28,6 +28,10 @@ of the past alone, and then the products ``G z`` are martingale differences, wha
     The largest residual, and how many are beyond three; values, or steps, that repeat themselves more often
     than rounding lets them; and stretches that stand in the record twice.
 
+``gaussian_force``
+    Of a slow force that was not recorded: the fourth cumulant of what a filter knows of it. Where a gate with
+    two values would not show in that, it is not tested.
+
 Of the neighbouring residual `siq.inference.checks` judges, which knows sensors and rounding: what it explains
 is left out here, and the past begins two steps back.
 """
@@ -61,6 +65,8 @@ SHORTEST_MEMORY, MEMORY_GROWTH, LONGEST_MEMORY = 4, 2.0, 1 / 30  # samples; a ra
 OVERLAP = 0.02  # quantile between which, and one minus it, recordings share states
 SLIGHT_EXCESS = 0.25  # of the standard deviation of what all recordings explain: 1/160 becomes 1/80
 RANK = 1e-8  # numerical: of the squares of a column, what is left of it by chance
+FORGOTTEN = 3.0  # of its times, after which a filter has forgotten that it did not know the force at first
+POWER = 0.8  # probability with which a gate in the place of a slow force would have been noticed
 TAIL = 3.0  # standard deviations: beyond are 2.7 in 1000
 HARMLESS_CHANGE = 0.01  # of a barrier
 
@@ -82,7 +88,7 @@ class _Residuals:
             rest, force = (np.einsum("nij,nj->ni", whitening, one) for one in (rest, force))
         moved = np.sqrt(((pairs.xh - pairs.x0) ** 2 / pairs.h[:, None]).mean(axis=0))
         self.noisy = np.sqrt((rest**2).mean(axis=0)) > NOISELESS * moved
-        if found.hidden_velocities:  # there is one innovation for each position
+        if found.hidden_states:  # there is one innovation for each position
             self.noisy[found.library.dimension // 2 :] = False
         shares = (force**2).mean(axis=0)[self.noisy] / (rest**2).mean(axis=0)[self.noisy]
         self.drift = float(shares.max(initial=0.0))  # of the squares of steps, over that of the noise
@@ -193,12 +199,39 @@ def check_claims(
     else:
         pairs = snapshot_pairs(whole, pair_step=pair_step)
     rest = _Residuals(found, pairs)
+    slow = {"gaussian_force": _gaussian_force(found, states, false_alarms)} if found.slow_force else {}
     return {
         "one_system": _one_system(rest, whole.labels, false_alarms),
         "unchanged": _unchanged(rest, false_alarms),
         "state_complete": _state_complete(rest, false_alarms),
         "gaussian_increments": _gaussian(rest, measured, false_alarms),
+        **slow,
     }
+
+
+def _gaussian_force(found: FieldEstimate, states: Recordings, limit: float) -> Verdict:
+    """Whether a slow force that was not recorded is spread as noise spreads it, and no gate with two values.
+
+    The fourth cumulant of n values with the correlations ρ_k has the variance ``24/n Σ_k ρ_k⁴`` where they
+    are Gaussian (Isserlis). Of a gate it is -2, of which a filter that knows the share r of the variance
+    sees r².
+    """
+    time, begins = -1 / found.values[-1], np.searchsorted(states.recording, states.recording)
+    known = states.t - states.t[begins] > FORGOTTEN * time
+    force = states.values[known, 1]
+    if len(force) < FEWEST_PAIRS:
+        return Verdict.not_tested(sentence(Remark("inference.recordings_too_short")))
+    force, lasted = force - force.mean(), len(force) * float(np.median(np.diff(states.t)))
+    seen = float((force**2).mean())
+    share = min(seen / (found.noise_rate[1, 1] * time / 2), 1.0) if found.noise_rate[1, 1] else 1.0
+    error = np.sqrt(24 / max(2 * lasted / time, 1.0))
+    score = float(((force**4).mean() / seen**2 - 3) / error)
+    chance = 2 * float(scipy.special.ndtr(-abs(score)))
+    if chance >= limit and 2 * share**2 / error < -scipy.special.ndtri(limit / 2) - scipy.special.ndtri(
+        1 - POWER
+    ):
+        return Verdict.not_tested(sentence(Remark("inference.slow_force_unseen", {"share": share})))
+    return _verdict("gaussian_force", chance, limit)
 
 
 def _one_system(rest: _Residuals, labels: Sequence[str], limit: float) -> Verdict:

@@ -351,7 +351,13 @@ def process_noise_increments(found: FieldEstimate, pairs: SnapshotPairs, rest: n
         spread = found.flow.moments(found.dynamics.drift_of_components, *given)[1]
         lost = ~np.isfinite(spread).all(axis=(1, 2))
         spread[lost] = found.noise_rate * pairs.h[lost, None, None]
-        root = np.linalg.cholesky(found.noise_rate) @ np.linalg.inv(np.linalg.cholesky(spread))
+        try:
+            root = np.linalg.cholesky(found.noise_rate) @ np.linalg.inv(np.linalg.cholesky(spread))
+        except np.linalg.LinAlgError:
+            raise NumericalFailure(
+                "samples are so far apart that what the noise did between two of them cannot be worked out;"
+                " sample more often"
+            ) from None
         return np.asarray(np.einsum("nij,nj->ni", root, rest))
     step = found.dynamics.jacobian(pairs.x0) * (found.flow.response_share * pairs.h)[:, None, None]
     if not (np.abs(step) <= MAX_RELAXATION).all():

@@ -106,8 +106,8 @@ class FlowMap:
 
         def rates(mean: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             known = np.nan_to_num(spread, posinf=0.0, neginf=0.0)
-            try:
-                root = np.linalg.cholesky(known + least)
+            try:  # of one state a factor is a root, which takes a tenth of the time
+                root = np.sqrt(np.maximum(known + least, 0)) if d == 1 else np.linalg.cholesky(known + least)
             except np.linalg.LinAlgError:  # of a trial f
                 levels, vectors = np.linalg.eigh(known)
                 root = vectors * np.sqrt(np.maximum(levels, 0.0))[:, None, :]
@@ -502,9 +502,16 @@ class FieldEstimate:
         return noise.measurement**2
 
     @property
-    def hidden_velocities(self) -> bool:
-        """Whether half of the states are velocities that were not recorded."""
+    def hidden_states(self) -> bool:
+        """Whether half of the states were not recorded: velocities, or a slow force."""
         return self.diagnosis is not None and len(self.diagnosis.measurement) * 2 == self.library.dimension
+
+    @property
+    def slow_force(self) -> float:
+        """The factor of a slow force that was not recorded in ``dx/dt``; zero where there is none."""
+        if not self.hidden_states or not self.noise_rate[0, 0] > 0:
+            return 0.0
+        return float(self.coefficients[self.library.terms.index(self.library.symbols[1]), 0])
 
     @property
     def exposure(self) -> float | None:
@@ -525,6 +532,17 @@ class FieldEstimate:
             return noise.intensity, noise.intensity_error
         samples = noise.pairs * self.library.dimension
         return noise.intensity, noise.intensity * (2 / samples) ** 0.5 if samples else 0.0
+
+    def error_of_strength(self, x0: np.ndarray, h: np.ndarray) -> float:
+        """Standard error of ``ln ε`` by residuals of pairs from states ``(n, d)``, h apart.
+
+        The variance of n residuals of d states has the relative standard error ``√(2/nd)``. A step multiplies
+        it by about ``exp(h tr J/d)``, which is known as well as the divergence of f is.
+        """
+        d, (components, terms) = self.library.dimension, self.support.T
+        means = (self.library.evaluate(x0) * h[:, None]).mean(axis=0)
+        forgotten = means @ self.library.derivatives[:, components, terms] * 2 * self.flow.response_share / d
+        return float(np.sqrt(2 / (len(h) * d) + forgotten @ self.covariance @ forgotten))
 
     def bias(self, slopes: np.ndarray) -> np.ndarray:
         """By how much alternative terms move what follows from f, by its derivatives ``(..., q, d)``."""
@@ -626,8 +644,16 @@ class FieldEstimate:
 
     @property
     def standard_errors(self) -> np.ndarray:
-        """Shape ``(q, d)``: standard error of each coefficient, zero where there is no term."""
-        return _spread_out(self.library, self.support, np.sqrt(np.diag(self.covariance)))
+        """Shape ``(q, d)``: standard error of each coefficient, zero where there is no term.
+
+        What other terms leave open is a part of it: a term that was chosen for its size is smaller in the
+        mean over supports, and one that took the place of another might not be there.
+        """
+        variance = np.diag(self.covariance).copy()
+        if self.alternatives is not None:
+            (components, terms), (bias, spread) = self.support.T, self.alternatives
+            variance += bias[terms, components] ** 2 + (spread[:, terms, components] ** 2).sum(axis=0)
+        return _spread_out(self.library, self.support, np.sqrt(variance))
 
 
 def _spread_out(library: CandidateLibrary, support: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -650,7 +676,7 @@ def write_field(path: str | Path, estimate: FieldEstimate, options: Identificati
     """Write an estimate whole or not at all, as `vector_field.json` is documented."""
     library, average = estimate.library, estimate.alternatives
     shares = [None] * len(estimate.support) if estimate.stability is None else estimate.stability.tolist()
-    errors = np.sqrt(np.diag(estimate.covariance))
+    errors = estimate.standard_errors[estimate.support[:, 1], estimate.support[:, 0]]
     terms = zip(estimate.support, estimate.values, errors, shares, strict=True)
     data = {
         "states": list(library.states),

@@ -13,6 +13,7 @@ constant one cannot be held; else the unit matrix. Last, f is tested on held-out
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -165,7 +166,8 @@ def identify(
                     return by_velocities
                 reason = "; ".join(one for one in (found.prediction.reason, advice) if one)
                 found = replace(found, prediction=replace(found.prediction, passed=False, reason=reason))
-        return found
+        by_force = None if hidden else case.with_slow_force(found)
+        return by_force or found
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         reason, claim = (str(error), error.claim) if isinstance(error, NumericalFailure) else (SINGULAR, "")
         rounding = rounding_text(recordings, coarse=True)
@@ -180,6 +182,8 @@ def identify(
         advice = case.advice(hidden=hidden)
         if not hidden and advice is not None and (by_velocities := case.with_velocities()) is not None:
             return by_velocities
+        if not hidden and not claim and (by_force := case.with_slow_force()) is not None:
+            return by_force
         raise NumericalFailure(reason if advice is None else f"{reason}; {advice}", claim=claim) from error
 
 
@@ -282,7 +286,7 @@ class _Case:
         assert noise is not None and noise.measurement_error is not None
         forced = bool(found.noise_rate.any())
         different = len({unit for unit in self.units if unit}) > 1
-        if found.hidden_velocities and not forced and different:
+        if found.hidden_states and not forced and different:
             raise NumericalFailure(
                 "no process noise is seen that would show D, and the positions have different units, so that"
                 " no unit matrix can stand for it; scale them to one unit"
@@ -290,7 +294,15 @@ class _Case:
         sizes = zip(noise.measurement, self.recordings.titles, strict=True)
         sensors = [{"size": float(size), "state": name} for size, name in sizes]
         remarks = [Remark("inference.measurement_noise", {"sensors": sensors})]
-        if found.hidden_velocities:
+        if found.slow_force:
+            time, slope = float(-1 / found.values[-1]), float(np.sqrt(found.covariance[-1, -1]))
+            values = {
+                "state": self.recordings.titles[0], "name": found.library.states[1], "time": time,
+                "error": slope * time**2, "unit": self.recordings.time_unit or "", "sensors": sensors,
+                "noise": bool(found.noise_rate[1, 1]),
+            }  # fmt: skip
+            remarks, source = [Remark("inference.slow_force", values)], DiffusionSource.ESTIMATED
+        elif found.hidden_states:
             remarks = [Remark("inference.hidden_velocities", {"sensors": sensors, "process_noise": forced})]
             source = DiffusionSource.OF_VELOCITIES if forced else DiffusionSource.UNIT_OF_VELOCITIES
         else:
@@ -377,7 +389,11 @@ class _Case:
 
         def diagnosed(found: FieldEstimate, source: DiffusionSource) -> FieldEstimate:
             noise = residual_noise(found, self.recordings, pair_step=self.pair_step)
-            return replace(found, diagnosis=replace(noise, diffusion=source, pairs=count))
+            noise = replace(noise, diffusion=source, pairs=count)
+            if noise.kind == "process":
+                share = found.error_of_strength(everything.x0, everything.h)
+                noise = replace(noise, intensity_error=noise.intensity * share)
+            return replace(found, diagnosis=noise)
 
         if self.given is not None:
             given = with_given_noise(found, everything, self.given, false_terms=false_terms)
@@ -442,6 +458,46 @@ class _Case:
         except (NumericalFailure, np.linalg.LinAlgError):
             return None
         return found if found.prediction is not None and found.prediction.passed else None
+
+    def with_slow_force(self, alone: FieldEstimate | None = None) -> FieldEstimate | None:
+        """f with a slow force on the one recorded state; None where none is needed, or it does not do.
+
+        It is tried where f `alone` fails its test or is refuted by the past, which tells more of the next
+        sample than the state does; or where there is none. It has to take that away, and to foresee
+        recordings that were held out better than f alone. First the force has noise alone, then it follows
+        the state.
+        """
+        if self.options.hidden_velocities != "auto" or self.given is not None or self.integrator_step:
+            return None
+        if len(self.recordings.names) != 1 or (alone is not None and alone.noise_free):
+            return None
+        if alone is None:
+            if not markov_lag(joined(self.recordings)).remembers:
+                return None
+        elif alone.prediction is not None and alone.prediction.passed and self._forgets(alone):
+            return None
+        names = (*self.recordings.names, f"force_{self.recordings.names[0]}")
+        library = field_library(names, self.options)
+        view = ObservationModel(library, Diffusion.identity(2), hidden=True, slow_force=1.0)
+        for follows in (False, True):
+            with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
+                found = self.finished(self.by_likelihood(replace(view, follows=follows)))
+                assert found.prediction is not None
+                gain = ObservationModel.of(found).gain(
+                    found, self.training, self.held_out, pair_step=self.pair_step
+                )
+                if gain > 0 and found.prediction.passed and self._forgets(found):
+                    return found
+        return None
+
+    def _forgets(self, found: FieldEstimate) -> bool:
+        """Whether the past tells nothing more of the next sample than the state does."""
+        states = self.recordings
+        if found.sensor_variance is not None or found.hidden_states:
+            states = filtered_recordings(found, states, pair_step=self.pair_step)
+        limit = self.limits.each
+        claims = check_claims(found, states, self.recordings, pair_step=self.pair_step, false_alarms=limit)
+        return claims["state_complete"].passed
 
     def advice(self, *, hidden: bool) -> str | None:
         """Advice where a recorded position has inertia, or hidden velocities are not needed."""

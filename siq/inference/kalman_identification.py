@@ -18,6 +18,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from scipy.special import ndtr, ndtri
 
 from siq.data.recordings import Recordings, parent_recordings
 from siq.data.stationarity import runs_of
@@ -47,9 +48,10 @@ from siq.systems.dynamics import Dynamics
 LAGS = (1, 2, 3)  # steps over which innovations are compared: what is correlated at all is so over these
 DIFFUSION_ROUNDS = 2  # of D by the trajectories of f, and f by the weights of D
 LIBRARY_ROUNDS = 8  # of the fit of a whole library, which only chooses terms
+SENSOR_BEGIN = 1e-3  # of what a sample moves by, squared
 NO_SENSOR_NOISE = 1e-6  # of a sensor's variance: as good as none
 MAX_NUMBERS = 4e8  # of the derivatives by all coefficients at all samples: 3 GB
-KNOWN_EQUATIONS = 2.0  # with hidden velocities half hold by definition: no false term comes into them
+SHORTEST_FORCE, LONGEST_FORCE = 4, 1 / 30  # steps; of a record: correlation times that a search begins with
 
 
 def identify_by_likelihood(
@@ -91,14 +93,20 @@ def identify_by_likelihood(
             f"{len(everything)} coefficients and {len(data.t)} samples with measurement noise are too much"
             " for the memory; lower identification.degree, or name the functions of f"
         )
-    if hidden:
+    begins = []
+    if observation.slow_force:
+        begins = _forced(observation, data)
+    elif hidden:
         x, noise = smoothed_motion(data, library.states[: d // 2])
         if not noise.process.any():
             raise NumericalFailure("no force is seen: the positions move evenly; record longer")
+        begins = [(np.zeros(len(everything)), x, noise)]
     else:
         assert noise is not None
-        x, noise = observation.states(data), observation.noise(replace(noise, shape=np.eye(d)[None]))
-    whole = _fit_library(observation.model(everything, np.zeros(len(everything))), data, x, noise)
+        noise = observation.noise(replace(noise, shape=np.eye(d)[None]))
+        begins = [(np.zeros(len(everything)), observation.states(data), noise)]
+    wholes = [_fit_library(observation.model(everything, one), data, x, noise) for one, x, noise in begins]
+    whole = max(wholes, key=lambda one: one.log_likelihood)
     likelihood = None if hidden else InnovationLikelihood(library.symbols, whole, data)
     chance = 1.0 if likelihood is None else likelihood.constant_probability()
     by_state = chance < false_terms and bool(whole.noise.process.any())
@@ -107,8 +115,9 @@ def identify_by_likelihood(
         formula, sensor, _ = likelihood.selected(false_terms=false_terms, probability=chance)
         noise = observation.noise(Noise(sensor, np.ones(d), field=formula.diffusion(1.0)))
         whole = _fit_library(whole.model, data, whole.linearised_at, noise)
-    share = min(KNOWN_EQUATIONS * false_terms, 0.5) if hidden else false_terms
-    critical = np.tile(critical_values(library, false_terms=share), len(everything) // library.size)
+    # What holds by definition brings no false term: the others share their probability.
+    chance = ndtr(-critical_values(library, false_terms=false_terms)[everything[:, 1]])
+    critical = -ndtri(chance * min(false_terms, 0.5) / (2 * chance.sum()))
     white = whiten(whole.linearisation, data, whole.noise)
     last = white.solve()[0] if whole.converged else 0.0
     goal = white.innovations + white.columns @ (whole.model.values - last)
@@ -134,6 +143,8 @@ def identify_by_likelihood(
     if by_state:
         found = _with_formula(observation, support, fit, data, false_terms=false_terms, probability=chance)
     else:
+        if observation.slow_force and not (fit.noise.process[0] and fit.model.values[-1] < 0):
+            raise NumericalFailure("the slow force is all the noise that there is, or grows")
         if hidden:  # the search for intensities ends at the least that it tries; of ring-downs there are none
             fit = drop_insignificant_process_noise(fit, data) or fit
         else:
@@ -148,7 +159,29 @@ def identify_by_likelihood(
     shares = stability(parts, lambda triangle: [problem_of(triangle)], support, generator=generator)
     shares = np.append(np.ones(len(observation.definitions)), shares)
     average = model_average([problem], support, library)
+    if observation.slow_force:  # in the unit of the estimate
+        of_state = library.terms.index(library.symbols[0])
+        average[0][of_state, 1] /= found.slow_force
+        average[1][:, of_state, 1] /= found.slow_force
     return replace(found, alternatives=average, stability=shares)
+
+
+def _forced(observation: ObservationModel, data: Measurements) -> list[tuple[np.ndarray, np.ndarray, Noise]]:
+    """Coefficients ``(p,)``, states and noise to begin with, for some correlation times of a slow force.
+
+    The likelihood has a maximum where the force is white noise, and others. To begin with it moves the state
+    as much within its correlation time as the white noise does.
+    """
+    moved, step = moved_by(data)
+    rate, x = moved[0] / step, observation.states(data)
+    longest = len(data.t) / len(data.labels) * len(np.unique(parent_recordings(data.labels))) * LONGEST_FORCE
+    count = max(int(np.log2(max(longest / SHORTEST_FORCE, 1.0)) / 2) + 1, 1)
+    found = []
+    for time in SHORTEST_FORCE * step * 4.0 ** np.arange(count):
+        values = np.zeros(len(observation.everything))
+        values[-1] = -1 / time
+        found.append((values, x, Noise(SENSOR_BEGIN * moved, np.array([rate, rate / time**2]))))
+    return found
 
 
 def _fit_library(model: Dynamics, data: Measurements, x: np.ndarray, noise: Noise) -> Fit:
@@ -166,6 +199,7 @@ def _estimate(
     sensor_error: np.ndarray,
     process_error: np.ndarray,
     covariance: np.ndarray,
+    joint: np.ndarray | None = None,
 ) -> FieldEstimate:
     """The estimate of a fit whose noise has known errors; see `noise_uncertainty`."""
     library, diffusion, d = observation.library, observation.diffusion, observation.library.dimension
@@ -173,6 +207,9 @@ def _estimate(
     rate = (intensity[0] if len(intensity) == 1 else intensity[data.begins].mean(axis=0))[:d, :d]
     moved, step = moved_by(data)
     strength, evidence, driven = 0.0, None, slice(observation.hidden_states, d)
+    values, known = fit.model.values, observation.definitions
+    whole, held = np.zeros((len(known) + len(support),) * 2), np.ones(len(known))
+    whole[len(known) :, len(known) :] = covariance
     if observation.hidden:
         # The part of D that acts on velocities has the determinant 1.
         force, matrix = rate[driven, driven], np.zeros((d, d))
@@ -180,7 +217,8 @@ def _estimate(
         matrix[driven, driven] = (force + force.T) / 2 / strength if force.any() else np.eye(len(force))
         diffusion = Diffusion(matrix)
         # What is not foreseen from a sample to the next: twice the sensor's noise, and what noise makes of v.
-        ratio = float(np.sqrt(((2 * sensor + np.diag(force) * step**3 / 3) / moved).mean()))
+        here, there = np.split(np.diag(rate), 2)
+        ratio = float(np.sqrt(((2 * sensor + here * step + there * step**3 / 3) / moved).mean()))
     else:
         strength = diffusion.intensity(rate) if diffusion.constant else 0.0
         ratio = float(np.sqrt(((np.diag(rate) * step + 2 * sensor) / positive(moved)).mean()))
@@ -189,9 +227,24 @@ def _estimate(
         likelihood = partial(fit.linearisation.log_likelihood, data.first, data.step)
         base = max(likelihood(without.scaled(factor)) for factor in factors)
         evidence = 2 * (likelihood(fit.noise) - base)
-    known = observation.definitions
-    whole = np.zeros((len(known) + len(support),) * 2)
-    whole[len(known) :, len(known) :] = covariance
+    if observation.slow_force and joint is not None:
+        # Its unit is such that noise moves it as it moves the state: D is known then, and the size of the
+        # force a coefficient. Without noise of its own, such that it follows the state.
+        on_state, on_force = np.diag(rate)
+        size = float(np.sqrt(on_force / on_state)) if on_force else -float(values[-1])
+        follows = (support[:, 0] == 1) & (support[:, 1] != support[-1, 1])
+        values, held = np.where(follows, values / size, values), np.array([size])
+        slopes = np.zeros((len(whole), len(joint)))
+        slopes[1:, :-2] = np.diag(np.where(follows, 1 / size, 1.0))
+        if on_force:
+            slopes[:, -1] = np.append(size, np.where(follows, -values, 0.0)) / 2
+            slopes[:, -2] = -slopes[:, -1]
+        whole = slopes @ joint @ slopes.T
+        rate, diffusion = (
+            np.diag([on_state, on_state if on_force else 0.0]),
+            Diffusion(np.diag([1.0, float(on_force > 0)])),
+        )
+        strength, driven = float(on_state), slice(0, 1)
     correlation, score = _strongest_correlation(whiten(fit.linearisation, data, fit.noise), data)
     error = strength * float(np.sqrt((process_error[driven] ** 2).sum())) / len(process_error[driven])
     deviation = np.sqrt(sensor)
@@ -205,7 +258,7 @@ def _estimate(
     if diagnosis.correlated:
         diagnosis = replace(diagnosis, kind="coloured")
     return FieldEstimate.on_support(
-        library, np.concatenate([known, support]), np.append(np.ones(len(known)), fit.model.values), whole,
+        library, np.concatenate([known, support]), np.append(held, values), whole,
         rate, ratio, FlowMap(fit.substeps), diffusion, diagnosis=diagnosis,
     )  # fmt: skip
 
@@ -252,17 +305,6 @@ def _strongest_correlation(white: Whitened, data: Measurements) -> tuple[float, 
     return float(correlation), float(score)
 
 
-def _follow(
-    observation: ObservationModel, data: Measurements, model: Dynamics, *, noise: Noise, substeps: int
-) -> Fit:
-    """The filter along recordings, with f and both noises as they are."""
-    still = replace(model, parameters=tuple(replace(each, fixed=True) for each in model.parameters))
-    return fit_by_filter(
-        still, data, x=observation.states(data), noise=noise, estimate_process=False, estimate_sensor=False,
-        substeps=substeps,
-    )  # fmt: skip
-
-
 def held_out_innovations(
     found: FieldEstimate, training: Recordings, unseen: Recordings, *, pair_step: float | None = None
 ) -> tuple[float, float]:
@@ -277,7 +319,7 @@ def held_out_innovations(
     own, other = (observation.measured(each, pair_step) for each in (training, unseen))
     begin = observation.states(own)
     fit = observation.fitted(support, values, own, noise=observation.noise_of(found), x=begin)
-    follow = _follow(observation, other, fit.model, noise=fit.noise, substeps=fit.substeps)
+    follow = observation.followed(other, fit.model, noise=fit.noise, substeps=fit.substeps)
     everything = observation.everything
     values = np.zeros(len(everything))
     values[[everything.tolist().index(one) for one in support.tolist()]] = fit.model.values
@@ -298,7 +340,7 @@ def of_all_states(
     recordings: Recordings, found: FieldEstimate, *, pair_step: float | None = None
 ) -> Recordings:
     """The recordings, with the velocities of an estimate that were not recorded among their states."""
-    hidden = found.hidden_velocities
+    hidden = found.hidden_states
     return filtered_recordings(found, recordings, pair_step=pair_step) if hidden else recordings
 
 
@@ -314,7 +356,7 @@ def filtered_recordings(
     data = observation.measured(recordings, pair_step)
     count = observation.library.dimension - observation.hidden_states
     model, noise = observation.model(*observation.unknown(found)), observation.noise_of(found)
-    follow = _follow(observation, data, model, noise=noise, substeps=found.flow.steps)
+    follow = observation.followed(data, model, noise=noise, substeps=found.flow.steps)
     runs, every = runs_of(recordings, longest=pair_step), observation.every(recordings)
     rows = np.concatenate([np.arange(run.start, run.stop, every) for run in runs])
     states = follow.linearised_at[~np.isnan(data.outputs).all(axis=1)]
@@ -332,6 +374,7 @@ def filtered_recordings(
 
     time = bracketed(seen.time_unit or "1")
     per_time = [None if unit is None else f"{bracketed(unit)}/{time}" for unit in seen.units]
+    per_time = list(seen.units) if observation.slow_force else per_time
     headings = (*seen.titles, *found.library.states[count:]) if seen.headings else ()
     units = (*seen.units, *per_time)
     return replace(seen, names=found.library.states, units=units, headings=headings, values=states)

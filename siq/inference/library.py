@@ -282,7 +282,8 @@ class IdentificationOptions:
     hidden_velocities
         Whether the recorded states are positions whose velocities were not recorded. These are states then,
         too, called ``v_x`` for a position x, and f says how forces change them. ``"auto"``: where one
-        position was recorded, its inertia is seen, and f of the position alone is refuted.
+        position was recorded, its inertia is seen, and f of the position alone is refuted; and where it is
+        refuted otherwise, a slow force that was not recorded is tried, ``force_x``.
     """
 
     degree: Annotated[int, Field(ge=1, le=12)] = 5

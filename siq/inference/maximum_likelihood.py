@@ -197,12 +197,13 @@ def _corrected(
     return moved if whole(moved) <= middle else _lowest(whole, vector, bounds)
 
 
-def noise_uncertainty(fit: Fit, data: Measurements) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def noise_uncertainty(fit: Fit, data: Measurements) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Errors of the noise of a fit, by the curvature of the likelihood along its trajectories.
 
     Standard errors of the logarithms of the sensors' variances ``(m,)``, and of the intensities of the
     process noise ``(d,)``: infinite where one is only bounded from above, zero where it was given. And the
-    covariance of the free parameters ``(p, p)``, with what the noise leaves open in them.
+    covariance of the free parameters ``(p, p)``, with what the noise leaves open in them; and of these with
+    the logarithms of the intensities behind them, ``(p + d, p + d)``.
     """
     known, line, driven = data.known_sensors, fit.linearisation, fit.noise.driven
     outputs, size = len(known), fit.noise.coordinates
@@ -230,16 +231,26 @@ def noise_uncertainty(fit: Fit, data: Measurements) -> tuple[np.ndarray, np.ndar
     errors = np.full(size, np.inf)
     errors[:outputs][known] = 0.0
     inside = [place for place, seen in zip(places, told, strict=True) if seen]
-    covariance = fit.covariance
+    covariance, together = fit.covariance, np.zeros((size, size))
+    slopes = np.zeros((len(covariance), size))
     if inside:
-        of_noise = np.linalg.pinv(curvature[np.ix_(told, told)], hermitian=True)
-        errors[inside] = np.sqrt(np.maximum(np.diag(of_noise), 0.0))
         ends = [[whiten(line, data, moved((one, step))).solve()[0] for step in (h, -h)] for one in inside]
         slope = np.stack([(up - down) / (2 * h) for up, down in ends], axis=1)
+        # The parameters follow the noise, and what they take over is not told of it.
+        followed = slope.T @ np.linalg.pinv(covariance, hermitian=True) @ slope
+        levels, ways = np.linalg.eigh(curvature[np.ix_(told, told)] - followed)
+        of_noise = (ways / np.maximum(levels, 1 / MAX_ERROR**2)) @ ways.T
+        errors[inside] = np.sqrt(np.diag(of_noise))
+        together[np.ix_(inside, inside)], slopes[:, inside] = of_noise, slope
         covariance = covariance + slope @ of_noise @ slope.T
-    process = np.zeros_like(fit.noise.process)
+    process, count = np.zeros_like(fit.noise.process), len(covariance)
     process[driven] = errors[outputs : outputs + len(driven)]
-    return errors[:outputs], process, covariance
+    own, joint = slice(outputs, outputs + len(driven)), np.zeros((count + len(process),) * 2)
+    joint[:count, :count] = covariance
+    joint[:count, count + driven] = (slopes @ together)[:, own]
+    joint[count + driven, :count] = joint[:count, count + driven].T
+    joint[np.ix_(count + driven, count + driven)] = together[own, own]
+    return errors[:outputs], process, covariance, joint
 
 
 def _noise_along(

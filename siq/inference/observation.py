@@ -15,6 +15,10 @@ Or samples show positions, and the second half of the states are velocities of w
 ``dv/dt = f(x, v)``. Differences of positions are no velocities: measurement noise is divided by the
 step in them, and what they leave is coloured.
 
+Or one state was recorded and a slow force z on it was not, which may follow it,
+
+    dx = (f(x) + z) dt + noise,    dz = (-z/τ + b x) dt + noise.
+
 Whether a recorded position has inertia, so that it alone is not the state, is asked of two models with the
 same functions F and measurement noise of their own:
 
@@ -116,44 +120,58 @@ class ObservationModel:
     """The relation of samples to the states of f.
 
     A sample may be a mean over an exposure. Where velocities are hidden they are the second half of the
-    states, and samples show nothing of them.
+    states, and samples show nothing of them. What is hidden may be a slow force instead, which is added to
+    ``dx/dt`` times a factor that is known, `slow_force`; it may follow the state, or has noise alone.
     """
 
     library: CandidateLibrary
     diffusion: Diffusion
     exposure: float | None = None
     hidden: bool = False
+    slow_force: float = 0.0
+    follows: bool = False
 
     @classmethod
     def of(cls, found: FieldEstimate) -> ObservationModel:
         """The one that an estimate was made with."""
-        return cls(found.library, found.diffusion, found.exposure, found.hidden_velocities)
+        library, slow = found.library, found.slow_force
+        follows = bool(slow) and found.coefficients[library.terms.index(library.symbols[0]), 1] != 0
+        return cls(library, found.diffusion, found.exposure, found.hidden_states, slow, follows)
 
     @property
     def hidden_states(self) -> int:
-        """Number of velocities that are not measured, and of components of f that hold by definition."""
+        """Number of states that are not measured."""
         return self.library.dimension // 2 if self.hidden else 0
 
     @property
     def everything(self) -> np.ndarray:
         """Component and term of every coefficient that is not known beforehand, shape ``(p, 2)``."""
-        return all_coefficients(range(self.hidden_states, self.library.dimension), self.library.size)
+        if not self.slow_force:
+            return all_coefficients(range(self.hidden_states, self.library.dimension), self.library.size)
+        (x, z), terms = self.library.symbols, self.library.terms
+        of_state = [(0, k) for k, term in enumerate(terms) if z not in term.free_symbols]
+        of_force = [(1, terms.index(one)) for one in ((x, z) if self.follows else (z,))]
+        return np.array([*of_state, *of_force])
 
     @property
     def definitions(self) -> np.ndarray:
-        """Component and term of each ``dx/dt = v``, shape ``(d/2, 2)``; none where nothing is hidden."""
+        """Component and term of each v in ``dx/dt``, shape ``(d/2, 2)``; none where nothing is hidden."""
         velocities = self.library.symbols[len(self.library.symbols) - self.hidden_states :]
         places = [self.library.terms.index(one) for one in velocities]
         return np.array(list(enumerate(places)), dtype=int).reshape(-1, 2)
 
     def unknown(self, found: FieldEstimate) -> tuple[np.ndarray, np.ndarray]:
         """The terms of an estimated f that are fitted, and their coefficients."""
-        fitted = found.support[:, 0] >= self.hidden_states
+        fitted = ~(found.support[:, None] == self.definitions).all(axis=2).any(axis=1)
         return found.support[fitted], found.values[fitted]
 
     def model(self, support: np.ndarray, values: np.ndarray) -> Dynamics:
         """Dynamics with the coefficients of a support as parameters, as they are measured."""
         plain = field_dynamics(self.library, support, values, diffusion=self.diffusion)
+        if self.slow_force:
+            z = plain.symbols[1]
+            forced = (plain.equations[0] + self.slow_force * z, plain.equations[1])
+            return replace(plain, equations=forced, outputs=plain.outputs[:1])
         if self.hidden:
             return _seen_positions(plain)
         if self.exposure is None:
@@ -210,6 +228,8 @@ class ObservationModel:
 
     def states(self, data: Measurements) -> np.ndarray:
         """States of the model to begin with, as they are measured next."""
+        if self.slow_force:
+            return np.column_stack([data.outputs, np.zeros(len(data.t))])
         if self.hidden:
             return smoothed_motion(data, self.library.states[: self.hidden_states])[0]
         unknown = np.isnan(data.outputs).any(axis=1)
@@ -229,6 +249,38 @@ class ObservationModel:
                 " often"
             )
         return fit
+
+    def followed(self, data: Measurements, model: Dynamics, *, noise: Noise, substeps: int) -> Fit:
+        """The filter along recordings, with f and both noises as they are."""
+        still = replace(model, parameters=tuple(replace(each, fixed=True) for each in model.parameters))
+        return fit_by_filter(
+            still, data, x=self.states(data), noise=noise, estimate_process=False, estimate_sensor=False,
+            substeps=substeps,
+        )  # fmt: skip
+
+    def gain(
+        self, found: FieldEstimate, training: Recordings, unseen: Recordings, *, pair_step: float | None
+    ) -> float:
+        """Log-likelihood of unseen recordings with a slow force, over that without, both fitted to others.
+
+        Without it f has the same functions of the state.
+        """
+        support, values = self.unknown(found)
+        model, noise = self.model(support, values), self.noise_of(found)
+        without = model.equations[0] - self.slow_force * model.symbols[1]
+        of_state = tuple(model.parameters[place] for place in np.flatnonzero(support[:, 0] == 0))
+        alone = Dynamics(model.states[:1], (without,), Diffusion.identity(1), parameters=of_state)
+        views = (
+            (self, model, noise),
+            (replace(self, hidden=False, slow_force=0.0), alone, Noise(noise.measurement, noise.process[:1])),
+        )
+        likelihoods = []
+        for view, begin, level in views:
+            own, other = (view.measured(each, pair_step) for each in (training, unseen))
+            fit = fit_by_filter(begin, own, x=view.states(own), noise=level)
+            follow = view.followed(other, fit.model, noise=fit.noise, substeps=fit.substeps)
+            likelihoods.append(follow.log_likelihood)
+        return likelihoods[0] - likelihoods[1]
 
 
 def moved_by(data: Measurements) -> tuple[np.ndarray, float]:

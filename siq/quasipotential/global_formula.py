@@ -26,6 +26,7 @@ from siq.quasipotential.hamilton_jacobi import HamiltonJacobi, LibraryBasis
 
 MIN_PROBABILITY = 1e-4  # a probability below which no orthogonal fit is believed
 FIT_POINTS = 400  # where ∇V·g is asked to vanish in a joint fit
+EXACT = 1e-6  # numerical, of a coefficient: the error of one that holds by definition
 MAX_STEPS = 50  # of it
 RANK_TOLERANCE = 1e-7  # singular values below this share of the largest are no constraint of their own
 
@@ -273,8 +274,10 @@ def _fit_orthogonal(
         return np.concatenate([product, absent @ theta]), np.concatenate([slope, absent])
 
     theta = np.concatenate([potential[of_potential], circulatory.T[of_circulatory]])
+    variance = np.diag(found.covariance)
+    exact = np.where(variance > 0, 0.0, (EXACT * found.values) ** 2)  # such as that of v in dx = v dt
     whiten = scipy.linalg.solve_triangular(
-        np.linalg.cholesky(found.covariance), np.eye(len(found.support)), lower=True
+        np.linalg.cholesky(found.covariance + np.diag(exact)), np.eye(len(found.support)), lower=True
     )
     # Coefficients in units of what each of them does to f, so that the units of the states do not matter.
     design = whiten @ whole[components, functions] / scale

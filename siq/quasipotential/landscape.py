@@ -327,7 +327,7 @@ class Landscape:
     @property
     def rung(self) -> int:
         """The rung of the ladder of answers, see `siq.quasipotential.certificate.Certificate.rung`."""
-        hidden = self.field_estimate is not None and self.field_estimate.hidden_velocities
+        hidden = self.field_estimate is not None and self.field_estimate.hidden_states
         return Certificate.rung(self.certificate, self.recorded_states, hidden=hidden)
 
     @property

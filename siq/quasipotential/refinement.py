@@ -288,7 +288,7 @@ class RefinementContext:
         self.options = refinement.with_routes(networks=networks is not None)
         mask = recordings.held_out(generator=generator(seed, number, Purpose.HOLD_OUT))
         self.measured, self.pair_step = recordings, pair_step
-        if found.sensor_variance is not None or found.hidden_velocities:
+        if found.sensor_variance is not None or found.hidden_states:
             # Of measured values the increments do not have the mean of f.
             recordings = filtered_recordings(found, recordings, pair_step=pair_step)
         pairs = snapshot_pairs(recordings, pair_step=pair_step)
@@ -348,7 +348,7 @@ class RefinementContext:
         found, recordings = self.found, self.recordings
         parents = parent_recordings(recordings.labels)
         second = np.searchsorted(np.unique(parents), parents) % 2 == 1
-        if found.noise_free or found.hidden_velocities or second.all() or not second.any():
+        if found.noise_free or found.hidden_states or second.all() or not second.any():
             return [(found, np.ones(len(second), dtype=bool))]
         halves = []
         for mask in (second, ~second):

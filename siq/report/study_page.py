@@ -86,7 +86,7 @@ class StudyResults:
         """Of the ladder of answers, see `siq.quasipotential.certificate.Certificate.rung`."""
         found = self.certificates.get(str(self.shown[1]))
         certificate = Certificate.from_data(found) if found and found.get("tests") else None
-        hidden = self.record is not None and self.record.hidden_velocities
+        hidden = self.record is not None and self.record.hidden_states
         return Certificate.rung(certificate, self.seen, hidden=hidden)
 
     def table(self, name: str) -> pd.DataFrame | None:

@@ -61,7 +61,7 @@ def test_coefficients_and_both_noises_are_found(ratio: float) -> None:
     sensor = ratio * FORCES * STEP
     fit, data = fitted(double_well(7, sensor=sensor, samples=2500), sensor=sensor)
     assert fit.converged
-    measurement, process, covariance = noise_uncertainty(fit, data)
+    measurement, process, covariance, _ = noise_uncertainty(fit, data)
     errors = np.sqrt(np.diag(covariance))
     assert (np.abs(fit.model.values - WELLS) < 3.5 * errors).all()
     assert (errors >= fit.standard_errors * (1 - 1e-9)).all()

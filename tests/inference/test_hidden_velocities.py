@@ -94,7 +94,7 @@ def test_it_is_kept_in_a_file(tmp_path: Path) -> None:
     assert done.result is not None
     write_field(tmp_path / "field.json", done.result, SETTINGS.identification)
     again = read_field(tmp_path / "field.json")
-    assert again is not None and again.hidden_velocities
+    assert again is not None and again.hidden_states
     assert again.diffusion_source == DiffusionSource.OF_VELOCITIES
     assert str(DiffusionSource.OF_VELOCITIES.note) in done.outcome.reason
     np.testing.assert_array_equal(again.coefficients, done.result.coefficients)

@@ -70,7 +70,7 @@ def test_it_is_of_one_position() -> None:
 def test_a_position_with_inertia_gets_a_velocity() -> None:
     settings = PipelineSettings(identification=IdentificationOptions(degree=3))
     done = pipeline.identify_run(settings, particle(1, records=4)[0], number=0)
-    assert done.outcome.status is Status.OK and done.result is not None and done.result.hidden_velocities
+    assert done.outcome.status is Status.OK and done.result is not None and done.result.hidden_states
     assert "velocities were not recorded" in done.outcome.reason
 
 

@@ -18,7 +18,8 @@ CODES = {
     if file.name != "remarks.py"
     for code in re.findall(r"\bRemark\(\s*\"([\w.]+)\"", file.read_text(encoding="utf-8"))
 } | {
-    f"inference.not_{claim}" for claim in ("one_system", "unchanged", "state_complete", "gaussian_increments")
+    f"inference.not_{claim}"
+    for claim in ("one_system", "unchanged", "state_complete", "gaussian_increments", "gaussian_force")
 }
 
 
