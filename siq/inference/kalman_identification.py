@@ -99,7 +99,7 @@ def identify_by_likelihood(
         assert noise is not None
         x, noise = observation.states(data), observation.noise(replace(noise, shape=np.eye(d)[None]))
     whole = _fit_library(observation.model(everything, np.zeros(len(everything))), data, x, noise)
-    likelihood = None if hidden else InnovationLikelihood(library.symbols, whole, data)
+    likelihood = None if hidden else InnovationLikelihood(library, whole, data)
     chance = 1.0 if likelihood is None else likelihood.constant_probability()
     by_state = chance < false_terms and bool(whole.noise.process.any())
     if likelihood is not None and by_state:
@@ -222,7 +222,7 @@ def _with_formula(
     """The estimate of a fit whose process noise depends on the state, once f and D know of each other."""
     symbols = observation.library.symbols
     for _ in range(DIFFUSION_ROUNDS):
-        likelihood = InnovationLikelihood(symbols, fit, data)
+        likelihood = InnovationLikelihood(observation.library, fit, data)
         formula, sensor, covariance = likelihood.selected(false_terms=false_terms, probability=probability)
         noise = observation.noise(Noise(sensor, np.ones(len(symbols)), field=formula.diffusion(1.0)))
         fit = observation.fitted(

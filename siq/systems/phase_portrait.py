@@ -291,10 +291,9 @@ def _at_home(cover: PhasePortrait, dynamics: Dynamics) -> PhasePortrait:
     numbers = np.full(len(settled) + 1, -1)
     numbers[home] = np.arange(len(home))
     ends, starts = cover.descents.ends, cover.descents.paths[:, 0]
-    descents = replace(
-        cover.descents, ends=numbers[ends], escaped=cover.descents.escaped | ((ends >= 0) & (numbers[ends] < 0))
-    )  # fmt: skip
     begun = ~dynamics.turns(starts).any(axis=1)
+    away = (numbers[ends] < 0) & ((ends >= 0) | ~begun)
+    descents = replace(cover.descents, ends=numbers[ends], escaped=cover.descents.escaped | away)
     middle, last = ends[begun], cover.descents.paths[begun, -1]
     remarks, gone = list(cover.remarks), (last < cover.box[:, 0]) | (last > cover.box[:, 1])
     running = (gone & (dynamics.periods > 0)).any(axis=1) & cover.descents.escaped[begun]
