@@ -241,6 +241,8 @@ class _Case:
         noise = Noise(share * variance, rate * (1 - 2 * share))
         try:
             again = self.by_likelihood(ObservationModel(self.library, found.diffusion), noise)
+            assert again.diagnosis is not None and again.diagnosis.sensor_evidence is not None
+            return self.finished(again) if again.diagnosis.sensor_evidence > 1 else None
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             if ((score < -SIGNIFICANT_SCORE) & (correlation < -HARMLESS_CORRELATION)).any():
                 reason = f"the sensor is noisy, and f with it is not found: {error}"
@@ -250,8 +252,6 @@ class _Case:
                     raise NumericalFailure(reason) from None
                 raise NumericalFailure(f"{tests[claim].reason}; {reason}", claim=claim) from None
             return None
-        assert again.diagnosis is not None and again.diagnosis.sensor_evidence is not None
-        return self.finished(again) if again.diagnosis.sensor_evidence > 1 else None
 
     def by_exposure(self, observation: ObservationModel) -> FieldEstimate | None:
         """By the likelihood of samples that are means over an exposure; None where they are no such means.
