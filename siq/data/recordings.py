@@ -220,7 +220,8 @@ class Recordings:
 
         Examples
         --------
-        >>> table = Recordings.from_arrays([0.0, 0.1, 0.2], np.array([[[3.0], [-3.1], [-2.9]]]), names=["phi"])
+        >>> values = np.array([[[3.0], [-3.1], [-2.9]]])
+        >>> table = Recordings.from_arrays([0.0, 0.1, 0.2], values, names=["phi"])
         >>> table.unwrapped({"phi": (-np.pi, np.pi)}).values[:, 0].round(2)
         array([3.  , 3.18, 3.38])
         """

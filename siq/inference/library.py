@@ -230,7 +230,7 @@ def _candidate_library(
 def candidate_functions(
     symbols: Sequence[sympy.Symbol], degree: int, angles: Sequence[tuple[str, float, float]] = ()
 ) -> list[tuple[int, sympy.Expr]]:
-    """Monomials up to a total degree, each with its own; of an angle its harmonics, see `candidate_library`."""
+    """Monomials up to a total degree, each with its own; of an angle its harmonics (`candidate_library`)."""
     waves = {name: exact_number(2 * np.pi / (high - low)) for name, low, high in angles}
     found = []
     for row in monomial_exponents(len(symbols), degree):
@@ -338,6 +338,4 @@ class IdentificationOptions:
 
 def field_library(states: Sequence[str], options: IdentificationOptions) -> CandidateLibrary:
     """The functions in which f is sought."""
-    return candidate_library(
-        states, degree=options.degree, further=options.functions, angles=options.angles
-    )
+    return candidate_library(states, degree=options.degree, further=options.functions, angles=options.angles)

@@ -44,10 +44,12 @@ so that ``x + χ - v t`` is a martingale.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from scipy import ndimage, sparse, special
 from scipy.sparse.linalg import splu
 
@@ -56,7 +58,7 @@ from siq.data.stationarity import runs_of
 from siq.errors import Fault, NumericalFailure
 from siq.numerics.randomness import positive
 from siq.quasipotential.characteristics import Function, ScaledSystem
-from siq.systems.cycles import Cycle
+from siq.systems.cycles import Cycle, hessians_along
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, hessian_at
 from siq.systems.escapes import Neighbourhood
@@ -73,6 +75,7 @@ WIDER = 0.75  # as many cells: by which the error of those is told, where three 
 FEWEST_PARTS, MOST_PARTS = 256, 4096  # of a period: in each Ψ changes by less than one half
 NODES = 8  # of Gauss and Legendre in each part: to rounding
 PIECES = 100  # of a record: D_eff is then known to 14 %
+TENTHS = 10  # of the committor, that are counted apart
 NO_CURRENT = 1e-12  # numerical: of what Σ̇ would be if all of f were a current
 QUANTILES = (0.025, 0.975)  # of an interval
 
@@ -93,6 +96,8 @@ class ReactiveFlow(NamedTuple):
         Net current of what is on its way, ``(n, d)``: per unit of time and of what is across.
     rate
         Of transitions per unit of time that A was the last of both.
+    sets
+        A, and the parts of B.
     """
 
     process: CellProcess
@@ -100,6 +105,41 @@ class ReactiveFlow(NamedTuple):
     density: np.ndarray
     current: np.ndarray
     rate: float
+    sets: tuple[Neighbourhood, ...] = ()
+
+    def counted(self, recordings: Recordings) -> pd.DataFrame:
+        """How often a record went to B before A, beside the committor.
+
+        Returns
+        -------
+        pandas.DataFrame
+            A row for each tenth of the committor, columns ``committor counted standard_error excursions``:
+            the means over samples between the sets of q and of whether B came next. Samples of one excursion,
+            from set to set, are not independent: its sums are what the error is of, and there are so many.
+        """
+        x = recordings.values.T
+        if self.process.dynamics.periodic:
+            x = self.process.dynamics.wrapped(recordings.values).T
+        inside = [
+            np.any([p.height(x + s[:, None]) <= 1 for s in self.process.shifts], axis=0) for p in self.sets
+        ]
+        met = np.where(inside[0], 0.0, np.where(np.any(inside[1:], axis=0), 1.0, np.nan))
+        following, number = np.full(len(met), np.nan), np.cumsum(~np.isnan(met))
+        for run in runs_of(recordings):
+            later = pd.Series(met[run]).bfill().to_numpy()
+            following[run], number[run] = later, number[run] + run.start
+        between = np.isnan(met) & ~np.isnan(following)
+        q, number = self.process.interpolated(self.committor)(x[:, between]), number[between]
+        table = pd.DataFrame({"bin": np.minimum((q * TENTHS).astype(int), TENTHS - 1), "number": number})
+        table["q"], table["hit"], table["size"] = q, following[between], 1.0
+        rows = []
+        for _, part in table.groupby("bin"):
+            own = part.groupby("number")[["q", "hit", "size"]].sum()
+            count, n = float(own["size"].sum()), len(own)
+            share = float(own["hit"].sum()) / count
+            spread = float(((own["hit"] - share * own["size"]) ** 2).sum()) * n / max(n - 1, 1)
+            rows.append((float(own["q"].sum()) / count, share, np.sqrt(spread) / count, n))
+        return pd.DataFrame(rows, columns=["committor", "counted", "standard_error", "excursions"])
 
     @property
     def mean_time(self) -> float:
@@ -275,13 +315,10 @@ class Rotation(NamedTuple):
         if state not in recordings.names:
             raise Fault(f"'{state}' is not recorded", f"name one of {', '.join(recordings.names)}")
         x, t = recordings.values[:, recordings.names.index(state)], recordings.t
-        runs = runs_of(recordings)
-        total = sum(float(t[run.stop - 1] - t[run.start]) for run in runs)
-        cuts = [
-            np.linspace(run.start, run.stop - 1, 1 + max(round(PIECES * (t[run.stop - 1] - t[run.start]) / total), 1))
-            for run in runs
-            if run.stop - run.start > 1
-        ]  # fmt: skip
+        ends = [(run.start, run.stop - 1) for run in runs_of(recordings) if run.stop - run.start > 1]
+        total = sum(float(t[last] - t[first]) for first, last in ends)
+        counts = [max(round(PIECES * float(t[last] - t[first]) / total), 1) for first, last in ends]
+        cuts = [np.linspace(*both, 1 + count) for both, count in zip(ends, counts, strict=True)]
         moved, passed = (np.concatenate([np.diff(one[c.astype(int)]) for c in cuts]) for one in (x, t))
         velocity = float(moved.sum() / passed.sum())
         rest = (moved - velocity * passed) ** 2 / (2 * passed)
@@ -348,6 +385,8 @@ class CellProcess:
         Invariant probabilities, shape ``(n,)``, 1 in total.
     rates
         L, shape ``(n, n)``.
+    shifts
+        What leads from a state to its images in the next periods, shape ``(m, d)``, zero among them.
 
     Raises
     ------
@@ -375,7 +414,7 @@ class CellProcess:
         if np.tril(shear, -1)[:, turning].any():
             raise NumericalFailure("the noise of a periodic state is correlated with that of others")
         self._periods = np.where(turning, dynamics.periods, 0.0)
-        self._shifts = np.unique(np.where(turning, dynamics.shifts, 0.0), axis=0)
+        self.shifts = np.unique(np.where(turning, dynamics.shifts, 0.0), axis=0)
         system = ScaledSystem(dynamics, np.zeros(dimension), shear, unit=1.0)
         corners = system.scaled(np.array(list(product(*box))))
         sides = np.stack([corners.min(axis=0), corners.max(axis=0)], axis=1)
@@ -432,7 +471,7 @@ class CellProcess:
 
     def inside(self, part: Neighbourhood) -> np.ndarray:
         """Mask of the cells in a neighbourhood, shape ``(n,)``; NumericalFailure where there is none."""
-        images = [self.points + shift for shift in self._shifts]
+        images = [self.points + shift for shift in self.shifts]
         found = np.any([part.height(one.T) <= 1 for one in images], axis=0)
         if not found.any():
             raise NumericalFailure("the core of a well is smaller than a cell of the grid")
@@ -469,7 +508,7 @@ class CellProcess:
         spent = float(self.density @ back)
         leaving = float((self.density * first) @ (self.rates @ forward))
         density = self.density * forward * back / self.volume
-        return ReactiveFlow(self, forward, density, self._current(flows), leaving / spent)
+        return ReactiveFlow(self, forward, density, self._current(flows), leaving / spent, (start, *ends))
 
     def mean_times(self, ends: Sequence[Neighbourhood]) -> np.ndarray:
         """Mean time until one of some neighbourhoods is reached, from each cell: shape ``(n,)``."""
@@ -616,7 +655,7 @@ def _invariant_density(rates: sparse.csr_matrix, dimension: int) -> np.ndarray:
 
 def cores_about(
     dynamics: Dynamics,
-    attractors: Sequence[Equilibrium],
+    attractors: Sequence[Equilibrium | Cycle],
     saddles: Sequence[Sequence[Equilibrium | Cycle]],
     intensity: float,
 ) -> list[Neighbourhood]:
@@ -626,9 +665,17 @@ def cores_about(
     """
     cores = []
     for place, one in enumerate(attractors):
-        hessian = hessian_at(dynamics, one.position)
-        others = [other.position for other in (*attractors, *saddles[place]) if other is not one]
-        away = np.reshape(others, (-1, dynamics.dimension)) - one.position
-        lowest = float(np.einsum("ni,ij,nj->n", away, hessian, away).min(initial=np.inf))
-        cores.append(Neighbourhood(one.position, hessian, min(intensity, CORE_SHARE * lowest) / 2))
+        others = [
+            other.points if isinstance(other, Cycle) else other.position[None]
+            for other in (*attractors, *saddles[place])
+            if other is not one
+        ]
+        if isinstance(one, Cycle):
+            hessians = hessians_along(dynamics, one)
+            core = Neighbourhood(one.position, hessians[0], 0.5, one, hessians)
+        else:
+            core = Neighbourhood(one.position, hessian_at(dynamics, one.position), 0.5)
+        away = np.concatenate([np.zeros((0, dynamics.dimension)), *others])
+        lowest = float(core.height(away.T).min(initial=np.inf)) if len(away) else np.inf
+        cores.append(replace(core, level=min(intensity, CORE_SHARE * lowest) / 2))
     return cores

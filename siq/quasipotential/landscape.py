@@ -36,6 +36,7 @@ from siq.quasipotential.certificate import Certificate
 from siq.quasipotential.characteristics import potential_errors
 from siq.quasipotential.fokker_planck import CellProcess, Dissipation, ReactiveFlow, Rotation, cores_about
 from siq.quasipotential.occupancy import VisitTest
+from siq.quasipotential.power_series import CycleFormula
 from siq.quasipotential.rates import EscapeRate, NoiseStrength, mean_residence_time
 from siq.quasipotential.transitions import Transition, missing_diffusion
 from siq.quasipotential.wells import Well
@@ -402,6 +403,26 @@ class Landscape:
             raise NumericalFailure(f"no formula was found about attractor {well}: {'; '.join(self.notes)}")
         return found
 
+    def about_cycle(self, attractor: int, *, degree: int = 10, tolerance: float = 0.01) -> CycleFormula:
+        """V about a limit cycle of two states as a formula in phase and distance, with its residual.
+
+        Parameters
+        ----------
+        attractor
+            A cycle by its place in `attractors`.
+        degree, tolerance
+            Highest power of the distance, and the relative residual up to which the formula is to hold.
+
+        Raises
+        ------
+        NumericalFailure
+            Where the attractor is a point, or there are more than two states.
+        """
+        cycle = self.attractors[attractor]
+        if not isinstance(cycle, Cycle):
+            raise NumericalFailure(f"attractor {attractor} is a point: ask for 'potential'")
+        return CycleFormula.of(self.dynamics, cycle, degree=degree, tolerance=tolerance)
+
     def barriers(self) -> pd.DataFrame:
         """ΔU on every way out of every well, one row each.
 
@@ -470,7 +491,7 @@ class Landscape:
         Parameters
         ----------
         start, end
-            Attractors by their place in `attractors`: points, in one to three states.
+            Attractors by their place in `attractors`, in one to three states.
         noise
             ε, in the unit of U; by default as the recordings show it.
 
@@ -573,7 +594,7 @@ class Landscape:
         ValueError
             When no noise is known.
         NumericalFailure
-            When there are limit cycles among the attractors, or the simulation fails.
+            When the simulation fails.
         """
         strength = self._strength(noise)
         intensity, rows = strength.intensity, []
@@ -583,7 +604,7 @@ class Landscape:
             system, box = system.unwrapped(), box + np.stack([-system.periods, system.periods], axis=1)
         for index, core in enumerate(cores):
             others = [
-                replace(one, center=one.center + shift)
+                one.moved(shift)
                 for one, shift in itertools.product(cores, shifts)
                 if one is not core or shift.any()
             ]
@@ -624,11 +645,9 @@ class Landscape:
 
     def _cores(self, intensity: float) -> list[Neighbourhood]:
         """The core of each attractor."""
-        points = [one for one in self.attractors if isinstance(one, Equilibrium)]
-        if self.cycles:
-            raise NumericalFailure("one of the attractors is a limit cycle, and no core is known about it")
-        saddles = [[way.saddle for way in self.transitions if way.start == k] for k in range(len(points))]
-        return cores_about(self.dynamics, points, saddles, intensity)
+        count = len(self.attractors)
+        saddles = [[way.saddle for way in self.transitions if way.start == k] for k in range(count)]
+        return cores_about(self.dynamics, self.attractors, saddles, intensity)
 
     @property
     def _box(self) -> np.ndarray:
@@ -657,7 +676,10 @@ class Landscape:
             values += [way.path.action / intensity + np.linspace(0, 1, len(down))]
         points, along = np.concatenate(states), np.concatenate(values)
         # Near is what the noise about the attractor makes so.
-        root = np.linalg.cholesky(hessian_at(self.dynamics, self.attractors[well].position))
+        one = self.attractors[well]
+        root = np.diag(1 / np.ptp(points, axis=0))
+        if isinstance(one, Equilibrium):
+            root = np.linalg.cholesky(hessian_at(self.dynamics, one.position))
         tree = cKDTree(points @ root)
         return lambda x: np.asarray(along[tree.query(x.T @ root)[1]])
 

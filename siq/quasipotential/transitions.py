@@ -131,7 +131,9 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
     `beyond_region` says whether a saddle behind which lies no attractor of the region is a way out, too: of a
     given f the path up to it is as good as any other. Of an identified one nothing is known beyond.
     """
-    whole = portrait if portrait.cover is None else portrait.cover  # on which wells of all periods have a number
+    whole = (
+        portrait if portrait.cover is None else portrait.cover
+    )  # on which wells of all periods have a number
     points, box, cycles = len(whole.attractors), whole.box, whole.cycles
     settled: list[np.ndarray | Cycle] = [*(one.position for one in whole.attractors), *cycles]
     homes = portrait.homes or tuple((number, ()) for number in range(len(settled)))
@@ -159,9 +161,7 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
         except NumericalFailure as error:
             remarks = (Remark("quasipotential.no_path", {"reason": str(error)}),)
         ways.append(
-            Transition(
-                number, target, over, path, remarks=remarks, from_cycle=start >= points, turns=turns
-            )
+            Transition(number, target, over, path, remarks=remarks, from_cycle=start >= points, turns=turns)
         )
 
     for cycle in whole.parting:
@@ -170,7 +170,9 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
             if start >= 0:
                 add(start, cycle, None if beyond < 0 else beyond)
     for index, (number, away) in enumerate(homes):
-        for saddle in whole.saddles[index] if number is not None and not any(away) else ():
+        if number is None or any(away):
+            continue
+        for saddle in whole.saddles[index]:
             reached = sides_of(dynamics, saddle, whole.attractors, box=box, cycles=cycles)
             end = min(set(reached[reached >= 0].tolist()) - {index}, default=None)
             if end is None and not beyond_region:

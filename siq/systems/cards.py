@@ -19,7 +19,15 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import sympy
 import yaml
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    field_validator,
+    model_validator,
+)
 
 from siq.errors import Fault, InputError
 from siq.numerics.files import Document, read_document, validate
@@ -289,7 +297,9 @@ def build_system(document: Document, card: SystemCard) -> Dynamics:
 def _changed_by(dynamics: Dynamics, name: str, period: float) -> str:
     """What is another one a period of a state on: an equation, or D; empty where nothing is."""
     shift, generator = {symbol(name): symbol(name) + period}, np.random.default_rng(0)
-    named = [*((f"equation of '{own}'", f) for own, f in zip(dynamics.states, dynamics.formulas, strict=True))]
+    named = [
+        *((f"equation of '{own}'", f) for own, f in zip(dynamics.states, dynamics.formulas, strict=True))
+    ]
     named += [("diffusion", entry) for row in dynamics.diffusion.formulas for entry in row]
     for what, formula in named:
         formula = sympy.sympify(formula)

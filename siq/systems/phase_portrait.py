@@ -301,11 +301,12 @@ def _at_home(cover: PhasePortrait, dynamics: Dynamics) -> PhasePortrait:
         values = {"states": list(dynamics.periodic), "share": float(running.mean())}
         remarks.append(Remark("systems.running", values))
     whose = np.array([-1 if number is None else number for number, _ in homes] + [-1])[middle]
+    parting = [one for one in cover.parting if not dynamics.turns(one.points.mean(axis=0)[None]).any()]
     return replace(
         cover, equilibria=tuple(inside), attractors=tuple(cover.attractors[index] for index in points),
-        saddles=tuple(around), basins=tuple(cover.basins[index] for index in points if cover.basins), descents=descents,
+        saddles=tuple(around), basins=tuple(cover.basins[index] for index in points if cover.basins),
         cycles=tuple(cover.cycles[index - len(cover.attractors)] for index in home[len(points) :]),
-        parting=tuple(one for one in cover.parting if not dynamics.turns(one.points.mean(axis=0)[None]).any()),
+        parting=tuple(parting), descents=descents,
         shares=np.array([float((whose == index).mean()) for index in range(len(home))]),
         cover=cover, homes=tuple(homes), remarks=tuple(remarks),
     )  # fmt: skip
