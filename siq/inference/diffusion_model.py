@@ -34,7 +34,7 @@ from siq.data.recordings import SnapshotPairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import STANDARD_ERRORS, FieldEstimate, NoiseFormula
 from siq.inference.kalman_filter import Noise, whiten
-from siq.inference.library import CandidateLibrary, candidate_functions
+from siq.inference.library import CandidateLibrary
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.numerics.randomness import positive
@@ -83,7 +83,7 @@ class _DiffusionLikelihood:
 
     def __init__(self, library: CandidateLibrary) -> None:
         self.symbols = library.symbols
-        self.terms = [term for _, term in candidate_functions(library.symbols, DEGREE, library.angles)]
+        self.terms = [term for _, term in library.functions(library.symbols, DEGREE, library.angles)]
 
     def reached(
         self, places: np.ndarray, values: np.ndarray, sensor: np.ndarray

@@ -54,6 +54,23 @@ class CandidateLibrary:
     derivatives: np.ndarray
     angles: tuple[tuple[str, float, float], ...] = ()
 
+    @staticmethod
+    def functions(
+        symbols: Sequence[sympy.Symbol], degree: int, angles: Sequence[tuple[str, float, float]] = ()
+    ) -> list[tuple[int, sympy.Expr]]:
+        """Monomials up to a total degree, each with its own; of an angle its harmonics."""
+        waves = {name: exact_number(2 * np.pi / (high - low)) for name, low, high in angles}
+        found = []
+        for row in monomial_exponents(len(symbols), degree):
+            parts = [
+                [sympy.sin(power * waves[each.name] * each), sympy.cos(power * waves[each.name] * each)]
+                if power and each.name in waves
+                else [each**power]
+                for each, power in zip(symbols, row, strict=True)
+            ]
+            found += [(sum(row), sympy.Mul(*several)) for several in itertools.product(*parts)]
+        return found
+
     @property
     def size(self) -> int:
         """Number of functions, q."""
@@ -195,7 +212,7 @@ def _candidate_library(
 ) -> CandidateLibrary:
     """`candidate_library`, once for the same functions: every step of a run asks for them, and every run."""
     symbols = tuple(sympy.Symbol(name, real=True) for name in states)
-    known = candidate_functions(symbols, degree, angles)
+    known = CandidateLibrary.functions(symbols, degree, angles)
     degrees, terms = [total for total, _ in known], [term for _, term in known]
     names: Mapping[str, sympy.Expr] = dict(zip(states, symbols, strict=True))
     for text in further:
@@ -225,23 +242,6 @@ def _candidate_library(
     for array in arrays:
         array.flags.writeable = False
     return CandidateLibrary(states, symbols, tuple(terms), *arrays, angles)
-
-
-def candidate_functions(
-    symbols: Sequence[sympy.Symbol], degree: int, angles: Sequence[tuple[str, float, float]] = ()
-) -> list[tuple[int, sympy.Expr]]:
-    """Monomials up to a total degree, each with its own; of an angle its harmonics (`candidate_library`)."""
-    waves = {name: exact_number(2 * np.pi / (high - low)) for name, low, high in angles}
-    found = []
-    for row in monomial_exponents(len(symbols), degree):
-        parts = [
-            [sympy.sin(power * waves[each.name] * each), sympy.cos(power * waves[each.name] * each)]
-            if power and each.name in waves
-            else [each**power]
-            for each, power in zip(symbols, row, strict=True)
-        ]
-        found += [(sum(row), sympy.Mul(*several)) for several in itertools.product(*parts)]
-    return found
 
 
 def monomial_exponents(dimension: int, degree: int) -> list[tuple[int, ...]]:

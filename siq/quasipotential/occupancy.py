@@ -384,8 +384,8 @@ def check_occupancy(
     if found.noise_free:
         return OccupancyCheck(missing=Remark("quasipotential.record_without_noise"))
     if found.dynamics.periodic:
-        told = {"states": " and ".join(found.dynamics.periodic)}
-        return OccupancyCheck(missing=Remark("quasipotential.record_of_angles", told))
+        named = {"states": " and ".join(found.dynamics.periodic)}
+        return OccupancyCheck(missing=Remark("quasipotential.record_of_angles", named))
     if len(portrait.attractors) < 2:
         if noise is None:
             return OccupancyCheck(missing=Remark("quasipotential.record_of_unknown_noise"))

@@ -46,7 +46,7 @@ from siq.quasipotential.formulas import (
     SymbolicDecomposition,
     decomposition_from_coefficients,
 )
-from siq.quasipotential.global_formula import GlobalFormula, fit_values, refine_globally, with_circulation
+from siq.quasipotential.global_formula import GlobalFormula, fit_values, refine_globally
 from siq.quasipotential.hamilton_jacobi import affordable_degree
 from siq.quasipotential.occupancy import OccupancyCheck, check_occupancy
 from siq.quasipotential.rates import NoiseStrength
@@ -185,7 +185,7 @@ def refine(
         remarks.append(Remark("quasipotential.noise_on_some_states_only"))
     else:
         if best is not None and good:
-            whole = with_circulation(best, found, points, single_formula=options.single_formula, **accepted)
+            whole = best.with_circulation(found, points, single_formula=options.single_formula, **accepted)
             if whole is not None:
                 if not (whole.joint or found.noise_free):
                     remarks.append(Remark("quasipotential.not_orthogonal"))
