@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from siq.networks.decomposition import TrainingOptions
     from siq.networks.regression import RegressionOptions, sparse_decomposition
     from siq.networks.training import train
+    from siq.quasipotential.fokker_planck import Rotation
     from siq.quasipotential.formulas import SymbolicDecomposition, read_model
     from siq.quasipotential.landscape import Landscape, NoLandscape
     from siq.quasipotential.landscape_assembly import EquationSettings
@@ -59,6 +60,7 @@ __all__ = [
     "PipelineSettings",
     "Recordings",
     "RegressionOptions",
+    "Rotation",
     "SimulationOptions",
     "Study",
     "Sweep",
@@ -102,6 +104,7 @@ _NAMES = {
     "siq.networks.decomposition": "TrainingOptions",
     "siq.networks.regression": "RegressionOptions sparse_decomposition",
     "siq.networks.training": "train",
+    "siq.quasipotential.fokker_planck": "Rotation",
     "siq.quasipotential.formulas": "SymbolicDecomposition read_model",
     "siq.quasipotential.landscape": "Landscape NoLandscape",
     "siq.quasipotential.landscape_assembly": "EquationSettings",

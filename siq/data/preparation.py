@@ -17,6 +17,8 @@ import numpy as np
 
 from siq.data.correlation import markov_lag, noise_floors
 from siq.data.recordings import (
+    MOST_WIDE_STEPS,
+    ROUNDED_TURN,
     SINGLE_RECORDING_REMEDY,
     Recordings,
     SnapshotPairs,
@@ -29,7 +31,7 @@ from siq.errors import InputError
 from siq.remarks import Remark
 
 FULL_TURNS = {2 * np.pi: "2π", 360.0: "360"}  # of an angle, in radians and in degrees
-WRAPPED_SHARE = 0.9  # of a turn: a jump by so much, in a column that stays within one, is no motion
+ENDS_OF_TURN = 0.05  # of a turn, within which a column that jumps by one comes to 0 and 1 of it, or to ±½
 FEWEST_STRETCHES = 10  # of a single recording, at least, two of which are held out
 MOST_STRETCHES = 40  # more make no error better known
 STRETCH_LENGTH = 10  # correlation times: what is left of its first sample at its end is then nothing
@@ -133,13 +135,18 @@ def unusual(recordings: Recordings) -> list[Remark]:
     single = int((np.bincount(recordings.recording) == 1).sum())
     found = [Remark("data.single_samples", {"recordings": single})] if single else []
     inside = recordings.recording[1:] == recordings.recording[:-1]
-    for title, values in zip(recordings.titles, recordings.values.T, strict=True):
+    named = zip(recordings.names, recordings.titles, recordings.values.T, strict=True)
+    for name, title, values in named:
         jumps = np.abs(np.diff(values)[inside])
         for turn, text in FULL_TURNS.items():
-            count = int((jumps > WRAPPED_SHARE * turn).sum())
-            between = ((jumps > 0.5 * turn) & (jumps < WRAPPED_SHARE * turn)).any()
-            if count and not between and np.ptp(values) <= turn * (1 + 1e-6):
-                found.append(Remark("data.wrapped_angle", {"column": title, "turn": text, "count": count}))
+            count = int((jumps > 0.75 * turn).sum())
+            wide = ((jumps > 0.25 * turn) & (jumps < 0.75 * turn)).mean() if len(jumps) else 0.0
+            ends = np.array([values.min(), values.max()])
+            within = [np.abs(ends - np.array(each) * turn).max() for each in ((0, 1), (-0.5, 0.5))]
+            close = min(within) < ENDS_OF_TURN * turn and np.ptp(values) <= turn * (1 + ROUNDED_TURN)
+            if count and wide <= MOST_WIDE_STEPS and close:
+                told = {"column": title, "name": name, "turn": text, "count": count}
+                found.append(Remark("data.wrapped_angle", told))
     return found
 
 

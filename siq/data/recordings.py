@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from siq.errors import NumericalFailure
+from siq.errors import InputError, NumericalFailure
 from siq.numerics.files import whole_file
 from siq.remarks import Remark, sentence
 
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 TABLE = "the table"  # what messages call what is in no file
 LONGEST_STEP = 1.5  # of the median step: a missing sample makes two of it, jitter rarely a half more
 HELD_OUT_SHARE = 0.2
+ROUNDED_TURN = 1e-6  # of a period, by which a wrapped angle may exceed it
+MOST_WIDE_STEPS = 0.01  # of normal steps as many are beyond 2.6 deviations, and twice as far 2 in 10 million
 SINGLE_RECORDING_REMEDY = (
     "record how the system settles from many starting points, or one long record in which noise makes it hop;"
     " if these are positions of something that has inertia, set 'identification.hidden_velocities'"
@@ -201,6 +203,44 @@ class Recordings:
             tuple(names), tuple(units or (None,) * len(names)), labels, recording, together,
             np.concatenate(parts), time_unit,
         )  # fmt: skip
+
+    def unwrapped(self, angles: Mapping[str, Sequence[float]]) -> Recordings:
+        """The same with angles that count their turns, where they were recorded within one.
+
+        Parameters
+        ----------
+        angles
+            The two ends of a period by the name of the column.
+
+        Raises
+        ------
+        InputError
+            For a name that no column has, and where samples are so far apart that nobody can tell which way
+            round an angle went: steps of a quarter of a period are one in a hundred then, or more.
+
+        Examples
+        --------
+        >>> values = np.array([[[3.0], [-3.1], [-2.9]]])
+        >>> table = Recordings.from_arrays([0.0, 0.1, 0.2], values, names=["phi"])
+        >>> table.unwrapped({"phi": (-np.pi, np.pi)}).values[:, 0].round(2)
+        array([3.  , 3.18, 3.38])
+        """
+        values, inside = self.values.copy(), np.diff(self.recording) == 0
+        for name, (low, high) in angles.items():
+            if name not in self.names:
+                fault = f"there is no column '{name}', which is called an angle"
+                raise InputError(TABLE, "", fault, f"name one of {', '.join(self.names)}")
+            place, period = self.names.index(name), float(high) - float(low)
+            column = values[:, place]
+            if np.ptp(column) > period * (1 + ROUNDED_TURN):
+                continue  # it counts its turns already
+            steps = np.diff(column)
+            turns = np.where(inside, np.round(steps / period), 0.0)
+            if (np.abs(steps - turns * period)[inside] > period / 4).mean() > MOST_WIDE_STEPS:
+                fault = "from one sample to the next it goes so far that nobody can tell which way round"
+                raise InputError(TABLE, f"column {self.titles[place]}", fault, "record it more often")
+            values[1:, place] -= period * np.cumsum(turns)
+        return replace(self, values=values)
 
     def of_states(self, places: Sequence[int] | np.ndarray, remarks: Iterable[Remark]) -> Recordings:
         """These states alone, by their places, with what there is to say of the others."""

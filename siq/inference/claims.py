@@ -81,6 +81,7 @@ class _Residuals:
     """
 
     def __init__(self, found: FieldEstimate, pairs: SnapshotPairs) -> None:
+        pairs = found.wrapped(pairs)
         rest = process_noise_increments(found, pairs, residuals(found, pairs))
         force = found.dynamics.drift(pairs.x0) * np.sqrt(pairs.h)[:, None]
         if not found.diffusion.constant:

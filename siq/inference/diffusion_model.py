@@ -34,7 +34,7 @@ from siq.data.recordings import SnapshotPairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import STANDARD_ERRORS, FieldEstimate, NoiseFormula
 from siq.inference.kalman_filter import Noise, whiten
-from siq.inference.library import monomial_exponents
+from siq.inference.library import CandidateLibrary
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.numerics.randomness import positive
@@ -81,12 +81,9 @@ class _DiffusionLikelihood:
 
     most_correlated = MAX_STATES
 
-    def __init__(self, symbols: Sequence[sympy.Symbol]) -> None:
-        self.symbols = tuple(symbols)
-        self.terms = [
-            sympy.Mul(*(each**power for each, power in zip(symbols, powers, strict=True)))
-            for powers in monomial_exponents(len(symbols), DEGREE)
-        ]
+    def __init__(self, library: CandidateLibrary) -> None:
+        self.symbols = library.symbols
+        self.terms = [term for _, term in library.functions(library.symbols, DEGREE, library.angles)]
 
     def reached(
         self, places: np.ndarray, values: np.ndarray, sensor: np.ndarray
@@ -276,7 +273,7 @@ class ResidualLikelihood(_DiffusionLikelihood):
     """
 
     def __init__(self, found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray) -> None:
-        super().__init__(found.library.symbols)
+        super().__init__(found.library)
         (n, d), symbols, m = rest.shape, self.symbols, len(self.terms)
         rows = np.unique(np.linspace(0, n - 1, min(n, int(MAX_NUMBERS / (m * d * (d + 1))))).astype(int))
         if len(rows) < n:
@@ -408,8 +405,9 @@ class InnovationLikelihood(_DiffusionLikelihood):
     the model, those of the symbols.
     """
 
-    def __init__(self, symbols: tuple[sympy.Symbol, ...], fit: Fit, data: Measurements) -> None:
-        super().__init__(symbols)
+    def __init__(self, library: CandidateLibrary, fit: Fit, data: Measurements) -> None:
+        super().__init__(library)
+        symbols = library.symbols
         change, _ = whiten(fit.linearisation, data, fit.noise).solve()
         still = fit.linearisation.with_parameters_changed(change)
         d, rows, x = len(symbols), data.begins, fit.linearised_at

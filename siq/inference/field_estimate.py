@@ -25,6 +25,7 @@ from typing import Any, Literal
 import numpy as np
 import sympy
 
+from siq.data.recordings import SnapshotPairs
 from siq.errors import Fault, InputError, NumericalFailure
 from siq.inference.library import CandidateLibrary, IdentificationOptions, field_dynamics, field_library
 from siq.numerics.files import whole_file
@@ -572,6 +573,12 @@ class FieldEstimate:
         values = coefficients[support[:, 1], support[:, 0]]
         return field_dynamics(self.library, support, values, diffusion=diffusion)
 
+    def wrapped(self, pairs: SnapshotPairs) -> SnapshotPairs:
+        """Pairs moved by whole periods, of states that have one, so that each begins in the first period."""
+        dynamics = self.dynamics
+        shift = dynamics.turns(pairs.x0) * dynamics.periods
+        return replace(pairs, x0=pairs.x0 - shift, xh=pairs.xh - shift) if shift.any() else pairs
+
     def variance(self, slopes: np.ndarray, *, of_mean: bool = False) -> np.ndarray:
         """Variance of what follows from f to first order, by its coefficients and by which terms there are.
 
@@ -682,6 +689,7 @@ def write_field(path: str | Path, estimate: FieldEstimate, options: Identificati
         "states": list(library.states),
         "degree": options.degree,
         "functions": list(options.functions),
+        "angles": {name: limits for name, *limits in library.angles},
         "terms": [
             {"component": library.states[i], "term": library.names[k], "coefficient": float(value),
              "standard_error": float(error), "stability": share}
@@ -715,7 +723,9 @@ def read_field(path: str | Path) -> FieldEstimate | None:
         if not text:
             return None
         data = json.loads(text)
-        options = IdentificationOptions(degree=data["degree"], functions=tuple(data["functions"]))
+        options = IdentificationOptions(
+            degree=data["degree"], functions=tuple(data["functions"]), angles=data.get("angles", {})
+        )
         library, rows = field_library(data["states"], options), data["terms"]
         support = np.array(
             [[library.states.index(row["component"]), library.names.index(row["term"])] for row in rows]

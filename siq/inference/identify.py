@@ -245,6 +245,8 @@ class _Case:
         noise = Noise(share * variance, rate * (1 - 2 * share))
         try:
             again = self.by_likelihood(ObservationModel(self.library, found.diffusion), noise)
+            assert again.diagnosis is not None and again.diagnosis.sensor_evidence is not None
+            return self.finished(again) if again.diagnosis.sensor_evidence > 1 else None
         except (NumericalFailure, np.linalg.LinAlgError) as error:
             if ((score < -SIGNIFICANT_SCORE) & (correlation < -HARMLESS_CORRELATION)).any():
                 reason = f"the sensor is noisy, and f with it is not found: {error}"
@@ -254,8 +256,6 @@ class _Case:
                     raise NumericalFailure(reason) from None
                 raise NumericalFailure(f"{tests[claim].reason}; {reason}", claim=claim) from None
             return None
-        assert again.diagnosis is not None and again.diagnosis.sensor_evidence is not None
-        return self.finished(again) if again.diagnosis.sensor_evidence > 1 else None
 
     def by_exposure(self, observation: ObservationModel) -> FieldEstimate | None:
         """By the likelihood of samples that are means over an exposure; None where they are no such means.
@@ -501,7 +501,7 @@ class _Case:
 
     def advice(self, *, hidden: bool) -> str | None:
         """Advice where a recorded position has inertia, or hidden velocities are not needed."""
-        if len(self.recordings.names) != 1:
+        if len(self.recordings.names) != 1 or self.library.angles:  # the test knows polynomials alone
             return None
         try:
             test = inertia_test(self.recordings, pair_step=self.pair_step, limit=hidden)

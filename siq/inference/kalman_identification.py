@@ -107,7 +107,7 @@ def identify_by_likelihood(
         begins = [(np.zeros(len(everything)), observation.states(data), noise)]
     wholes = [_fit_library(observation.model(everything, one), data, x, noise) for one, x, noise in begins]
     whole = max(wholes, key=lambda one: one.log_likelihood)
-    likelihood = None if hidden else InnovationLikelihood(library.symbols, whole, data)
+    likelihood = None if hidden else InnovationLikelihood(library, whole, data)
     chance = 1.0 if likelihood is None else likelihood.constant_probability()
     by_state = chance < false_terms and bool(whole.noise.process.any())
     if likelihood is not None and by_state:
@@ -275,7 +275,7 @@ def _with_formula(
     """The estimate of a fit whose process noise depends on the state, once f and D know of each other."""
     symbols = observation.library.symbols
     for _ in range(DIFFUSION_ROUNDS):
-        likelihood = InnovationLikelihood(symbols, fit, data)
+        likelihood = InnovationLikelihood(observation.library, fit, data)
         formula, sensor, covariance = likelihood.selected(false_terms=false_terms, probability=probability)
         noise = observation.noise(Noise(sensor, np.ones(len(symbols)), field=formula.diffusion(1.0)))
         fit = observation.fitted(

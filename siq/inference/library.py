@@ -19,11 +19,12 @@ import sympy
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
-from siq.errors import NumericalFailure
+from siq.errors import Fault, NumericalFailure
 from siq.numerics.randomness import positive
+from siq.systems.cards import Limit
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, symbol
-from siq.systems.formulas import FormulaError, compile_formulas, parse_formula
+from siq.systems.formulas import FormulaError, compile_formulas, exact_number, parse_formula
 
 FAR = 10.0  # half ranges from the origin within which powers are alike for other reasons
 
@@ -41,6 +42,8 @@ class CandidateLibrary:
     derivatives
         T, shape ``(q, d, q)``: ``derivatives[k, i, j]`` is the coefficient of θ_k in ∂θ_j/∂x_i. Columns
         of functions that V may not use are zero.
+    angles
+        States of which the functions are periodic: name, and the two ends of a period.
     """
 
     states: tuple[str, ...]
@@ -49,6 +52,24 @@ class CandidateLibrary:
     in_potential: np.ndarray
     in_circulatory: np.ndarray
     derivatives: np.ndarray
+    angles: tuple[tuple[str, float, float], ...] = ()
+
+    @staticmethod
+    def functions(
+        symbols: Sequence[sympy.Symbol], degree: int, angles: Sequence[tuple[str, float, float]] = ()
+    ) -> list[tuple[int, sympy.Expr]]:
+        """Monomials up to a total degree, each with its own; of an angle its harmonics."""
+        waves = {name: exact_number(2 * np.pi / (high - low)) for name, low, high in angles}
+        found = []
+        for row in monomial_exponents(len(symbols), degree):
+            parts = [
+                [sympy.sin(power * waves[each.name] * each), sympy.cos(power * waves[each.name] * each)]
+                if power and each.name in waves
+                else [each**power]
+                for each, power in zip(symbols, row, strict=True)
+            ]
+            found += [(sum(row), sympy.Mul(*several)) for several in itertools.product(*parts)]
+        return found
 
     @property
     def size(self) -> int:
@@ -152,8 +173,11 @@ def candidate_library(
     potential_degree: int | None = None,
     circulatory_degree: int | None = None,
     further: Sequence[str] = (),
+    angles: Mapping[str, Sequence[float]] | None = None,
 ) -> CandidateLibrary:
     """Monomials up to a total degree, and whatever further functions a study lists.
+
+    Of a periodic state sines and cosines stand in the place of its powers: the k-th harmonics have degree k.
 
     Parameters
     ----------
@@ -164,6 +188,8 @@ def candidate_library(
     further
         Further functions as formulas of the states, such as ``"sqrt(x**2 + 1)"``. V may use all of them;
         their derivatives are taken into the library for f and g.
+    angles
+        The two ends of a period of each periodic state, by its name.
 
     Raises
     ------
@@ -171,7 +197,8 @@ def candidate_library(
         When a further function is not a formula of the states, or is there already.
     """
     limits = (degree if limit is None else limit for limit in (potential_degree, circulatory_degree))
-    return _candidate_library(tuple(states), degree, *limits, tuple(further))
+    periods = tuple((name, *map(float, (angles or {})[name])) for name in states if name in (angles or {}))
+    return _candidate_library(tuple(states), degree, *limits, tuple(further), periods)
 
 
 @lru_cache(maxsize=64)
@@ -181,11 +208,12 @@ def _candidate_library(
     potential_degree: int,
     circulatory_degree: int,
     further: tuple[str, ...],
+    angles: tuple[tuple[str, float, float], ...],
 ) -> CandidateLibrary:
     """`candidate_library`, once for the same functions: every step of a run asks for them, and every run."""
     symbols = tuple(sympy.Symbol(name, real=True) for name in states)
-    exponents = monomial_exponents(len(states), degree)
-    terms = [sympy.Mul(*(s**e for s, e in zip(symbols, row, strict=True))) for row in exponents]
+    known = CandidateLibrary.functions(symbols, degree, angles)
+    degrees, terms = [total for total, _ in known], [term for _, term in known]
     names: Mapping[str, sympy.Expr] = dict(zip(states, symbols, strict=True))
     for text in further:
         function = parse_formula(text, names)
@@ -194,7 +222,7 @@ def _candidate_library(
         if function in terms:
             raise FormulaError(f"the library function '{text}' is in the library already", "leave it out")
         terms.append(function)
-    in_potential = [sum(row) <= potential_degree for row in exponents] + [True] * len(further)
+    in_potential = [total <= potential_degree for total in degrees] + [True] * len(further)
     # The library is closed once under differentiation of what V may use; what that adds serves f and g.
     columns = {
         (i, j): linear_combination(terms[j].diff(symbol))
@@ -203,8 +231,8 @@ def _candidate_library(
     }
     terms = list(dict.fromkeys(itertools.chain(terms, *columns.values())))
     in_potential += [False] * (len(terms) - len(in_potential))
-    in_circulatory = [sum(row) <= circulatory_degree for row in exponents]
-    in_circulatory += [True] * (len(terms) - len(exponents))
+    in_circulatory = [total <= circulatory_degree for total in degrees]
+    in_circulatory += [True] * (len(terms) - len(degrees))
     position = {term: k for k, term in enumerate(terms)}
     derivatives = np.zeros((len(terms), len(states), len(terms)))
     for (i, j), combination in columns.items():
@@ -213,7 +241,7 @@ def _candidate_library(
     arrays = (np.array(in_potential), np.array(in_circulatory), derivatives)
     for array in arrays:
         array.flags.writeable = False
-    return CandidateLibrary(states, symbols, tuple(terms), *arrays)
+    return CandidateLibrary(states, symbols, tuple(terms), *arrays, angles)
 
 
 def monomial_exponents(dimension: int, degree: int) -> list[tuple[int, ...]]:
@@ -258,7 +286,12 @@ def field_dynamics(
     for (component, term), name in zip(support, names, strict=True):
         equations[component] += symbol(name) * library.terms[term]
     parameters = tuple(Parameter(name, float(value)) for name, value in zip(names, values, strict=True))
-    return Dynamics(library.states, tuple(equations), diffusion, parameters=parameters, covariance=covariance)
+    ends = {name: limits for name, *limits in library.angles}
+    return Dynamics(
+        library.states, tuple(equations), diffusion, parameters=parameters, covariance=covariance,
+        domain=np.array([ends.get(name, [np.nan] * 2) for name in library.states]) if ends else None,
+        periodic=tuple(ends),
+    )  # fmt: skip
 
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -284,6 +317,10 @@ class IdentificationOptions:
         too, called ``v_x`` for a position x, and f says how forces change them. ``"auto"``: where one
         position was recorded, its inertia is seen, and f of the position alone is refuted; and where it is
         refuted otherwise, a slow force that was not recorded is tried, ``force_x``.
+    angles
+        States that are angles, or phases, each with the two ends of a period, such as ``phi: [0, 2*pi]``.
+        They are unwrapped; f is sought in their sines and cosines, and wells are the same a period on.
+        Those of a card say it there.
     """
 
     degree: Annotated[int, Field(ge=1, le=12)] = 5
@@ -292,8 +329,14 @@ class IdentificationOptions:
     precision: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7
     pairs: Annotated[int, Field(ge=100)] = 8_000
     hidden_velocities: bool | Literal["auto"] = "auto"
+    angles: dict[str, tuple[Limit, Limit]] = Field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in self.angles.items():
+            if not low < high:
+                raise Fault(f"the period of '{name}' is empty", "write it as [lower, upper], lower < upper")
 
 
 def field_library(states: Sequence[str], options: IdentificationOptions) -> CandidateLibrary:
     """The functions in which f is sought."""
-    return candidate_library(states, degree=options.degree, further=options.functions)
+    return candidate_library(states, degree=options.degree, further=options.functions, angles=options.angles)

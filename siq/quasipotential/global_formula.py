@@ -62,6 +62,48 @@ class GlobalFormula:
         size = np.linalg.norm(values - values[lowest])
         return float(np.sqrt(np.maximum(variance, 0).sum()) / size)
 
+    def with_circulation(
+        self,
+        found: FieldEstimate,
+        points: np.ndarray,
+        *,
+        false_terms: float,
+        precision: float,
+        single_formula: float,
+    ) -> GlobalFormula | None:
+        """The circulation g = f + D∇V with its uncertainty, on the terms that differ from zero.
+
+        Under noise V and g are fitted together: V may fail the Hamilton–Jacobi equation of the identified f
+        by as much as f errs. What tells whether that is all is the joint fit: an f that V and g make up
+        exactly, and that the data allow. Where there is none V has to solve the equation as without noise;
+        None where it does not.
+        """
+        assert self.sensitivity is not None
+        library = found.library
+        q, d = library.size, library.dimension
+        downhill = library.downhill(found.diffusion)
+        circulatory = found.coefficients + np.einsum("ikj,j->ki", downhill, self.potential)
+        # δg = δf + D∇δV with δV = S δf, coefficient by coefficient
+        response = np.einsum("ikj,jp->ikp", downhill, self.sensitivity)
+        response[*found.support.T, np.arange(len(found.support))] += 1.0
+        errors = np.sqrt(np.einsum("ikp,pr,ikr->ki", response, found.covariance, response))
+        values = library.evaluate(points)
+        size = np.sqrt((values**2).mean(axis=0))[:, None]
+        speed = np.sqrt((found.dynamics.drift(points) ** 2).mean(axis=0))[None, :]
+        critical = float(-scipy.special.ndtri(false_terms / (2 * q * d)))
+        weak = np.abs(circulatory) * size < precision * speed.max()
+        if not found.noise_free:
+            weak |= np.abs(circulatory) < critical * errors
+        circulatory = np.where(weak, 0.0, circulatory)
+        if not found.noise_free:
+            rows = np.unique(np.linspace(0, len(points) - 1, FIT_POINTS).astype(int))
+            fit = _fit_orthogonal(found, self.potential, circulatory, points[rows])
+            if fit is not None and fit.probability >= MIN_PROBABILITY:
+                return fit
+            if self.residual >= single_formula:
+                return None
+        return replace(self, circulatory=circulatory, circulatory_errors=np.where(weak, 0.0, errors))
+
 
 def fit_values(
     library: CandidateLibrary, points: Sequence[np.ndarray], values: Sequence[np.ndarray]
@@ -187,49 +229,6 @@ def _eliminate(
             break
         active = np.delete(active, weakest)
     return active
-
-
-def with_circulation(
-    best: GlobalFormula,
-    found: FieldEstimate,
-    points: np.ndarray,
-    *,
-    false_terms: float,
-    precision: float,
-    single_formula: float,
-) -> GlobalFormula | None:
-    """The circulation g = f + D∇V with its uncertainty, on the terms that differ from zero.
-
-    Under noise V and g are fitted together: V may fail the Hamilton–Jacobi equation of the identified f by as
-    much as f errs. What tells whether that is all is the joint fit: an f that V and g make up exactly, and
-    that the data allow. Where there is none V has to solve the equation as without noise; None where it does
-    not.
-    """
-    assert best.sensitivity is not None
-    library = found.library
-    q, d = library.size, library.dimension
-    downhill = library.downhill(found.diffusion)
-    circulatory = found.coefficients + np.einsum("ikj,j->ki", downhill, best.potential)
-    # δg = δf + D∇δV with δV = S δf, coefficient by coefficient
-    response = np.einsum("ikj,jp->ikp", downhill, best.sensitivity)
-    response[*found.support.T, np.arange(len(found.support))] += 1.0
-    errors = np.sqrt(np.einsum("ikp,pr,ikr->ki", response, found.covariance, response))
-    values = library.evaluate(points)
-    size = np.sqrt((values**2).mean(axis=0))[:, None]
-    speed = np.sqrt((found.dynamics.drift(points) ** 2).mean(axis=0))[None, :]
-    critical = float(-scipy.special.ndtri(false_terms / (2 * q * d)))
-    weak = np.abs(circulatory) * size < precision * speed.max()
-    if not found.noise_free:
-        weak |= np.abs(circulatory) < critical * errors
-    circulatory = np.where(weak, 0.0, circulatory)
-    if not found.noise_free:
-        rows = np.unique(np.linspace(0, len(points) - 1, FIT_POINTS).astype(int))
-        fit = _fit_orthogonal(found, best.potential, circulatory, points[rows])
-        if fit is not None and fit.probability >= MIN_PROBABILITY:
-            return fit
-        if best.residual >= single_formula:
-            return None
-    return replace(best, circulatory=circulatory, circulatory_errors=np.where(weak, 0.0, errors))
 
 
 def _fit_orthogonal(

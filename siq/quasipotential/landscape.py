@@ -34,8 +34,9 @@ from siq.errors import Fault, NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
 from siq.quasipotential.certificate import Certificate
 from siq.quasipotential.characteristics import potential_errors
-from siq.quasipotential.fokker_planck import CellProcess, Dissipation, ReactiveFlow, cores_about
+from siq.quasipotential.fokker_planck import CellProcess, Dissipation, ReactiveFlow, Rotation, cores_about
 from siq.quasipotential.occupancy import VisitTest
+from siq.quasipotential.power_series import CycleFormula
 from siq.quasipotential.rates import EscapeRate, NoiseStrength, mean_residence_time
 from siq.quasipotential.transitions import Transition, missing_diffusion
 from siq.quasipotential.wells import Well
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
     from siq.workflow.pipeline import PipelineSettings
 
 MOST_WELLS = 6  # of which all trees can be counted
-DISSIPATION_DRAWS = 40  # of an estimated f: the ends of a 95 % interval are then two of them
+DRAWS = 40  # of an estimated f: the ends of a 95 % interval are then two of them
 MARGIN = 0.15  # of the states that were seen, on each side: there the density ends
 LEVEL_TOLERANCE = 1e-6  # numerical, of the level of a well: two values of U are one
 
@@ -126,8 +127,20 @@ class GlobalQuasipotential:
     def by_well(self, x: np.ndarray) -> np.ndarray:
         """``W_i + U_i`` at points, shape ``(k, n)``, NaN where the formula of a well is not believed."""
         return np.stack(
-            [h + 2 * one.known_values(x) for h, one in zip(self.heights, self.wells, strict=True)]
+            [
+                h + 2 * one.known_values(self.placed(one, x))
+                for h, one in zip(self.heights, self.wells, strict=True)
+            ]
         )
+
+    def placed(self, well: Well, x: np.ndarray) -> np.ndarray:
+        """Points ``(n, d)``, moved by whole periods to where V of a well is least."""
+        dynamics = well.dynamics
+        if not dynamics.periodic:
+            return x
+        images = dynamics.wrapped(x) + dynamics.shifts[:, None]
+        values = [well.known_values(each) for each in images]
+        return np.asarray(images[np.argmin(np.nan_to_num(values, nan=np.inf), axis=0), np.arange(len(x))])
 
 
 def heights_of_attractors(barriers: np.ndarray) -> np.ndarray:
@@ -376,7 +389,8 @@ class Landscape:
             mine = values <= least + LEVEL_TOLERANCE * well.level  # false of NaN
             if mine.any():
                 found = self.field_estimate
-                errors[mine] = 2 * potential_errors(found, well.gradients, well.attractor, x[mine])
+                places = whole.placed(well, x[mine])
+                errors[mine] = 2 * potential_errors(found, well.gradients, well.attractor, places)
         return errors
 
     def potential(self, well: int = 0) -> Well:
@@ -389,6 +403,26 @@ class Landscape:
             raise NumericalFailure(f"no formula was found about attractor {well}: {'; '.join(self.notes)}")
         return found
 
+    def about_cycle(self, attractor: int, *, degree: int = 10, tolerance: float = 0.01) -> CycleFormula:
+        """V about a limit cycle of two states as a formula in phase and distance, with its residual.
+
+        Parameters
+        ----------
+        attractor
+            A cycle by its place in `attractors`.
+        degree, tolerance
+            Highest power of the distance, and the relative residual up to which the formula is to hold.
+
+        Raises
+        ------
+        NumericalFailure
+            Where the attractor is a point, or there are more than two states.
+        """
+        cycle = self.attractors[attractor]
+        if not isinstance(cycle, Cycle):
+            raise NumericalFailure(f"attractor {attractor} is a point: ask for 'potential'")
+        return CycleFormula.of(self.dynamics, cycle, degree=degree, tolerance=tolerance)
+
     def barriers(self) -> pd.DataFrame:
         """ΔU on every way out of every well, one row each.
 
@@ -397,11 +431,20 @@ class Landscape:
         pandas.DataFrame
             Columns ``start end barrier standard_error``: attractors by their place in `attractors`, the end
             missing where the way leads out of the recorded region; ΔU in the unit of ε with its standard
-            error, NaN where it is not known, which is that of every page (`Transition.error`).
+            error, NaN where it is not known, which is that of every page (`Transition.error`). Of every
+            periodic state follows a column ``turns_NAME``: by how many periods the end is further on.
         """
         types: dict[str, Any] = {"start": int, "end": "Int64", "barrier": float, "standard_error": float}
         rows = [[way.start, way.end, way.barrier, way.error] for way in self.transitions]
-        return pd.DataFrame(rows, columns=list(types)).astype(types)
+        return self._with_turns(pd.DataFrame(rows, columns=list(types)).astype(types))
+
+    def _with_turns(self, table: pd.DataFrame) -> pd.DataFrame:
+        """A table of transitions with columns that tell the turns of periodic states."""
+        for place, name in enumerate(self.dynamics.states):
+            if name in self.dynamics.periodic:
+                turns = [way.turns[place] if way.turns else None for way in self.transitions]
+                table[f"turns_{name}"] = pd.array(turns, dtype="Int64")
+        return table
 
     def dwell_times(self, *, noise: float | None = None) -> pd.DataFrame:
         """Mean residence times, one row for every attractor.
@@ -448,7 +491,7 @@ class Landscape:
         Parameters
         ----------
         start, end
-            Attractors by their place in `attractors`: points, in one to three states.
+            Attractors by their place in `attractors`, in one to three states.
         noise
             ε, in the unit of U; by default as the recordings show it.
 
@@ -491,13 +534,39 @@ class Landscape:
         NumericalFailure
             As for `committor`.
         """
-        strength, found = self._strength(noise), self.field_estimate
-        generator, draws = np.random.default_rng(seed), list[tuple[Dynamics, float]]()
-        share = strength.standard_error / strength.intensity
-        for _ in range(0 if found is None else DISSIPATION_DRAWS):
-            drawn = found.drawn(generator) if found is not None else self.dynamics
-            draws.append((drawn, strength.intensity * float(np.exp(share * generator.standard_normal()))))
+        strength = self._strength(noise)
+        draws = self._draws(strength, np.random.default_rng(seed))
         return Dissipation.of(self.dynamics, strength.intensity, self._box, draws=draws)
+
+    def _draws(self, strength: NoiseStrength, generator: np.random.Generator) -> list[tuple[Dynamics, float]]:
+        """f and ε drawn from the distribution of their estimates; none where f is given."""
+        found, share = self.field_estimate, strength.standard_error / strength.intensity
+        return [
+            (found.drawn(generator), strength.intensity * float(np.exp(share * generator.standard_normal())))
+            for _ in range(0 if found is None else DRAWS)
+            if found is not None
+        ]
+
+    def rotation(self, state: str | None = None, *, noise: float | None = None, seed: int = 0) -> Rotation:
+        """The mean velocity and the effective diffusion of a periodic state, such as an angle.
+
+        Parameters
+        ----------
+        state
+            Its name; may be left out where there is but one.
+        noise
+            ε, in the unit of U; by default as the recordings show it.
+        seed
+            Decides the draws of an estimated f, of which the errors come.
+
+        Returns
+        -------
+        Rotation
+            See `siq.quasipotential.fokker_planck.Rotation.of`, which needs no landscape and no wells.
+        """
+        strength = self._strength(noise)
+        draws = self._draws(strength, np.random.default_rng(seed))
+        return Rotation.of(self.dynamics, strength.intensity, state, box=self._box, draws=draws)
 
     def verify_times(self, *, noise: float | None = None, seed: int = 0) -> pd.DataFrame:
         """Mean residence times by the law, by the operator, and checked by a simulation that splits.
@@ -517,23 +586,33 @@ class Landscape:
             which holds for any ε, and its relative ``operator_error``, NaN beyond three states and where
             wells are narrower than cells; ``check`` with its ``relative_error`` and its 95 % interval ``lower
             upper``. The check assumes neither (`siq.systems.escapes.split_escapes`), and takes seconds a
-            well at ΔU/ε = 5, ten at 20. It has no rows where there is but one attractor.
+            well at ΔU/ε = 5, ten at 20. It has no rows where there is but one attractor; of periodic states
+            that a turn further on is another one.
 
         Raises
         ------
         ValueError
             When no noise is known.
         NumericalFailure
-            When there are limit cycles among the attractors, or the simulation fails.
+            When the simulation fails.
         """
         strength = self._strength(noise)
         intensity, rows = strength.intensity, []
         cores, laws = self._cores(intensity), self.dwell_times(noise=noise)
-        for index, core in enumerate(cores if len(cores) > 1 else ()):
-            others = [one for one in cores if one is not core]
+        system, box, shifts = self.dynamics, self._box, self.dynamics.shifts
+        if system.periodic:
+            system, box = system.unwrapped(), box + np.stack([-system.periods, system.periods], axis=1)
+        for index, core in enumerate(cores):
+            others = [
+                one.moved(shift)
+                for one, shift in itertools.product(cores, shifts)
+                if one is not core or shift.any()
+            ]
+            if not others:
+                break
             operator = (np.nan, np.nan)
             try:
-                process = CellProcess(self.dynamics, intensity, self._box)
+                process = CellProcess(system, intensity, box)
                 progress = process.between(core, others).progress
                 operator = process.mean_time(core, others)
             except (NumericalFailure, np.linalg.LinAlgError, RuntimeError):
@@ -566,11 +645,9 @@ class Landscape:
 
     def _cores(self, intensity: float) -> list[Neighbourhood]:
         """The core of each attractor."""
-        points = [one for one in self.attractors if isinstance(one, Equilibrium)]
-        if self.cycles:
-            raise NumericalFailure("one of the attractors is a limit cycle, and no core is known about it")
-        saddles = [[way.saddle for way in self.transitions if way.start == k] for k in range(len(points))]
-        return cores_about(self.dynamics, points, saddles, intensity)
+        count = len(self.attractors)
+        saddles = [[way.saddle for way in self.transitions if way.start == k] for k in range(count)]
+        return cores_about(self.dynamics, self.attractors, saddles, intensity)
 
     @property
     def _box(self) -> np.ndarray:
@@ -578,10 +655,12 @@ class Landscape:
         limits = self.dynamics.limits
         if np.isfinite(limits).all():
             return limits
+        turning = self.dynamics.periods > 0
         places = [*(one.position[None] for one in self.attractors), *(way.uphill for way in self.transitions)]
         points = np.concatenate([*places, *(one.points for one in self.wells if one is not None)])
         low, high = points.min(axis=0), points.max(axis=0)
-        return np.stack([low - MARGIN * (high - low), high + MARGIN * (high - low)], axis=1)
+        box = np.stack([low - MARGIN * (high - low), high + MARGIN * (high - low)], axis=1)
+        return np.where(turning[:, None], limits, box)
 
     def _along_paths(self, well: int, intensity: float) -> Callable[[np.ndarray], np.ndarray]:
         """Progress by U/ε at the nearest state of the paths out of a well; beyond the saddle by one more."""
@@ -597,7 +676,10 @@ class Landscape:
             values += [way.path.action / intensity + np.linspace(0, 1, len(down))]
         points, along = np.concatenate(states), np.concatenate(values)
         # Near is what the noise about the attractor makes so.
-        root = np.linalg.cholesky(hessian_at(self.dynamics, self.attractors[well].position))
+        one = self.attractors[well]
+        root = np.diag(1 / np.ptp(points, axis=0))
+        if isinstance(one, Equilibrium):
+            root = np.linalg.cholesky(hessian_at(self.dynamics, one.position))
         tree = cKDTree(points @ root)
         return lambda x: np.asarray(along[tree.query(x.T @ root)[1]])
 
@@ -614,6 +696,7 @@ class Landscape:
         pandas.DataFrame
             Columns ``start end mean_time note``: the mean time by the law of Eyring and Kramers with its
             prefactor (`siq.quasipotential.rates`), NaN with a note that says why where the law does not hold.
+            Turns of periodic states stand as in `barriers`.
 
         Raises
         ------
@@ -633,7 +716,7 @@ class Landscape:
                 note = str(error)
             rows.append((way.start, way.end, time, note))
         table = pd.DataFrame(rows, columns=["start", "end", "mean_time", "note"])
-        return table.astype({"start": int, "end": "Int64", "mean_time": float})
+        return self._with_turns(table.astype({"start": int, "end": "Int64", "mean_time": float}))
 
     def compare_with(self, equations: Landscape, *, noise: float | None = None) -> pd.DataFrame:
         """Barriers, prefactors and mean times of trajectories beside those of the equations behind them.

@@ -250,7 +250,6 @@ def _assembled(
     noise: NoiseStrength | None,
 ) -> Landscape:
     """The landscape of what was found, with the heights of its attractors."""
-    ends = portrait.descents.ends
     left = None if certificate is None else certificate.tests.get("error")
     if left is not None and np.isfinite(left.value):
         ways = [replace(way, of_residual=left.value * abs(way.formula_share * way.barrier)) for way in ways]
@@ -266,7 +265,7 @@ def _assembled(
         heights = np.full(len(settled), np.nan)
     return Landscape(
         dynamics_of(found), portrait.equilibria, settled,
-        np.array([float((ends == index).mean()) for index in range(len(settled))]),
+        portrait.shares,
         tuple(wells), tuple(ways), heights, tuple(remarks), certificate,
         np.array([position_standard_errors(found, one.position) for one in settled]),
         noise, None if isinstance(found, Dynamics) else found,

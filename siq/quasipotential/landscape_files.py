@@ -175,6 +175,7 @@ def _transition_data(one: Transition) -> dict[str, Any]:
     data |= {"turn": None if rate.loss is None else _written(rate, TURN)}
     data |= dict.fromkeys((*WAY, "path")) if path is None else _written(path, WAY)
     data |= {} if path is None else {"path": _written(path, PATH)}
+    data |= {"turns": list(one.turns)} if one.turns else {}
     return data | ({"over_cycle": one.saddle.period} if isinstance(one.saddle, Cycle) else {})
 
 
@@ -214,7 +215,7 @@ def landscape_from_data(data: Mapping[str, Any], dynamics: Dynamics) -> Landscap
             turn = {} if one["turn"] is None else _read(one["turn"], TURN)
             rate = EscapeRate(one["minimum_action"], **_read(OLDER_LAW | one, LAW), **turn)
         from_cycle = isinstance(attractors[one["start"]], Cycle)
-        own = _read({"of_residual": 0.0} | one, TRANSITION)
+        own = _read({"of_residual": 0.0} | one, TRANSITION) | {"turns": tuple(one.get("turns", ()))}
         way = Transition(saddle=saddle, path=path, rate=rate, from_cycle=from_cycle, **own)
         transitions.append(way)
     errors = [one["standard_errors"] for one in wells]

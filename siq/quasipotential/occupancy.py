@@ -383,6 +383,9 @@ def check_occupancy(
     """
     if found.noise_free:
         return OccupancyCheck(missing=Remark("quasipotential.record_without_noise"))
+    if found.dynamics.periodic:
+        named = {"states": " and ".join(found.dynamics.periodic)}
+        return OccupancyCheck(missing=Remark("quasipotential.record_of_angles", named))
     if len(portrait.attractors) < 2:
         if noise is None:
             return OccupancyCheck(missing=Remark("quasipotential.record_of_unknown_noise"))

@@ -23,15 +23,19 @@ unknowns. Eigenvectors would do, too, but those of a long chain that turns are a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import scipy.linalg
 import scipy.special
 import sympy
+from scipy.spatial import cKDTree
 
-from siq.errors import Fault
+from siq.errors import Fault, NumericalFailure
 from siq.inference.library import monomial_exponents
 from siq.quasipotential.hamilton_jacobi import Expansion, PowerBasis
+from siq.systems.cycles import Cycle, closed_orbit, hessians_along
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import classify, hessian_at
 from siq.systems.formulas import compile_formulas, formulas_in_time
@@ -238,3 +242,220 @@ class _Homogeneous:
         if not all(np.isfinite(part).all() for part in parts):
             raise ValueError(f"{name} has no finite derivatives up to order {degree} at {center.tolist()}")
         return parts
+
+
+LEAST_SHARE = 1e-7  # numerical, of the largest coefficient: smaller ones are rounding
+FARTHEST = 0.9  # of the radius of curvature: farther from a cycle its distance has no unique foot
+MOST_POINTS = 1024  # of a cycle: as many as it takes for V, and no more
+SHORTEST, RESOLVED = 16, 1e-8  # waves of each coefficient: their size to the largest one
+STATIONS, UNSEEN = (64, 200), 1024  # phases and distances that tell the reach; states that test the residual
+FOOT_STEPS, FOOT_ERROR = 12, 1e-6  # of Newton's method for the foot of a distance; and of the cycle's width
+
+
+class CycleFormula(NamedTuple):
+    """V about a stable cycle of two states, ``Σ_k c_k(φ) s^k``, zero on it.
+
+    φ = 2π t/T is the phase on the cycle γ, and s the distance from it along its normal, positive to the left
+    of the motion. With v = |γ'|, n' = β γ'/v, and f and D in parts along and across, ``V_t + ...`` of
+
+        q V_t f_t + q² V_s f_s + D_tt V_t² + 2 q D_ts V_t V_s + q² D_ss V_s² = 0,    q = v + β s,
+
+    at the power s^k is a linear equation ``c_k' + k (∂_s f_s + 4 c_2 D_ss) c_k = r_k`` with one periodic
+    solution, r_k being known from lower powers; c_2 is half of the Hessian across.
+
+    Attributes
+    ----------
+    dynamics, cycle
+        f and D, and the cycle.
+    coefficients
+        Shape ``(K - 1, n)``: c_2 … c_K at the points of the cycle.
+    level
+        V up to which the formula holds.
+    residual
+        ``|∇V·(f + D∇V)|/∇V·D∇V`` at most, at states that no step has seen, from a thousandth of the level up
+        to it. By that share V may be off, to first order: along its characteristics it rises at the rate of
+        the denominator.
+    reach
+        The least and the largest s, shape ``(2, m)``, at m phases that are evenly spread.
+    """
+
+    dynamics: Dynamics
+    cycle: Cycle
+    coefficients: np.ndarray
+    level: float = 0.0
+    residual: float = np.inf
+    reach: np.ndarray = np.zeros((2, 1))
+
+    @classmethod
+    def of(
+        cls, dynamics: Dynamics, cycle: Cycle, *, degree: int = 10, tolerance: float = 0.01, seed: int = 0
+    ) -> CycleFormula:
+        """The formula of the degree, up to one, that holds farthest within a relative residual.
+
+        Raises
+        ------
+        NumericalFailure
+            Where there are more than two states, or the cycle is not stable.
+        """
+        if dynamics.dimension != 2:
+            raise NumericalFailure("V about a cycle is written in phase and distance for two states only")
+        while True:
+            coefficients = _cycle_coefficients(dynamics, cycle, degree)
+            waves = np.abs(np.fft.rfft(coefficients, axis=1))
+            size = np.maximum(waves.max(axis=1), LEAST_SHARE * waves.max())
+            if (waves[:, -SHORTEST:].max(axis=1) < RESOLVED * size).all() or len(cycle.points) >= MOST_POINTS:
+                break
+            t = cycle.period * np.arange(2 * len(cycle.points)) / (2 * len(cycle.points))
+            guess, width = _wave(cycle.points.T, cycle.period, t).T, np.ptp(cycle.points, axis=0)
+            cycle = closed_orbit(dynamics, guess, cycle.period, scale=width)
+        found = cls(dynamics, cycle, coefficients)
+        whole = [found._replace(coefficients=found.coefficients[:count]) for count in range(1, degree)]
+        best = max((one._up_to(tolerance) for one in whole), key=lambda one: one.level)
+        draw = np.random.default_rng(seed)
+        t = draw.uniform(0, cycle.period, UNSEEN)
+        s = draw.uniform(best.reach.min(), best.reach.max(), UNSEEN)
+        value, *_, share = best._at(t, s)
+        tested = best._inside(t, s, value) & (value > best.level / 1000)
+        return best._replace(residual=float(share[tested].max(initial=0.0)))
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """V at points ``(n, 2)``: shape ``(n,)``, NaN beyond where the formula holds."""
+        t, s = self._feet(x)
+        value = self._at(t, s)[0]
+        place, _, across, *_ = self._frame(t)
+        foot = (
+            np.linalg.norm(place + s[:, None] * across - x, axis=1)
+            <= FOOT_ERROR * np.ptp(place, axis=0).max()
+        )
+        return np.where(foot & self._inside(t, s, value), value, np.nan)
+
+    def _inside(self, t: np.ndarray, s: np.ndarray, value: np.ndarray) -> np.ndarray:
+        """Whether the formula holds at times and distances with these values."""
+        count = self.reach.shape[1]
+        before = np.floor(t / self.cycle.period * count).astype(int)
+        low, high = (self.reach[:, (before + step) % count] for step in (0, 1))
+        within = (s >= np.maximum(low[0], high[0])) & (s <= np.minimum(low[1], high[1]))
+        return np.asarray(within & (value <= self.level))
+
+    def terms(self) -> pd.DataFrame:
+        """Columns ``power harmonic cosine sine``: V is the sum of ``s^power`` times these parts of c(φ)."""
+        waves = np.fft.rfft(self.coefficients, axis=1) / self.coefficients.shape[1]
+        waves[:, 1:] *= 2
+        kept = np.abs(waves) > LEAST_SHARE * np.abs(waves).max()
+        rows = [
+            (k + 2, m, waves[k, m].real, -waves[k, m].imag) for k, m in zip(*np.nonzero(kept), strict=True)
+        ]
+        return pd.DataFrame(rows, columns=["power", "harmonic", "cosine", "sine"])
+
+    def _up_to(self, tolerance: float) -> CycleFormula:
+        """With the level, and the distances, up to which the residual keeps to a tolerance and V rises."""
+        period, (phases, places) = self.cycle.period, STATIONS
+        bend = self._frame(np.arange(phases) / phases * period)[-1]
+        level, reach = np.inf, []
+        for side in (-1, 1):
+            radius = float(np.max(-side * bend))
+            longest = FARTHEST / radius if radius > 0 else np.ptp(self.cycle.points, axis=0).max()
+            t = np.repeat(np.arange(phases) / phases * period, places)
+            s = np.tile(side * longest * np.arange(1, places + 1) / places, phases)
+            value, _, slope, share = (one.reshape(phases, places) for one in self._at(t, s))
+            bad = ~((share <= tolerance) & (side * slope > 0))
+            bad[:, -1] = True
+            first = np.argmax(bad, axis=1)
+            # All that is claimed lies below the lowest level that is reached in a good place.
+            level = min(level, float(np.where(first > 0, value[np.arange(phases), first - 1], 0.0).min()))
+            reach.append(side * longest * first / places)
+        return self._replace(level=level, reach=np.array(reach))
+
+    def _frame(self, t: np.ndarray) -> tuple[np.ndarray, ...]:
+        """γ, its unit tangent and normal, |γ'|, and β/|γ'| at times ``(n,)``."""
+        place, moved, bent = (_wave(self.cycle.points.T, self.cycle.period, t, order) for order in range(3))
+        speed = np.linalg.norm(moved, axis=0)
+        along = moved / speed
+        across = np.stack([-along[1], along[0]])
+        return place.T, along.T, across.T, speed, -(across * bent).sum(axis=0) / speed**2
+
+    def _feet(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Time on the cycle and distance of points ``(n, 2)``."""
+        points, period = self.cycle.points, self.cycle.period
+        t = period / len(points) * cKDTree(points).query(x)[1]
+        for _ in range(FOOT_STEPS):
+            place, along, across, speed, bend = self._frame(t)
+            s = ((x - place) * across).sum(axis=1)
+            t = t + ((x - place) * along).sum(axis=1) / (speed * np.maximum(1 + s * bend, 1 - FARTHEST))
+        place, _, across, *_ = self._frame(t)
+        return t, ((x - place) * across).sum(axis=1)
+
+    def _at(self, t: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, ...]:
+        """V, its slopes by t and s, and the relative residual."""
+        t, again = np.unique(t, return_inverse=True)
+        place, along, across, speed, bend = (one[again] for one in self._frame(t))
+        powers = np.arange(2, len(self.coefficients) + 2)[:, None]
+        c, moved = (_wave(self.coefficients, self.cycle.period, t, order)[:, again] for order in (0, 1))
+        value, turned, slope = (
+            (c * s**powers).sum(0),
+            (moved * s**powers).sum(0),
+            (powers * c * s ** (powers - 1)).sum(0),
+        )
+        x = place + s[:, None] * across
+        push = (turned / (speed * (1 + s * bend)))[:, None] * along + slope[:, None] * across
+        spent = (push * self.dynamics.diffusion.push(x, push)).sum(axis=1)
+        rest = (push * self.dynamics.drift(x)).sum(axis=1) + spent
+        return value, turned, slope, np.abs(rest) / np.maximum(spent, np.finfo(float).tiny)
+
+
+def _wave(values: np.ndarray, period: float, t: np.ndarray, order: int = 0) -> np.ndarray:
+    """A derivative by time of periodic functions with values ``(m, n)``, at times ``(k,)``: ``(m, k)``."""
+    count = values.shape[1]
+    numbers = 2j * np.pi / period * np.fft.fftfreq(count, 1 / count)
+    numbers[count // 2] = 0.0  # of the highest wave only the cosine is known
+    waves = np.fft.fft(values, axis=1) / count * numbers**order
+    return np.asarray((waves @ np.exp(np.outer(numbers, t))).real)
+
+
+def _cycle_coefficients(dynamics: Dynamics, cycle: Cycle, degree: int) -> np.ndarray:
+    """c_2 … c_K of `CycleFormula` at the points of a cycle, power by power."""
+    count, period = len(cycle.points), cycle.period
+    t = period * np.arange(count) / count
+    here = CycleFormula(dynamics, cycle, np.zeros((0, count)))
+    place, along, across, speed, bend = here._frame(t)
+    s, normal = sympy.Symbol("s_", real=True), sympy.symbols("n_0 n_1", real=True)
+    shift = {own: own + s * to for own, to in zip(dynamics.symbols, normal, strict=True)}
+    formulas = [*dynamics.formulas, *(entry for row in dynamics.diffusion.formulas for entry in row)]
+    series = [sympy.sympify(one).xreplace(shift) for one in formulas]
+    arguments, parts = np.concatenate([place.T, across.T]), []
+    with formulas_in_time("the powers of f"):
+        for k in range(degree + 1):
+            known = compile_formulas(
+                [one.xreplace({s: sympy.S.Zero}) for one in series], [*dynamics.symbols, *normal]
+            )
+            parts.append(known(np.ascontiguousarray(arguments)))
+            series = [one.diff(s) / (k + 1) for one in series]
+    powers = np.array(parts)  # (K + 1, 6, n)
+    flow, noise = powers[:, :2], powers[:, 2:].reshape(degree + 1, 2, 2, count)
+    f_t, f_s = (np.einsum("kin,ni->kn", flow, one) for one in (along, across))
+    d_tt, d_ts, d_ss = (
+        np.einsum("kijn,ni,nj->kn", noise, one, other)
+        for one, other in ((along, along), (along, across), (across, across))
+    )
+    f_s[0] = 0.0
+    q = np.zeros((degree + 1, count))
+    q[0], q[1] = speed, speed * bend
+
+    def times(*factors: np.ndarray) -> np.ndarray:
+        """The product of power series ``(K + 1, n)``."""
+        found = factors[0]
+        for one in factors[1:]:
+            found = np.array([sum(found[i] * one[k - i] for i in range(k + 1)) for k in range(degree + 1)])
+        return found
+
+    derivative = _wave(np.eye(count), period, t, 1).T
+    c = np.zeros((degree + 1, count))
+    c[2] = np.einsum("ni,nij,nj->n", across, hessians_along(dynamics, cycle), across) / 2
+    rate = f_s[1] + 4 * c[2] * d_ss[0]
+    for k in range(3, degree + 1):
+        turned, slope = c @ derivative.T, np.zeros_like(c)
+        slope[:-1] = np.arange(1, degree + 1)[:, None] * c[1:]
+        rest = times(q, turned, f_t) + times(q, q, slope, f_s) + times(d_tt, turned, turned)
+        rest += 2 * times(q, d_ts, turned, slope) + times(q, q, d_ss, slope, slope)
+        c[k] = np.linalg.solve(derivative + np.diag(k * rate), -rest[k] / speed**2)
+    return c[2:]

@@ -121,7 +121,11 @@ def _energy_loss_per_cycle(
         return None, None, False
     saddle, attractor = path.points[-1], path.points[0]
     if (loss := _particle_loss(dynamics, saddle, attractor)) is not None:
-        return loss, _particle_loss(dynamics, saddle, 2 * saddle - attractor) if beyond else None, True
+        try:
+            further = _particle_loss(dynamics, saddle, 2 * saddle - attractor) if beyond else None
+        except NumericalFailure:  # it runs on downhill, and nothing comes back from there
+            further = None
+        return loss, further, True
     away = np.linalg.norm((path.points - path.points[-1]) / np.ptp(path.points, axis=0), axis=1)[::-1]
     back = np.flatnonzero((away < RETURN_DISTANCE * np.maximum.accumulate(away)) & (np.arange(len(away)) > 0))
     if not len(back):

@@ -46,7 +46,7 @@ from siq.quasipotential.formulas import (
     SymbolicDecomposition,
     decomposition_from_coefficients,
 )
-from siq.quasipotential.global_formula import GlobalFormula, fit_values, refine_globally, with_circulation
+from siq.quasipotential.global_formula import GlobalFormula, fit_values, refine_globally
 from siq.quasipotential.hamilton_jacobi import affordable_degree
 from siq.quasipotential.occupancy import OccupancyCheck, check_occupancy
 from siq.quasipotential.rates import NoiseStrength
@@ -151,6 +151,9 @@ def refine(
 
     The seed decides which points are used where there are too many.
     """
+    if found.library.angles:  # one formula of V that is periodic, or not, would have to be chosen
+        wells, remarks = _local_wells(found, portrait, options=options, seed=seed)
+        return Refined(found, wells, (*remarks, Remark("quasipotential.no_single_formula")))
     library = _formula_library(found, options)
     found = _over_library(found, library)
     wells, remarks = _local_wells(found, portrait, options=options, seed=seed)
@@ -182,7 +185,7 @@ def refine(
         remarks.append(Remark("quasipotential.noise_on_some_states_only"))
     else:
         if best is not None and good:
-            whole = with_circulation(best, found, points, single_formula=options.single_formula, **accepted)
+            whole = best.with_circulation(found, points, single_formula=options.single_formula, **accepted)
             if whole is not None:
                 if not (whole.joint or found.noise_free):
                     remarks.append(Remark("quasipotential.not_orthogonal"))
@@ -291,7 +294,7 @@ class RefinementContext:
         if found.sensor_variance is not None or found.hidden_states:
             # Of measured values the increments do not have the mean of f.
             recordings = filtered_recordings(found, recordings, pair_step=pair_step)
-        pairs = snapshot_pairs(recordings, pair_step=pair_step)
+        pairs = found.wrapped(snapshot_pairs(recordings, pair_step=pair_step))
         held, x = mask[pairs.recording], pairs.x0
         if held.all() or not held.any():
             raise NumericalFailure(
@@ -302,7 +305,7 @@ class RefinementContext:
         self.points = x[~held][evenly_spread(x[~held], generator=draw)]
         self.held_out = x[held][evenly_spread(x[held], generator=draw)]
         if (memory := found.memory) is not None:
-            pairs = coarse_pairs(recordings, memory[0], lost=memory[1])
+            pairs = found.wrapped(coarse_pairs(recordings, memory[0], lost=memory[1]))
         self.portrait: PhasePortrait = phase_portrait(self.found.dynamics, self.points, seed=number)
         if not self.found.noise_free:
             mask = _every_well_held_out(self.portrait, pairs, mask)

@@ -67,6 +67,8 @@ class Transition:
         Relative standard error of ΔU/ε from an estimated D over that of ε.
     of_residual
         What the residual of V leaves open of the part of the barrier that the formula accounts for.
+    turns
+        Of each state, how many of its periods it has gained at the end; empty where no state is periodic.
     remarks
         What is not known.
     """
@@ -84,6 +86,7 @@ class Transition:
     by_rivals: float = 0.0
     from_cycle: bool = False
     of_residual: float = 0.0
+    turns: tuple[int, ...] = ()
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -128,11 +131,19 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
     `beyond_region` says whether a saddle behind which lies no attractor of the region is a way out, too: of a
     given f the path up to it is as good as any other. Of an identified one nothing is known beyond.
     """
-    points, box, cycles = len(portrait.attractors), portrait.box, portrait.cycles
-    settled: list[np.ndarray | Cycle] = [*(one.position for one in portrait.attractors), *cycles]
+    whole = (
+        portrait if portrait.cover is None else portrait.cover
+    )  # on which wells of all periods have a number
+    points, box, cycles = len(whole.attractors), whole.box, whole.cycles
+    settled: list[np.ndarray | Cycle] = [*(one.position for one in whole.attractors), *cycles]
+    homes = portrait.homes or tuple((number, ()) for number in range(len(settled)))
     ways: list[Transition] = []
 
     def add(start: int, over: Equilibrium | Cycle, end: int | None) -> None:
+        number, away = homes[start]
+        if number is None or any(away):
+            return
+        target, turns = (None, ()) if end is None else homes[end]
         first, last = settled[start], over if isinstance(over, Cycle) else over.position
         beyond = None if end is None else settled[end]
         kind = "unstable cycle" if isinstance(over, Cycle) else "saddle"
@@ -149,21 +160,25 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
             )
         except NumericalFailure as error:
             remarks = (Remark("quasipotential.no_path", {"reason": str(error)}),)
-        ways.append(Transition(start, end, over, path, remarks=remarks, from_cycle=start >= points))
+        ways.append(
+            Transition(number, target, over, path, remarks=remarks, from_cycle=start >= points, turns=turns)
+        )
 
-    for cycle in portrait.parting:
-        ends = sides_of(dynamics, cycle, portrait.attractors, box=box, cycles=cycles).tolist()
+    for cycle in whole.parting:
+        ends = sides_of(dynamics, cycle, whole.attractors, box=box, cycles=cycles).tolist()
         for start, beyond in (ends, ends[::-1]) if ends[0] != ends[1] else ():
             if start >= 0:
                 add(start, cycle, None if beyond < 0 else beyond)
-    for index in range(len(settled)):
-        for saddle in portrait.saddles[index]:
-            reached = sides_of(dynamics, saddle, portrait.attractors, box=box, cycles=cycles)
+    for index, (number, away) in enumerate(homes):
+        if number is None or any(away):
+            continue
+        for saddle in whole.saddles[index]:
+            reached = sides_of(dynamics, saddle, whole.attractors, box=box, cycles=cycles)
             end = min(set(reached[reached >= 0].tolist()) - {index}, default=None)
             if end is None and not beyond_region:
                 remarks = (Remark("quasipotential.nothing_beyond_saddle"),)
                 ways.append(
-                    Transition(index, None, saddle, None, remarks=remarks, from_cycle=index >= points)
+                    Transition(number, None, saddle, None, remarks=remarks, from_cycle=index >= points)
                 )
             elif end is not None or not (reached == index).all():  # else it parts no wells
                 add(index, saddle, end)

@@ -30,7 +30,6 @@ from sympy.printing.str import StrPrinter
 from siq.numerics.text import (
     MINUS,
     SUPERSCRIPTS,
-    capital,
     listed,
     mantissa_and_exponent,
     number_text,
@@ -154,7 +153,7 @@ def environment() -> Environment:
         "range": lambda ends, **options: range_text(*ends, **options),
         "unit": unit_text,
         "listed": lambda names, word="and": listed(list(names), word),
-        "capital": capital,
+        "capital": lambda text: text[:1].upper() + text[1:],
         "lower_first": lambda text: text[:1].lower() + text[1:],
         "count_word": lambda count: COUNTS[count] if count < len(COUNTS) else str(count),
         "term": term_text,

@@ -19,7 +19,15 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import sympy
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    field_validator,
+    model_validator,
+)
 
 from siq.errors import Fault, InputError
 from siq.numerics.files import Document, read_document, validate
@@ -65,10 +73,21 @@ def check_title(text: str) -> str:
 Name = Annotated[str, AfterValidator(check_name)]
 FileName = Annotated[str, AfterValidator(check_title)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
+
+
+def _number(text: object) -> object:
+    """What a formula without names is worth, such as ``2*pi``; anything else as it is."""
+    return float(parse_formula(text, {})) if isinstance(text, str) else text
+
+
+Limit = Annotated[Number, BeforeValidator(_number)]
+"""A limit of a domain: a number, or a formula such as ``2*pi``."""
 Formula = str | Number
 DiffusionEntry = Literal["identity"] | list[Formula] | list[list[Formula]]
 
 LINE_WIDTH = 110
+PERIODS_TRIED = 5  # states at which equations are compared with themselves a period on
+SAME_VALUE = 1e-9  # numerical, of their size
 LONGEST_NAME = 100  # letters: names of files have up to 255 bytes, of which two names may be a part
 
 
@@ -82,7 +101,16 @@ class StateEntry(_CardPart):
     unit: str = "1"  #: compared with the units of recordings; nothing is converted
     #: The interval ``[lower, upper]``, in this unit: initial states are drawn from it, and scores use it.
     #: Only a simulation needs it. Where there are recordings to compare with, they tell it.
-    domain: tuple[Number, Number] | None = None
+    domain: tuple[Limit, Limit] | None = None
+    #: ``true`` of an angle, or a phase: the domain is one period then, such as ``[0, 2*pi]``, and the state
+    #: counts its turns.
+    periodic: bool = False
+
+    @model_validator(mode="after")
+    def _of_known_period(self) -> StateEntry:
+        if self.periodic and self.domain is None:
+            raise Fault("the period is not known", "add 'domain: [0, 2*pi]', one period")
+        return self
 
     @field_validator("domain")
     @classmethod
@@ -241,7 +269,7 @@ def build_system(document: Document, card: SystemCard) -> Dynamics:
         diffusion = Diffusion.of_rows([symbol(name) for name in card.states], rows, parse=inserted)
     except Fault as error:
         raise error.at(document.file, document.place(("diffusion",))) from None
-    return Dynamics(
+    dynamics = Dynamics(
         name=card.name,
         title=card.title or card.name,
         time_unit=card.time_unit,
@@ -256,7 +284,31 @@ def build_system(document: Document, card: SystemCard) -> Dynamics:
         equations=tuple(parse(("equations", name), card.equations[name]) for name in card.states),
         outputs=tuple((name, parse(("outputs", name), text)) for name, text in outputs.items()),
         parameters_of_noise=tuple(sorted(of_noise)),
+        periodic=tuple(name for name, entry in card.states.items() if entry.periodic),
     )
+    for name, period in zip(dynamics.states, dynamics.periods, strict=True):
+        if period and (other := _changed_by(dynamics, name, period)):
+            fault = f"the {other} is not the same a period of '{name}' on"
+            remedy = f"write it in sines and cosines of {name}, or leave out 'periodic'"
+            raise InputError(document.file, document.place(("states", name)), fault, remedy)
+    return dynamics
+
+
+def _changed_by(dynamics: Dynamics, name: str, period: float) -> str:
+    """What is another one a period of a state on: an equation, or D; empty where nothing is."""
+    shift, generator = {symbol(name): symbol(name) + period}, np.random.default_rng(0)
+    named = [
+        *((f"equation of '{own}'", f) for own, f in zip(dynamics.states, dynamics.formulas, strict=True))
+    ]
+    named += [("diffusion", entry) for row in dynamics.diffusion.formulas for entry in row]
+    for what, formula in named:
+        formula = sympy.sympify(formula)
+        for _ in range(PERIODS_TRIED):
+            at = {each: float(generator.uniform(-1, 1)) for each in formula.free_symbols}
+            here, there = (complex(one.subs(at).evalf()) for one in (formula, formula.xreplace(shift)))
+            if np.isfinite([here, there]).all() and abs(there - here) > SAME_VALUE * (abs(here) + period):
+                return what
+    return ""
 
 
 def load_exact(path: str | Path) -> sympy.Expr | None:
@@ -299,6 +351,7 @@ def card_of(dynamics: Dynamics) -> str:
         "states": {
             state: {"unit": unit}
             | ({"domain": [float(limit) for limit in limits]} if limits[0] < limits[1] else {})
+            | ({"periodic": True} if state in dynamics.periodic else {})
             for state, unit, limits in zip(dynamics.states, dynamics.units, dynamics.limits, strict=True)
         },
     }

@@ -13,6 +13,7 @@ tape is made in no time, and one compiled loop runs all tapes (`siq.inference.tr
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -26,6 +27,7 @@ from siq.systems.formulas import compile_formulas, compile_values, delay, exact_
 
 TIME = sympy.Symbol("t", real=True)
 Compiled = Callable[..., Sequence[np.ndarray | float]]
+TURN_TOLERANCE = 1e-9  # numerical, of a period: a state at the begin of the domain belongs to it
 JUMP_WIDTHS = 30.0  # widths of a jump over which its derivative is spread
 
 
@@ -303,6 +305,9 @@ class Dynamics:
         Names of the parameters of a card that stand in D, where they count with the card's values.
     expected_together
         What is expected of several parameters at a time.
+    periodic
+        Names of states whose domain is one period, such as angles: f and D are the same a period on. Such a
+        state is not wrapped, so that it counts its turns.
 
     Raises
     ------
@@ -335,6 +340,7 @@ class Dynamics:
     edges: tuple[tuple[sympy.Expr, float], ...] = ()
     parameters_of_noise: tuple[str, ...] = ()
     expected_together: tuple[JointExpectation, ...] = ()
+    periodic: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         d = len(self.states)
@@ -350,6 +356,9 @@ class Dynamics:
             raise Fault("D is one of other states", "give it with these in their order")
         if self.domain is not None and np.shape(self.domain) != (d, 2):
             raise Fault(f"the domain has the shape {np.shape(self.domain)}", "give two limits a state")
+        for name in self.periodic:
+            if name not in self.states or not np.ptp(self.limits[self.states.index(name)]) > 0:
+                raise Fault(f"the period of '{name}' is not known", "give the state a domain of one period")
 
     @classmethod
     def of(
@@ -360,6 +369,7 @@ class Dynamics:
         diffusion: Diffusion | np.ndarray | Sequence[Sequence[sympy.Expr | float]] | None = None,
         domain: Sequence[Sequence[float]] | np.ndarray | None = None,
         parameters: Mapping[sympy.Symbol, float] | None = None,
+        periodic: Sequence[str] = (),
     ) -> Dynamics:
         """Dynamics of formulas alone, with D = 1 unless another is given.
 
@@ -375,6 +385,8 @@ class Dynamics:
             Two limits a state, where somebody says them.
         parameters
             Real symbols of f that may take other values, with the values that they have.
+        periodic
+            Names of states whose domain is one period.
         """
         if diffusion is None:
             diffusion = Diffusion.identity(len(symbols))
@@ -385,7 +397,7 @@ class Dynamics:
         names, formulas = tuple(each.name for each in symbols), tuple(map(sympy.sympify, equations))
         box = None if domain is None else np.asarray(domain, dtype=float)
         named = tuple(Parameter(each.name, float(value)) for each, value in (parameters or {}).items())
-        return cls(names, formulas, diffusion, domain=box, parameters=named)
+        return cls(names, formulas, diffusion, domain=box, parameters=named, periodic=tuple(periodic))
 
     @property
     def dimension(self) -> int:
@@ -409,6 +421,33 @@ class Dynamics:
     def limits(self) -> np.ndarray:
         """The domain as far as it is known, shape ``(d, 2)``: NaN for a state of which nobody said it."""
         return np.full((self.dimension, 2), np.nan) if self.domain is None else self.domain
+
+    @cached_property
+    def periods(self) -> np.ndarray:
+        """The period of each state, shape ``(d,)``, zero of one that has none."""
+        return np.where([name in self.periodic for name in self.states], np.ptp(self.limits, axis=1), 0.0)
+
+    @cached_property
+    def shifts(self) -> np.ndarray:
+        """What leads to a state and its next images, shape ``(3^k, d)`` for k periodic states; zero first."""
+        signs = ((0, -1, 1) if period else (0,) for period in self.periods)
+        return np.array(list(itertools.product(*signs))) * self.periods
+
+    def turns(self, x: np.ndarray) -> np.ndarray:
+        """By how many periods states ``(n, d)`` lie beyond the domain, whole numbers of that shape."""
+        known = self.periods > 0
+        places = (x - np.where(known, self.limits[:, 0], 0.0)) / np.where(known, self.periods, 1.0)
+        return np.where(known, np.floor(places + TURN_TOLERANCE), 0.0)
+
+    def wrapped(self, x: np.ndarray) -> np.ndarray:
+        """States ``(n, d)`` moved by whole periods into the domain."""
+        return x - self.turns(x) * self.periods
+
+    def unwrapped(self) -> Dynamics:
+        """The same on three periods of each periodic state, the domain being the middle one."""
+        return replace(
+            self, domain=self.limits + np.stack([-self.periods, self.periods], axis=1), periodic=()
+        )
 
     @property
     def output_names(self) -> tuple[str, ...]:

@@ -30,14 +30,17 @@ C.-E. Bréhier et al., Ann. Appl. Probab. 26 (2016) 3559: the mean is p.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from scipy import special
+from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
 from siq.numerics.integration import heun_step, runge_kutta_step
+from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
 from siq.systems.simulation import noise_source
@@ -68,20 +71,39 @@ HEUN = 0.25  # ln E[τ] is off by this times ΔU/ε (h/τ)², as the variance of
 class Neighbourhood:
     """An ellipsoid about an attractor: ``½ (x - center)·hessian (x - center) ≤ level``.
 
-    With the Hessian of V (`siq.systems.equilibria.hessian_at`) it approximates a level set of V.
+    With the Hessian of V (`siq.systems.equilibria.hessian_at`) it approximates a level set of V. About a
+    cycle it is a tube, by the Hessian at the nearest of its points.
     """
 
     center: np.ndarray  #: shape (d,)
     hessian: np.ndarray  #: shape (d, d)
     level: float  #: in the unit of V, not of U = 2V; it should be well below that of the saddles
+    cycle: Cycle | None = None  #: about which it lies, center being one of its states
+    hessians: np.ndarray | None = None  #: shape (n, d, d), at the states of the cycle
 
     @classmethod
     def about(cls, dynamics: Dynamics, attractor: np.ndarray, *, level: float) -> Neighbourhood:
         """The ellipsoid on which V, to second order, has a level (of V, not of U = 2V)."""
         return cls(np.asarray(attractor, dtype=float), hessian_at(dynamics, attractor), level)
 
+    def moved(self, shift: np.ndarray) -> Neighbourhood:
+        """The same a displacement ``(d,)`` on."""
+        cycle = None if self.cycle is None else replace(self.cycle, points=self.cycle.points + shift)
+        return replace(self, center=self.center + shift, cycle=cycle)
+
+    @cached_property
+    def _nearest(self) -> Callable[[np.ndarray], np.ndarray]:
+        assert self.cycle is not None
+        width = np.ptp(self.cycle.points, axis=0)
+        tree = cKDTree(self.cycle.points / width)
+        return lambda x: np.asarray(tree.query(x / width)[1])
+
     def height(self, x: np.ndarray) -> np.ndarray:
         """The quadratic form in units of the level: components ``(d, n)`` to ``(n,)``."""
+        if self.cycle is not None and self.hessians is not None:
+            near = self._nearest(x.T)
+            away = x.T - self.cycle.points[near]
+            return np.einsum("ni,nij,nj->n", away, self.hessians[near], away) / (2 * self.level)
         y = x - self.center[:, None]
         return np.sum(y * (self.hessian @ y), axis=0) / (2 * self.level)
 
@@ -265,8 +287,10 @@ def split_escapes(
         When no walker reaches a target, or all run to infinity.
     """
     centers = np.stack([start.center, *(one.center for one in targets)])
-    rates = np.linalg.eigvals(dynamics.jacobian(centers))
-    slowest = float(np.abs(rates[0].real).min())
+    around = [one.cycle.points for one in (start, *targets) if one.cycle is not None]
+    rates = np.linalg.eigvals(dynamics.jacobian(np.concatenate([centers, *around])))
+    own = rates[0] if start.cycle is None else start.cycle.eigenvalues
+    slowest = float(np.abs(own.real).min())
     along = progress(centers.T)
     lowest, top = float(along[0]), float(along[1:].max())
     if step is None:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -96,6 +96,12 @@ class PhasePortrait:
     remarks: tuple[Remark, ...] = ()  #: what is not known
     cycles: tuple[Cycle, ...] = ()  #: stable cycles that states of the domain lead to
     parting: tuple[Cycle, ...] = ()  #: unstable cycles, which part basins
+    #: Share of the points from which f leads to each attractor, and each cycle after these.
+    shares: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    #: Where states are periodic: the portrait of three periods, of which this is what lies in the middle one;
+    #: and of each attractor there, and each cycle, the number here and by how many periods it is off.
+    cover: PhasePortrait | None = None
+    homes: tuple[tuple[int | None, tuple[int, ...]], ...] = ()
 
     @property
     def unsettled(self) -> float:
@@ -114,6 +120,9 @@ class PhasePortrait:
             place = np.array2string(degenerate[0].position, precision=4)
             return Remark("systems.degenerate_equilibrium", {"place": place})
         alone = not (self.attractors or self.cycles)
+        running = [one for one in self.remarks if one.code == "systems.running"]
+        if alone and running:
+            return running[0]
         if self.unsettled <= UNSETTLED:
             return Remark("systems.no_stable_equilibrium") if alone else None
         values: dict[str, object] = {"share": None if alone else self.unsettled, "kind": None}
@@ -157,6 +166,10 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
     NumericalFailure
         When f has no value in a part of the domain, or nothing moves.
     """
+    if dynamics.periodic:
+        if points is not None:
+            points = (dynamics.wrapped(points) + dynamics.shifts[:, None]).reshape(-1, dynamics.dimension)
+        return _at_home(phase_portrait(dynamics.unwrapped(), points, seed=seed), dynamics)
     generator = np.random.default_rng(seed)
     d, recorded = dynamics.dimension, points is not None
     searched = not recorded and d <= MOST_SEARCHED  # the whole domain
@@ -252,6 +265,50 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
     return PhasePortrait(
         points, box, equilibria, tuple(attractors), tuple(map(tuple, around)), tuple(basins), descents,
         recurrence, harmless, tuple(remarks), cycles, unstable_cycles,
+        np.array([float((descents.ends == index).mean()) for index in range(len(around))]),
+    )  # fmt: skip
+
+
+def _at_home(cover: PhasePortrait, dynamics: Dynamics) -> PhasePortrait:
+    """Of a portrait of three periods what lies in the middle one, in the order that it has there."""
+    settled = [one.position for one in cover.attractors] + [one.points.mean(axis=0) for one in cover.cycles]
+    turns = [tuple(map(int, dynamics.turns(place[None])[0])) for place in settled]
+    home = [index for index, turn in enumerate(turns) if not any(turn)]
+    homes, width = list[tuple[int | None, tuple[int, ...]]](), np.ptp(cover.box, axis=1)
+    for place, turn in zip(settled, turns, strict=True):
+        moved = place - turn * dynamics.periods
+        away = [np.abs((moved - settled[index]) / width).max() for index in home]
+        near = int(np.argmin(away)) if away else 0
+        homes.append((near if away and away[near] < CYCLE_MERGE_TOLERANCE else None, turn))
+    points = [index for index in home if index < len(cover.attractors)]
+    around = [cover.saddles[index] for index in home]
+    inside = [
+        one
+        for one in cover.equilibria
+        if not dynamics.turns(one.position[None]).any() or any(one in saddles for saddles in around)
+    ]
+    # Other wells are elsewhere: to the descents that lead there nothing is at rest here.
+    numbers = np.full(len(settled) + 1, -1)
+    numbers[home] = np.arange(len(home))
+    ends, starts = cover.descents.ends, cover.descents.paths[:, 0]
+    begun = ~dynamics.turns(starts).any(axis=1)
+    away = (numbers[ends] < 0) & ((ends >= 0) | ~begun)
+    descents = replace(cover.descents, ends=numbers[ends], escaped=cover.descents.escaped | away)
+    middle, last = ends[begun], cover.descents.paths[begun, -1]
+    remarks, gone = list(cover.remarks), (last < cover.box[:, 0]) | (last > cover.box[:, 1])
+    running = (gone & (dynamics.periods > 0)).any(axis=1) & cover.descents.escaped[begun]
+    if running.mean() > UNSETTLED:
+        values = {"states": list(dynamics.periodic), "share": float(running.mean())}
+        remarks.append(Remark("systems.running", values))
+    whose = np.array([-1 if number is None else number for number, _ in homes] + [-1])[middle]
+    parting = [one for one in cover.parting if not dynamics.turns(one.points.mean(axis=0)[None]).any()]
+    return replace(
+        cover, equilibria=tuple(inside), attractors=tuple(cover.attractors[index] for index in points),
+        saddles=tuple(around), basins=tuple(cover.basins[index] for index in points if cover.basins),
+        cycles=tuple(cover.cycles[index - len(cover.attractors)] for index in home[len(points) :]),
+        parting=tuple(parting), descents=descents,
+        shares=np.array([float((whose == index).mean()) for index in range(len(home))]),
+        cover=cover, homes=tuple(homes), remarks=tuple(remarks),
     )  # fmt: skip
 
 

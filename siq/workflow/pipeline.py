@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from siq.data.preparation import in_stretches, joined, read_pairs, without_background
+from siq.data.preparation import in_stretches, joined, read_pairs, unusual, without_background
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.data.states import RecordStates
 from siq.errors import NumericalFailure
@@ -56,9 +56,7 @@ def draw_run(
 ) -> StepResult[Recordings]:
     """The trajectories of run `number`: of a system simulated, of recordings all in run 0, then resampled."""
     if isinstance(source, Recordings):
-        hidden = settings.identification.hidden_velocities
-        source = without_background(source) if settings.sampling.background else source
-        source = in_stretches(source, hidden_velocities=hidden)
+        source = _prepared(settings, source)
         if number > 0:
             draw = generator(settings.seed, number, Purpose.RESAMPLE)
             source = source.resampled(generator=draw)
@@ -70,6 +68,15 @@ def draw_run(
         return StepResult(recordings, Outcome(number, Step.SIMULATE))
     except NumericalFailure as error:
         return StepResult(None, Outcome(number, Step.SIMULATE, Status.FAILED, str(error)))
+
+
+def _prepared(settings: PipelineSettings, recordings: Recordings) -> Recordings:
+    """Recordings whose angles count turns, less what drifts slowly, in stretches."""
+    options = settings.identification
+    recordings = recordings.unwrapped(options.angles)
+    if settings.sampling.background and not options.angles:  # an angle that turns on drifts by itself
+        recordings = without_background(recordings)
+    return in_stretches(recordings, hidden_velocities=options.hidden_velocities)
 
 
 def source_of(path: str | Path, settings: PipelineSettings) -> Dynamics | Recordings:
@@ -107,6 +114,9 @@ def identify_run(
         reason = "the run has no trajectories"
         return StepResult(None, Outcome(number, Step.IDENTIFY, Status.SKIPPED, reason))
     named, options = zip(recordings.names, recordings.units, strict=True), settings.identification
+    for one in unusual(recordings):
+        if one.code == "data.wrapped_angle":
+            return StepResult(None, Outcome(number, Step.IDENTIFY, Status.FAILED, sentence(one)))
     if settings.training is not None:  # networks know recorded states only
         options = replace(options, hidden_velocities=False)
     try:
@@ -297,7 +307,7 @@ def landscape_of_run(
         reason = "no vector field was identified"
         return StepResult(None, Outcome(number, Step.LANDSCAPE, Status.SKIPPED, reason))
     recordings = of_all_states(recordings, record, pair_step=settings.sampling.pair_step)
-    x = snapshot_pairs(recordings, pair_step=settings.sampling.pair_step).x0
+    x = record.wrapped(snapshot_pairs(recordings, pair_step=settings.sampling.pair_step)).x0
     draw = generator(settings.seed, number, Purpose.LANDSCAPE)
     points = x[evenly_spread(x, generator=draw)]
     try:
@@ -365,10 +375,9 @@ def analyse(
     or ``cuda``.
     """
     settings = settings or PipelineSettings()
-    networks, hidden = settings.training is not None, settings.identification.hidden_velocities
+    networks = settings.training is not None
     settings = replace(settings, refinement=settings.refinement.with_routes(networks=networks))
-    recordings = without_background(recordings) if settings.sampling.background else recordings
-    recordings = in_stretches(recordings, hidden_velocities=hidden)
+    recordings = _prepared(settings, recordings)
     identified = identify_run(settings, recordings, number=number)
     trained, regressed, landscape = not_trained(number), None, None
     if networks:
@@ -398,7 +407,8 @@ def landscape_from_recordings(
         settings = replace(settings, identification=identification)
     analysis = analyse(trajectories, settings)
     found = None if analysis.landscape is None else analysis.landscape.result
-    seen = RecordStates.of(joined(trajectories))
+    # Levels of an angle are the same a turn on, and no levels of a record.
+    seen = None if settings.identification.angles else RecordStates.of(joined(trajectories))
     if found is None:
         raise NoLandscape(why_no_landscape(analysis.outcomes), seen, analysis.dynamics)
     return replace(found, recorded_states=seen)

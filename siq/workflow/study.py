@@ -9,6 +9,7 @@ and its card.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -574,9 +575,12 @@ def settings_of(study: Study, system: Dynamics | None) -> PipelineSettings:
     else:
         assert recordings is not None  # the schema asks for one of the two
         space = StateSpace(recordings.states, recordings.units, recordings.diffusion)
-    networks = study.training is not None
+    networks, identification = study.training is not None, study.identification
+    if system is not None and system.periodic:
+        ends = {name: system.limits[system.states.index(name)].tolist() for name in system.periodic}
+        identification = replace(identification, angles=ends | identification.angles)
     return PipelineSettings(
-        seed=study.seed, space=space, sampling=sampling, identification=study.identification,
+        seed=study.seed, space=space, sampling=sampling, identification=identification,
         training=study.training, published_method=networks, regression=study.regression,
         refinement=study.refinement.with_routes(networks=networks), certificate=study.certificate,
         landscape=study.landscape, simulation=simulation, invariant=study.invariant,
@@ -589,7 +593,7 @@ def card_content_beside(card: str | None, names: Sequence[str]) -> list[Any] | N
         return None
     said = validate(read_document(card), SystemCard)
     values = {name: entry.value for name, entry in said.parameters.items() if name not in names}
-    states = {name: entry.domain for name, entry in said.states.items()}
+    states = {name: entry.model_dump(include={"domain", "periodic"}) for name, entry in said.states.items()}
     return [states, said.equations, said.diffusion, values, list(said.parameters)]
 
 
@@ -602,4 +606,4 @@ def card_content(system: Dynamics | None) -> list[Any] | None:
         return None
     formulas = [str(equation) for equation in system.formulas]
     domain = None if system.domain is None else system.domain.tolist()
-    return [list(system.states), domain, formulas, system.diffusion.rows]
+    return [list(system.states), domain, formulas, system.diffusion.rows, *system.periodic]

@@ -8,6 +8,7 @@ import sympy
 from scipy.integrate import cumulative_trapezoid
 from scipy.linalg import solve_continuous_lyapunov
 
+from siq import Landscape, Recordings
 from siq.errors import NumericalFailure
 from siq.quasipotential.fokker_planck import CellProcess, Dissipation
 from siq.systems.dynamics import Dynamics
@@ -145,3 +146,21 @@ def test_terms_without_a_current_set_no_upper_limit() -> None:
     draws = [(Dynamics.of((x, y), (-rate * x, -y)), 0.5) for rate in (0.9, 1.0, 1.1)]
     found = Dissipation.of(draws[1][0], 0.5, np.array([[-2.5, 2.5]] * 2), draws=draws, cells=60)
     assert found.value == found.lower == 0 and np.isnan(found.upper)
+
+
+def test_what_a_record_shows_is_the_committor() -> None:
+    x = sympy.Symbol("x", real=True)
+    system = Dynamics.of([x], [x - x**3], domain=[(-2.2, 2.2)])
+    landscape, noise, step = Landscape.from_equations(system), 0.35, 0.02
+    flow = landscape.committor(0, 1, noise=noise)
+    generator = np.random.default_rng(2)
+    state, kept = np.full(20, -1.0), []
+    for number in range(60_000):
+        state = state + step * (state - state**3) + np.sqrt(noise * step) * generator.standard_normal(20)
+        if number % 2 == 0:
+            kept.append(state)
+    times = 2 * step * np.arange(len(kept))
+    table = flow.counted(Recordings.from_arrays(times, np.array(kept).T[:, :, None], names=["x"]))
+    assert len(table) == 10 and (table.excursions > 100).all()
+    score = (table.counted - table.committor) / np.hypot(table.standard_error, 0.02)
+    assert np.abs(score).max() < 3.5
