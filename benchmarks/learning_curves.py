@@ -180,7 +180,7 @@ def draw() -> None:
             axes.axvline(HOUR, color="0.8", linewidth=0.7, zorder=0)
         if y in card:
             for number, one in card.groupby("run"):
-                label = "" if number else "the same, fifty runs on a card"
+                label = "" if number else "published, fifty runs on a card"
                 axes.loglog(one[x], one[y], color="0.6", linestyle=":", linewidth=0.7, label=label, zorder=0)
         axes.set(xlabel=below, ylabel=beside)
     figure.legend(*figure.axes[-3].get_legend_handles_labels(), loc="outside upper center", ncols=3)
