@@ -53,6 +53,7 @@ RUNS = 10
 MARKS = (10, 20, 50, 100, 200, 300, 500, 700, 1000, 1500, *range(2000, 150_001, 500))  # steps, of a row each
 CPU = torch.device("cpu")
 GRID_POINTS = 30_000  # of the grid over Ω
+HOUR = 3600.0  # CPU seconds
 SPACING = 0.1  # of the points at which residuals are taken: the paper's r
 TIMES = {"cpu_seconds": "CPU time / s", "step": "steps of Adam"}
 AXES = {
@@ -168,15 +169,18 @@ def draw() -> None:
     names = {"published.csv": "published training, one run", "ours.csv": "ours, ten runs, to output weights"}
     figure, looks = Figure(figsize=(10, 6), layout="constrained"), ("color", "linestyle", "marker")
     panels = figure.subplots(2, len(AXES), sharey="col").flat
-    card = pd.read_csv(CARD_CURVES)  # of trainings on a graphics card, of which only the steps compare
+    card, reached = pd.read_csv(CARD_CURVES), pd.read_csv(FOLDER / "published.csv").iloc[-1]
+    card["cpu_seconds"] = card["step"] * reached["cpu_seconds"] / reached["step"]  # what its steps take here
     for axes, ((x, below), (y, beside)) in zip(panels, product(TIMES.items(), AXES.items()), strict=True):
         for place, (file, name) in enumerate(names.items()):
             told: dict[str, Any] = dict(zip(looks, look(place), strict=True))
             for number, one in pd.read_csv(FOLDER / file).groupby("run"):
                 axes.loglog(one[x], one[y], markevery=[-1], label="" if number else name, **told)
-        if x == "step" and y in card:
+        if x == "cpu_seconds":
+            axes.axvline(HOUR, color="0.8", linewidth=0.7, zorder=0)
+        if y in card:
             for number, one in card.groupby("run"):
-                label = "" if number else "published training, fifty runs on a card"
+                label = "" if number else "published, fifty runs on a card"
                 axes.loglog(one[x], one[y], color="0.6", linestyle=":", linewidth=0.7, label=label, zorder=0)
         axes.set(xlabel=below, ylabel=beside)
     figure.legend(*figure.axes[-3].get_legend_handles_labels(), loc="outside upper center", ncols=3)
@@ -187,7 +191,7 @@ def main() -> None:
     """Train, or draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("what", choices=("published", "ours", "draw"))
-    parser.add_argument("--seconds", type=float, default=3600.0, help="of the CPU, for the published one")
+    parser.add_argument("--seconds", type=float, default=HOUR, help="of the CPU, for the published one")
     asked = parser.parse_args()
     torch.set_num_threads(1)
     FOLDER.mkdir(parents=True, exist_ok=True)

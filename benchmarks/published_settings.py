@@ -479,15 +479,17 @@ def scored(number: int, networks: TrainedNetworks) -> dict[str, object]:
 
 
 def score(folder: Path) -> None:
-    """The two tables that are kept."""
+    """The two tables that are kept; runs that were scored before are not scored again."""
     archive = read_archive(folder / "networks.npz")
     curves = pd.read_csv(folder / "curves.csv")
     with np.load(folder / "state.npz", allow_pickle=False) as state:
         steps = int(state["0000"])
-    rows = []
-    for number in range(int(archive["count"])):
+    kept = folder / f"scores_{steps}.csv"
+    rows: list[dict[Any, Any]] = pd.read_csv(kept).to_dict("records") if kept.exists() else []
+    for number in range(len(rows), int(archive["count"])):
         rows.append({"steps": steps, **scored(number, unpack(archive, number))})
         print(rows[-1], flush=True)
+        pd.DataFrame(rows).to_csv(kept, index=False, float_format="%.4g")
     pd.DataFrame(rows).to_csv(TABLE, index=False, float_format="%.4g")
     curves.to_csv(CURVES, index=False, float_format="%.4g")
 

@@ -54,7 +54,7 @@ class EquationSettings:
     seed
         Of the sequences of states that stand for the domain.
     refinement
-        How V about an attractor is sought: degrees, accuracy, reach and tolerance.
+        How V about an attractor is sought: degrees, functions, accuracy, reach and tolerance.
     certificate
         The limits of its tests.
     landscape
@@ -163,6 +163,12 @@ def landscape_from_equations(
             references=references_about(system, portrait, depths=depths, seed=seed),
         )  # fmt: skip
         certificate = certify(sought, evidence)
+        if not certificate.certified and any(well.instead for well in sought):
+            powers = [well and (well.instead or well) for well in wells]
+            again = certify([well for well in powers if well is not None], evidence)
+            if again.certified:
+                wells, certificate = powers, again
+                sought = [well for well in wells if well is not None]
         remarks += caustics_below(system, sought, portrait, certificate.error, seed=seed)
     wells += [None] * len(portrait.cycles)
     noises = settings.landscape.noise_intensities

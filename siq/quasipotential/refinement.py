@@ -395,7 +395,13 @@ class RefinementContext:
             "compared": "network" in (self.options.routes or ()),
         }
         if formulas.potential is None:
-            return refined, formulas, certify(refined.wells, self.evidence, **told)
+            certificate = certify(refined.wells, self.evidence, **told)
+            if not certificate.certified and any(well.instead for well in refined.wells):
+                powers = replace(refined, wells=tuple(well.instead or well for well in refined.wells))
+                again = certify(powers.wells, self.evidence, **told)
+                if again.certified:
+                    return powers, _refined_decomposition(powers, self.points), again
+            return refined, formulas, certificate
         error = 0.0
         if whole is not None and not self.found.noise_free:
             error = whole.relative_error(refined.found.library.evaluate(self.points))

@@ -91,6 +91,8 @@ class Well(Expansion):
         Recorded states from which f leads to other attractors, shape ``(m, d)``; None for none.
     trials
         The degrees that were tried.
+    instead
+        V in powers, of V over units, for where these are refused; otherwise None.
     """
 
     basis: PowerBasis
@@ -104,6 +106,7 @@ class Well(Expansion):
     tolerance: float = RESIDUAL_TOLERANCE
     elsewhere: np.ndarray | None = None
     trials: tuple[DegreeTrial, ...] = ()
+    instead: Well | None = None
 
     def __post_init__(self) -> None:
         if not self.reach:
@@ -364,7 +367,7 @@ def local_well(
             other = _over_units(well, basin, kept, path, np.random.default_rng(seed))
             its, share = stated(other)
             if its < left and share >= claimed - COVERAGE_TOLERANCE:
-                return other
+                return replace(other, instead=None if options.about == "units" else well)
     return well
 
 

@@ -103,3 +103,11 @@ def test_a_well_over_units_is_written_and_read(of_units: siq.Landscape, tmp_path
     exec(well.to_numpy(), module)
     assert np.allclose(module["V"](*x.T), well.values(x), rtol=1e-9, atol=1e-9 * well.level)
     assert np.allclose(module["V_gradient"](*x.T).T, well.gradients(x), atol=1e-8)
+
+
+@pytest.mark.slow
+def test_powers_stand_where_units_run_away() -> None:
+    # About (-1, 0) units follow V to 2 % where they claim to, and at a few states are off by more than V.
+    card = Path(__file__).parents[2] / "config" / "systems" / "maier-stein-10.yaml"
+    found = siq.Landscape.from_equations(card)
+    assert found.certificate.certified
