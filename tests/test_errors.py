@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from siq.errors import MissingExtra, needs_extra
-from siq.version import DISTRIBUTION
+from siq.errors import DISTRIBUTION, MissingExtra, needs_extra
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

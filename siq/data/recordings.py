@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from siq.errors import NumericalFailure
+from siq.errors import NumericalFailure, needs_extra
 from siq.numerics.files import whole_file
 from siq.remarks import Remark, sentence
 
 if TYPE_CHECKING:
     import pandas as pd
+    import xarray
 
 TABLE = "the table"  # what messages call what is in no file
 LONGEST_STEP = 1.5  # of the median step: a missing sample makes two of it, jitter rarely a half more
@@ -82,8 +83,8 @@ class Recordings:
         return tuple(map(sentence, self.remarks))
 
     @classmethod
-    def of(cls, source: str | Path | Recordings | pd.DataFrame) -> Recordings:
-        """Recordings, whatever they are in: a file or a folder, a table in memory, or recordings as they are.
+    def of(cls, source: str | Path | Recordings | pd.DataFrame | xarray.Dataset) -> Recordings:
+        """Recordings, whatever they are in: a file or a folder, a table or a dataset, or as they are.
 
         Raises
         ------
@@ -92,7 +93,13 @@ class Recordings:
         """
         if isinstance(source, Recordings):
             return source
-        return read_recordings(source) if isinstance(source, str | Path) else cls.from_frame(source)
+        if isinstance(source, str | Path):
+            return read_recordings(source)
+        if hasattr(source, "data_vars"):
+            from siq.data.tables import read_tables  # which imports pyarrow
+
+            return read_tables(source, columns=None, units=None)
+        return cls.from_frame(source)
 
     @classmethod
     def from_frame(
@@ -201,6 +208,29 @@ class Recordings:
             tuple(names), tuple(units or (None,) * len(names)), labels, recording, together,
             np.concatenate(parts), time_unit,
         )  # fmt: skip
+
+    def to_xarray(self) -> xarray.Dataset:
+        """An `xarray.Dataset` over the dimension ``sample``, with units; ``Recordings.of`` reads it back.
+
+        Its method ``to_netcdf`` writes a file that `read_recordings` reads.
+
+        Raises
+        ------
+        MissingExtra
+            Where xarray is not installed.
+        """
+        with needs_extra("netcdf"):
+            import xarray
+
+        def variable(values: np.ndarray, unit: str | None) -> tuple[str, np.ndarray, dict[str, str]]:
+            return "sample", values, {} if unit is None else {"units": unit}
+
+        states = zip(self.names, self.values.T, self.units, strict=True)
+        labels = np.array(self.labels)[self.recording]
+        return xarray.Dataset(
+            {name: variable(values, unit) for name, values, unit in states},
+            {"recording": variable(labels, None), "t": variable(self.t, self.time_unit)},
+        )
 
     def of_states(self, places: Sequence[int] | np.ndarray, remarks: Iterable[Remark]) -> Recordings:
         """These states alone, by their places, with what there is to say of the others."""
