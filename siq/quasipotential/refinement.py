@@ -112,7 +112,7 @@ class RefinementOptions:
 
 
 @dataclass(frozen=True)
-class Refined:
+class _Refined:
     """V about the attractors and over the region."""
 
     found: FieldEstimate  #: over the functions of a formula for the region: those of f and of V together
@@ -146,7 +146,7 @@ def refine(
     points: np.ndarray,
     options: RefinementOptions,
     seed: int = 0,
-) -> Refined:
+) -> _Refined:
     """V about each attractor, and one formula over the recorded states ``(n, d)`` where one holds.
 
     The seed decides which points are used where there are too many.
@@ -186,9 +186,9 @@ def refine(
             if whole is not None:
                 if not (whole.joint or found.noise_free):
                     remarks.append(Remark("quasipotential.not_orthogonal"))
-                return Refined(found, wells, tuple(remarks), whole)
+                return _Refined(found, wells, tuple(remarks), whole)
         remarks.append(Remark("quasipotential.no_single_formula"))
-    return Refined(found, wells, tuple(remarks))
+    return _Refined(found, wells, tuple(remarks))
 
 
 def _over_library(found: FieldEstimate, library: CandidateLibrary) -> FieldEstimate:
@@ -223,7 +223,7 @@ def _local_wells(
     return tuple(wells), remarks
 
 
-def _refined_decomposition(refined: Refined, points: np.ndarray) -> SymbolicDecomposition:
+def _refined_decomposition(refined: _Refined, points: np.ndarray) -> SymbolicDecomposition:
     """V, g and f of a refinement, V zero at its minimum within the box of recorded states ``(n, d)``.
 
     f is that which was identified, so that f = -D∇V + g is a statement and no definition. Where there is
@@ -381,7 +381,7 @@ class RefinementContext:
         reason = reason if verdict.passed else verdict.reason
         return uncertified(reason) | {"tests": {"agreement": verdict.as_data()}}
 
-    def _certified(self) -> tuple[Refined, SymbolicDecomposition, Certificate]:
+    def _certified(self) -> tuple[_Refined, SymbolicDecomposition, Certificate]:
         """V about the attractors and over the region, with the certificate of what is to stand."""
         refined = refine(
             self.found, self.portrait, points=self.points, options=self.options, seed=self.number

@@ -73,7 +73,7 @@ X, Y, Z, V = sympy.symbols("x y z v", real=True)
 
 
 @dataclass(frozen=True)
-class ReferenceSystem:
+class _ReferenceSystem:
     """A system, and what is known of its landscape."""
 
     name: str
@@ -84,7 +84,7 @@ class ReferenceSystem:
     barriers: tuple[_KnownBarrier, ...]  #: between attractors, known exactly or by two methods
 
 
-def reference_systems() -> dict[str, ReferenceSystem]:
+def reference_systems() -> dict[str, _ReferenceSystem]:
     """Every system whose landscape is known exactly, or was computed by two methods, by name.
 
     Returns
@@ -237,7 +237,7 @@ def _exact(
     dynamics: Dynamics,
     quasipotential: sympy.Expr,
     ways: Sequence[Sequence[Sequence[float]]] = (),
-) -> ReferenceSystem:
+) -> _ReferenceSystem:
     """A system whose U is a formula; ways are attractor, saddle and the attractor behind it, about where."""
     symbols, noise, barriers = dynamics.symbols, dynamics.diffusion, []
     second = compile_formulas([quasipotential.diff(a, b) for a in symbols for b in symbols], symbols)
@@ -270,15 +270,15 @@ def _exact(
         barriers.append(
             _KnownBarrier(start, saddle, end, float(levels[1] - levels[0]), 0.0, prefactor, "exact")
         )
-    return ReferenceSystem(name, about, source, dynamics, quasipotential, tuple(barriers))
+    return _ReferenceSystem(name, about, source, dynamics, quasipotential, tuple(barriers))
 
 
-def _computed_twice(name: str, about: str, source: str, dynamics: Dynamics) -> ReferenceSystem:
+def _computed_twice(name: str, about: str, source: str, dynamics: Dynamics) -> _ReferenceSystem:
     """A system of which nobody knows a formula of U, and two methods the barriers."""
-    return ReferenceSystem(name, about, source, dynamics, None, DOUBLY_COMPUTED[name])
+    return _ReferenceSystem(name, about, source, dynamics, None, DOUBLY_COMPUTED[name])
 
 
-def _point_and_cycle() -> ReferenceSystem:
+def _point_and_cycle() -> _ReferenceSystem:
     """Rings about a stable point: V' = r(r² - a²)(r² - b²) with a turn."""
     inner, outer, turns = sympy.Rational(1, 4), sympy.S.One, 2
     square = X**2 + Y**2
@@ -293,7 +293,7 @@ def _point_and_cycle() -> ReferenceSystem:
         _KnownBarrier(origin, edge, circle, value, 0.0, np.nan, how),
         _KnownBarrier(circle, edge, origin, beyond, 0.0, np.nan, how),
     )
-    return ReferenceSystem(
+    return _ReferenceSystem(
         "point-and-cycle", "A stable point within a stable limit cycle, and an unstable cycle between them.",
         "V' = r(r² - a²)(r² - b²) with a turn", dynamics, 2 * half, barriers,
     )  # fmt: skip

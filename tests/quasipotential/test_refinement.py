@@ -15,10 +15,10 @@ from siq.quasipotential import refinement
 from siq.quasipotential.certificate import Certificate
 from siq.quasipotential.global_formula import GlobalFormula
 from siq.quasipotential.refinement import (
-    Refined,
     RefinementContext,
     RefinementOptions,
     _every_well_held_out,
+    _Refined,
 )
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import phase_portrait
@@ -43,7 +43,7 @@ def test_the_wells_carry_the_certificate_where_one_formula_is_refused(
 ) -> None:
     well: Any = object()
     one = GlobalFormula(np.ones(1), np.eye(1), joint=True)
-    found = Refined(SimpleNamespace(noise_free=True), (well,), formula=one)  # type: ignore[arg-type]
+    found = _Refined(SimpleNamespace(noise_free=True), (well,), formula=one)  # type: ignore[arg-type]
     monkeypatch.setattr(refinement, "refine", lambda *_, **__: found)
     monkeypatch.setattr(refinement, "_formula_library", lambda *_: None)
     monkeypatch.setattr(

@@ -14,7 +14,7 @@ import siq
 from siq.quasipotential.hamiltonian_paths import hamiltonian_paths
 from siq.quasipotential.paths import minimum_action_path
 from siq.systems.equilibria import classify
-from siq.validation.reference_systems import TWO_METHODS, ReferenceSystem, _KnownBarrier
+from siq.validation.reference_systems import TWO_METHODS, _KnownBarrier, _ReferenceSystem
 
 SYSTEMS = siq.reference_systems()
 KNOWN = [name for name, each in SYSTEMS.items() if each.quasipotential is not None]
@@ -38,7 +38,7 @@ def test_ways_lead_from_attractors_over_saddles(name: str) -> None:
         assert found == ["attractor", "saddle", "attractor"]
 
 
-def _settled(system: ReferenceSystem, barrier: _KnownBarrier) -> list[np.ndarray]:
+def _settled(system: _ReferenceSystem, barrier: _KnownBarrier) -> list[np.ndarray]:
     """The equilibria of a way by one step of Newton's method, which has to be a small one."""
     places = np.stack([barrier.start, barrier.saddle, barrier.end])
     steps = np.linalg.solve(system.dynamics.jacobian(places), system.dynamics.drift(places)[..., None])[
