@@ -148,12 +148,14 @@ def passed(module: str, tests: str, number: int | None, *, limit: float | None =
 def main() -> None:
     """A line for each survivor, and the score of each module."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("modules", nargs="*", choices=[[], *MODULES], help="by default all")
+    parser.add_argument("modules", nargs="*", help="certificate, selection, holdout, verify; by default all")
     parser.add_argument("--sample", type=int, default=20, help="mutants of each module")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0, help="go on after so many mutants of this seed")
     parser.add_argument("--limit", type=float, help="seconds for the tests of a mutant; by default measured")
     arguments = parser.parse_args()
+    if unknown := set(arguments.modules) - set(MODULES):
+        parser.error(f"there is no {', '.join(unknown)}; name some of {', '.join(MODULES)}")
     for name in arguments.modules or MODULES:
         module, tests = MODULES[name]
         file = ROOT.joinpath(*module.split(".")).with_suffix(".py")
