@@ -168,14 +168,14 @@ class LandscapeRegressor(RegressorMixin, BaseEstimator):
         velocities = self.field_.library.evaluate(x) @ self.field_.coefficients
         return np.asarray(velocities[:, 0] if self._flat else velocities)
 
-    def score(self, X: Any, y: np.ndarray | None = None, sample_weight: np.ndarray | None = None) -> float:
+    def score(self, X: Any, y: np.ndarray | None = None) -> float:
         """R² of the velocities; of recordings, without `y`, of the increments from sample to sample.
 
         Under noise the last is small also of the true f: of the order of ``f² h`` over the noise rate.
         """
         check_is_fitted(self)
         if y is not None:
-            return float(super().score(X, y, sample_weight))
+            return float(super().score(X, y))
         pairs = snapshot_pairs(self._recordings(X))
         increments, h = pairs.xh - pairs.x0, pairs.h[:, None]
         left = (residuals(self.field_, pairs) ** 2 / h).sum(axis=0)
