@@ -411,7 +411,7 @@ class StreamedPairs:
 
     def take(self, rows: np.ndarray | slice) -> SnapshotPairs:
         """Some of the pairs, by their indices in ascending order."""
-        wanted = np.arange(len(self))[rows] if isinstance(rows, slice) else rows
+        wanted = np.arange(*rows.indices(len(self))) if isinstance(rows, slice) else rows
         parts, first = [], 0
         for block in self.blocks():
             low, high = np.searchsorted(wanted, [first, first + len(block)])
