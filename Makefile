@@ -15,7 +15,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .DEFAULT_GOAL := help
 
 .PHONY: help statistics examples test suite test-portable full untuned noise wheel test-pages newcomer laboratories coverage supports discrepancies \
-        hostile golden official docs docs-full schemas release-check lint format environment clean
+        hostile golden mutants official docs docs-full schemas release-check lint format environment clean
 
 help:  ## this list, which plain `make` prints, too
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
@@ -119,11 +119,17 @@ docs-full: environment  ## examples, notebooks and pictures made anew, then the 
 	$(BIN)/python docs/make/figures.py
 	$(MAKE) docs
 
+# Faults put into the modules that decide, one at a time: do their tests see them? `make mutants MODULE=selection`.
+MODULE ?=
+MUTANTS ?= 20
+mutants: environment  ## whether tests see faults in the modules that decide: hours (MODULE=selection MUTANTS=5)
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m benchmarks.mutation $(MODULE) --sample $(MUTANTS)
+
 # Schemas of configuration for editors and for the catalogue of workflows, from the classes that check it.
 schemas: environment  ## workflow/schemas/, from the classes that check the configuration
 	$(BIN)/python docs/make/schemas.py
 
-# Version, changelog, citation, schemas, wheel and sdist, documentation, worktree. Nothing is published.
+# Version, changelog, citation, recipe, schemas, wheel and sdist, documentation, worktree. Nothing is published.
 release-check: environment  ## the checklist before a release, walked by a machine; nothing is published
 	$(BIN)/python .ci/release_check.py
 

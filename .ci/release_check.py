@@ -19,6 +19,7 @@ import tomllib
 import zipfile
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -33,7 +34,7 @@ def _text(name: str) -> str:
     return (ROOT / name).read_text(encoding="utf-8")
 
 
-def _project() -> dict[str, str]:
+def _project() -> dict[str, Any]:
     return tomllib.loads(_text("pyproject.toml"))["project"]
 
 
@@ -66,6 +67,24 @@ def dates() -> None:
     cited = str(yaml.safe_load(_text("CITATION.cff"))["date-released"])
     if cited != heading[1]:
         raise Missing(f"CITATION.cff is of {cited}, CHANGELOG.md of {heading[1]}")
+
+
+def recipe() -> None:
+    """Recipe for conda: version, dependencies and constraints are those of pyproject.toml."""
+    project, written = _project(), yaml.safe_load(_text("recipe/recipe.yaml"))
+    if written["context"]["version"] != project["version"]:
+        raise Missing(f"recipe/recipe.yaml has version {written['context']['version']}")
+    needed = {line.replace(">", " >", 1) for line in project["dependencies"]}
+    needed.add(f"python {project['requires-python']}")
+    if needed != set(written["requirements"]["run"]):
+        other = sorted(needed ^ set(written["requirements"]["run"]))
+        raise Missing(f"recipe/recipe.yaml and pyproject.toml differ in: {', '.join(other)}")
+    called = {"matplotlib-base": "matplotlib", "pytorch": "torch", "snakemake-minimal": "snakemake"}
+    extras = {line for lines in project["optional-dependencies"].values() for line in lines}
+    for line in written["requirements"]["run_constraints"]:
+        name, limits = line.split(" ", 1)
+        if not any(re.sub(r"\[.*\]", "", one) == called.get(name, name) + limits for one in extras):
+            raise Missing(f"recipe/recipe.yaml says '{line}', and no extra does")
 
 
 def schemas() -> None:
@@ -122,7 +141,7 @@ def worktree() -> None:
         raise Missing(f"commit or remove these first:\n{changed.rstrip()}")
 
 
-CHECKS = (versions, dates, schemas, packages, docs, worktree)
+CHECKS = (versions, dates, recipe, schemas, packages, docs, worktree)
 
 
 def main(wanted: list[str]) -> int:

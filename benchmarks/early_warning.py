@@ -19,8 +19,9 @@ from __future__ import annotations
 import argparse
 import itertools
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -56,7 +57,11 @@ class Laboratory(NamedTuple):
     end: float
 
 
-def family(kind: str, odd: bool) -> tuple[Callable, np.ndarray, np.ndarray, float, float]:
+def _line(begin: float, slope: float, t: float) -> float:
+    return begin + slope * t
+
+
+def family(kind: str, odd: bool) -> tuple[Callable[..., Any], np.ndarray, np.ndarray, np.ndarray, float]:
     """f, values of the parameter up to the fold, wells and saddles at them, and where it has tipped."""
     kind = {"steady": "fold" if odd else "tilted"}.get(kind, kind)
     if kind == "fold":
@@ -109,7 +114,7 @@ def made(kind: str, seed: int) -> Laboratory:
             duration = n * h
             slope = (last - a[first]) / duration
             return Laboratory(
-                f, lambda t, a=a[first], slope=slope: a + slope * t, noise,
+                f, partial(_line, float(a[first]), float(slope)), noise,
                 np.arange(0, n + 1, SUBSTEPS) * h, x[::SUBSTEPS], duration * (1 + ahead), begin, end,
             )  # fmt: skip
 
@@ -145,7 +150,8 @@ def indicators(x: np.ndarray) -> tuple[float, float]:
     size = len(x) // 2
     windows = [rest[k : k + size] for k in np.linspace(0, len(x) - size, 50).astype(int)]
     course = [[one.var() for one in windows], [np.corrcoef(one[:-1], one[1:])[0, 1] for one in windows]]
-    return tuple(float(scipy.stats.kendalltau(range(50), each).statistic) for each in course)
+    first, second = (float(scipy.stats.kendalltau(range(50), each).statistic) for each in course)
+    return first, second
 
 
 def judged(kind: str, seed: int) -> dict[str, object]:
@@ -167,7 +173,7 @@ def judged(kind: str, seed: int) -> dict[str, object]:
     row["variance"], row["correlation"] = indicators(lab.x)
     families = tipping.FAMILIES
     try:
-        tipping.FAMILIES = ((4, 0), (3, 0))
+        tipping.FAMILIES = ((4, 0), (3, 0))  # type: ignore[assignment]
         last = siq.early_warning(record[-len(record) // 3 :], until=lab.until, seed=seed)
         row |= {f"window_{column}": value for column, value in last.course.iloc[-1].items()}
         row["window_probability"] = last.probability["probability"].iloc[-1]

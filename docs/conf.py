@@ -103,7 +103,7 @@ def write_reference(app: Sphinx, config: Config) -> None:
     folder = Path(app.srcdir) / "api"
     folder.mkdir(exist_ok=True)
     packages = sorted(file.parent for file in (ROOT / "siq").rglob("__init__.py"))
-    pages = {name: [name] for name in ("siq.errors", "siq.remarks", "siq.version")}
+    pages = {name: [name] for name in ("siq.errors", "siq.remarks", "siq.sklearn")}
     for package in packages:
         name = ".".join(package.relative_to(ROOT).parts)
         modules = [f"{name}.{file.stem}" for file in sorted(package.glob("[!_]*.py"))]

@@ -128,7 +128,7 @@ _MODULES = {name: module for module, names in _NAMES.items() for name in names.s
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        value: Any = importlib.import_module("siq.version").version()
+        value: Any = importlib.import_module("siq.errors").version()
     elif name in _MODULES:
         value = getattr(importlib.import_module(_MODULES[name]), name)
     else:

@@ -1,4 +1,7 @@
-"""Errors: a value or a file that cannot be used, a computation without a result, a missing package."""
+"""Errors: a value or a file that cannot be used, a computation without a result, a missing package.
+
+And the version, for people who tell of one.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from siq.version import DISTRIBUTION
-
+DISTRIBUTION = "quasipotential"  # what pip installs; the name `siq` is another project's there
 LONGEST_FAULT = 1000  # letters: some messages list all names that could be meant
 
 
@@ -146,3 +148,17 @@ def needs_extra(extra: str) -> Iterator[None]:
         if package in ("", "siq"):
             raise
         raise MissingExtra(extra, package) from None
+
+
+def version() -> str:
+    """The version in pyproject.toml: of the checkout that this file lies in, else of the installation."""
+    checkout = Path(__file__).parents[1] / "pyproject.toml"
+    if checkout.is_file():
+        import tomllib  # here, so that `siq --help` answers at once
+
+        project = tomllib.loads(checkout.read_text(encoding="utf-8")).get("project", {})
+        if project.get("name") == DISTRIBUTION:
+            return str(project["version"])
+    from importlib.metadata import version as installed
+
+    return installed(DISTRIBUTION)

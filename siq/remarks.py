@@ -7,7 +7,7 @@ never for words.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
@@ -48,11 +48,6 @@ class Remark:
     def from_data(cls, data: Mapping[str, Any]) -> Remark:
         """A remark as it was stored by `as_data`."""
         return cls(data["code"], data["values"])
-
-
-def has_code(remarks: Iterable[Remark], code: str) -> bool:
-    """Whether any of these remarks has a code."""
-    return any(remark.code == code for remark in remarks)
 
 
 @cache

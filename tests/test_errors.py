@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from siq.errors import MissingExtra, needs_extra
-from siq.version import DISTRIBUTION
+from siq.errors import DISTRIBUTION, MissingExtra, needs_extra
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -73,10 +72,12 @@ def test_the_mathematics_needs_no_extra() -> None:
         ("import siq; siq.train", "torch", "networks"),
         ("import siq.networks.training", "torch", "networks"),
         ("import siq.report.plots.style", "matplotlib", "plots"),
+        ("import siq.sklearn", "sklearn", "sklearn"),
+        ("import siq; siq.Recordings.to_xarray(None)", "xarray", "netcdf"),
     ],
 )
 def test_what_an_extra_is_for_names_it(statement: str, package: str, extra: str) -> None:
-    done = run_without(ABSENT, statement)
+    done = run_without((package,), statement)
     assert done.returncode
     assert done.stderr.splitlines()[-1].endswith(
         f"'{package}' is not installed; install it by: pip install '{DISTRIBUTION}[{extra}]'."
@@ -85,4 +86,5 @@ def test_what_an_extra_is_for_names_it(statement: str, package: str, extra: str)
 
 def test_the_extras_are_those_of_the_distribution() -> None:
     assert PROJECT["name"] == DISTRIBUTION
-    assert {"networks", "plots", "workflow", "docs", "pages", "dev"} == set(PROJECT["optional-dependencies"])
+    extras = {"networks", "plots", "workflow", "sklearn", "netcdf", "docs", "pages", "dev"}
+    assert extras == set(PROJECT["optional-dependencies"])

@@ -18,7 +18,6 @@ ROOT = Path(__file__).parents[1]
 
 # From the ground up: a package imports those before it, and none after it (docs/decisions).
 ORDER = (
-    "version",
     "errors",
     "numerics",
     "remarks",
@@ -31,6 +30,7 @@ ORDER = (
     "diagnosis",
     "workflow",
     "report",
+    "sklearn",
     "__main__",
 )
 

@@ -151,7 +151,7 @@ def test_forms_ask_for_what_inspect_prints() -> None:
 
 def test_the_papers_of_a_release_agree() -> None:
     checklist = loaded(".ci/release_check.py")
-    for check in (checklist.versions, checklist.schemas):
+    for check in (checklist.versions, checklist.recipe, checklist.schemas):
         check()
 
 

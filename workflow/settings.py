@@ -15,11 +15,10 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, Field
 
 from siq.data.preparation import read_pairs
-from siq.errors import InputError, suggestion
+from siq.errors import DISTRIBUTION, InputError, suggestion
 from siq.numerics.files import Document, read_document, validate
 from siq.systems.cards import check_name, load_exact
 from siq.systems.dynamics import Dynamics
-from siq.version import DISTRIBUTION
 from siq.workflow.study import (
     PipelineSettings,
     Study,

@@ -1,4 +1,4 @@
-"""Files of recordings as columns: text tables and their dialects, Parquet, HDF5, MATLAB, NumPy.
+"""Files of recordings as columns: text tables and their dialects, Parquet, HDF5, NetCDF, MATLAB, NumPy.
 
 All formats become the same thing: headings, known before anything large is read, and columns of cells, read
 on request. What headings mean is the matter of `siq.data.layout`, what cells mean that of `siq.data.tables`.
@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -34,6 +34,7 @@ from siq.remarks import Remark
 
 if TYPE_CHECKING:
     import pandas as pd
+    import xarray
 
 Column: TypeAlias = "pa.Array | pa.ChunkedArray"
 
@@ -64,14 +65,15 @@ class ColumnFile:
     remarks: tuple[Remark, ...] = ()  #: what was recognised or assumed
 
 
-def open_columns(path: str | Path | pd.DataFrame) -> ColumnFile:
-    """Open a file of columns by its suffix, or a table in memory.
+def open_columns(path: str | Path | pd.DataFrame | xarray.Dataset) -> ColumnFile:
+    """Open a file of columns by its suffix, or a table or a dataset in memory.
 
     Parameters
     ----------
     path
         A file with one of the suffixes of `READERS`. HDF5 holds one dataset per column at the root, or a
-        single compound dataset; a MATLAB file holds one vector per column.
+        single compound dataset; a MATLAB file holds one vector per column. A NetCDF file holds variables,
+        each over some of its dimensions, such as ``(recording, t)``.
 
     Raises
     ------
@@ -80,7 +82,7 @@ def open_columns(path: str | Path | pd.DataFrame) -> ColumnFile:
         for columns that are no vectors of numbers or text, or that differ in length.
     """
     if not isinstance(path, str | Path):
-        return _open_frame(path)
+        return _open_dataset(path) if hasattr(path, "data_vars") else _open_frame(path)
     file, path = str(path), Path(path)
     suffix, exists, begin = path.suffix.lower(), path.exists(), b""
     reader = READERS.get(suffix)
@@ -395,6 +397,96 @@ def _open_hdf5(file: str) -> ColumnFile:
     return ColumnFile(tuple(names), tuple(units), load)
 
 
+class _Variable(NamedTuple):
+    """A variable of a NetCDF file, over dimensions."""
+
+    dimensions: tuple[str, ...]
+    values: np.ndarray
+    attributes: Mapping[str, Any]
+
+    @property
+    def unit(self) -> str | None:
+        """Of a clock, ``seconds since 2020-01-01``, without its beginning."""
+        said = _text(self.attributes.get("units"))
+        return said and said.partition(" since ")[0]
+
+    def unpacked(self) -> np.ndarray:
+        """Values as the conventions for climate data (CF) pack them into integers, NaN where none is."""
+        told, values = self.attributes, self.values
+        if values.dtype.kind not in "iuf":
+            return values
+        empty = [told[key] for key in ("_FillValue", "missing_value") if key in told]
+        packed = any(key in told for key in ("scale_factor", "add_offset"))
+        if not empty and not packed:
+            return values
+        numbers = np.where(np.isin(values, np.ravel(empty)), np.nan, values.astype(float))
+        return np.asarray(numbers * told.get("scale_factor", 1.0) + told.get("add_offset", 0.0))
+
+
+def _open_dataset(dataset: xarray.Dataset) -> ColumnFile:
+    """The columns of a dataset in memory."""
+    every = {str(name): each for name, each in dataset.variables.items()}
+    return _over_dimensions(
+        TABLE, {name: _Variable(tuple(map(str, v.dims)), v.values, v.attrs) for name, v in every.items()}
+    )
+
+
+def _open_netcdf(file: str) -> ColumnFile:
+    import h5py
+    from scipy.io import netcdf_file
+
+    found = {}
+    with _reading(file, "NetCDF"):
+        if not h5py.is_hdf5(file):  # version 3
+            with netcdf_file(file, mmap=False) as handle:
+                for name, each in handle.variables.items():
+                    dimensions = each.dimensions
+                    values = np.array(each[...] if dimensions else each.data)
+                    if values.dtype == "S1" and values.ndim:  # text, character by character
+                        values, dimensions = values.view(f"S{values.shape[-1]}")[..., 0], dimensions[:-1]
+                    found[name] = _Variable(dimensions, values, each._attributes)
+            return _over_dimensions(file, found)
+        with h5py.File(file, "r") as handle:
+            for name, each in handle.items():
+                attributes = dict(each.attrs)
+                bare = b"not a netCDF variable" in attributes.get("NAME", b"")  # the size of a dimension
+                if bare or not isinstance(each, h5py.Dataset):
+                    continue
+                axes = ((name,) if each.is_scale and not axis else (axis[0].name,) for axis in each.dims)
+                dimensions = tuple(axis[0].rpartition("/")[2] for axis in axes)
+                found[name] = _Variable(dimensions, each[()], attributes)
+    return _over_dimensions(file, found)
+
+
+def _over_dimensions(file: str, variables: dict[str, _Variable]) -> ColumnFile:
+    """Variables as columns: a row for every element of the dimensions that they have together.
+
+    A dimension that numbers recordings and has no variable of its name is a column, too.
+    """
+    several = {name: each for name, each in variables.items() if each.dimensions}
+    if not several:
+        raise InputError(file, "", "it has no variable over a dimension", "store t and the states over one")
+    sizes: dict[str, int] = {}
+    for each in sorted(several.values(), key=lambda one: -len(one.dimensions)):
+        sizes |= dict(zip(each.dimensions, each.values.shape, strict=True))
+    for name in sizes:
+        if name not in several and read_heading(name).is_label:
+            several[name] = _Variable((name,), np.arange(sizes[name]), {})
+    names, order = tuple(several), list(sizes)
+
+    def load(positions: Sequence[int]) -> list[Column]:
+        columns = {}
+        for name in (names[position] for position in positions):
+            own = several[name].dimensions
+            axes = [own.index(one) for one in order if one in own]
+            values = several[name].unpacked().transpose(axes)
+            values = values.reshape([sizes[one] if one in own else 1 for one in order])
+            columns[name] = np.broadcast_to(values, tuple(sizes.values())).ravel()
+        return _vectors(file, columns)
+
+    return ColumnFile(names, tuple(several[name].unit for name in names), load)
+
+
 def _open_matlab(file: str) -> ColumnFile:
     import h5py
     from scipy.io import loadmat, whosmat
@@ -446,6 +538,7 @@ READERS: dict[str, Callable[[str], ColumnFile]] = {
     ".lvm": _open_text,
     ".h5": _open_hdf5,
     ".hdf5": _open_hdf5,
+    ".nc": _open_netcdf,
     ".mat": _open_matlab,
     ".npz": _open_numpy,
     ".npy": _open_numpy,
@@ -478,6 +571,8 @@ def _vector(file: str, name: str, values: np.ndarray) -> Column:
         return pa.array(values.astype(values.dtype.newbyteorder("="), copy=False))
     if kind == "S" or (kind == "O" and all(isinstance(each, bytes) for each in values[:1])):
         return pa.array(values.tolist(), type=pa.binary()).cast(pa.string())
+    if kind == "M":
+        return pa.array(values)
     if kind == "U":
         return pa.array(values.tolist(), type=pa.string())
     held = "complex numbers" if kind == "c" else "cells, structs or references"

@@ -8,20 +8,21 @@ is refused with its row and column; rows are counted from 1 without the header.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from siq.errors import InputError, NumericalFailure
+from siq.errors import InputError, NumericalFailure, needs_extra
 from siq.numerics.files import whole_file
 from siq.remarks import Remark, sentence
 
 if TYPE_CHECKING:
     import pandas as pd
+    import xarray
 
 TABLE = "the table"  # what messages call what is in no file
 LONGEST_STEP = 1.5  # of the median step: a missing sample makes two of it, jitter rarely a half more
@@ -84,8 +85,8 @@ class Recordings:
         return tuple(map(sentence, self.remarks))
 
     @classmethod
-    def of(cls, source: str | Path | Recordings | pd.DataFrame) -> Recordings:
-        """Recordings, whatever they are in: a file or a folder, a table in memory, or recordings as they are.
+    def of(cls, source: str | Path | Recordings | pd.DataFrame | xarray.Dataset) -> Recordings:
+        """Recordings, whatever they are in: a file or a folder, a table or a dataset, or as they are.
 
         Raises
         ------
@@ -94,7 +95,13 @@ class Recordings:
         """
         if isinstance(source, Recordings):
             return source
-        return read_recordings(source) if isinstance(source, str | Path) else cls.from_frame(source)
+        if isinstance(source, str | Path):
+            return read_recordings(source)
+        if hasattr(source, "data_vars"):
+            from siq.data.tables import read_tables  # which imports pyarrow
+
+            return read_tables(source, columns=None, units=None)
+        return cls.from_frame(source)
 
     @classmethod
     def from_frame(
@@ -242,6 +249,29 @@ class Recordings:
             values[1:, place] -= period * np.cumsum(turns)
         return replace(self, values=values)
 
+    def to_xarray(self) -> xarray.Dataset:
+        """An `xarray.Dataset` over the dimension ``sample``, with units; ``Recordings.of`` reads it back.
+
+        Its method ``to_netcdf`` writes a file that `read_recordings` reads.
+
+        Raises
+        ------
+        MissingExtra
+            Where xarray is not installed.
+        """
+        with needs_extra("netcdf"):
+            import xarray
+
+        def variable(values: np.ndarray, unit: str | None) -> tuple[str, np.ndarray, dict[str, str]]:
+            return "sample", values, {} if unit is None else {"units": unit}
+
+        states = zip(self.names, self.values.T, self.units, strict=True)
+        labels = np.array(self.labels)[self.recording]
+        return xarray.Dataset(
+            {name: variable(values, unit) for name, values, unit in states},
+            {"recording": variable(labels, None), "t": variable(self.t, self.time_unit)},
+        )
+
     def of_states(self, places: Sequence[int] | np.ndarray, remarks: Iterable[Remark]) -> Recordings:
         """These states alone, by their places, with what there is to say of the others."""
 
@@ -332,10 +362,103 @@ class SnapshotPairs:
     recording: np.ndarray  #: (n,): the index of the recording that the pair is from
     copies: float = field(default=1.0, kw_only=True)  #: how often a pair stands there, in the mean over pairs
 
-    def take(self, rows: np.ndarray) -> SnapshotPairs:
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self.h)
+
+    def blocks(self) -> Iterator[SnapshotPairs]:
+        """All pairs in one block, which is what `StreamedPairs` are without."""
+        yield self
+
+    @cached_property
+    def mean_square_speed(self) -> np.ndarray:
+        """The mean of ``|Xh - X0|²/h`` of each state, shape ``(d,)``."""
+        return np.asarray(((self.xh - self.x0) ** 2 / self.h[:, None]).mean(axis=0))
+
+    def take(self, rows: np.ndarray | slice) -> SnapshotPairs:
         """Some of the pairs, by their indices or by a mask."""
         parts = self.x0[rows], self.xh[rows], self.h[rows], self.recording[rows]
         return SnapshotPairs(*parts, copies=self.copies)
+
+
+class StreamedPairs:
+    """Pairs of a Parquet file that need not fit into memory: read block by block whenever they are used.
+
+    A regression of them is that of `snapshot_pairs`, to rounding (`siq.inference.regression`). The file is as
+    `write_recordings` writes it: the rows of a recording stand together, in the order of time.
+
+    Parameters
+    ----------
+    path
+        A Parquet file with the columns ``t``, the states, and ``recording`` where there are several.
+    pair_step
+        See `snapshot_pairs`; by default from the median step of the first block.
+    rows
+        Samples in a block.
+
+    Raises
+    ------
+    InputError
+        When the rows are in another order, or a number is missing.
+    """
+
+    copies = 1.0
+
+    def __init__(self, path: str | Path, *, pair_step: float | None = None, rows: int = 1 << 18) -> None:
+        from pyarrow import parquet
+
+        self.path, self.rows, self.pair_step = Path(path), rows, pair_step
+        self._columns = parquet.read_schema(path).names
+        self.names = tuple(name for name in self._columns if name not in ("recording", "t"))
+        count, squares = 0, np.zeros(len(self.names))
+        for block in self.blocks():
+            if self.pair_step is None:
+                self.pair_step = LONGEST_STEP * float(np.quantile(block.h, 0.5, method="lower"))
+            count, squares = count + len(block), squares + block.mean_square_speed * len(block)
+        self._count, self.mean_square_speed = count, squares / max(count, 1)
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return self._count
+
+    def blocks(self) -> Iterator[SnapshotPairs]:
+        """The pairs, block by block; each begins with the last sample of the one before."""
+        from pyarrow import parquet
+
+        t, x, which = np.empty(0), np.empty((0, len(self.names))), np.empty(0, dtype=np.int64)
+        label, seen = None, 0
+        with parquet.ParquetFile(self.path) as file:
+            for batch in file.iter_batches(batch_size=self.rows):
+                new = np.zeros(len(batch), dtype=np.int64)
+                if "recording" in self._columns:
+                    labels = batch.column("recording").dictionary_decode().to_numpy(zero_copy_only=False)
+                    new[1:] = labels[1:] != labels[:-1]
+                    new[0], label = label is not None and labels[0] != label, labels[-1]
+                states = [batch.column(name).to_numpy(zero_copy_only=False) for name in self.names]
+                t = np.concatenate([t[-1:], batch.column("t").to_numpy(zero_copy_only=False)])
+                x = np.concatenate([x[-1:], np.stack(states, axis=1)])
+                which = np.concatenate([which[-1:], (which[-1] if len(which) else 0) + np.cumsum(new)])
+                if not np.isfinite(x).all() or not (np.diff(t)[np.diff(which) == 0] > 0).all():
+                    fault = "a number is missing, or the times of a recording do not increase"
+                    place = f"rows {seen + 1} to {seen + len(batch)}"
+                    raise InputError(self.path, place, fault, "write it by siq.write_recordings")
+                seen += len(batch)
+                own = which - which[0]
+                numbers = tuple(map(str, range(own[-1] + 1)))
+                part = Recordings(self.names, (None,) * len(self.names), numbers, own, t, x)
+                if len(t) > 1:
+                    yield snapshot_pairs(part, pair_step=self.pair_step)
+
+    def take(self, rows: np.ndarray | slice) -> SnapshotPairs:
+        """Some of the pairs, by their indices in ascending order."""
+        wanted = np.arange(*rows.indices(len(self))) if isinstance(rows, slice) else rows
+        parts, first = [], 0
+        for block in self.blocks():
+            low, high = np.searchsorted(wanted, [first, first + len(block)])
+            parts.append(block.take(wanted[low:high] - first))
+            first += len(block)
+        x0, xh, h = (np.concatenate([getattr(one, name) for one in parts]) for name in ("x0", "xh", "h"))
+        return SnapshotPairs(x0, xh, h, np.zeros(len(wanted), dtype=np.int64))
 
 
 def read_recordings(

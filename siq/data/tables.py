@@ -15,7 +15,7 @@ import re
 import unicodedata
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -29,6 +29,9 @@ from siq.data.recordings import TABLE, Recordings
 from siq.errors import InputError
 from siq.numerics.files import files_of
 from siq.remarks import Remark, sentence
+
+if TYPE_CHECKING:
+    import xarray
 
 # Text that holds a number, and what may follow as its unit: "1.2mm", "5 %", but "3 1/s" only after a space.
 _NUMBER = r"(?:[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?(?i:nan|infinity|inf))"
@@ -60,7 +63,7 @@ class _Rows(NamedTuple):
 
 
 def read_tables(
-    source: str | Path | pd.DataFrame,
+    source: str | Path | pd.DataFrame | xarray.Dataset,
     *,
     columns: Sequence[str] | None,
     units: Mapping[str, str] | None,
@@ -70,20 +73,20 @@ def read_tables(
 
     See `siq.data.recordings.read_recordings`.
     """
-    if isinstance(source, pd.DataFrame) or not Path(source).is_dir():
+    if not isinstance(source, str | Path) or not Path(source).is_dir():
         return _checked(source, columns, units, gaps)
     files = files_of(Path(source))
     return _joined(files, [_checked(file, columns, units, gaps) for file in files], str(source))
 
 
 def _checked(
-    table: str | Path | pd.DataFrame,
+    table: str | Path | pd.DataFrame | xarray.Dataset,
     columns: Sequence[str] | None,
     units: Mapping[str, str] | None,
     gaps: bool,
 ) -> Recordings:
     """Read and check a table; raises InputError for the first thing that cannot be used."""
-    file, source = TABLE if isinstance(table, pd.DataFrame) else str(table), open_columns(table)
+    file, source = str(table) if isinstance(table, str | Path) else TABLE, open_columns(table)
     layout = layout_of(file, source, columns)
     used = [layout.time, *layout.states]
     cells = source.load([*([] if layout.recording is None else [layout.recording]), *used])

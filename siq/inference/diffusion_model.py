@@ -30,7 +30,7 @@ import numpy as np
 import scipy.special
 import sympy
 
-from siq.data.recordings import SnapshotPairs
+from siq.data.recordings import SnapshotPairs, StreamedPairs
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import STANDARD_ERRORS, FieldEstimate, NoiseFormula
 from siq.inference.kalman_filter import Noise, whiten
@@ -363,7 +363,7 @@ def process_noise_increments(found: FieldEstimate, pairs: SnapshotPairs, rest: n
     return np.asarray((back @ rest[:, :, None])[:, :, 0] / np.sqrt(pairs.h)[:, None])
 
 
-def with_process_noise_rate(found: FieldEstimate, pairs: SnapshotPairs) -> FieldEstimate:
+def with_process_noise_rate(found: FieldEstimate, pairs: SnapshotPairs | StreamedPairs) -> FieldEstimate:
     """An estimate by pairs whose `noise_rate` is that of the process noise and no longer that of residuals.
 
     Along a step the system forgets a part of what kicked it: a residual has the covariance
@@ -371,10 +371,10 @@ def with_process_noise_rate(found: FieldEstimate, pairs: SnapshotPairs) -> Field
     inverted. What is left is of second order in the step, where the noise moves J itself. An Euler–Maruyama
     simulation forgets in steps of its own, and nothing within one.
     """
-    if found.noise_free or found.flow.coarse or not len(pairs.h):
+    if found.noise_free or found.flow.coarse or not len(pairs):
         return found
-    every = max(len(pairs.h) // AVERAGED_PAIRS, 1)
-    step = found.dynamics.jacobian(pairs.x0[::every]) * pairs.h[::every, None, None]
+    some = pairs.take(slice(None, None, max(len(pairs) // AVERAGED_PAIRS, 1)))
+    step = found.dynamics.jacobian(some.x0) * some.h[:, None, None]
     if not np.isfinite(step).all() or np.abs(np.linalg.eigvals(step)).max() > MAX_STEP_RELAXATION:
         return found
     n, d, _ = step.shape

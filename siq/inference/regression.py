@@ -20,7 +20,7 @@ which standard errors follow, and the process noise: over longer times it is whi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -28,7 +28,7 @@ import numpy as np
 import scipy.linalg
 from scipy.special import erfc
 
-from siq.data.recordings import Recordings, SnapshotPairs, parents_of
+from siq.data.recordings import Recordings, SnapshotPairs, StreamedPairs, parents_of
 from siq.data.stationarity import even_stretches, lagged_covariances, long_run_covariance
 from siq.errors import NumericalFailure
 from siq.inference.diffusion_model import ResidualLikelihood
@@ -44,6 +44,7 @@ from siq.inference.selection import (
     fit_significant,
     model_average,
     stability,
+    stacked_triangle,
     strong_terms,
     triangles,
 )
@@ -147,17 +148,34 @@ class _PairRegression:
     """Pairs with the functions of a support, by default all, at X0, and what the current f makes of them."""
 
     def __init__(
-        self, library: CandidateLibrary, pairs: SnapshotPairs, support: np.ndarray | None = None
+        self,
+        library: CandidateLibrary,
+        pairs: SnapshotPairs | StreamedPairs,
+        support: np.ndarray | None = None,
     ) -> None:
         self.library, self.pairs = library, pairs
         everything = all_coefficients(range(library.dimension), library.size)
         self.support = everything if support is None else support
         self.active, self.position = np.unique(self.support[:, 1], return_inverse=True)
         self._terms = compile_formulas([library.terms[k] for k in self.active], library.symbols)
-        self.x0, self.xh, self.h = np.ascontiguousarray(pairs.x0.T), pairs.xh.T, pairs.h
-        self.theta = self._terms(self.x0)
-        if not np.isfinite(self.theta).all():
-            raise NumericalFailure("a library function of the vector field is not finite on some pairs")
+        if isinstance(pairs, SnapshotPairs):
+            self.x0, self.xh, self.h = np.ascontiguousarray(pairs.x0.T), pairs.xh.T, pairs.h
+            self.theta = self._terms(self.x0)
+            if not np.isfinite(self.theta).all():
+                raise NumericalFailure("a library function of the vector field is not finite on some pairs")
+
+    def _parts(self) -> Iterator[_PairRegression]:
+        """Itself where the pairs are in memory; else one for each block of them."""
+        if isinstance(self.pairs, SnapshotPairs):
+            yield self
+        else:
+            yield from (_PairRegression(self.library, block, self.support) for block in self.pairs.blocks())
+
+    @cached_property
+    def _sample(self) -> tuple[np.ndarray, np.ndarray]:
+        """X0 ``(d, n)`` and h of some pairs, by which the accuracy of the flow is judged."""
+        some = self.pairs.take(slice(None, None, max(len(self.pairs) // FLOW_SAMPLE, 1)))
+        return np.ascontiguousarray(some.x0.T), some.h
 
     def matrix(self, values: np.ndarray) -> np.ndarray:
         """Coefficients as a matrix ``(d, active)``."""
@@ -178,8 +196,7 @@ class _PairRegression:
         It is coarse where the first order in h shifts the means of pairs by so much that a coefficient could
         be off by more than is harmless: by ``√(Σ b² / variance)`` standard errors at most, of shifts b.
         """
-        matrix, some = self.matrix(values), slice(None, None, max(len(self.h) // FLOW_SAMPLE, 1))
-        x0, h = self.x0[:, some], self.h[some]
+        matrix, (x0, h) = self.matrix(values), self._sample
         found = FlowMap.of(
             lambda x: matrix @ self._terms(x), x0, h, integrator_step=integrator_step, tolerance=tolerance
         )
@@ -189,7 +206,7 @@ class _PairRegression:
         first, second = (self._shift(matrix, one, x0, h, rate) for one in (found, coarse))
         squares = np.einsum("in,ij,jn->n", first - second, np.linalg.inv(rate), first - second) * h
         usual = squares[np.isfinite(squares)]
-        far = len(self.h) / max(len(usual), 1) * float(usual.sum()) > HARMLESS_BIAS**2
+        far = len(self.pairs) / max(len(usual), 1) * float(usual.sum()) > HARMLESS_BIAS**2
         return coarse if far else found
 
     def _shift(
@@ -220,9 +237,8 @@ class _PairRegression:
         """
         if not flow.coarse:
             return rest
-        matrix, some = self.matrix(values), slice(None, None, max(len(self.h) // FLOW_SAMPLE, 1))
-        h = self.h[some]
-        _, spread = flow.moments(lambda x: matrix @ self._terms(x), self.x0[:, some], h, guess)
+        matrix, (x0, h) = self.matrix(values), self._sample
+        _, spread = flow.moments(lambda x: matrix @ self._terms(x), x0, h, guess)
         kept = np.isfinite(spread).all(axis=(1, 2))
         seen = (spread / h[:, None, None])[kept].mean(axis=0) if kept.any() else np.zeros_like(guess)
         if not np.linalg.eigvalsh(seen)[0] > 0:  # a trial f that runs away
@@ -252,15 +268,26 @@ class _PairRegression:
         by_states = zip(*self.library.second_derivatives(self.active.tolist()), strict=True)
         return compile_formulas([each for row in by_states for each in row], self.library.symbols)
 
-    def triangle(self, velocity: np.ndarray) -> np.ndarray:
-        """R of the QR decomposition of √h [Θ, velocity], on which every fit with one weight depends."""
-        stacked = np.concatenate([self.theta.T, velocity], axis=1) * np.sqrt(self.h)[:, None]
-        return np.asarray(np.linalg.qr(stacked, mode="r"))
+    def triangle(
+        self, values: np.ndarray, flow: FlowMap | None, rate: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """R of the QR decomposition of √h [Θ, velocity], on which every fit with one weight depends.
+
+        And the mean square of the `corrected` velocities, shape ``(d,)``. Blocks are stacked below R.
+        """
+        squares = np.zeros(self.library.dimension)
+
+        def rows(part: _PairRegression) -> np.ndarray:
+            nonlocal squares
+            velocity = part.corrected(values, flow, rate)
+            squares = squares + (velocity**2).sum(axis=0)
+            return np.concatenate([part.theta.T, velocity], axis=1) * np.sqrt(part.h)[:, None]
+
+        return stacked_triangle(map(rows, self._parts())), squares / len(self.pairs)
 
     def residual_ratio(self, rate: np.ndarray) -> float:
         """Rms of residuals of a covariance per time over rms of the increments, each component by its own."""
-        size = ((self.pairs.xh - self.pairs.x0) ** 2 / self.h[:, None]).mean(axis=0)
-        return float(np.sqrt((np.diag(rate) / positive(size)).mean()))
+        return float(np.sqrt((np.diag(rate) / positive(self.pairs.mean_square_speed)).mean()))
 
     def generalised(
         self, columns: np.ndarray, goals: np.ndarray, spread: np.ndarray
@@ -282,10 +309,10 @@ def _fit_everything(
     regression: _PairRegression, *, integrator_step: float | None
 ) -> tuple[np.ndarray, np.ndarray, float, FlowMap]:
     """Least squares of all functions: triangle, the residuals' covariance per time and their ratio, flow."""
-    q, d, n = regression.library.size, regression.library.dimension, len(regression.h)
+    q, d, n = regression.library.size, regression.library.dimension, len(regression.pairs)
     flow, rate, values = None, None, np.zeros(d * q)
     for done in range(CORRECTION_ROUNDS):
-        triangle = regression.triangle(regression.corrected(values, flow, rate))
+        triangle, _ = regression.triangle(values, flow, rate)
         # Scaled columns, for functions differ by many orders of magnitude where units are small or large.
         scale = positive(np.linalg.norm(triangle[:q, :q], axis=0))
         solution = np.linalg.lstsq(triangle[:q, :q] / scale, triangle[:q, q:], rcond=1e-14)[0]
@@ -308,15 +335,20 @@ def _fit_everything(
     return triangle, rate, ratio, flow
 
 
-def _refuse_forgotten(pairs: SnapshotPairs) -> None:
+def _refuse_forgotten(pairs: SnapshotPairs | StreamedPairs) -> None:
     """Refuse pairs whose ends do not depend on their beginnings: any f that is fast enough made them.
 
     Bartlett's test of the last canonical correlation ρ between beginnings and ends (Biometrika 34 (1947) 33):
     of independent ones ``-n ln(1 - ρ²)`` has the law of χ² with one degree of freedom.
     """
-    halves = [np.linalg.qr(x - x.mean(axis=0))[0] for x in (pairs.x0, pairs.xh)]
-    last = float(np.linalg.svd(halves[0].T @ halves[1], compute_uv=False)[-1])
-    count = len(pairs.h) / pairs.copies
+    # R of [1, X0, Xh], less its first row, is that of X0 and Xh about their means.
+    found = stacked_triangle(
+        np.concatenate([np.ones((len(one), 1)), one.x0, one.xh], axis=1) for one in pairs.blocks()
+    )
+    d = len(found) // 2
+    ends = np.linalg.qr(found[1:, 1 + d :])[0]
+    last = float(np.linalg.svd(ends[:d], compute_uv=False)[-1])
+    count = len(pairs) / pairs.copies
     if erfc(np.sqrt(-count * np.log1p(-(min(last, 1 - 1e-12) ** 2)) / 2)) > FORGOTTEN:
         raise NumericalFailure(
             f"within a step the state forgets where it was (a correlation of {last:.2g} is left, chance makes"
@@ -332,24 +364,24 @@ def _evenly(count: int, most: int) -> np.ndarray:
 
 def carries_noise(
     library: CandidateLibrary,
-    pairs: SnapshotPairs,
+    pairs: SnapshotPairs | StreamedPairs,
     *,
     options: IdentificationOptions,
     integrator_step: float | None = None,
 ) -> bool:
     """Whether pairs are more than an integrator's error away from any f in the library."""
-    if len(pairs.h) < 2 * library.size:
+    if len(pairs) < 2 * library.size:
         raise NumericalFailure(
-            f"only {len(pairs.h)} pairs for {library.size} candidate functions of f;"
+            f"only {len(pairs)} pairs for {library.size} candidate functions of f;"
             " lower identification.degree or record more"
         )
-    some = pairs.take(_evenly(len(pairs.h), max(options.pairs // 4, 4 * library.size)))
+    some = pairs.take(_evenly(len(pairs), max(options.pairs // 4, 4 * library.size)))
     return _fit_everything(_PairRegression(library, some), integrator_step=integrator_step)[2] >= NOISE_FREE
 
 
 def identify_vector_field(
     library: CandidateLibrary,
-    pairs: SnapshotPairs,
+    pairs: SnapshotPairs | StreamedPairs,
     *,
     options: IdentificationOptions,
     integrator_step: float | None = None,
@@ -361,7 +393,8 @@ def identify_vector_field(
     Parameters
     ----------
     library, pairs, options
-        The candidate functions; X0, Xh and h; and what makes a term significant.
+        The candidate functions; X0, Xh and h, in memory or streamed from a file, which gives the same to
+        rounding; and what makes a term significant.
     integrator_step
         Step of the Euler–Maruyama simulation that made the pairs, None for everything else. Then the
         increment of each step is h f exactly, and f is that of the continuous process.
@@ -381,12 +414,12 @@ def identify_vector_field(
     if isinstance(pairs, LaggedPairs):
         return _identify_by_instruments(library, pairs, options)
     if not carries_noise(library, pairs, options=options, integrator_step=integrator_step):
-        pairs = pairs.take(_evenly(len(pairs.h), options.pairs))
+        pairs = pairs.take(_evenly(len(pairs), options.pairs))
     regression = _PairRegression(library, pairs)
     triangle, rate, ratio, flow = _fit_everything(regression, integrator_step=integrator_step)
     noise_free = ratio < NOISE_FREE
     critical = critical_values(library, false_terms=options.false_terms)
-    samples = len(pairs.h) / (1.0 if noise_free else pairs.copies)
+    samples = len(pairs) / (1.0 if noise_free else pairs.copies)
     problems = LinearProblem.of_components(triangle, samples=samples, critical=critical)
     choose = partial(strong_terms, precision=options.precision) if noise_free else best_support
     chosen, noise = chosen_terms(problems, library, choose), Diffusion.identity(library.dimension)
@@ -411,17 +444,16 @@ def identify_vector_field(
 
 def _fit_support(found: FieldEstimate, regression: _PairRegression) -> FieldEstimate:
     """Generalised least squares on a support, with flow, noise and covariance brought up to date."""
-    d, n, active = found.library.dimension, len(regression.h), len(regression.active)
+    d, n, active = found.library.dimension, len(regression.pairs), len(regression.active)
     values, rate, flow = found.values, found.noise_rate, found.flow
     rest = rate
     if not flow.euler:
         forced = None if found.noise_free else rate
         flow = regression.flow(values, forced, tolerance=1e-11 if found.noise_free else 1e-6)
     for _ in range(CORRECTION_ROUNDS):
-        velocity = regression.corrected(values, flow, rate)
-        triangle = regression.triangle(velocity)
+        triangle, squares = regression.triangle(values, flow, rate)
         # Where there is no noise only the relative weight of the components matters.
-        spread = rest if not found.noise_free else np.diag((velocity**2).mean(axis=0))
+        spread = rest if not found.noise_free else np.diag(squares)
         solution, inverse, scale = regression.generalised(triangle[:, :active], triangle[:, active:], spread)
         change = (np.abs(solution - values) * scale).max() / (np.abs(solution) * scale).max()
         values = solution

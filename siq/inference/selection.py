@@ -32,7 +32,7 @@ J. A. Hoeting et al., Bayesian model averaging: a tutorial, Statistical Science 
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -388,15 +388,16 @@ def triangle_of(columns: np.ndarray, goals: np.ndarray) -> np.ndarray:
     Shape ``(c + g, c + g)``, or ``(n, c + g)`` of fewer rows.
     """
     goals = goals.reshape(len(goals), -1)
-    count = columns.shape[1]
-    width = count + goals.shape[1]
-    found = np.zeros((0, width))
-    rows = max(ROWS_AT_ONCE, 8 * width)
-    for begin in range(0, len(goals), rows):
-        part = slice(begin, begin + rows)
-        together = np.empty((len(found) + len(goals[part]), width))
-        together[: len(found)] = found
-        together[len(found) :, :count] = columns[part]
-        together[len(found) :, count:] = goals[part]
+    rows = max(ROWS_AT_ONCE, 8 * (columns.shape[1] + goals.shape[1]))
+    parts = [slice(begin, begin + rows) for begin in range(0, max(len(goals), 1), rows)]
+    return stacked_triangle(np.concatenate([columns[part], goals[part]], axis=1) for part in parts)
+
+
+def stacked_triangle(blocks: Iterable[np.ndarray]) -> np.ndarray:
+    """R of the QR decomposition of blocks of rows ``(n, c)``, at least one, below each other."""
+    found: np.ndarray | None = None
+    for block in blocks:
+        together = block if found is None else np.concatenate([found, block])
         found = np.asarray(np.linalg.qr(together, mode="r"))
+    assert found is not None
     return found

@@ -112,7 +112,7 @@ class RefinementOptions:
 
 
 @dataclass(frozen=True)
-class Refined:
+class _Refined:
     """V about the attractors and over the region."""
 
     found: FieldEstimate  #: over the functions of a formula for the region: those of f and of V together
@@ -146,14 +146,14 @@ def refine(
     points: np.ndarray,
     options: RefinementOptions,
     seed: int = 0,
-) -> Refined:
+) -> _Refined:
     """V about each attractor, and one formula over the recorded states ``(n, d)`` where one holds.
 
     The seed decides which points are used where there are too many.
     """
     if found.library.angles:  # one formula of V that is periodic, or not, would have to be chosen
         wells, remarks = _local_wells(found, portrait, options=options, seed=seed)
-        return Refined(found, wells, (*remarks, Remark("quasipotential.no_single_formula")))
+        return _Refined(found, wells, (*remarks, Remark("quasipotential.no_single_formula")))
     library = _formula_library(found, options)
     found = _over_library(found, library)
     wells, remarks = _local_wells(found, portrait, options=options, seed=seed)
@@ -189,9 +189,9 @@ def refine(
             if whole is not None:
                 if not (whole.joint or found.noise_free):
                     remarks.append(Remark("quasipotential.not_orthogonal"))
-                return Refined(found, wells, tuple(remarks), whole)
+                return _Refined(found, wells, tuple(remarks), whole)
         remarks.append(Remark("quasipotential.no_single_formula"))
-    return Refined(found, wells, tuple(remarks))
+    return _Refined(found, wells, tuple(remarks))
 
 
 def _over_library(found: FieldEstimate, library: CandidateLibrary) -> FieldEstimate:
@@ -226,7 +226,7 @@ def _local_wells(
     return tuple(wells), remarks
 
 
-def _refined_decomposition(refined: Refined, points: np.ndarray) -> SymbolicDecomposition:
+def _refined_decomposition(refined: _Refined, points: np.ndarray) -> SymbolicDecomposition:
     """V, g and f of a refinement, V zero at its minimum within the box of recorded states ``(n, d)``.
 
     f is that which was identified, so that f = -D∇V + g is a statement and no definition. Where there is
@@ -384,7 +384,7 @@ class RefinementContext:
         reason = reason if verdict.passed else verdict.reason
         return uncertified(reason) | {"tests": {"agreement": verdict.as_data()}}
 
-    def _certified(self) -> tuple[Refined, SymbolicDecomposition, Certificate]:
+    def _certified(self) -> tuple[_Refined, SymbolicDecomposition, Certificate]:
         """V about the attractors and over the region, with the certificate of what is to stand."""
         refined = refine(
             self.found, self.portrait, points=self.points, options=self.options, seed=self.number

@@ -214,6 +214,14 @@ class Well(Expansion):
         """Source of the functions ``V`` and ``V_gradient`` in numpy."""
         return self.formula.source("numpy")
 
+    def to_jax(self) -> str:
+        """Source of the functions ``V`` and ``V_gradient`` in JAX."""
+        return self.formula.source("jax")
+
+    def to_torch(self) -> str:
+        """Source of the functions ``V`` and ``V_gradient`` of tensors in torch."""
+        return self.formula.source("torch")
+
     def to_c(self) -> str:
         """Source of the functions ``V`` and ``V_gradient`` in C."""
         return self.formula.source("c")

@@ -6,9 +6,10 @@ ever evaluated as code, as sympy's own parser does.
 
 Expressions are evaluated as numpy functions (`compile_formulas`, `compile_values`).
 
-For other programs a formula is written as text, LaTeX, and source in numpy, C and Julia. A polynomial about a
-center is written in powers of the offsets from it by Horner's rule, never multiplied out: expanded, its terms
-would be far larger than their sum. Numbers have the digits that it takes to read the same double back.
+For other programs a formula is written as text, LaTeX, and source in numpy, JAX, torch, C and Julia. A
+polynomial about a center is written in powers of the offsets from it by Horner's rule, never multiplied out:
+expanded, its terms would be far larger than their sum. Numbers have the digits that it takes to read the same
+double back.
 """
 
 from __future__ import annotations
@@ -463,15 +464,16 @@ class Formula:
         ]
         return "\n".join([r"\begin{aligned}", *lines, f"{left} &= {right}", r"\end{aligned}"])
 
-    def source(self, language: Literal["text", "numpy", "c", "julia"]) -> str:
+    def source(self, language: Literal["text", "numpy", "jax", "torch", "c", "julia"]) -> str:
         """The function for other programs.
 
         Parameters
         ----------
         language
-            ``text``: a line for each definition, which `parse_formula` reads. ``numpy``, ``c``, ``julia``: a
-            function of the states, and one of the same name with ``_gradient``: in numpy, where both take
-            arrays as well, components come first, shape ``(d, ...)``; in C they go to the last argument.
+            ``text``: a line for each definition, which `parse_formula` reads. Otherwise a function of the
+            states, and one of the same name with ``_gradient``: in ``numpy``, ``jax`` and ``torch``, where
+            both take arrays, or tensors, components come first, shape ``(d, ...)``; in ``c`` they go to the
+            last argument.
         """
         printer = _PRINTERS[language]()
         taken = {*_TAKEN, self.name, f"{self.name}_gradient"}
@@ -506,8 +508,10 @@ class Formula:
             autoescape=False,
         )  # fmt: skip
         environment.filters["wrapped"] = _wrapped
-        return environment.get_template(f"formula.{language}.j2").render(
-            name=self.name, arguments=arguments, result=result, offsets=offsets, value=value, slopes=slopes,
+        module = _MODULES.get(language)
+        return environment.get_template(f"formula.{'numpy' if module else language}.j2").render(
+            module=module, name=self.name, arguments=arguments, result=result, offsets=offsets,
+            value=value, slopes=slopes,
             # A unit is the user's text: nothing of it may end a comment.
             header=[re.sub(r"[^\S ]+|[\\\x00-\x1f\x7f\x85\u2028\u2029]", " ", line) for line in header],
             ignored=[str(variables[symbol]) for symbol in self.symbols if symbol not in common],
@@ -524,7 +528,7 @@ _JULIA = frozenset(
 )  # fmt: skip
 _TAKEN = frozenset(
     {*keyword.kwlist, *reserved_words, *_JULIA, "inline", "restrict", *FUNCTIONS, *CONSTANTS,
-     "abs", "fabs", "fmax", "fmin", "functools", "max", "min", "numpy", "pow"}
+     "abs", "fabs", "fmax", "fmin", "functools", "jax", "max", "min", "numpy", "pow", "torch"}
 )  # fmt: skip
 
 
@@ -532,9 +536,10 @@ SOURCE_WIDTH = 100  # characters after which source goes on in the next line
 
 
 def _horner(expression: sympy.Expr, symbols: Sequence[sympy.Symbol]) -> sympy.Expr:
-    """A sum of powers, as it stands, by Horner's rule; anything else with numbers in the place of π."""
-    constants = expression.atoms(sympy.NumberSymbol)
-    plain = expression.xreplace({each: sympy.Float(each, DIGITS) for each in constants})
+    """A sum of powers, as it stands, by Horner's rule; anything else with numbers for π and √2."""
+    functions = expression.atoms(sympy.NumberSymbol, sympy.Function, sympy.Pow)
+    constants = {each for each in functions if not each.free_symbols}
+    plain = expression.xreplace({each: each.evalf(DIGITS) for each in constants})
     powers = plain.as_poly(*symbols) if symbols else None
     # Of a product as many terms as it has factors would be a coincidence.
     if powers is None or len(powers.terms()) != len(sympy.Add.make_args(plain)):
@@ -571,7 +576,38 @@ class _Julia(_Doubles, JuliaCodePrinter):
         return f"min({', '.join(map(self._print, expr.args))})"
 
 
+_MODULES = {"numpy": "numpy", "jax": "jax.numpy", "torch": "torch"}
+
+
+class _Arrays(_Doubles, NumPyPrinter):
+    """Functions by their names in numpy, which the module of another library has, too."""
+
+    _module = "numpy"
+
+    def __init_subclass__(cls) -> None:
+        for table in ("_kf", "_kc"):
+            known = getattr(NumPyPrinter, table).items()
+            setattr(cls, table, {key: name.replace("numpy.", f"{cls._module}.") for key, name in known})
+
+
+class _Torch(_Arrays):
+    _module = "torch"
+
+    def _reduced(self, function: str, expr: sympy.Expr) -> str:
+        # Of tensors alone, so that numbers are made one.
+        one = ("torch.as_tensor({}, dtype=torch.float64)" if each.is_number else "{}" for each in expr.args)
+        args = (form.format(self._print(each)) for form, each in zip(one, expr.args, strict=True))
+        return f"functools.reduce(torch.{function}, [{', '.join(args)}])"
+
+    def _print_Max(self, expr: sympy.Expr) -> str:  # noqa: N802
+        return self._reduced("maximum", expr)
+
+    def _print_Min(self, expr: sympy.Expr) -> str:  # noqa: N802
+        return self._reduced("minimum", expr)
+
+
 _PRINTERS: Mapping[str, type[CodePrinter | StrPrinter]] = {
-    "text": type("_Text", (_Doubles, StrPrinter), {}), "numpy": type("_NumPy", (_Doubles, NumPyPrinter), {}),
-    "c": type("_C", (_Doubles, C99CodePrinter), {}), "julia": _Julia,
+    "text": type("_Text", (_Doubles, StrPrinter), {}), "c": type("_C", (_Doubles, C99CodePrinter), {}),
+    "julia": _Julia, "numpy": type("_NumPy", (_Arrays,), {}), "torch": _Torch,
+    "jax": type("_Jax", (_Arrays,), {"_module": "jax.numpy"}),
 }  # fmt: skip

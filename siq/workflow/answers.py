@@ -20,8 +20,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from siq.errors import InputError
-from siq.version import version
+from siq.errors import InputError, version
 
 
 class Exit(IntEnum):

@@ -7,8 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from siq.errors import InputError, MissingExtra, NumericalFailure
-from siq.version import version
+from siq.errors import InputError, MissingExtra, NumericalFailure, version
 from siq.workflow.answers import Exit
 
 EPILOG = """\

@@ -15,10 +15,9 @@ import numpy as np
 from siq.data.inspection import Inspection
 from siq.data.inspection import inspect as inspect_recordings
 from siq.data.recordings import read_recordings
-from siq.errors import Fault, InputError
+from siq.errors import DISTRIBUTION, Fault, InputError
 from siq.numerics.files import whole_file
 from siq.systems.cards import check_title
-from siq.version import DISTRIBUTION
 
 STUDIES = (".yaml", ".yml")  # what files end in that are studies, and no recordings
 GENERATED = Path(".snakemake", "siq")

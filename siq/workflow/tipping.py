@@ -377,7 +377,7 @@ def early_warning(
     if fit.fault or not fit.has_process_noise:
         raise NumericalFailure(fit.fault or "the record shows no noise that drives the state")
     generator = np.random.default_rng(seed)
-    _, noise_error, covariance = noise_uncertainty(fit, data)
+    _, noise_error, covariance, _ = noise_uncertainty(fit, data)
     fitted = fit.model.values - _bias(fit.model.values, fit.noise.process[0], t, x, bounds[:-1], generator)
     coefficients, weights = _drawn(fitted, covariance, generator)
     noise = fit.noise.process[0] * np.exp(min(noise_error[0], 1.0) * generator.normal(size=DRAWS))

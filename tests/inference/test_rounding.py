@@ -12,7 +12,6 @@ from siq.inference.checks import _rounding_bias, _rounding_errors, bias_of_round
 from siq.inference.field_estimate import HARMLESS_BIAS
 from siq.inference.library import IdentificationOptions, candidate_library
 from siq.inference.regression import identify_vector_field
-from siq.remarks import has_code
 from siq.workflow import pipeline
 from siq.workflow.pipeline import PipelineSettings
 from siq.workflow.tables import Status
@@ -89,7 +88,7 @@ def test_rounding_that_is_too_coarse_is_refused_with_the_decimals_that_it_takes(
     assert (
         noise.kind == "rounding"
         and noise.fault(("x", "y")) is None
-        and has_code(noise.remarks, "inference.rounding")
+        and "inference.rounding" in {one.code for one in noise.remarks}
     )
     needed = noise.decimals
     assert identified(settling(needed)).noise_free and not identified(settling(needed - 2)).noise_free

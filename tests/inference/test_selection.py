@@ -4,13 +4,17 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
+from siq.errors import NumericalFailure
 from siq.inference.library import CandidateLibrary, candidate_library
 from siq.inference.selection import (
     LinearProblem,
     _improved_support,
     _lacks_terms,
     best_support,
+    chosen_terms,
     critical_values,
+    fit_significant,
+    strong_terms,
 )
 
 pytestmark = pytest.mark.portable
@@ -113,3 +117,37 @@ def test_scores_of_neighbours_are_those_of_fits() -> None:
     support = (NAMES.index("y"), NAMES.index("x"))
     for score, other in made.neighbours(support):
         assert score == pytest.approx(made.score(other), rel=1e-6)
+
+
+def test_without_noise_a_term_counts_by_its_share() -> None:
+    draw = np.random.default_rng(0)
+    functions = LIBRARY.evaluate(draw.uniform(-1, 1, (500, 2)))
+    x, weak = functions[:, NAMES.index("x")], functions[:, NAMES.index("y**2")]
+    share = 1e-3
+    goal = x + share * np.linalg.norm(x) / np.linalg.norm(weak) * weak
+    exact = of_rows(np.column_stack([functions, goal]), LIBRARY)
+    assert named(strong_terms(exact, precision=share / 10)) == {"x", "y**2"}
+    assert named(strong_terms(exact, precision=share * 10)) == {"x"}
+
+
+def test_an_equation_without_a_term_is_named() -> None:
+    rows = np.random.default_rng(0).standard_normal((400, 1 + LIBRARY.size))
+    noise, motion = of_rows(rows, LIBRARY), equation(0, {"x": 2.0})
+    assert {NAMES[k] for _, k in chosen_terms([motion], LIBRARY)} == {"x"}
+    with pytest.raises(NumericalFailure, match="equation of x is significant; record longer"):
+        chosen_terms([noise], LIBRARY, lambda problem: ())
+    with pytest.raises(NumericalFailure, match="equation of x"):
+        chosen_terms([noise], LIBRARY)
+
+
+def test_weak_terms_leave_one_by_one_but_for_the_last_of_an_equation() -> None:
+    strengths = {(0, 1): 0.5, (0, 2): 3.0, (0, 3): 0.9, (1, 4): 0.1}
+    seen = []
+
+    def fit(support: np.ndarray) -> tuple[int, np.ndarray]:
+        seen.append({tuple(row) for row in support.tolist()})
+        return len(support), np.array([strengths[tuple(row)] for row in support.tolist()])
+
+    fitted, support = fit_significant(fit, np.array(list(strengths)))
+    assert [len(each) for each in seen] == [4, 3, 2] and (0, 1) not in seen[1]
+    assert fitted == 2 and support.tolist() == [[0, 2], [1, 4]]

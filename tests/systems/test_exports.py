@@ -106,6 +106,27 @@ def test_numpy_source_gives_the_same(case: Case) -> None:
     assert np.shape(gradient(*case.points[:, 0])) == (len(grid),)
 
 
+def test_torch_source_gives_the_same(case: Case) -> None:
+    torch = pytest.importorskip("torch")
+    module: dict[str, object] = {}
+    exec(case.formula.source("torch"), module)
+    value, gradient = module[case.formula.name], module[f"{case.formula.name}_gradient"]
+    assert callable(value) and callable(gradient)
+    points = torch.tensor(case.points)
+    case.check(torch.cat([value(*points)[None], gradient(*points)]).numpy())
+    assert gradient(*points[:, 0]).shape == (len(points),)
+
+
+def test_jax_source_gives_the_same(case: Case) -> None:
+    jax = pytest.importorskip("jax")
+    jax.config.update("jax_enable_x64", True)
+    module: dict[str, object] = {}
+    exec(case.formula.source("jax"), module)
+    value, gradient = module[case.formula.name], module[f"{case.formula.name}_gradient"]
+    assert callable(value) and callable(gradient)
+    case.check(np.stack([jax.jit(value)(*case.points), *jax.jit(gradient)(*case.points)]))
+
+
 def test_c_source_gives_the_same(case: Case, tmp_path: Path) -> None:
     compiler = shutil.which("cc")
     if compiler is None:

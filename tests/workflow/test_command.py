@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from siq.version import version
+from siq.errors import version
 from siq.workflow.answers import Exit, answer_of_page
 from siq.workflow.command import main
 

@@ -1,0 +1,88 @@
+"""NetCDF files and datasets in memory are recordings with their units."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from scipy.io import netcdf_file
+
+from siq.data.recordings import Recordings, read_recordings
+from siq.errors import InputError
+
+LENGTHS = (4, 3)
+
+
+def recordings() -> Recordings:
+    draw = np.random.default_rng(0)
+    return Recordings.from_arrays(
+        [0.1 * np.arange(n) for n in LENGTHS], [draw.normal(size=(n, 2)) for n in LENGTHS],
+        names=["x", "y"], units=["mm", "µm/s"], time_unit="s",
+    )  # fmt: skip
+
+
+def padded() -> tuple[np.ndarray, np.ndarray]:
+    """Times ``(4,)`` and x ``(2, 4)``, not a number where the second recording has ended."""
+    made = recordings()
+    x = np.full((2, 4), np.nan)
+    x[0], x[1, :3] = made.values[:4, 0], made.values[4:, 0]
+    return made.t[:4], x
+
+
+def test_version_3_over_two_dimensions(tmp_path: Path) -> None:
+    t, x = padded()
+    with netcdf_file(tmp_path / "a.nc", "w") as file:
+        for name, size in (("t", 4), ("recording", 2), ("letters", 5)):
+            file.createDimension(name, size)
+        time = file.createVariable("t", "d", ("t",))
+        time[:], time.units = t, "seconds since 2020-01-01"
+        labels = file.createVariable("recording", "S1", ("recording", "letters"))
+        labels[:] = np.array(["first", "other"], dtype="S5").view("S1").reshape(2, 5)
+        packed = file.createVariable("x", "i2", ("t", "recording"))  # transposed
+        packed[:] = np.where(np.isnan(x.T), -99, np.round(x.T * 100)).astype("i2")
+        packed.units, packed.scale_factor, packed._FillValue = b"mm", 0.01, np.int16(-99)
+        note = file.createVariable("station", "S1", ("letters",))  # no column
+        note[:] = np.array(list("north"), dtype="S1")
+    found = read_recordings(tmp_path / "a.nc")
+    assert (found.names, found.units, found.time_unit) == (("x",), ("mm",), "seconds")
+    assert found.labels == ("first", "other")
+    assert found.recording.tolist() == [0] * 4 + [1] * 3
+    assert found.values[:, 0] == pytest.approx(recordings().values[:, 0], abs=0.005)
+
+
+def test_version_4_is_hdf5_with_dimensions(tmp_path: Path) -> None:
+    t, x = padded()
+    with h5py.File(tmp_path / "a.nc", "w") as file:
+        file["t"], file["x"], file["trajectory"] = t, x, np.zeros(2)
+        file["x"].attrs["units"] = "mm"
+        file["t"].make_scale()
+        file["trajectory"].make_scale("This is a netCDF dimension but not a netCDF variable.         2")
+        file["x"].dims[0].attach_scale(file["trajectory"])
+        file["x"].dims[1].attach_scale(file["t"])
+    found = read_recordings(tmp_path / "a.nc")
+    assert (found.names, found.units, found.labels) == (("x",), ("mm",), ("0", "1"))
+    assert np.array_equal(found.values[:, 0], recordings().values[:, 0])
+
+
+def test_a_file_without_dimensions_is_refused(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.nc", "w") as file:
+        file.attrs["title"] = "nothing"
+    with pytest.raises(InputError, match="no variable over a dimension"):
+        read_recordings(tmp_path / "a.nc")
+
+
+@pytest.mark.parametrize("version", ["memory", "NETCDF3_64BIT", "NETCDF4"])
+def test_a_dataset_is_read_back(version: str, tmp_path: Path) -> None:
+    pytest.importorskip("xarray")
+    made = recordings()
+    dataset = made.to_xarray()
+    if version == "memory":
+        found = Recordings.of(dataset)
+    else:
+        dataset.to_netcdf(tmp_path / "a.nc", format=version)
+        found = Recordings.of(tmp_path / "a.nc")
+    assert (found.names, found.units, found.labels) == (made.names, made.units, made.labels)
+    assert found.time_unit == made.time_unit
+    assert np.array_equal(found.values, made.values) and np.array_equal(found.t, made.t)
