@@ -41,11 +41,11 @@ import scipy.special
 from siq.data.recordings import Recordings
 from siq.data.stationarity import (
     Stretches,
-    bridged_runs,
     even_stretches,
     lagged_covariances,
     long_run_covariance,
     relaxation_samples,
+    runs_of,
     same_stretch,
     usual_step,
 )
@@ -253,7 +253,7 @@ def _increments(recordings: Recordings, stretches: Stretches) -> _Increments | N
     eigenvalues, vectors = np.linalg.eigh(functions[known].T @ functions[known] / known.sum())
     kept = eigenvalues > 1e-10 * eigenvalues[-1]
     increments = np.where(known[:, None], np.diff(values, axis=0), 0.0)
-    runs = bridged_runs(recordings)
+    runs = runs_of(recordings, bridged=True)
     times = [relaxation_samples(column, runs) for column in recordings.values.T]
     return _Increments(
         functions @ (vectors[:, kept] / np.sqrt(eigenvalues[kept])),

@@ -26,7 +26,7 @@ from siq.data.recordings import (
     snapshot_pairs,
 )
 from siq.data.states import switching
-from siq.data.stationarity import background_of, bridged_runs, correlated_samples, runs_of
+from siq.data.stationarity import background_of, correlated_samples, runs_of
 from siq.errors import InputError
 from siq.remarks import Remark
 
@@ -164,7 +164,7 @@ def in_stretches(recordings: Recordings, *, hidden_velocities: bool | Literal["a
     smooth = hidden_velocities is not True and _shows_no_process_noise(recordings)
     if smooth and not (hidden_velocities and goes_to_and_fro(recordings)):
         return recordings
-    runs = bridged_runs(recordings)
+    runs = runs_of(recordings, bridged=True)
     longest = max(correlated_samples(column, runs) for column in recordings.values.T)
     cut = int(np.clip(count / (STRETCH_LENGTH * longest), FEWEST_STRETCHES, min(MOST_STRETCHES, count // 2)))
     label = recordings.labels[0]

@@ -48,10 +48,10 @@ from siq.data.recordings import Recordings
 from siq.data.stationarity import (
     MOST_STRETCHES,
     background_of,
-    bridged_runs,
     change_of,
     correlated_samples,
     relaxation_samples,
+    runs_of,
     stretches_of,
     usual_step,
 )
@@ -441,7 +441,8 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     >>> found.supported, [round(level, 1) for level in found.levels]
     (True, [-0.9, 0.8])
     """
-    runs, generator = bridged_runs(recordings), np.random.default_rng(0)  # always the same surrogates
+    runs = runs_of(recordings, bridged=True)
+    generator = np.random.default_rng(0)  # always the same surrogates
     relaxations = {
         place: time
         for place, one in enumerate(recordings.values.T)
@@ -545,7 +546,7 @@ def _baselines(recordings: Recordings, rest: np.ndarray) -> np.ndarray:
     found = np.zeros_like(rest)
     if number < 2:
         return found
-    counts, runs = np.bincount(labels, minlength=number), bridged_runs(recordings)
+    counts, runs = np.bincount(labels, minlength=number), runs_of(recordings, bridged=True)
     for place, one in enumerate(rest.T):
         means = np.bincount(labels, weights=one, minlength=number) / np.maximum(counts, 1)
         inside = one - means[labels]

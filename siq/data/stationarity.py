@@ -43,33 +43,29 @@ def usual_step(recordings: Recordings) -> float:
     return float(np.quantile(gaps, 0.5, method="lower")) if len(gaps) else float("nan")
 
 
-def runs_of(recordings: Recordings, *, longest: float | None = None) -> list[slice]:
+def runs_of(recordings: Recordings, *, longest: float | None = None, bridged: bool = False) -> list[slice]:
     """Rows of one recording without a gap between them, each a slice.
 
-    A time between samples is a gap beyond the longest, by default `LONGEST_STEP` median steps.
+    A time between samples is a gap beyond the longest, by default `LONGEST_STEP` median steps. Where gaps are
+    `bridged`, they end a run only if they are longer than what the record remembers: the least local
+    relaxation time (`relaxation_samples`), or `BRIDGED` of the correlation time. What lasts longer, such as a
+    visit to a state or a drift, is not ended by samples that are missing; increments are.
     """
-    if longest is None:
-        longest = LONGEST_STEP * usual_step(recordings)
     broken = np.diff(recordings.recording) != 0
+    if longest is None:
+        remembered = LONGEST_STEP
+        if bridged:
+            whole, times = runs_of(recordings, longest=np.inf), []
+            some = whole[:: -(-len(whole) // MOST_RUNS)]
+            for one in recordings.values.T:
+                relaxation = relaxation_samples(one, whole) or 0.0
+                times.append(max(relaxation, BRIDGED * correlated_samples(one, some), LONGEST_STEP))
+            remembered = min(times)
+        longest = remembered * usual_step(recordings)
     if np.isfinite(longest):
         broken |= np.diff(recordings.t) > longest * (1 + 1e-6)
     bounds = np.concatenate([[0], np.flatnonzero(broken) + 1, [len(recordings.t)]])
     return [slice(int(a), int(b)) for a, b in pairwise(bounds) if b > a]
-
-
-def bridged_runs(recordings: Recordings) -> list[slice]:
-    """Rows of one recording without a gap longer than what the record remembers, each a slice.
-
-    That is the least local relaxation time (`relaxation_samples`), or `BRIDGED` of the correlation time. What
-    lasts longer, such as a visit to a state or a drift, is not ended by samples that are missing; increments
-    are, and want `runs_of`.
-    """
-    whole, longest = runs_of(recordings, longest=np.inf), []
-    some = whole[:: -(-len(whole) // MOST_RUNS)]
-    for one in recordings.values.T:
-        relaxation = relaxation_samples(one, whole) or 0.0
-        longest.append(max(relaxation, BRIDGED * correlated_samples(one, some), LONGEST_STEP))
-    return runs_of(recordings, longest=min(longest) * usual_step(recordings))
 
 
 def stretches_of(runs: list[slice], length: int, *, most: int | None = None) -> np.ndarray:
@@ -173,7 +169,7 @@ def change_of(recordings: Recordings, values: np.ndarray, path: np.ndarray) -> f
     lines = [np.linspace(-1, 1, len(path))]
     if len(parts) > 1:
         lines.append(np.concatenate([np.linspace(-1, 1, one.stop - one.start) for one in parts]))
-    runs = bridged_runs(recordings)
+    runs = runs_of(recordings, bridged=True)
     some = runs[:: -(-len(runs) // MOST_RUNS)]
     for line in lines:
         line = np.where(known, line - line[known].mean(), 0.0)
@@ -215,7 +211,7 @@ def background_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarra
     the drift ``(n,)``, less its mean over the record, and how many half periods the fastest cosine has in a
     recording; both are zero where none is seen.
     """
-    runs, counts = bridged_runs(recordings), np.bincount(recordings.recording)
+    runs, counts = runs_of(recordings, bridged=True), np.bincount(recordings.recording)
     best, found = 0.0, (np.zeros(len(values)), 0)
     spread = float(np.var(values))
     if spread <= 0:

@@ -49,7 +49,7 @@ from siq.data.states import (
     RecordStates,
     switching,
 )
-from siq.data.stationarity import bridged_runs, correlated_samples, runs_of, usual_step
+from siq.data.stationarity import correlated_samples, runs_of, usual_step
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.numerics.randomness import positive
@@ -398,7 +398,7 @@ def check_occupancy(
     if noise is None:
         return OccupancyCheck(missing=Remark("quasipotential.record_of_unknown_noise"))
     cores = cores_about(found.dynamics, portrait.attractors, portrait.saddles, noise.intensity)
-    runs, whole_runs = bridged_runs(recordings), bridged_runs(joined(recordings))
+    runs, whole_runs = runs_of(recordings, bridged=True), runs_of(joined(recordings), bridged=True)
     visits = continued_visits(_core_of(cores, recordings.values), whole_runs)
     passages = _passages_of(portrait, joined(recordings), cores)
     states = len(portrait.attractors)

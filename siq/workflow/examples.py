@@ -35,7 +35,7 @@ def name_for(path: Path) -> str:
         return f"{name[:10]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
-def own_path(path: Path, *, start: Path | None = None) -> str:
+def _own_path(path: Path, *, start: Path | None = None) -> str:
     """A path as one writes it in a folder: relative where both lie on one drive."""
     try:
         return Path(os.path.relpath(path, start or Path.cwd())).as_posix()
@@ -43,14 +43,17 @@ def own_path(path: Path, *, start: Path | None = None) -> str:
         return path.resolve().as_posix()
 
 
-def write_generated(path: Path, name: str) -> Path:
-    """Write the shortest study for a file of recordings, or a folder of files, once they have been read."""
+def write_generated(path: Path, name: str) -> tuple[Path, str]:
+    """Write the shortest study for a file of recordings, or a folder of files, once they have been read.
+
+    Returned are the study, and the path of the recordings as one writes it in the folder in which one is.
+    """
     read_recordings(path)  # before anything starts or is written
     study = GENERATED / f"{name}.yaml"
-    text = f"name: {_scalar(name)}\nrecordings: {{file: {_scalar(own_path(path, start=study.parent))}}}\n"
+    text = f"name: {_scalar(name)}\nrecordings: {{file: {_scalar(_own_path(path, start=study.parent))}}}\n"
     with whole_file(study) as partial:
         partial.write_text(text, encoding="utf-8")
-    return study
+    return study, _own_path(path)
 
 
 def init_study(path: Path, *, output: Path | None = None, replace: bool = False) -> Path:
@@ -82,7 +85,7 @@ def _commented_study(found: Inspection, path: Path, study: Path) -> str:
         else ""
     )
     return f"""\
-# A study: what siq is to answer, from which recordings. Run it by: siq run {own_path(study)}
+# A study: what siq is to answer, from which recordings. Run it by: siq run {_own_path(study)}
 # Relative paths start from the folder of this file. What is left out takes its default.
 #
 {looked_at}
@@ -90,7 +93,7 @@ name: {_scalar(name_for(path))}                # names the folder of the results
 title: {_scalar("Landscape of " + name_for(path))}      # what the page is headed
 
 recordings:
-  file: {_scalar(own_path(path, start=study.resolve().parent))}
+  file: {_scalar(_own_path(path, start=study.resolve().parent))}
   # The columns to use, in this order; by default all of them.
   # states: [{", ".join(states)}]
   # Samples further apart than this ({unit}) are no neighbours; by default 1.5 usual steps.

@@ -24,7 +24,7 @@ from typing import IO, Any, TextIO
 from siq.errors import InputError, MissingExtra, suggestion
 from siq.numerics.files import CARD, case_folders, given_path, read_document
 from siq.workflow.answers import Exit, answer_of_page
-from siq.workflow.examples import STUDIES, name_for, own_path, write_generated
+from siq.workflow.examples import STUDIES, name_for, write_generated
 
 MARK = "\x1e"
 """Begins a line that is an event, as the logger plugin of the workflow writes them."""
@@ -351,7 +351,8 @@ def run_study(given: str, asked: Request) -> Exit:
         name, study = load_study(path).name, path
     else:
         name = name_for(path)
-        study, settings = write_generated(path, name), (f"origin={own_path(path)}",)
+        study, origin = write_generated(path, name)
+        settings = (f"origin={origin}",)
     page = RESULTS / name / "report.html"
     return _answered(replace(asked, targets=(page.as_posix(),), study=study, settings=settings), [page])
 

@@ -36,7 +36,8 @@ def test_the_shortest_study_names_the_file_from_its_own_folder(
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "my: bead.csv").write_text(double_well_recordings(1, 20))
     monkeypatch.chdir(tmp_path)
-    study = write_generated(Path("data/my: bead.csv"), "my-bead")
+    study, origin = write_generated(Path("data/my: bead.csv"), "my-bead")
+    assert origin == "data/my: bead.csv"
     options = load_study(study).recordings
     assert options is not None
     assert (study.parent / options.file).resolve() == tmp_path / "data" / "my: bead.csv"
