@@ -232,6 +232,8 @@ class Recordings:
         >>> table.unwrapped({"phi": (-np.pi, np.pi)}).values[:, 0].round(2)
         array([3.  , 3.18, 3.38])
         """
+        if not angles:
+            return self
         values, inside = self.values.copy(), np.diff(self.recording) == 0
         for name, (low, high) in angles.items():
             if name not in self.names:

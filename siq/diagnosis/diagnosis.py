@@ -80,11 +80,12 @@ def _withdrawn(found: Investigation) -> Investigation:
 
 
 def _is_what_was_found(described: AugmentedModel | None, search: Search) -> bool:
-    """Whether a model without a name, the best where it was not fitted, is the equation of one mechanism."""
+    """Whether a function without a name, that foresees best, is the same everywhere, as what was found is."""
     if described is None or len(search.found) != 1 or len(described.parts) != 1:
         return False
-    (part,), mechanism = described.parts, search.found[0].best.candidate
-    return mechanism.terms == part.candidate.terms and not {*mechanism.shapes, *part.candidate.shapes}
+    part, mechanism = described.parts[0].candidate, search.found[0].best.candidate
+    constant = not any(unit.free_symbols for _, unit in part.terms)
+    return constant and mechanism.terms == part.terms and not (mechanism.shapes or part.shapes)
 
 
 @dataclass(frozen=True, repr=False)

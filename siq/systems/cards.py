@@ -80,7 +80,7 @@ def _number(text: object) -> object:
     return float(parse_formula(text, {})) if isinstance(text, str) else text
 
 
-Limit = Annotated[Number, BeforeValidator(_number)]
+Limit = Annotated[Number, BeforeValidator(_number, json_schema_input_type=float | str)]
 """A limit of a domain: a number, or a formula such as ``2*pi``."""
 Formula = str | Number
 DiffusionEntry = Literal["identity"] | list[Formula] | list[list[Formula]]

@@ -9,8 +9,8 @@ from benchmarks.hostile.scores import scored
 
 # Chosen for what they are, and for a short computing time: a minute and a half together.
 REFUSED = (
-    "joined_levels", "swinging_tilt", "gate", "growing_noise", "force_with_memory",
-    "relaxation_oscillator", "lost_buffers", "square_wave", "resets", "growing_oscillation",
+    "hysteresis", "swinging_tilt", "projected_wells", "growing_noise", "force_with_memory",
+    "relaxation_oscillator", "lost_buffers", "square_wave", "feedback_with_delay", "growing_oscillation",
 )  # fmt: skip
 NAMED = ("held_values", "held_gaps", "quantised")  # values that repeat themselves are no copies of recordings
 HONEST = ("gate", "swinging_tilt", "two_offsets", "growing_noise")

@@ -12,7 +12,7 @@ import sympy
 from siq.diagnosis.diagnosis import _is_what_was_found
 from siq.diagnosis.dictionary import roles_of, standard_dictionary
 from siq.diagnosis.evidence import averaged_evidence, evidence_of_function, smooth_prior
-from siq.diagnosis.mechanisms import candidates_of, fresh_names
+from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of, fresh_names
 from siq.diagnosis.study import SearchOptions
 from siq.diagnosis.terms import Place, _powers, _simplest, _with_formula
 from siq.systems.diffusion import Diffusion
@@ -104,7 +104,7 @@ def test_a_formula_without_its_first_coordinate_is_one_of_the_second() -> None:
     assert both.words == ("t", "v")
 
 
-def test_a_formula_without_a_name_is_the_mechanism_that_adds_the_same_equation() -> None:
+def test_a_function_that_is_the_same_everywhere_is_the_mechanism_that_adds_a_constant() -> None:
     """Names and signs of parameters are no difference; another state, another power, or a shape are."""
     every = candidates_of(OSCILLATOR, roles_of(OSCILLATOR), standard_dictionary())
     bias, drag = (
@@ -117,11 +117,15 @@ def test_a_formula_without_a_name_is_the_mechanism_that_adds_the_same_equation()
     assert len({each.terms for each in (constant, linear, quadratic)}) == 3
     elsewhere = replace(place("v"), equations=(("x", sympy.Integer(1)),))
     assert _with_formula(OSCILLATOR, elsewhere, powers[:1]).terms != bias.terms
-    part, found = (SimpleNamespace(candidate=each) for each in (constant, bias))
-    search = SimpleNamespace(found=(SimpleNamespace(best=found),))
-    assert _is_what_was_found(SimpleNamespace(parts=(part,)), search)  # type: ignore[arg-type]
-    assert not _is_what_was_found(SimpleNamespace(parts=(part, part)), search)  # type: ignore[arg-type]
-    assert not _is_what_was_found(None, search)  # type: ignore[arg-type]
+
+    def named(function: MechanismCandidate, mechanism: MechanismCandidate, *, parts: int = 1) -> bool:
+        found = SimpleNamespace(found=(SimpleNamespace(best=SimpleNamespace(candidate=mechanism)),))
+        described = SimpleNamespace(parts=(SimpleNamespace(candidate=function),) * parts)
+        return _is_what_was_found(described, found)  # type: ignore[arg-type]
+
+    # A function of v that is linear may be another one; one that is the same everywhere is none of v.
+    assert named(constant, bias) and not named(linear, drag) and not named(constant, drag)
+    assert not named(constant, bias, parts=2)
 
 
 def test_new_names_are_new() -> None:

@@ -47,7 +47,7 @@ def followed(recordings: Recordings) -> tuple[Fit, Measurements, InnovationLikel
         noise=Noise(np.array([0.003]), np.array([0.5])), closure=False,
     )  # fmt: skip
     assert fit.converged
-    return fit, data, InnovationLikelihood(library.symbols, fit, data)
+    return fit, data, InnovationLikelihood(library, fit, data)
 
 
 def test_scores_are_the_derivatives_of_the_likelihood() -> None:
