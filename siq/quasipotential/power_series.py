@@ -256,11 +256,12 @@ class CycleFormula(NamedTuple):
     """V about a stable cycle of two states, ``Σ_k c_k(φ) s^k``, zero on it.
 
     φ = 2π t/T is the phase on the cycle γ, and s the distance from it along its normal, positive to the left
-    of the motion. With v = |γ'|, n' = β γ'/v, and f and D in parts along and across, ``V_t + ...`` of
+    of the motion. With ``v = |γ'|``, ``n' = β γ'/v``, and f and D in parts along and across, the equation of
+    V ::
 
         q V_t f_t + q² V_s f_s + D_tt V_t² + 2 q D_ts V_t V_s + q² D_ss V_s² = 0,    q = v + β s,
 
-    at the power s^k is a linear equation ``c_k' + k (∂_s f_s + 4 c_2 D_ss) c_k = r_k`` with one periodic
+    is at the power s^k a linear equation ``c_k' + k (∂_s f_s + 4 c_2 D_ss) c_k = r_k`` with one periodic
     solution, r_k being known from lower powers; c_2 is half of the Hessian across.
 
     Attributes
