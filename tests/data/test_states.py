@@ -66,7 +66,7 @@ def test_intervals_of_stays_cover() -> None:
 
 @pytest.mark.parametrize(
     ("power", "seeds"),
-    [(1, 8), (3, 8), *(pytest.param(power, 40, marks=pytest.mark.slow) for power in (1, 3))],
+    [(1, 5), (3, 5), *(pytest.param(power, 40, marks=pytest.mark.slow) for power in (1, 3))],
 )
 def test_one_well_is_never_two(power: int, seeds: int) -> None:
     step = 0.05
@@ -180,11 +180,11 @@ def test_hops_that_depend_on_what_was_not_recorded_end_on_the_second_rung() -> N
 
 def test_baselines_that_differ_are_given_one_each() -> None:
     pair = np.array([[-0.06, 0.06], [0.10, -0.10]])
-    path = np.array([chain(seed, pair, 4000) for seed in range(4)])
-    x = 3.0 * path + 0.2 * np.array([noise(seed, 4000) for seed in range(4)])
+    path = np.array([chain(seed, pair, 2500) for seed in range(4)])
+    x = 3.0 * path + 0.2 * np.array([noise(seed, 2500) for seed in range(4)])
     offsets = np.array([0.0, 0.1, -0.1, 0.15])
     names = ["x"]
-    together = Recordings.from_arrays(np.arange(4000.0), (x + offsets[:, None])[:, :, None], names=names)
+    together = Recordings.from_arrays(np.arange(2500.0), (x + offsets[:, None])[:, :, None], names=names)
     found = switching(together)
     assert found is not None and found.offset == pytest.approx(0.25, abs=0.05)
     assert "differ in their baselines" in found.sentence()
@@ -192,7 +192,7 @@ def test_baselines_that_differ_are_given_one_each() -> None:
     assert "differ in their baselines" in flat.notes[-1]
     taken = (together.values - flat.values)[:, 0].reshape(4, -1)
     np.testing.assert_allclose(taken.mean(axis=1), offsets - offsets.mean(), atol=0.02)
-    recordings = Recordings.from_arrays(np.arange(4000.0), x[:, :, None], names=names)
+    recordings = Recordings.from_arrays(np.arange(2500.0), x[:, :, None], names=names)
     alike = switching(recordings)
     assert alike is not None and alike.offset == 0
     assert without_background(recordings) is recordings

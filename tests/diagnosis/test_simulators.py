@@ -63,7 +63,7 @@ def swings() -> pd.DataFrame:
 def warmings() -> pd.DataFrame:
     """Bodies that also lose 0.03 K/h per K² of heat."""
     noise, tables = np.random.default_rng(0), []
-    for label in range(5):
+    for label in range(3):
         q, T, course = np.repeat(noise.uniform(0, 6, 6), 15), noise.uniform(0, 6), []
         for heat in q:
             course.append(T)
