@@ -255,7 +255,8 @@ def _one_system(rest: _Residuals, labels: Sequence[str], limit: float) -> Verdic
             mean = _explained(columns[own], noise[own], rest.basis[own])
             sums = (sums[0] + mean[0], sums[1] + mean[1])
             if place in enough:
-                variance = _explained(rest.states[own, :1], power[own], rest.basis[own])
+                freedom, square = _explained(rest.states[own, :1], power[own], rest.basis[own])
+                variance = freedom, _as_normal(square, np.sign(power[own].sum(axis=0)), len(own))
                 of_power = (of_power[0] + variance[0], of_power[1] + variance[1])
                 chances[place] = 2 * min(_chance(*mean), _chance(*variance)) * len(enough)
         if not sums[0]:
@@ -315,6 +316,15 @@ def _explained(columns: np.ndarray, rest: np.ndarray, basis: np.ndarray) -> tupl
     values, vectors = np.linalg.eigh(columns.T @ columns - inner.T @ inner)
     kept = values > RANK * len(columns)
     return int(kept.sum()), ((vectors[:, kept].T @ pushed) ** 2 / values[kept, None]).sum(axis=0)
+
+
+def _as_normal(square: np.ndarray, sign: np.ndarray, count: int) -> np.ndarray:
+    """Squares of scores of means of so many χ²₁, from those of a normal distribution (Wilson, Hilferty 1931).
+
+    Of thousands of short recordings one has a variance that its mean and spread alone would make impossible.
+    """
+    mean, spread = np.maximum(1 + sign * np.sqrt(2 * square / count), 0.0), 2 / (9 * count)
+    return np.asarray((np.cbrt(mean) - 1 + spread) ** 2 / spread)
 
 
 def _chance(count: int, explained: np.ndarray) -> float:

@@ -6,9 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from siq.data.recordings import Recordings, snapshot_pairs
-from siq.inference.claims import check_claims
+from siq.inference.claims import _as_normal, check_claims
 from siq.inference.field_estimate import FieldEstimate, FlowMap, Verdict
 from siq.inference.library import IdentificationOptions, field_library
 from siq.inference.regression import refit
@@ -71,6 +72,22 @@ def test_many_short_recordings_are_one_system_and_an_offset_of_force_is_seen() -
     assert sum(10.0**-one.value < 0.05 for one in honest) <= 2 and all(one.passed for one in honest)
     pushed = records(20, samples=60, seed=4, force=lambda x, time, generator: np.full_like(x, 0.8))
     assert not claims(*seen[:80], *pushed)["one_system"].passed
+
+
+@pytest.mark.parametrize(("count", "score"), [(30, 3.0), (30, 5.0), (60, 7.0), (200, -4.0)])
+def test_the_variance_of_a_short_recording_has_the_tails_of_its_distribution(
+    count: int, score: float
+) -> None:
+    """The most deviating of thousands is beyond five standard deviations by chance."""
+    total = count + score * np.sqrt(2 * count)
+    exact = scipy.stats.chi2.sf(total, count) if score > 0 else scipy.stats.chi2.cdf(total, count)
+    square = _as_normal(np.array([score**2]), np.sign([score]), count)
+    assert scipy.stats.chi2.sf(square[0], 1) / 2 == pytest.approx(exact, rel=0.25)
+
+
+def test_of_thousands_of_short_recordings_none_stands_apart_by_chance() -> None:
+    honest = claims(*records(5000, samples=45, seed=11))["one_system"]
+    assert honest.tested and honest.passed and 10.0**-honest.value > 0.1
 
 
 def swinging(x: np.ndarray, time: float, generator: np.random.Generator) -> np.ndarray:
