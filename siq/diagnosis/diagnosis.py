@@ -280,8 +280,9 @@ def solve_case(
             found = _withdrawn(found)
             shown = held_out_runs(found, case.kept)
         elif found.too_faint and _is_what_was_found(shown.described, found.search):
-            verdict, remark = MismatchVerdict.MISSING_PHYSICS, Remark("diagnosis.same_formula")
-            found = replace(found, verdict=verdict, models=(), too_faint=False, remarks=(remark,))
+            others = (one for one in found.remarks if one.code != "diagnosis.not_certain")
+            verdict, remarks = MismatchVerdict.MISSING_PHYSICS, (*others, Remark("diagnosis.same_formula"))
+            found = replace(found, verdict=verdict, models=(), too_faint=False, remarks=remarks)
             shown = held_out_runs(found, case.kept)
         statement = statement_of(found, shown)
     except InputError:

@@ -541,10 +541,11 @@ class Landscape:
     def _draws(self, strength: NoiseStrength, generator: np.random.Generator) -> list[tuple[Dynamics, float]]:
         """f and ε drawn from the distribution of their estimates; none where f is given."""
         found, share = self.field_estimate, strength.standard_error / strength.intensity
+        if found is None:
+            return []
         return [
             (found.drawn(generator), strength.intensity * float(np.exp(share * generator.standard_normal())))
-            for _ in range(0 if found is None else DRAWS)
-            if found is not None
+            for _ in range(DRAWS)
         ]
 
     def rotation(self, state: str | None = None, *, noise: float | None = None, seed: int = 0) -> Rotation:

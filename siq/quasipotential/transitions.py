@@ -131,9 +131,7 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
     `beyond_region` says whether a saddle behind which lies no attractor of the region is a way out, too: of a
     given f the path up to it is as good as any other. Of an identified one nothing is known beyond.
     """
-    whole = (
-        portrait if portrait.cover is None else portrait.cover
-    )  # on which wells of all periods have a number
+    whole = portrait.cover or portrait  # on which wells of all periods have a number
     points, box, cycles = len(whole.attractors), whole.box, whole.cycles
     settled: list[np.ndarray | Cycle] = [*(one.position for one in whole.attractors), *cycles]
     homes = portrait.homes or tuple((number, ()) for number in range(len(settled)))

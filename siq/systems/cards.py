@@ -297,9 +297,7 @@ def build_system(document: Document, card: SystemCard) -> Dynamics:
 def _changed_by(dynamics: Dynamics, name: str, period: float) -> str:
     """What is another one a period of a state on: an equation, or D; empty where nothing is."""
     shift, generator = {symbol(name): symbol(name) + period}, np.random.default_rng(0)
-    named = [
-        *((f"equation of '{own}'", f) for own, f in zip(dynamics.states, dynamics.formulas, strict=True))
-    ]
+    named = [(f"equation of '{own}'", f) for own, f in zip(dynamics.states, dynamics.formulas, strict=True)]
     named += [("diffusion", entry) for row in dynamics.diffusion.formulas for entry in row]
     for what, formula in named:
         formula = sympy.sympify(formula)
