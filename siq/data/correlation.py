@@ -40,6 +40,7 @@ import scipy.special
 
 from siq.data.recordings import Recordings
 from siq.data.stationarity import (
+    STEP_TOLERANCE,
     Stretches,
     even_stretches,
     lagged_covariances,
@@ -146,6 +147,7 @@ class _Increments(NamedTuple):
     values: np.ndarray  # (n, d)
     stretches: Stretches
     size: np.ndarray  # (d,): root mean square
+    root: np.ndarray  # (n, 1): of the time of each step over the usual one
     relaxation: float
 
     def residuals(self, lag: int) -> _Residuals | None:
@@ -188,8 +190,11 @@ class _Increments(NamedTuple):
 
 
 def markov_lag(recordings: Recordings) -> MarkovLag:
-    """Find the lag from which on recordings are Markovian; evenly spaced stretches of them are looked at."""
-    d, stretches = len(recordings.names), even_stretches(recordings)
+    """Find the lag from which on recordings are Markovian; evenly spaced stretches of them are looked at.
+
+    Where samples are uneven throughout, increments over the root of their time are, and lags count steps.
+    """
+    d, stretches = len(recordings.names), even_stretches(recordings, uneven=True)
     step, sensor = stretches.step, np.zeros(d)
     problem = _increments(recordings, stretches)
     first = None if problem is None else problem.residuals(0)
@@ -205,6 +210,11 @@ def markov_lag(recordings: Recordings) -> MarkovLag:
     left = np.diag(lagged_covariances(first.rest, first.number, 0)[0])
     if (left <= NOISE_FREE_RESIDUAL**2 * problem.size**2).all():
         return told("none", 0, first, FIRST_LAGS)
+    # Of a motion without noise uneven steps leave what is of the next order in their time: half the rate
+    # times the spread of the steps, which is at most half of one.
+    uneven = float(np.ptp(problem.root)) > 0
+    if uneven and not (left > (step / relaxation / 4) ** 2 * problem.size**2).all():
+        return told("unknown", None, first, FIRST_LAGS)
     if not _significant(*first.correlations(FIRST_LAGS)).any():
         return told("white", 0, first, FIRST_LAGS)
     lag = 1
@@ -225,7 +235,7 @@ def markov_lag(recordings: Recordings) -> MarkovLag:
         return told("white", 0, seen, most)
     if longest.departure > max(SHAPE_DEPARTURE, 4 * float(seen.correlations(most)[1][0].max())):
         return told("memory", lag, seen, most)
-    sensor[marked] = np.sqrt([fit.sensor for fit in fits])
+    sensor[marked] = np.sqrt([fit.sensor for fit in fits]) / (1 / problem.root).mean()
     return told(longest.shape, 1 if longest.memory == 0 else lag, seen, most, longest.memory * step)
 
 
@@ -250,9 +260,13 @@ def _increments(recordings: Recordings, stretches: Stretches) -> _Increments | N
     functions = np.ones((len(scaled), len(exponents)))
     for state, row in enumerate(np.transpose(exponents)):
         functions *= powers[:, state, row]
+    # Of a time h, √h f and √h φ(x): so the strength of what is left is that of white noise, whatever h.
+    root = np.sqrt(np.where(known, np.diff(recordings.t[: most + 1]) / stretches.step, 1.0))[:, None]
+    root[np.abs(root - 1) <= STEP_TOLERANCE] = 1.0
+    functions *= root
     eigenvalues, vectors = np.linalg.eigh(functions[known].T @ functions[known] / known.sum())
     kept = eigenvalues > 1e-10 * eigenvalues[-1]
-    increments = np.where(known[:, None], np.diff(values, axis=0), 0.0)
+    increments = np.where(known[:, None], np.diff(values, axis=0) / root, 0.0)
     runs = runs_of(recordings, bridged=True)
     times = [relaxation_samples(column, runs) for column in recordings.values.T]
     return _Increments(
@@ -260,6 +274,7 @@ def _increments(recordings: Recordings, stretches: Stretches) -> _Increments | N
         increments,
         Stretches(number, stretches.step),
         np.sqrt((increments[known] ** 2).mean(axis=0)),
+        root,
         min((time for time in times if time is not None), default=float("nan")) * usual_step(recordings),
     )
 
@@ -374,30 +389,34 @@ class NoiseFloor:
 
 
 def noise_floors(recordings: Recordings) -> tuple[NoiseFloor, ...] | None:
-    """The noise of each state; None where too few neighbouring samples are evenly spaced."""
-    stretches = even_stretches(recordings)
+    """The noise of each state; None where too few neighbouring samples have no gap between them."""
+    stretches = even_stretches(recordings, uneven=True)
     for width in WINDOWS:
         begins = stretches.within(width - 2)
         begins = begins[begins % (width // 2) == 0]
         begins = begins[:: max(len(begins) // MOST_WINDOWS, 1)]
         if len(begins) >= FEWEST_WINDOWS:
-            step = float(np.median(recordings.t[begins + 1] - recordings.t[begins]))
             rows = begins[:, None] + np.arange(width)
-            return tuple(_noise_floor(column[rows], step) for column in recordings.values.T)
+            elapsed = (recordings.t[rows] - recordings.t[begins, None]) / stretches.step
+            even = np.abs(np.diff(elapsed) - 1) <= 2 * STEP_TOLERANCE
+            times = np.arange(width, dtype=float)[None] if even.all() else elapsed
+            return tuple(_noise_floor(column[rows], times, stretches.step) for column in recordings.values.T)
     return None
 
 
-def _noise_floor(window: np.ndarray, step: float) -> NoiseFloor:
-    """The noise of one state in windows of shape ``(windows, width)``."""
+def _noise_floor(window: np.ndarray, times: np.ndarray, step: float) -> NoiseFloor:
+    """The noise of one state in windows of shape ``(windows, width)``, at times in steps, one row or one each."""
     width = window.shape[1]
-    polynomials = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, width), width - 1))[0]
-    walk = np.minimum.outer(np.arange(width), np.arange(width)).astype(float)
+    scaled = 2 * times / times[:, -1:] - 1
+    polynomials = np.linalg.qr(np.polynomial.legendre.legvander(scaled, width - 1))[0]
+    walk = np.minimum(times[:, :, None], times[:, None])
     typical = float(np.mean(np.diff(window, axis=1) ** 2))
     for lowest in (width // SMOOTH_SHARE, width // 2):
-        contrasts = polynomials[:, lowest:]
-        rest = (window - window[:, :1]) @ contrasts
+        contrasts = polynomials[..., lowest:]
+        rest = ((window - window[:, :1])[:, None] @ contrasts)[:, 0]
         empirical = rest.T @ rest / len(rest)
-        parts = np.array([contrasts.T @ contrasts, contrasts.T @ walk @ contrasts])
+        back = np.swapaxes(contrasts, -1, -2)
+        parts = np.array([(back @ contrasts).mean(axis=0), (back @ walk @ contrasts).mean(axis=0)])
         # Windows overlap by a half, so that about half of them are independent.
         (sensor, process), errors = _most_likely(parts, empirical, len(rest) / 2)
         if 2 * sensor + process <= VISIBLE_NOISE**2 * typical:

@@ -206,7 +206,11 @@ def path_of(
         # What hops from well to well for long before it is anywhere else knows a valley by all its passages.
         fine = _wells_apart(smooth, runs, _wells_of(spread_out, relaxation))
         wells = fine if len(wells) < len(fine) <= MOST_STATES else wells
-    each = [wells] if len(longest) == 1 else [_wells_of(smooth[:, [k]], one) for k, one in enumerate(longest)]
+    each = (
+        [wells]
+        if len(longest) == 1
+        else [_wells_of(spread_out[:, [k]], one) for k, one in enumerate(longest)]
+    )
     alone = each[column]
 
     def guess(states: int, place: int = column) -> np.ndarray:

@@ -17,8 +17,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 
+from siq.data.correlation import MIN_REPETITIONS
 from siq.errors import InputError, suggestion
 from siq.remarks import Remark
 
@@ -35,20 +37,22 @@ RESERVED = _words("sin cos tan exp log sqrt tanh atan Abs sign Max Min pi record
 
 TIME_NAMES = _words(
     "t time times zeit temps tiempo tempo timestamp timestamps datetime date elapsed elapsedtime clock"
-    " clocktime uhrzeit seconds xvalue"
+    " clocktime uhrzeit seconds xvalue age ages alter"
 )
 LABEL_NAMES = _words(
     "recording recordings record run runs trial trials id rec experiment measurement series trajectory traj"
     " track trackid runid recordingid trialid recid trajectoryid replicate repetition rep file filename sweep"
     " ringdown label particle particleid messung versuch aufnahme"
 )
+AGE_NAMES = _words("age ages alter")
 INDEX_NAMES = _words("index idx row rowid rownumber unnamed")
 TIME_UNITS = _words(
-    "ns us µs μs ms s sec secs second seconds min minute minutes h hr hrs hour hours d day days yr year years"
+    "ns us µs μs ms s sec secs second seconds min minute minutes h hr hrs hour hours d day days week weeks month"
+    " months yr year years ka kyr myr"
 )
 
 _UNITS_AS_TITLES = TIME_UNITS - _words(
-    "ns us µs μs ms s min h hr d yr"
+    "ns us µs μs ms s min h hr d yr ka"
 )  # these are called so for other reasons
 EVEN = 0.01  # share of the steps of a nameless clock that may be others: gaps, and where recordings begin
 
@@ -57,8 +61,8 @@ _PREFIX = "(?:da|[YZEPTGMkhdcmuµμnpfazy])?"
 _PREFIXED = "mol|Ohm|ohm|rad|bar|cal|cd|Hz|Pa|Wb|lm|lx|sr|Da|eV|px|Ω|m|s|g|A|K|N|J|W|V|C|F|H|T|S|L|l|M|B"
 _ALONE = (
     r"counts?|cts|pixels?|px|adu|ADU|a\.?u\.?|arb\.? ?u(?:nits?)?\.?|n\.?u\.?|atm|Torr|mmHg|rpm|ppm|ppb|dB"
-    r"|deg|degrees?|radians?|°[CF]?|%|‰|permil|1|-|min|minutes?|hours?|hrs?|h|days?|d|years?|yr|sec(?:ond)?s?|volts?"
-    r"|meters?|metres?|k_?B ?T|kT|Å|u|LSB|lsb|bits?"
+    r"|deg|degrees?|radians?|°[CF]?|%|‰|permil|1|-|min|minutes?|hours?|hrs?|h|days?|d|weeks?|months?|years?|[kM]?yr|ka"
+    r"|sec(?:ond)?s?|volts?|meters?|metres?|k_?B ?T|kT|Å|u|LSB|lsb|bits?"
 )
 _POWER = r"(?:(?:\^|\*\*)?\{?[-−+]?\d+(?:[./]\d+)?\}?|[⁺⁻]?[⁰¹²³⁴⁵⁶⁷⁸⁹]+)?"
 _FACTOR = rf"(?:(?:{_ALONE}|{_PREFIX}(?:{_PREFIXED})){_POWER})"
@@ -66,6 +70,9 @@ _UNIT = re.compile(rf"\(?{_FACTOR}(?:\s*(?:[·*⋅×/]|\s)\s*\(?{_FACTOR}\)?)*\)
 
 
 _TIME_ARGUMENT = re.compile(r"\s*\(\s*t\s*\)$")  # x(t) is x
+_BEFORE_PRESENT = re.compile(
+    r"[\s_]*(?<![^\W_])(?:cal[\s_]+)?(?:b2k|BP|before present)(?![^\W_])", re.IGNORECASE
+)
 
 
 class _Heading(NamedTuple):
@@ -73,6 +80,12 @@ class _Heading(NamedTuple):
 
     title: str
     unit: str | None
+    before_present: bool = False
+
+    @property
+    def is_age(self) -> bool:
+        """Whether a time of this heading runs backwards, such as the ages of a core."""
+        return self.before_present or _plain(self.title) in AGE_NAMES
 
     @property
     def is_label(self) -> bool:
@@ -96,9 +109,16 @@ def read_heading(heading: str) -> _Heading:
 
     Examples
     --------
-    >>> [tuple(read_heading(text)) for text in ("bead x (µm)", "x(t)", "time_ms", "year")]
+    >>> [tuple(read_heading(text)[:2]) for text in ("bead x (µm)", "x(t)", "time_ms", "year")]
     [('bead x', 'µm'), ('x', None), ('time', 'ms'), ('year', 'year')]
+    >>> read_heading("age (yr b2k)")
+    _Heading(title='age', unit='yr', before_present=True)
     """
+    text = _BEFORE_PRESENT.sub("", heading).strip()
+    if text != heading.strip():
+        age = _Heading("age", text) if text in TIME_UNITS else read_heading(text)
+        if _may_be_time(age):
+            return age._replace(before_present=True)
     text = heading.strip()
     if match := re.fullmatch(r"(.*?)\s*\[\s*(.*?)\s*\]", text):
         return _Heading(_TIME_ARGUMENT.sub("", match[1]), match[2] or None)
@@ -148,6 +168,7 @@ class _Layout(NamedTuple):
 
     recording: int | None  # None where all rows are one recording
     time: int
+    backwards: bool  # an age, which falls as time goes on
     states: tuple[int, ...]
     names: tuple[str, ...]  # of the states, in formulas, ...
     titles: tuple[str, ...]  # ... and to people
@@ -195,7 +216,7 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
     free = [place for place in free if place not in dropped]
     time = _time_column(file, source, parts, free, remarks)
     free.remove(time)
-    recording = _label_column(source, parts, free, remarks)
+    recording = _label_column(source, parts, time, free, remarks)
     if columns is None:
         others = [place for place in free if place != recording and _is_second_time(source, parts, place)]
         for place in others:
@@ -221,7 +242,9 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
     pairs = zip(parts, source.units, strict=True)
     units = tuple({"name": part.unit, "metadata": unit} for part, unit in pairs)
     shown = tuple(titles[place] for place in states)
-    return _Layout(recording, time, tuple(states), tuple(names), shown, units, tuple(remarks))
+    return _Layout(
+        recording, time, parts[time].is_age, tuple(states), tuple(names), shown, units, tuple(remarks)
+    )
 
 
 def _numbers(source: ColumnFile, place: int) -> np.ndarray | None:
@@ -267,11 +290,13 @@ def _time_column(
     found = [place for place in free if _may_be_time(parts[place])]
     if not found:
         found = [place for place in free if _runs_evenly(_numbers(source, place))]
-    if len(found) > 1:
-        # "T" is a temperature rather than a time.
-        found = [place for place in found if parts[place].title != "T"]
+    # "T" is a temperature rather than a time, and an age that of what is measured.
+    for is_other in (lambda part: part.title == "T", lambda part: part.is_age):
+        if len(found) > 1:
+            found = [place for place in found if not is_other(parts[place])] or found
     if len(found) == 1:
-        remarks.append(Remark("data.time_column", {"column": parts[found[0]].title}))
+        backwards = parts[found[0]].is_age
+        remarks.append(Remark("data.time_column", {"column": parts[found[0]].title, "backwards": backwards}))
         return found[0]
     if found:
         names = " and ".join(f"'{source.headings[place].strip()}'" for place in found)
@@ -280,9 +305,13 @@ def _time_column(
 
 
 def _label_column(
-    source: ColumnFile, parts: list[_Heading], free: list[int], remarks: list[Remark]
+    source: ColumnFile, parts: list[_Heading], time: int, free: list[int], remarks: list[Remark]
 ) -> int | None:
-    """The column of labels, None where there is none; one that counts the rows is taken out of `free`."""
+    """The column of labels, None where there is none; what is neither label nor measured goes out of `free`.
+
+    It is called so; or it is of words, or of whole numbers, and tells apart the rows of one time, or is the
+    same in rows that follow each other. Words that do neither, such as flags, are no state either.
+    """
     plain = [part.title for part in parts]
     if "recording" in plain:
         return plain.index("recording")
@@ -298,7 +327,25 @@ def _label_column(
             continue
         remarks.append(Remark("data.label_column", {"column": plain[place]}))
         return place
-    return None
+    times, *columns = (one.to_pandas() for one in source.load([time, *free]))
+    repeated = bool(times.duplicated().any())
+    chosen = None
+    for place, cells in zip(list(free), columns, strict=True):
+        words = not pd.api.types.is_numeric_dtype(cells.dtype)
+        if words and not cells.dropna().astype(str).str.match(r"\s*[^\W\d_]").all():
+            continue  # numbers in some other way of writing, or dates
+        if not words and not (repeated and (cells == cells.round()).all()):
+            continue
+        counts, blocks = cells.value_counts(), int((cells != cells.shift()).sum())
+        few = chosen is None and 1 < len(counts) <= len(cells) / MIN_REPETITIONS and cells.notna().all()
+        apart = repeated and not pd.DataFrame({"time": times, "label": cells}).duplicated().any()
+        if few and (blocks == len(counts) or (apart and (words or counts.min() == counts.max()))):
+            chosen = place
+            remarks.append(Remark("data.label_column", {"column": plain[place]}))
+        elif words and cells.notna().any():
+            free.remove(place)
+            remarks.append(Remark("data.words_left_out", {"column": plain[place]}))
+    return chosen
 
 
 def _wanted(file: str, name: str, plain: list[str], known: list[int], remarks: list[Remark]) -> int:

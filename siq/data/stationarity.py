@@ -264,8 +264,8 @@ def same_stretch(number: np.ndarray, lag: int) -> np.ndarray:
     return np.asarray((earlier >= 0) & (earlier == number[lag:]))
 
 
-def even_stretches(recordings: Recordings) -> Stretches:
-    """Cut recordings into stretches of even steps."""
+def even_stretches(recordings: Recordings, *, uneven: bool = False) -> Stretches:
+    """Cut recordings into stretches of even steps; with `uneven`, where most are not, of any without a gap."""
     gap = np.diff(recordings.t)
     inside = np.diff(recordings.recording) == 0
     if not inside.any():
@@ -273,6 +273,8 @@ def even_stretches(recordings: Recordings) -> Stretches:
     usual = usual_step(recordings)
     # Times such as 0.1·k, or seconds since 1970, carry rounding errors into their differences.
     even = inside & (np.abs(gap - usual) <= STEP_TOLERANCE * usual + 4 * np.spacing(np.abs(recordings.t[1:])))
+    if uneven and 2 * even.sum() < inside.sum():
+        even = inside & (gap <= LONGEST_STEP * usual * (1 + 1e-6))
     return Stretches(np.where(even, np.cumsum(~even), -1), usual)
 
 

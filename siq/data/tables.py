@@ -109,6 +109,8 @@ def _checked(
             faults += [fault] if fault else []
         stated = {**layout.units[place], "cells": cell_unit}
         found_units.append(_agreed_unit(file, called[index], stated, (units or {}).get(name)))
+    if layout.backwards:
+        numbers[0] *= -1
     # Rows without a label and without any number are padding.
     blank = np.asarray(np.isnan(numbers).all(axis=0))
     if labels is None:
@@ -142,10 +144,10 @@ def _checked(
 
 
 def _without_clocks_and_labels(recordings: Recordings) -> Recordings:
-    """Recordings without columns that are no states: another clock, or a label of a few values.
+    """Recordings without columns that are no states: another clock, a label, or what never changes.
 
-    A clock is a straight line in time in every recording, with one slope. Nobody named the columns, and the
-    last one stays.
+    A clock is a straight line in time in every recording, with one slope; a label has a few values, or one in
+    each recording. Nobody named the columns, and the last one stays.
     """
     elapsed, begins = np.diff(recordings.t), np.diff(recordings.recording) == 0
     kept, remarks = [], []
@@ -158,8 +160,11 @@ def _without_clocks_and_labels(recordings: Recordings) -> Recordings:
         )
         if len(steps) > FEWEST_ON_A_LINE and slope and off <= exact:
             remarks.append(Remark("data.clock_left_out", {"column": title}))
-        elif 2 <= len(different) < FEWEST_VALUES <= len(x) / MIN_REPETITIONS:
-            remarks.append(Remark("data.label_left_out", {"column": title, "values": len(different)}))
+        elif len(different) > 1 and (
+            not steps.any() or len(different) < FEWEST_VALUES <= len(x) / MIN_REPETITIONS
+        ):
+            values = {"column": title, "values": len(different), "within": bool(steps.any())}
+            remarks.append(Remark("data.label_left_out", values))
         else:
             kept.append(place)
     if not remarks or not kept:

@@ -97,10 +97,24 @@ def test_what_has_no_noise_or_too_few_samples_is_said() -> None:
     quiet = starts * np.exp(-t)
     assert looked_at(quiet[:, :, None]).kind == "none"
     assert looked_at(quiet[:1, :40, None]).kind == "unknown"
-    uneven = Recordings.from_arrays(
-        np.cumsum(1.0 + np.arange(500) % 3), quiet[:2, :250].reshape(500, 1), names=["x"]
-    )
-    assert markov_lag(uneven).kind == "unknown"
+
+
+def test_uneven_samples_show_noise_of_the_sensor_and_no_memory_and_quiet_ones_tell_nothing() -> None:
+    random = np.random.default_rng(3)
+    x = double_wells(1, samples=40_000)[0]
+    at = np.cumsum(random.integers(1, 8, size=9_000))
+    at = at[at < len(x)]
+    white = Recordings.from_arrays(0.1 * at, x[at], names=["x"])
+    assert markov_lag(white).kind == "white"
+    noisy = 0.3 * random.standard_normal((len(at), 1))
+    sensor = markov_lag(Recordings.from_arrays(0.1 * at, x[at] + noisy, names=["x"]))
+    assert sensor.kind == "sensor"
+    assert sensor.sensor[0] == pytest.approx(0.3, rel=0.15)
+    t = np.cumsum(random.uniform(0.02, 0.06, (30, 100)), axis=1)
+    quiet = random.uniform(-1.5, 1.5, (30, 1)) * np.exp(-t)
+    parts = np.repeat(np.arange(30), 100)
+    given = Recordings(("x",), (None,), tuple(map(str, range(30))), parts, t.ravel(), quiet.reshape(-1, 1))
+    assert markov_lag(given).kind == "unknown"
 
 
 def test_units_change_nothing() -> None:

@@ -120,8 +120,9 @@ REFUSED: dict[str, tuple[str, str | bytes, str, str]] = {
     "a step back": (
         "a.csv", "t,x\n0,1\n1,2\n2,3\n1.5,2\n3,4\n", "unsorted (1.5 comes after 2.0)", "sort its rows",
     ),
-    "text": ("a.csv", "t,x,who\n0,1,anna\n1,2,anna\n", "'anna' is no number", "name the states in the study"),
-    "true and false": ("a.csv", "t,x,ok\n0,1,True\n1,2,False\n", "'True' is no number", "remove the column"),
+    "other numbers": (
+        "a.csv", "t,x,y\n0,1,1'234.5\n1,2,1'200.1\n", "'1'234.5' is no number", "name the states in the study",
+    ),
     "Excel": ("a.xlsx", b"PK\x03\x04....", "it is a spreadsheet", "save the sheet as CSV"),
     "Excel, renamed": ("a.csv", b"PK\x03\x04....", "it is a spreadsheet", "save the sheet as CSV"),
     "a binary file": ("a.csv", b"t,x\n\0\0\0", "the file is no text", "as CSV in UTF-8"),
@@ -252,6 +253,39 @@ def test_a_wrong_path_says_where_it_was_looked_for_and_what_is_near(tmp_path: Pa
         read_recordings(tmp_path / "nowhere" / "a.csv")
 
 
+def test_a_column_of_words_or_numbers_that_tells_recordings_apart_is_their_label(tmp_path: Path) -> None:
+    times = range(5)
+    blocks = "month,lake,TP\n" + "".join(f"{t},{lake},{t**2}\n" for lake in ("Como", "Iseo") for t in times)
+    read = read_recordings(put(tmp_path, "blocks.csv", blocks))
+    assert (read.names, read.labels, read.recording.tolist()) == (
+        ("TP",),
+        ("Como", "Iseo"),
+        [0] * 5 + [1] * 5,
+    )
+    mixed = "day,vole,x\n" + "".join(f"{t},{vole},{t + vole / 7}\n" for t in times for vole in (3, 8))
+    read = read_recordings(put(tmp_path, "mixed.csv", mixed))
+    assert (read.names, read.labels, read.t.tolist()) == (("x",), ("3", "8"), [*times, *times])
+
+
+def test_words_that_are_no_label_are_left_out(tmp_path: Path) -> None:
+    flags = "ok ok bad ok ok ok bad ok".split()
+    text = "t,x,flag\n" + "".join(f"{t},{t % 3},{flag}\n" for t, flag in enumerate(flags))
+    read = read_recordings(put(tmp_path, "flags.csv", text))
+    assert (read.names, read.labels) == (("x",), ("0",))
+    assert "data.words_left_out" in {one.code for one in read.remarks}
+
+
+@pytest.mark.parametrize(
+    ("heading", "unit"),
+    [("age (yr b2k)", "yr"), ("Age [ka BP]", "ka"), ("age_ka_BP", "ka"), ("yr BP", "yr"), ("Age", None)],
+)
+def test_ages_fall_as_time_goes_on(tmp_path: Path, heading: str, unit: str | None) -> None:
+    text = f"{heading},d18O\n" + "".join(f"{100 + 20 * row},{row}\n" for row in range(6))
+    read = read_recordings(put(tmp_path, "core.csv", text))
+    assert (read.names, read.time_unit) == (("d18O",), unit)
+    assert read.values[:, 0].tolist() == [5, 4, 3, 2, 1, 0] and read.t.tolist() == sorted(read.t.tolist())
+
+
 def test_where_the_time_starts_over_a_recording_begins_unless_labels_say_otherwise(tmp_path: Path) -> None:
     rows = "0,1\n1,2\n2,3\n0,4\n1,5\n2,6\n"
     read = read_recordings(put(tmp_path, "a.csv", f"t,x\n{rows}"))
@@ -304,7 +338,7 @@ def test_reserved_names_are_those_that_formulas_refuse() -> None:
     ],
 )  # fmt: skip
 def test_a_unit_in_brackets_is_one_and_a_word_is_not(heading: str, title: str, unit: str | None) -> None:
-    assert read_heading(heading) == (title, unit)
+    assert read_heading(heading)[:2] == (title, unit)
 
 
 def test_units_are_told_from_words() -> None:
