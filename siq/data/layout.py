@@ -47,8 +47,8 @@ LABEL_NAMES = _words(
 AGE_NAMES = _words("age ages alter")
 INDEX_NAMES = _words("index idx row rowid rownumber unnamed")
 TIME_UNITS = _words(
-    "ns us µs μs ms s sec secs second seconds min minute minutes h hr hrs hour hours d day days week weeks month"
-    " months yr year years ka kyr myr"
+    "ns us µs μs ms s sec secs second seconds min minute minutes h hr hrs hour hours d day days week weeks"
+    " month months yr year years ka kyr myr"
 )
 
 _UNITS_AS_TITLES = TIME_UNITS - _words(
@@ -290,10 +290,10 @@ def _time_column(
     found = [place for place in free if _may_be_time(parts[place])]
     if not found:
         found = [place for place in free if _runs_evenly(_numbers(source, place))]
-    # "T" is a temperature rather than a time, and an age that of what is measured.
-    for is_other in (lambda part: part.title == "T", lambda part: part.is_age):
-        if len(found) > 1:
-            found = [place for place in found if not is_other(parts[place])] or found
+    if len(found) > 1:
+        # "T" is a temperature rather than a time, and an age that of what is measured.
+        found = [place for place in found if parts[place].title != "T"]
+        found = [place for place in found if not parts[place].is_age] or found
     if len(found) == 1:
         backwards = parts[found[0]].is_age
         remarks.append(Remark("data.time_column", {"column": parts[found[0]].title, "backwards": backwards}))

@@ -265,7 +265,7 @@ def same_stretch(number: np.ndarray, lag: int) -> np.ndarray:
 
 
 def even_stretches(recordings: Recordings, *, uneven: bool = False) -> Stretches:
-    """Cut recordings into stretches of even steps; with `uneven`, where most are not, of any without a gap."""
+    """Cut recordings into stretches of even steps; with `uneven`, where most are not, of all without gaps."""
     gap = np.diff(recordings.t)
     inside = np.diff(recordings.recording) == 0
     if not inside.any():

@@ -26,7 +26,7 @@ from siq.errors import NumericalFailure
 from siq.inference.checks import correlations_between, unexplained_probability
 from siq.inference.diffusion_model import InnovationLikelihood
 from siq.inference.field_estimate import FieldEstimate, FlowMap, NoiseDiagnosis
-from siq.inference.kalman_filter import Grid, Noise, Whitened, linearise, whiten
+from siq.inference.kalman_filter import Grid, Noise, linearise, whiten
 from siq.inference.maximum_likelihood import Fit, fit_by_filter, noise_uncertainty
 from siq.inference.measurements import Measurements
 from siq.inference.observation import ObservationModel, moved_by, smoothed_motion
@@ -46,6 +46,7 @@ from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 
 LAGS = (1, 2, 3)  # steps over which innovations are compared: what is correlated at all is so over these
+UNKNOWN_STATE = 100.0  # standard deviations of a state, from which a filter begins that knows none
 DIFFUSION_ROUNDS = 2  # of D by the trajectories of f, and f by the weights of D
 LIBRARY_ROUNDS = 8  # of the fit of a whole library, which only chooses terms
 SENSOR_BEGIN = 1e-3  # of what a sample moves by, squared
@@ -245,7 +246,7 @@ def _estimate(
             Diffusion(np.diag([1.0, float(on_force > 0)])),
         )
         strength, driven = float(on_state), slice(0, 1)
-    correlation, score = _strongest_correlation(whiten(fit.linearisation, data, fit.noise), data)
+    correlation, score = _strongest_correlation(fit, data)
     error = strength * float(np.sqrt((process_error[driven] ** 2).sum())) / len(process_error[driven])
     deviation = np.sqrt(sensor)
     unit = diffusion.matrix if observation.hidden else np.eye(d)
@@ -293,10 +294,16 @@ def _with_formula(
     return replace(found, diagnosis=replace(found.diagnosis, intensity=intensity, intensity_error=error))
 
 
-def _strongest_correlation(white: Whitened, data: Measurements) -> tuple[float, float]:
-    """Strongest correlation of near innovations over outputs and lags, and in standard errors."""
-    measured = white.known.reshape(len(data.t), -1).any(axis=1)
-    innovations, recording = white.innovations.reshape(len(data.t), -1)[measured], data.recording[measured]
+def _strongest_correlation(fit: Fit, data: Measurements) -> tuple[float, float]:
+    """Strongest correlation of near innovations over outputs and lags, and in standard errors.
+
+    Initial states are as good as unknown to the filter: fitted ones, of many short recordings, would make
+    innovations depend on each other.
+    """
+    unknown = np.diag(UNKNOWN_STATE**2 * positive(fit.linearised_at.var(axis=0)))
+    white = fit.linearisation.filtered(data.first, data.step, fit.noise, begin_covariance=unknown)[0]
+    measured = ~np.isnan(fit.linearisation.residual).all(axis=1)
+    innovations, recording = white[measured][:, :, 0], data.recording[measured]
     found: list[tuple[float, float]] = []
     for lag in LAGS:
         rows = np.flatnonzero(recording[lag:] == recording[:-lag])

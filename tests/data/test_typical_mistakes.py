@@ -121,7 +121,7 @@ REFUSED: dict[str, tuple[str, str | bytes, str, str]] = {
         "a.csv", "t,x\n0,1\n1,2\n2,3\n1.5,2\n3,4\n", "unsorted (1.5 comes after 2.0)", "sort its rows",
     ),
     "other numbers": (
-        "a.csv", "t,x,y\n0,1,1'234.5\n1,2,1'200.1\n", "'1'234.5' is no number", "name the states in the study",
+        "a.csv", "t,x,y\n0,1,1'234.5\n1,2,1'200.1\n", "'1'234.5' is no number", "name the states in",
     ),
     "Excel": ("a.xlsx", b"PK\x03\x04....", "it is a spreadsheet", "save the sheet as CSV"),
     "Excel, renamed": ("a.csv", b"PK\x03\x04....", "it is a spreadsheet", "save the sheet as CSV"),
@@ -268,7 +268,7 @@ def test_a_column_of_words_or_numbers_that_tells_recordings_apart_is_their_label
 
 
 def test_words_that_are_no_label_are_left_out(tmp_path: Path) -> None:
-    flags = "ok ok bad ok ok ok bad ok".split()
+    flags = ["ok", "ok", "bad", "ok", "ok", "ok", "bad", "ok"]
     text = "t,x,flag\n" + "".join(f"{t},{t % 3},{flag}\n" for t, flag in enumerate(flags))
     read = read_recordings(put(tmp_path, "flags.csv", text))
     assert (read.names, read.labels) == (("x",), ("0",))
