@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-from scipy import ndimage, sparse, special
+from scipy import ndimage, signal, sparse, special
 from scipy.spatial import cKDTree
 
 from siq.data.correlation import resolution_step
@@ -91,8 +91,18 @@ def _wells_of(values: np.ndarray, relaxation: float) -> np.ndarray:
     return places[np.lexsort(places.T[::-1])]
 
 
-def _wells_apart(values: np.ndarray, runs: list[slice], wells: np.ndarray) -> np.ndarray:
-    """Wells ``(k, 1)`` of a series ``(n, 1)``, without those that no valley tells from their neighbours."""
+def _wells_apart(values: np.ndarray, runs: list[slice]) -> np.ndarray:
+    """Wells ``(k, 1)`` of a series ``(n, 1)``: peaks of its histogram, if valleys tell them from the others.
+
+    A state that is rare, and visited often, has neighbours enough in a bin, and not in all of the record.
+    """
+    counts, edges = np.histogram(values, PROFILE_BINS, np.quantile(values, [OUTSIDE, 1 - OUTSIDE]).tolist())
+    padded = np.concatenate([[0], counts, [0]]) + 0.5
+    peaks, shape = signal.find_peaks(np.log(padded), prominence=0.0)
+    valleys = np.maximum(padded[shape["left_bases"]], padded[shape["right_bases"]])
+    # With errors as if all samples were independent: what these do not tell, nothing does.
+    peaks = peaks[shape["prominences"] > FALSE_WELL * np.sqrt(1 / padded[peaks] + 1 / valleys)]
+    wells = ((edges[1:] + edges[:-1]) / 2)[peaks - 1, None]
     while len(wells) > 1:
         path, _ = _path_between(values, runs, wells)
         profile = Profile.of(values[:, 0], runs, path, wells[:, 0])
@@ -204,7 +214,7 @@ def path_of(
     wells = _wells_of(spread_out, max(longest))
     if len(longest) == 1:
         # What hops from well to well for long before it is anywhere else knows a valley by all its passages.
-        fine = _wells_apart(smooth, runs, _wells_of(spread_out, relaxation))
+        fine = _wells_apart(spread_out, runs)
         wells = fine if len(wells) < len(fine) <= MOST_STATES else wells
     each = (
         [wells]

@@ -77,6 +77,18 @@ def test_terms_and_noises_are_found(found: tuple[FieldEstimate, Recordings, np.n
     assert noise.sensor_evidence > 100 and abs(noise.correlation_score) < 4
 
 
+def test_many_short_recordings_leave_white_innovations() -> None:
+    """An initial state fitted to each seven samples would leave correlations of about minus one in seven."""
+    whole, _ = double_well(1)
+    count = len(whole.t) // 7
+    cut = Recordings.from_arrays(
+        STEP * np.arange(7), whole.values[: 7 * count].reshape(count, 7, 1), names=["x"]
+    )
+    noise = identified(cut, degree=3).diagnosis
+    assert noise is not None and noise.kind == "process"
+    assert abs(noise.correlation) < 0.02 and noise.measurement[0] == pytest.approx(SENSOR, rel=0.05)
+
+
 def test_where_the_origin_is_does_not_matter(found: tuple[FieldEstimate, Recordings, np.ndarray]) -> None:
     """Five states away from its wells a cubic is four monomials that are nearly alike."""
     one, recordings, _ = found
