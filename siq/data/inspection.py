@@ -181,6 +181,7 @@ class Inspection:
         noises = [state.noise for state in self.states if state.noise is not None]
         # Correlated forces fill the windows of the first look as a smooth motion does.
         forced = memory.remembers or any(noise.process > 0 for noise in noises)
+        forced = forced or (self.switching is not None and self.switching.supported)
         if forced:
             found = [Remark("data.noise_seen")]
         elif noises and len(recordings.labels) == 1:

@@ -48,6 +48,7 @@ RESTART_SHARE = 0.1  # of the time that a recording took: where it starts over, 
 # Of the steps lead back in time where rows are shuffled: recordings of three samples, one after another, have
 # as many.
 SHUFFLED_SHARE = 1 / 3
+DAY = 86_400.0  # seconds
 FEWEST_ON_A_LINE = 10  # steps: fewer may lie on one by themselves
 
 Fault = tuple[int, InputError]
@@ -102,7 +103,9 @@ def _checked(
         if index == 0 and (clock := _seconds_of_clock(file, called[0], cells[0])) is not None:
             numbers[index], start = clock
             cell_unit: str | None = "s"
-            remarks.append(Remark("data.seconds_of_clock", {"start": start}))
+            if not np.nan_to_num(numbers[index] % DAY).any():
+                numbers[index], cell_unit = numbers[index] / DAY, "d"
+            remarks.append(Remark("data.time_of_clock", {"start": start, "unit": cell_unit}))
         else:
             shown = "t" if index == 0 else called[index]
             numbers[index], cell_unit, fault = _parse_numbers(file, shown, cells[index])

@@ -267,6 +267,13 @@ def test_a_column_of_words_or_numbers_that_tells_recordings_apart_is_their_label
     assert (read.names, read.labels, read.t.tolist()) == (("x",), ("3", "8"), [*times, *times])
 
 
+def test_dates_are_days_and_times_of_day_seconds(tmp_path: Path) -> None:
+    days = read_recordings(put(tmp_path, "days.csv", "date,x\n2024-02-28,1\n2024-02-29,3\n2024-03-02,2\n"))
+    assert (days.t.tolist(), days.time_unit) == ([0, 1, 3], "d")
+    hours = read_recordings(put(tmp_path, "hours.csv", "time,x\n2024-02-28 11:00,1\n2024-02-28 12:00,3\n"))
+    assert (hours.t.tolist(), hours.time_unit) == ([0, 3600], "s")
+
+
 def test_words_that_are_no_label_are_left_out(tmp_path: Path) -> None:
     flags = ["ok", "ok", "bad", "ok", "ok", "ok", "bad", "ok"]
     text = "t,x,flag\n" + "".join(f"{t},{t % 3},{flag}\n" for t, flag in enumerate(flags))
