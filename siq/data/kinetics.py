@@ -214,7 +214,8 @@ def path_of(
     wells = _wells_of(spread_out, max(longest))
     if len(longest) == 1:
         # What hops from well to well for long before it is anywhere else knows a valley by all its passages.
-        fine = _wells_apart(spread_out, runs)
+        # Not in averages, though: halfway between two levels these have a peak of hops.
+        fine = _wells_apart(values + steps * (draw.random(values.shape) - 0.5), runs)
         wells = fine if len(wells) < len(fine) <= MOST_STATES else wells
     each = (
         [wells]

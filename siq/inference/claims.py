@@ -328,8 +328,8 @@ def _as_normal(square: np.ndarray, sign: np.ndarray, count: int) -> np.ndarray:
 
 
 def _chance(count: int, explained: np.ndarray) -> float:
-    """Probability of so much explained, of the residual of which most is, by so many columns."""
-    if not count:
+    """Probability of so much explained, of the residual of which most is, by so many columns; 1 of none."""
+    if not count or not len(explained):
         return 1.0
     return min(float(scipy.special.chdtrc(count, explained).min()) * len(explained), 1.0)
 

@@ -207,7 +207,7 @@ def test_units_come_from_names_metadata_and_cells(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("heading", "unit"),
-    [("year", "year"), ("day", "day"), ("Hours", "Hours"), ("frame", None), ("kyr b2k", None)],
+    [("year", "year"), ("day", "day"), ("Hours", "Hours"), ("frame", None), ("no. of frame", None)],
 )
 def test_a_clock_is_known_by_its_unit_or_by_its_even_steps(
     tmp_path: Path, heading: str, unit: str | None
