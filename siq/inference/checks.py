@@ -48,6 +48,8 @@ CHANCE_TESTS = (  # of a certificate: those that chance can refuse
     "prediction", "descent", "one_system", "unchanged", "state_complete", "gaussian_increments", "times",
     "record",
 )  # fmt: skip
+SMALL_CHANGE = 0.3  # standard deviations: up to there a distribution is flat
+ROUNDED_LINE = 2  # steps by which a straight line that is rounded is bent at most
 COPIED = 12  # samples of a stretch that is sought a second time
 ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 UNPREDICTED = "f does not predict held-out recordings"
@@ -249,12 +251,15 @@ def repetitions(recordings: Recordings, column: int) -> list[tuple[float, str, f
         return []
     step = resolution_step(x)
     found, width = [], ALIKE * size if step is None else step
-    held, straight = np.abs(moves) < ALIKE * size, np.abs(np.diff(moves)) < ALIKE * size
-    for kind, repeated, spread in (
-        ("held", held & same, size),
-        ("straight", straight & same[1:] & same[:-1], np.sqrt(2) * size),
-    ):
-        count, usual = int(repeated.sum()), len(moves) * min(width / (np.sqrt(2 * np.pi) * spread), 1.0)
+    for kind, changes in (("held", moves[same]), ("straight", np.diff(moves)[same[1:] & same[:-1]])):
+        sizes, spread = np.abs(changes), max(float(np.sqrt((changes**2).mean())), 1e-300)
+        count = int((sizes < ALIKE * size).sum())
+        usual = len(changes) * min(width / (np.sqrt(2 * np.pi) * spread), 1.0)
+        # As many are zero as any other small number of steps; a line that is rounded is bent by one or two.
+        most = int(SMALL_CHANGE * spread / width)
+        if most >= 2 * ROUNDED_LINE:
+            small = (sizes > (ROUNDED_LINE + 0.5) * width) & (sizes < (most + 0.5) * width)
+            usual = max(usual, float(small.sum()) / (2 * (most - ROUNDED_LINE)))
         found.append((float(scipy.special.gammainc(count, usual)), kind, count / len(moves)))
     # A stretch is another one by chance where each of its steps is.
     begins = np.arange(len(x) - COPIED + 1)
