@@ -200,6 +200,8 @@ def check_claims(
     else:
         pairs = snapshot_pairs(whole, pair_step=pair_step)
     rest = _Residuals(found, pairs)
+    if not rest.noisy.any():  # what settles, seen by a sensor, has no noise that claims are about
+        return {}
     slow = {"gaussian_force": _gaussian_force(found, states, false_alarms)} if found.slow_force else {}
     return {
         "one_system": _one_system(rest, whole.labels, false_alarms),
@@ -328,8 +330,8 @@ def _as_normal(square: np.ndarray, sign: np.ndarray, count: int) -> np.ndarray:
 
 
 def _chance(count: int, explained: np.ndarray) -> float:
-    """Probability of so much explained, of the residual of which most is, by so many columns; 1 of none."""
-    if not count or not len(explained):
+    """Probability of so much explained, of the residual of which most is, by so many columns."""
+    if not count:
         return 1.0
     return min(float(scipy.special.chdtrc(count, explained).min()) * len(explained), 1.0)
 
