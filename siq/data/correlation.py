@@ -268,7 +268,7 @@ def _increments(recordings: Recordings, stretches: Stretches) -> _Increments | N
     kept = eigenvalues > 1e-10 * eigenvalues[-1]
     increments = np.where(known[:, None], np.diff(values, axis=0) / root, 0.0)
     runs = runs_of(recordings, bridged=True)
-    times = [relaxation_samples(column, runs) for column in recordings.values.T]
+    times = [relaxation_samples(column, runs, noisy=True) for column in recordings.values.T]
     return _Increments(
         functions @ (vectors[:, kept] / np.sqrt(eigenvalues[kept])),
         increments,

@@ -52,6 +52,7 @@ from siq.data.stationarity import (
     correlated_samples,
     relaxation_samples,
     runs_of,
+    slow_part,
     stretches_of,
     usual_step,
 )
@@ -450,15 +451,22 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     }
     if not relaxations:
         return None
-    tried = list(relaxations)
+    tried, recorded = list(relaxations), recordings.values
+    # Each as it is, and less what a drift in one direction would have moved it by: hops may hide that.
+    drifts = np.zeros((2, *recorded.shape))
+    for place in tried:
+        drifts[1, :, place] = slow_part(recordings, recorded[:, place], 1)
     apart = np.array(
         [
-            [_pushed_apart(recordings.values[:, place], runs, time, degree=degree) for degree in DEGREES]
+            [
+                [_pushed_apart(series[:, place], runs, time, degree=degree) for degree in DEGREES]
+                for series in recorded - drifts
+            ]
             for place, time in relaxations.items()
         ]
     )
-    pushed = apart[..., 1].min(axis=1)
-    chance = len(DEGREES) * len(tried) * float(pushed.min())
+    pushed, count = apart[..., 1].min(axis=(1, 2)), 2 * len(DEGREES) * len(tried)
+    chance = count * float(pushed.min())
     rarest, rarities, depths = 1.0, np.ones(len(tried)), np.zeros(len(tried))
     if chance >= DECISIVE_P:
         rarest, rarities, depths = _valleys(
@@ -475,10 +483,12 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     columns, state = sorted(tried[one] for one in order[:MOST_COLUMNS]), tried[order[0]]
     values, column = recordings.values[:, columns], columns.index(state)
     relaxation = min(relaxations[place] for place in columns)
-    background, baseline = np.zeros_like(values), np.zeros_like(values)
+    drifting = apart[[tried.index(place) for place in columns], :, :, 1].min(axis=2).argmin(axis=1)
+    background, baseline = drifts[drifting, :, columns].T, np.zeros_like(values)
     places, path, expected = np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None
     wells, levels = 1, False
     if probability >= SIGNIFICANCE:
+        background[:] = 0.0
         background[:, column] = background_of(recordings, values[:, column])[0]
     for _ in range(MOST_PASSES if probability < SIGNIFICANCE else 0):
         flat = values - background
@@ -494,7 +504,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     counts = DwellCount.of_visits(recordings.t, path, runs, states=number)
     density, edges = np.histogram(flat[:, column], bins=BINS, density=True)
     # A valley that is deeper than a linear system's may be the floor of one flat well.
-    wanted = kinds * len(DEGREES) * len(tried) * pushed[order[0]] >= SIGNIFICANCE
+    wanted = kinds * count * pushed[order[0]] >= SIGNIFICANCE
     supported = probability < SIGNIFICANCE and any(one.visits for one in counts)
     profile = Profile.of(flat[:, column], runs, path, places[:, column]) if supported else None
     if profile is not None and wanted and wells == 1:

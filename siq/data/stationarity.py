@@ -76,14 +76,20 @@ def stretches_of(runs: list[slice], length: int, *, most: int | None = None) -> 
     return found if most is None else found[:: max(len(found) // most, 1)]
 
 
-def relaxation_samples(values: np.ndarray, runs: list[slice]) -> float | None:
-    """The local relaxation time in samples; None where no stretch is long enough to tell."""
+def relaxation_samples(values: np.ndarray, runs: list[slice], *, noisy: bool = False) -> float | None:
+    """The local relaxation time in samples; None where no stretch is long enough to tell.
+
+    Short stretches of levels, or of a `noisy` sensor, show white noise alone. Levels relax at once; behind a
+    sensor's noise longer stretches tell.
+    """
     length, longest = SHORTEST_STRETCH, max((run.stop - run.start for run in runs), default=0)
     times = []
     while length <= longest and longest >= SHORTEST_RUN:
         if (time := _correlated(values, stretches_of(runs, length, most=MOST_STRETCHES), length)) is not None:
             times.append(max(time, SHORTEST_TIME))
         length *= 2
+    if noisy:
+        times = [one for one in times if one > SHORTEST_TIME] or times
     if len(times) < 2:
         return None
     # A walk that nothing holds is correlated over the same share of every stretch, a relaxation for as long.
@@ -217,7 +223,7 @@ def background_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarra
     if spread <= 0:
         return found
     for half_periods in range(1, MOST_HALF_PERIODS + 1):
-        fitted = _slow(recordings, values, half_periods)
+        fitted = slow_part(recordings, values, half_periods)
         rest = values - fitted
         independent = len(values) / (2 * correlated_samples(rest, runs))
         used = half_periods * int((counts > half_periods).sum())
@@ -231,19 +237,20 @@ def background_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarra
     return found
 
 
-def _slow(recordings: Recordings, values: np.ndarray, half_periods: int) -> np.ndarray:
+def slow_part(recordings: Recordings, values: np.ndarray, half_periods: int) -> np.ndarray:
+    """Cosines of up to so many half periods in each recording, fitted to a series: ``(n,)``, of mean zero."""
     fitted = np.empty(len(values))
     bounds = np.searchsorted(recordings.recording, np.arange(len(recordings.labels) + 1))
     for first, last in pairwise(bounds):
         part = values[first:last]
         if last - first <= half_periods:
-            fitted[first:last] = part.mean() if len(part) else 0.0
+            fitted[first:last] = 0.0
             continue
         t = recordings.t[first:last]
         phase = np.pi * (t - t[0]) / (t[-1] - t[0])
         waves = np.cos(phase[:, None] * np.arange(half_periods + 1))
         fitted[first:last] = waves @ np.linalg.lstsq(waves, part, rcond=None)[0]
-        fitted[first:last] -= fitted[first:last].mean() - values.mean()
+        fitted[first:last] -= fitted[first:last].mean()
     return fitted
 
 

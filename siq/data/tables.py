@@ -24,7 +24,7 @@ import pyarrow.compute as pc
 
 from siq.data.correlation import FEWEST_VALUES, MIN_REPETITIONS
 from siq.data.formats import Column, open_columns
-from siq.data.layout import layout_of
+from siq.data.layout import layout_of, stacked
 from siq.data.recordings import TABLE, Recordings
 from siq.errors import InputError
 from siq.numerics.files import files_of
@@ -88,6 +88,8 @@ def _checked(
 ) -> Recordings:
     """Read and check a table; raises InputError for the first thing that cannot be used."""
     file, source = str(table) if isinstance(table, str | Path) else TABLE, open_columns(table)
+    if columns is None:
+        source = stacked(source)
     layout = layout_of(file, source, columns)
     used = [layout.time, *layout.states]
     cells = source.load([*([] if layout.recording is None else [layout.recording]), *used])
@@ -110,6 +112,9 @@ def _checked(
             shown = "t" if index == 0 else called[index]
             numbers[index], cell_unit, fault = _parse_numbers(file, shown, cells[index])
             faults += [fault] if fault else []
+            if index and (mark := _mark_of_missing(numbers[index])) is not None:
+                numbers[index][numbers[index] == mark] = np.nan
+                remarks.append(Remark("data.mark_of_missing", {"column": shown, "value": mark}))
         stated = {**layout.units[place], "cells": cell_unit}
         found_units.append(_agreed_unit(file, called[index], stated, (units or {}).get(name)))
     if layout.backwards:
@@ -201,6 +206,18 @@ def _parse_numbers(file: str, name: str, cells: Column) -> tuple[np.ndarray, str
         remedy = "remove the row or write a finite number"
         fault = row, InputError(file, f"row {row}, column {name}", "the value is infinite", remedy)
     return values, unit or None, fault
+
+
+def _mark_of_missing(values: np.ndarray) -> float | None:
+    """The number that stands for a missing value: nines alone, or beyond 10²⁰, and far from all others."""
+    known = values[np.isfinite(values)]
+    for mark in (float(known.min(initial=np.inf)), float(known.max(initial=-np.inf))):
+        if set(f"{abs(mark):.15g}".replace(".", "")) != {"9"} and not 1e20 <= abs(mark) < np.inf:
+            continue
+        others = known[known != mark]
+        if 0 < len(others) < len(known) - 1 and np.abs(others - mark).min() > np.ptp(others):
+            return mark
+    return None
 
 
 def _split_units(file: str, name: str, cells: Column) -> tuple[Column, str, Fault | None]:

@@ -117,6 +117,13 @@ def test_uneven_samples_show_noise_of_the_sensor_and_no_memory_and_quiet_ones_te
     assert markov_lag(given).kind == "unknown"
 
 
+def test_a_sensor_that_hides_the_relaxation_of_neighbours_has_no_memory() -> None:
+    x = double_wells(1, samples=20_000)
+    found = looked_at(x + np.random.default_rng(0).standard_normal(x.shape))
+    assert found.kind == "sensor" and found.sensor[0] == pytest.approx(1.0, rel=0.05)
+    assert found.relaxation > 4 * found.step
+
+
 def test_units_change_nothing() -> None:
     values = double_wells(3, memory=3.0, samples=5_000)
     one, other = looked_at(values), looked_at(1e-6 * values + 4.0)

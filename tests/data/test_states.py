@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.linalg
+from remembering import double_wells
 from scipy.signal import lfilter
 
 from siq.data.inspection import inspect
@@ -204,3 +205,25 @@ def test_an_inspection_tells_the_rungs() -> None:
     assert found.switching is not None and found.switching.rung == 3
     assert len(runs_of(found.recordings)) == 1
     assert "The hops are a Markov process" in found.text()
+
+
+def test_states_are_seen_over_a_drift_as_large_as_their_distance() -> None:
+    x = double_wells(1, samples=40_000)[0, :, 0]
+    drift = np.linspace(-1, 1, len(x))
+    found = switching(recorded(x + drift))
+    assert found is not None and found.supported and len(found.levels) == 2
+    still = switching(recorded(x))
+    assert still is not None and not still.background.any()
+    assert abs(found.transitions - still.transitions) <= 0.2 * still.transitions
+
+
+def test_a_rare_state_between_two_is_one() -> None:
+    """Wells of 6 % and of 45 % of the time: a bin of the histogram holds enough of the rare one."""
+    path = np.repeat(np.tile([0.0, 1.0, 2.0, 1.0], 12), np.tile([900, 120, 900, 120], 12))
+    about = np.zeros(len(path))
+    kicks = 0.1 * noise(3, len(path))
+    for k in range(1, len(path)):
+        about[k] = 0.6 * about[k - 1] + kicks[k]
+    found = switching(recorded(path + about))
+    assert found is not None and found.supported
+    assert np.round(found.levels, 1).tolist() == [0.0, 1.0, 2.0]

@@ -267,6 +267,31 @@ def test_a_column_of_words_or_numbers_that_tells_recordings_apart_is_their_label
     assert (read.names, read.labels, read.t.tolist()) == (("x",), ("3", "8"), [*times, *times])
 
 
+def test_columns_called_like_recordings_are_some_and_numbered_states_are_not(tmp_path: Path) -> None:
+    rows = [(0.1 * k, np.sin(k), np.cos(k), k % 3) for k in range(6)]
+    text = "".join(",".join(map(str, row)) + "\n" for row in rows)
+    read = read_recordings(put(tmp_path, "wide.csv", "t,cell 1 (nm),cell 2 (nm),cell 3 (nm)\n" + text))
+    assert (read.names, read.units, read.labels) == (("x",), ("nm",), ("cell 1", "cell 2", "cell 3"))
+    assert read.t.tolist() == [row[0] for row in rows] * 3
+    assert read.values[:, 0].tolist() == [row[place] for place in (1, 2, 3) for row in rows]
+    named = read_recordings(tmp_path / "wide.csv", columns=["cell_1", "cell_3"])
+    assert named.values.tolist() == [[row[1], row[3]] for row in rows]
+    states = read_recordings(put(tmp_path, "states.csv", "t,x1,x2,x3\n" + text))
+    assert states.names == ("x1", "x2", "x3")
+
+
+@pytest.mark.parametrize("mark", ["-9999", "999.9", "1e36"])
+def test_a_number_that_stands_for_a_missing_value_is_none(tmp_path: Path, mark: str) -> None:
+    x = ["1.5", "2.5", mark, "0.5", "1.0", mark, "2.0", "1.0"]
+    text = "t,x\n" + "".join(f"{t},{value}\n" for t, value in enumerate(x))
+    read = read_recordings(put(tmp_path, "marks.csv", text))
+    assert (read.t.tolist(), float(read.values.max())) == ([0, 1, 3, 4, 6, 7], 2.5)
+    # What lies among the others was measured, and so was a state that is always the same.
+    for other in ("3.5", "0", "-50"):
+        kept = read_recordings(put(tmp_path, "kept.csv", text.replace(mark, other)))
+        assert len(kept.t) == len(x)
+
+
 def test_dates_are_days_and_times_of_day_seconds(tmp_path: Path) -> None:
     days = read_recordings(put(tmp_path, "days.csv", "date,x\n2024-02-28,1\n2024-02-29,3\n2024-03-02,2\n"))
     assert (days.t.tolist(), days.time_unit) == ([0, 1, 3], "d")
