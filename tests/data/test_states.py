@@ -208,7 +208,7 @@ def test_an_inspection_tells_the_rungs() -> None:
 
 
 def test_states_are_seen_over_a_drift_as_large_as_their_distance() -> None:
-    x = double_wells(1, samples=40_000)[0, :, 0]
+    x = double_wells(1, samples=120_000, traces=1, intensity=0.3)[0, ::5, 0]
     drift = np.linspace(-1, 1, len(x))
     found = switching(recorded(x + drift))
     assert found is not None and found.supported and len(found.levels) == 2
