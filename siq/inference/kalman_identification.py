@@ -117,8 +117,8 @@ def identify_by_likelihood(
         noise = observation.noise(Noise(sensor, np.ones(d), field=formula.diffusion(1.0)))
         whole = _fit_library(whole.model, data, whole.linearised_at, noise)
     # What holds by definition brings no false term: the others share their probability.
-    chance = ndtr(-critical_values(library, false_terms=false_terms)[everything[:, 1]])
-    critical = -ndtri(chance * min(false_terms, 0.5) / (2 * chance.sum()))
+    each = ndtr(-critical_values(library, false_terms=false_terms)[everything[:, 1]])
+    critical = -ndtri(each * min(false_terms, 0.5) / (2 * each.sum()))
     white = whiten(whole.linearisation, data, whole.noise)
     last = white.solve()[0] if whole.converged else 0.0
     goal = white.innovations + white.columns @ (whole.model.values - last)
