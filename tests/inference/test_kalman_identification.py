@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from remembering import double_wells
 
 from siq.data.correlation import markov_lag
 from siq.data.recordings import Recordings, snapshot_pairs
-from siq.inference.field_estimate import FieldEstimate
+from siq.inference.field_estimate import FieldEstimate, read_field, write_field
 from siq.inference.identify import _possible_exposures, identify
 from siq.inference.kalman_filter import Noise
 from siq.inference.kalman_identification import (
@@ -87,6 +88,25 @@ def test_many_short_recordings_leave_white_innovations() -> None:
     noise = identified(cut, degree=3).diagnosis
     assert noise is not None and noise.kind == "process"
     assert abs(noise.correlation) < 0.02 and noise.measurement[0] == pytest.approx(SENSOR, rel=0.05)
+
+
+def test_noise_that_depends_on_the_state_behind_a_noisy_sensor_is_kept(tmp_path: Path) -> None:
+    generator, step = np.random.default_rng(4), STEP / 10
+    x, now = np.empty((3000, 4)), np.array([1.0, -1.0, 1.0, -1.0])
+    for row in range(len(x)):
+        x[row] = now
+        for _ in range(10):
+            kick = np.sqrt(0.2 * (0.2 + now**2) * step) * generator.standard_normal(4)
+            now = now + step * (now - now**3) + kick
+    seen = x + 0.05 * generator.standard_normal(x.shape)
+    found = identified(
+        Recordings.from_arrays(STEP * np.arange(len(x)), seen.T[:, :, None], names=["x"]), degree=3
+    )
+    assert found.noise is not None and found.noise.probability < 0.05
+    write_field(tmp_path / "field.json", found, IdentificationOptions(degree=3))
+    again = read_field(tmp_path / "field.json")
+    assert again is not None and again.noise is not None
+    assert again.noise.probability == found.noise.probability
 
 
 def test_where_the_origin_is_does_not_matter(found: tuple[FieldEstimate, Recordings, np.ndarray]) -> None:
