@@ -25,7 +25,7 @@ from siq.data.correlation import (
     resolution_step,
     rounding_error,
 )
-from siq.data.preparation import SINGLE_RECORDING, unusual
+from siq.data.preparation import SINGLE_RECORDING, unusual, without_faults
 from siq.data.recordings import (
     LONGEST_STEP,
     SINGLE_RECORDING_REMEDY,
@@ -230,7 +230,7 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
     >>> found.memory.kind, found.memory.lag
     ('white', 0)
     """
-    recordings = Recordings.of(source)
+    recordings = without_faults(Recordings.of(source))
     named = "the recordings" if isinstance(source, Recordings) else "the table"
     counts = np.bincount(recordings.recording)
     first = np.cumsum(counts) - counts

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from scipy import optimize, special
 
 from siq.data.correlation import markov_lag, noise_floors
 from siq.data.recordings import (
@@ -26,7 +27,7 @@ from siq.data.recordings import (
     snapshot_pairs,
 )
 from siq.data.states import switching
-from siq.data.stationarity import background_of, correlated_samples, runs_of
+from siq.data.stationarity import background_of, correlated_samples, line_in, runs_of, usual_step
 from siq.errors import InputError
 from siq.remarks import Remark
 
@@ -35,6 +36,11 @@ ENDS_OF_TURN = 0.05  # of a turn, within which a column that jumps by one comes 
 FEWEST_STRETCHES = 10  # of a single recording, at least, two of which are held out
 MOST_STRETCHES = 40  # more make no error better known
 STRETCH_LENGTH = 10  # correlation times: what is left of its first sample at its end is then nothing
+BLOCK = 200  # steps, whose median says how large steps are thereabouts
+FALSE_FAULT_RATE = 1e-3  # probability with which a record of white noise has a step that stands out
+FEW_JUMPS, MOST_APART = 0.05, 0.01  # that stay, a sample that does not; of all samples
+QUARTERS, SAME_WAVE = 4, 0.5  # of a recording, in which a hum has one amplitude and phase, to a half of it
+SLIGHT_HUM = 0.1  # of the variance of a state: what moves it more may be the state itself, which circulates
 _STRETCH_LABEL = re.compile(r"(?P<label>.*) \((?P<number>\d+) of (?P<of>\d+)\)")
 SINGLE_RECORDING = (
     "there is one recording, and it shows no process noise: it leads into one stable state and tells nothing"
@@ -194,6 +200,82 @@ def joined(recordings: Recordings) -> Recordings:
     # Of recordings drawn again, some may follow, and others not.
     labels = wholes if len(set(wholes)) == len(wholes) else labels
     return replace(recordings, labels=tuple(labels), recording=(np.cumsum(begins) - 1)[recordings.recording])
+
+
+def without_faults(recordings: Recordings) -> Recordings:
+    """Recordings less what only the sensor can have added: samples that stand apart, and the hum of mains.
+
+    A sample stands apart whose steps from the last and to the next are both larger than noise makes one in
+    all of the record, and lead back to where it came from. Where more than a few such steps do not lead back,
+    the state itself jumps, and nothing is left out. A hum is a line in the spectrum of the steps that keeps
+    its amplitude and its phase in every quarter of a recording, and that hardly moves the state.
+    """
+    floors = noise_floors(recordings)
+    if floors is None:
+        return recordings
+    noisy = [state for state, floor in enumerate(floors) if floor.process]  # what else jumps was measured
+    apart, remarks = np.zeros(len(recordings.t), dtype=bool), list(recordings.remarks)
+    for state in noisy:
+        steps = np.where(np.diff(recordings.recording) == 0, np.diff(recordings.values[:, state]), 0.0)
+        blocks = [np.abs(one) for one in np.array_split(steps, max(len(steps) // BLOCK, 1))]
+        usual = np.repeat([np.median(one) for one in blocks], [len(one) for one in blocks])
+        scale = np.maximum(usual, np.median(usual)) / special.ndtri(0.75)
+        largest = -special.ndtri(FALSE_FAULT_RATE / 2 / len(steps)) * scale
+        large = np.abs(steps) > largest
+        alone = large[:-1] & large[1:] & (np.abs(steps[:-1] + steps[1:]) <= largest[1:])
+        jumps, count = int(large.sum()) - 2 * int(alone.sum()), int(alone.sum())
+        if jumps <= FEW_JUMPS * count and 0 < count <= MOST_APART * len(steps):
+            apart[1:-1] |= alone
+            remarks.append(
+                Remark("data.samples_apart", {"column": recordings.titles[state], "samples": count})
+            )
+    kept = {"t": recordings.t, "recording": recordings.recording, "values": recordings.values}
+    found = replace(recordings, **{name: array[~apart] for name, array in kept.items()})
+    for state in noisy:
+        hum, period = _hum_of(found, found.values[:, state])
+        if hum.any():
+            found.values[:, state] -= hum
+            told = {
+                "column": found.titles[state],
+                "period": period,
+                "amplitude": float(np.sqrt(2) * hum.std()),
+            }
+            units = {"unit": found.units[state], "time_unit": found.time_unit}
+            remarks.append(Remark("data.hum_taken_off", told | units))
+    return replace(found, remarks=tuple(remarks)) if len(remarks) > len(recordings.remarks) else recordings
+
+
+def _hum_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, float]:
+    """The hum in a series, ``(n,)`` and zero where there is none, and its period in the unit of time."""
+    bounds = np.searchsorted(recordings.recording, np.arange(len(recordings.labels) + 1))
+    parts = [slice(int(a), int(b)) for a, b in pairwise(bounds) if b - a > QUARTERS]
+    nothing, steps = np.zeros(len(values)), np.append(np.diff(values), 0.0)
+    steps[bounds[1:] - 1] = 0.0
+    if not parts or (period := line_in(parts, steps[:, None])) is None:
+        return nothing, 0.0
+    about = 2 * np.pi / (period * usual_step(recordings))
+    width = np.pi / max(float(np.ptp(recordings.t[part])) for part in parts)
+
+    def amplitude(frequency: float, part: slice) -> complex:
+        """That of the hum, by the steps of a part: those of ``exp(iωt)`` are known."""
+        wave = np.diff(np.exp(1j * frequency * recordings.t[part]))
+        columns = np.column_stack([wave.real, -wave.imag])
+        return complex(*np.linalg.lstsq(columns, steps[part][:-1], rcond=None)[0])
+
+    def lost(frequency: float) -> float:
+        return -sum(abs(amplitude(frequency, part)) ** 2 * (part.stop - part.start) for part in parts)
+
+    bounds_of_line = (about - width, about + width)
+    frequency = float(optimize.minimize_scalar(lost, bounds=bounds_of_line, method="bounded").x)
+    hum = nothing.copy()
+    for part in parts:
+        whole, length = amplitude(frequency, part), part.stop - part.start
+        cuts = part.start + length * np.arange(QUARTERS + 1) // QUARTERS
+        each = [amplitude(frequency, slice(int(a), int(b))) for a, b in pairwise(cuts)]
+        if max(abs(one - whole) for one in each) > SAME_WAVE * abs(whole):
+            return nothing, 0.0
+        hum[part] = (whole * np.exp(1j * frequency * recordings.t[part])).real
+    return (hum, 2 * np.pi / frequency) if hum.var() < SLIGHT_HUM * values.var() else (nothing, 0.0)
 
 
 def without_background(recordings: Recordings) -> Recordings:

@@ -13,6 +13,7 @@ Three times of a record differ by orders of magnitude, and each has its use:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -30,7 +31,7 @@ STEP_TOLERANCE = 0.01  # of a step: stretches end where a step differs by more
 MOST_STRETCHES = 4000  # looked at
 MOST_RUNS = 200  # without a gap, from which a correlation time is found
 BRIDGED = 0.1  # of the correlation time: so long a gap hides two hops in one case of a hundred
-MOST_HALF_PERIODS = 8  # of the background in a record: what returns more often is part of the system
+MOST_SLOW_FUNCTIONS = 8  # of the background in a record: what returns more often is part of the system
 NEIGHBOURS, FEWEST_NEIGHBOURS = 10, 3  # frequencies on either side to compare one with, of all recordings
 HARMLESS_LINE = 0.01  # of the variance: it changes -log p by a hundredth
 FALSE_CHANGE_RATE = 0.01  # probability with which a stationary record is said to change
@@ -158,8 +159,7 @@ def change_of(recordings: Recordings, values: np.ndarray, path: np.ndarray) -> f
 
     The state at each sample, `path` ``(n,)`` with -1 where it is not known, the distance of the `values`
     ``(n,)`` from the mean of their state, and its square are asked for a straight line, in the course of all
-    recordings and of each, and for a frequency that stands out from its neighbours: with power P there and
-    L at these, ``P/L`` has the F distribution in any stationary process whose spectrum is smooth.
+    recordings and of each, and for a frequency that stands out from its neighbours, see `line_in`.
     """
     inside = (path[:, None] == np.arange(path.max() + 1)).astype(float)
     shares = np.maximum(inside.sum(axis=0), 1.0)
@@ -188,6 +188,15 @@ def change_of(recordings: Recordings, values: np.ndarray, path: np.ndarray) -> f
             chance = 2 * float(special.stdtr(freedom, -abs(slope) / max(error, 1e-300)))
             if chance * len(lines) * series.shape[1] < FALSE_CHANGE_RATE / 2:
                 return np.inf
+    return line_in(parts, series)
+
+
+def line_in(parts: Sequence[slice], series: np.ndarray) -> float | None:
+    """The period, in samples, of a line that stands out of the spectra of series ``(n, k)``, if one does.
+
+    With power P there and L at the frequencies around, ``P/L`` has the F distribution in any stationary
+    process whose spectrum is smooth. What is less than `HARMLESS_LINE` of the variance is none.
+    """
     longest = max(one.stop - one.start for one in parts)
     used = [one for one in parts if one.stop - one.start > 4 * NEIGHBOURS]
     # At half the distance of independent frequencies, so that none falls between two of them.
@@ -213,42 +222,42 @@ def change_of(recordings: Recordings, values: np.ndarray, path: np.ndarray) -> f
 def background_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, int]:
     """The slow drift of a series, common to all that it does: of a hopping record, less its levels.
 
-    Every recording has cosines of its own, ``cos(πkt/T)`` with k from 1 to the number of half periods. Gives
-    the drift ``(n,)``, less its mean over the record, and how many half periods the fastest cosine has in a
-    recording; both are zero where none is seen.
+    Every recording has a straight line of its own, and cosines ``cos(πkt/T)`` with k from 1 on. Gives the
+    drift ``(n,)``, less its mean over the record, and how many such functions a recording has; both are zero
+    where none is seen.
     """
     runs, counts = runs_of(recordings, bridged=True), np.bincount(recordings.recording)
     best, found = 0.0, (np.zeros(len(values)), 0)
     spread = float(np.var(values))
     if spread <= 0:
         return found
-    for half_periods in range(1, MOST_HALF_PERIODS + 1):
-        fitted = slow_part(recordings, values, half_periods)
+    for functions in range(1, MOST_SLOW_FUNCTIONS + 1):
+        fitted = slow_part(recordings, values, functions)
         rest = values - fitted
         independent = len(values) / (2 * correlated_samples(rest, runs))
-        used = half_periods * int((counts > half_periods).sum())
+        used = functions * int((counts > functions).sum())
         if independent <= 4 * used:
             break
         gain = independent * np.log(spread / max(float(np.var(rest)), 1e-300))
         # Twice the gain in the logarithm of the likelihood, less what chance gives it with this probability.
         surplus = gain - used * np.log(independent) - 2 * np.log(1 / FALSE_DRIFT_RATE)
         if surplus > best:
-            best, found = surplus, (fitted - fitted.mean(), half_periods)
+            best, found = surplus, (fitted - fitted.mean(), functions)
     return found
 
 
-def slow_part(recordings: Recordings, values: np.ndarray, half_periods: int) -> np.ndarray:
-    """Cosines of up to so many half periods in each recording, fitted to a series: ``(n,)``, of mean zero."""
+def slow_part(recordings: Recordings, values: np.ndarray, functions: int) -> np.ndarray:
+    """A straight line and cosines in each recording, fitted to a series: ``(n,)``, of mean zero."""
     fitted = np.empty(len(values))
     bounds = np.searchsorted(recordings.recording, np.arange(len(recordings.labels) + 1))
     for first, last in pairwise(bounds):
         part = values[first:last]
-        if last - first <= half_periods:
+        if last - first <= functions:
             fitted[first:last] = 0.0
             continue
         t = recordings.t[first:last]
         phase = np.pi * (t - t[0]) / (t[-1] - t[0])
-        waves = np.cos(phase[:, None] * np.arange(half_periods + 1))
+        waves = np.column_stack([phase, np.cos(phase[:, None] * np.arange(functions))])
         fitted[first:last] = waves @ np.linalg.lstsq(waves, part, rcond=None)[0]
         fitted[first:last] -= fitted[first:last].mean()
     return fitted

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from siq.data.preparation import in_stretches, joined, read_pairs, unusual, without_background
+from siq.data.preparation import in_stretches, joined, read_pairs, unusual, without_background, without_faults
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.data.states import RecordStates
 from siq.errors import NumericalFailure
@@ -71,11 +71,11 @@ def draw_run(
 
 
 def _prepared(settings: PipelineSettings, recordings: Recordings) -> Recordings:
-    """Recordings whose angles count turns, less what drifts slowly, in stretches."""
+    """Recordings whose angles count turns, less what drifts slowly or the sensor adds, in stretches."""
     options = settings.identification
     recordings = recordings.unwrapped(options.angles)
     if settings.sampling.background and not options.angles:  # an angle that turns on drifts by itself
-        recordings = without_background(recordings)
+        recordings = without_background(without_faults(recordings))
     return in_stretches(recordings, hidden_velocities=options.hidden_velocities)
 
 

@@ -181,8 +181,8 @@ class RecordingsOptions(BaseModel):
         Step of the Euler–Maruyama simulation that made the recordings, where one did: its increments are
         those of a map, from which the continuous process is then found. Leave it out for measurements.
     background
-        Whether slow drift of a single recording, and the baselines of several that hop and differ in them,
-        are taken off; what was taken off is noted.
+        Whether slow drift of a single recording, the baselines of several that hop and differ in them, and
+        what only a sensor can have added are taken off: hum, and samples that stand apart. It is noted.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -430,7 +430,7 @@ class Sampling:
     integrator_step
         Step of the Euler–Maruyama simulation that made the recordings; None where none did.
     background
-        Whether slow drift, and the baselines of recordings that differ in them, are taken off.
+        Whether slow drift, baselines of recordings that differ in them, and faults of sensors are taken off.
     """
 
     pair_step: Annotated[float, Field(gt=0)] | None = None
