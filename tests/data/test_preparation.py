@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
+from remembering import double_wells
 
-from siq.data.preparation import in_stretches, joined
+from siq.data.preparation import in_stretches, joined, without_faults
 from siq.data.recordings import Recordings
 from siq.data.stationarity import runs_of
 
@@ -46,3 +48,53 @@ def test_recordings_that_nobody_cut_stay_as_they_are() -> None:
     assert joined(several) is several
     named = replace(several, labels=("run (1 of 3)", "run (3 of 3)", "other (2 of 3)"))
     assert joined(named) is named
+
+
+def hopping(seed: int = 1) -> np.ndarray:
+    """A double well of 20,000 samples, twelve of them a relaxation time."""
+    return double_wells(seed, samples=80_000, traces=1, intensity=0.3)[0, ::4]
+
+
+def seen(values: np.ndarray) -> Recordings:
+    return Recordings.from_arrays(0.04 * np.arange(len(values)), values, names=["x", "y"][: values.shape[1]])
+
+
+def test_samples_that_stand_apart_are_left_out_and_nothing_else() -> None:
+    x, generator = hopping(), np.random.default_rng(0)
+    rows = np.sort(generator.choice(np.arange(5, len(x) - 5, 7), 30, replace=False))
+    spoiled = x.copy()
+    spoiled[rows, 0] += np.where(generator.random(30) < 0.5, -1, 1) * generator.uniform(2, 20, 30)
+    found = without_faults(seen(spoiled))
+    np.testing.assert_array_equal(found.t, np.delete(0.04 * np.arange(len(x)), rows))
+    assert "data.samples_apart" in {one.code for one in found.remarks}
+    assert without_faults(seen(x)).values.shape == x.shape
+
+
+def test_what_jumps_and_stays_is_the_states_own() -> None:
+    x = hopping()
+    jumps = 3.0 * (np.arange(len(x)) // 1500 % 2)
+    jumps[5000] += 8.0
+    assert len(without_faults(seen(x + jumps[:, None])).t) == len(x)
+
+
+def test_a_hum_is_taken_off_to_its_phase() -> None:
+    x, t = hopping(), 0.04 * np.arange(20_000)
+    hum = 0.2 * np.sin(2 * np.pi * t / 0.313 + 0.4)
+    found = without_faults(seen(x + hum[:, None]))
+    assert float(np.std(found.values - x)) < 0.02 * np.std(hum)
+    told = next(one.values for one in found.remarks if one.code == "data.hum_taken_off")
+    assert told["period"] == pytest.approx(0.313, rel=1e-4)
+    assert told["amplitude"] == pytest.approx(0.2, rel=0.02)
+
+
+def test_a_noisy_limit_cycle_is_no_hum() -> None:
+    generator, state = np.random.default_rng(2), np.array([1.0, 0.0])
+    path = np.empty((8000, 2))
+    for row in range(len(path)):
+        path[row] = state
+        x, y = state
+        grows = 1 - x**2 - y**2
+        force = np.array([x * grows - 3 * y, y * grows + 3 * x])
+        state = state + 0.04 * force + 0.02 * generator.standard_normal(2)
+    given = seen(path)
+    assert without_faults(given) is given
