@@ -52,7 +52,7 @@ def claims(*parts: np.ndarray) -> dict[str, Verdict]:
 
 
 def test_honest_records_are_refused_as_seldom_as_they_may_be() -> None:
-    seen = records(160, samples=3000, seed=1)
+    seen = records(160, samples=3000, seed=5)
     probabilities: dict[str, list[float]] = {}
     for first in range(0, 160, 4):  # forty records of four recordings
         for name, verdict in claims(*seen[first : first + 4]).items():
