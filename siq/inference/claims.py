@@ -111,7 +111,7 @@ class _Residuals:
         self.runs = [slice(int(a), int(b)) for a, b in pairwise(bounds)]
         self.noise = self.without(rest[:, self.noisy])
         self.noise = _orthonormal(self.noise) * np.sqrt(n)
-        self.neighbour = self._standardised(self.past(self.noise, 0.0, delay=1))
+        self.near = _orthonormal(self._standardised(self.past(self.noise, 0.0, delay=1)))
         self.power = self._standardised(self.noise**2 - 1)
 
     def _standardised(self, values: np.ndarray) -> np.ndarray:
@@ -149,12 +149,11 @@ class _Residuals:
     def probability(self, columns: np.ndarray, rest: np.ndarray) -> float:
         """Probability of what columns explain of residuals, neighbours and the state apart."""
         columns = self.without(columns)
-        near = _orthonormal(self.neighbour)
-        columns, rest = (one - near @ (near.T @ one) for one in (columns, rest))
+        columns, rest = (one - self.near @ (self.near.T @ one) for one in (columns, rest))
         columns = _orthonormal(columns)
         if not columns.shape[1] or len(rest) < FEWEST_PER_COLUMN * (columns.shape[1] + self.basis.shape[1]):
             return 1.0
-        freedom = len(rest) - self.basis.shape[1] - near.shape[1]
+        freedom = len(rest) - self.basis.shape[1] - self.near.shape[1]
         return unexplained_probability(columns, rest, freedom=freedom)
 
     def memories(self) -> Iterator[float]:
