@@ -16,14 +16,13 @@ of the past alone, and then the products ``G z`` are martingale differences, wha
     Each recording by itself: a constant, and slopes in the states. Likewise of ``z² - 1``, for D. Recordings
     that share no states cannot be compared.
 ``unchanged``
-    Cosines and sines of time, and these times the states, from half a period in a recording to two samples.
-    The highest peak of the periodograms of z, of ``φ(x) z`` and of ``z² - 1`` counts. Each octave of
-    frequencies is as likely to hold one, and so the price of a peak is the number of octaves times that of
-    frequencies in its own.
+    Time itself, for a drift, and cosines and sines of it, from half a period in a recording to two samples;
+    and these times the states. Half of the level is for drifts. Of periodograms of z, of ``φ(x) z`` and of
+    ``z² - 1`` each octave of frequencies has the same share, since it is as likely to hold a peak.
 ``state_complete``
     Means of the past that fade with memories from a few samples to a thirtieth of the record, of the states,
-    and of ``φ(x) z``, which follow what a hidden variable does to the force. A hidden variable that changes D
-    shows in those of ``z² - 1``.
+    and of ``φ(x) z``, which follow what a hidden variable does to the force; and what filters know of a gate,
+    which is not forgotten as such means are. A hidden variable that changes D shows in means of ``z² - 1``.
 ``gaussian_increments``
     The largest residual, and how many are beyond three; values, or steps, that repeat themselves more often
     than rounding lets them; and stretches that stand in the record twice.
@@ -52,6 +51,7 @@ from siq.inference.checks import repetitions, unexplained_probability
 from siq.inference.diffusion_model import process_noise_increments
 from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.inference.regression import coarse_pairs, residuals
+from siq.numerics.integration import machine_code
 from siq.numerics.randomness import positive
 from siq.remarks import Remark, sentence
 
@@ -62,11 +62,13 @@ FEWEST_PER_COLUMN = 10  # pairs for each column of a regression
 FASTEST_PERIOD = 2  # samples
 FEWEST_OF_SPECTRUM = 10  # pairs of a run whose spectrum is asked for
 SHORTEST_MEMORY, MEMORY_GROWTH, LONGEST_MEMORY = 4, 2.0, 1 / 30  # samples; a ratio; of all samples
+VISIBLE = 4.0  # squares of the standard deviations by which a gate shows within its memory
+ROUNDS = 4  # numerical: of filter and state, until they agree on what the state tells of a gate
 OVERLAP = 0.02  # quantile between which, and one minus it, recordings share states
 SLIGHT_EXCESS = 0.25  # of the standard deviation of what all recordings explain: 1/160 becomes 1/80
 RANK = 1e-8  # numerical: of the squares of a column, what is left of it by chance
 FORGOTTEN = 3.0  # of its times, after which a filter has forgotten that it did not know the force at first
-POWER = 0.8  # probability with which a gate in the place of a slow force would have been noticed
+POWER = 0.8  # probability with which a flaw as large as is said would have been noticed
 TAIL = 3.0  # standard deviations: beyond are 2.7 in 1000
 HARMLESS_CHANGE = 0.01  # of a barrier
 
@@ -84,6 +86,7 @@ class _Residuals:
         pairs = found.wrapped(pairs)
         rest = process_noise_increments(found, pairs, residuals(found, pairs))
         force = found.dynamics.drift(pairs.x0) * np.sqrt(pairs.h)[:, None]
+        moves = positive(np.sqrt((rest**2).mean(axis=0)))
         if not found.diffusion.constant:
             whitening = found.diffusion.whitening_at(pairs.x0)
             rest, force = (np.einsum("nij,nj->ni", whitening, one) for one in (rest, force))
@@ -91,6 +94,7 @@ class _Residuals:
         self.noisy = np.sqrt((rest**2).mean(axis=0)) > NOISELESS * moved
         if found.hidden_states:  # there is one innovation for each position
             self.noisy[found.library.dimension // 2 :] = False
+        self.reach = float((pairs.x0.std(axis=0) / moves)[self.noisy].max(initial=0.0))
         shares = (force**2).mean(axis=0)[self.noisy] / (rest**2).mean(axis=0)[self.noisy]
         self.drift = float(shares.max(initial=0.0))  # of the squares of steps, over that of the noise
         self.pairs, n = pairs, len(pairs.h)
@@ -107,7 +111,7 @@ class _Residuals:
         self.runs = [slice(int(a), int(b)) for a, b in pairwise(bounds)]
         self.noise = self.without(rest[:, self.noisy])
         self.noise = _orthonormal(self.noise) * np.sqrt(n)
-        self.neighbour = self._standardised(self.past(self.noise, 0.0, delay=1))
+        self.near = _orthonormal(self._standardised(self.past(self.noise, 0.0, delay=1)))
         self.power = self._standardised(self.noise**2 - 1)
 
     def _standardised(self, values: np.ndarray) -> np.ndarray:
@@ -129,15 +133,27 @@ class _Residuals:
                 found[run][delay:] = faded
         return found
 
+    def gated(self, memory: float, shape: np.ndarray) -> np.ndarray:
+        """What a gate ±1 that pushes like a shape does to residuals, by filters with a memory in pairs.
+
+        What the state tells of the gate f has taken over; it is given back to the residuals.
+        """
+        push, fade = np.sqrt(VISIBLE / memory) * shape[:, None], float(np.exp(-1 / memory))
+        told = seen = np.zeros_like(self.noise)
+        for _ in range(ROUNDS):
+            values = self.noise + push * told
+            seen = np.concatenate([_foreseen(values[run], push[run, 0], fade) for run in self.runs])
+            told = seen - self.without(seen)
+        return np.asarray(push * seen)
+
     def probability(self, columns: np.ndarray, rest: np.ndarray) -> float:
         """Probability of what columns explain of residuals, neighbours and the state apart."""
         columns = self.without(columns)
-        near = _orthonormal(self.neighbour)
-        columns, rest = (one - near @ (near.T @ one) for one in (columns, rest))
+        columns, rest = (one - self.near @ (self.near.T @ one) for one in (columns, rest))
         columns = _orthonormal(columns)
         if not columns.shape[1] or len(rest) < FEWEST_PER_COLUMN * (columns.shape[1] + self.basis.shape[1]):
             return 1.0
-        freedom = len(rest) - self.basis.shape[1] - near.shape[1]
+        freedom = len(rest) - self.basis.shape[1] - self.near.shape[1]
         return unexplained_probability(columns, rest, freedom=freedom)
 
     def memories(self) -> Iterator[float]:
@@ -147,6 +163,18 @@ class _Residuals:
         while memory <= longest:
             yield memory
             memory *= MEMORY_GROWTH
+
+
+@machine_code
+def _foreseen(values: np.ndarray, push: np.ndarray, fade: float) -> np.ndarray:
+    """The mean, before each value, of a gate ±1 that adds ±push to noise of variance one (Wonham 1965)."""
+    seen, mean = np.zeros_like(values), np.zeros(values.shape[1])
+    for k in range(len(values)):
+        mean = mean * fade
+        seen[k] = mean
+        told = np.tanh(push[k] * values[k])
+        mean = (mean + told) / (1 + mean * told)
+    return seen
 
 
 def _orthonormal(columns: np.ndarray) -> np.ndarray:
@@ -336,17 +364,39 @@ def _chance(count: int, explained: np.ndarray) -> float:
     return min(float(scipy.special.chdtrc(count, explained).min()) * len(explained), 1.0)
 
 
+def _combined(chances: np.ndarray, shares: np.ndarray | None = None) -> float:
+    """One probability of L tests with shares of a level, however they depend on each other: a harmonic mean.
+
+    Of ``t = Σ s/p / Σ s`` it is ``1/(t - log L - 0.874)`` where it is small (Wilson, PNAS 116 (2019) 1195).
+    """
+    inverse = float(np.average(1 / np.maximum(chances, 1e-300), weights=shares))
+    return 1 / max(inverse - np.log(len(chances)) - 0.874, 1.0)
+
+
 def _unchanged(rest: _Residuals, limit: float) -> Verdict:
     runs = [run for run in rest.runs if run.stop - run.start >= FEWEST_OF_SPECTRUM]
     if not runs:
         return Verdict.not_tested(sentence(Remark("inference.runs_too_short")))
-    size = 2 * max(run.stop - run.start for run in runs)
+    size, step = 2 * max(run.stop - run.start for run in runs), float(np.median(rest.pairs.h))
     frequencies = np.arange(1, size // FASTEST_PERIOD + 1)
     octaves = np.log2(frequencies).astype(int)
+    share = 1 / (np.bincount(octaves)[octaves] * (octaves[-1] + 1))
+    # A drift has one direction in each recording, or in all as they follow each other.
+    clocks = [np.concatenate([np.linspace(-1, 1, run.stop - run.start) for run in rest.runs])[:, None]]
+    if len(rest.runs) > 1:
+        clocks.append(np.linspace(-1, 1, len(rest.noise))[:, None])
     one = rest.states[:, :1]
     tried = [(rest.noise, one, False), (rest.noise, rest.states, False), (rest.power, one, True)]
-    price = len(tried) * (octaves[-1] + 1) * np.bincount(octaves)[octaves]
-    best = (1.0, 0.0, False)
+    found = [  # probabilities, their shares of the level, periods, and whether they are of the noise
+        (
+            np.full(1, rest.probability(clock * shapes, series)),
+            np.full(1, 1 / len(clocks)),
+            np.zeros(1),
+            of_noise,
+        )
+        for series, shapes, of_noise in tried
+        for clock in clocks
+    ]
     for series, shapes, of_noise in tried:
         peaks, freedom = np.zeros(len(frequencies)), np.zeros(len(frequencies))
         for run in runs:
@@ -359,31 +409,40 @@ def _unchanged(rest: _Residuals, limit: float) -> Verdict:
         # The variance of a peak of n samples is larger by the share of their fourth cumulant over n.
         excess = float(((series**4).mean(axis=0) / (series**2).mean(axis=0) ** 2).max() - 3)
         wider = 1 + max(excess, 0.0) * len(runs) / sum(run.stop - run.start for run in runs)
-        chances = scipy.special.chdtrc(np.maximum(freedom, 1) / wider, peaks / wider) * price
-        place = int(np.argmin(chances))
-        best = min(best, (float(chances[place]), size / float(frequencies[place]), of_noise))
-    chance, period, of_noise = best
-    period *= float(np.median(rest.pairs.h))
-    return _verdict("unchanged", chance, limit, period=period, of_noise=of_noise)
+        swings = scipy.special.chdtrc(np.maximum(freedom, 1) / wider, peaks / wider)
+        found.append((swings, share, size / frequencies * step, of_noise))
+    chances, shares, periods = (np.concatenate([one[k] for one in found]) for k in range(3))
+    which = np.concatenate([np.full(len(one[0]), one[3]) for one in found])
+    worst = np.argmin(chances / shares)
+    values = {"period": float(periods[worst]), "of_noise": bool(which[worst])}
+    verdict = _verdict("unchanged", _combined(chances, shares), limit, **values)
+    # A drift of the force from -a to a is a√h/√q of each residual in its direction, and 4as/q of U/ε along s.
+    told = rest.without(clocks[0] * np.sqrt(rest.pairs.h)[:, None])
+    least = -scipy.special.ndtri(limit / (4 * len(tried) * len(clocks))) + scipy.special.ndtri(POWER)
+    change = 4 * rest.reach * float(least / np.linalg.norm(told))
+    drift = sentence(Remark("inference.drift_unseen", {"change": change}))
+    return replace(verdict, reason=drift) if verdict.passed else verdict
 
 
 def _state_complete(rest: _Residuals, limit: float) -> Verdict:
-    best, tried = (1.0, 0.0, "force"), 0
+    found: list[tuple[float, float, str]] = []
     shapes = rest.states
     forces = (rest.noise[:, :, None] * shapes[:, None, :]).reshape(len(shapes), -1)
     for memory in rest.memories():
         pushed = rest.past(forces, memory).reshape(len(shapes), -1, shapes.shape[1]) * shapes[:, None, :]
-        chances = {
-            "force": rest.probability(pushed.reshape(len(shapes), -1), rest.noise),
-            "past": rest.probability(rest.past(shapes[:, 1:], memory), rest.noise),
-            "noise": rest.probability(rest.past(rest.power, memory), rest.power),
-        }
-        tried += len(chances)
-        best = min(best, *((chance, memory, kind) for kind, chance in chances.items()))
-    if not tried:
+        found += [
+            (rest.probability(pushed.reshape(len(shapes), -1), rest.noise), memory, "force"),
+            (rest.probability(rest.past(shapes[:, 1:], memory), rest.noise), memory, "past"),
+            (rest.probability(rest.past(rest.power, memory), rest.power), memory, "noise"),
+        ]
+        found += [
+            (rest.probability(rest.gated(memory, shape), rest.noise), memory, "force") for shape in shapes.T
+        ]
+    if not found:
         return Verdict.not_tested(sentence(Remark("inference.runs_too_short")))
-    time = best[1] * float(np.median(rest.pairs.h))
-    return _verdict("state_complete", best[0] * tried, limit, memory=time, kind=best[2])
+    time = min(found)[1] * float(np.median(rest.pairs.h))
+    chance = _combined(np.array([one[0] for one in found]))
+    return _verdict("state_complete", chance, limit, memory=time, kind=min(found)[2])
 
 
 def _gaussian(rest: _Residuals, recordings: Recordings, limit: float) -> Verdict:

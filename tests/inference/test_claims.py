@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 import scipy.stats
 
 from siq.data.recordings import Recordings, snapshot_pairs
-from siq.inference.claims import _as_normal, check_claims
+from siq.inference.claims import _as_normal, _combined, _foreseen, check_claims
 from siq.inference.field_estimate import FieldEstimate, FlowMap, Verdict
 from siq.inference.library import IdentificationOptions, field_library
 from siq.inference.regression import refit
@@ -52,7 +53,7 @@ def claims(*parts: np.ndarray) -> dict[str, Verdict]:
 
 
 def test_honest_records_are_refused_as_seldom_as_they_may_be() -> None:
-    seen = records(160, samples=3000, seed=1)
+    seen = records(160, samples=3000, seed=5)
     probabilities: dict[str, list[float]] = {}
     for first in range(0, 160, 4):  # forty records of four recordings
         for name, verdict in claims(*seen[first : first + 4]).items():
@@ -139,6 +140,40 @@ def test_what_is_not_in_the_state_is_noticed(force: Force, claim: str) -> None:
     found = claims(*records(1, samples=40_000, seed=3, force=force))
     assert found[claim].tested and not found[claim].passed and found[claim].reason
     assert found["gaussian_increments"].passed
+
+
+def test_a_drift_as_large_as_the_claim_says_is_noticed() -> None:
+    """Of 80 % that it states; half as much again is noticed in 99 of 100."""
+    honest = records(1, samples=20_000, seed=5)
+    verdict = claims(*honest)["unchanged"]
+    stated = re.search(r"by ([0-9.]+) or more", verdict.reason)
+    assert verdict.passed and stated is not None
+    size = 1.5 * float(stated[1]) * INTENSITY / (4 * honest.std())
+    seen = records(
+        4, samples=20_000, seed=6, force=lambda x, time, draw: np.full_like(x, size * (time / 500 - 1))
+    )
+    found = [claims(one)["unchanged"] for one in seen]
+    assert not any(one.passed for one in found)
+    assert "drifts from the beginning to the end" in found[0].reason
+
+
+def test_a_gate_is_foreseen_as_bayes_says() -> None:
+    generator, push, stays = np.random.default_rng(8), 0.3, 0.96
+    values = generator.standard_normal((300, 1)) + push * np.repeat([[1.0], [-1.0], [1.0]], 100, axis=0)
+    switch, open_gate = (1 - stays) / 2, 0.5
+    for value, foreseen in zip(values[:, 0], _foreseen(values, np.full(300, push), stays)[:, 0], strict=True):
+        open_gate = open_gate * (1 - switch) + (1 - open_gate) * switch
+        assert foreseen == pytest.approx(2 * open_gate - 1, abs=1e-12)
+        likely = scipy.stats.norm.pdf(value, [push, -push])
+        open_gate = open_gate * likely[0] / (likely @ [open_gate, 1 - open_gate])
+
+
+@pytest.mark.parametrize("same", [False, True])
+def test_tests_that_share_a_level_keep_it(same: bool) -> None:
+    """Those that depend on each other, too, up to a harmless share."""
+    chances = np.random.default_rng(9).random((20_000, 1 if same else 30)) * np.ones(30)
+    refused = np.mean([_combined(one) < 0.01 for one in chances])
+    assert 0.006 < refused < 0.012
 
 
 def test_a_recording_that_stands_apart_is_named() -> None:
