@@ -249,9 +249,11 @@ def repetitions(recordings: Recordings, column: int) -> list[tuple[float, str, f
     size = float(np.sqrt((moves[same] ** 2).mean())) if same.any() else 0.0
     if len(x) <= COPIED or not size > 0:
         return []
-    step = resolution_step(x)
+    # Less a straight drift, what was rounded has no step: its second differences do.
+    bends = np.diff(moves)[same[1:] & same[:-1]]
+    step = resolution_step(x) or resolution_step(ALIKE * size * np.round(bends / (ALIKE * size)))
     found, width = [], ALIKE * size if step is None else step
-    for kind, changes in (("held", moves[same]), ("straight", np.diff(moves)[same[1:] & same[:-1]])):
+    for kind, changes in (("held", moves[same]), ("straight", bends)):
         sizes, spread = np.abs(changes), max(float(np.sqrt((changes**2).mean())), 1e-300)
         count = int((sizes < ALIKE * size).sum())
         usual = len(changes) * min(width / (np.sqrt(2 * np.pi) * spread), 1.0)

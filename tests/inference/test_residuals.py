@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import sympy
 from known_systems import KnownSystem, archetype, as_system, double_well, maier_stein
+from scipy.signal import lfilter
 
 from siq.data.recordings import Recordings, snapshot_pairs
-from siq.inference.checks import mean_residual_probability, residual_noise
+from siq.inference.checks import mean_residual_probability, repetitions, residual_noise
 from siq.inference.field_estimate import FieldEstimate, NoiseDiagnosis
 from siq.inference.library import IdentificationOptions, field_library
 from siq.inference.regression import identify_vector_field
@@ -193,3 +194,20 @@ def test_the_probability_of_the_mean_is_uniform_for_the_right_f() -> None:
     ]
     assert min(found) > 0.002
     assert np.median(found) > 0.15
+
+
+def test_what_rounding_repeats_is_no_sign_of_values_filled_in() -> None:
+    generator, t = np.random.default_rng(0), np.arange(20_000.0)
+    walk = 0.1 * np.cumsum(generator.standard_normal(len(t)))
+    inert = 0.1 * np.cumsum(lfilter([1.0], [1.0, -0.95], generator.standard_normal(len(t))))
+    filled = walk.copy()
+    for begin in range(0, len(t), 1000):
+        filled[begin : begin + 6] = np.linspace(*filled[[begin, begin + 5]], 6)
+
+    def straight(x: np.ndarray) -> float:
+        found = repetitions(Recordings.from_arrays(t, x[:, None], names=["x"]), 0)
+        return next(chance for chance, kind, _ in found if kind == "straight")
+
+    for x in (walk, walk.round(3), walk.round(3) - 1e-4 * t, inert.round(3)):
+        assert straight(x) > 0.01
+    assert straight(filled) < 1e-9 and straight(filled.round(3)) < 1e-3
