@@ -349,12 +349,12 @@ def _gained(
 ) -> np.ndarray:
     """What terms gain at a horizon over nothing, or over a leading mechanism in its place, ``(terms,)``."""
     fit, data = horizon.fit, horizon.data
-    fold, nothing = _fold_of(data), -np.inf
+    fold, nothing, known = _fold_of(data), -np.inf, _places_of(leading, fit, linear=True)
     best, at = np.full(len(terms), -np.inf), 0
     for some in portions(fit, data, terms):
         work = evaluation(fit.model, data, columns=sum(each.width for each in some))
         budget.charge((min(fit.substeps, PROBE_SUBSTEPS) + len(IN_PLACE)) * work)
-        response, groups = linearised_with(fit, data, some)
+        response, groups = linearised_with(fit, data, some, without=known)
         for level in ALONE if leading is None else IN_PLACE:
             try:
                 white = whiten(response, data, fit.noise.scaled(level))
@@ -363,8 +363,7 @@ def _gained(
                 continue
             further = white.columns[:, len(fit.model.free) :]
             constant = -0.5 * white.log_determinant
-            known = white.columns[:, _places_of(leading, fit, linear=True)]
-            nothing = max(nothing, float(problem.log_density(known).sum()) + constant)
+            nothing = max(nothing, float(problem.log_density(white.columns[:, known]).sum()) + constant)
             for place, (term, group) in enumerate(zip(some, groups, strict=True), start=at):
                 columns = further[:, group]
                 if not np.isfinite(columns).all():
@@ -440,7 +439,8 @@ def _containing(horizon: Horizon, sites: Sequence[_Site], leading: MechanismCand
     """
     fit, data, found = horizon.fit, horizon.data, np.zeros(len(sites), dtype=bool)
     chosen = [place for place, site in enumerate(sites) if site.candidate is None]
-    response, groups = linearised_with(fit, data, [sites[place].terms[0] for place in chosen])
+    terms, without = [sites[place].terms[0] for place in chosen], _places_of(leading, fit, linear=True)
+    response, groups = linearised_with(fit, data, terms, without=without)
     white = whiten(response, data, fit.noise)
     problem = _in_place_of(leading, fit, white, _fold_of(data))
     basis, effect = orthonormal(problem.own), problem.target - white.innovations

@@ -11,7 +11,8 @@ range, is read off them.
 Where a simulation has a free damping rate, linear damping is another value of it: no recording can tell the
 two apart, and a mechanism of that kind would only stand in the way of the parameter. To first order a
 mechanism adds the derivatives of f and h by its amplitudes; it is something new where these are linearly
-independent, as functions of states, inputs and time, of the derivatives by the free parameters.
+independent, as functions of states, inputs and time, of the derivatives by the free parameters, and of what
+other units and zeros of the states do.
 """
 
 from __future__ import annotations
@@ -444,20 +445,30 @@ def _beyond_parameters(
 ) -> list[MechanismCandidate | None]:
     """Candidates less what the simulation's own parameters can do; None for those of which nothing is left.
 
+    Other units and zeros of the states are no parameters, and can do as little: a sensor's gain beside a free
+    inertia and a free damping is another unit of the angle.
+
     Of several amplitudes those are taken out that the parameters, together with those before, stand for.
     """
-    count = 2 * (len(model.free) + 6)
+    d = model.dimension
+    count = 2 * (len(model.free) + (d + 1) ** 2)
     x, signals = trial_points(model, count, either_sign=True)
     # A parameter that happens to be zero hides what others do in the same term.
     nonzero = np.random.default_rng(0).uniform(*ANYWHERE, size=len(model.parameters))
     values = np.where(model.values == 0, nonzero, model.values)
-    by_parameter = model.functions.slopes(x, signals, values)[1]
-    outputs_by_parameter = model.functions.output_slopes(x, signals, values)[1]
-    own = np.concatenate([by_parameter, outputs_by_parameter]).swapaxes(1, 2)
-    own = own.reshape(len(own) * count, len(model.free))
+    slopes = model.functions.slopes(x, signals, values), model.functions.output_slopes(x, signals, values)
+    by_state, own = (np.concatenate(each) for each in zip(*slopes, strict=True))
+    # States x + ε(A x + b) obey f + ε([A x + b] f' - A f), and show h + ε[A x + b] h': nobody sees units.
+    moved, rates = np.ones((d + 1, count)), np.zeros((d + 1, count))
+    moved[1:], rates[1:] = x, model.functions.rates(x, signals, values)
+    seen_otherwise = by_state[:, :, None] * moved
+    seen_otherwise[range(d), range(d)] -= rates
+    own = np.concatenate([own, seen_otherwise.reshape(len(own), -1, count)], axis=1)
+    own = own.swapaxes(1, 2).reshape(len(own) * count, -1)
     result: list[MechanismCandidate | None] = []
     for each in candidates:
-        new = _new_columns(own, _columns(model, each, x, signals, values))
+        shown = any(search.recorded for search in each.searches)  # and known where it acts by recordings only
+        new = [True] if shown else _new_columns(own, _columns(model, each, x, signals, values))
         needless = {name for name, is_new in zip(each.amplitudes, new, strict=False) if not is_new}
         if not any(new):
             result.append(None)

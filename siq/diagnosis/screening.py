@@ -277,30 +277,30 @@ def portions(fit: Fit, data: Measurements, terms: Sequence[AnyTerm]) -> list[lis
 
 
 def linearised_with(
-    fit: Fit, data: Measurements, terms: Sequence[Term], *, substeps: int = PROBE_SUBSTEPS
+    fit: Fit,
+    data: Measurements,
+    terms: Sequence[Term],
+    *,
+    substeps: int = PROBE_SUBSTEPS,
+    without: Sequence[int] = (),
 ) -> tuple[Linearisation, list[slice]]:
     """The linearisation of a fit with the columns of terms behind its parameters, and which is whose.
 
-    These are worked out with so many substeps between samples at most.
+    These are worked out with so many substeps between samples at most, and in the place of what some free
+    parameters do, by their places.
     """
     grid = Grid(data, min(fit.substeps, substeps))
+    noise = fit.noise if fit.has_process_noise else None
     with np.errstate(all="ignore"):  # what overflows is left out of the screening
         columns = _TermColumns(terms, Trajectories(fit.model, grid, fit.x))
-        coarse = linearise(fit.model, grid, fit.model.values, fit.linearised_at, columns=columns)
+        at, values = fit.linearised_at, fit.model.values
+        coarse = linearise(fit.model, grid, values, at, columns=columns, noise=noise, without=without)
     known, parameters = fit.linearisation, len(fit.model.free)
-    further, measured = coarse.response[:, :, parameters:], coarse.measured_response[:, :, parameters:]
-    if fit.has_process_noise:
-        # What a filter knows at a sample it knows from that sample. A fault of a sensor acts on what was
-        # foreseen; taken at what is known it would explain the innovations by themselves.
-        foreseen = fit.linearised_at.copy()
-        foreseen[data.begins + 1] += known.gap[data.begins]
-        with np.errstate(all="ignore"):
-            at_foreseen = columns.outputs(np.ascontiguousarray(foreseen.T), fit.model.values)
-        measured = np.moveaxis(at_foreseen, 2, 0)
+    further = coarse.response[:, :, parameters:], coarse.measured_response[:, :, parameters:]
     return replace(
         known,
-        response=np.concatenate([known.response, further], axis=2),
-        measured_response=np.concatenate([known.measured_response, measured], axis=2),
+        response=np.concatenate([known.response, further[0]], axis=2),
+        measured_response=np.concatenate([known.measured_response, further[1]], axis=2),
     ), columns.slices
 
 
