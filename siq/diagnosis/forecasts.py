@@ -222,7 +222,11 @@ def _horizons_of(fit: Fit, context: FitContext) -> list[Horizon]:
             return found
         begin = found[-1].fit if found else fit
         try:
-            found.append(Horizon.of(_fitted(fit.model, some, begin, budget=context.budget), some))
+            there = _fitted(fit.model, some, begin, budget=context.budget)
+            # Where f jumps its derivatives are never exact, and steps may go to and fro about the best fit.
+            if not (there.converged or there.model.edges):
+                raise NumericalFailure("its fit does not settle")
+            found.append(Horizon.of(there, some))
         except NUMERICAL_ERRORS as error:
             LOGGER.info("every %d. sample: %s", every, error)
             if not found:
@@ -234,7 +238,10 @@ def _horizons_of(fit: Fit, context: FitContext) -> list[Horizon]:
 def _fitted(
     model: Dynamics, data: Measurements, begin: Fit, x: np.ndarray | None = None, *, budget: Budget
 ) -> Fit:
-    """A model fitted with forces at random, from the states and the noise of a fit."""
+    """A model fitted with forces at random, from the states and the noise of a fit.
+
+    One that does not settle, as where shapes stand in for each other, is judged by what it foresees.
+    """
     states, substeps = begin.x if x is None else x, begin.substeps
     if jumps_of(model):
         substeps = max(substeps, EDGE_SUBSTEPS)
@@ -243,9 +250,8 @@ def _fitted(
     fit = fit_by_multiple_shooting(
         model, data, x=states, noise=noise, estimate_process=True, substeps=substeps, budget=budget
     )
-    # Where f jumps its derivatives are never exact, and steps may go to and fro about the best fit.
-    if fit.fault or not (fit.converged or fit.model.edges):
-        raise NumericalFailure(fit.fault or "its fit does not settle")
+    if fit.fault:
+        raise NumericalFailure(fit.fault)
     return fit
 
 

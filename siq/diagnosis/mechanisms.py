@@ -382,7 +382,7 @@ def _build_candidate(
         generalises=mechanism.generalises,
         turning=form.turning,
         variant=form.variant.format_map(assignment),
-        family=mechanism.family or mechanism.name,
+        family=form.family or mechanism.family or mechanism.name,
         weight=mechanism.weight,
     )
     return _labelled(candidate, model)
