@@ -529,18 +529,19 @@ def _fitted_at(
     horizons: Sequence[Horizon], site: _Site, budget: Budget, untried: dict[str, NotFitted]
 ) -> tuple[list[Horizon], float] | None:
     """A mechanism fitted at every horizon, and what it gains; None where that fails, or its sign is wrong."""
-    candidate = site.candidate
-    assert candidate is not None
-    found: list[Horizon] = []
+    candidate, probe, found = site.candidate, site.terms[0], list[Horizon]()
+    assert candidate is not None and isinstance(probe, Probe)
+    known = dict(probe.shapes)  # to begin with; then what the horizon before led to
     for each in horizons:
         try:
-            fit, x = _begun(site, each, found[-1].fit if found else None)
-            fit = _fitted(fit.model, each.data, fit, x, budget=budget)
+            x = probe.states_along(each.fit, each.data, each.fit.x)
+            fit = _fitted(candidate.begun(each.fit.model, known), each.data, each.fit, x, budget=budget)
             if not candidate.admits(fit):
                 raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
             if candidate.generalises and candidate.idle(fit):
                 raise NumericalFailure("it is no more than the special case of it")
             found.append(Horizon.of(fit, each.data))
+            known |= {one.name: one.value for one in fit.model.parameters if one.name in candidate.new}
         except NUMERICAL_ERRORS as error:
             LOGGER.info("%s at a horizon: %s", candidate.label, error)
             untried[candidate.label] = NotFitted.of(candidate, error)
@@ -553,17 +554,6 @@ def _fitted_at(
         ]
     )
     return found, float(gain)
-
-
-def _begun(site: _Site, horizon: Horizon, before: Fit | None) -> tuple[Fit, np.ndarray]:
-    """A fit with a mechanism to begin with, from its best shapes, or from the fit at the horizon before."""
-    candidate, fit, probe = site.candidate, horizon.fit, site.terms[0]
-    assert candidate is not None and isinstance(probe, Probe)
-    known = dict(probe.shapes)
-    if before is not None:
-        known |= {each.name: each.value for each in before.model.parameters if each.name in candidate.new}
-    begun = replace(fit, model=candidate.begun(fit.model, known))
-    return begun, probe.states_along(fit, horizon.data, fit.x)
 
 
 def _next_rung(
@@ -610,6 +600,11 @@ def _next_rung(
                 outdone, leader = {leader.site.label}, ground
         sites, gains = _gains(ground.horizons, remaining, ground.candidate, budget, untried)
         gains = gains + ground.gain
+
+    def attempt(site: _Site) -> None:
+        if (another := _fitted_at(horizons, site, budget, untried)) is not None:
+            fitted[site.label] = _Leader(site, *another)
+
     # What would outvote it is fitted first: a sensor's gain may promise what a parameter then takes over.
     promised = gains + np.array([site.prior for site in sites])
     suspects = [
@@ -620,9 +615,7 @@ def _next_rung(
         and sites[place].label in alone.keys() - fitted.keys() - untried.keys()
     ]
     for site in suspects[:SUSPECTS]:
-        another = _fitted_at(horizons, site, budget, untried)
-        if another is not None:
-            fitted[site.label] = _Leader(site, *another)
+        attempt(site)
     # What was fitted in earnest counts as it was fitted.
     kept = [place for place, site in enumerate(sites) if site.label not in fitted]
     sites = [*(sites[place] for place in kept), *(each.site for each in fitted.values())]
@@ -652,9 +645,7 @@ def _next_rung(
     members = {sites[k].label: weights[k] for k in np.flatnonzero(family) if sites[k].candidate is not None}
     alike = {label for label, weight in members.items() if weight > leader.weight + np.log(PLAUSIBLE)}
     for label in alike.intersection(alone) - fitted.keys():
-        another = _fitted_at(horizons, alone[label], budget, untried)
-        if another is not None:
-            fitted[label] = _Leader(alone[label], *another)
+        attempt(alone[label])
     known = {
         label: FittedCandidate.of(
             each.horizons[0].fit, base, horizons[0].data, each.candidate, blocks=options.blocks

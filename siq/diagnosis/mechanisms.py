@@ -520,10 +520,17 @@ def _columns(
             delayed[place] = signals.delayed[model.delays.index(each)]
     at = (*x, *further, *signals.inputs, *delayed, *delayed, signals.t)
     shapes = dict(zip(candidate.shapes, candidate.searches, strict=True))
-    new = [
-        _typical(shapes[each.name], model, x, signals) if each.name in shapes else 0.0
-        for each in augmented.parameters[len(model.parameters) :]
-    ]
+    new = []
+    for each in augmented.parameters[len(model.parameters) :]:
+        # A shape for which a mechanism is what its name says: in the middle of the search.
+        shape = shapes.get(each.name)
+        typical = 0.0 if shape is None else shape.at[len(shape.at) // 2] or 1.0
+        text = shape and (shape.scale_of or shape.inverse_scale_of or shape.quantiles_of)
+        if shape and text:
+            formula, arguments = parse_formula(text, model.names), list(coordinates_of(model).values())
+            (course,) = compile_values([formula], arguments, common=False)(*x, *signals.inputs, signals.t)
+            typical = float(_sized(shape, np.array(typical), np.broadcast_to(course, x.shape[1:])))
+        new.append(typical)
     entries = candidate.columns(model)
     result = np.zeros((model.dimension + len(model.outputs), count, max(len(candidate.amplitudes), 1)))
     functions = compile_values([each for _, _, each in entries], augmented.arguments, common=False)
@@ -532,18 +539,6 @@ def _columns(
     for (row, column, _), value in zip(entries, found, strict=True):
         result[row, :, column] = value
     return result.reshape(-1, result.shape[2])
-
-
-def _typical(shape: Shape, model: Dynamics, x: np.ndarray, signals: Signals) -> float:
-    """A value of a shape for which a mechanism is what its name says: in the middle of the search."""
-    at = shape.at[len(shape.at) // 2]
-    text = shape.scale_of or shape.inverse_scale_of or shape.quantiles_of
-    if text is None:
-        return at if at > 0 else 1.0
-    formula, arguments = parse_formula(text, model.names), list(coordinates_of(model).values())
-    compiled = compile_values([formula], arguments, common=False)
-    (course,) = compiled(*x, *signals.inputs, signals.t)
-    return float(_sized(shape, np.array(at), np.broadcast_to(course, x.shape[1:])))
 
 
 def _without_amplitudes(

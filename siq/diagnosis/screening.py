@@ -277,13 +277,9 @@ def portions(fit: Fit, data: Measurements, terms: Sequence[AnyTerm]) -> list[lis
 
 
 def linearised_with(
-    fit: Fit,
-    data: Measurements,
-    terms: Sequence[Term],
-    *,
-    substeps: int = PROBE_SUBSTEPS,
+    fit: Fit, data: Measurements, terms: Sequence[Term], *, substeps: int = PROBE_SUBSTEPS,
     without: Sequence[int] = (),
-) -> tuple[Linearisation, list[slice]]:
+) -> tuple[Linearisation, list[slice]]:  # fmt: skip
     """The linearisation of a fit with the columns of terms behind its parameters, and which is whose.
 
     These are worked out with so many substeps between samples at most, and in the place of what some free
@@ -425,26 +421,6 @@ Judge = Callable[[AnyTerm, Projection, slice], tuple[float, np.ndarray, np.ndarr
 nothing to judge."""
 
 
-def _rank_along(
-    response: Linearisation,
-    groups: Sequence[slice],
-    fit: Fit,
-    data: Measurements,
-    terms: Sequence[AnyTerm],
-    judge: Judge[AnyTerm],
-) -> list[Ranked[AnyTerm]]:
-    """Terms along a linearisation that has their columns, in their order."""
-    base, best = -np.inf, [Ranked(each) for each in terms]
-    for level, problem in at_noise_levels(response, fit, data):
-        base = max(base, problem.likelihood(problem.total))
-        for place, (term, group) in enumerate(zip(terms, groups, strict=True)):
-            if (found := judge(term, problem, group)) is not None:
-                best[place] = replace(best[place], finite=True)
-                if found[0] > best[place].gain:
-                    best[place] = Ranked(term, found[0], level, *found[1:], finite=True)
-    return [replace(each, gain=each.gain - base) for each in best]
-
-
 def rank(
     fit: Fit,
     data: Measurements,
@@ -463,7 +439,15 @@ def rank(
             work = evaluation(fit.model, data, columns=sum(each.width for each in some))
             budget.charge(min(fit.substeps, PROBE_SUBSTEPS) * work)
             response, groups = linearised_with(fit, data, some)
-            ranked += _rank_along(response, groups, fit, data, some, judge)
+            base, best = -np.inf, [Ranked(each) for each in some]
+            for level, problem in at_noise_levels(response, fit, data):
+                base = max(base, problem.likelihood(problem.total))
+                for place, (term, group) in enumerate(zip(some, groups, strict=True)):
+                    if (found := judge(term, problem, group)) is not None:
+                        best[place] = replace(best[place], finite=True)
+                        if found[0] > best[place].gain:
+                            best[place] = Ranked(term, found[0], level, *found[1:], finite=True)
+            ranked += [replace(each, gain=each.gain - base) for each in best]
         except BudgetSpent:
             break
         except NUMERICAL_ERRORS as error:

@@ -293,7 +293,9 @@ def linearise(
         return along
     places = list(without)
     effect = response[:, :, places] @ values[[model.free[place] for place in places]]
-    still = Linearisation(transition, response[:, :, :0], gap - effect, measured, answered[:, :, :0], residual)
+    still = Linearisation(
+        transition, response[:, :, :0], gap - effect, measured, answered[:, :, :0], residual
+    )
     found = still.filtered(data.first, data.step, noise, kept=True)
     foreseen, known = (slopes(samples + deviation.T)[1] for deviation in found[5:7])
     corrected = transition @ np.einsum("nmd,nmp->ndp", found[-2], known - foreseen)
