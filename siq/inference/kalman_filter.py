@@ -298,7 +298,8 @@ def linearise(
     )
     found = still.filtered(data.first, data.step, noise, kept=True)
     foreseen, known = (slopes(samples + deviation.T)[1] for deviation in found[5:7])
-    corrected = transition @ np.einsum("nmd,nmp->ndp", found[-2], known - foreseen)
+    gains = found[-2] / found[-1][:, :, None]
+    corrected = transition @ np.einsum("nmd,nmp->ndp", gains, known - foreseen)
     return replace(along, response=response - corrected, measured_response=foreseen)
 
 
