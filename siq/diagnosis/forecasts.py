@@ -585,19 +585,20 @@ def _next_rung(
     plausible = [each for each in fitted.values() if each.weight > heaviest + np.log(PLAUSIBLE)]
     leader = min(plausible, key=lambda each: (len(each.candidate.new), -each.weight))
     # All others are compared in the place of one that brings no states of its own.
-    d, outdone = base.model.dimension, set[str]()
+    d, enough = base.model.dimension, -np.inf
     steady = [each for each in fitted.values() if each.candidate.model.dimension == d]
     if steady:
         ground = leader if leader in steady else max(steady, key=lambda each: each.weight)
         there = ground.horizons[0].fit
         rebased = [each.rebased(base.model, there.model) for each in candidates]
         remaining = _sites(rebased, there, context, untried)
-        if leader is not ground:
-            # A state that follows the motion may be a simple mechanism and something else at a time.
-            above, further = _gains(ground.horizons, remaining, None, budget, untried)
+        if len(steady) < len(fitted):
+            # A state that follows the motion may be a simple mechanism and something simple at a time.
+            plain = [one for one in remaining if one.candidate is None or one.candidate.model.dimension == d]
+            above, further = _gains(ground.horizons, plain, None, budget, untried)
             both = max(gain + site.prior for site, gain in zip(above, further, strict=True))
-            if ground.weight + max(both, 0.0) > leader.weight:
-                outdone, leader = {leader.site.label}, ground
+            enough = ground.weight + max(both, 0.0)
+            leader = ground if enough > leader.weight else leader
         sites, gains = _gains(ground.horizons, remaining, ground.candidate, budget, untried)
         gains = gains + ground.gain
 
@@ -620,7 +621,9 @@ def _next_rung(
     kept = [place for place, site in enumerate(sites) if site.label not in fitted]
     sites = [*(sites[place] for place in kept), *(each.site for each in fitted.values())]
     gains = np.append(gains[kept], [each.gain for each in fitted.values()])
-    gains[[site.label in outdone for site in sites]] = -np.inf
+    for place, each in enumerate(fitted.values(), start=len(kept)):
+        if each.candidate.model.dimension > d and each.weight < enough:
+            gains[place] = -np.inf
     # The mechanism and hardly more is no rival, nor is what cannot be fitted; but what is clearly better says
     # that it is another thing.
     more = np.array([site.label in untried for site in sites])
