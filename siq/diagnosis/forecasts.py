@@ -64,6 +64,7 @@ ALONE, IN_PLACE = (0.1, 1.0), (1.0, 10.0)  # levels of process noise, relative t
 PROMISING, SHAPES = 32, 3  # explanations, and shapes of each, that are asked at all horizons: a choice
 LEADERS, ATTEMPTS = 6, 12  # explanations that are fitted in earnest before none is said to lead: a choice
 SUSPECTS = 4  # rivals of the leader that are fitted in earnest before they count: a choice
+UNSETTLED = "its fit does not settle"
 RIDGE = 1e-10  # numerical: of normal equations whose columns have unit length
 # Of the budget, for the first name, so that tests have something left where forecasts name nothing: a choice.
 FIRST_NAME_SHARE = 0.5
@@ -225,7 +226,7 @@ def _horizons_of(fit: Fit, context: FitContext) -> list[Horizon]:
             there = _fitted(fit.model, some, begin, budget=context.budget)
             # Where f jumps its derivatives are never exact, and steps may go to and fro about the best fit.
             if not (there.converged or there.model.edges):
-                raise NumericalFailure("its fit does not settle")
+                raise NumericalFailure(UNSETTLED)
             found.append(Horizon.of(there, some))
         except NUMERICAL_ERRORS as error:
             LOGGER.info("every %d. sample: %s", every, error)
@@ -240,7 +241,8 @@ def _fitted(
 ) -> Fit:
     """A model fitted with forces at random, from the states and the noise of a fit.
 
-    One that does not settle, as where shapes stand in for each other, is judged by what it foresees.
+    One that does not settle, as where shapes stand in for each other, leads nothing. As a rival
+    it promises no more than it foresees.
     """
     states, substeps = begin.x if x is None else x, begin.substeps
     if jumps_of(model):
@@ -437,25 +439,26 @@ def _places_of(leading: MechanismCandidate | None, fit: Fit, *, linear: bool) ->
     return [names.index(name) for name in chosen if name in names]
 
 
-def _containing(horizon: Horizon, sites: Sequence[_Site], leading: MechanismCandidate) -> np.ndarray:
-    """Which sites are functions that could do nearly all that a leading mechanism does, shape ``(sites,)``.
+def _containing(horizon: Horizon, sites: Sequence[_Site], leading: MechanismCandidate) -> set[str]:
+    """Labels of sites with more parameters that could do nearly all that a leading mechanism does.
 
     A product of a function and a velocity contains linear damping. It is the mechanism and more, rather than
-    something else.
+    something else. So is a hysteresis that does what a drag does.
     """
-    fit, data, found = horizon.fit, horizon.data, np.zeros(len(sites), dtype=bool)
-    chosen = [place for place, site in enumerate(sites) if site.candidate is None]
-    terms, without = [sites[place].terms[0] for place in chosen], _places_of(leading, fit, linear=True)
+    fit, data, found, size = horizon.fit, horizon.data, set[str](), len(leading.new)
+    chosen = [each for each in sites if each.candidate is None or len(each.candidate.new) > size]
+    terms, without = [each.terms[0] for each in chosen], _places_of(leading, fit, linear=True)
     response, groups = linearised_with(fit, data, terms, without=without)
     white = whiten(response, data, fit.noise)
     problem = _in_place_of(leading, fit, white, _fold_of(data))
     basis, effect = orthonormal(problem.own), problem.target - white.innovations
     effect = effect - basis @ (basis.T @ effect)
-    for place, group in zip(chosen, groups, strict=True):
+    for each, group in zip(chosen, groups, strict=True):
         columns = white.columns[:, len(fit.model.free) :][:, group]
         if np.isfinite(columns).all():
             own = orthonormal(columns - basis @ (basis.T @ columns))
-            found[place] = ((own.T @ effect) ** 2).sum() >= NEARLY_ALL * (effect @ effect)
+            if ((own.T @ effect) ** 2).sum() >= NEARLY_ALL * (effect @ effect):
+                found.add(each.label)
     return found
 
 
@@ -528,7 +531,10 @@ class _Leader:
 def _fitted_at(
     horizons: Sequence[Horizon], site: _Site, budget: Budget, untried: dict[str, NotFitted]
 ) -> tuple[list[Horizon], float] | None:
-    """A mechanism fitted at every horizon, and what it gains; None where that fails, or its sign is wrong."""
+    """A mechanism fitted at every horizon, and what it gains; None where that fails, or its sign is wrong.
+
+    One that does not settle at one of them is among the untried, too.
+    """
     candidate, probe, found = site.candidate, site.terms[0], list[Horizon]()
     assert candidate is not None and isinstance(probe, Probe)
     known = dict(probe.shapes)  # to begin with; then what the horizon before led to
@@ -547,6 +553,8 @@ def _fitted_at(
             untried[candidate.label] = NotFitted.of(candidate, error)
             return None
     untried.pop(candidate.label, None)
+    if not all(each.fit.converged or each.fit.model.edges for each in found):
+        untried[candidate.label] = NotFitted.of(candidate, NumericalFailure(UNSETTLED))
     gain = np.mean(
         [
             (one.log_density - other.log_density) / min(one.correlated, other.correlated)
@@ -567,44 +575,44 @@ def _next_rung(
     budget.says("comparing forecasts of what was left out")
     sites, gains = _gains(horizons, _sites(candidates, base, context, untried), None, budget, untried)
     # The mechanisms that promise most, fitted at every horizon; those that foresee better than nothing.
-    fitted: dict[str, _Leader] = {}
+    fitted, leading = dict[str, _Leader](), list[_Leader]()
+
+    def attempt(site: _Site) -> None:
+        if (another := _fitted_at(horizons, site, budget, untried)) is not None:
+            fitted[site.label] = _Leader(site, *another)
+
     weights = gains + np.array([site.prior for site in sites])
     order = [place for place in np.argsort(-weights) if sites[place].candidate is not None]
     for number, place in enumerate(order[:ATTEMPTS], start=1):
-        if not gains[place] > 0 or len(fitted) == LEADERS:
+        if not gains[place] > 0 or len(leading) == LEADERS:
             break
         budget.says(f"candidate {number} of at most {min(ATTEMPTS, len(order))}: {sites[place].label}")
-        found = _fitted_at(horizons, sites[place], budget, untried)
-        if found is not None and found[1] > 0:
-            fitted[sites[place].label] = _Leader(sites[place], *found)
-    if not fitted:
+        attempt(sites[place])
+        leading = [each for label, each in fitted.items() if label not in untried and each.gain > 0]
+    if not leading:
         return None
     alone = {site.label: site for site in sites if site.candidate is not None}
     # Of those that are not told apart, the one with the fewest parameters.
-    heaviest = max(each.weight for each in fitted.values())
-    plausible = [each for each in fitted.values() if each.weight > heaviest + np.log(PLAUSIBLE)]
+    heaviest = max(each.weight for each in leading)
+    plausible = [each for each in leading if each.weight > heaviest + np.log(PLAUSIBLE)]
     leader = min(plausible, key=lambda each: (len(each.candidate.new), -each.weight))
     # All others are compared in the place of one that brings no states of its own.
-    d, enough = base.model.dimension, -np.inf
-    steady = [each for each in fitted.values() if each.candidate.model.dimension == d]
+    d, outdone = base.model.dimension, set[str]()
+    steady = [each for each in leading if each.candidate.model.dimension == d]
     if steady:
         ground = leader if leader in steady else max(steady, key=lambda each: each.weight)
         there = ground.horizons[0].fit
         rebased = [each.rebased(base.model, there.model) for each in candidates]
         remaining = _sites(rebased, there, context, untried)
-        if len(steady) < len(fitted):
+        if leader is not ground:
             # A state that follows the motion may be a simple mechanism and something simple at a time.
             plain = [one for one in remaining if one.candidate is None or one.candidate.model.dimension == d]
             above, further = _gains(ground.horizons, plain, None, budget, untried)
             both = max(gain + site.prior for site, gain in zip(above, further, strict=True))
-            enough = ground.weight + max(both, 0.0)
-            leader = ground if enough > leader.weight else leader
+            if ground.weight + max(both, 0.0) > leader.weight:
+                outdone, leader = {leader.site.label}, ground
         sites, gains = _gains(ground.horizons, remaining, ground.candidate, budget, untried)
         gains = gains + ground.gain
-
-    def attempt(site: _Site) -> None:
-        if (another := _fitted_at(horizons, site, budget, untried)) is not None:
-            fitted[site.label] = _Leader(site, *another)
 
     # What would outvote it is fitted first: a sensor's gain may promise what a parameter then takes over.
     promised = gains + np.array([site.prior for site in sites])
@@ -617,18 +625,15 @@ def _next_rung(
     ]
     for site in suspects[:SUSPECTS]:
         attempt(site)
+    contained = _containing(leader.horizons[0], sites, leader.candidate) if leader in steady else set[str]()
     # What was fitted in earnest counts as it was fitted.
     kept = [place for place, site in enumerate(sites) if site.label not in fitted]
     sites = [*(sites[place] for place in kept), *(each.site for each in fitted.values())]
     gains = np.append(gains[kept], [each.gain for each in fitted.values()])
-    for place, each in enumerate(fitted.values(), start=len(kept)):
-        if each.candidate.model.dimension > d and each.weight < enough:
-            gains[place] = -np.inf
+    gains[[site.label in outdone for site in sites]] = -np.inf
     # The mechanism and hardly more is no rival, nor is what cannot be fitted; but what is clearly better says
     # that it is another thing.
-    more = np.array([site.label in untried for site in sites])
-    if leader in steady:
-        more |= _containing(leader.horizons[0], sites, leader.candidate)
+    more = np.array([site.label in untried or site.label in contained for site in sites])
     clearly = (gains > leader.gain + options.least_log_odds) & (leader.gain < NEARLY_ALL * gains)
     rival = ~more | clearly
     weights = np.where(rival, gains + np.array([site.prior for site in sites]), -np.inf)
