@@ -319,7 +319,9 @@ def test_a_sensor_gains_nothing_from_what_a_filter_learned_from_it(monkeypatch: 
     assert len(terms) == 2 and len(horizons) == 2
     assert all((_gained(each, terms, None, Budget()) < 0).all() for each in horizons)
 
-    def at_filtered(fit: Fit, data: Measurements, some: Sequence[Term]) -> tuple[Linearisation, list[slice]]:
+    def at_filtered(
+        fit: Fit, data: Measurements, some: Sequence[Term], **_: object
+    ) -> tuple[Linearisation, list[slice]]:
         # Where a fit has no process noise nothing is foreseen other than what is known.
         return linearised_with(replace(fit, noise=fit.noise.without_process()), data, some)
 
