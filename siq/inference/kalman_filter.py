@@ -288,19 +288,18 @@ def linearise(
         with np.errstate(invalid="ignore"):
             gap[at] = ends.T - x[at + 1]
     residual = data.outputs - np.where(np.isfinite(simulated), simulated, np.inf)
-    along = Linearisation(transition, response, gap, measured, answered, residual)
+    found = Linearisation(transition, response, gap, measured, answered, residual)
     if noise is None or not answered.any():
-        return along
+        return found
     places = list(without)
     effect = response[:, :, places] @ values[[model.free[place] for place in places]]
     still = Linearisation(
         transition, response[:, :, :0], gap - effect, measured, answered[:, :, :0], residual
     )
-    found = still.filtered(data.first, data.step, noise, kept=True)
-    foreseen, known = (slopes(samples + deviation.T)[1] for deviation in found[5:7])
-    gains = found[-2] / found[-1][:, :, None]
-    corrected = transition @ np.einsum("nmd,nmp->ndp", gains, known - foreseen)
-    return replace(along, response=response - corrected, measured_response=foreseen)
+    *_, before, after, _, _, gains, variances = still.filtered(data.first, data.step, noise, kept=True)
+    foreseen, known = (slopes(samples + deviation.T)[1] for deviation in (before, after))
+    corrected = transition @ np.einsum("nmd,nm,nmp->ndp", gains, 1 / variances, known - foreseen)
+    return replace(found, response=response - corrected, measured_response=foreseen)
 
 
 def _carried(
