@@ -164,6 +164,8 @@ class Form(_Part):
         Whether exchanging the roles gives the same mechanism.
     one_unit
         Whether the states and inputs that fill the roles must have one unit, and not be mere numbers.
+    family
+        Where it is a member of another family than the mechanism's other forms.
     turning
         Whether it shows only where the motion turns back: the coordinate is a velocity, and has both signs.
     """
@@ -180,6 +182,7 @@ class Form(_Part):
     variant: str = ""
     symmetric: bool = False
     one_unit: bool = False
+    family: str = ""
     turning: bool = False
 
     @model_validator(mode="after")

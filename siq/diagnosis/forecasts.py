@@ -64,6 +64,7 @@ ALONE, IN_PLACE = (0.1, 1.0), (1.0, 10.0)  # levels of process noise, relative t
 PROMISING, SHAPES = 32, 3  # explanations, and shapes of each, that are asked at all horizons: a choice
 LEADERS, ATTEMPTS = 6, 12  # explanations that are fitted in earnest before none is said to lead: a choice
 SUSPECTS = 4  # rivals of the leader that are fitted in earnest before they count: a choice
+UNSETTLED = "its fit does not settle"
 RIDGE = 1e-10  # numerical: of normal equations whose columns have unit length
 # Of the budget, for the first name, so that tests have something left where forecasts name nothing: a choice.
 FIRST_NAME_SHARE = 0.5
@@ -222,7 +223,11 @@ def _horizons_of(fit: Fit, context: FitContext) -> list[Horizon]:
             return found
         begin = found[-1].fit if found else fit
         try:
-            found.append(Horizon.of(_fitted(fit.model, some, begin, budget=context.budget), some))
+            there = _fitted(fit.model, some, begin, budget=context.budget)
+            # Where f jumps its derivatives are never exact, and steps may go to and fro about the best fit.
+            if not (there.converged or there.model.edges):
+                raise NumericalFailure(UNSETTLED)
+            found.append(Horizon.of(there, some))
         except NUMERICAL_ERRORS as error:
             LOGGER.info("every %d. sample: %s", every, error)
             if not found:
@@ -234,7 +239,11 @@ def _horizons_of(fit: Fit, context: FitContext) -> list[Horizon]:
 def _fitted(
     model: Dynamics, data: Measurements, begin: Fit, x: np.ndarray | None = None, *, budget: Budget
 ) -> Fit:
-    """A model fitted with forces at random, from the states and the noise of a fit."""
+    """A model fitted with forces at random, from the states and the noise of a fit.
+
+    One that does not settle, as where shapes stand in for each other, leads nothing. As a rival
+    it promises no more than it foresees.
+    """
     states, substeps = begin.x if x is None else x, begin.substeps
     if jumps_of(model):
         substeps = max(substeps, EDGE_SUBSTEPS)
@@ -243,9 +252,8 @@ def _fitted(
     fit = fit_by_multiple_shooting(
         model, data, x=states, noise=noise, estimate_process=True, substeps=substeps, budget=budget
     )
-    # Where f jumps its derivatives are never exact, and steps may go to and fro about the best fit.
-    if fit.fault or not (fit.converged or fit.model.edges):
-        raise NumericalFailure(fit.fault or "its fit does not settle")
+    if fit.fault:
+        raise NumericalFailure(fit.fault)
     return fit
 
 
@@ -349,12 +357,12 @@ def _gained(
 ) -> np.ndarray:
     """What terms gain at a horizon over nothing, or over a leading mechanism in its place, ``(terms,)``."""
     fit, data = horizon.fit, horizon.data
-    fold, nothing = _fold_of(data), -np.inf
+    fold, nothing, known = _fold_of(data), -np.inf, _places_of(leading, fit, linear=True)
     best, at = np.full(len(terms), -np.inf), 0
     for some in portions(fit, data, terms):
         work = evaluation(fit.model, data, columns=sum(each.width for each in some))
         budget.charge((min(fit.substeps, PROBE_SUBSTEPS) + len(IN_PLACE)) * work)
-        response, groups = linearised_with(fit, data, some)
+        response, groups = linearised_with(fit, data, some, without=known)
         for level in ALONE if leading is None else IN_PLACE:
             try:
                 white = whiten(response, data, fit.noise.scaled(level))
@@ -363,8 +371,7 @@ def _gained(
                 continue
             further = white.columns[:, len(fit.model.free) :]
             constant = -0.5 * white.log_determinant
-            known = white.columns[:, _places_of(leading, fit, linear=True)]
-            nothing = max(nothing, float(problem.log_density(known).sum()) + constant)
+            nothing = max(nothing, float(problem.log_density(white.columns[:, known]).sum()) + constant)
             for place, (term, group) in enumerate(zip(some, groups, strict=True), start=at):
                 columns = further[:, group]
                 if not np.isfinite(columns).all():
@@ -432,24 +439,26 @@ def _places_of(leading: MechanismCandidate | None, fit: Fit, *, linear: bool) ->
     return [names.index(name) for name in chosen if name in names]
 
 
-def _containing(horizon: Horizon, sites: Sequence[_Site], leading: MechanismCandidate) -> np.ndarray:
-    """Which sites are functions that could do nearly all that a leading mechanism does, shape ``(sites,)``.
+def _containing(horizon: Horizon, sites: Sequence[_Site], leading: MechanismCandidate) -> set[str]:
+    """Labels of sites with more parameters that could do nearly all that a leading mechanism does.
 
     A product of a function and a velocity contains linear damping. It is the mechanism and more, rather than
-    something else.
+    something else. So is a hysteresis that does what a drag does.
     """
-    fit, data, found = horizon.fit, horizon.data, np.zeros(len(sites), dtype=bool)
-    chosen = [place for place, site in enumerate(sites) if site.candidate is None]
-    response, groups = linearised_with(fit, data, [sites[place].terms[0] for place in chosen])
+    fit, data, found, size = horizon.fit, horizon.data, set[str](), len(leading.new)
+    chosen = [each for each in sites if each.candidate is None or len(each.candidate.new) > size]
+    terms, without = [each.terms[0] for each in chosen], _places_of(leading, fit, linear=True)
+    response, groups = linearised_with(fit, data, terms, without=without)
     white = whiten(response, data, fit.noise)
     problem = _in_place_of(leading, fit, white, _fold_of(data))
     basis, effect = orthonormal(problem.own), problem.target - white.innovations
     effect = effect - basis @ (basis.T @ effect)
-    for place, group in zip(chosen, groups, strict=True):
+    for each, group in zip(chosen, groups, strict=True):
         columns = white.columns[:, len(fit.model.free) :][:, group]
         if np.isfinite(columns).all():
             own = orthonormal(columns - basis @ (basis.T @ columns))
-            found[place] = ((own.T @ effect) ** 2).sum() >= NEARLY_ALL * (effect @ effect)
+            if ((own.T @ effect) ** 2).sum() >= NEARLY_ALL * (effect @ effect):
+                found.add(each.label)
     return found
 
 
@@ -522,24 +531,30 @@ class _Leader:
 def _fitted_at(
     horizons: Sequence[Horizon], site: _Site, budget: Budget, untried: dict[str, NotFitted]
 ) -> tuple[list[Horizon], float] | None:
-    """A mechanism fitted at every horizon, and what it gains; None where that fails, or its sign is wrong."""
-    candidate = site.candidate
-    assert candidate is not None
-    found: list[Horizon] = []
+    """A mechanism fitted at every horizon, and what it gains; None where that fails, or its sign is wrong.
+
+    One that does not settle at one of them is among the untried, too.
+    """
+    candidate, probe, found = site.candidate, site.terms[0], list[Horizon]()
+    assert candidate is not None and isinstance(probe, Probe)
+    known = dict(probe.shapes)  # to begin with; then what the horizon before led to
     for each in horizons:
         try:
-            fit, x = _begun(site, each, found[-1].fit if found else None)
-            fit = _fitted(fit.model, each.data, fit, x, budget=budget)
+            x = probe.states_along(each.fit, each.data, each.fit.x)
+            fit = _fitted(candidate.begun(each.fit.model, known), each.data, each.fit, x, budget=budget)
             if not candidate.admits(fit):
                 raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
             if candidate.generalises and candidate.idle(fit):
                 raise NumericalFailure("it is no more than the special case of it")
             found.append(Horizon.of(fit, each.data))
+            known |= {one.name: one.value for one in fit.model.parameters if one.name in candidate.new}
         except NUMERICAL_ERRORS as error:
             LOGGER.info("%s at a horizon: %s", candidate.label, error)
             untried[candidate.label] = NotFitted.of(candidate, error)
             return None
     untried.pop(candidate.label, None)
+    if not all(each.fit.converged or each.fit.model.edges for each in found):
+        untried[candidate.label] = NotFitted.of(candidate, NumericalFailure(UNSETTLED))
     gain = np.mean(
         [
             (one.log_density - other.log_density) / min(one.correlated, other.correlated)
@@ -547,17 +562,6 @@ def _fitted_at(
         ]
     )
     return found, float(gain)
-
-
-def _begun(site: _Site, horizon: Horizon, before: Fit | None) -> tuple[Fit, np.ndarray]:
-    """A fit with a mechanism to begin with, from its best shapes, or from the fit at the horizon before."""
-    candidate, fit, probe = site.candidate, horizon.fit, site.terms[0]
-    assert candidate is not None and isinstance(probe, Probe)
-    known = dict(probe.shapes)
-    if before is not None:
-        known |= {each.name: each.value for each in before.model.parameters if each.name in candidate.new}
-    begun = replace(fit, model=candidate.begun(fit.model, known))
-    return begun, probe.states_along(fit, horizon.data, fit.x)
 
 
 def _next_rung(
@@ -571,39 +575,45 @@ def _next_rung(
     budget.says("comparing forecasts of what was left out")
     sites, gains = _gains(horizons, _sites(candidates, base, context, untried), None, budget, untried)
     # The mechanisms that promise most, fitted at every horizon; those that foresee better than nothing.
-    fitted: dict[str, _Leader] = {}
+    fitted, leading = dict[str, _Leader](), list[_Leader]()
+
+    def attempt(site: _Site) -> None:
+        if (another := _fitted_at(horizons, site, budget, untried)) is not None:
+            fitted[site.label] = _Leader(site, *another)
+
     weights = gains + np.array([site.prior for site in sites])
     order = [place for place in np.argsort(-weights) if sites[place].candidate is not None]
     for number, place in enumerate(order[:ATTEMPTS], start=1):
-        if not gains[place] > 0 or len(fitted) == LEADERS:
+        if not gains[place] > 0 or len(leading) == LEADERS:
             break
         budget.says(f"candidate {number} of at most {min(ATTEMPTS, len(order))}: {sites[place].label}")
-        found = _fitted_at(horizons, sites[place], budget, untried)
-        if found is not None and found[1] > 0:
-            fitted[sites[place].label] = _Leader(sites[place], *found)
-    if not fitted:
+        attempt(sites[place])
+        leading = [each for label, each in fitted.items() if label not in untried and each.gain > 0]
+    if not leading:
         return None
     alone = {site.label: site for site in sites if site.candidate is not None}
     # Of those that are not told apart, the one with the fewest parameters.
-    heaviest = max(each.weight for each in fitted.values())
-    plausible = [each for each in fitted.values() if each.weight > heaviest + np.log(PLAUSIBLE)]
+    heaviest = max(each.weight for each in leading)
+    plausible = [each for each in leading if each.weight > heaviest + np.log(PLAUSIBLE)]
     leader = min(plausible, key=lambda each: (len(each.candidate.new), -each.weight))
     # All others are compared in the place of one that brings no states of its own.
     d, outdone = base.model.dimension, set[str]()
-    steady = [each for each in fitted.values() if each.candidate.model.dimension == d]
+    steady = [each for each in leading if each.candidate.model.dimension == d]
     if steady:
         ground = leader if leader in steady else max(steady, key=lambda each: each.weight)
         there = ground.horizons[0].fit
         rebased = [each.rebased(base.model, there.model) for each in candidates]
         remaining = _sites(rebased, there, context, untried)
         if leader is not ground:
-            # A state that follows the motion may be a simple mechanism and something else at a time.
-            above, further = _gains(ground.horizons, remaining, None, budget, untried)
+            # A state that follows the motion may be a simple mechanism and something simple at a time.
+            plain = [one for one in remaining if one.candidate is None or one.candidate.model.dimension == d]
+            above, further = _gains(ground.horizons, plain, None, budget, untried)
             both = max(gain + site.prior for site, gain in zip(above, further, strict=True))
             if ground.weight + max(both, 0.0) > leader.weight:
                 outdone, leader = {leader.site.label}, ground
         sites, gains = _gains(ground.horizons, remaining, ground.candidate, budget, untried)
         gains = gains + ground.gain
+
     # What would outvote it is fitted first: a sensor's gain may promise what a parameter then takes over.
     promised = gains + np.array([site.prior for site in sites])
     suspects = [
@@ -614,9 +624,8 @@ def _next_rung(
         and sites[place].label in alone.keys() - fitted.keys() - untried.keys()
     ]
     for site in suspects[:SUSPECTS]:
-        another = _fitted_at(horizons, site, budget, untried)
-        if another is not None:
-            fitted[site.label] = _Leader(site, *another)
+        attempt(site)
+    contained = _containing(leader.horizons[0], sites, leader.candidate) if leader in steady else set[str]()
     # What was fitted in earnest counts as it was fitted.
     kept = [place for place, site in enumerate(sites) if site.label not in fitted]
     sites = [*(sites[place] for place in kept), *(each.site for each in fitted.values())]
@@ -624,9 +633,7 @@ def _next_rung(
     gains[[site.label in outdone for site in sites]] = -np.inf
     # The mechanism and hardly more is no rival, nor is what cannot be fitted; but what is clearly better says
     # that it is another thing.
-    more = np.array([site.label in untried for site in sites])
-    if leader in steady:
-        more |= _containing(leader.horizons[0], sites, leader.candidate)
+    more = np.array([site.label in untried or site.label in contained for site in sites])
     clearly = (gains > leader.gain + options.least_log_odds) & (leader.gain < NEARLY_ALL * gains)
     rival = ~more | clearly
     weights = np.where(rival, gains + np.array([site.prior for site in sites]), -np.inf)
@@ -646,9 +653,7 @@ def _next_rung(
     members = {sites[k].label: weights[k] for k in np.flatnonzero(family) if sites[k].candidate is not None}
     alike = {label for label, weight in members.items() if weight > leader.weight + np.log(PLAUSIBLE)}
     for label in alike.intersection(alone) - fitted.keys():
-        another = _fitted_at(horizons, alone[label], budget, untried)
-        if another is not None:
-            fitted[label] = _Leader(alone[label], *another)
+        attempt(alone[label])
     known = {
         label: FittedCandidate.of(
             each.horizons[0].fit, base, horizons[0].data, each.candidate, blocks=options.blocks

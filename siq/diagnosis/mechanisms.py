@@ -11,7 +11,8 @@ range, is read off them.
 Where a simulation has a free damping rate, linear damping is another value of it: no recording can tell the
 two apart, and a mechanism of that kind would only stand in the way of the parameter. To first order a
 mechanism adds the derivatives of f and h by its amplitudes; it is something new where these are linearly
-independent, as functions of states, inputs and time, of the derivatives by the free parameters.
+independent, as functions of states, inputs and time, of the derivatives by the free parameters, and of what
+other units and zeros of the states do.
 """
 
 from __future__ import annotations
@@ -381,7 +382,7 @@ def _build_candidate(
         generalises=mechanism.generalises,
         turning=form.turning,
         variant=form.variant.format_map(assignment),
-        family=mechanism.family or mechanism.name,
+        family=form.family or mechanism.family or mechanism.name,
         weight=mechanism.weight,
     )
     return _labelled(candidate, model)
@@ -444,20 +445,30 @@ def _beyond_parameters(
 ) -> list[MechanismCandidate | None]:
     """Candidates less what the simulation's own parameters can do; None for those of which nothing is left.
 
+    Other units and zeros of the states are no parameters, and can do as little: a sensor's gain beside a free
+    inertia and a free damping is another unit of the angle.
+
     Of several amplitudes those are taken out that the parameters, together with those before, stand for.
     """
-    count = 2 * (len(model.free) + 6)
+    d = model.dimension
+    count = 2 * (len(model.free) + (d + 1) ** 2)
     x, signals = trial_points(model, count, either_sign=True)
     # A parameter that happens to be zero hides what others do in the same term.
     nonzero = np.random.default_rng(0).uniform(*ANYWHERE, size=len(model.parameters))
     values = np.where(model.values == 0, nonzero, model.values)
-    by_parameter = model.functions.slopes(x, signals, values)[1]
-    outputs_by_parameter = model.functions.output_slopes(x, signals, values)[1]
-    own = np.concatenate([by_parameter, outputs_by_parameter]).swapaxes(1, 2)
-    own = own.reshape(len(own) * count, len(model.free))
+    slopes = model.functions.slopes(x, signals, values), model.functions.output_slopes(x, signals, values)
+    by_state, own = (np.concatenate(each) for each in zip(*slopes, strict=True))
+    # States x + ε(A x + b) obey f + ε([A x + b] f' - A f), and show h + ε[A x + b] h': nobody sees units.
+    moved, rates = np.ones((d + 1, count)), np.zeros((d + 1, count))
+    moved[1:], rates[1:] = x, model.functions.rates(x, signals, values)
+    seen_otherwise = by_state[:, :, None] * moved
+    seen_otherwise[range(d), range(d)] -= rates
+    own = np.concatenate([own, seen_otherwise.reshape(len(own), -1, count)], axis=1)
+    own = own.swapaxes(1, 2).reshape(len(own) * count, -1)
     result: list[MechanismCandidate | None] = []
     for each in candidates:
-        new = _new_columns(own, _columns(model, each, x, signals, values))
+        shown = any(search.recorded for search in each.searches)  # and known where it acts by recordings only
+        new = [True] if shown else _new_columns(own, _columns(model, each, x, signals, values))
         needless = {name for name, is_new in zip(each.amplitudes, new, strict=False) if not is_new}
         if not any(new):
             result.append(None)
@@ -509,10 +520,17 @@ def _columns(
             delayed[place] = signals.delayed[model.delays.index(each)]
     at = (*x, *further, *signals.inputs, *delayed, *delayed, signals.t)
     shapes = dict(zip(candidate.shapes, candidate.searches, strict=True))
-    new = [
-        _typical(shapes[each.name], model, x, signals) if each.name in shapes else 0.0
-        for each in augmented.parameters[len(model.parameters) :]
-    ]
+    new = []
+    for each in augmented.parameters[len(model.parameters) :]:
+        # A shape for which a mechanism is what its name says: in the middle of the search.
+        shape = shapes.get(each.name)
+        typical = 0.0 if shape is None else shape.at[len(shape.at) // 2] or 1.0
+        text = shape and (shape.scale_of or shape.inverse_scale_of or shape.quantiles_of)
+        if shape and text:
+            formula, arguments = parse_formula(text, model.names), list(coordinates_of(model).values())
+            (course,) = compile_values([formula], arguments, common=False)(*x, *signals.inputs, signals.t)
+            typical = float(_sized(shape, np.array(typical), np.broadcast_to(course, x.shape[1:])))
+        new.append(typical)
     entries = candidate.columns(model)
     result = np.zeros((model.dimension + len(model.outputs), count, max(len(candidate.amplitudes), 1)))
     functions = compile_values([each for _, _, each in entries], augmented.arguments, common=False)
@@ -521,18 +539,6 @@ def _columns(
     for (row, column, _), value in zip(entries, found, strict=True):
         result[row, :, column] = value
     return result.reshape(-1, result.shape[2])
-
-
-def _typical(shape: Shape, model: Dynamics, x: np.ndarray, signals: Signals) -> float:
-    """A value of a shape for which a mechanism is what its name says: in the middle of the search."""
-    at = shape.at[len(shape.at) // 2]
-    text = shape.scale_of or shape.inverse_scale_of or shape.quantiles_of
-    if text is None:
-        return at if at > 0 else 1.0
-    formula, arguments = parse_formula(text, model.names), list(coordinates_of(model).values())
-    compiled = compile_values([formula], arguments, common=False)
-    (course,) = compiled(*x, *signals.inputs, signals.t)
-    return float(_sized(shape, np.array(at), np.broadcast_to(course, x.shape[1:])))
 
 
 def _without_amplitudes(

@@ -277,30 +277,26 @@ def portions(fit: Fit, data: Measurements, terms: Sequence[AnyTerm]) -> list[lis
 
 
 def linearised_with(
-    fit: Fit, data: Measurements, terms: Sequence[Term], *, substeps: int = PROBE_SUBSTEPS
-) -> tuple[Linearisation, list[slice]]:
+    fit: Fit, data: Measurements, terms: Sequence[Term], *, substeps: int = PROBE_SUBSTEPS,
+    without: Sequence[int] = (),
+) -> tuple[Linearisation, list[slice]]:  # fmt: skip
     """The linearisation of a fit with the columns of terms behind its parameters, and which is whose.
 
-    These are worked out with so many substeps between samples at most.
+    These are worked out with so many substeps between samples at most, and in the place of what some free
+    parameters do, by their places.
     """
     grid = Grid(data, min(fit.substeps, substeps))
+    noise = fit.noise if fit.has_process_noise else None
     with np.errstate(all="ignore"):  # what overflows is left out of the screening
         columns = _TermColumns(terms, Trajectories(fit.model, grid, fit.x))
-        coarse = linearise(fit.model, grid, fit.model.values, fit.linearised_at, columns=columns)
+        at, values = fit.linearised_at, fit.model.values
+        coarse = linearise(fit.model, grid, values, at, columns=columns, noise=noise, without=without)
     known, parameters = fit.linearisation, len(fit.model.free)
-    further, measured = coarse.response[:, :, parameters:], coarse.measured_response[:, :, parameters:]
-    if fit.has_process_noise:
-        # What a filter knows at a sample it knows from that sample. A fault of a sensor acts on what was
-        # foreseen; taken at what is known it would explain the innovations by themselves.
-        foreseen = fit.linearised_at.copy()
-        foreseen[data.begins + 1] += known.gap[data.begins]
-        with np.errstate(all="ignore"):
-            at_foreseen = columns.outputs(np.ascontiguousarray(foreseen.T), fit.model.values)
-        measured = np.moveaxis(at_foreseen, 2, 0)
+    further = coarse.response[:, :, parameters:], coarse.measured_response[:, :, parameters:]
     return replace(
         known,
-        response=np.concatenate([known.response, further], axis=2),
-        measured_response=np.concatenate([known.measured_response, measured], axis=2),
+        response=np.concatenate([known.response, further[0]], axis=2),
+        measured_response=np.concatenate([known.measured_response, further[1]], axis=2),
     ), columns.slices
 
 
@@ -425,26 +421,6 @@ Judge = Callable[[AnyTerm, Projection, slice], tuple[float, np.ndarray, np.ndarr
 nothing to judge."""
 
 
-def _rank_along(
-    response: Linearisation,
-    groups: Sequence[slice],
-    fit: Fit,
-    data: Measurements,
-    terms: Sequence[AnyTerm],
-    judge: Judge[AnyTerm],
-) -> list[Ranked[AnyTerm]]:
-    """Terms along a linearisation that has their columns, in their order."""
-    base, best = -np.inf, [Ranked(each) for each in terms]
-    for level, problem in at_noise_levels(response, fit, data):
-        base = max(base, problem.likelihood(problem.total))
-        for place, (term, group) in enumerate(zip(terms, groups, strict=True)):
-            if (found := judge(term, problem, group)) is not None:
-                best[place] = replace(best[place], finite=True)
-                if found[0] > best[place].gain:
-                    best[place] = Ranked(term, found[0], level, *found[1:], finite=True)
-    return [replace(each, gain=each.gain - base) for each in best]
-
-
 def rank(
     fit: Fit,
     data: Measurements,
@@ -463,7 +439,15 @@ def rank(
             work = evaluation(fit.model, data, columns=sum(each.width for each in some))
             budget.charge(min(fit.substeps, PROBE_SUBSTEPS) * work)
             response, groups = linearised_with(fit, data, some)
-            ranked += _rank_along(response, groups, fit, data, some, judge)
+            base, best = -np.inf, [Ranked(each) for each in some]
+            for level, problem in at_noise_levels(response, fit, data):
+                base = max(base, problem.likelihood(problem.total))
+                for place, (term, group) in enumerate(zip(some, groups, strict=True)):
+                    if (found := judge(term, problem, group)) is not None:
+                        best[place] = replace(best[place], finite=True)
+                        if found[0] > best[place].gain:
+                            best[place] = Ranked(term, found[0], level, *found[1:], finite=True)
+            ranked += [replace(each, gain=each.gain - base) for each in best]
         except BudgetSpent:
             break
         except NUMERICAL_ERRORS as error:

@@ -184,8 +184,14 @@ def _fit_most_promising(
         candidate = promised.term.candidate
         try:
             x = promised.term.states_along(current, data, begin.x[:, : current.model.dimension])
+            start = dict(promised.term.shapes)
+            # Linearised amplitudes can be far off, and a fit that begins there may diverge: they are a start
+            # only where shapes need one.
+            if candidate.amplitudes and candidate.shapes:
+                start |= dict(zip(candidate.amplitudes, map(float, promised.amplitudes), strict=True))
+            model = candidate.begun(begin.model, start)
             fit = fit_with_process_noise_as_needed(
-                _with_start(promised, begin.model), data, begin, level=promised.level, x=x, budget=budget
+                model, data, begin, level=promised.level, x=x, budget=budget
             )
             if not fit.converged:
                 raise NumericalFailure(fit.fault or "its fit does not settle")
@@ -267,19 +273,6 @@ def best_probes(screened: Sequence[Ranked[Probe]]) -> dict[str, Ranked[Probe]]:
         if each.gain > 0 and (label not in best or each.gain > best[label].gain):
             best[label] = each
     return best
-
-
-def _with_start(promised: Ranked[Probe], base: Dynamics) -> Dynamics:
-    """The candidate's model with parameters to begin with: those of the base, and no effect yet.
-
-    Linearised amplitudes can be far off, and a fit that begins there may diverge: they are a start only where
-    shapes need one.
-    """
-    candidate = promised.term.candidate
-    known = dict(promised.term.shapes)
-    if candidate.amplitudes and candidate.shapes:
-        known |= dict(zip(candidate.amplitudes, map(float, promised.amplitudes), strict=True))
-    return candidate.begun(base, known)
 
 
 def _stands_together(

@@ -14,6 +14,7 @@ explains of them, the unknown initial states projected out, are all that estimat
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -245,21 +246,35 @@ def linearise(
     columns: Columns | None = None,
     drift: ClosedFunctions | None = None,
     spread: np.ndarray | None = None,
+    noise: Noise | None = None,
+    without: Sequence[int] = (),
 ) -> Linearisation:
     """Integrate every interval from the states in hand ``(n, d)``, with the derivatives.
 
     Free parameters, and behind them further right-hand sides, are the columns of the response; `values` are
     those of all parameters. The mean of f over a spread of states, ``(intervals, d, d)``, may take the place
     of f as `drift`.
+
+    Where the states are what a filter with a process noise knows, it is given. A fault of a sensor, φ, acts
+    on what was foreseen, and taken at what is known it would explain the innovations e by themselves. The
+    gain K changes with it, too, by -K φ' K for an exact sensor: known states are corrected by φ where they
+    are. Without that, a scale of a state, which parameters can take over, would explain errors that last.
+    What is foreseen is so `without` the effect of some free parameters, where what is missing is asked for in
+    the place of that.
     """
     data, compiled, delays = grid.data, model.functions, model.lags(values)
     samples, signals = np.ascontiguousarray(x.T), grid.at_samples(delays)
-    by_state, by_parameter = compiled.output_slopes(samples, signals, values)
-    if columns is not None:
-        by_parameter = np.concatenate([by_parameter, columns.outputs(samples, values)], axis=1)
+
+    def slopes(at: np.ndarray) -> list[np.ndarray]:
+        by_state, by_parameter = compiled.output_slopes(at, signals, values)
+        if columns is not None:
+            by_parameter = np.concatenate([by_parameter, columns.outputs(at, values)], axis=1)
+        return [np.ascontiguousarray(np.moveaxis(each, 2, 0)) for each in (by_state, by_parameter)]
+
+    measured, answered = slopes(samples)
     simulated = compiled.outputs(samples, signals, values).T
     (n, d), rows, count = x.shape, grid.rows, len(grid.rows)
-    transition, response = np.zeros((n, d, d)), np.zeros((n, d, by_parameter.shape[1]))
+    transition, response = np.zeros((n, d, d)), np.zeros((n, d, answered.shape[2]))
     gap = np.zeros((n, d))
     # Candidates have their own grid, and come as they are.
     together = count if columns is not None else INTERVALS
@@ -272,9 +287,19 @@ def linearise(
         ends, transition[at], response[at] = _carried(model, part, values, begins, along, columns, width)
         with np.errstate(invalid="ignore"):
             gap[at] = ends.T - x[at + 1]
-    measured, answered = (np.ascontiguousarray(np.moveaxis(each, 2, 0)) for each in (by_state, by_parameter))
     residual = data.outputs - np.where(np.isfinite(simulated), simulated, np.inf)
-    return Linearisation(transition, response, gap, measured, answered, residual)
+    found = Linearisation(transition, response, gap, measured, answered, residual)
+    if noise is None or not answered.any():
+        return found
+    places = list(without)
+    effect = response[:, :, places] @ values[[model.free[place] for place in places]]
+    still = Linearisation(
+        transition, response[:, :, :0], gap - effect, measured, answered[:, :, :0], residual
+    )
+    *_, before, after, _, _, gains, variances = still.filtered(data.first, data.step, noise, kept=True)
+    foreseen, known = (slopes(samples + deviation.T)[1] for deviation in (before, after))
+    corrected = transition @ np.einsum("nmd,nm,nmp->ndp", gains, 1 / variances, known - foreseen)
+    return replace(found, response=response - corrected, measured_response=foreseen)
 
 
 def _carried(

@@ -430,13 +430,14 @@ class _Shooting:
     ) -> Linearisation:
         """At parameters ``(p,)`` and states ``(n, d)``."""
         self.charge(self.grid.substeps)
+        known = noise if self.filtered else None
         if self.closed is None or spread is None:
-            return linearise(self.model, self.grid, values, x)
+            return linearise(self.model, self.grid, values, x, noise=known)
         rows, data = self.grid.rows, self.grid.data
         intensity = noise.intensity if len(noise.intensity) == 1 else noise.intensity[rows]
         # In the middle of an interval noise of half of it is added.
         wide = spread[rows] + intensity * data.step[rows][:, None, None] / 2
-        return linearise(self.model, self.grid, values, x, drift=self.closed, spread=wide)
+        return linearise(self.model, self.grid, values, x, drift=self.closed, spread=wide, noise=known)
 
     def stepped(self, now: Fit, change: np.ndarray) -> tuple[Fit, float] | None:
         """The step suggested, shortened until it does about what was foreseen, and the share taken."""

@@ -13,14 +13,14 @@ import pandas as pd
 import pytest
 import yaml
 
-from siq.diagnosis import forecasts, investigation, naming, search
+from siq.diagnosis import investigation, naming
 from siq.diagnosis.diagnosis import Diagnosis, _withdrawn, solve_case
 from siq.diagnosis.dictionary import standard_dictionary
 from siq.diagnosis.evidence import FittedCandidate
 from siq.diagnosis.investigation import held_out_runs, investigate
+from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.diagnosis.naming import Investigation
 from siq.diagnosis.residual_structure import Remainder
-from siq.diagnosis.screening import Probe, Ranked
 from siq.diagnosis.search import FitContext, Search
 from siq.diagnosis.study import Comparison, MismatchVerdict, read_case
 from siq.diagnosis.unnamed_models import AugmentedModel
@@ -452,22 +452,14 @@ def test_a_mechanism_that_overflows_ends_itself_and_not_the_diagnosis(tmp_path: 
 def test_a_candidate_whose_fit_fails_unforeseen_is_recorded_with_the_reason(
     error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begun = forecasts._begun
+    begun = MechanismCandidate.begun
 
-    def failing(site: Any, *further: Any) -> Any:
-        if site.candidate.name == "cubic stiffness":
+    def failing(candidate: MechanismCandidate, *further: Any) -> Dynamics:
+        if candidate.name == "cubic stiffness":
             raise error
-        return begun(site, *further)
+        return begun(candidate, *further)
 
-    right = search._with_start
-
-    def failing_in_tests(promised: Ranked[Probe], *further: Any) -> Dynamics:
-        if promised.term.candidate.name == "cubic stiffness":
-            raise error
-        return right(promised, *further)
-
-    monkeypatch.setattr(forecasts, "_begun", failing)
-    monkeypatch.setattr(search, "_with_start", failing_in_tests)
+    monkeypatch.setattr(MechanismCandidate, "begun", failing)
     # Nor what has no name, which would take the place of the failed one, and most of the time.
     for module in (investigation, naming):
         monkeypatch.setattr(module, "fit_unnamed_models", lambda *_: ())

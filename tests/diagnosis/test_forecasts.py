@@ -12,7 +12,7 @@ import pytest
 from homes_of_mechanisms import model_of, numbers, states
 
 from siq.data.recordings import Recordings
-from siq.diagnosis import forecasts
+from siq.diagnosis import forecasts, mechanisms
 from siq.diagnosis.dictionary import roles_of, standard_dictionary
 from siq.diagnosis.forecasts import (
     FOLDS,
@@ -31,7 +31,7 @@ from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
 from siq.diagnosis.screening import Probe, Term, linearised_with
 from siq.diagnosis.search import FitContext
 from siq.inference.budget import Budget
-from siq.inference.kalman_filter import Linearisation, Whitened
+from siq.inference.kalman_filter import Linearisation, Whitened, whiten
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, measurements
 from siq.inference.recalibration import recalibrate
@@ -307,6 +307,8 @@ def kicked_decays(count: int = 4, samples: int = 60) -> Measurements:
 
 
 def test_a_sensor_gains_nothing_from_what_a_filter_learned_from_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Another unit of x, so that it is none of the candidates.
+    monkeypatch.setattr(mechanisms, "_beyond_parameters", lambda _, candidates: candidates)
     data = kicked_decays()
     context = context_of(DECAY, data, ("sensor gain or offset",))
     horizons = _horizons_of(recalibrate(DECAY, data)[0], context)
@@ -317,7 +319,9 @@ def test_a_sensor_gains_nothing_from_what_a_filter_learned_from_it(monkeypatch: 
     assert len(terms) == 2 and len(horizons) == 2
     assert all((_gained(each, terms, None, Budget()) < 0).all() for each in horizons)
 
-    def at_filtered(fit: Fit, data: Measurements, some: Sequence[Term]) -> tuple[Linearisation, list[slice]]:
+    def at_filtered(
+        fit: Fit, data: Measurements, some: Sequence[Term], **_: object
+    ) -> tuple[Linearisation, list[slice]]:
         # Where a fit has no process noise nothing is foreseen other than what is known.
         return linearised_with(replace(fit, noise=fit.noise.without_process()), data, some)
 
@@ -325,6 +329,19 @@ def test_a_sensor_gains_nothing_from_what_a_filter_learned_from_it(monkeypatch: 
     monkeypatch.setattr(forecasts, "linearised_with", at_filtered)
     assert all((_gained(each, terms, None, Budget()) > 9).all() for each in horizons)
     assert (_gained(horizons[0], terms, None, Budget()) > 500).all()
+
+
+def test_the_gain_of_a_sensor_is_another_unit_of_the_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To first order in the gain g, x/(1 + g) decays as x does: nothing that is foreseen may change by it."""
+    monkeypatch.setattr(mechanisms, "_beyond_parameters", lambda _, candidates: candidates)
+    data = kicked_decays()
+    fit = recalibrate(DECAY, data)[0]
+    gain = context_of(DECAY, data, ("sensor gain or offset",)).candidates[1]
+    assert gain.amplitudes == ("g_1",)
+    response, groups = linearised_with(fit, data, [Probe(gain, ())])
+    white = whiten(response, data, fit.noise)
+    effect = white.columns[:, len(DECAY.values) :][:, groups[0]]
+    assert np.sqrt(np.mean(effect**2)) < 0.1  # 0.78 without the change of the filter's gain
 
 
 def refitted(start: float, *, force: float, seed: int) -> bool:

@@ -205,3 +205,19 @@ def test_a_formula_outside_the_whitelist_is_refused(oscillator: Dynamics, tmp_pa
     )
     with pytest.raises(InputError, match="evil"):
         candidates_of(oscillator, roles_of(oscillator), _read_dictionary(path), file="mechanisms.yaml")
+
+
+@pytest.mark.parametrize("inertia, offered", [({}, False), ({"fixed": True}, True)])
+def test_another_unit_of_a_state_is_no_fault_of_its_sensor(inertia: dict, *, offered: bool) -> None:
+    card = {
+        "time_unit": "s",
+        "states": {"q": {"unit": "rad"}, "w": {"unit": "rad/s"}},
+        "inputs": {"u": {"unit": "N*m", "interpolation": "linear"}},
+        "parameters": {"J": {"value": 0.03, **inertia}, "b": {"value": 0.08}},
+        "equations": {"q": "w", "w": "(u - b*w)/J"},
+        "outputs": {"y": "q"},
+    }
+    model = model_of(card)
+    labels = {each.label for each in candidates_of(model, roles_of(model), standard_dictionary())}
+    assert ("sensor gain or offset in y, by g_1" in labels) is offered
+    assert {"dry friction in w", "clipping on both sides in y"} <= labels

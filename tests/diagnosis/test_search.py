@@ -11,13 +11,13 @@ import scipy.stats
 import sympy
 
 from siq.data.recordings import Recordings
-from siq.diagnosis import naming
+from siq.diagnosis import naming, screening
 from siq.diagnosis.dictionary import Roles, Shape
 from siq.diagnosis.evidence import FittedCandidate, _blocks_of, _correlated_probability, _correlation_time
 from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.diagnosis.naming import Investigation, _judge_mechanisms
 from siq.diagnosis.residual_structure import Remainder, Structure
-from siq.diagnosis.screening import Ranked, _rank_along, by_likelihood
+from siq.diagnosis.screening import Ranked, by_likelihood, rank
 from siq.diagnosis.search import AcceptedMechanism, FitContext, Search, _accepted, _better_without
 from siq.diagnosis.study import MismatchStudy, SearchOptions
 from siq.diagnosis.terms import ONE, Place
@@ -99,7 +99,7 @@ def test_every_place_at_which_a_shape_was_looked_for_is_a_chance(decaying: Dynam
 
 
 def test_an_amplitude_that_may_not_be_negative_is_zero_and_leaves_the_special_case(
-    decaying: Dynamics,
+    decaying: Dynamics, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     t = np.linspace(0, 3, 400)
     shapes = np.stack([np.sin(6 * t), np.cos(9 * t)], axis=1)
@@ -112,8 +112,10 @@ def test_an_amplitude_that_may_not_be_negative_is_zero_and_leaves_the_special_ca
         response=np.concatenate([known.response, np.zeros((*known.response.shape[:2], 2))], axis=2),
     )
     groups = [slice(0, 2), slice(0, 1), slice(0, 2)]
-    terms = [SimpleNamespace(positive=np.array(each)) for each in ([True, True], [True], [False, False])]
-    either, first, both = _rank_along(with_shapes, groups, fit, data, terms, by_likelihood)
+    signs = [True, True], [True], [False, False]
+    terms = [SimpleNamespace(positive=np.array(each), width=len(each)) for each in signs]
+    monkeypatch.setattr(screening, "linearised_with", lambda *_: (with_shapes, groups))
+    (either, first, both), _ = rank(fit, data, terms, judge=by_likelihood)
     assert either.amplitudes[1] == 0
     assert either.amplitudes[0] == pytest.approx(first.amplitudes[0])
     assert either.gain == pytest.approx(first.gain)
