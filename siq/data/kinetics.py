@@ -70,20 +70,20 @@ def _wells_of(values: np.ndarray, relaxation: float) -> np.ndarray:
     density = -dimension * np.log(np.maximum(distance[:, -1], np.finfo(float).tiny))
     needed = FALSE_WELL * np.sqrt(2 * together / neighbours)
     linked = near[:, 1 :: max(neighbours // LINKS, 1)] if dimension == 1 else near[:, 1 : LINKS + 1]
-    parent = np.full(count, -1)
+    parent, height, links = [-1] * count, density.tolist(), linked.tolist()
 
     def top(node: int) -> int:
         while parent[node] != node:
             node = parent[node]
         return node
 
-    for node in np.argsort(-density):
+    for node in np.argsort(-density).tolist():
         tops = sorted(
-            {top(other) for other in linked[node] if parent[other] >= 0}, key=lambda one: -density[one]
+            {top(other) for other in links[node] if parent[other] >= 0}, key=lambda one: -height[one]
         )
         parent[node] = tops[0] if tops else node
         for lower in tops[1:]:
-            if density[lower] - density[node] < needed:
+            if height[lower] - height[node] < needed:
                 parent[lower] = tops[0]
     well = np.array([top(node) for node in range(count)])
     kept = [one for one in np.unique(well) if (well == one).sum() >= neighbours / 2]
