@@ -119,7 +119,6 @@ BINS = 40  # of a histogram, at most
 FEWEST_BINS = 10  # in which a valley can be seen
 DEGREES = (5, 9)  # of f in the test: two attractors that differ need more than a cubic, three more than that
 STRETCH_TIMES = 40  # local relaxation times: shorter ones bias f towards one state, longer ones let drifts in
-HOPS_TIMES = 10  # correlation times, hops included, after which nothing is left of the first sample
 FEWEST_STRETCHES, SHORTEST_TIMES = 6, 10  # for so many stretches they may be as short as ten of these
 LAG_SHARE = 0.1  # of the local relaxation time: over it a state hardly changes what pushes it
 PLACES_COMPARED = 25  # at which f is compared with itself, between the quantiles

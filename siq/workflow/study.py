@@ -129,16 +129,17 @@ class SweepOptions(SweptParameter):
             return tuple((one,) for one in self.numbers)
         return tuple((one, other) for one in self.numbers for other in self.second.numbers)
 
+    @property
+    def point_names(self) -> list[str]:
+        """How the file of each point is called: ``K=8.1``, or ``K=8.1,h=0.5``."""
+        pairs = (zip(self.names, values, strict=True) for values in self.points)
+        return [",".join(f"{name}={value:.12g}" for name, value in each) for each in pairs]
 
-def point_name(names: tuple[str, ...], values: tuple[float, ...]) -> str:
-    """How the file of a point is called: ``K=8.1``, or ``K=8.1,h=0.5``."""
-    return ",".join(f"{name}={value:.12g}" for name, value in zip(names, values, strict=True))
-
-
-def point_values(name: str) -> tuple[tuple[str, ...], tuple[float, ...]]:
-    """Names and values of a point from the name of its file."""
-    parts = [one.partition("=") for one in name.split(",")]
-    return tuple(part[0] for part in parts), tuple(float(part[2]) for part in parts)
+    @staticmethod
+    def of_point(name: str) -> tuple[tuple[str, ...], tuple[float, ...]]:
+        """Names and values of the parameters at a point, from the name of its file."""
+        parts = [one.partition("=") for one in name.split(",")]
+        return tuple(part[0] for part in parts), tuple(float(part[2]) for part in parts)
 
 
 Entrance = Literal["trajectories", "equations"]

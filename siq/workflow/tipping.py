@@ -51,6 +51,7 @@ from siq.inference.kalman_filter import whiten
 from siq.inference.maximum_likelihood import first_noise, fit_by_filter, noise_uncertainty
 from siq.inference.measurements import first_states, measurements
 from siq.numerics.text import listed
+from siq.quasipotential.fokker_planck import exchange_rates
 from siq.quasipotential.rates import MIN_BARRIER_OVER_NOISE
 from siq.remarks import Remark, sentence
 from siq.systems.diffusion import Diffusion
@@ -503,7 +504,7 @@ def _contradictions(rest: np.ndarray, x: np.ndarray, t: np.ndarray) -> tuple[Rem
 class _DrawnProcess:
     """Fokker–Planck operators of drawn equations on the same cells, shape ``(draws, cells)``.
 
-    Neighbouring cells exchange at Scharfetter and Gummel's rates ``(Q/2h²) B(ΔU/ε)``, ``B(z) = z/(eᶻ - 1)``.
+    Neighbouring cells exchange at Scharfetter and Gummel's rates, with ``z = -ΔU/ε`` and ``a = Q/2``.
     Tridiagonal systems of all draws are solved as one. Beyond both ends all is absorbed.
     """
 
@@ -546,12 +547,11 @@ class _DrawnProcess:
     def _solved(self, u: np.ndarray, inside: np.ndarray, right: np.ndarray, *, dt: float) -> np.ndarray:
         """Densities p, zero outside, with ``p - dt L p = right``; with an infinite dt, ``-L p = right``."""
         scale = self.noise[:, None] / (2 * (self.x[1] - self.x[0]) ** 2)
-        rise, edge = np.diff(u, axis=1), np.zeros((len(u), 1))
-        up, down = (scale / scipy.special.exprel(np.clip(one, -700, 700)) for one in (rise, -rise))
+        up, down = exchange_rates(-np.diff(u, axis=1), scale)
         # Out of each cell to the right and to the left; nothing comes back from outside.
         up, down = inside * np.hstack([up, scale]), inside * np.hstack([scale, down])
         own, dt = (1.0, dt) if np.isfinite(dt) else (1.0 * ~inside, 1.0)
-        above, below = np.hstack([edge, down[:, 1:]]), np.hstack([up[:, :-1], edge])
+        above, below = np.pad(down[:, 1:], [(0, 0), (1, 0)]), np.pad(up[:, :-1], [(0, 0), (0, 1)])
         bands = np.stack([one.ravel() for one in (-dt * above, own + dt * (up + down), -dt * below)])
         solved = solve_banded((1, 1), bands, np.where(inside, right, 0.0).ravel(), check_finite=False)
         return np.where(inside, solved.reshape(u.shape), 0.0)
