@@ -338,7 +338,7 @@ def continued_visits(core: np.ndarray, runs: list[slice]) -> np.ndarray:
 
 
 def stays_of(path: np.ndarray, runs: list[slice], states: int) -> list[np.ndarray]:
-    """Lengths, in samples, of the visits to each state that were seen from begin to end."""
+    """Lengths, in samples, of the visits to each state that were seen from beginning to end."""
     found: list[list[np.ndarray]] = [[] for _ in range(states)]
     for run in runs:
         part = path[run]

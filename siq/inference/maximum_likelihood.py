@@ -2,7 +2,7 @@
 
 The model is fitted with noise in what is measured (variance R) and, where asked, noise that drives the states
 (intensity Q per time). With Q = 0 this is the least-squares fit of whole trajectories. With Q > 0 it is the
-extended Kalman filter, linearised at what it knows at the begin of each interval, whose likelihood is that
+extended Kalman filter, linearised at what it knows at the start of each interval, whose likelihood is that
 of its innovations. Linearising along *smoothed* states, which know the future, would be another thing: what
 process noise did later is then in the states at which f is taken, and the coefficients of f come out too
 small, by a half where sensor and process noise do alike. Smoothed states are where the filter begins, since
@@ -380,7 +380,7 @@ def _fit_from(
     model: Dynamics, x: np.ndarray, along: Linearisation, noise: Noise, substeps: int,
     fit: Callable[[Fit], Fit],
 ) -> Fit:  # fmt: skip
-    """A fit from a begin; what leads to no number is that begin with a fault."""
+    """A fit from a start; where it leads to no number, the start itself, with the fault."""
     unknown, fault = np.full((len(model.free),) * 2, np.nan), "" if along.finite else RUNS_AWAY
     begin = Fit(model, unknown, x, x, None, noise, along, -np.inf, np.inf, 1, substeps, False, fault)
     try:
@@ -478,7 +478,7 @@ class _Shooting:
         return _fit_from(self.model, x, along, noise, self.grid.substeps, descended)
 
     def descended(self, now: Fit, *, estimate_process: bool, most: int) -> Fit:
-        """Gauss–Newton steps from a begin, at most so many."""
+        """Gauss–Newton steps from a start, at most so many."""
         data, noise = self.grid.data, now.noise
         before: np.ndarray | None = None
         totals: list[float] = []

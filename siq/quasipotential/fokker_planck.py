@@ -345,7 +345,7 @@ def _ring_integrals(dynamics: Dynamics, intensity: float) -> tuple[float, float]
     nodes, weights = (nodes + 1) / 2, weights / 2
     h, places = period / count, low + period * np.arange(count) / count
     inner = places[:, None] + h * nodes
-    # Ψ from the begin of each part to each node, and to its end.
+    # Ψ from the start of each part to each node, and to its end.
     rise = h * nodes * (slope(places[:, None, None] + h * nodes[:, None] * nodes)[0] @ weights)
     whole = h * slope(inner)[0] @ weights
     ahead = np.log(h * (np.exp(rise) / slope(inner)[1]) @ weights)  # of e^Ψ/a, and of e^-Ψ

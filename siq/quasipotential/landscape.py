@@ -760,7 +760,7 @@ class Landscape:
         return landscape_html(self)
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw U with its wells, passes and paths; see `siq.plot_quasipotential`, which this calls.
+        """Draw U with its wells, saddles and paths; see `siq.plot_quasipotential`, which this calls.
 
         Parameters
         ----------

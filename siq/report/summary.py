@@ -265,7 +265,7 @@ class LandscapeSummary:
         return {**certificate, "stated_error": max([certificate["stated_error"], *known])}
 
     @property
-    def lowest_pass(self) -> np.ndarray:
+    def lowest_saddle(self) -> np.ndarray:
         """Where the lowest saddle lies; the deepest well where there is none."""
         known = [way for way in self.ways if np.isfinite(self.wells[way.start].height + way.barrier)]
         if known:

@@ -27,7 +27,7 @@ from siq.systems.formulas import compile_formulas, compile_values, delay, exact_
 
 TIME = sympy.Symbol("t", real=True)
 Compiled = Callable[..., Sequence[np.ndarray | float]]
-TURN_TOLERANCE = 1e-9  # numerical, of a period: a state at the begin of the domain belongs to it
+TURN_TOLERANCE = 1e-9  # numerical, of a period: a state at the lower end of the domain belongs to it
 JUMP_WIDTHS = 30.0  # widths of a jump over which its derivative is spread
 
 

@@ -50,7 +50,7 @@ class Equilibrium:
     """A state at which f vanishes.
 
     ``attractor``: all real parts of eigenvalues are negative. ``saddle``: some of each, or of one state the
-    positive one: the top between two wells is the pass between them. ``repeller``: all positive, of several
+    positive one: the top between two wells is the saddle between them. ``repeller``: all positive, of several
     states. ``degenerate``: a real part is zero to rounding, and the linearisation decides nothing.
     """
 

@@ -588,7 +588,7 @@ def settings_of(study: Study, system: Dynamics | None) -> PipelineSettings:
     )  # fmt: skip
 
 
-def card_content_beside(card: str | None, names: Sequence[str]) -> list[Any] | None:
+def card_content_but_for(card: str | None, names: Sequence[str]) -> list[Any] | None:
     """What a sweep takes from a card, as plain data: all but titles and the values of what is swept."""
     if card is None:
         return None

@@ -1,4 +1,4 @@
-"""How likely has a well been left, by some time, while a parameter drifts?
+"""Tipping: the probability that a well has been left while a parameter drifts, and early warning by a record.
 
 As long as the parameter changes slowly, a well is left at the rate r of the moment, and
 
@@ -267,7 +267,7 @@ class _EarlyWarning(NamedTuple):
         That the state has been left by later times: ``time probability lower upper``. The probability is the
         mean over all that the record leaves open, and the interval holds 90 % of that.
     falling
-        The probability that the barrier is lower at the end of the record than at its begin; where a draw
+        The probability that the barrier is lower at the end of the record than at its start; where a draw
         has no saddle near the record at either, that the state relaxes more slowly.
     weights
         Of the equations that were averaged over, by how many powers of x they have, and how many of them

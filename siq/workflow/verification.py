@@ -1,4 +1,4 @@
-"""Whether results are what they say: their files by digests, their numbers derived again from the recordings.
+"""Verification of results: files by their digests, numbers derived again from the recordings.
 
 The files are compared with ``provenance.jsonl``, in which each step has written what it read and made. Then
 trajectories are drawn from the recordings again, f and D identified and the certificate computed, by the
