@@ -37,7 +37,7 @@ import sympy
 
 from siq.errors import NumericalFailure
 from siq.numerics.integration import runge_kutta_step
-from siq.quasipotential.landscape import GlobalQuasipotential
+from siq.quasipotential.global_formula import GlobalQuasipotential
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import compile_formulas
 

@@ -1,14 +1,5 @@
 """The landscape of a vector field: attractors, wells, transitions, and U = 2V over all of them.
 
-About each attractor i the quasipotential is ``U_i(x)``, zero there. The one that the invariant distribution
-follows, ``p ~ exp(-U/ε)``, is
-
-    U(x) = min_i (W_i + U_i(x)) - min_i W_i,
-
-where W_i is the least total of barriers over all trees of transitions that end in i (M. Freidlin,
-A. Wentzell, *Random Perturbations of Dynamical Systems*, chapter 6). For two wells this says that both local
-formulas have the same value at the saddle between them.
-
 A `Landscape` is data with answers. `siq.quasipotential.landscape_assembly` finds it, and
 `siq.quasipotential.landscape_files` stores it.
 """
@@ -35,6 +26,7 @@ from siq.inference.field_estimate import FieldEstimate
 from siq.quasipotential.certificate import Certificate
 from siq.quasipotential.characteristics import potential_errors
 from siq.quasipotential.fokker_planck import CellProcess, Dissipation, ReactiveFlow, Rotation, cores_about
+from siq.quasipotential.global_formula import GlobalQuasipotential
 from siq.quasipotential.occupancy import VisitTest
 from siq.quasipotential.power_series import CycleFormula
 from siq.quasipotential.rates import EscapeRate, NoiseStrength, mean_residence_time
@@ -52,7 +44,6 @@ if TYPE_CHECKING:
     from siq.quasipotential.landscape_assembly import EquationSettings
     from siq.workflow.pipeline import PipelineSettings
 
-MOST_WELLS = 6  # of which all trees can be counted
 DRAWS = 40  # of an estimated f: the ends of a 95 % interval are then two of them
 MARGIN = 0.15  # of the states that were seen, on each side: there the density ends
 LEVEL_TOLERANCE = 1e-6  # numerical, of the level of a well: two values of U are one
@@ -111,64 +102,6 @@ def sentences_without_landscape(reason: str, states: RecordStates | None) -> lis
     missing = sentence(Remark("quasipotential.without_landscape", values))
     seen = "" if states is None else states.sentence() or sentence(states.rest())
     return [seen, missing] if seen else [missing]
-
-
-@dataclass(frozen=True)
-class GlobalQuasipotential:
-    """U over all wells, where it is known."""
-
-    wells: tuple[Well, ...]  #: V about the attractors
-    heights: np.ndarray  #: U at the attractors, shape (k,); the lowest is zero
-
-    def __call__(self, x: np.ndarray) -> np.ndarray:
-        """U at points ``(n, d)``: shape ``(n,)``, NaN where it is not known."""
-        return np.fmin.reduce(self.by_well(x))
-
-    def by_well(self, x: np.ndarray) -> np.ndarray:
-        """``W_i + U_i`` at points, shape ``(k, n)``, NaN where the formula of a well is not believed."""
-        return np.stack(
-            [
-                h + 2 * one.known_values(self.placed(one, x))
-                for h, one in zip(self.heights, self.wells, strict=True)
-            ]
-        )
-
-    def placed(self, well: Well, x: np.ndarray) -> np.ndarray:
-        """Points ``(n, d)``, moved by whole periods to where V of a well is least."""
-        dynamics = well.dynamics
-        if not dynamics.periodic:
-            return x
-        images = dynamics.wrapped(x) + dynamics.shifts[:, None]
-        values = [well.known_values(each) for each in images]
-        return np.asarray(images[np.argmin(np.nan_to_num(values, nan=np.inf), axis=0), np.arange(len(x))])
-
-
-def heights_of_attractors(barriers: np.ndarray) -> np.ndarray:
-    """U at the attractors, shape ``(k,)``, the lowest being zero, from the barriers between them.
-
-    The barriers, ``(k, k)``, are the lowest of U on the way from i to j in one step, infinite where there is
-    none. It fails (`NumericalFailure`) when they do not connect the attractors, or there are too many of
-    them.
-    """
-    count = len(barriers)
-    if count > MOST_WELLS:
-        raise NumericalFailure(f"there are {count} attractors; heights are found for {MOST_WELLS} at most")
-    totals = np.full(count, np.inf)
-    for root in range(count):
-        others = [index for index in range(count) if index != root]
-        for targets in itertools.product(range(count), repeat=count - 1):
-            step = dict(zip(others, targets, strict=True))
-            total = float(sum(barriers[start, end] for start, end in step.items()))
-            ends = others
-            if total < totals[root]:
-                for _ in others:  # of a tree every branch has arrived at the root by then
-                    ends = [step.get(index, root) for index in ends]
-                totals[root] = total if all(end == root for end in ends) else totals[root]
-    if not np.isfinite(totals).all():
-        raise NumericalFailure(
-            "no transitions over known saddles connect all attractors: their heights are not known"
-        )
-    return np.asarray(totals - totals.min())
 
 
 @dataclass(frozen=True, eq=False, repr=False)

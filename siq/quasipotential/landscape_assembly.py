@@ -29,7 +29,8 @@ from siq.quasipotential.certificate import (
     references_about,
 )
 from siq.quasipotential.certificate_tests import CertificateOptions
-from siq.quasipotential.landscape import Landscape, LandscapeOptions, NoLandscape, heights_of_attractors
+from siq.quasipotential.global_formula import heights_of_attractors
+from siq.quasipotential.landscape import Landscape, LandscapeOptions, NoLandscape
 from siq.quasipotential.path_chains import evenly
 from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.refinement import RefinementOptions
