@@ -358,7 +358,7 @@ class RecordStates:
         return pd.DataFrame(rows, columns=names.split())
 
     def remark(self) -> Remark:
-        """The same as a remark."""
+        """What was found as a remark."""
         model = [] if self.markov is None else self.markov.stays.tolist()
         apart = any(high < one.limits[0] for (_, _, high), one in zip(model, self.counts, strict=False))
         values = {
@@ -380,7 +380,7 @@ class RecordStates:
         return Remark("data.record_rests", values)
 
     def sentence(self) -> str:
-        """The same in a sentence; empty where only one state is supported."""
+        """What was found in a sentence; empty where only one state is supported."""
         limit = "" if self.limit is None else " " + sentence(self.limit)
         return sentence(self.remark()) + limit if self.supported else ""
 

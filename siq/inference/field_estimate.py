@@ -328,7 +328,7 @@ class FieldEstimate:
         D, which recordings do not tell apart from ε: of these only the product, `noise_rate`, is identified.
     alternatives
         What other terms that fit nearly as well make of f: bias ``(q, d)`` and spread ``(r, q, d)``, see
-        `siq.inference.selection.model_average`. This and what follows is None where nobody asked.
+        `siq.inference.selection.model_average`. This and what follows is None where it was not asked for.
     stability
         Shape ``(p,)``: the share of resampled recordings in which each term would be chosen
         (`siq.inference.selection`).
@@ -573,7 +573,7 @@ def _spread_out(library: CandidateLibrary, support: np.ndarray, values: np.ndarr
 
 
 AnyField = FieldEstimate | Dynamics
-"""f and D with what is not known of them, or as somebody gave them."""
+"""f and D with their uncertainty, or as given."""
 
 
 def dynamics_of(found: AnyField) -> Dynamics:

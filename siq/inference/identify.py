@@ -110,7 +110,7 @@ def identify(
     draw
         Gives the generator for a purpose: for held-out recordings, and for resampling.
     diffusion, units
-        D, where it is given; and the states' units, None of one that nobody knows, by default those of the
+        D, where it is given; and the states' units, None of an unknown one, by default those of the
         recordings.
     pair_step, integrator_step
         Longest time between samples that still belong together; step of the Euler–Maruyama simulation that

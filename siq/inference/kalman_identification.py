@@ -350,7 +350,7 @@ def filtered_recordings(
 ) -> Recordings:
     """The states as a filter knows them at each sample that it uses, from that and the earlier ones.
 
-    Velocities that nobody measured are among them. Their increments have the mean of f, as those of the
+    Velocities that were not measured are among them. Their increments have the mean of f, as those of the
     states do; those of the measured values do not.
     """
     observation = ObservationModel.of(found)

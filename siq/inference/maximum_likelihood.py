@@ -68,7 +68,7 @@ def first_noise(model: Dynamics, data: Measurements, x: np.ndarray) -> Noise:
     process = 0.01 * np.mean((x[rows + 1] - x[rows]) ** 2 / step, axis=0)
     if not (process > 0).all():
         spread = np.ptp(model.limits, axis=1) ** 2 / (data.t[-1] - data.t[0] + 1e-300)
-        # Of a state at rest whose domain nobody knows, what its own equation moves it by.
+        # Of a state at rest whose domain is unknown, what its own equation moves it by.
         signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
         rates = model.functions.rates(x.T, signals, model.values).T
         rates = np.where(np.isfinite(rates), rates, 0.0)
@@ -439,7 +439,7 @@ class _Shooting:
         return linearise(self.model, self.grid, values, x, drift=self.closed, spread=wide)
 
     def stepped(self, now: Fit, change: np.ndarray) -> tuple[Fit, float] | None:
-        """The step suggested, shortened until it does about what was foreseen, and the share taken."""
+        """The step suggested, shortened until it does about what was predicted, and the share taken."""
         data, here, noise = self.grid.data, now.linearisation, now.noise
         still = here.with_parameters_changed(change)
         white = still.filtered(data.first, data.step, noise)[0]

@@ -74,7 +74,7 @@ class LandscapeOptions:
 class NoLandscape(NumericalFailure):
     """Recordings that no landscape was found of; what they show by themselves is kept.
 
-    The message says why, what would make it an answer, and what is known all the same.
+    The message says why, what would make it an answer, and what is known nevertheless.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ class Landscape:
     position_errors
         Standard error of each attractor's position, shape ``(k, d)``; None where not known.
     noise
-        Strength of the noise that drives the system, None where nobody knows it.
+        Strength of the noise that drives the system, None where it is unknown.
     field_estimate
         The identified f with its uncertainty; None where f is given, and after reading from a file.
     visits
@@ -149,7 +149,7 @@ class Landscape:
     parting
         Unstable cycles, which part wells.
     checked_times
-        What `verify_times` said, with a column ``noise``; None where nobody asked for it.
+        What `verify_times` said, with a column ``noise``; None where it was not asked for.
     """
 
     dynamics: Dynamics
@@ -198,7 +198,7 @@ class Landscape:
             For the first thing that cannot be read.
         NoLandscape
             When f cannot be identified, or it has no landscape. It says why, and what would make it an
-            answer; its `states` are what the recordings show by themselves all the same.
+            answer; its `states` are what the recordings show by themselves.
 
         Examples
         --------
@@ -282,7 +282,7 @@ class Landscape:
         return tuple(one for one in self.attractors if isinstance(one, Cycle))
 
     def in_units(self, units: Sequence[str], *, time: str = "1") -> Landscape:
-        """The same with the units of the states and of the time said; nothing is converted."""
+        """The landscape with the units of its states and of time named; nothing is converted."""
         dynamics = replace(self.dynamics, units=tuple(units), time_unit=time)
         wells = tuple(None if well is None else replace(well, dynamics=dynamics) for well in self.wells)
         return replace(self, dynamics=dynamics, wells=wells)
@@ -560,7 +560,7 @@ class Landscape:
         return pd.DataFrame(rows, columns=columns.split())
 
     def with_checked_times(self, options: LandscapeOptions | None, *, seed: int = 0) -> Landscape:
-        """The same with its times checked, where the options ask for that; a remark where that fails.
+        """The landscape with its times checked, where the options ask for that; a remark where that fails.
 
         ε are those of the options, or else as the recordings show it.
         """

@@ -107,7 +107,7 @@ class RefinementOptions:
     precision: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7
 
     def with_routes(self, *, networks: bool) -> RefinementOptions:
-        """These options with the routes named, where nobody named them: those that there are."""
+        """These options with the routes named, where none were named: those that there are."""
         there: tuple[Route, ...] = ("network", "local") if networks else ("local",)
         return self if self.routes is not None else replace(self, routes=there)
 

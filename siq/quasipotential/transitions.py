@@ -106,7 +106,7 @@ class Transition:
 
     @property
     def downhill(self) -> np.ndarray:
-        """The way down from there without noise, likewise."""
+        """The way down from there without noise, shape ``(n, d)``; empty where none was found."""
         down = None if self.path is None else self.path.downhill
         return np.zeros((0, len(self.saddle.position))) if down is None else down
 
@@ -187,7 +187,7 @@ def missing_diffusion(dynamics: Dynamics) -> str | None:
     """Why there are no escape times for want of D, in words; None where nothing speaks against them.
 
     No noise drives ``dx/dt = v``, where one state is but the derivative of another; a D that is the unit
-    matrix says that it does, and mostly nobody has said so.
+    matrix says that it does, and mostly by default.
     """
     defined = defined_states(dynamics)
     noise = dynamics.diffusion

@@ -68,7 +68,7 @@ class ReportFigure:
     """A figure of the report; it can be downloaded."""
 
     caption: str  #: what the figure shows, in sentences
-    alternative: str  #: what somebody who cannot see it should know of it
+    alternative: str  #: what it shows, for readers who cannot see it
     image: bytes  #: the bytes of the file
     kind: Literal["svg", "png"] = "svg"  #: its format
     vector: bytes | None = None  #: the same as SVG, for the download

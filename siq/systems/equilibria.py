@@ -3,7 +3,7 @@
 Equilibria of an identified f are sought from the recorded points alone; nobody says how many there are, or
 where.
 
-Noise that acts on velocities alone moves positions all the same: dx/dt = v. It *reaches* a state if it acts
+Noise that acts on velocities alone moves positions, too: dx/dt = v. It *reaches* a state if it acts
 on it, or on a state that stands in its equation, or on one that stands in the equation of that one, and so
 on. About an equilibrium with Jacobian J this is Kalman's condition: the linear dynamics can be steered
 everywhere by D = σσᵀ if ``(σ, Jσ, J²σ, …)`` has full rank, and then, and only then, W of ``J W + W Jᵀ =

@@ -85,7 +85,7 @@ class Neighbourhood:
         return cls(np.asarray(attractor, dtype=float), hessian_at(dynamics, attractor), level)
 
     def moved(self, shift: np.ndarray) -> Neighbourhood:
-        """The same a displacement ``(d,)`` on."""
+        """The neighbourhood, moved by a displacement ``(d,)``."""
         cycle = None if self.cycle is None else replace(self.cycle, points=self.cycle.points + shift)
         return replace(self, center=self.center + shift, cycle=cycle)
 

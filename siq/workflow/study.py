@@ -88,7 +88,7 @@ class SweptParameter(BaseModel):
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """The values in rising order, each as somebody would write it: 8.1, and not 8.100000000000001."""
+        """The values in rising order, each as one would write it: 8.1, and not 8.100000000000001."""
         if self.values is not None:
             return tuple(sorted(set(self.values)))
         first, last, step = (Decimal(repr(one)) for one in (self.first, self.last, self.step))
@@ -448,10 +448,10 @@ class StateSpace:
     names
         Of the states, in order; None where the recordings tell.
     units
-        Unit of each state by name, and of the time as ``t``; None where nobody said.
+        Unit of each state by name, and of the time as ``t``; None where not given.
     diffusion
         D: ``identity``, its diagonal, or the matrix, of numbers or formulas of the states, in their units
-        squared per unit of time; None where nobody said, see `siq.inference.field_estimate`.
+        squared per unit of time; None where not given, see `siq.inference.field_estimate`.
     """
 
     names: tuple[str, ...] | None = None
@@ -459,7 +459,7 @@ class StateSpace:
     diffusion: DiffusionEntry | None = None
 
     def noise(self, states: Sequence[str]) -> Diffusion | None:
-        """D of the states by their names in formulas, None where nobody said."""
+        """D of the states by their names in formulas, None where not given."""
         if self.diffusion is None:
             return None
         return Diffusion.of_rows(
@@ -467,7 +467,7 @@ class StateSpace:
         )
 
     def constant_noise(self, dimension: int) -> Diffusion | None:
-        """D of so many states where it is the same everywhere, None where nobody said.
+        """D of so many states where it is the same everywhere, None where not given.
 
         Raises
         ------

@@ -153,13 +153,10 @@ def probability_of_tipping(
     integral = np.where(ended, np.inf, integral)
     valid = error < 1 / MIN_BARRIER_OVER_NOISE
     reasons = [
-        (ended, "the well has ended"),
-        (unknown & ~ended, "the sweep knows no rate of this well here, or knew none before"),
-        (
-            ~valid & (law > drift),
-            f"it was left where its barrier is below {MIN_BARRIER_OVER_NOISE:g} times the noise",
-        ),
-        (~valid & (drift >= law), "the parameter changes faster than the well relaxes"),
+        (ended, Remark("workflow.well_has_ended")),
+        (unknown & ~ended, Remark("workflow.rate_unknown")),
+        (~valid & (law > drift), Remark("workflow.left_without_law", {"ratio": MIN_BARRIER_OVER_NOISE})),
+        (~valid & (drift >= law), Remark("workflow.drift_faster_than_relaxation")),
     ]
     at = np.searchsorted(fine, times)
     return pd.DataFrame(
@@ -172,7 +169,7 @@ def probability_of_tipping(
             "drift_error": drift[at],
             "error": error[at],
             "valid": valid[at],
-            "note": [next((text for holds, text in reasons if holds[k]), "") for k in at],
+            "note": [next((sentence(remark) for holds, remark in reasons if holds[k]), "") for k in at],
         }
     )
 
@@ -180,7 +177,7 @@ def probability_of_tipping(
 def _regimes(
     found: Sweep, well: int, noise: float, value: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Where no way leads out of a well, no law holds, nobody knows the rate or did before, and it has ended.
+    """Where no way leads out of a well, no law holds, no rate is known or was before, and it has ended.
 
     Between two values of the sweep both have a say. Between one without a way out and one with a rate, this
     rate is taken, which is too high.

@@ -378,7 +378,7 @@ def plot_barriers(landscape: Landscape | LandscapeSummary, *, ax: Axes | None = 
 
 
 def _with_error(value: float, error: float, *, broken: bool) -> str:
-    """A barrier with its error, without the digits that nobody reads; on two lines where there is no room."""
+    """A barrier with its error, without digits that mean nothing; on two lines where there is no room."""
     if not (np.isfinite(error) and error > NO_ERROR * abs(value)):
         return magnitude_label(value, digits=4)
     text = mean_and_spread(value, error)
