@@ -7,7 +7,7 @@ A `Landscape` is data with answers. `siq.quasipotential.landscape_assembly` find
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +17,6 @@ import numpy as np
 import pandas as pd
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as pydantic_dataclass
-from scipy.spatial import cKDTree
 
 from siq.data.recordings import Recordings
 from siq.data.states import RecordStates
@@ -30,12 +29,12 @@ from siq.quasipotential.global_formula import GlobalQuasipotential
 from siq.quasipotential.occupancy import VisitTest
 from siq.quasipotential.power_series import CycleFormula
 from siq.quasipotential.rates import EscapeRate, NoiseStrength, mean_residence_time
-from siq.quasipotential.transitions import Transition, missing_diffusion
+from siq.quasipotential.transitions import Transition, missing_diffusion, progress_along
 from siq.quasipotential.wells import Well
 from siq.remarks import Remark, sentence
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
-from siq.systems.equilibria import Equilibrium, hessian_at
+from siq.systems.equilibria import Equilibrium
 from siq.systems.escapes import Neighbourhood, split_escapes
 
 if TYPE_CHECKING:
@@ -550,7 +549,8 @@ class Landscape:
                 progress = process.between(core, others).progress
                 operator = process.mean_time(core, others)
             except (NumericalFailure, np.linalg.LinAlgError, RuntimeError):
-                progress = self._along_paths(index, intensity)
+                mine = [way for way in self.transitions if way.start == index]
+                progress = progress_along(mine, self.attractors[index], self.dynamics, intensity)
             check = split_escapes(
                 self.dynamics, core, others, intensity=intensity, progress=progress,
                 generator=np.random.default_rng([seed, index]),
@@ -595,27 +595,6 @@ class Landscape:
         low, high = points.min(axis=0), points.max(axis=0)
         box = np.stack([low - MARGIN * (high - low), high + MARGIN * (high - low)], axis=1)
         return np.where(turning[:, None], limits, box)
-
-    def _along_paths(self, well: int, intensity: float) -> Callable[[np.ndarray], np.ndarray]:
-        """Progress by U/ε at the nearest state of the paths out of a well; beyond the saddle by one more."""
-        ways = [way for way in self.transitions if way.start == well and way.path is not None]
-        if not ways:
-            raise NumericalFailure("no path leads out of the well, along which a simulation could be split")
-        states, values = [], []
-        for way in ways:
-            assert way.path is not None
-            down = way.downhill
-            states += [way.path.points, down]
-            values += [way.path.values / intensity]
-            values += [way.path.action / intensity + np.linspace(0, 1, len(down))]
-        points, along = np.concatenate(states), np.concatenate(values)
-        # Near is what the noise about the attractor makes so.
-        one = self.attractors[well]
-        root = np.diag(1 / np.ptp(points, axis=0))
-        if isinstance(one, Equilibrium):
-            root = np.linalg.cholesky(hessian_at(self.dynamics, one.position))
-        tree = cKDTree(points @ root)
-        return lambda x: np.asarray(along[tree.query(x.T @ root)[1]])
 
     def escape_times(self, *, noise: float | None = None) -> pd.DataFrame:
         """Mean times until noise has led from each attractor to the next, one row for every way out.
