@@ -184,9 +184,9 @@ class PowerBasis:
 
     def sum_of_units(self, coefficients: np.ndarray, scaled: Sequence[sympy.Expr]) -> sympy.Expr:
         """The units as a formula of y: hyperbolic tangents, less one polynomial for all of them."""
-        slopes, biases = self.units[:, :-1], self.units[:, -1]
-        here, slope, bend = (coefficients * one for one in _tanh_derivatives(biases))
-        along = (_weighted_sum(one, scaled) + float(bias) for one, bias in zip(slopes, biases, strict=True))
+        slopes = self.units[:, :-1]
+        here, slope, bend = (coefficients * one for one in _tanh_derivatives(self.units[:, -1]))
+        along = (_weighted_sum(unit, [*scaled, sympy.S.One]) for unit in self.units)
         taylor = [here.sum(), *(slope @ slopes), *((slopes.T * bend) @ slopes / 2).ravel()]
         products = (one * other for one, other in itertools.product(scaled, repeat=2))
         tangents = _weighted_sum(coefficients, map(sympy.tanh, along))
