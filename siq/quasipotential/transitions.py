@@ -320,14 +320,10 @@ def progress_along(
     known = [(way.path, way.downhill) for way in ways if way.path is not None]
     if not known:
         raise NumericalFailure("no path leads out of the well, along which a simulation could be split")
-    points = np.concatenate([part for path, down in known for part in (path.points, down)])
-    along = np.concatenate(
-        [
-            part
-            for path, down in known
-            for part in (path.values / intensity, path.action / intensity + np.linspace(0, 1, len(down)))
-        ]
-    )
+    points = np.concatenate([np.concatenate([path.points, down]) for path, down in known])
+    beyond = [path.action / intensity + np.linspace(0, 1, len(down)) for path, down in known]
+    pairs = zip(known, beyond, strict=True)
+    along = np.concatenate([np.append(path.values / intensity, last) for (path, _), last in pairs])
     # Near is what the noise about the attractor makes so.
     root = np.diag(1 / np.ptp(points, axis=0))
     if isinstance(attractor, Equilibrium):
