@@ -18,9 +18,10 @@ import numpy as np
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.inference.checks import PredictionLimits
 from siq.inference.claims import check_claims
-from siq.inference.field_estimate import FieldEstimate, FlowMap, Verdict
+from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.inference.library import IdentificationOptions, field_library
 from siq.inference.regression import refit
+from siq.numerics.integration import FlowMap
 from siq.systems.diffusion import Diffusion
 
 STEP, WITHIN, SAMPLES, INTENSITY = 0.05, 4, 40_000, 0.25

@@ -33,7 +33,7 @@ class Fault(ValueError):
         self.remedy = remedy
 
     def at(self, file: str | Path, place: str = "") -> InputError:
-        """The same fault, with the file and the place in it."""
+        """An `InputError` of the fault, with the file and the place in it."""
         return InputError(file, place, self.fault, self.remedy)
 
 
@@ -107,7 +107,7 @@ class MissingExtra(ImportError):
 
 
 def suggestion(name: str, known: Iterable[str], *, otherwise: str) -> str:
-    """The remedy for a name that nobody knows: the one that is most like it, or what to do instead.
+    """The remedy for an unknown name: the known one that is most like it, or what to do instead.
 
     Parameters
     ----------

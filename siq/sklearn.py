@@ -185,7 +185,7 @@ class LandscapeRegressor(RegressorMixin, BaseEstimator):
     def landscape(self) -> Landscape:
         """Wells, barriers and ways of what it was fitted to, with their certificate.
 
-        Of velocities nobody knows how strong the noise is: give ε for times.
+        The strength of the noise does not follow from velocities: give ε for times.
 
         Raises
         ------

@@ -18,8 +18,9 @@ import numpy as np
 import sympy
 from scipy.optimize import minimize
 
-from siq.inference.field_estimate import FieldEstimate, FlowMap
+from siq.inference.field_estimate import FieldEstimate
 from siq.inference.library import candidate_library, monomial_exponents
+from siq.numerics.integration import FlowMap
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics

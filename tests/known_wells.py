@@ -7,7 +7,7 @@ import functools
 import numpy as np
 from known_systems import KnownSystem, double_well, maier_stein, portrait_of, potential_values
 
-from siq.quasipotential.landscape import GlobalQuasipotential, heights_of_attractors
+from siq.quasipotential.global_formula import GlobalQuasipotential, heights_of_attractors
 from siq.quasipotential.refinement import RefinementOptions
 from siq.quasipotential.wells import local_well
 

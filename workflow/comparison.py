@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 import sympy
 
+from benchmarks.publication.publication import normalisation_bessel
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import read_field
 from siq.networks.decomposition import AnyNetworks, NetworksByWell
@@ -28,7 +29,6 @@ from siq.quasipotential.invariant_density import (
     SampledPotential,
     StationaryDensity,
     marginal_density,
-    normalisation_bessel,
     shares_by_rates,
 )
 from siq.quasipotential.landscape import Landscape, NoLandscape

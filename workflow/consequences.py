@@ -9,8 +9,9 @@ import pandas as pd
 import sympy
 
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import FieldEstimate, FlowMap
+from siq.inference.field_estimate import FieldEstimate
 from siq.inference.library import CandidateLibrary
+from siq.numerics.integration import FlowMap
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.refinement import RefinementOptions

@@ -23,7 +23,7 @@ from siq.workflow.study import (
     PipelineSettings,
     Study,
     card_content,
-    card_content_beside,
+    card_content_but_for,
     check_states,
     completed,
     load_study_system,
@@ -184,7 +184,7 @@ class CheckedStudy:
         swept = self.study.sweep
         others: dict[str, Callable[[], Any]] = {
             "card": lambda: card_content(self.system),
-            "card_but_for_swept": lambda: card_content_beside(self.card(), swept.names if swept else ()),
+            "card_but_for_swept": lambda: card_content_but_for(self.card(), swept.names if swept else ()),
             "exact": lambda: None if (card := self.card()) is None else str(load_exact(card)),
             "study": lambda: self.study.model_dump(mode="json"),
             "sweep": lambda: None if swept is None else swept.model_dump(mode="json"),

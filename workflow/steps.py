@@ -277,10 +277,10 @@ def equations(given: Given, settings: PipelineSettings) -> Any:
 @task("card", options=("seed", "card_but_for_swept"))
 def sweep_point(given: Given, settings: PipelineSettings) -> Any:
     """The landscape at one point of a sweep, in a file of its name: another range makes new values only."""
-    from siq.workflow.study import point_values
+    from siq.workflow.study import SweepOptions
     from siq.workflow.sweep import point_at
 
-    names, values = point_values(given.wildcards["point"])
+    names, values = SweepOptions.of_point(given.wildcards["point"])
     card = given.path("card")
     assert card is not None
     return {"point": point_at(card, names, values, seed=settings.seed)}

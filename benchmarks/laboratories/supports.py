@@ -26,11 +26,12 @@ from benchmarks.laboratories.models import ARCHETYPE, Laboratory, maier_stein, r
 from benchmarks.laboratories.one import read, write
 from benchmarks.laboratories.records import generator, recorded, table
 from siq.data.recordings import Recordings, snapshot_pairs
-from siq.inference.field_estimate import FieldEstimate, FlowMap
+from siq.inference.field_estimate import FieldEstimate
 from siq.inference.kalman_filter import Noise
 from siq.inference.library import CandidateLibrary, IdentificationOptions, field_library
 from siq.inference.observation import ObservationModel, unbroken
 from siq.inference.regression import refit
+from siq.numerics.integration import FlowMap
 from siq.systems.diffusion import Diffusion
 from siq.workflow.pipeline import identify_run
 from siq.workflow.study import PipelineSettings, Sampling, StateSpace

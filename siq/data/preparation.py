@@ -66,7 +66,7 @@ def read_pairs(
         See `snapshot_pairs`.
     hidden_velocities
         Whether they are positions: these are smooth, however strong the process noise on velocities is.
-        ``"auto"``: where one of them `goes_to_and_fro`.
+        ``"auto"``: where one of them `turns_back`.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def _checked_for_learning(
         ]
         recordings = recordings.of_states(kept, remarks)
     smooth = hidden_velocities is not True and _shows_no_process_noise(recordings)
-    if smooth and len(recordings.labels) == 1 and not (hidden_velocities and goes_to_and_fro(recordings)):
+    if smooth and len(recordings.labels) == 1 and not (hidden_velocities and turns_back(recordings)):
         raise InputError(file, "", SINGLE_RECORDING, SINGLE_RECORDING_REMEDY)
     return replace(recordings, remarks=(*recordings.remarks, *unusual(recordings)))
 
@@ -120,7 +120,7 @@ def _shows_no_process_noise(recordings: Recordings) -> bool:
     return floors is not None and all(floor.process == 0 for floor in floors)
 
 
-def goes_to_and_fro(recordings: Recordings) -> bool:
+def turns_back(recordings: Recordings) -> bool:
     """Whether one recorded state without process noise turns back, more than once, by a third of its range.
 
     A force on the state alone moves it one way only; what turns back has a velocity, or is driven.
@@ -168,7 +168,7 @@ def in_stretches(recordings: Recordings, *, hidden_velocities: bool | Literal["a
     if len(recordings.labels) > 1 or count < 2 * FEWEST_STRETCHES:
         return recordings
     smooth = hidden_velocities is not True and _shows_no_process_noise(recordings)
-    if smooth and not (hidden_velocities and goes_to_and_fro(recordings)):
+    if smooth and not (hidden_velocities and turns_back(recordings)):
         return recordings
     runs = runs_of(recordings, bridged=True)
     longest = max(correlated_samples(column, runs) for column in recordings.values.T)

@@ -212,7 +212,7 @@ class Recordings:
         )  # fmt: skip
 
     def unwrapped(self, angles: Mapping[str, Sequence[float]]) -> Recordings:
-        """The same with angles that count their turns, where they were recorded within one.
+        """These recordings with angles that count their turns, where they were recorded within one.
 
         Parameters
         ----------
@@ -222,7 +222,7 @@ class Recordings:
         Raises
         ------
         InputError
-            For a name that no column has, and where samples are so far apart that nobody can tell which way
+            For a name that no column has, and where samples are too far apart to tell which way
             round an angle went: steps of a quarter of a period are one in a hundred then, or more.
 
         Examples

@@ -120,7 +120,6 @@ BINS = 40  # of a histogram, at most
 FEWEST_BINS = 10  # in which a valley can be seen
 DEGREES = (5, 9)  # of f in the test: two attractors that differ need more than a cubic, three more than that
 STRETCH_TIMES = 40  # local relaxation times: shorter ones bias f towards one state, longer ones let drifts in
-HOPS_TIMES = 10  # correlation times, hops included, after which nothing is left of the first sample
 FEWEST_STRETCHES, SHORTEST_TIMES = 6, 10  # for so many stretches they may be as short as ten of these
 LAG_SHARE = 0.1  # of the local relaxation time: over it a state hardly changes what pushes it
 PLACES_COMPARED = 25  # at which f is compared with itself, between the quantiles
@@ -241,7 +240,7 @@ def _valleys(
             whole = np.fft.irfft(spectrum * turns if number else spectrum, n=size)
             drawn.append(whole.transpose(1, 0, 2).reshape(len(bins), -1))
         series = np.concatenate(drawn, axis=1)
-        depths.append([_valley(one, each) for one, each in zip(series, bins, strict=True)])
+        depths.append(_valley_depths(series, bins))
         if (
             number == FEWEST_SURROGATES
             and (np.sum(depths[1:] >= np.array(depths[0]), axis=0) >= ENOUGH_DEEPER).all()
@@ -261,14 +260,20 @@ def _valleys(
     return float(np.mean(least <= least[0])), alone[0], depth[0].reshape(columns, -1).max(axis=1)
 
 
-def _valley(series: np.ndarray, bins: int) -> float:
-    low, high = np.quantile(series, [0.001, 0.999])
-    if not high > low:
-        return 0.0
-    share = np.histogram(series, bins=bins, range=(float(low), float(high)))[0] / len(series)
-    above = np.maximum(share[:, None] - share, 0)  # bins by places of the valley
-    left, right = np.tril(above.T, -1).sum(axis=1), np.triu(above.T, 1).sum(axis=1)
-    return float(np.minimum(left, right).max())
+def _valley_depths(series: np.ndarray, bins: Sequence[int]) -> list[float]:
+    """Of each row ``(c, n)``, in so many bins, the largest share of its samples in a lesser peak."""
+    count = series.shape[1]
+    ordered = np.sort(series, axis=1)  # which has the quantiles and, between edges, the histogram
+    depths = []
+    for row, number in zip(ordered, bins, strict=True):
+        least, most = np.interp([0.001 * (count - 1), 0.999 * (count - 1)], np.arange(count), row)
+        below = np.searchsorted(row, np.linspace(least, most, number + 1))
+        inside = np.diff(below)
+        inside[-1] += np.searchsorted(row, most, side="right") - below[-1]
+        above = np.maximum(inside[:, None] - inside, 0).cumsum(axis=0)  # bins by places of the valley
+        left = above.diagonal()
+        depths.append(float(np.minimum(left, above[-1] - left).max()) / count if most > least else 0.0)
+    return depths
 
 
 SIGNIFICANCE = 0.01  # probability with which a single state is taken for several
@@ -354,7 +359,7 @@ class RecordStates:
         return pd.DataFrame(rows, columns=names.split())
 
     def remark(self) -> Remark:
-        """The same as a remark."""
+        """What was found as a remark."""
         model = [] if self.markov is None else self.markov.stays.tolist()
         apart = any(high < one.limits[0] for (_, _, high), one in zip(model, self.counts, strict=False))
         values = {
@@ -376,7 +381,7 @@ class RecordStates:
         return Remark("data.record_rests", values)
 
     def sentence(self) -> str:
-        """The same in a sentence; empty where only one state is supported."""
+        """What was found in a sentence; empty where only one state is supported."""
         limit = "" if self.limit is None else " " + sentence(self.limit)
         return sentence(self.remark()) + limit if self.supported else ""
 

@@ -46,7 +46,7 @@ class Account:
 
 
 UNLIMITED = Account(float("inf"), 0.0, 0.0)
-"""Of work that nobody counted."""
+"""Of work that is not counted."""
 
 
 @dataclass

@@ -37,9 +37,9 @@ from siq.remarks import Remark
 FIRST_STATES = 64  # tried, evenly spread; a choice
 PERIODS = 12  # tried of an input, from the whole recording to eight samples each; a choice
 SAMPLES_PER_PERIOD = 8
-MOST_LOG_ODDS = np.log(1e6)  # more than that nobody believes of a model
+MOST_LOG_ODDS = np.log(1e6)  # no model is believed more than that
 NUDGE = 0.1  # numerical: of a standard error, for derivatives by a parameter
-MOST_SAMPLES = 1000  # of a proposed recording: what is foreseen of more is hardly better known
+MOST_SAMPLES = 1000  # of a proposed recording: predictions of more are hardly better known
 
 Plan = Mapping[str, Any]
 
@@ -53,7 +53,7 @@ def next_experiment(
     correlated: float,
     enough: float,
 ) -> Remark | None:
-    """The experiment that is expected to tell a model from others best; None where none can be foreseen.
+    """The experiment that is expected to tell a model from others best; None where nothing can be predicted.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def next_experiment(
         ``period``, which is 0 for a constant course.
     """
     plans, proposed, begin = _plans(one, data)
-    known, *further = ((fit, *_foreseen(fit, proposed, begin)) for fit in (one, *others))
+    known, *further = ((fit, *_predicted(fit, proposed, begin)) for fit in (one, *others))
     usual, width = one.x[data.first[:-1]].mean(axis=0), positive(np.ptp(begin, axis=0))
     far = (((begin - usual) / width) ** 2).sum(axis=1)
     found: list[tuple[float, float, Plan]] = []
@@ -159,7 +159,7 @@ def _plans(fit: Fit, data: Measurements) -> tuple[list[Plan], Measurements, np.n
     return plans, proposed, begin
 
 
-def _foreseen(fit: Fit, proposed: Measurements, begin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _predicted(fit: Fit, proposed: Measurements, begin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Outputs ``(n, m)`` that a fit foresees, and their changes by a standard error of each parameter."""
     grid = Grid(proposed, max(fit.substeps, 1))
 

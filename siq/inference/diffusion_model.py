@@ -341,7 +341,7 @@ def process_noise_increments(found: FieldEstimate, pairs: SnapshotPairs, rest: n
     """Residuals per root of time, with what the system forgot within the step put back: shape ``(n, d)``.
 
     ``∫₀ʰ e^{Js} D e^{Jᵀs} ds`` is ``h e^{Jh/2} D e^{Jᵀh/2}`` but for the second order in Jh. Of coarse steps
-    it is the covariance of `siq.inference.field_estimate.FlowMap.moments`.
+    it is the covariance of `siq.numerics.integration.FlowMap.moments`.
     """
     if found.flow.coarse:
         given = np.ascontiguousarray(pairs.x0.T), pairs.h, found.noise_rate

@@ -29,117 +29,19 @@ from siq.data.recordings import SnapshotPairs
 from siq.errors import Fault, InputError, NumericalFailure
 from siq.inference.library import CandidateLibrary, IdentificationOptions, field_dynamics, field_library
 from siq.numerics.files import whole_file
-from siq.numerics.integration import runge_kutta_step
+from siq.numerics.integration import FlowMap
 from siq.numerics.randomness import normal_draws
 from siq.remarks import Remark, sentence
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import compile_formulas, parse_formula
 
-Field = Callable[[np.ndarray], np.ndarray]
-"""f, mapping components ``(d, n)`` to components ``(d, n)``."""
-
 NoiseKind = Literal["none", "process", "sensor", "measurement", "rounding", "coloured"]
 NOISE_FREE = 1e-6  # residuals below this share of the increments are the integrator's and the rounding's
-MAX_REFINEMENT = 64  # Runge–Kutta steps within one pair
 STANDARD_ERRORS = 4.0  # derived: chance passes it once in 16 000 pairs of states
 SIGNIFICANT_SCORE = 5.0  # standard errors
 HARMLESS_CORRELATION = 0.02  # a correlation, or a deviation of D, below this is harmless however significant
 HARMLESS_BIAS = 0.5  # of a standard error: with such a bias an error bar holds 0.95 - 0.02 of the time
-
-
-@dataclass(frozen=True)
-class FlowMap:
-    """The map of a state over the step of a pair, by so many steps of an integrator.
-
-    By Euler's rule for pairs that an Euler–Maruyama simulation made with as many steps; otherwise by the
-    classical Runge–Kutta rule, for everything that is continuous in time. Of a `coarse` step noise is not
-    allowed for by the first order in h, but by `moments`.
-    """
-
-    steps: int = 1
-    euler: bool = False
-    coarse: bool = False
-
-    def __call__(self, field: Field, x0: np.ndarray, h: np.ndarray) -> np.ndarray:
-        """The state after h without noise: components ``(d, n)`` and steps ``(n,)`` to ``(d, n)``."""
-        step = h / self.steps
-        x = x0
-        with np.errstate(over="ignore", invalid="ignore"):  # a trial f may run away
-            for _ in range(self.steps):
-                x = x + step * field(x) if self.euler else runge_kutta_step(field, x, step)
-        return x
-
-    @classmethod
-    def of(
-        cls, field: Field, x0: np.ndarray, h: np.ndarray, *, integrator_step: float | None, tolerance: float
-    ) -> FlowMap:
-        """The map that fits the data: as many steps as the accuracy needs, or as the simulation made.
-
-        The tolerance of increments of states ``(d, n)`` over steps ``(n,)`` is relative to their root mean
-        square, state by state; `integrator_step` is that of the Euler–Maruyama simulation that made the data,
-        None elsewhere.
-        """
-        if integrator_step is not None:
-            return cls(steps=max(round(float(np.median(h)) / integrator_step), 1), euler=True)
-        flow = cls()
-        coarse = flow(field, x0, h)
-        while flow.steps < MAX_REFINEMENT:
-            fine = (finer := cls(2 * flow.steps))(field, x0, h)
-            with np.errstate(over="ignore", invalid="ignore"):  # a trial f may run away
-                size, error = (np.sqrt((one**2).mean(axis=1)) for one in (fine - x0, fine - coarse))
-            # The error of the coarse result; that of the fine one is sixteen times smaller.
-            if not (error > tolerance * size).any():
-                break
-            flow, coarse = finer, fine
-        return flow
-
-    def moments(
-        self, field: Field, x0: np.ndarray, h: np.ndarray, rate: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Mean ``(d, n)`` and covariance ``(n, d, d)`` after h, with noise of the covariance `rate` per time.
-
-        ``dm/dt = E f,  dP/dt = E[f (x-m)ᵀ] + E[(x-m) fᵀ] + εD`` are closed by the normal law ``N(m, P)``:
-        means are by ``2d + 1`` points, exact for cubic f (Julier and Uhlmann, Proc. IEEE 92 (2004) 401).
-        """
-        d, n = x0.shape
-        step, least, away = h / self.steps, 1e-12 * np.diag(np.diag(rate)) * h[:, None, None], np.sqrt(3.0)
-
-        def rates(mean: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            known = np.nan_to_num(spread, posinf=0.0, neginf=0.0)
-            try:  # of one state a factor is a root, which takes a tenth of the time
-                root = np.sqrt(np.maximum(known + least, 0)) if d == 1 else np.linalg.cholesky(known + least)
-            except np.linalg.LinAlgError:  # of a trial f
-                levels, vectors = np.linalg.eigh(known)
-                root = vectors * np.sqrt(np.maximum(levels, 0.0))[:, None, :]
-            root = np.moveaxis(root, 0, 2)  # (d, d, n)
-            middle, gain = (3 - d) / 3 * field(mean), np.zeros((n, d, d))
-            for direction in root.transpose(1, 0, 2):
-                ahead, behind = field(mean + away * direction), field(mean - away * direction)
-                middle = middle + (ahead + behind) / 6
-                gain += (away / 6 * (ahead - behind)).T[:, :, None] * direction.T[:, None, :]
-            return middle, gain + gain.transpose(0, 2, 1) + rate
-
-        mean, spread, wide = x0, np.zeros((n, d, d)), step[:, None, None]
-        with np.errstate(over="ignore", invalid="ignore"):  # a trial f may run away
-            for _ in range(self.steps):
-                first = rates(mean, spread)
-                second = rates(mean + step / 2 * first[0], spread + wide / 2 * first[1])
-                third = rates(mean + step / 2 * second[0], spread + wide / 2 * second[1])
-                fourth = rates(mean + step * third[0], spread + wide * third[1])
-                parts = zip(first, second, third, fourth, strict=True)
-                moved, wider = ((a + 2 * b + 2 * c + e) / 6 for a, b, c, e in parts)
-                mean, spread = mean + step * moved, spread + wide * wider
-        return mean, spread
-
-    @property
-    def response_share(self) -> float:
-        """The mean time, as a share of a step, for which the system goes on after a kick within the step.
-
-        Half of it times h² is the weight with which noise shifts the mean, ``Σ(εD)_jk ∂²f/∂x_j∂x_k``. Euler's
-        rule sees the noise only after each of its steps.
-        """
-        return (1 - 1 / self.steps) / 2 if self.euler else 0.5
 
 
 @dataclass(frozen=True)
@@ -426,7 +328,7 @@ class FieldEstimate:
         D, which recordings do not tell apart from ε: of these only the product, `noise_rate`, is identified.
     alternatives
         What other terms that fit nearly as well make of f: bias ``(q, d)`` and spread ``(r, q, d)``, see
-        `siq.inference.selection.model_average`. This and what follows is None where nobody asked.
+        `siq.inference.selection.model_average`. This and what follows is None where it was not asked for.
     stability
         Shape ``(p,)``: the share of resampled recordings in which each term would be chosen
         (`siq.inference.selection`).
@@ -671,7 +573,7 @@ def _spread_out(library: CandidateLibrary, support: np.ndarray, values: np.ndarr
 
 
 AnyField = FieldEstimate | Dynamics
-"""f and D with what is not known of them, or as somebody gave them."""
+"""f and D with their uncertainty, or as given."""
 
 
 def dynamics_of(found: AnyField) -> Dynamics:

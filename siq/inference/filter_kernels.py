@@ -34,11 +34,11 @@ def carry_linearly(
     step
         Lengths of the substeps, shape ``(n,)``.
     jacobians
-        J at the begin, the middle and the end of each, shape ``(3, n, d, d)``.
+        J at the start, the middle and the end of each, shape ``(3, n, d, d)``.
     forcings
         F at the same places, shape ``(3, n, d, p)``: the derivatives by parameters.
     transition
-        Shape ``(n, d, d)``: derivative of the state by the state at the begin of the interval.
+        Shape ``(n, d, d)``: derivative of the state by the state at the start of the interval.
     response
         Shape ``(n, d, p)``: derivative of the state by the parameters.
     """

@@ -22,7 +22,7 @@ from typing import Any, Literal
 import numpy as np
 
 from siq.data.correlation import MarkovLag, markov_lag
-from siq.data.preparation import goes_to_and_fro, joined
+from siq.data.preparation import joined, turns_back
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.checks import (
@@ -110,7 +110,7 @@ def identify(
     draw
         Gives the generator for a purpose: for held-out recordings, and for resampling.
     diffusion, units
-        D, where it is given; and the states' units, None of one that nobody knows, by default those of the
+        D, where it is given; and the states' units, None of an unknown one, by default those of the
         recordings.
     pair_step, integrator_step
         Longest time between samples that still belong together; step of the Euler–Maruyama simulation that
@@ -135,7 +135,7 @@ def identify(
         recordings, library, options, draw, diffusion, units or recordings.units, pair_step, integrator_step,
         limits or PredictionLimits(),
     )  # fmt: skip
-    if options.hidden_velocities == "auto" and diffusion is None and goes_to_and_fro(recordings):
+    if options.hidden_velocities == "auto" and diffusion is None and turns_back(recordings):
         if (by_velocities := case.with_velocities()) is None:
             raise NumericalFailure(
                 "the recording turns back as no force on the state alone would make it, and with the velocity"

@@ -112,7 +112,7 @@ class Grid:
         return (self.data.t[self.rows + 1] - self.data.t[self.rows]) / self.substeps
 
     def signals(self, node: int, delays: tuple[tuple[int, float], ...]) -> Signals:
-        """Inputs at a node, all intervals: nodes 0, 1, 2 are begin, middle and end of the first substep."""
+        """Inputs at a node, all intervals: 0, 1, 2 are the start, middle and end of the first substep."""
         if self.whole is not None:
             known, at = self.whole.signals(node, delays), self.chosen
             return Signals(known.inputs[:, at], known.delayed[:, at], known.slopes[:, at], known.t[at])
@@ -229,7 +229,7 @@ class Linearisation:
 
 
 def integrate_intervals(model: Dynamics, grid: Grid, values: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """The states at the ends of all intervals: from states ``(d, k)`` at their begins to ``(d, k)``."""
+    """The states at the ends of all intervals: from states ``(d, k)`` at their starts to ``(d, k)``."""
     delays = model.lags(values)
     for part in range(grid.substeps):
         with np.errstate(all="ignore"):  # what runs away is seen by its end
@@ -373,7 +373,7 @@ def _runge_kutta(
     drift: ParametricFunctions | ClosedFunctions, grid: Grid, values: np.ndarray, x: np.ndarray, part: int,
     delays: tuple[tuple[int, float], ...], first: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """State after a substep, and f at its begin (`first` where known) and end; inputs differ among stages."""
+    """State after a substep, and f at its start (`first` where known) and end; inputs differ among stages."""
     rates, step = drift.rates, grid.step
     begin, middle, end = (grid.signals(3 * part + node, delays) for node in range(3))
     k1 = rates(x, begin, values) if first is None else first

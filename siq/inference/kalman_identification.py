@@ -25,7 +25,7 @@ from siq.data.stationarity import runs_of
 from siq.errors import NumericalFailure
 from siq.inference.checks import correlations_between, unexplained_probability
 from siq.inference.diffusion_model import InnovationLikelihood
-from siq.inference.field_estimate import FieldEstimate, FlowMap, NoiseDiagnosis
+from siq.inference.field_estimate import FieldEstimate, NoiseDiagnosis
 from siq.inference.kalman_filter import Grid, Noise, linearise, whiten
 from siq.inference.maximum_likelihood import Fit, fit_by_filter, noise_uncertainty
 from siq.inference.measurements import Measurements
@@ -41,6 +41,7 @@ from siq.inference.selection import (
     stability,
     triangles,
 )
+from siq.numerics.integration import FlowMap
 from siq.numerics.randomness import positive
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -356,7 +357,7 @@ def filtered_recordings(
 ) -> Recordings:
     """The states as a filter knows them at each sample that it uses, from that and the earlier ones.
 
-    Velocities that nobody measured are among them. Their increments have the mean of f, as those of the
+    Velocities that were not measured are among them. Their increments have the mean of f, as those of the
     states do; those of the measured values do not.
     """
     observation = ObservationModel.of(found)

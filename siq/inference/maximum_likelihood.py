@@ -2,7 +2,7 @@
 
 The model is fitted with noise in what is measured (variance R) and, where asked, noise that drives the states
 (intensity Q per time). With Q = 0 this is the least-squares fit of whole trajectories. With Q > 0 it is the
-extended Kalman filter, linearised at what it knows at the begin of each interval, whose likelihood is that
+extended Kalman filter, linearised at what it knows at the start of each interval, whose likelihood is that
 of its innovations. Linearising along *smoothed* states, which know the future, would be another thing: what
 process noise did later is then in the states at which f is taken, and the coefficients of f come out too
 small, by a half where sensor and process noise do alike. Smoothed states are where the filter begins, since
@@ -68,7 +68,7 @@ def first_noise(model: Dynamics, data: Measurements, x: np.ndarray) -> Noise:
     process = 0.01 * np.mean((x[rows + 1] - x[rows]) ** 2 / step, axis=0)
     if not (process > 0).all():
         spread = np.ptp(model.limits, axis=1) ** 2 / (data.t[-1] - data.t[0] + 1e-300)
-        # Of a state at rest whose domain nobody knows, what its own equation moves it by.
+        # Of a state at rest whose domain is unknown, what its own equation moves it by.
         signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
         rates = model.functions.rates(x.T, signals, model.values).T
         rates = np.where(np.isfinite(rates), rates, 0.0)
@@ -380,7 +380,7 @@ def _fit_from(
     model: Dynamics, x: np.ndarray, along: Linearisation, noise: Noise, substeps: int,
     fit: Callable[[Fit], Fit],
 ) -> Fit:  # fmt: skip
-    """A fit from a begin; what leads to no number is that begin with a fault."""
+    """A fit from a start; where it leads to no number, the start itself, with the fault."""
     unknown, fault = np.full((len(model.free),) * 2, np.nan), "" if along.finite else RUNS_AWAY
     begin = Fit(model, unknown, x, x, None, noise, along, -np.inf, np.inf, 1, substeps, False, fault)
     try:
@@ -440,7 +440,7 @@ class _Shooting:
         return linearise(self.model, self.grid, values, x, drift=self.closed, spread=wide, noise=known)
 
     def stepped(self, now: Fit, change: np.ndarray) -> tuple[Fit, float] | None:
-        """The step suggested, shortened until it does about what was foreseen, and the share taken."""
+        """The step suggested, shortened until it does about what was predicted, and the share taken."""
         data, here, noise = self.grid.data, now.linearisation, now.noise
         still = here.with_parameters_changed(change)
         white = still.filtered(data.first, data.step, noise)[0]
@@ -479,7 +479,7 @@ class _Shooting:
         return _fit_from(self.model, x, along, noise, self.grid.substeps, descended)
 
     def descended(self, now: Fit, *, estimate_process: bool, most: int) -> Fit:
-        """Gauss–Newton steps from a begin, at most so many."""
+        """Gauss–Newton steps from a start, at most so many."""
         data, noise = self.grid.data, now.noise
         before: np.ndarray | None = None
         totals: list[float] = []

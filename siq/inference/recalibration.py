@@ -45,7 +45,7 @@ UNLIKELY = 8.0  # logarithm of a likelihood, relative to the largest, that adds 
 THRESHOLD = 1e-4  # probability by chance, below which process noise is believed
 FAINT = 1e-4  # process noise, relative to the motion, from which a fit without any is loosened
 # Mean square of errors in units of the sensors' noise. Errors twice as large cost a log-likelihood of 0.7 for
-# each value, which nobody believes.
+# each value, which is not credible.
 MISSED = 4.0
 FOLLOWING_SHARES = (0.5, 0.9, 0.99)  # of the forces that follow the motion
 NOISE_RATIOS = (1 / 8, 1 / 4, 1 / 2, 1 / 1.4, 1.0, 1.4, 2.0, 4.0, 8.0)  # of process noise, to that of the fit

@@ -32,7 +32,7 @@ from siq.data.recordings import Recordings, SnapshotPairs, StreamedPairs, parent
 from siq.data.stationarity import even_stretches, lagged_covariances, long_run_covariance
 from siq.errors import NumericalFailure
 from siq.inference.diffusion_model import ResidualLikelihood
-from siq.inference.field_estimate import HARMLESS_BIAS, NOISE_FREE, FieldEstimate, FlowMap
+from siq.inference.field_estimate import HARMLESS_BIAS, NOISE_FREE, FieldEstimate
 from siq.inference.library import CandidateLibrary, IdentificationOptions
 from siq.inference.selection import (
     LinearProblem,
@@ -48,6 +48,7 @@ from siq.inference.selection import (
     strong_terms,
     triangles,
 )
+from siq.numerics.integration import FlowMap
 from siq.numerics.randomness import positive
 from siq.systems.diffusion import Diffusion
 from siq.systems.formulas import compile_formulas

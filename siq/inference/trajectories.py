@@ -221,7 +221,7 @@ def fit_trajectories(
     Returns
     -------
     Fit
-        Not converged where the simulation runs away at the begin, or where more simulations would be needed
+        Not converged where the simulation runs away at the start, or where more simulations would be needed
         than are allowed.
 
     Raises

@@ -38,7 +38,7 @@ def whole_file(path: str | Path) -> Iterator[Path]:
 
 
 def given_path(text: str | Path) -> Path:
-    """The path that somebody wrote: as it stands where that is there, and ``~`` for a home otherwise."""
+    """The path as a user wrote it: as it stands where that is there, and ``~`` for a home otherwise."""
     path = Path(text)
     with suppress(OSError, ValueError, RuntimeError):  # no such user, or no path at all
         return path if path.exists() else path.expanduser()

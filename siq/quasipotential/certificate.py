@@ -257,6 +257,23 @@ def certify(
     return Certificate(tests, error, "; ".join(dict.fromkeys(refused)), scope, tested_on)
 
 
+def certify_wells(
+    wells: Sequence[Well | None], evidence: Evidence, **options: Any
+) -> tuple[list[Well | None], Certificate]:
+    """Wells with their certificate: with powers in the place of units where it refuses these alone.
+
+    `options` are those of `certify`; None stands for an attractor without a formula.
+    """
+    chosen = list(wells)
+    certificate = certify([well for well in chosen if well is not None], evidence, **options)
+    if not certificate.certified and any(well is not None and well.instead for well in chosen):
+        powers = [well and (well.instead or well) for well in chosen]
+        again = certify([well for well in powers if well is not None], evidence, **options)
+        if again.certified:
+            return powers, again
+    return chosen, certificate
+
+
 def _candidate_of_region(
     formulas: SymbolicDecomposition, evidence: Evidence, relative_error: float
 ) -> Candidate:

@@ -345,7 +345,7 @@ def _ring_integrals(dynamics: Dynamics, intensity: float) -> tuple[float, float]
     nodes, weights = (nodes + 1) / 2, weights / 2
     h, places = period / count, low + period * np.arange(count) / count
     inner = places[:, None] + h * nodes
-    # Ψ from the begin of each part to each node, and to its end.
+    # Ψ from the start of each part to each node, and to its end.
     rise = h * nodes * (slope(places[:, None, None] + h * nodes[:, None] * nodes)[0] @ weights)
     whole = h * slope(inner)[0] @ weights
     ahead = np.log(h * (np.exp(rise) / slope(inner)[1]) @ weights)  # of e^Ψ/a, and of e^-Ψ
@@ -606,9 +606,8 @@ def _rates(
             drift = drift - (noise(face + move) - noise(face - move))[:, 0, 1] / steps[other]
             spread = spread - np.abs(tensor[:, 0, 1]) * h / steps[other]
         spread = np.maximum(spread, 1e-9 * tensor[:, axis, axis])
-        z = np.clip(drift * h / spread, -STEEP, STEEP)
-        ways = ((left, right, -z), (right, left, z))  # B = 1/exprel
-        pairs += [(one, other, spread / h**2 / special.exprel(own)) for one, other, own in ways]
+        forth, back = exchange_rates(drift * h / spread, spread / h**2)
+        pairs += [(left, right, forth), (right, left, back)]
     if dimension == 2:
         for sign in (1, -1):
             low = index[:-1, :-1] if sign > 0 else index[:-1, 1:]
@@ -620,6 +619,12 @@ def _rates(
             pairs += [(start[used], end[used], mixed[used]), (end[used], start[used], mixed[used])]
     rows, columns, values = (np.concatenate(part) for part in zip(*pairs, strict=True))
     return sparse.csr_matrix((values, (rows, columns)), shape=(len(y), len(y)))
+
+
+def exchange_rates(z: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rates ``(a/h²) B(-z)`` to the next cell and ``(a/h²) B(z)`` back, with `spread` for a/h²."""
+    z = np.clip(z, -STEEP, STEEP)
+    return spread / special.exprel(-z), spread / special.exprel(z)  # B = 1/exprel
 
 
 def _factorised(matrix: sparse.csc_matrix, dimension: int) -> Callable[[np.ndarray], np.ndarray]:

@@ -1,4 +1,4 @@
-"""One formula of V, with g, for the whole recorded region, in the functions of a candidate library.
+"""U over the whole region: one formula of V, with g, in functions of a library, or U of all wells together.
 
 Gauss–Newton on the Hamilton–Jacobi equation starts from the V of networks or of wells with all functions of
 the library; then those that their own standard errors do not tell from zero are dropped one by one
@@ -8,10 +8,20 @@ An f identified from noisy data has no exact decomposition on the terms that V a
 err independently. Given those terms, only few of its coefficients are free: f = -D∇V + g with ∇V·g = 0
 identically. The generalised least-squares fit of f within that family uses all of the data's information
 about V, which solving the Hamilton–Jacobi equation for the f found does not (`_fit_orthogonal`).
+
+About each attractor i the quasipotential is ``U_i(x)``, zero there. The one that the invariant distribution
+follows, ``p ~ exp(-U/ε)``, is
+
+    U(x) = min_i (W_i + U_i(x)) - min_i W_i,
+
+where W_i is the least total of barriers over all trees of transitions that end in i (M. Freidlin,
+A. Wentzell, *Random Perturbations of Dynamical Systems*, chapter 6). For two wells this says that both local
+formulas have the same value at the saddle between them.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -19,11 +29,14 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 
+from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
 from siq.inference.library import CandidateLibrary
 from siq.numerics.randomness import positive
 from siq.quasipotential.hamilton_jacobi import HamiltonJacobi, LibraryBasis
+from siq.quasipotential.wells import Well
 
+MOST_WELLS = 6  # of which all trees can be counted
 MIN_PROBABILITY = 1e-4  # a probability below which no orthogonal fit is believed
 FIT_POINTS = 400  # where ∇V·g is asked to vanish in a joint fit
 EXACT = 1e-6  # numerical, of a coefficient: the error of one that holds by definition
@@ -306,3 +319,61 @@ def _fit_orthogonal(
         of_v, of_v_covariance, circulatory=of_g.T, circulatory_errors=of_g_errors.T, joint=True,
         freedom=len(found.values) - tangent.shape[1], chi_square=float(distance @ distance),
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class GlobalQuasipotential:
+    """U over all wells, where it is known."""
+
+    wells: tuple[Well, ...]  #: V about the attractors
+    heights: np.ndarray  #: U at the attractors, shape (k,); the lowest is zero
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """U at points ``(n, d)``: shape ``(n,)``, NaN where it is not known."""
+        return np.fmin.reduce(self.by_well(x))
+
+    def by_well(self, x: np.ndarray) -> np.ndarray:
+        """``W_i + U_i`` at points, shape ``(k, n)``, NaN where the formula of a well is not believed."""
+        return np.stack(
+            [
+                h + 2 * one.known_values(self.placed(one, x))
+                for h, one in zip(self.heights, self.wells, strict=True)
+            ]
+        )
+
+    def placed(self, well: Well, x: np.ndarray) -> np.ndarray:
+        """Points ``(n, d)``, moved by whole periods to where V of a well is least."""
+        dynamics = well.dynamics
+        if not dynamics.periodic:
+            return x
+        images = dynamics.wrapped(x) + dynamics.shifts[:, None]
+        values = [well.known_values(each) for each in images]
+        return np.asarray(images[np.argmin(np.nan_to_num(values, nan=np.inf), axis=0), np.arange(len(x))])
+
+
+def heights_of_attractors(barriers: np.ndarray) -> np.ndarray:
+    """U at the attractors, shape ``(k,)``, the lowest being zero, from the barriers between them.
+
+    The barriers, ``(k, k)``, are the lowest of U on the way from i to j in one step, infinite where there is
+    none. It fails (`NumericalFailure`) when they do not connect the attractors, or there are too many of
+    them.
+    """
+    count = len(barriers)
+    if count > MOST_WELLS:
+        raise NumericalFailure(f"there are {count} attractors; heights are found for {MOST_WELLS} at most")
+    totals = np.full(count, np.inf)
+    for root in range(count):
+        others = [index for index in range(count) if index != root]
+        for targets in itertools.product(range(count), repeat=count - 1):
+            step = dict(zip(others, targets, strict=True))
+            total = float(sum(barriers[start, end] for start, end in step.items()))
+            ends = others
+            if total < totals[root]:
+                for _ in others:  # of a tree every branch has arrived at the root by then
+                    ends = [step.get(index, root) for index in ends]
+                totals[root] = total if all(end == root for end in ends) else totals[root]
+    if not np.isfinite(totals).all():
+        raise NumericalFailure(
+            "no transitions over known saddles connect all attractors: their heights are not known"
+        )
+    return np.asarray(totals - totals.min())

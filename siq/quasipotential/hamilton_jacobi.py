@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -176,22 +176,31 @@ class PowerBasis:
             symbol if (c, s) == (0, 1) else (symbol - sympy.Float(float(c), 17)) / sympy.Float(float(s), 17)
             for symbol, c, s in zip(self.symbols, self.center, self.scale, strict=True)
         ]
-        powers = ([base ** int(e) for base, e in zip(scaled, row, strict=True)] for row in self.exponents)
-        return _weighted_sum(coefficients, itertools.chain(map(sympy.prod, powers), self.unit_terms(scaled)))
+        powers = (
+            sympy.prod(base ** int(e) for base, e in zip(scaled, row, strict=True)) for row in self.exponents
+        )
+        of_powers, of_units = np.split(coefficients, [len(self.exponents)])
+        return _weighted_sum(of_powers, powers) + self.sum_of_units(of_units, scaled)
 
-    def unit_terms(self, scaled: Sequence[sympy.Expr]) -> Iterator[sympy.Expr]:
-        """The units as formulas of y."""
-        for *weights, bias in self.units.tolist():
-            along, here = _weighted_sum(np.array(weights), scaled), sympy.Float(math.tanh(bias), 17)
-            slope = 1 - here**2
-            yield sympy.tanh(along + sympy.Float(bias, 17)) - here - slope * along + here * slope * along**2
+    def sum_of_units(self, coefficients: np.ndarray, scaled: Sequence[sympy.Expr]) -> sympy.Expr:
+        """The units as a formula of y: hyperbolic tangents, less one polynomial for all of them."""
+        slopes = self.units[:, :-1]
+        here, slope, bend = (coefficients * one for one in _tanh_derivatives(self.units[:, -1]))
+        along = (_weighted_sum(unit, [*scaled, sympy.S.One]) for unit in self.units)
+        taylor = [here.sum(), *(slope @ slopes), *((slopes.T * bend) @ slopes / 2).ravel()]
+        products = (one * other for one, other in itertools.product(scaled, repeat=2))
+        tangents = _weighted_sum(coefficients, map(sympy.tanh, along))
+        return tangents - _weighted_sum(np.array(taylor), [sympy.S.One, *scaled, *products])
 
     def _of_units(self, x: np.ndarray, order: int) -> np.ndarray:
         """Derivatives of the units by ``w·y``, of an order up to 2, shape ``(n, m - p)``."""
         along, biases = ((x - self.center) / self.scale) @ self.units[:, :-1].T, self.units[:, -1]
-        _, slope, bend = at_center = _tanh_derivatives(biases)
-        taken = (at_center[0] + slope * along + bend * along**2 / 2, slope + bend * along, bend)
-        return np.asarray(_tanh_derivatives(along + biases)[order] - taken[order])
+        here, slope, bend = _tanh_derivatives(biases)
+        there = np.tanh(along + biases)
+        if order == 0:
+            return np.asarray(there - here - along * (slope + bend / 2 * along))
+        steepness = 1 - there**2
+        return np.asarray(steepness - slope - bend * along if order == 1 else -2 * there * steepness - bend)
 
     def _powers(self, x: np.ndarray) -> np.ndarray:
         """Powers of every scaled state, shape ``(highest + 1, d, n)``."""

@@ -37,7 +37,7 @@ import sympy
 
 from siq.errors import NumericalFailure
 from siq.numerics.integration import runge_kutta_step
-from siq.quasipotential.landscape import GlobalQuasipotential
+from siq.quasipotential.global_formula import GlobalQuasipotential
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import compile_formulas
 
@@ -229,49 +229,6 @@ def _gauss_legendre(bounds: np.ndarray, count: int, panels: int = 1) -> tuple[np
     edges = np.linspace(bounds[0], bounds[1], panels + 1)
     half = (edges[1] - edges[0]) / 2
     return (edges[:-1, None] + half * (nodes + 1)).ravel(), np.tile(half * weights, panels)
-
-
-def normalisation_bessel(
-    quasipotential: sympy.Expr, symbols: Sequence[sympy.Symbol], *, intensity: float
-) -> float | None:
-    """Z over all of space in closed form, for one quartic state and any number of quadratic ones.
-
-    For ``U = a₁x⁴ - a₂x² + a₃ + Σ b_k y_k²`` it is, with ``s = a₂²/(8 a₁ ε)``, the paper's Appendix C,
-    ``Z = π sqrt(a₂/(8a₁)) exp(s - a₃/ε) [I_{1/4}(s) + I_{-1/4}(s)] Π sqrt(πε/b_k)``; a₂ < 0 (one well)
-    changes the sign of I_{1/4}, and a₂ = 0 leaves a Gamma function.
-
-    Z is in the product of the states' units, and ε in the unit of U, positive (`ValueError`). None where U
-    has another form, or is not bounded below.
-    """
-    if not 0 < intensity < math.inf:
-        raise ValueError(f"the noise intensity ({intensity}) must be positive")
-    if not quasipotential.is_polynomial(*symbols):
-        return None
-    constant, powers = 0.0, [dict[int, float]() for _ in symbols]
-    for exponents, coefficient in sympy.Poly(quasipotential, *symbols).terms():
-        present = [(index, power) for index, power in enumerate(exponents) if power]
-        if len(present) > 1:
-            return None
-        for index, power in present:
-            powers[index][power] = float(coefficient)
-        constant += 0.0 if present else float(coefficient)
-    quartic = [(own[4], -own.get(2, 0.0)) for own in powers if own.keys() in ({4}, {2, 4})]
-    quadratic = [own[2] for own in powers if own.keys() == {2}]
-    if len(quartic) != 1 or len(quadratic) != len(symbols) - 1 or min([quartic[0][0], *quadratic]) <= 0:
-        return None
-    a1, a2 = quartic[0]
-    s = a2**2 / (8 * a1 * intensity)
-    # ive and kve carry a factor exp(-s), exp(s): what remains in the exponent is -min U/ε.
-    exponent = -constant / intensity
-    if a2 > 0:
-        exponent += 2 * s
-        along = math.pi * math.sqrt(a2 / (8 * a1)) * sum(scipy.special.ive((0.25, -0.25), s))
-    elif a2 < 0:  # π (I_{-1/4} - I_{1/4}) = sqrt(2) K_{1/4}
-        along = math.sqrt(-a2 / (4 * a1)) * scipy.special.kve(0.25, s)
-    else:
-        along = 2 * math.gamma(1.25) * (intensity / a1) ** 0.25
-    across = math.prod(math.sqrt(math.pi * intensity / b) for b in quadratic)
-    return float(along * across * np.exp(exponent))
 
 
 def marginal_density(

@@ -1,14 +1,5 @@
 """The landscape of a vector field: attractors, wells, transitions, and U = 2V over all of them.
 
-About each attractor i the quasipotential is ``U_i(x)``, zero there. The one that the invariant distribution
-follows, ``p ~ exp(-U/ε)``, is
-
-    U(x) = min_i (W_i + U_i(x)) - min_i W_i,
-
-where W_i is the least total of barriers over all trees of transitions that end in i (M. Freidlin,
-A. Wentzell, *Random Perturbations of Dynamical Systems*, chapter 6). For two wells this says that both local
-formulas have the same value at the saddle between them.
-
 A `Landscape` is data with answers. `siq.quasipotential.landscape_assembly` finds it, and
 `siq.quasipotential.landscape_files` stores it.
 """
@@ -16,7 +7,7 @@ A `Landscape` is data with answers. `siq.quasipotential.landscape_assembly` find
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -26,7 +17,6 @@ import numpy as np
 import pandas as pd
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as pydantic_dataclass
-from scipy.spatial import cKDTree
 
 from siq.data.recordings import Recordings
 from siq.data.states import RecordStates
@@ -35,15 +25,16 @@ from siq.inference.field_estimate import FieldEstimate
 from siq.quasipotential.certificate import Certificate
 from siq.quasipotential.characteristics import potential_errors
 from siq.quasipotential.fokker_planck import CellProcess, Dissipation, ReactiveFlow, Rotation, cores_about
+from siq.quasipotential.global_formula import GlobalQuasipotential
 from siq.quasipotential.occupancy import VisitTest
 from siq.quasipotential.power_series import CycleFormula
 from siq.quasipotential.rates import EscapeRate, NoiseStrength, mean_residence_time
-from siq.quasipotential.transitions import Transition, missing_diffusion
+from siq.quasipotential.transitions import Transition, missing_diffusion, progress_along
 from siq.quasipotential.wells import Well
 from siq.remarks import Remark, sentence
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
-from siq.systems.equilibria import Equilibrium, hessian_at
+from siq.systems.equilibria import Equilibrium
 from siq.systems.escapes import Neighbourhood, split_escapes
 
 if TYPE_CHECKING:
@@ -52,7 +43,6 @@ if TYPE_CHECKING:
     from siq.quasipotential.landscape_assembly import EquationSettings
     from siq.workflow.pipeline import PipelineSettings
 
-MOST_WELLS = 6  # of which all trees can be counted
 DRAWS = 40  # of an estimated f: the ends of a 95 % interval are then two of them
 MARGIN = 0.15  # of the states that were seen, on each side: there the density ends
 LEVEL_TOLERANCE = 1e-6  # numerical, of the level of a well: two values of U are one
@@ -83,7 +73,7 @@ class LandscapeOptions:
 class NoLandscape(NumericalFailure):
     """Recordings that no landscape was found of; what they show by themselves is kept.
 
-    The message says why, what would make it an answer, and what is known all the same.
+    The message says why, what would make it an answer, and what is known nevertheless.
 
     Parameters
     ----------
@@ -111,64 +101,6 @@ def sentences_without_landscape(reason: str, states: RecordStates | None) -> lis
     missing = sentence(Remark("quasipotential.without_landscape", values))
     seen = "" if states is None else states.sentence() or sentence(states.rest())
     return [seen, missing] if seen else [missing]
-
-
-@dataclass(frozen=True)
-class GlobalQuasipotential:
-    """U over all wells, where it is known."""
-
-    wells: tuple[Well, ...]  #: V about the attractors
-    heights: np.ndarray  #: U at the attractors, shape (k,); the lowest is zero
-
-    def __call__(self, x: np.ndarray) -> np.ndarray:
-        """U at points ``(n, d)``: shape ``(n,)``, NaN where it is not known."""
-        return np.fmin.reduce(self.by_well(x))
-
-    def by_well(self, x: np.ndarray) -> np.ndarray:
-        """``W_i + U_i`` at points, shape ``(k, n)``, NaN where the formula of a well is not believed."""
-        return np.stack(
-            [
-                h + 2 * one.known_values(self.placed(one, x))
-                for h, one in zip(self.heights, self.wells, strict=True)
-            ]
-        )
-
-    def placed(self, well: Well, x: np.ndarray) -> np.ndarray:
-        """Points ``(n, d)``, moved by whole periods to where V of a well is least."""
-        dynamics = well.dynamics
-        if not dynamics.periodic:
-            return x
-        images = dynamics.wrapped(x) + dynamics.shifts[:, None]
-        values = [well.known_values(each) for each in images]
-        return np.asarray(images[np.argmin(np.nan_to_num(values, nan=np.inf), axis=0), np.arange(len(x))])
-
-
-def heights_of_attractors(barriers: np.ndarray) -> np.ndarray:
-    """U at the attractors, shape ``(k,)``, the lowest being zero, from the barriers between them.
-
-    The barriers, ``(k, k)``, are the lowest of U on the way from i to j in one step, infinite where there is
-    none. It fails (`NumericalFailure`) when they do not connect the attractors, or there are too many of
-    them.
-    """
-    count = len(barriers)
-    if count > MOST_WELLS:
-        raise NumericalFailure(f"there are {count} attractors; heights are found for {MOST_WELLS} at most")
-    totals = np.full(count, np.inf)
-    for root in range(count):
-        others = [index for index in range(count) if index != root]
-        for targets in itertools.product(range(count), repeat=count - 1):
-            step = dict(zip(others, targets, strict=True))
-            total = float(sum(barriers[start, end] for start, end in step.items()))
-            ends = others
-            if total < totals[root]:
-                for _ in others:  # of a tree every branch has arrived at the root by then
-                    ends = [step.get(index, root) for index in ends]
-                totals[root] = total if all(end == root for end in ends) else totals[root]
-    if not np.isfinite(totals).all():
-        raise NumericalFailure(
-            "no transitions over known saddles connect all attractors: their heights are not known"
-        )
-    return np.asarray(totals - totals.min())
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -202,7 +134,7 @@ class Landscape:
     position_errors
         Standard error of each attractor's position, shape ``(k, d)``; None where not known.
     noise
-        Strength of the noise that drives the system, None where nobody knows it.
+        Strength of the noise that drives the system, None where it is unknown.
     field_estimate
         The identified f with its uncertainty; None where f is given, and after reading from a file.
     visits
@@ -216,7 +148,7 @@ class Landscape:
     parting
         Unstable cycles, which part wells.
     checked_times
-        What `verify_times` said, with a column ``noise``; None where nobody asked for it.
+        What `verify_times` said, with a column ``noise``; None where it was not asked for.
     """
 
     dynamics: Dynamics
@@ -265,7 +197,7 @@ class Landscape:
             For the first thing that cannot be read.
         NoLandscape
             When f cannot be identified, or it has no landscape. It says why, and what would make it an
-            answer; its `states` are what the recordings show by themselves all the same.
+            answer; its `states` are what the recordings show by themselves.
 
         Examples
         --------
@@ -349,7 +281,7 @@ class Landscape:
         return tuple(one for one in self.attractors if isinstance(one, Cycle))
 
     def in_units(self, units: Sequence[str], *, time: str = "1") -> Landscape:
-        """The same with the units of the states and of the time said; nothing is converted."""
+        """The landscape with the units of its states and of time named; nothing is converted."""
         dynamics = replace(self.dynamics, units=tuple(units), time_unit=time)
         wells = tuple(None if well is None else replace(well, dynamics=dynamics) for well in self.wells)
         return replace(self, dynamics=dynamics, wells=wells)
@@ -617,7 +549,8 @@ class Landscape:
                 progress = process.between(core, others).progress
                 operator = process.mean_time(core, others)
             except (NumericalFailure, np.linalg.LinAlgError, RuntimeError):
-                progress = self._along_paths(index, intensity)
+                mine = [way for way in self.transitions if way.start == index]
+                progress = progress_along(mine, self.attractors[index], self.dynamics, intensity)
             check = split_escapes(
                 self.dynamics, core, others, intensity=intensity, progress=progress,
                 generator=np.random.default_rng([seed, index]),
@@ -627,7 +560,7 @@ class Landscape:
         return pd.DataFrame(rows, columns=columns.split())
 
     def with_checked_times(self, options: LandscapeOptions | None, *, seed: int = 0) -> Landscape:
-        """The same with its times checked, where the options ask for that; a remark where that fails.
+        """The landscape with its times checked, where the options ask for that; a remark where that fails.
 
         ε are those of the options, or else as the recordings show it.
         """
@@ -662,27 +595,6 @@ class Landscape:
         low, high = points.min(axis=0), points.max(axis=0)
         box = np.stack([low - MARGIN * (high - low), high + MARGIN * (high - low)], axis=1)
         return np.where(turning[:, None], limits, box)
-
-    def _along_paths(self, well: int, intensity: float) -> Callable[[np.ndarray], np.ndarray]:
-        """Progress by U/ε at the nearest state of the paths out of a well; beyond the saddle by one more."""
-        ways = [way for way in self.transitions if way.start == well and way.path is not None]
-        if not ways:
-            raise NumericalFailure("no path leads out of the well, along which a simulation could be split")
-        states, values = [], []
-        for way in ways:
-            assert way.path is not None
-            down = way.downhill
-            states += [way.path.points, down]
-            values += [way.path.values / intensity]
-            values += [way.path.action / intensity + np.linspace(0, 1, len(down))]
-        points, along = np.concatenate(states), np.concatenate(values)
-        # Near is what the noise about the attractor makes so.
-        one = self.attractors[well]
-        root = np.diag(1 / np.ptp(points, axis=0))
-        if isinstance(one, Equilibrium):
-            root = np.linalg.cholesky(hessian_at(self.dynamics, one.position))
-        tree = cKDTree(points @ root)
-        return lambda x: np.asarray(along[tree.query(x.T @ root)[1]])
 
     def escape_times(self, *, noise: float | None = None) -> pd.DataFrame:
         """Mean times until noise has led from each attractor to the next, one row for every way out.
@@ -760,7 +672,7 @@ class Landscape:
         return landscape_html(self)
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw U with its wells, passes and paths; see `siq.plot_quasipotential`, which this calls.
+        """Draw U with its wells, saddles and paths; see `siq.plot_quasipotential`, which this calls.
 
         Parameters
         ----------

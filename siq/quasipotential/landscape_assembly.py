@@ -21,9 +21,16 @@ from pydantic.dataclasses import dataclass
 from siq.errors import InputError, NumericalFailure
 from siq.inference.field_estimate import AnyField, FieldEstimate, dynamics_of
 from siq.numerics.randomness import Purpose, generator
-from siq.quasipotential.certificate import Certificate, Evidence, caustics_below, certify, references_about
+from siq.quasipotential.certificate import (
+    Certificate,
+    Evidence,
+    caustics_below,
+    certify_wells,
+    references_about,
+)
 from siq.quasipotential.certificate_tests import CertificateOptions
-from siq.quasipotential.landscape import Landscape, LandscapeOptions, NoLandscape, heights_of_attractors
+from siq.quasipotential.global_formula import heights_of_attractors
+from siq.quasipotential.landscape import Landscape, LandscapeOptions, NoLandscape
 from siq.quasipotential.path_chains import evenly
 from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.refinement import RefinementOptions
@@ -162,13 +169,8 @@ def landscape_from_equations(
             system, portrait, np.concatenate(unseen), options=settings.certificate, seed=seed,
             references=references_about(system, portrait, depths=depths, seed=seed),
         )  # fmt: skip
-        certificate = certify(sought, evidence)
-        if not certificate.certified and any(well.instead for well in sought):
-            powers = [well and (well.instead or well) for well in wells]
-            again = certify([well for well in powers if well is not None], evidence)
-            if again.certified:
-                wells, certificate = powers, again
-                sought = [well for well in wells if well is not None]
+        wells, certificate = certify_wells(wells, evidence)
+        sought = [well for well in wells if well is not None]
         remarks += caustics_below(system, sought, portrait, certificate.error, seed=seed)
     wells += [None] * len(portrait.cycles)
     noises = settings.landscape.noise_intensities

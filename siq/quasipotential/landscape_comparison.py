@@ -27,7 +27,8 @@ from siq.inference.field_estimate import STANDARD_ERRORS, FieldEstimate
 from siq.numerics.files import whole_file
 from siq.numerics.text import place_text
 from siq.quasipotential.characteristics import adapted_fan
-from siq.quasipotential.landscape import Landscape, heights_of_attractors
+from siq.quasipotential.global_formula import heights_of_attractors
+from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.paths import minimum_action_path
 from siq.quasipotential.rates import NoiseStrength, mean_residence_time
 from siq.remarks import Remark, sentence

@@ -52,7 +52,7 @@ def _read(data: Mapping[str, Any], fields: Mapping[str, tuple[str, Codec]]) -> d
 
 
 def _maybe(read: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """The same, None of None."""
+    """That encoder or decoder, with None for None."""
     return lambda value: None if value is None else read(value)
 
 

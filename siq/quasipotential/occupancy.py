@@ -114,7 +114,7 @@ class _VisitProcess(CellProcess):
                 self.means[well] = spent.sum() / flow
 
     def of(self, dynamics: Dynamics) -> _VisitProcess | None:
-        """The same of another f; None where that has none."""
+        """The process of another f between these cells and cores; None where it has none."""
         intensity, box, cores, cells = self._given
         try:
             return _VisitProcess(dynamics, intensity, box, cores, cells=cells)

@@ -36,8 +36,8 @@ from siq.inference.field_estimate import FieldEstimate
 from siq.networks.decomposition import NetworksByWell, TrainedNetworks
 from siq.numerics.integration import runge_kutta_step
 from siq.quasipotential.certificate_tests import LEVEL_SHARE
+from siq.quasipotential.global_formula import heights_of_attractors
 from siq.quasipotential.hamilton_jacobi import HamiltonJacobi, PowerBasis
-from siq.quasipotential.landscape import heights_of_attractors
 from siq.quasipotential.wells import Well, grown
 from siq.systems.basins import STARTS_NEAR_ATTRACTOR, Basin, basin_of
 from siq.systems.diffusion import Diffusion

@@ -36,7 +36,7 @@ from siq.quasipotential.path_chains import (
     products,
     total_turn,
 )
-from siq.systems.cycles import Cycle, states_beside
+from siq.systems.cycles import Cycle, states_on_both_sides
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import measure_at
 
@@ -315,7 +315,8 @@ def _downhill(
 
     way = _arriving(
         lambda _, y: dynamics.drift((y * width)[None])[0] / width,
-        states_beside(dynamics, over, width=width, place=place) / width, LONGEST_PERIODS * period, [arrives],
+        states_on_both_sides(dynamics, over, width=width, place=place) / width,
+        LONGEST_PERIODS * period, [arrives],
         rtol=1e-6, atol=1e-8, max_step=period / 40,
     )  # fmt: skip
     if way is None:

@@ -33,6 +33,7 @@ from siq.quasipotential.certificate import (
     Evidence,
     caustics_below,
     certify,
+    certify_wells,
     check_agreement,
     references_about,
     uncertified,
@@ -106,7 +107,7 @@ class RefinementOptions:
     precision: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7
 
     def with_routes(self, *, networks: bool) -> RefinementOptions:
-        """These options with the routes named, where nobody named them: those that there are."""
+        """These options with the routes named, where none were named: those that there are."""
         there: tuple[Route, ...] = ("network", "local") if networks else ("local",)
         return self if self.routes is not None else replace(self, routes=there)
 
@@ -394,26 +395,21 @@ class RefinementContext:
             "networks": self.networks,
             "compared": "network" in (self.options.routes or ()),
         }
-        if formulas.potential is None:
-            certificate = certify(refined.wells, self.evidence, **told)
-            if not certificate.certified and any(well.instead for well in refined.wells):
-                powers = replace(refined, wells=tuple(well.instead or well for well in refined.wells))
-                again = certify(powers.wells, self.evidence, **told)
-                if again.certified:
-                    return powers, _refined_decomposition(powers, self.points), again
+        alone = refined
+        if formulas.potential is not None:
+            error = 0.0
+            if whole is not None and not self.found.noise_free:
+                error = whole.relative_error(refined.found.library.evaluate(self.points))
+            certificate = certify(formulas, self.evidence, relative_error=error, **told)
+            if certificate.certified or not refined.wells:
+                return refined, formulas, certificate
+            # One formula for all wells is an extra. What refuses it is no word against the wells.
+            refused = Remark("quasipotential.single_formula_refused", {"reason": certificate.reason})
+            alone = replace(refined, formula=None, remarks=(*refined.remarks, refused))
+        wells, of_wells = certify_wells(refined.wells, self.evidence, **told)
+        if formulas.potential is not None and not of_wells.certified:
             return refined, formulas, certificate
-        error = 0.0
-        if whole is not None and not self.found.noise_free:
-            error = whole.relative_error(refined.found.library.evaluate(self.points))
-        certificate = certify(formulas, self.evidence, relative_error=error, **told)
-        if certificate.certified or not refined.wells:
-            return refined, formulas, certificate
-        # One formula for all wells is an extra. What refuses it is no word against the wells.
-        refused = Remark("quasipotential.single_formula_refused", {"reason": certificate.reason})
-        alone = replace(refined, formula=None, remarks=(*refined.remarks, refused))
-        of_wells = certify(refined.wells, self.evidence, **told)
-        if not of_wells.certified:
-            return refined, formulas, certificate
+        alone = replace(alone, wells=tuple(well for well in wells if well is not None))
         return alone, _refined_decomposition(alone, self.points), of_wells
 
 

@@ -15,10 +15,11 @@ the barrier (`siq.inference.selection`).
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
 from siq.inference.diffusion_model import defined_states
@@ -31,7 +32,7 @@ from siq.remarks import Remark, sentence
 from siq.systems.basins import sides_of
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
-from siq.systems.equilibria import Equilibrium, measure_at
+from siq.systems.equilibria import Equilibrium, hessian_at, measure_at
 from siq.systems.phase_portrait import PhasePortrait
 
 logger = logging.getLogger(__name__)
@@ -106,7 +107,7 @@ class Transition:
 
     @property
     def downhill(self) -> np.ndarray:
-        """The way down from there without noise, likewise."""
+        """The way down from there without noise, shape ``(n, d)``; empty where none was found."""
         down = None if self.path is None else self.path.downhill
         return np.zeros((0, len(self.saddle.position))) if down is None else down
 
@@ -187,7 +188,7 @@ def missing_diffusion(dynamics: Dynamics) -> str | None:
     """Why there are no escape times for want of D, in words; None where nothing speaks against them.
 
     No noise drives ``dx/dt = v``, where one state is but the derivative of another; a D that is the unit
-    matrix says that it does, and mostly nobody has said so.
+    matrix says that it does, and mostly by default.
     """
     defined = defined_states(dynamics)
     noise = dynamics.diffusion
@@ -307,3 +308,25 @@ def position_standard_errors(found: AnyField, position: np.ndarray) -> np.ndarra
     except np.linalg.LinAlgError:
         return np.full(found.library.dimension, np.nan)
     return np.sqrt(found.variance(np.einsum("k,ij->ikj", found.library.evaluate(position[None])[0], moved)))
+
+
+def progress_along(
+    ways: Sequence[Transition], attractor: Equilibrium | Cycle, dynamics: Dynamics, intensity: float
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Progress of states ``(d, n)`` out of a well: U/ε at the nearest state of its paths of least action.
+
+    Beyond a saddle it rises by one more. A `NumericalFailure` where no path is known.
+    """
+    known = [(way.path, way.downhill) for way in ways if way.path is not None]
+    if not known:
+        raise NumericalFailure("no path leads out of the well, along which a simulation could be split")
+    points = np.concatenate([np.concatenate([path.points, down]) for path, down in known])
+    beyond = [path.action / intensity + np.linspace(0, 1, len(down)) for path, down in known]
+    pairs = zip(known, beyond, strict=True)
+    along = np.concatenate([np.append(path.values / intensity, last) for (path, _), last in pairs])
+    # Near is what the noise about the attractor makes so.
+    root = np.diag(1 / np.ptp(points, axis=0))
+    if isinstance(attractor, Equilibrium):
+        root = np.linalg.cholesky(hessian_at(dynamics, attractor.position))
+    tree = cKDTree(points @ root)
+    return lambda x: np.asarray(along[tree.query(x.T @ root)[1]])

@@ -195,8 +195,7 @@ class Well(Expansion):
             units=self.dynamics.units, title=f"U = 2V is the quasipotential, known up to V = {self.reach!r}",
         )  # fmt: skip
         scaled = [one / sympy.Float(s, DIGITS) for one, s in zip(basis.symbols, basis.scale, strict=True)]
-        terms = [float(one) * unit for one, unit in zip(of_units, basis.unit_terms(scaled), strict=True)]
-        return replace(formula, expression=sympy.Add(formula.expression, *terms))
+        return replace(formula, expression=formula.expression + basis.sum_of_units(of_units, scaled))
 
     def to_text(self) -> str:
         """The formula as text, a line for each definition."""

@@ -68,7 +68,7 @@ class ReportFigure:
     """A figure of the report; it can be downloaded."""
 
     caption: str  #: what the figure shows, in sentences
-    alternative: str  #: what somebody who cannot see it should know of it
+    alternative: str  #: what it shows, for readers who cannot see it
     image: bytes  #: the bytes of the file
     kind: Literal["svg", "png"] = "svg"  #: its format
     vector: bytes | None = None  #: the same as SVG, for the download
@@ -413,7 +413,7 @@ def _solid_view(landscape: LandscapeSummary) -> Markup | None:
     count = len(landscape.names)
     if count < 2:
         return None
-    first, lowest = list(landscape.plane()), landscape.lowest_pass
+    first, lowest = list(landscape.plane()), landscape.lowest_saddle
     shown = sorted([*first, *(place for place in range(count) if place not in first)][:MOST_STATES])
     nodes = min(int(NODES ** (1 / len(shown)) + 1e-9), MOST_NODES)
     axes = [landscape.along(place, nodes) for place in shown]

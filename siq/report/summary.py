@@ -118,11 +118,11 @@ class LandscapeSummary:
     """Wells, exits and U of a landscape."""
 
     names: tuple[str, ...]  #: of the states
-    units: tuple[str, ...]  #: of the states, 1 where nobody said
-    time_unit: str  #: of the recordings, likewise
+    units: tuple[str, ...]  #: of the states, 1 where unknown
+    time_unit: str  #: of the recordings, 1 where unknown
     wells: tuple[WellSummary, ...]  #: the attractors in the order of the tables, as A, B, C and so on
     ways: tuple[Transition, ...]  #: the ways out of the wells
-    noise: NoiseStrength | None  #: that drives the system, None where nobody knows it
+    noise: NoiseStrength | None  #: that drives the system, None where it is unknown
     given: bool = False  #: whether f was given as equations, and not identified from recordings
     run: int = 0  #: the run of a study whose landscape it is
     remarks: tuple[str, ...] = ()  #: what has to be known of it
@@ -165,7 +165,7 @@ class LandscapeSummary:
 
     @property
     def parting(self) -> tuple[np.ndarray, ...]:
-        """Unstable cycles, likewise."""
+        """Unstable cycles, each of shape ``(n, d)`` and closed."""
         return tuple(_closed(cycle) for cycle in self.unstable_cycles)
 
     def potential(self, x: np.ndarray) -> np.ndarray:
@@ -265,7 +265,7 @@ class LandscapeSummary:
         return {**certificate, "stated_error": max([certificate["stated_error"], *known])}
 
     @property
-    def lowest_pass(self) -> np.ndarray:
+    def lowest_saddle(self) -> np.ndarray:
         """Where the lowest saddle lies; the deepest well where there is none."""
         known = [way for way in self.ways if np.isfinite(self.wells[way.start].height + way.barrier)]
         if known:

@@ -21,7 +21,7 @@ import scipy.optimize
 from siq.errors import NumericalFailure
 from siq.numerics.integration import dormand_prince_step, next_step
 from siq.numerics.randomness import representative_subset
-from siq.systems.cycles import Cycle, states_beside
+from siq.systems.cycles import Cycle, states_on_both_sides
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, classify, crossing_rate, distinct_roots, hessian_at
 
@@ -136,7 +136,7 @@ def sides_of(
 ) -> np.ndarray:
     """Where f leads from both sides of a saddle, or of an unstable cycle, see `_ends_of`."""
     place = over if isinstance(over, Cycle) else over.position
-    starts = states_beside(dynamics, place, width=np.ptp(box, axis=1))
+    starts = states_on_both_sides(dynamics, place, width=np.ptp(box, axis=1))
     return _ends_of(dynamics, starts, attractors, cycles, box=box)
 
 

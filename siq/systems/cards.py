@@ -340,7 +340,7 @@ def _parser(
 
 
 def card_of(dynamics: Dynamics) -> str:
-    """A system card, in YAML, with the parameters' values; a domain that nobody knows is left out."""
+    """A system card, in YAML, with the parameters' values; an unknown domain is left out."""
     name = dynamics.name or "system"
     data: dict[str, Any] = {
         "name": name,

@@ -187,7 +187,7 @@ def _unstable_direction(dynamics: Dynamics, cycle: Cycle, place: int = 0, *, sca
     return np.asarray(_unstable_rows(rows, flows, cycle.unstable)[place, 0] * scale)
 
 
-def states_beside(
+def states_on_both_sides(
     dynamics: Dynamics, over: np.ndarray | Cycle, *, width: np.ndarray, place: int = 0
 ) -> np.ndarray:
     """States on both sides of a saddle along its k unstable directions, or of a point of an unstable cycle.

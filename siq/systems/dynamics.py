@@ -27,7 +27,7 @@ from siq.systems.formulas import compile_formulas, compile_values, delay, exact_
 
 TIME = sympy.Symbol("t", real=True)
 Compiled = Callable[..., Sequence[np.ndarray | float]]
-TURN_TOLERANCE = 1e-9  # numerical, of a period: a state at the begin of the domain belongs to it
+TURN_TOLERANCE = 1e-9  # numerical, of a period: a state at the lower end of the domain belongs to it
 JUMP_WIDTHS = 30.0  # widths of a jump over which its derivative is spread
 
 
@@ -290,7 +290,7 @@ class Dynamics:
         Of each state; ``1`` by default.
     domain
         Shape ``(d, 2)``: where the states are expected, in their units; NaN for a state, or None for all of
-        them, where nobody said.
+        them, where not given.
     inputs
         The signals that drive it.
     parameters, covariance
@@ -382,7 +382,7 @@ class Dynamics:
         diffusion
             D, as `Diffusion`, as a matrix ``(d, d)``, or as rows of formulas.
         domain
-            Two limits a state, where somebody says them.
+            Two limits a state, where they are given.
         parameters
             Real symbols of f that may take other values, with the values that they have.
         periodic
@@ -411,7 +411,7 @@ class Dynamics:
 
     @property
     def box(self) -> np.ndarray:
-        """The domain, shape ``(d, 2)``, where it has to be known; raises ValueError where nobody said it."""
+        """The domain, shape ``(d, 2)``, where it has to be known; raises ValueError where it is not given."""
         unknown = [name for name, ends in zip(self.states, self.limits, strict=True) if np.isnan(ends).any()]
         if unknown:
             raise Fault(f"no domain of {', '.join(unknown)} is known", "give the limits of each state")
@@ -419,7 +419,7 @@ class Dynamics:
 
     @property
     def limits(self) -> np.ndarray:
-        """The domain as far as it is known, shape ``(d, 2)``: NaN for a state of which nobody said it."""
+        """The domain as far as it is known, shape ``(d, 2)``: NaN where it is not given."""
         return np.full((self.dimension, 2), np.nan) if self.domain is None else self.domain
 
     @cached_property
@@ -444,7 +444,7 @@ class Dynamics:
         return x - self.turns(x) * self.periods
 
     def unwrapped(self) -> Dynamics:
-        """The same on three periods of each periodic state, the domain being the middle one."""
+        """These dynamics on three periods of each periodic state, the domain being the middle one."""
         return replace(
             self, domain=self.limits + np.stack([-self.periods, self.periods], axis=1), periodic=()
         )

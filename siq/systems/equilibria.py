@@ -3,7 +3,7 @@
 Equilibria of an identified f are sought from the recorded points alone; nobody says how many there are, or
 where.
 
-Noise that acts on velocities alone moves positions all the same: dx/dt = v. It *reaches* a state if it acts
+Noise that acts on velocities alone moves positions, too: dx/dt = v. It *reaches* a state if it acts
 on it, or on a state that stands in its equation, or on one that stands in the equation of that one, and so
 on. About an equilibrium with Jacobian J this is Kalman's condition: the linear dynamics can be steered
 everywhere by D = σσᵀ if ``(σ, Jσ, J²σ, …)`` has full rank, and then, and only then, W of ``J W + W Jᵀ =
@@ -50,7 +50,7 @@ class Equilibrium:
     """A state at which f vanishes.
 
     ``attractor``: all real parts of eigenvalues are negative. ``saddle``: some of each, or of one state the
-    positive one: the top between two wells is the pass between them. ``repeller``: all positive, of several
+    positive one: the top between two wells is the saddle between them. ``repeller``: all positive, of several
     states. ``degenerate``: a real part is zero to rounding, and the linearisation decides nothing.
     """
 

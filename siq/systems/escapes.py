@@ -39,13 +39,11 @@ from scipy import special
 from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
-from siq.numerics.integration import heun_step, runge_kutta_step
+from siq.numerics.integration import Field, heun_step, runge_kutta_step
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
 from siq.systems.simulation import noise_source
-
-Field = Callable[[np.ndarray], np.ndarray]
 
 STEP = 0.1  # of the shortest time of the linearised equations
 SETTLED = 0.1  # of the level of a neighbourhood: without noise, one who has escaped gets so far down
@@ -87,7 +85,7 @@ class Neighbourhood:
         return cls(np.asarray(attractor, dtype=float), hessian_at(dynamics, attractor), level)
 
     def moved(self, shift: np.ndarray) -> Neighbourhood:
-        """The same a displacement ``(d,)`` on."""
+        """The neighbourhood, moved by a displacement ``(d,)``."""
         cycle = None if self.cycle is None else replace(self.cycle, points=self.cycle.points + shift)
         return replace(self, center=self.center + shift, cycle=cycle)
 

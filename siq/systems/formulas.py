@@ -1,4 +1,4 @@
-"""Formulas of people: text, checked against a whitelist, to sympy, numpy, machine code and other languages.
+"""Formulas: from text, checked against a whitelist, to sympy, numpy, machine code and other languages.
 
 A formula is data. Its text is parsed into a syntax tree, of which only numbers, declared names, the operators
 ``+ - * / **`` and named functions are accepted; the sympy expression is then built node by node. Nothing is

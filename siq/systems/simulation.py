@@ -6,7 +6,7 @@ at once; the arrays hold components first, ``(d, trajectories)``, so that each c
 The step of a pair follows from the fastest rate of the Jacobian over the card's domain, the length of a
 trajectory from the slowest relaxation to an attractor.
 
-A simulator of somebody else has no equations to read, and is asked instead: `with_simulator`.
+An external simulator has no equations to read, and is asked instead: `with_simulator`.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class SimulationEntry:
     noise_intensity: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
 
     def completed(self, dynamics: Dynamics) -> SimulationEntry:
-        """The same with values from the rates of what is simulated, over its domain, where it has none."""
+        """The entry with missing values filled in from the rates of what is simulated, over its domain."""
         if self.pair_step is not None and self.interval is not None:
             return self
         fastest, slowest = _rates(dynamics)

@@ -85,7 +85,7 @@ class _ReferenceSystem:
     about: str  #: in a sentence
     source: str  #: where it comes from
     dynamics: Dynamics  #: f, D and the domain
-    quasipotential: sympy.Expr | None  #: U in the whole domain, up to a constant; None where nobody knows it
+    quasipotential: sympy.Expr | None  #: U in the whole domain, up to a constant; None where it is unknown
     barriers: tuple[_KnownBarrier, ...]  #: between attractors, known exactly or by two methods
 
 
@@ -302,7 +302,7 @@ def _exact(
 
 
 def _computed_twice(name: str, about: str, source: str, dynamics: Dynamics) -> _ReferenceSystem:
-    """A system of which nobody knows a formula of U, and two methods the barriers."""
+    """A system without a known formula of U, of which two methods give the barriers."""
     return _ReferenceSystem(name, about, source, dynamics, None, DOUBLY_COMPUTED[name])
 
 

@@ -1,4 +1,4 @@
-"""What came of a study or a diagnosis, in one sentence, with the exit code that says the same; and from what.
+"""The answer of a study or a diagnosis in one sentence and an exit code, and the provenance of its files.
 
 Beside every page lies ``provenance.jsonl``: a line for each job, with the digests of all that it read and
 made, the versions of the programs, seed, machine and time.

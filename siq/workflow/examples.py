@@ -21,7 +21,7 @@ from siq.systems.cards import check_title
 
 STUDIES = (".yaml", ".yml")  # what files end in that are studies, and no recordings
 GENERATED = Path(".snakemake", "siq")
-"""Where studies lie that were written for a file of recordings: no result, and of use to nobody else."""
+"""Where studies lie that were written for a file of recordings: neither results nor of use elsewhere."""
 
 
 def name_for(path: Path) -> str:

@@ -45,7 +45,7 @@ SECONDS = {
 Only their ratios matter once a job has ended: the speed of the machine then follows."""
 
 OF_SNAKEMAKE = "Using workflow specific profile"
-"""What Snakemake prints before it has a logger, of use to nobody here."""
+"""What Snakemake prints before it has a logger, of no use here."""
 
 EVERY = 15.0
 """Seconds between lines where they are kept, as in a log; a choice."""

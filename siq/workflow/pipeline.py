@@ -178,7 +178,7 @@ def _regressed(
         recordings.names, degree=options.degree, potential_degree=options.potential_degree,
         circulatory_degree=options.circulatory_degree, further=options.functions,
     )  # fmt: skip
-    # D that nobody gave is that of the networks, in their precision.
+    # A D that was not given is that of the networks, in their precision.
     noise = settings.space.constant_noise(points.shape[1]) or Diffusion(networks.diffusion)
     parts = (points[below], potential[below], circulatory[below], vector_field[below])
     result = sparse_decomposition(library, *parts, diffusion=noise, options=options)

@@ -88,7 +88,7 @@ class SweptParameter(BaseModel):
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """The values in rising order, each as somebody would write it: 8.1, and not 8.100000000000001."""
+        """The values in rising order, each as one would write it: 8.1, and not 8.100000000000001."""
         if self.values is not None:
             return tuple(sorted(set(self.values)))
         first, last, step = (Decimal(repr(one)) for one in (self.first, self.last, self.step))
@@ -129,16 +129,17 @@ class SweepOptions(SweptParameter):
             return tuple((one,) for one in self.numbers)
         return tuple((one, other) for one in self.numbers for other in self.second.numbers)
 
+    @property
+    def point_names(self) -> list[str]:
+        """How the file of each point is called: ``K=8.1``, or ``K=8.1,h=0.5``."""
+        pairs = (zip(self.names, values, strict=True) for values in self.points)
+        return [",".join(f"{name}={value:.12g}" for name, value in each) for each in pairs]
 
-def point_name(names: tuple[str, ...], values: tuple[float, ...]) -> str:
-    """How the file of a point is called: ``K=8.1``, or ``K=8.1,h=0.5``."""
-    return ",".join(f"{name}={value:.12g}" for name, value in zip(names, values, strict=True))
-
-
-def point_values(name: str) -> tuple[tuple[str, ...], tuple[float, ...]]:
-    """Names and values of a point from the name of its file."""
-    parts = [one.partition("=") for one in name.split(",")]
-    return tuple(part[0] for part in parts), tuple(float(part[2]) for part in parts)
+    @staticmethod
+    def of_point(name: str) -> tuple[tuple[str, ...], tuple[float, ...]]:
+        """Names and values of the parameters at a point, from the name of its file."""
+        parts = [one.partition("=") for one in name.split(",")]
+        return tuple(part[0] for part in parts), tuple(float(part[2]) for part in parts)
 
 
 Entrance = Literal["trajectories", "equations"]
@@ -447,10 +448,10 @@ class StateSpace:
     names
         Of the states, in order; None where the recordings tell.
     units
-        Unit of each state by name, and of the time as ``t``; None where nobody said.
+        Unit of each state by name, and of the time as ``t``; None where not given.
     diffusion
         D: ``identity``, its diagonal, or the matrix, of numbers or formulas of the states, in their units
-        squared per unit of time; None where nobody said, see `siq.inference.field_estimate`.
+        squared per unit of time; None where not given, see `siq.inference.field_estimate`.
     """
 
     names: tuple[str, ...] | None = None
@@ -458,7 +459,7 @@ class StateSpace:
     diffusion: DiffusionEntry | None = None
 
     def noise(self, states: Sequence[str]) -> Diffusion | None:
-        """D of the states by their names in formulas, None where nobody said."""
+        """D of the states by their names in formulas, None where not given."""
         if self.diffusion is None:
             return None
         return Diffusion.of_rows(
@@ -466,7 +467,7 @@ class StateSpace:
         )
 
     def constant_noise(self, dimension: int) -> Diffusion | None:
-        """D of so many states where it is the same everywhere, None where nobody said.
+        """D of so many states where it is the same everywhere, None where not given.
 
         Raises
         ------
@@ -587,7 +588,7 @@ def settings_of(study: Study, system: Dynamics | None) -> PipelineSettings:
     )  # fmt: skip
 
 
-def card_content_beside(card: str | None, names: Sequence[str]) -> list[Any] | None:
+def card_content_but_for(card: str | None, names: Sequence[str]) -> list[Any] | None:
     """What a sweep takes from a card, as plain data: all but titles and the values of what is swept."""
     if card is None:
         return None

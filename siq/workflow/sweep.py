@@ -337,7 +337,7 @@ def _exits(point: SweptPoint, index: int, number: Sequence[int], noise: float | 
     mine = [way for way in point.ways if way.start == index]
     known = [way for way in mine if way.barrier is not None]
     if not known:
-        # Beside a limit cycle, or another well, it can be left although nobody knows how.
+        # Beside a limit cycle, or another well, it can be left in an unknown way.
         alone = len(point.wells) == 1 and not point.notes and not mine
         told = "; ".join(dict.fromkeys(way.note for way in mine if way.note))
         return {"note": ALONE if alone else told or "; ".join(point.notes) or UNKNOWN}
@@ -347,9 +347,9 @@ def _exits(point: SweptPoint, index: int, number: Sequence[int], noise: float | 
         [way.as_exit() for way in mine], None if noise is None else NoiseStrength(noise)
     )
     if noise is not None and time is None:
-        notes.append(f"no time: the noise {noise:g} is not below the barrier, or the law has no prefactor")
+        notes.append(sentence(Remark("workflow.no_time_in_noise", {"noise": noise})))
     if time is not None and not time.complete:
-        notes.append("a way out has no rate: the well lasts no longer than this")
+        notes.append(sentence(Remark("workflow.exit_without_rate")))
     return {
         "barrier": lowest.barrier,
         "exit": None if lowest.end is None else number[lowest.end],

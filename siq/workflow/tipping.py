@@ -1,4 +1,4 @@
-"""How likely has a well been left, by some time, while a parameter drifts?
+"""Tipping: the probability that a well has been left while a parameter drifts, and early warning by a record.
 
 As long as the parameter changes slowly, a well is left at the rate r of the moment, and
 
@@ -51,6 +51,7 @@ from siq.inference.kalman_filter import whiten
 from siq.inference.maximum_likelihood import first_noise, fit_by_filter, noise_uncertainty
 from siq.inference.measurements import first_states, measurements
 from siq.numerics.text import listed
+from siq.quasipotential.fokker_planck import exchange_rates
 from siq.quasipotential.rates import MIN_BARRIER_OVER_NOISE
 from siq.remarks import Remark, sentence
 from siq.systems.diffusion import Diffusion
@@ -152,13 +153,10 @@ def probability_of_tipping(
     integral = np.where(ended, np.inf, integral)
     valid = error < 1 / MIN_BARRIER_OVER_NOISE
     reasons = [
-        (ended, "the well has ended"),
-        (unknown & ~ended, "the sweep knows no rate of this well here, or knew none before"),
-        (
-            ~valid & (law > drift),
-            f"it was left where its barrier is below {MIN_BARRIER_OVER_NOISE:g} times the noise",
-        ),
-        (~valid & (drift >= law), "the parameter changes faster than the well relaxes"),
+        (ended, Remark("workflow.well_has_ended")),
+        (unknown & ~ended, Remark("workflow.rate_unknown")),
+        (~valid & (law > drift), Remark("workflow.left_without_law", {"ratio": MIN_BARRIER_OVER_NOISE})),
+        (~valid & (drift >= law), Remark("workflow.drift_faster_than_relaxation")),
     ]
     at = np.searchsorted(fine, times)
     return pd.DataFrame(
@@ -171,7 +169,7 @@ def probability_of_tipping(
             "drift_error": drift[at],
             "error": error[at],
             "valid": valid[at],
-            "note": [next((text for holds, text in reasons if holds[k]), "") for k in at],
+            "note": [next((sentence(remark) for holds, remark in reasons if holds[k]), "") for k in at],
         }
     )
 
@@ -179,7 +177,7 @@ def probability_of_tipping(
 def _regimes(
     found: Sweep, well: int, noise: float, value: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Where no way leads out of a well, no law holds, nobody knows the rate or did before, and it has ended.
+    """Where no way leads out of a well, no law holds, no rate is known or was before, and it has ended.
 
     Between two values of the sweep both have a say. Between one without a way out and one with a rate, this
     rate is taken, which is too high.
@@ -266,7 +264,7 @@ class _EarlyWarning(NamedTuple):
         That the state has been left by later times: ``time probability lower upper``. The probability is the
         mean over all that the record leaves open, and the interval holds 90 % of that.
     falling
-        The probability that the barrier is lower at the end of the record than at its begin; where a draw
+        The probability that the barrier is lower at the end of the record than at its start; where a draw
         has no saddle near the record at either, that the state relaxes more slowly.
     weights
         Of the equations that were averaged over, by how many powers of x they have, and how many of them
@@ -503,7 +501,7 @@ def _contradictions(rest: np.ndarray, x: np.ndarray, t: np.ndarray) -> tuple[Rem
 class _DrawnProcess:
     """Fokker–Planck operators of drawn equations on the same cells, shape ``(draws, cells)``.
 
-    Neighbouring cells exchange at Scharfetter and Gummel's rates ``(Q/2h²) B(ΔU/ε)``, ``B(z) = z/(eᶻ - 1)``.
+    Neighbouring cells exchange at Scharfetter and Gummel's rates, with ``z = -ΔU/ε`` and ``a = Q/2``.
     Tridiagonal systems of all draws are solved as one. Beyond both ends all is absorbed.
     """
 
@@ -546,12 +544,11 @@ class _DrawnProcess:
     def _solved(self, u: np.ndarray, inside: np.ndarray, right: np.ndarray, *, dt: float) -> np.ndarray:
         """Densities p, zero outside, with ``p - dt L p = right``; with an infinite dt, ``-L p = right``."""
         scale = self.noise[:, None] / (2 * (self.x[1] - self.x[0]) ** 2)
-        rise, edge = np.diff(u, axis=1), np.zeros((len(u), 1))
-        up, down = (scale / scipy.special.exprel(np.clip(one, -700, 700)) for one in (rise, -rise))
+        up, down = exchange_rates(-np.diff(u, axis=1), scale)
         # Out of each cell to the right and to the left; nothing comes back from outside.
         up, down = inside * np.hstack([up, scale]), inside * np.hstack([scale, down])
         own, dt = (1.0, dt) if np.isfinite(dt) else (1.0 * ~inside, 1.0)
-        above, below = np.hstack([edge, down[:, 1:]]), np.hstack([up[:, :-1], edge])
+        above, below = np.pad(down[:, 1:], [(0, 0), (1, 0)]), np.pad(up[:, :-1], [(0, 0), (0, 1)])
         bands = np.stack([one.ravel() for one in (-dt * above, own + dt * (up + down), -dt * below)])
         solved = solve_banded((1, 1), bands, np.where(inside, right, 0.0).ravel(), check_finite=False)
         return np.where(inside, solved.reshape(u.shape), 0.0)

@@ -1,4 +1,4 @@
-"""Whether results are what they say: their files by digests, their numbers derived again from the recordings.
+"""Verification of results: files by their digests, numbers derived again from the recordings.
 
 The files are compared with ``provenance.jsonl``, in which each step has written what it read and made. Then
 trajectories are drawn from the recordings again, f and D identified and the certificate computed, by the
@@ -184,7 +184,7 @@ def _of_equations(study: Study, card: Path | None, kept: Provenance) -> Iterator
 
 def _field(one: Dynamics, other: Dynamics, x: np.ndarray) -> Iterator[Finding]:
     """The largest difference of f and of D at recorded states, as a share of the largest there."""
-    if one.dimension != x.shape[1] or other.dimension != x.shape[1]:  # velocities that nobody recorded
+    if one.dimension != x.shape[1] or other.dimension != x.shape[1]:  # velocities that were not recorded
         error = 0.0 if list(map(str, one.formulas)) == list(map(str, other.formulas)) else np.inf
     else:
         pairs = ((one.drift(x), other.drift(x)), (one.diffusion.at(x), other.diffusion.at(x)))

@@ -11,9 +11,10 @@ import scipy.stats
 
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.inference.claims import _as_normal, _combined, _foreseen, check_claims
-from siq.inference.field_estimate import FieldEstimate, FlowMap, Verdict
+from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.inference.library import IdentificationOptions, field_library
 from siq.inference.regression import refit
+from siq.numerics.integration import FlowMap
 from siq.systems.diffusion import Diffusion
 
 STEP, WITHIN, INTENSITY, LIMIT = 0.05, 4, 0.25, 0.05 / 8

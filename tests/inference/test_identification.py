@@ -18,7 +18,7 @@ from known_systems import (
 
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.errors import NumericalFailure
-from siq.inference.field_estimate import FieldEstimate, FlowMap
+from siq.inference.field_estimate import FieldEstimate
 from siq.inference.library import IdentificationOptions, candidate_library, field_library
 from siq.inference.regression import (
     _evenly,
@@ -27,7 +27,7 @@ from siq.inference.regression import (
     refit,
     residuals,
 )
-from siq.numerics.integration import dormand_prince_step
+from siq.numerics.integration import FlowMap, dormand_prince_step
 from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
 

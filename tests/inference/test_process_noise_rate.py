@@ -12,9 +12,9 @@ import siq
 from siq.data.recordings import snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.diffusion_model import with_process_noise_rate
-from siq.inference.field_estimate import FlowMap
 from siq.inference.library import IdentificationOptions, field_library
 from siq.inference.regression import identify_vector_field
+from siq.numerics.integration import FlowMap
 
 SYSTEMS = {
     "one state, relaxing twice a second": (np.array([[-2.0]]), np.array([[0.25]])),

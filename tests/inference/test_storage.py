@@ -12,7 +12,6 @@ from siq.errors import InputError
 from siq.inference.field_estimate import (
     DiffusionSource,
     FieldEstimate,
-    FlowMap,
     NoiseDiagnosis,
     NoiseFormula,
     Verdict,
@@ -20,6 +19,7 @@ from siq.inference.field_estimate import (
     write_field,
 )
 from siq.inference.library import IdentificationOptions, field_library
+from siq.numerics.integration import FlowMap
 from siq.remarks import Remark
 from siq.systems.diffusion import Diffusion
 

@@ -8,7 +8,7 @@ from known_systems import potential_values, uniform_points
 from known_wells import matched, stationary
 
 from siq.errors import NumericalFailure
-from siq.quasipotential.landscape import MOST_WELLS, GlobalQuasipotential, heights_of_attractors
+from siq.quasipotential.global_formula import MOST_WELLS, GlobalQuasipotential, heights_of_attractors
 
 NONE = np.inf
 

@@ -9,12 +9,10 @@ import scipy.stats
 import sympy
 from known_systems import exact_archetype
 
+from benchmarks.publication.publication import normalisation_bessel
 from siq.errors import NumericalFailure
 from siq.numerics.randomness import generator
-from siq.quasipotential.invariant_density import (
-    marginal_density,
-    normalisation_bessel,
-)
+from siq.quasipotential.invariant_density import marginal_density
 from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import simulate_stationary
 

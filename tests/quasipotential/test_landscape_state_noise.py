@@ -7,8 +7,8 @@ import pytest
 from known_noise import exit_time, multiplicative, one_state, potential_of_one_state
 from known_systems import KnownSystem, portrait_of, potential_gradient, potential_values
 
+from siq.quasipotential.global_formula import GlobalQuasipotential
 from siq.quasipotential.invariant_density import SampledPotential
-from siq.quasipotential.landscape import GlobalQuasipotential
 from siq.quasipotential.path_chains import PathProblem, _Across
 from siq.quasipotential.paths import minimum_action_path
 from siq.quasipotential.rates import escape_rate

@@ -9,8 +9,9 @@ from siq.data.kinetics import continued_visits
 from siq.data.preparation import in_stretches
 from siq.data.recordings import Recordings
 from siq.data.states import SIGNIFICANCE, DwellCount
-from siq.inference.field_estimate import FieldEstimate, FlowMap
+from siq.inference.field_estimate import FieldEstimate
 from siq.inference.library import IdentificationOptions, field_library
+from siq.numerics.integration import FlowMap
 from siq.quasipotential.fokker_planck import cores_about
 from siq.quasipotential.occupancy import _as_sampled, _core_of, _VisitProcess, check_occupancy
 from siq.quasipotential.rates import NoiseStrength

@@ -50,10 +50,10 @@ def test_the_wells_carry_the_certificate_where_one_formula_is_refused(
         refinement, "_refined_decomposition", lambda one, _: SimpleNamespace(potential=one.formula)
     )
 
-    def certified(one: Any, *_: Any, **__: Any) -> Certificate:
-        return certificate(wells, "wells") if one == (well,) else certificate(formula, "region")
-
-    monkeypatch.setattr(refinement, "certify", certified)
+    monkeypatch.setattr(refinement, "certify", lambda *_, **__: certificate(formula, "region"))
+    monkeypatch.setattr(
+        refinement, "certify_wells", lambda given, *_, **__: (list(given), certificate(wells, "wells"))
+    )
     context: Any = SimpleNamespace(
         found=found.found, portrait=None, points=None, number=0, evidence=None, networks=None,
         options=RefinementOptions(),

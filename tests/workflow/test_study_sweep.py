@@ -3,7 +3,7 @@
 import pytest
 from pydantic import ValidationError
 
-from siq.workflow.study import Study, SweepOptions, point_name, point_values
+from siq.workflow.study import Study, SweepOptions
 
 BASE = {"name": "s", "system": "toggle", "from": "equations"}
 
@@ -11,14 +11,13 @@ BASE = {"name": "s", "system": "toggle", "from": "equations"}
 def test_values_are_written_as_somebody_would():
     options = SweepOptions.model_validate({"parameter": "K", "from": 8, "to": 12, "step": 0.1})
     assert len(options.numbers) == 41 and options.numbers[1] == 8.1 and options.numbers[-1] == 12
-    assert [point_name(("K",), (one,)) for one in options.numbers[:3]] == ["K=8", "K=8.1", "K=8.2"]
+    assert options.point_names[:3] == ["K=8", "K=8.1", "K=8.2"]
 
 
 def test_another_range_has_the_same_names_where_they_overlap():
     def names(first, last):
         asked = {"parameter": "K", "from": first, "to": last, "step": 0.1}
-        options = SweepOptions.model_validate(asked)
-        return {point_name(options.names, values) for values in options.points}
+        return set(SweepOptions.model_validate(asked).point_names)
 
     assert names(8, 9) < names(7, 12)
 
@@ -26,9 +25,10 @@ def test_another_range_has_the_same_names_where_they_overlap():
 def test_two_parameters_are_combined():
     second = {"parameter": "h", "values": [0.5, -1e-5]}
     options = SweepOptions.model_validate({"parameter": "K", "values": [2, 1], "second": second})
-    names = [point_name(options.names, values) for values in options.points]
+    names = options.point_names
     assert names == ["K=1,h=-1e-05", "K=1,h=0.5", "K=2,h=-1e-05", "K=2,h=0.5"]
-    assert [point_values(name) for name in names] == [(("K", "h"), values) for values in options.points]
+    points = [(("K", "h"), values) for values in options.points]
+    assert [SweepOptions.of_point(name) for name in names] == points
 
 
 @pytest.mark.parametrize(

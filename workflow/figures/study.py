@@ -16,7 +16,8 @@ from siq.networks.decomposition import AnyNetworks
 from siq.networks.regression import highest_used, points_below
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.formulas import SymbolicDecomposition
-from siq.quasipotential.landscape import GlobalQuasipotential, Landscape
+from siq.quasipotential.global_formula import GlobalQuasipotential
+from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_comparison import Potential, ReferenceLandscape
 from siq.report.plots.prediction import residuals_figure
 from siq.report.plots.quasipotential import quasipotential_figure

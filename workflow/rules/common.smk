@@ -11,7 +11,6 @@ from siq.errors import InputError
 from siq.numerics.files import files_of
 from siq.report.formatting import texts
 from siq.workflow.answers import Exit, Provenance, answer_of_page
-from siq.workflow.study import point_name
 from workflow.places import config_path, find_file
 from workflow.published import load_published
 from workflow.settings import Studies, prepare_environment
@@ -78,9 +77,7 @@ def tables(*names, of="results/{study}/tables"):
 def points_of_sweep(wildcards):
     """Input function: a file for every point of a sweep."""
     swept = study_of(wildcards).study.sweep
-    names = (
-        [] if swept is None else [point_name(swept.names, one) for one in swept.points]
-    )
+    names = [] if swept is None else swept.point_names
     return expand(
         "results/{study}/sweep/{point}.json", study=wildcards.study, point=names
     )

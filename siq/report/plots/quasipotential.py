@@ -49,13 +49,13 @@ def _on_plane(
     rest = [place for place in range(len(landscape.names)) if place not in shown]
     count = POINTS_OF_MORE if rest and view == "projection" else POINTS
     x1, x2 = (landscape.along(place, count) for place in shown)
-    at = landscape.lowest_pass
+    at = landscape.lowest_saddle
     grid = np.tile(at, (count * count, 1))
     grid[:, shown] = np.stack(np.meshgrid(x1, x2, indexing="ij"), axis=-1).reshape(-1, 2)
     sentence = ""
     if rest and view == "section":
         held = ", ".join(f"{landscape.names[place]} = {at[place]:.3g}" for place in rest)
-        sentence = f"Section at {held}, through the lowest pass"
+        sentence = f"Section at {held}, through the lowest saddle"
     elif rest:
         sentence = f"Projection: the lowest $U$ over {', '.join(landscape.names[place] for place in rest)}"
     projected = rest and view == "projection"
@@ -176,7 +176,7 @@ def plot_quasipotential(
     legend: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw U with its wells, passes and most probable paths, and the recorded states.
+    """Draw U with its wells, saddles and most probable paths, and the recorded states.
 
     Main arguments
     --------------
@@ -193,7 +193,7 @@ def plot_quasipotential(
         which the wells lie apart.
     view
         Of three states and more: ``projection`` draws the lowest U that the other states allow, on which
-        wells and passes keep their heights; ``section`` holds the others at the lowest pass.
+        wells and saddles keep their heights; ``section`` holds the others at the lowest saddle.
     legend
         Whether to say below the axes what the signs mean.
     ax
@@ -383,7 +383,7 @@ def _draw_ways(axes: Axes, landscape: LandscapeSummary, shown: tuple[int, int]) 
 
 
 def draw_equilibria(axes: Axes, landscape: LandscapeSummary, shown: tuple[int, int]) -> list[Any]:
-    """Draw wells with their letters, and passes."""
+    """Draw wells with their letters, and saddles."""
     low, high = landscape.box[list(shown)].T
     marks = [(one, SADDLE) for one in landscape.saddles] + [(one, WELL) for one in landscape.wells]
     for lines, drawn_as in ((landscape.cycles, CYCLE), (landscape.parting, PARTING)):
@@ -412,12 +412,12 @@ def _names_of_marks(landscape: LandscapeSummary) -> list[Any]:
 
 
 def name_energy(axes: Axes, landscape: LandscapeSummary, largest: float, what: str = "$U$") -> None:
-    """U and its unit at the upright axis, with a power of ten where numbers are unhandy."""
+    """U and its unit at the upright axis, with a power of ten where numbers are unwieldy."""
     axes.set_ylabel(scaled_label(axes.yaxis, what, landscape.energy_unit or "unit of ε", largest))
 
 
 def name_axes(axes: Axes, landscape: LandscapeSummary, shown: Sequence[int]) -> None:
-    """Names and units of states at the axes, with a power of ten where numbers are unhandy."""
+    """Names and units of states at the axes, with a power of ten where numbers are unwieldy."""
     for axis, place in zip((axes.xaxis, axes.yaxis), shown, strict=False):
         largest = float(np.abs(landscape.box[place]).max())
         label = scaled_label(axis, f"${name_label(landscape.names[place])}$", landscape.units[place], largest)

@@ -124,7 +124,7 @@ def _states_figure(found: Inspection, hops: RecordStates) -> Figure:
         stays.set(xlabel=f"stay {time_label}".strip(), ylabel="share that last longer", yscale="log")
         stays.legend()
     else:
-        say(stays, "no stay was seen from its begin to its end")
+        say(stays, "no stay was seen from beginning to end")
     return figure
 
 

@@ -128,7 +128,7 @@ def name_label(name: str) -> str:
 
 
 def unit_label(unit: str) -> str:
-    """Write a unit behind a name: ``(mV)``; ``1`` is that of a plain number, and nothing that of nobody."""
+    """A unit behind a name: ``(mV)``; ``(dimensionless)`` for ``1``, nothing where none is known."""
     if unit == "":
         return ""
     return "(dimensionless)" if unit == "1" else f"({unit_text(unit)})"

@@ -44,7 +44,7 @@ from siq.report.summary import LandscapeSummary, summarise
 if TYPE_CHECKING:
     from siq.data.recordings import Recordings
 
-_Join = tuple[tuple[int, ...], tuple[int, ...], float]  # the wells on both sides of a pass, and U at it
+_Join = tuple[tuple[int, ...], tuple[int, ...], float]  # the wells on both sides of a saddle, and U at it
 
 COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY_BLUE)
 
@@ -79,7 +79,7 @@ def plot_wells(
     -------
     matplotlib.axes.Axes
         A colour for each well. Of one state its curve of U; of two and more its states, and a line around
-        those that lie below its lowest pass. A state is the well's whose formula holds there and gives the
+        those that lie below its lowest saddle. A state is the well's whose formula holds there and gives the
         lowest U; one where no formula holds is grey.
 
     Examples
@@ -117,7 +117,7 @@ def plot_wells(
 def plot_paths(
     landscape: Landscape | LandscapeSummary, *, legend: bool = True, ax: Axes | None = None
 ) -> Axes:
-    """Draw U along the most probable way out of each well, over its pass, and down into the next.
+    """Draw U along the most probable way out of each well, over its saddle, and down into the next.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def plot_paths(
     Returns
     -------
     matplotlib.axes.Axes
-        U against the distance from the pass along the way. Of two wells the one that comes first in the
+        U against the distance from the saddle along the way. Of two wells the one that comes first in the
         tables is on the left, so that a way and the way back lie on one another where they are the same.
         Where the states have different units the distance is a share of the region that is shown.
 
@@ -190,7 +190,7 @@ def plot_paths(
 def _profile(
     landscape: LandscapeSummary, way: Transition, scale: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distance along a way, zero at the pass, and U there: by the action uphill, by the formulas downhill."""
+    """Distance along a way, zero at the saddle, and U: by the action uphill, by the formulas downhill."""
     up, down = way.uphill, way.downhill[1:]
     points = np.concatenate([up, down])
     steps = np.linalg.norm(np.diff(points / scale, axis=0), axis=1)
@@ -283,7 +283,7 @@ def _draw_states(
         if place < 0 and rows.any():
             handles.append(Line2D([], [], linestyle="none", marker=".", color=GREY, label="no formula holds"))
     if len(landscape.names) == 2:
-        # Around each well the line of U at the height of its lowest pass.
+        # Around each well the line of U at the height of its lowest saddle.
         x1, x2 = landscape.along(0, POINTS), landscape.along(1, POINTS)
         grid = np.stack(np.meshgrid(x1, x2, indexing="ij"), axis=-1).reshape(-1, 2)
         for place, well in known:
@@ -305,7 +305,7 @@ OPEN = 0.14  # of the height of the picture: how far a way out of the recorded r
 
 
 def plot_barriers(landscape: Landscape | LandscapeSummary, *, ax: Axes | None = None) -> Axes:
-    """Draw the wells as a tree: each hangs as deep as it is, and joins the next at the height of their pass.
+    """Draw the wells as a tree: each hangs as deep as it is, and joins the next at their saddle.
 
     Parameters
     ----------
@@ -317,7 +317,7 @@ def plot_barriers(landscape: Landscape | LandscapeSummary, *, ax: Axes | None = 
     Returns
     -------
     matplotlib.axes.Axes
-        A column for each well, from U at its bottom up to the lowest pass that leads out of it, with ΔU and
+        A column for each well, from U at its bottom up to the lowest saddle that leads out of it, with ΔU and
         its standard error below, as a bar at the top too. A dashed column is left out of the recorded region.
         Where the heights of the wells are not known, each column begins at zero.
 
@@ -378,7 +378,7 @@ def plot_barriers(landscape: Landscape | LandscapeSummary, *, ax: Axes | None = 
 
 
 def _with_error(value: float, error: float, *, broken: bool) -> str:
-    """A barrier with its error, without the digits that nobody reads; on two lines where there is no room."""
+    """A barrier with its error, without digits that mean nothing; on two lines where there is no room."""
     if not (np.isfinite(error) and error > NO_ERROR * abs(value)):
         return magnitude_label(value, digits=4)
     text = mean_and_spread(value, error)
@@ -386,16 +386,16 @@ def _with_error(value: float, error: float, *, broken: bool) -> str:
 
 
 def _joined(landscape: LandscapeSummary) -> tuple[list[_Join], tuple[int, ...]]:
-    """How wells join into one, from the lowest pass to the highest; their order, without crossings."""
+    """How wells join into one, from the lowest saddle to the highest; their order, without crossings."""
     wells = landscape.wells
     groups: dict[int, tuple[int, ...]] = {well: (well,) for well in range(len(wells))}
-    passes = sorted(
+    saddles = sorted(
         (wells[way.start].height + way.barrier, way.start, way.end)
         for way in landscape.ways
         if way.end is not None and np.isfinite(way.barrier) and landscape.matched
     )
     joins: list[_Join] = []
-    for height, start, end in passes:
+    for height, start, end in saddles:
         left, right = sorted((groups[start], groups[end]), key=min)
         if left != right:
             joins.append((left, right, height))
