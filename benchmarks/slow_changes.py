@@ -21,9 +21,10 @@ from benchmarks.hostile.records import Record, Scene, Series, double_wells
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.inference.checks import PredictionLimits
 from siq.inference.claims import check_claims
-from siq.inference.field_estimate import FieldEstimate, FlowMap, Verdict
+from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.inference.library import IdentificationOptions, field_library
 from siq.inference.regression import refit
+from siq.numerics.integration import FlowMap
 from siq.systems.diffusion import Diffusion
 
 LIBRARY = field_library(["x"], IdentificationOptions(degree=3))
