@@ -664,7 +664,11 @@ class Landscape:
         return np.where(turning[:, None], limits, box)
 
     def _along_paths(self, well: int, intensity: float) -> Callable[[np.ndarray], np.ndarray]:
-        """Progress by U/ε at the nearest state of the paths out of a well; beyond the saddle by one more."""
+        """Progress by U/ε at the nearest state of the paths out of a well; beyond the saddle by one more.
+
+        Over an unstable cycle it is that of the state of the path whose distances from there and from the
+        attractor differ by as much, whatever the phase.
+        """
         ways = [way for way in self.transitions if way.start == well and way.path is not None]
         if not ways:
             raise NumericalFailure("no path leads out of the well, along which a simulation could be split")
@@ -678,6 +682,15 @@ class Landscape:
         points, along = np.concatenate(states), np.concatenate(values)
         # Near is what the noise about the attractor makes so.
         one = self.attractors[well]
+        lowest = min(ways, key=lambda way: way.barrier)
+        if isinstance(lowest.saddle, Cycle) and lowest.path is not None:
+            near, far = (
+                cKDTree(each.points if isinstance(each, Cycle) else each.position[None])
+                for each in (one, lowest.saddle)
+            )
+            apart = near.query(lowest.path.points)[0] - far.query(lowest.path.points)[0]
+            apart, height = np.maximum.accumulate(apart), lowest.path.values / intensity
+            return lambda x: np.interp(near.query(x.T)[0] - far.query(x.T)[0], apart, height)
         root = np.diag(1 / np.ptp(points, axis=0))
         if isinstance(one, Equilibrium):
             root = np.linalg.cholesky(hessian_at(self.dynamics, one.position))

@@ -150,7 +150,8 @@ class LandscapeSummary:
     @property
     def has_times(self) -> bool:
         """Whether some exit has a law of its mean time."""
-        return any(math.isfinite(way.exit.prefactor) for way in self.ways)
+        laws = [way.exit for way in self.ways]
+        return any(math.isfinite(one.prefactor) or one.phases is not None for one in laws)
 
     @property
     def no_time_reason(self) -> str:

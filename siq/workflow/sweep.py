@@ -56,11 +56,14 @@ class _SweptWay:
     barrier: float | None
     prefactor: float | None
     note: str = ""
+    power: float = 0.0
+    phases: tuple[tuple[float, ...], ...] | None = None
 
     def as_exit(self) -> EscapeRate:
         """What its time follows from."""
         barrier, prefactor = (np.nan if one is None else one for one in (self.barrier, self.prefactor))
-        return EscapeRate(barrier, prefactor)
+        phases = None if self.phases is None else np.array(self.phases)
+        return EscapeRate(barrier, prefactor, power=self.power, phases=phases)
 
 
 @pydantic_dataclass(frozen=True, config=PLAIN)
@@ -127,6 +130,8 @@ def point_at(
                 float(way.barrier) if np.isfinite(way.barrier) else None,
                 None if way.rate is None else float(way.rate.prefactor),
                 "; ".join(way.notes),
+                way.exit.power,
+                None if way.exit.phases is None else tuple(map(tuple, way.exit.phases.tolist())),
             )
             for way in found.transitions
         ),
@@ -328,7 +333,7 @@ def _weights(point: SweptPoint, noise: float | None) -> np.ndarray:
         return np.full(count, np.nan)
     if count == 1:
         return np.ones(1)
-    listed = [(way.start, way.end, way.barrier, way.prefactor) for way in between]
+    listed = [(way.start, way.end, way.barrier, way.as_exit().prefactor_at(noise)) for way in between]
     return shares_by_rates(listed, count, intensity=noise)
 
 
