@@ -66,7 +66,6 @@ LONGEST_STEP = 0.01  # along a branch: a curve of a hundred chords looks smooth
 LONGEST_STEP_OF_CYCLES = 0.03  # which take long, and bend no more
 FIRST_AMPLITUDE = 0.01  # of a cycle next to a Hopf point
 LONGEST_PERIOD = 30.0  # of the first one: a cycle so slow nears a homoclinic orbit, where the branch ends
-SAME_PERIOD = 0.02
 COURSE = 400  # numerical: steps around a cycle
 SHORTEST_STEP = 1e-9  # a branch that asks for shorter steps is given up
 MIN_TANGENT_COSINE = 0.98  # of the angle between the tangents of a step's ends: 11 degrees
@@ -359,9 +358,13 @@ class _Cycles(_Equilibria):
     def limit(self, y: np.ndarray) -> tuple[int, float] | None:
         if y[-1] > LONGEST_PERIOD:
             return len(y) - 1, LONGEST_PERIOD
-        if np.linalg.norm(self.family.flow(y[: self.count])) * y[-1] * self.unit < FIRST_AMPLITUDE:
+        if self.length(y) < FIRST_AMPLITUDE:
             return 0, float(y[0])  # it has shrunk to an equilibrium
         return super().limit(y)
+
+    def length(self, y: np.ndarray) -> float:
+        """About that of the cycle, in shares: of a small one 2π times its amplitude."""
+        return float(np.linalg.norm(self.family.flow(y[: self.count])) * y[-1] * self.unit)
 
     def resolved(self, last: np.ndarray, y: np.ndarray) -> bool:
         return True
@@ -520,14 +523,17 @@ class Branch:
         course = self._equations.course(self._points)
         return np.stack([course.min(axis=0), course.max(axis=0)])
 
-    def index_of_cycle(self, period: float, value: float) -> int | None:
-        """The point before or at which a cycle has a period at a value; None where it is on another branch."""
-        periods = 2 * np.pi / self.frequencies
+    def index_of_cycle(self, state: np.ndarray, value: float) -> int | None:
+        """The point before a cycle that passes a state ``(d,)`` at a value; None where none of these does."""
+        assert isinstance(self._equations, _Cycles)
+        family, nearest, found = self._equations.family, LONGEST_STEP_OF_CYCLES / 2, None
         for k in np.flatnonzero((self.values[:-1] - value) * (self.values[1:] - value) <= 0):
             share = (value - self.values[k]) / ((self.values[k + 1] - self.values[k]) or 1.0)
-            if abs((1 - share) * periods[k] + share * periods[k + 1] - period) < SAME_PERIOD * period:
-                return int(k)
-        return None
+            y = self._points[k] + share * (self._points[k + 1] - self._points[k])
+            away = (self._equations.course(y[None])[:, 0] - state) / family.width[: family.d]
+            if (distance := float(np.linalg.norm(away, axis=1).min())) < nearest:
+                nearest, found = distance, int(k)
+        return found
 
     def index_of(self, state: np.ndarray, values: float | np.ndarray) -> int | None:
         """The point next to a state ``(d,)`` at values of the parameters; None where it is not on it."""
@@ -663,22 +669,21 @@ def follow_cycles(
         cycles = _Cycles(family, period, z[: family.d], z[: family.d])
         starts.append((cycles.at(z), np.append(z, 1.0), np.eye(family.count + 1)[family.d]))
     for equations, guess, ahead in starts:
-        value, known = float(family.natural(guess[: family.count])[-1]), [one._points for one in branches]
-        ends = [points[place] for points in known for place in (0, -1)]
+        state, value = np.split(family.natural(guess[: family.count]), [family.d])
+        ends = [one._points[place] for one in branches for place in (0, -1)]
         begun = any(np.linalg.norm((end - guess)[: family.count]) < 5 * FIRST_AMPLITUDE for end in ends)
-        if begun or any(one.index_of_cycle(equations.unit, value) is not None for one in branches):
+        if begun or any(one.index_of_cycle(state, float(value[0])) is not None for one in branches):
             continue
         branch, stop = _branch_through(equations, _across(equations, guess, ahead), ahead, [])
         if branch is None or stop:
-            place = {"state": np.round(family.natural(guess[: family.count])[: family.d], 4).tolist()}
-            stop = stop or {"most": None}
-            remarks.append(
-                Remark("systems.branch_not_followed", place | {"parameter": parameter, "value": value} | stop)
-            )
+            place = {"state": np.round(state, 4).tolist(), "parameter": parameter, "value": float(value[0])}
+            remarks.append(Remark("systems.branch_not_followed", place | (stop or {"most": None})))
         if branch is None:
             continue
         for k in np.flatnonzero(branch.tangents[:-1, family.d] * branch.tangents[1:, family.d] < 0):
             y = _fold_of_cycles(equations, branch, int(k))
+            if equations.length(y) < 2 * np.pi * FIRST_AMPLITUDE:
+                continue  # at a Hopf point λ turns back, too, as the cycle goes on with its other side
             states = equations.course(y[None])[:, 0]
             fold = family.natural(y[: family.count])[-1]
             place_of_fold = states[np.argmax(states[:, 0])]

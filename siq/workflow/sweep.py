@@ -5,13 +5,13 @@ point, so that a change of the range, or of the noise, leaves those that there a
 equilibria are joined to branches by continuation (`siq.systems.continuation`), and a well is a stable stretch
 of a branch that does not turn back: it ends at a fold, at a Hopf point, and where branches meet. Of two,
 folds and Hopf points along rows and columns of the map are points of curves, which are followed through the
-plane. Times and weights follow from barriers and prefactors for a noise.
+plane. Limit cycles are followed from Hopf points, and from where they were found. Times and weights follow from barriers and prefactors for a noise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,7 +30,8 @@ from siq.quasipotential.landscape_assembly import EquationSettings, landscape_fr
 from siq.quasipotential.rates import EscapeRate, NoiseStrength, mean_residence_time
 from siq.remarks import Remark, sentence
 from siq.systems.cards import ParameterEntry, SystemCard, build_system, load_system
-from siq.systems.continuation import Bifurcation, Branch, follow_branches, follow_curves
+from siq.systems.continuation import Bifurcation, Branch, follow_branches, follow_curves, follow_cycles
+from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import all_equilibria
 from siq.systems.phase_portrait import MOST_SEARCHED, UNSETTLED
@@ -41,10 +42,11 @@ PLAIN = ConfigDict(extra="forbid", ser_json_inf_nan="constants")
 
 @pydantic_dataclass(frozen=True, config=PLAIN)
 class _SweptWell:
-    """An attractor at a point: its state, and the slowest rate at which f leads back to it."""
+    """An attractor at a point: its state, the slowest rate at which f leads back to it, a cycle's period."""
 
     state: tuple[float, ...]
     relaxation: float
+    period: float | None = None
 
 
 @pydantic_dataclass(frozen=True, config=PLAIN)
@@ -120,7 +122,10 @@ def point_at(
         values,
         tuple(tuple(map(float, one.position)) for one in found.equilibria),
         tuple(
-            _SweptWell(tuple(map(float, one.position)), float(-one.eigenvalues.real.max()))
+            _SweptWell(
+                tuple(map(float, one.position)), float(-one.eigenvalues.real.max()),
+                one.period if isinstance(one, Cycle) else None,
+            )
             for one in found.attractors
         ),
         tuple(
@@ -159,7 +164,8 @@ def _wells_along(branches: Sequence[Branch]) -> list[np.ndarray]:
     """For each branch the well of each of its points, -1 where it is unstable; in the order of the states."""
     stretches = []
     for index, branch in enumerate(branches):
-        kind = np.where(branch.unstable == 0, np.where(branch.tangents[:, -1] > 0, 1, -1), 0)
+        rises = branch.tangents[:, branch.states.shape[1]] > 0
+        kind = np.where(branch.unstable == 0, np.where(rises, 1, -1), 0)
         ends = [*(np.flatnonzero(np.diff(kind)) + 1), len(kind)]
         starts = [0, *ends[:-1]]
         stretches += [
@@ -179,11 +185,15 @@ def _wells_along(branches: Sequence[Branch]) -> list[np.ndarray]:
 
 
 def _well_of(
-    branches: Sequence[Branch], numbers: Sequence[np.ndarray], state: np.ndarray, value: float
+    branches: Sequence[Branch], numbers: Sequence[np.ndarray], well: _SweptWell, value: float
 ) -> int:
     """Which well an attractor is at a value; -1 for one that is on no branch."""
     for branch, number in zip(branches, numbers, strict=True):
-        place = branch.index_of(state, value)
+        place = None
+        if branch.kind == "cycle" and well.period is not None:
+            place = branch.index_of_cycle(np.array(well.state), value)
+        elif branch.kind != "cycle" and well.period is None:
+            place = branch.index_of(np.array(well.state), value)
         if place is not None:
             # Next to a fold the nearest point of the branch may lie behind it.
             beside = number[max(place - 1, 0) : place + 2]
@@ -196,12 +206,15 @@ def _branch_rows(branches: Sequence[Branch], numbers: Sequence[np.ndarray]) -> l
     return [
         {
             "branch": index,
+            "kind": branch.kind,
             "well": int(number[k]),
             "value": branch.values[k],
             "position": _position_text(branch.states[k]),
             "unstable": int(branch.unstable[k]),
             "growth": branch.eigenvalues[k, 0].real,
-            "frequency": abs(branch.eigenvalues[k, 0].imag),
+            "frequency": branch.frequencies[k] or abs(branch.eigenvalues[k, 0].imag),
+            "least": _position_text(branch.extents[0, k]),
+            "largest": _position_text(branch.extents[1, k]),
         }
         for index, (branch, number) in enumerate(zip(branches, numbers, strict=True))
         for k in range(len(branch.values))
@@ -384,9 +397,9 @@ class Sweep:
         One row for every value and way out of a well, barrier and prefactor; what
         `siq.probability_of_tipping` reads.
     branches
-        Equilibria along their branches, stable or not; empty for two parameters.
+        Equilibria and limit cycles along their branches, stable or not; empty for two parameters.
     bifurcations
-        Folds, Hopf points and branch points; empty for two parameters.
+        Folds, also of cycles, Hopf points and branch points; empty for two parameters.
     notes
         What could not be done, in words.
     units
@@ -515,9 +528,19 @@ def collected(
         limits = (min(values), max(values))
         seeds = [(point.values[0], np.array(one)) for point in points for one in point.equilibria]
         branches, bifurcations, remarks = follow_branches(system, names[0], limits, seeds)
+        known = [
+            (point.values[0], np.array(well.state), well.period)
+            for point in points
+            for well in point.wells
+            if well.period is not None
+        ]
+        cycles, folds, more = follow_cycles(system, names[0], limits, bifurcations, known)
+        folds = [replace(one, branch=one.branch + len(branches)) for one in folds]
+        branches, remarks = [*branches, *cycles], [*remarks, *more]
+        bifurcations = sorted([*bifurcations, *folds], key=lambda one: one.value)
         stretches = _wells_along(branches)
         numbers = [
-            [_well_of(branches, stretches, np.array(well.state), point.values[0]) for well in point.wells]
+            [_well_of(branches, stretches, well, point.values[0]) for well in point.wells]
             for point in points
         ]
     else:
