@@ -1,7 +1,7 @@
 """Leaving a limit cycle: a noisy oscillator beside a state of rest, and how long each lasts.
 
-An unstable cycle parts both. The way out of the oscillation winds along it and begins at one phase, which is
-far better than any other; the law adds up all of them, and a simulation tells whether it is right.
+An unstable cycle parts both. Ways out of the oscillation cross it at any phase, at some more often than at
+others; the law adds up all of them, and a simulation tells whether it is right.
 """
 
 # %% Liénard's equation with noise on both states
@@ -14,7 +14,7 @@ import siq
 from siq.systems.escapes import Neighbourhood, simulate_escapes
 
 x, y = sympy.symbols("x y", real=True)
-friction = sympy.Rational(1, 4) - x**2 + sympy.Rational(2, 5) * x**4
+friction = sympy.Rational(2, 5) - x**2 + sympy.Rational(2, 5) * x**4
 noises = [[1, 0], [0, sympy.Rational(1, 2)]]
 system = siq.Dynamics.of((x, y), (y - x * friction, -x), diffusion=noises, domain=[(-2.2, 2.2)] * 2)
 landscape = siq.Landscape.from_equations(system)
@@ -25,7 +25,7 @@ rest, cycle = landscape.attractors
 ways = {way.start: way for way in landscape.transitions}
 core = Neighbourhood.about(system, rest.position, level=0.1 * ways[0].barrier)
 rows = []
-for height in (3.5, 4.5, 5.5):
+for height in (3, 4, 5, 6):
     noise = ways[1].barrier / height
     law = landscape.dwell_times(noise=noise).loc[1]
     found = simulate_escapes(
@@ -48,11 +48,13 @@ left.plot(*rest.position, "o", color="C2", label="rest")
 left.plot(*ways[1].uphill.T, color="C3", linewidth=1, label="out of the cycle")
 left.plot(*ways[0].uphill.T, color="C2", linewidth=1, label="out of rest")
 left.set(xlabel="x", ylabel="y", aspect="equal")
-left.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, 1.35), ncols=2)
-heights = np.linspace(3, 8, 40)
+figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8)
+heights = np.linspace(2.5, 7, 40)
 times = [ways[1].exit.mean_time(ways[1].barrier / one) for one in heights]
 right.semilogy(heights, times, color="C3", label="law")
-right.errorbar(table.barrier_over_noise, table.simulated, 2 * table.standard_error, fmt="ko", label="simulated")
+right.errorbar(
+    table.barrier_over_noise, table.simulated, 2 * table.standard_error, fmt="ko", label="simulated"
+)
 right.set(xlabel="ΔU/ε", ylabel="mean time in the oscillation")
 right.legend()
 plt.show()

@@ -111,7 +111,8 @@ LAW = (
     | _fields(ARRAY, "phases")
     | _fields(REMARKS, law_remarks="remarks")
 )
-OLDER_LAW = {"correction": 0.0, "unknown": 1.0, "power": 0.0, "phases": None}  # of files from before there was one
+# Of files from before there was one.
+OLDER_LAW = {"correction": 0.0, "unknown": 1.0, "power": 0.0, "phases": None}
 TURN = _fields(PLAIN, own="loss", beyond="loss_beyond", exact="particle")
 WAY = _fields(PLAIN, minimum_action="action") | _fields(ARRAY, "downhill", uphill="points")
 PATH = (

@@ -347,7 +347,8 @@ def escape_rate(
     Raises
     ------
     NumericalFailure
-        When the path does not lead from an attractor to a saddle with one unstable direction; when it meets a caustic; or when V is not smooth at the saddle.
+        When the path does not lead from an attractor to a saddle with one unstable direction; when it meets a
+        caustic; or when V is not smooth at the saddle.
     """
     frame = _Frame(dynamics, path, cycle)
     twins = any(abs(one - path.action) < SAME_ACTION * path.action for one in path.rivals)
@@ -370,9 +371,7 @@ def escape_rate(
     at_saddle = frame.continued(curvatures) if frame.at_saddle is None else frame.at_saddle
     volume, power = frame.volume()
     root = np.sqrt(abs(np.linalg.det(at_saddle)))
-    prefactor = float(
-        2 * np.pi / (frame.unstable * frame.problem.rate) * root * volume * np.exp(exponent)
-    )
+    prefactor = float(2 * np.pi / (frame.unstable * frame.problem.rate) * root * volume * np.exp(exponent))
     phases = None if power == 0 else np.array([[0.0], [1 / prefactor]])
     loss, loss_beyond, particle = _energy_loss_per_cycle(dynamics, path, beyond=beyond)
     if loss is not None and not particle:
@@ -493,9 +492,9 @@ class _Frame:
         return float(float(odd[0] - odd[1]) / 2 + along + outer)
 
     def volume(self) -> tuple[float, float]:
-        """What the density at the start of the path is the inverse of, up to ``(πε)^(d/2)``; and a power of ε.
+        """The inverse of the density at the start of the path, up to ``(πε)^(d/2)``; and a power of ε.
 
-        About a cycle it is spread evenly in time, and across the cycle normally (`Tube.density`).
+        About a cycle the density is spread evenly in time, and across the cycle normally (`Tube.density`).
         """
         problem = self.problem
         if not isinstance(problem.begin, Tube):

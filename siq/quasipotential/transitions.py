@@ -188,9 +188,7 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
             end = min(set(reached[reached >= 0].tolist()) - {index}, default=None)
             if end is None and not beyond_region:
                 remarks = (Remark("quasipotential.nothing_beyond_saddle"),)
-                ways.append(
-                    Transition(number, None, saddle, None, remarks=remarks, cycle=at_cycle[index])
-                )
+                ways.append(Transition(number, None, saddle, None, remarks=remarks, cycle=at_cycle[index]))
             elif end is not None or not (reached == index).all():  # else it parts no wells
                 add(index, saddle, end)
     return ways
@@ -287,7 +285,12 @@ def escape_rate_over_cycle(
 
 
 def _fan(
-    problem: PathProblem, begin: LevelSet, side: float, places: np.ndarray, level: float, sense: float,
+    problem: PathProblem,
+    begin: LevelSet,
+    side: float,
+    places: np.ndarray,
+    level: float,
+    sense: float,
     short_of: Callable[[np.ndarray], np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Trajectories of Hamilton's equations from where the cost is as given, until they come somewhere.

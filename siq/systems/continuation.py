@@ -26,8 +26,8 @@ in λ, or it was found at some value. It is followed likewise, in its state on a
 
     φ_T(x, λ) = x,    c·(x - x₀) = 0                                         (a cycle)
 
-with c along f at the last point x₀. It ends where it shrinks to an equilibrium, leaves the domain or becomes so
-slow that it nears a homoclinic orbit; where its tangent turns back in λ is a *fold of cycles*.
+with c along f at the last point x₀. It ends where it shrinks to an equilibrium, leaves the domain or becomes
+so slow that it nears a homoclinic orbit; where its tangent turns back in λ is a *fold of cycles*.
 
 References
 ----------
@@ -319,7 +319,7 @@ class _Cycles(_Equilibria):
         return equations, np.append(z, 1.0) + FIRST_AMPLITUDE * ahead, ahead
 
     def flow_of_period(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """``φ_T`` in shares, ``(d,)``, and its derivatives by states and parameter; not a number where none."""
+        """``φ_T`` in shares, ``(d,)``, and its derivatives by states and parameter; NaN where none."""
         d, key = self.d, y.tobytes()
         if self._around[0] == key:
             return self._around[1:]
@@ -487,7 +487,7 @@ class Bifurcation:
 
 
 class Branch:
-    """Equilibria or cycles against a parameter; or folds, or Hopf points, along a curve in the plane of two."""
+    """Equilibria or cycles against a parameter; or folds, or Hopf points, along a curve over two."""
 
     def __init__(self, equations: _Equilibria, points: np.ndarray, tangents: np.ndarray) -> None:
         self._equations, self._points = equations, points
@@ -664,8 +664,8 @@ def follow_cycles(
         z = family.shares(one.state, one.value)
         if one.kind == "Hopf" and (start := _Cycles.from_hopf(family, z)) is not None:
             starts.append(start)
-    for value, state, period in seeds:
-        z = family.shares(state, value)
+    for known, passed, period in seeds:
+        z = family.shares(passed, known)
         cycles = _Cycles(family, period, z[: family.d], z[: family.d])
         starts.append((cycles.at(z), np.append(z, 1.0), np.eye(family.count + 1)[family.d]))
     for equations, guess, ahead in starts:

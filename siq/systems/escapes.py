@@ -349,9 +349,7 @@ def split_escapes(
     return result(int(walkers * min((found.relative_error / AIMED_ERROR) ** 2, MOST_MORE)))
 
 
-def _at_sigma(
-    advance: Field, levels: Field, center: np.ndarray, count: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _at_sigma(advance: Field, levels: Field, center: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """States at Σ, ``(d, walkers)``, and how many steps each has made from one Σ to the next.
 
     They begin at states of the attractor, of the same shape.

@@ -5,7 +5,8 @@ point, so that a change of the range, or of the noise, leaves those that there a
 equilibria are joined to branches by continuation (`siq.systems.continuation`), and a well is a stable stretch
 of a branch that does not turn back: it ends at a fold, at a Hopf point, and where branches meet. Of two,
 folds and Hopf points along rows and columns of the map are points of curves, which are followed through the
-plane. Limit cycles are followed from Hopf points, and from where they were found. Times and weights follow from barriers and prefactors for a noise.
+plane. Limit cycles are followed from Hopf points, and from where they were found. Times and weights follow
+from barriers and prefactors for a noise.
 """
 
 from __future__ import annotations
@@ -123,7 +124,8 @@ def point_at(
         tuple(tuple(map(float, one.position)) for one in found.equilibria),
         tuple(
             _SweptWell(
-                tuple(map(float, one.position)), float(-one.eigenvalues.real.max()),
+                tuple(map(float, one.position)),
+                float(-one.eigenvalues.real.max()),
                 one.period if isinstance(one, Cycle) else None,
             )
             for one in found.attractors
@@ -540,8 +542,7 @@ def collected(
         bifurcations = sorted([*bifurcations, *folds], key=lambda one: one.value)
         stretches = _wells_along(branches)
         numbers = [
-            [_well_of(branches, stretches, well, point.values[0]) for well in point.wells]
-            for point in points
+            [_well_of(branches, stretches, well, point.values[0]) for well in point.wells] for point in points
         ]
     else:
         numbers = [list(range(len(point.wells))) for point in points]

@@ -238,7 +238,7 @@ def test_what_could_not_be_followed_is_remarked(monkeypatch):
 
 
 def test_cycles_begin_at_a_hopf_point_as_roots_and_fold() -> None:
-    """``r² = (1 ± √(1 + 4a))/2``: both folds and amplitudes are exact, and a known cycle lies on the branch."""
+    """``r² = (1 ± √(1 + 4a))/2``: fold and amplitudes are exact, and a known cycle is no second branch."""
     grow = a + (x**2 + y**2) - (x**2 + y**2) ** 2
     form = Dynamics.of((x, y), (x * grow - y, y * grow + x), domain=[(-2, 2)] * 2, parameters={a: 0.0})
     _, hopf, _ = follow_branches(form, "a", (-0.4, 0.2), [(0.1, np.zeros(2))])

@@ -65,10 +65,10 @@ def plot_sweep(
     Returns
     -------
     matplotlib.figure.Figure
-        Of one parameter: equilibria and the least and the largest state of cycles, stable ones as lines of
-        their well's colour and unstable ones dashed, with folds, Hopf points and branch points; below it the lowest barrier of every well, and, where the
-        noise is known, how long each lasts and its share of time in the long run. Of two: maps of the number
-        of wells and of the lowest barrier, with curves of folds and of Hopf points.
+        Of one parameter: equilibria and the extents of cycles, stable ones as lines of their well's colour
+        and unstable ones dashed, with folds, Hopf points and branch points; below it the lowest barrier of
+        every well, and, where the noise is known, how long each lasts and its share of time in the long run.
+        Of two: maps of the number of wells and of the lowest barrier, with curves of folds and Hopf points.
     """
     units = units or {}
     if len(parameters) > 1:
