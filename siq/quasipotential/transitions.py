@@ -330,7 +330,8 @@ def _fan(
     def area(z: np.ndarray) -> np.ndarray:
         return _cross(rates(z)[:, :2], z[:, 4:6])
 
-    begun, alive, strength = area(z), np.arange(len(z)), norm(z[:, 2:4])
+    begun, alive = area(z), np.arange(len(z))
+    strength: np.ndarray = norm(z[:, 2:4])
     done, steps = np.zeros(len(z), dtype=bool), np.full(len(z), FIRST_STEP)
     for _ in range(MOST_FAN_STEPS):
         with np.errstate(all="ignore"):
@@ -353,7 +354,7 @@ def _fan(
         if not len(alive):
             break
     with np.errstate(all="ignore"):
-        return z, np.abs([begun, area(z)]), done
+        return z, np.abs(np.stack([begun, area(z)])), done
 
 
 def _arrived(
@@ -444,7 +445,7 @@ def transitions(
             replace(
                 way, barrier=barrier + by_rivals, formula_share=share, standard_error=spread, rate=rate,
                 remarks=tuple({str(one): one for one in remarks}.values()), by_rivals=by_rivals,
-                leverage=noise_leverage(path, dynamics),
+                leverage=_noise_leverage(path, dynamics),
             )
         )  # fmt: skip
     return found_ways
@@ -474,7 +475,7 @@ def _barrier_uncertainty(path: MinimumActionPath, found: AnyField) -> tuple[floa
     return float(np.sqrt(max(variance, 0.0))), by_rivals
 
 
-def noise_leverage(path: MinimumActionPath, dynamics: Dynamics) -> float:
+def _noise_leverage(path: MinimumActionPath, dynamics: Dynamics) -> float:
     """Relative standard error of ΔU/ε from an estimated εD, over that of ε, the mean of its parts.
 
     A change of εD changes ``ΔU/ε = 2∫p·dx/ε`` by ``-2∫ p·δ(εD)p dt/ε²``. With the covariance of a matrix that

@@ -150,8 +150,7 @@ class LandscapeSummary:
     @property
     def has_times(self) -> bool:
         """Whether some exit has a law of its mean time."""
-        laws = [way.exit for way in self.ways]
-        return any(math.isfinite(one.prefactor) or one.phases is not None for one in laws)
+        return any(way.exit.phases is not None or math.isfinite(way.exit.prefactor) for way in self.ways)
 
     @property
     def no_time_reason(self) -> str:

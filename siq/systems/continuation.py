@@ -585,11 +585,17 @@ def follow_branches(
     parameter: str,
     limits: tuple[float, float],
     seeds: Sequence[tuple[float, np.ndarray]],
+    *,
+    cycles: Sequence[tuple[float, np.ndarray, float]] | None = None,
 ) -> tuple[list[Branch], list[Bifurcation], list[Remark]]:
-    """Branches of equilibria within a range of a parameter λ and within the domain of the states.
+    """Branches of equilibria, and of cycles if asked for, within a range of a parameter λ and the domain.
 
     Seeds are known equilibria: the value of λ and the state, shape ``(d,)``. A branch through none of them is
     not found. Each branch is given once; the bifurcations, by the value of λ; and what could not be followed.
+
+    Branches of cycles come after those of equilibria, from Hopf points and from the `cycles` that are known:
+    value of λ, a state of the cycle, and its period. Each fold of cycles is given at the state whose first
+    component is largest.
 
     Raises
     ------
@@ -606,6 +612,15 @@ def follow_branches(
     >>> _, found, _ = follow_branches(cusp, "h", (-1.0, 1.0), [(0.0, np.array([1.0]))])
     >>> [(one.kind, round(one.value, 10)) for one in found]
     [('fold', -0.3849001795), ('fold', 0.3849001795)]
+
+    Cycles ``r² = (1 ± √(1 + 4a))/2`` of a normal form begin at ``a = 0``, and fold at ``a = -1/4``:
+
+    >>> a, x, y = sympy.symbols("a x y", real=True)
+    >>> grow = a + (x**2 + y**2) - (x**2 + y**2) ** 2
+    >>> form = Dynamics.of((x, y), (x * grow - y, y * grow + x), domain=[(-2, 2)] * 2, parameters={a: 0.0})
+    >>> _, found, _ = follow_branches(form, "a", (-0.5, 0.5), [(0.1, np.zeros(2))], cycles=())
+    >>> [(one.kind, round(one.value, 8)) for one in found]
+    [('fold of cycles', -0.25), ('Hopf', 0.0)]
     """
     family = _Family(dynamics, {parameter: limits})
     equations, along = _Equilibria(family), np.eye(family.count)[-1]
@@ -627,40 +642,24 @@ def follow_branches(
             if all(np.abs(place_of_one - other).max() > BIFURCATION_MERGE_TOLERANCE for other in others):
                 found.append(one)
         branches.append(branch)
+    if cycles is not None:
+        _follow_cycles(family, parameter, branches, found, remarks, cycles)
     found.sort(key=lambda one: one.value)
     return branches, found, remarks
 
 
-def follow_cycles(
-    dynamics: Dynamics,
+def _follow_cycles(
+    family: _Family,
     parameter: str,
-    limits: tuple[float, float],
-    bifurcations: Sequence[Bifurcation],
-    seeds: Sequence[tuple[float, np.ndarray, float]] = (),
-) -> tuple[list[Branch], list[Bifurcation], list[Remark]]:
-    """Branches of cycles within a range of a parameter, from Hopf points and from cycles that are known.
-
-    Seeds are the value of the parameter, a state ``(d,)`` of the cycle, and its period. Branches have numbers
-    of their own, from 0; the bifurcations are folds of cycles, each at the state whose first component is
-    largest; and what could not be followed.
-
-    Examples
-    --------
-    Cycles ``r² = (1 ± √(1 + 4a))/2`` of a normal form begin at ``a = 0``, and fold at ``a = -1/4``:
-
-    >>> import sympy
-    >>> a, x, y = sympy.symbols("a x y", real=True)
-    >>> grow = a + (x**2 + y**2) - (x**2 + y**2) ** 2
-    >>> form = Dynamics.of((x, y), (x * grow - y, y * grow + x), domain=[(-2, 2)] * 2, parameters={a: 0.0})
-    >>> _, hopf, _ = follow_branches(form, "a", (-0.5, 0.5), [(0.1, np.zeros(2))])
-    >>> (branch,), (fold,), _ = follow_cycles(form, "a", (-0.5, 0.5), hopf)
-    >>> fold.kind, round(fold.value, 6)
-    ('fold of cycles', -0.25)
-    """
-    family, branches, found = _Family(dynamics, {parameter: limits}), list[Branch](), list[Bifurcation]()
-    remarks: list[Remark] = []
+    branches: list[Branch],
+    found: list[Bifurcation],
+    remarks: list[Remark],
+    seeds: Sequence[tuple[float, np.ndarray, float]],
+) -> None:
+    """Add branches of cycles to those of equilibria, folds of cycles to what was found, and remarks."""
+    first = len(branches)
     starts: list[tuple[_Cycles, np.ndarray, np.ndarray]] = []
-    for one in bifurcations:
+    for one in found:
         z = family.shares(one.state, one.value)
         if one.kind == "Hopf" and (start := _Cycles.from_hopf(family, z)) is not None:
             starts.append(start)
@@ -670,9 +669,9 @@ def follow_cycles(
         starts.append((cycles.at(z), np.append(z, 1.0), np.eye(family.count + 1)[family.d]))
     for equations, guess, ahead in starts:
         state, value = np.split(family.natural(guess[: family.count]), [family.d])
-        ends = [one._points[place] for one in branches for place in (0, -1)]
+        ends = [one._points[place] for one in branches[first:] for place in (0, -1)]
         begun = any(np.linalg.norm((end - guess)[: family.count]) < 5 * FIRST_AMPLITUDE for end in ends)
-        if begun or any(one.index_of_cycle(state, float(value[0])) is not None for one in branches):
+        if begun or any(one.index_of_cycle(state, float(value[0])) is not None for one in branches[first:]):
             continue
         branch, stop = _branch_through(equations, _across(equations, guess, ahead), ahead, [])
         if branch is None or stop:
@@ -693,7 +692,6 @@ def follow_cycles(
                             equations.frequency(y), gap)
             )  # fmt: skip
         branches.append(branch)
-    return branches, found, remarks
 
 
 def _fold_of_cycles(equations: _Cycles, branch: Branch, k: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from barriers and prefactors for a noise.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,7 +31,7 @@ from siq.quasipotential.landscape_assembly import EquationSettings, landscape_fr
 from siq.quasipotential.rates import EscapeRate, NoiseStrength, mean_residence_time
 from siq.remarks import Remark, sentence
 from siq.systems.cards import ParameterEntry, SystemCard, build_system, load_system
-from siq.systems.continuation import Bifurcation, Branch, follow_branches, follow_curves, follow_cycles
+from siq.systems.continuation import Bifurcation, Branch, follow_branches, follow_curves
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import all_equilibria
@@ -529,17 +529,13 @@ def collected(
     if len(names) == 1 and min(values) < max(values):
         limits = (min(values), max(values))
         seeds = [(point.values[0], np.array(one)) for point in points for one in point.equilibria]
-        branches, bifurcations, remarks = follow_branches(system, names[0], limits, seeds)
         known = [
             (point.values[0], np.array(well.state), well.period)
             for point in points
             for well in point.wells
             if well.period is not None
         ]
-        cycles, folds, more = follow_cycles(system, names[0], limits, bifurcations, known)
-        folds = [replace(one, branch=one.branch + len(branches)) for one in folds]
-        branches, remarks = [*branches, *cycles], [*remarks, *more]
-        bifurcations = sorted([*bifurcations, *folds], key=lambda one: one.value)
+        branches, bifurcations, remarks = follow_branches(system, names[0], limits, seeds, cycles=known)
         stretches = _wells_along(branches)
         numbers = [
             [_well_of(branches, stretches, well, point.values[0]) for well in point.wells] for point in points

@@ -8,7 +8,7 @@ import sympy
 
 from siq.remarks import sentence
 from siq.systems import continuation
-from siq.systems.continuation import follow_branches, follow_curves, follow_cycles
+from siq.systems.continuation import follow_branches, follow_curves
 from siq.systems.dynamics import Dynamics
 
 pytestmark = pytest.mark.portable
@@ -241,11 +241,11 @@ def test_cycles_begin_at_a_hopf_point_as_roots_and_fold() -> None:
     """``r² = (1 ± √(1 + 4a))/2``: fold and amplitudes are exact, and a known cycle is no second branch."""
     grow = a + (x**2 + y**2) - (x**2 + y**2) ** 2
     form = Dynamics.of((x, y), (x * grow - y, y * grow + x), domain=[(-2, 2)] * 2, parameters={a: 0.0})
-    _, hopf, _ = follow_branches(form, "a", (-0.4, 0.2), [(0.1, np.zeros(2))])
     radius = np.sqrt((1 + np.sqrt(1.4)) / 2)
     known = [(0.1, np.array([0.0, radius]), 2 * np.pi)]
-    (branch,), found, remarks = follow_cycles(form, "a", (-0.4, 0.2), hopf, known)
-    assert [one.kind for one in found] == ["fold of cycles"] and not remarks
+    seeds = [(0.1, np.zeros(2))]
+    (_, branch), found, remarks = follow_branches(form, "a", (-0.4, 0.2), seeds, cycles=known)
+    assert [one.kind for one in found] == ["fold of cycles", "Hopf"] and not remarks
     assert found[0].value == pytest.approx(-0.25, abs=1e-9)
     assert np.linalg.norm(found[0].state) == pytest.approx(np.sqrt(0.5), abs=1e-5)
     square = branch.extents[1, :, 0] ** 2

@@ -150,12 +150,9 @@ def plot_early_warning(
 
 
 def _draw_branches(axes: Axes, branches: pd.DataFrame, bifurcations: pd.DataFrame, place: int) -> None:
-    ends = [
-        branches.assign(state=[float(ast.literal_eval(text)[place]) for text in branches[name]])
-        for name in ("largest", "least")
-    ]
-    ends[1] = ends[1][ends[1]["kind"] == "cycle"]  # an equilibrium is both
-    for rows in (rows for each in ends for _, rows in each.groupby("branch")):
+    ends = pd.concat([branches.assign(end=name, at=branches[name]) for name in ("least", "largest")])
+    ends["state"] = [float(ast.literal_eval(text)[place]) for text in ends["at"]]
+    for _, rows in ends.groupby(["branch", "end"]):
         # Neighbouring stretches share a point, or a gap would part them.
         change = np.flatnonzero(np.diff(rows["well"].to_numpy())) + 1
         for first, last in pairwise([0, *change, len(rows)]):
