@@ -331,7 +331,7 @@ def _fan(
         return _cross(rates(z)[:, :2], z[:, 4:6])
 
     begun, alive = area(z), np.arange(len(z))
-    strength: np.ndarray = norm(z[:, 2:4])
+    strength = np.asarray(norm(z[:, 2:4]))
     done, steps = np.zeros(len(z), dtype=bool), np.full(len(z), FIRST_STEP)
     for _ in range(MOST_FAN_STEPS):
         with np.errstate(all="ignore"):
