@@ -195,7 +195,7 @@ def run_escapes(
         return as_table("escape", [])
     rows = []
     for way in complete.transitions:
-        if way.rate is None or not np.isfinite(way.barrier) or way.end is None:
+        if np.isnan(way.exit.prefactor) or not np.isfinite(way.barrier) or way.end is None:
             continue
         for number, intensity in enumerate(settings.noises):
             draw = generator(settings.seed, Purpose.ESCAPE, str(way.start), str(number))

@@ -129,7 +129,7 @@ def compare_landscapes(
         barriers[name] = {
             f"{labels[way.start]} to {labels[way.end]}": (way.barrier, way.rate.prefactor)
             for way in found.transitions
-            if way.end is not None and way.rate is not None and np.isfinite(way.barrier)
+            if way.end is not None and way.rate is not None and np.isfinite(way.barrier * way.rate.prefactor)
         }
     if all(len([row for row in wells if row["simulation"] == name and row["kind"] == "attractor"]) < 2
            for name in models):  # fmt: skip

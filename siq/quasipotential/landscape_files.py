@@ -105,11 +105,14 @@ TRANSITION = (
     | _fields(REMARKS, "remarks")
 )
 LAW = (
-    _fields(KNOWN, "prefactor", "prefactor_error", "exponent", prefactor_covariance="covariance")
-    | _fields(PLAIN, "correction", "unknown")
+    _fields(NUMBER, "prefactor")
+    | _fields(KNOWN, "prefactor_error", "exponent", prefactor_covariance="covariance")
+    | _fields(PLAIN, "correction", "unknown", "power")
+    | _fields(ARRAY, "phases")
     | _fields(REMARKS, law_remarks="remarks")
 )
-OLDER_LAW = {"correction": 0.0, "unknown": 1.0}  # of files from before there was one
+# Of files from before there was one.
+OLDER_LAW = {"correction": 0.0, "unknown": 1.0, "power": 0.0, "phases": None}
 TURN = _fields(PLAIN, own="loss", beyond="loss_beyond", exact="particle")
 WAY = _fields(PLAIN, minimum_action="action") | _fields(ARRAY, "downhill", uphill="points")
 PATH = (
@@ -211,12 +214,13 @@ def landscape_from_data(data: Mapping[str, Any], dynamics: Dynamics) -> Landscap
         path = rate = None
         if one["path"] is not None:
             path = MinimumActionPath(**_read(one, WAY), **_read(one["path"], PATH))
-        if one["prefactor"] is not None:
+        if one["prefactor"] is not None or one.get("phases") is not None:
             turn = {} if one["turn"] is None else _read(one["turn"], TURN)
             rate = EscapeRate(one["minimum_action"], **_read(OLDER_LAW | one, LAW), **turn)
-        from_cycle = isinstance(attractors[one["start"]], Cycle)
+        start = attractors[one["start"]]
         own = _read({"of_residual": 0.0} | one, TRANSITION) | {"turns": tuple(one.get("turns", ()))}
-        way = Transition(saddle=saddle, path=path, rate=rate, from_cycle=from_cycle, **own)
+        cycle = start if isinstance(start, Cycle) else None
+        way = Transition(saddle=saddle, path=path, rate=rate, cycle=cycle, **own)
         transitions.append(way)
     errors = [one["standard_errors"] for one in wells]
     return Landscape(

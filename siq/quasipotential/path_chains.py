@@ -117,6 +117,7 @@ class Tube:
 
     def __init__(self, points: np.ndarray, hessians: np.ndarray, period: float) -> None:
         n, self.period = len(points), period
+        self.count = n
         places = np.arange(n + 1)
         self.curve = CubicSpline(places, np.vstack([points, points[:1]]), bc_type="periodic")
         self.costs = CubicSpline(places, np.concatenate([hessians, hessians[:1]]), bc_type="periodic")
@@ -160,6 +161,15 @@ class Tube:
         moved = along / (along @ along - offset @ self.curve(place, 2))
         return np.asarray(2 * self.costs(place) @ offset + (offset @ self.costs(place, 1) @ offset) * moved)
 
+    def density(self, place: np.ndarray, flow: np.ndarray) -> np.ndarray:
+        """Stationary density on the cycle, ``(det' H)^½/(T |f|)`` over ``(πε)^((d - 1)/2)``: shape ``(n,)``.
+
+        It is spread evenly in time, and normally across with the variance ``ε/2 H⁻¹``; det' is the product of
+        the eigenvalues across f.
+        """
+        across = np.linalg.eigvalsh(self.costs(place))[:, 1:].prod(axis=1)
+        return np.asarray(np.sqrt(across) / (self.period * np.linalg.norm(flow, axis=1)))
+
     def curvature(self, y: np.ndarray) -> np.ndarray:
         """Second derivatives of the cost next to one point, to leading order: shape ``(d, d)``."""
         return np.asarray(2 * self.costs(self.place(y[None])[0]))
@@ -182,6 +192,10 @@ class _Bowl:
 
     def curvature(self, _: np.ndarray) -> np.ndarray:
         return 2 * self.hessian
+
+
+LevelSet = _Bowl | Tube
+"""What a chain begins or ends on."""
 
 
 class Segments:
@@ -229,7 +243,7 @@ class PathProblem(ScaledSystem):
         super().__init__(dynamics, first, units, unit=distance**2 * rate, rate=rate)
         self.end = self.inverse @ (last - first)
         self.hessian: np.ndarray | None = None
-        self.begin: _Bowl | Tube | None = None
+        self.begin: LevelSet | None = None
         self.finish: Tube | None = None
 
         def tube(cycle: Cycle, hessians: np.ndarray) -> Tube:

@@ -68,10 +68,11 @@ from scipy.interpolate import CubicSpline
 
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import AnyField
-from siq.quasipotential.path_chains import MinimumActionPath, PathProblem
+from siq.quasipotential.path_chains import MinimumActionPath, PathProblem, Tube
 from siq.quasipotential.paths import minimum_action_path
 from siq.quasipotential.power_series import MOST_STATES_OF_DEGREE_4, local_series
 from siq.remarks import Remark
+from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import classify, hessian_at, measure_at
 
@@ -83,6 +84,7 @@ ORBIT_STEPS = 2000  # in each distance from saddle to attractor, in search of th
 ORBIT_REACH = 20.0  # of these distances, up to which it is sought
 
 SERIES_RADIUS = {4: 0.01, 3: 0.003}  # of the distance from A to S, in the metric of M: V is its power series
+TUBE_LEVEL = 1e-5  # of the action, U where the density about a cycle is no longer that of its tube
 SADDLE_RADIUS = 0.003  # of the distance: from there at the latest the integrand is continued to S
 RICCATI_STEP = 0.2  # in units of the largest rate
 MOST_RICCATI_STEPS = 1e6  # numerical, a guard
@@ -201,6 +203,10 @@ class EscapeRate:
         Relative standard error of ΔU/ε from an estimated D over that of ε.
     correction, unknown
         By how much ln E[τ] grows with ε, in the unit of 1/U; and what is not known of that, in ε/ΔU.
+    power, phases
+        Of ways from or over a cycle K depends on ε, ``K = ε^power / Σ r exp(-δ/ε)``: δ, by how much more the
+        path through another phase costs, and r, its part of the rate, shape ``(2, n)``. The prefactor is
+        NaN then; of all other ways these are None and 0.
     """
 
     barrier: float
@@ -216,6 +222,22 @@ class EscapeRate:
     leverage: float = 1.0
     correction: float = 0.0
     unknown: float = 1.0
+    power: float = 0.0
+    phases: np.ndarray | None = None
+
+    def prefactor_at(self, intensity: float) -> float:
+        """K for the noise intensity ε, in time units; NaN where the law does not hold.
+
+        Examples
+        --------
+        >>> phases = np.array([[0.0, 10.0], [0.25, 0.25]])
+        >>> round(EscapeRate(1.0, np.nan, power=-0.5, phases=phases).prefactor_at(0.25), 6)
+        8.0
+        """
+        if self.phases is None:
+            return self.prefactor
+        excess, rates = self.phases
+        return float(intensity**self.power / (rates @ np.exp(-excess / intensity)))
 
     def slowing(self, intensity: float) -> float:
         """By which factor weak damping makes escape rarer than by the law; NaN where that is not known.
@@ -243,7 +265,7 @@ class EscapeRate:
         Raises `NumericalFailure` when the law has no prefactor; when ε is not below the barrier, so that
         there is nothing to escape from; or when damping is too weak for ε.
         """
-        if np.isnan(self.prefactor):
+        if np.isnan(self.prefactor_at(intensity)):
             raise NumericalFailure("the law of escape does not hold")
         if not 0 < intensity < self.barrier:
             raise NumericalFailure(
@@ -253,7 +275,7 @@ class EscapeRate:
         with np.errstate(over="ignore"):
             slower = self.slowing(intensity)
             known = np.clip(self.correction * intensity, -1, 1)  # beyond, the series says nothing
-            time = float(self.prefactor * np.exp(self.barrier / intensity + known) / slower)
+            time = float(self.prefactor_at(intensity) * np.exp(self.barrier / intensity + known) / slower)
         if not np.isfinite(slower):
             raise NumericalFailure(
                 f"damping is too weak for the escape law: in one turn U = {self.loss:.3g} is lost, and"
@@ -298,6 +320,7 @@ def escape_rate(
     *,
     hessian: Callable[[np.ndarray], np.ndarray] | None = None,
     beyond: bool = True,
+    cycle: Cycle | None = None,
 ) -> EscapeRate:
     """The law of escape along a minimum action path from an attractor to a saddle.
 
@@ -318,14 +341,16 @@ def escape_rate(
         ∇²V of a formula, points ``(n, d)`` to ``(n, d, d)``; by default it is integrated along the path.
     beyond
         Whether beyond the saddle lies another well; it matters where damping is weak.
+    cycle
+        The stable cycle from which the path begins, if it does not begin at a point.
 
     Raises
     ------
     NumericalFailure
-        When the path does not lead from an attractor, which cannot be a cycle, to a saddle with one unstable
-        direction; when it meets a caustic; or when V is not smooth at the saddle.
+        When the path does not lead from an attractor to a saddle with one unstable direction; when it meets a
+        caustic; or when V is not smooth at the saddle.
     """
-    frame = _Frame(dynamics, path)
+    frame = _Frame(dynamics, path, cycle)
     twins = any(abs(one - path.action) < SAME_ACTION * path.action for one in path.rivals)
     remarks, skew = list[Remark](), frame.skew()
     if not path.converged:
@@ -344,8 +369,10 @@ def escape_rate(
     curvatures = frame.integrated() if hessian is None else frame.curvature(hessian, frame.points[::2])
     exponent = frame.exponent(curvatures)
     at_saddle = frame.continued(curvatures) if frame.at_saddle is None else frame.at_saddle
-    ratio = abs(np.linalg.det(at_saddle)) / np.linalg.det(frame.at_attractor)
-    prefactor = 2 * np.pi / (frame.unstable * frame.problem.rate) * np.sqrt(ratio) * np.exp(exponent)
+    volume, power = frame.volume()
+    root = np.sqrt(abs(np.linalg.det(at_saddle)))
+    prefactor = float(2 * np.pi / (frame.unstable * frame.problem.rate) * root * volume * np.exp(exponent))
+    phases = None if power == 0 else np.array([[0.0], [1 / prefactor]])
     loss, loss_beyond, particle = _energy_loss_per_cycle(dynamics, path, beyond=beyond)
     if loss is not None and not particle:
         remarks.append(Remark("quasipotential.law_limited_by_turning", {"loss": loss}))
@@ -353,8 +380,8 @@ def escape_rate(
         remarks.append(Remark("quasipotential.law_of_weak_damping", {"loss": loss}))
     correction, unknown = frame.correction()
     return EscapeRate(
-        path.action, float(prefactor), exponent, tuple(remarks), loss, loss_beyond, particle,
-        correction=correction, unknown=unknown,
+        path.action, np.nan if power else prefactor, exponent, tuple(remarks), loss, loss_beyond, particle,
+        correction=correction, unknown=unknown, power=power, phases=phases,
     )  # fmt: skip
 
 
@@ -365,11 +392,12 @@ class _Frame:
     inverse is replaced in these units (`siq.systems.equilibria.measure_at`).
     """
 
-    def __init__(self, dynamics: Dynamics, path: MinimumActionPath) -> None:
+    def __init__(self, dynamics: Dynamics, path: MinimumActionPath, cycle: Cycle | None) -> None:
         start, end = path.points[0], path.points[-1]
-        problem = PathProblem(dynamics, start, end, measure=measure_at(dynamics, start).frozen(start))
+        measure = measure_at(dynamics, start).frozen(start) if cycle is None else None
+        problem = PathProblem(dynamics, start if cycle is None else cycle, end, measure=measure)
         saddle = classify(dynamics, end)
-        if problem.hessian is None:
+        if problem.begin is None:
             raise NumericalFailure(f"the path starts at {start.tolist()}, which is no stable equilibrium")
         if not problem.rests(problem.end) or saddle.kind == "degenerate" or saddle.unstable != 1:
             raise NumericalFailure(f"the path ends at {end.tolist()}, no saddle with one unstable direction")
@@ -379,14 +407,19 @@ class _Frame:
         self.resonant = bool(sums.min(initial=np.inf) < RESONANCE * self.unstable)
         self.stable = float(-rates[1:].real.max(initial=-np.inf))
         self.problem, self.height = problem, path.action / problem.unit
-        self.gradients, self.hessians = local_series(dynamics, start)
-        self.at_attractor = problem.hessian
         self.at_saddle = None if self.resonant else problem.curvatures(hessian_at(dynamics, end))
         points, momenta = problem.scaled(path.points), problem.slopes(path.momenta)
-        level = np.einsum("ni,ij,nj->n", points, self.at_attractor, points)
+        level = problem.level(points)
         degree = 3 if dynamics.dimension > MOST_STATES_OF_DEGREE_4 else 4
+        least = TUBE_LEVEL * self.height if cycle is not None else SERIES_RADIUS[degree] ** 2 * level[-1]
         used = np.linalg.norm(points - problem.end, axis=1) > SADDLE_RADIUS
-        used[: int(np.sum(level < SERIES_RADIUS[degree] ** 2 * level[-1]))] = False
+        used[: int(np.argmax(level >= least))] = False
+        if isinstance(problem.begin, Tube):
+            self.place = problem.begin.place(points[used][:1])
+            self.at_attractor = problem.begin.costs(self.place)[0]
+        else:
+            self.gradients, self.hessians = local_series(dynamics, start)
+            self.at_attractor = problem.begin.hessian
         # A grid along the path, with the time per unit of it; a step in time is two of its intervals.
         count = int(used.sum())
         curve = CubicSpline(np.arange(count), np.column_stack([points[used], momenta[used]]))
@@ -444,13 +477,13 @@ class _Frame:
 
     def exponent(self, curvatures: np.ndarray) -> float:
         """∫ c dt over the whole path; near S the integrand per length is continued as a straight line."""
-        problem = self.problem
-        # From A to the first point y: with ẏ = By and c = b·y it is b·B⁻¹y.
-        here = np.zeros((1, problem.dimension))
-        flow = problem.jacobian(here)[0] + 2 * problem.noise.at(here)[0] @ self.at_attractor
-        y = np.linalg.solve(flow, self.points[0]) * np.array([[1.0], [-1.0]])
-        p = problem.slopes(self.gradients(problem.points(y)))
-        odd = self.rise(y, p, self.curvature(self.hessians, y))
+        problem, odd = self.problem, np.zeros(2)
+        if problem.hessian is not None:  # from A to the first point y: with ẏ = By and c = b·y it is b·B⁻¹y
+            here = np.zeros((1, problem.dimension))
+            flow = problem.jacobian(here)[0] + 2 * problem.noise.at(here)[0] @ self.at_attractor
+            y = np.linalg.solve(flow, self.points[0]) * np.array([[1.0], [-1.0]])
+            p = problem.slopes(self.gradients(problem.points(y)))
+            odd = self.rise(y, p, self.curvature(self.hessians, y))
         rise = self.rise(self.points[::2], self.momenta[::2], curvatures)
         density = rise / np.linalg.norm(self.velocities[::2], axis=1)
         rest = float(np.linalg.norm(self.points[-1] - problem.end))
@@ -458,10 +491,21 @@ class _Frame:
         along = simpson(rise * self.pace[::2], x=self.grid[::2])
         return float(float(odd[0] - odd[1]) / 2 + along + outer)
 
+    def volume(self) -> tuple[float, float]:
+        """The inverse of the density at the start of the path, up to ``(πε)^(d/2)``; and a power of ε.
+
+        About a cycle the density is spread evenly in time, and across the cycle normally (`Tube.density`).
+        """
+        problem = self.problem
+        if not isinstance(problem.begin, Tube):
+            return float(1 / np.sqrt(np.linalg.det(self.at_attractor))), 0.0
+        density = problem.begin.density(self.place, problem.force(problem.begin.curve(self.place)))
+        return float(np.sqrt(problem.unit / np.pi) / density[0]), -0.5
+
     def correction(self) -> tuple[float, float]:
         """By how much ln E[τ] grows with ε, in the unit of 1/U; and what is not known of it, times ΔU."""
         problem, terms, turning = self.problem, [], 0.0
-        if not (problem.noise.constant and problem.noise.regular):
+        if not (problem.noise.constant and problem.noise.regular and problem.hessian is not None):
             return 0.0, 1.0
         for y in (np.zeros(problem.dimension), problem.end):
             jacobian = problem.jacobian(y[None])[0]
@@ -500,7 +544,10 @@ class _Frame:
             product = m @ turned[index]
             return -self.pace[index] * (product + product.T + 2 * m @ noise[index] @ m + bends[index])
 
-        m = _imposed(self.curvature(self.hessians, self.points[:1])[0], self.velocities[0], forces[0])
+        m = self.at_attractor
+        if problem.hessian is not None:
+            m = self.curvature(self.hessians, self.points[:1])[0]
+        m = _imposed(m, self.velocities[0], forces[0])
         kept = [m]
         for index in range(0, len(self.points) - 2, 2):
             h = self.grid[index + 2] - self.grid[index]

@@ -19,12 +19,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
 from siq.inference.diffusion_model import defined_states
 from siq.inference.field_estimate import AnyField, dynamics_of
-from siq.quasipotential.path_chains import MinimumActionPath
+from siq.numerics.integration import Rates, dormand_prince_step, next_step
+from siq.quasipotential.characteristics import norm
+from siq.quasipotential.path_chains import LevelSet, LimitSet, MinimumActionPath, PathProblem, Tube
 from siq.quasipotential.paths import descent, transition_path
 from siq.quasipotential.rates import EscapeRate, escape_rate, prefactor_error
 from siq.quasipotential.wells import Well
@@ -41,6 +44,15 @@ NOTEWORTHY_CHANGE = 0.5  # of its standard error, by which alternative terms mov
 NOTEWORTHY_DIFFERENCE = 0.02  # share of a barrier by which formula and path may differ without a remark
 MOST_STATES_OF_BENT_GUESSES = 8  # up to which first guesses of a path bend to all sides
 GUESS_POINTS = 200  # of one that is a way down taken backwards
+FAN = 64  # trajectories at different phases
+FAN_LEVEL = 1e-6  # of the action, where they begin
+MEETING = 0.25  # of the action: W on the curve on which trajectories from both ends meet
+COUNTED = 1.0  # of the action: what costs so much more than the best phase does not count
+SAME_WAY = 0.01  # of the action: of the chain and of trajectories
+FAN_ACCURACY, MOST_FAN_STEPS = 1e-8, 5_000  # numerical: of one step, in units of the problem; a guard
+FAN_SPENT = 0.01  # of its largest momentum: below, a trajectory goes where f leads
+FAN_REACH = 6.0  # in units of the distance of both ends: what is so far away does not come back
+FIRST_STEP, ARRIVAL_STEPS, SHIFT = 1e-3, 8, 1e-6  # numerical, in units of the shortest time
 PATH_TOLERANCE = 1e-5  # of the action; prefactors follow the end of the path and need more than barriers
 
 
@@ -50,9 +62,9 @@ class Transition:
 
     Attributes
     ----------
-    start, end, from_cycle
+    start, end, cycle
         Indices of the attractors, `end` None where the saddle leads back, or out of the recorded region; and
-        whether the first is a cycle.
+        the first itself if it is a cycle.
     saddle, path
         The saddle, or the unstable cycle; and the path of least action with the way down, None where none was
         found.
@@ -85,7 +97,7 @@ class Transition:
     remarks: tuple[Remark, ...] = ()
     leverage: float = 1.0
     by_rivals: float = 0.0
-    from_cycle: bool = False
+    cycle: Cycle | None = None
     of_residual: float = 0.0
     turns: tuple[int, ...] = ()
 
@@ -135,6 +147,7 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
     whole = portrait.cover or portrait  # on which wells of all periods have a number
     points, box, cycles = len(whole.attractors), whole.box, whole.cycles
     settled: list[np.ndarray | Cycle] = [*(one.position for one in whole.attractors), *cycles]
+    at_cycle: list[Cycle | None] = [*(None for _ in range(points)), *cycles]
     homes = portrait.homes or tuple((number, ()) for number in range(len(settled)))
     ways: list[Transition] = []
 
@@ -160,7 +173,7 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
         except NumericalFailure as error:
             remarks = (Remark("quasipotential.no_path", {"reason": str(error)}),)
         ways.append(
-            Transition(number, target, over, path, remarks=remarks, from_cycle=start >= points, turns=turns)
+            Transition(number, target, over, path, remarks=remarks, turns=turns, cycle=at_cycle[start])
         )
 
     for cycle in whole.parting:
@@ -176,12 +189,201 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
             end = min(set(reached[reached >= 0].tolist()) - {index}, default=None)
             if end is None and not beyond_region:
                 remarks = (Remark("quasipotential.nothing_beyond_saddle"),)
-                ways.append(
-                    Transition(number, None, saddle, None, remarks=remarks, from_cycle=index >= points)
-                )
+                ways.append(Transition(number, None, saddle, None, remarks=remarks, cycle=at_cycle[index]))
             elif end is not None or not (reached == index).all():  # else it parts no wells
                 add(index, saddle, end)
     return ways
+
+
+def escape_rate_over_cycle(
+    dynamics: Dynamics, path: MinimumActionPath, start: LimitSet, over: Cycle
+) -> EscapeRate:
+    """The law of escape of two states over an unstable cycle, from a stable point or cycle.
+
+    The density of those who come, ``C exp(-U/ε)``, and the probability ``B exp(-W/ε)`` that one who is there
+    leaves make a current. Through any closed curve about the unstable cycle it is
+
+        1/E[τ] = ∮ C B |dx × ẋ| exp(-(U + W)/ε).
+
+    U and C follow from trajectories of Hamilton's equations that leave the start at all phases, W and B from
+    such as end on the unstable cycle, which are followed back. With J for the area between neighbours per
+    phase and time, and ``e = ½∫ ∇·f + 2 (∇·D)·p dt``, ``C √J exp(e)`` and ``B √J exp(-e)`` are constant along
+    them. About a stable cycle C is that of `siq.quasipotential.path_chains.Tube.density`; close to the
+    unstable one B is ``½ √(ε/πW)``, as of an error function. The curve is a level of W.
+
+    Where all phases are as good, as on circles, U + W is constant, and K goes as ε^½ from a point, and as ε⁰
+    from a cycle; where one is best by far, Laplace's method makes ε⁰ and ε^(-½) of that. The integral is
+    taken as a whole, and holds in between. At which phase the unstable cycle is crossed depends on ln ε
+    periodically; the rate, a sum over all phases, does not to this order.
+
+    Raises
+    ------
+    NumericalFailure
+        When there are more than two states, when the start is no attractor, or when trajectories next to the
+        best one do not meet, as beyond a caustic.
+
+    References
+    ----------
+    J. Lehmann, P. Reimann, P. Hänggi, Phys. Rev. Lett. 84 (2000) 1639: one state that is driven.
+    R. S. Maier, D. L. Stein, Phys. Rev. Lett. 77 (1996) 4860: the current on the unstable cycle itself.
+    N. Berglund, B. Gentz, SIAM J. Math. Anal. 46 (2014) 310: at which phase it is crossed.
+    """
+    if dynamics.dimension != 2:
+        raise NumericalFailure("the law of ways over an unstable cycle is known for two states only")
+    problem = PathProblem(dynamics, start, over)
+    first, last = problem.begin, problem.finish
+    if first is None or last is None:
+        raise NumericalFailure("a way over an unstable cycle has to begin at an attractor")
+    height, every = path.action / problem.unit, np.arange(float(FAN))
+    level, met = FAN_LEVEL * height, MEETING * height
+    inwards = _side(last, first.closest(np.zeros((1, 2)))[0])
+    outwards = _side(first, last.curve(np.zeros(1))[0]) if isinstance(first, Tube) else 1.0
+    z, areas, done = _fan(problem, last, inwards, every, level, -1.0, lambda z: met - z[:, 8])
+    if not done.all():
+        raise NumericalFailure("paths that end on the unstable cycle meet a caustic next to it")
+    curve = Tube(z[:, :2], np.zeros((FAN, 2, 2)), 1.0)
+    likely = np.log(areas[0] / areas[1] / (4 * np.pi * level)) / 2 + z[:, 9]
+    likely = CubicSpline(np.arange(FAN + 1), np.append(likely, likely[0]), bc_type="periodic")
+
+    def short_of(z: np.ndarray) -> np.ndarray:
+        """Distance from the curve where the two meet, negative beyond it."""
+        place = curve.place(z[:, :2])
+        along = curve.curve(place, 1)
+        away = _cross(along, z[:, :2] - curve.curve(place))
+        return np.asarray(inwards * away / np.linalg.norm(along, axis=1))
+
+    def through(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """U + W and the current per phase, of paths that leave at places."""
+        z, areas, done = _fan(problem, first, outwards, places, level, 1.0, short_of)
+        if isinstance(first, Tube):
+            on = places * (first.count / FAN)
+            dense = first.density(on, problem.force(first.curve(on))) / np.sqrt(np.pi)
+        else:
+            dense = np.full(len(places), np.sqrt(np.linalg.det(first.hessian)) / np.pi)
+        with np.errstate(all="ignore"):
+            current = dense * np.sqrt(areas[0] * areas[1]) * np.exp(likely(curve.place(z[:, :2])) - z[:, 9])
+        return np.where(done, z[:, 8] + met, np.inf), np.where(done, current, 0.0)
+
+    costs, currents = through(every)
+    close = costs < (1 + COUNTED) * height
+    if not close.all():  # runs of phases that count, each resolved by as many trajectories
+        begins = np.flatnonzero(close & ~np.roll(close, 1))
+        lengths = [int(np.argmin(np.roll(close, -begin))) for begin in begins]
+        runs = [
+            (np.linspace(begin - 1, begin + length, FAN), (length + 1) / (FAN - 1))
+            for begin, length in zip(begins, lengths, strict=True)
+        ]
+        found = [(*through(places), share) for places, share in runs]
+        costs = np.concatenate([np.full(1, np.inf), *(one[0] for one in found)])
+        currents = np.concatenate([np.zeros(1), *(one[1] * one[2] for one in found)])
+    if not abs(costs.min() / height - 1) < SAME_WAY:
+        raise NumericalFailure("trajectories from the attractor do not come to the path over the cycle")
+    known = currents > 0
+    excess = (costs[known] - costs[known].min()) * problem.unit
+    power = 0.0 if isinstance(first, Tube) else 0.5
+    parts = currents[known] * problem.rate * problem.unit**power
+    return EscapeRate(path.action, np.nan, power=power, phases=np.array([excess, parts]))
+
+
+def _fan(
+    problem: PathProblem,
+    begin: LevelSet,
+    side: float,
+    places: np.ndarray,
+    level: float,
+    sense: float,
+    short_of: Callable[[np.ndarray], np.ndarray],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Trajectories of Hamilton's equations from where the cost is as given, until they come somewhere.
+
+    They begin on one side of a tube, or on an ellipse, at places that are counted from 0 to `FAN` around it,
+    and run backwards in time from an unstable cycle, with the sense -1. Gives states, momenta, their changes
+    from place to place, the cost, and e, shape ``(n, 10)``; the areas J at begin and end, ``(2, n)``; and
+    which came there.
+    """  # fmt: skip
+    around = np.arange(FAN)
+    if isinstance(begin, Tube):
+        on = around * (begin.count / FAN)
+        along = begin.curve(on, 1)
+        across = side * np.stack([-along[:, 1], along[:, 0]], axis=1)
+        across /= np.linalg.norm(along, axis=1)[:, None]
+        steep = np.einsum("ni,nij,nj->n", across, begin.costs(on), across)[:, None]
+        y, q = begin.curve(on) + np.sqrt(level / steep) * across, sense * np.sqrt(level * steep) * across
+    else:
+        angle = 2 * np.pi * around / FAN
+        circle = np.stack([np.cos(angle), np.sin(angle)])
+        y = np.sqrt(level) * np.linalg.solve(np.linalg.cholesky(begin.hessian).T, circle).T
+        q = y @ begin.hessian
+    ring = np.column_stack([y, q])
+    ring = CubicSpline(np.arange(FAN + 1), np.vstack([ring, ring[:1]]), bc_type="periodic")
+    z = np.column_stack([ring(places), ring(places, 1), np.full(len(places), level), 0 * places])
+
+    def rates(z: np.ndarray) -> np.ndarray:
+        y, q, x_moved, q_moved = z[:, :2], z[:, 2:4], z[:, 4:6, None], z[:, 6:8, None]
+        turned = problem.turned(y, q)
+        velocity, pull, cost = problem.velocities(y, q, turned)
+        spread = turned @ x_moved + 2 * problem.noise.at(y) @ q_moved
+        bent = -turned.transpose(0, 2, 1) @ q_moved - problem.bend(y, q) @ x_moved
+        thins = np.trace(problem.jacobian(y), axis1=1, axis2=2) / 2
+        thins += (problem.noise.divergence(y) * q).sum(axis=1)
+        return sense * np.column_stack([velocity, pull, spread[:, :, 0], bent[:, :, 0], sense * cost, thins])
+
+    def area(z: np.ndarray) -> np.ndarray:
+        return _cross(rates(z)[:, :2], z[:, 4:6])
+
+    begun, alive = area(z), np.arange(len(z))
+    strength = np.asarray(norm(z[:, 2:4]))
+    done, steps = np.zeros(len(z), dtype=bool), np.full(len(z), FIRST_STEP)
+    for _ in range(MOST_FAN_STEPS):
+        with np.errstate(all="ignore"):
+            last, step = z[alive], steps[alive]
+            moved, error = dormand_prince_step(rates, last, step)
+            relative = np.abs(error[:, :4]).max(axis=1) / FAN_ACCURACY
+        steps[alive] = next_step(step, relative)
+        taken = np.isfinite(moved).all(axis=1) & (relative <= 1)
+        z[alive[taken]] = moved[taken]
+        arrived = np.flatnonzero(taken)[short_of(moved[taken]) <= 0]
+        if len(arrived):
+            z[alive[arrived]] = _arrived(rates, last[arrived], step[arrived], short_of)
+            done[alive[arrived]] = True
+        crossed = area(z[alive]) * begun[alive] <= 0  # a caustic
+        away = norm(z[alive, :2]) > FAN_REACH
+        strength[alive] = np.maximum(strength[alive], norm(z[alive, 2:4]))
+        spent = norm(z[alive, 2:4]) < FAN_SPENT * strength[alive]
+        dear = z[alive, 8] > (1 + COUNTED) * level / FAN_LEVEL
+        alive = alive[~(done[alive] | crossed | away | spent | dear)]
+        if not len(alive):
+            break
+    with np.errstate(all="ignore"):
+        return z, np.abs(np.stack([begun, area(z)])), done
+
+
+def _arrived(
+    rates: Rates, last: np.ndarray, step: np.ndarray, short_of: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """States at which trajectories arrive within a step, by Newton's method between bounds."""
+    low, high = np.zeros(len(step)), step.copy()
+    for _ in range(ARRIVAL_STEPS):
+        z, _ = dormand_prince_step(rates, last, step)
+        left = short_of(z)
+        low, high = np.where(left > 0, step, low), np.where(left > 0, high, step)
+        ahead = (short_of(z + SHIFT * rates(z)) - left) / SHIFT
+        with np.errstate(all="ignore"):
+            step = step - left / ahead
+        step = np.where((step >= low) & (step <= high), step, (low + high) / 2)
+    return z
+
+
+def _cross(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+    return np.asarray(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0])
+
+
+def _side(tube: Tube, point: np.ndarray) -> float:
+    """1 if a point lies on the side of a cycle to the left of the motion, -1 to the right."""
+    ring = tube.curve(np.arange(tube.count + 1))
+    angle = np.unwrap(np.arctan2(*(ring - point).T[::-1]))
+    turn = float(np.sign(_cross(ring[:-1] - ring[0], ring[1:] - ring[0]).sum()))
+    return turn if abs(angle[-1] - angle[0]) > np.pi else -turn
 
 
 def missing_diffusion(dynamics: Dynamics) -> str | None:
@@ -217,11 +419,13 @@ def transitions(
         if not path.converged:
             remarks.append(Remark("quasipotential.path_not_converged"))
         try:
-            if way.from_cycle or isinstance(way.saddle, Cycle):
-                raise NumericalFailure("no law is implemented for ways that begin or end on a cycle")
             if (missing := missing_diffusion(dynamics)) is not None:
                 raise NumericalFailure(missing)
-            rate = escape_rate(dynamics, path, beyond=way.end is not None)
+            if isinstance(way.saddle, Cycle):
+                begin = path.points[0] if way.cycle is None else way.cycle
+                rate = escape_rate_over_cycle(dynamics, path, begin, way.saddle)
+            else:
+                rate = escape_rate(dynamics, path, beyond=way.end is not None, cycle=way.cycle)
             remarks += rate.remarks
             error, covariance = prefactor_error(found, path)
             rate = replace(rate, prefactor_error=error, covariance=covariance)
@@ -242,7 +446,7 @@ def transitions(
             replace(
                 way, barrier=barrier + by_rivals, formula_share=share, standard_error=spread, rate=rate,
                 remarks=tuple({str(one): one for one in remarks}.values()), by_rivals=by_rivals,
-                leverage=noise_leverage(path, dynamics),
+                leverage=_noise_leverage(path, dynamics),
             )
         )  # fmt: skip
     return found_ways
@@ -272,7 +476,7 @@ def _barrier_uncertainty(path: MinimumActionPath, found: AnyField) -> tuple[floa
     return float(np.sqrt(max(variance, 0.0))), by_rivals
 
 
-def noise_leverage(path: MinimumActionPath, dynamics: Dynamics) -> float:
+def _noise_leverage(path: MinimumActionPath, dynamics: Dynamics) -> float:
     """Relative standard error of ΔU/ε from an estimated εD, over that of ε, the mean of its parts.
 
     A change of εD changes ``ΔU/ε = 2∫p·dx/ε`` by ``-2∫ p·δ(εD)p dt/ε²``. With the covariance of a matrix that
@@ -315,7 +519,9 @@ def progress_along(
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Progress of states ``(d, n)`` out of a well: U/ε at the nearest state of its paths of least action.
 
-    Beyond a saddle it rises by one more. A `NumericalFailure` where no path is known.
+    Beyond a saddle it rises by one more. Over an unstable cycle it is that of the state of the path whose
+    distances from there and from the attractor differ by as much, whatever the phase. A `NumericalFailure`
+    where no path is known.
     """
     known = [(way.path, way.downhill) for way in ways if way.path is not None]
     if not known:
@@ -324,6 +530,15 @@ def progress_along(
     beyond = [path.action / intensity + np.linspace(0, 1, len(down)) for path, down in known]
     pairs = zip(known, beyond, strict=True)
     along = np.concatenate([np.append(path.values / intensity, last) for (path, _), last in pairs])
+    lowest = min(ways, key=lambda way: way.barrier)
+    if isinstance(lowest.saddle, Cycle) and lowest.path is not None:
+        near, far = (
+            cKDTree(each.points if isinstance(each, Cycle) else each.position[None])
+            for each in (attractor, lowest.saddle)
+        )
+        apart = near.query(lowest.path.points)[0] - far.query(lowest.path.points)[0]
+        apart, height = np.maximum.accumulate(apart), lowest.path.values / intensity
+        return lambda x: np.interp(near.query(x.T)[0] - far.query(x.T)[0], apart, height)
     # Near is what the noise about the attractor makes so.
     root = np.diag(1 / np.ptp(points, axis=0))
     if isinstance(attractor, Equilibrium):

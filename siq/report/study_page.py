@@ -647,7 +647,7 @@ def _barriers_over_runs(landscape: pd.DataFrame | None) -> pd.DataFrame | None:
 def _bifurcations(
     system: Dynamics, options: SweepOptions | None, found: pd.DataFrame | None
 ) -> pd.DataFrame | None:
-    """Where equilibria meet and vanish, begin to oscillate, or cross."""
+    """Where equilibria or cycles meet and vanish, begin to oscillate, or cross."""
     if options is None or found is None:
         return None
     unit = next(each.unit for each in system.parameters if each.name == options.parameter)
@@ -659,7 +659,7 @@ def _bifurcations(
                 "what": one.kind,
                 with_unit(options.parameter, unit): f"{one.value:.10g}",
                 "state": ", ".join(f"{name} = {x:.5g}" for name, x in states),
-                "frequency": f"{one.frequency:.6g}" if one.kind == "Hopf" else "",
+                "frequency": f"{one.frequency:.6g}" if one.frequency else "",
             }
         )
     return pd.DataFrame(rows)

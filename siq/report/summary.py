@@ -150,7 +150,7 @@ class LandscapeSummary:
     @property
     def has_times(self) -> bool:
         """Whether some exit has a law of its mean time."""
-        return any(math.isfinite(way.exit.prefactor) for way in self.ways)
+        return any(way.exit.phases is not None or math.isfinite(way.exit.prefactor) for way in self.ways)
 
     @property
     def no_time_reason(self) -> str:

@@ -1,4 +1,4 @@
-"""Continuation of equilibria along a parameter, and of their folds and Hopf points in a plane of two.
+"""Continuation of equilibria and cycles along a parameter, and of folds and Hopf points in a plane of two.
 
 All lengths are shares of the domain of each state and of the range of each parameter λ. A branch
 ``f(x(s), λ(s)) = 0`` is followed along its own length s, not along λ, so that it passes through its folds: a
@@ -21,6 +21,14 @@ have one equation fewer than unknowns, and folds and Hopf points lie on curves, 
 are. In all of these unknowns a curve has no corner at a cusp, at which two curves of folds meet in the plane,
 and one of folds passes a point of Bogdanov and Takens. A curve of Hopf points ends there, with ω = 0.
 
+A *cycle* begins at a Hopf point, with the period 2π/ω and an amplitude that grows as the root of the distance
+in λ, or it was found at some value. It is followed likewise, in its state on a section and its period T,
+
+    φ_T(x, λ) = x,    c·(x - x₀) = 0                                         (a cycle)
+
+with c along f at the last point x₀. It ends where it shrinks to an equilibrium, leaves the domain or becomes
+so slow that it nears a homoclinic orbit; where its tangent turns back in λ is a *fold of cycles*.
+
 References
 ----------
 H. B. Keller, in Applications of Bifurcation Theory (1977) 359: pseudo-arclength continuation.
@@ -38,9 +46,11 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from siq.errors import Fault
+from siq.numerics.integration import runge_kutta_step
 from siq.remarks import Remark
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, symbol
@@ -53,6 +63,10 @@ NEWTON_RADIUS = 0.01  # so far from its first place Newton's method may end: the
 BIFURCATION_MERGE_TOLERANCE = 1e-5
 FOLD_MARGIN = 1e-6  # |ψ·∂f/∂λ| to |∂f/∂λ| below which a singular point is no fold
 LONGEST_STEP = 0.01  # along a branch: a curve of a hundred chords looks smooth
+LONGEST_STEP_OF_CYCLES = 0.03  # which take long, and bend no more
+FIRST_AMPLITUDE = 0.01  # of a cycle next to a Hopf point
+LONGEST_PERIOD = 30.0  # of the first one: a cycle so slow nears a homoclinic orbit, where the branch ends
+COURSE = 400  # numerical: steps around a cycle
 SHORTEST_STEP = 1e-9  # a branch that asks for shorter steps is given up
 MIN_TANGENT_COSINE = 0.98  # of the angle between the tangents of a step's ends: 11 degrees
 ON_CURVE_TOLERANCE = 1e-6
@@ -77,6 +91,11 @@ class _Family:
             (*dynamics.symbols, *map(symbol, limits)), (*formulas, *[0] * len(limits)),
             diffusion=Diffusion.identity(self.count),
         )  # fmt: skip
+
+    def whole(self, x: np.ndarray) -> np.ndarray:
+        """f of components in natural units, with parameters that rest: ``(d + p, n)`` to the same."""
+        with np.errstate(all="ignore"):
+            return self._of_both.drift_of_components(x)
 
     def shares(self, state: np.ndarray, values: float | np.ndarray) -> np.ndarray:
         """A state and the values of the parameters as shares, shape ``(d + p,)``."""
@@ -117,6 +136,7 @@ class _Equilibria:
     """
 
     kind: str = "equilibrium"
+    longest: float = LONGEST_STEP
 
     def __init__(self, family: _Family) -> None:
         self.family, self.d, self.count = family, family.d, family.count
@@ -153,8 +173,12 @@ class _Equilibria:
         return changed < 2 or (changed == 2 and pairs)
 
     def frequency(self, y: np.ndarray) -> float:
-        """ω, in radian per unit of time; zero but at Hopf points."""
+        """ω, in radian per unit of time; zero but at Hopf points and of cycles."""
         return 0.0
+
+    def eigenvalues(self, y: np.ndarray) -> np.ndarray:
+        """Of A, by falling real part; of a cycle its Floquet exponents."""
+        return self.family.eigenvalues(y[: self.count])
 
 
 class _Folds(_Equilibria):
@@ -270,6 +294,99 @@ class _BranchPoints(_Equilibria):
         ])  # fmt: skip
 
 
+class _Cycles(_Equilibria):
+    """``φ_T(x) = x, c·(x - x₀) = 0`` for (z, T), with T in units of the first period."""
+
+    kind, longest = "cycle", LONGEST_STEP_OF_CYCLES
+
+    def __init__(self, family: _Family, unit: float, place: np.ndarray, section: np.ndarray) -> None:
+        super().__init__(family)
+        self.unit, self.place, self.section = unit, place, section
+        self._around: tuple[bytes, np.ndarray, np.ndarray] = (b"", place, section)
+
+    @classmethod
+    def from_hopf(cls, family: _Family, z: np.ndarray) -> tuple[Self, np.ndarray, np.ndarray] | None:
+        """Of small cycles about a Hopf point, with a first guess and the direction in which they grow."""
+        if (near := _HopfPoints.near(family, z)) is None:
+            return None
+        hopf, y = near
+        u, w = y[family.count : -1].reshape(2, -1)
+        across = w / np.linalg.norm(w)
+        turn = np.arctan2(u @ across, np.linalg.norm(w))  # where the ellipse u cos - w sin is on the section
+        grows = u * np.cos(turn) - w * np.sin(turn)
+        ahead = np.append(grows / np.linalg.norm(grows), [0.0, 0.0])
+        equations = cls(family, 2 * np.pi / hopf.frequency(y), z[: family.d], across)
+        return equations, np.append(z, 1.0) + FIRST_AMPLITUDE * ahead, ahead
+
+    def flow_of_period(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """``φ_T`` in shares, ``(d,)``, and its derivatives by states and parameter; NaN where none."""
+        d, key = self.d, y.tobytes()
+        if self._around[0] == key:
+            return self._around[1:]
+
+        def rates(_: float, s: np.ndarray) -> np.ndarray:
+            at = np.append(s[:d], y[d])
+            slopes = self.family.slopes(at)
+            change = slopes[:, :d] @ s[d:].reshape(d, d + 1)
+            change[:, d] += slopes[:, d]
+            return np.concatenate([self.family.flow(at), change.ravel()])
+
+        end = np.full(d * (d + 2), np.nan)
+        if 0 < y[-1] < 2 * LONGEST_PERIOD:
+            start = np.concatenate([y[:d], np.eye(d, d + 1).ravel()])
+            with np.errstate(all="ignore"):
+                way = solve_ivp(
+                    rates, (0.0, y[-1] * self.unit), start, method="DOP853", rtol=1e-9, atol=1e-11
+                )
+            end = way.y[:, -1] if way.success else end
+        self._around = key, end[:d], end[d:].reshape(d, d + 1)
+        return self._around[1:]
+
+    def residual(self, y: np.ndarray) -> np.ndarray:
+        return np.append(self.flow_of_period(y)[0] - y[: self.d], self.section @ (y[: self.d] - self.place))
+
+    def slope(self, y: np.ndarray) -> np.ndarray:
+        end, change = self.flow_of_period(y)
+        speed = self.family.flow(np.append(end, y[self.d])) * self.unit
+        closing = np.column_stack([change - np.eye(self.d, self.d + 1), speed])
+        return np.vstack([closing, np.append(self.section, [0.0, 0.0])])
+
+    def at(self, y: np.ndarray) -> Self:
+        flow = self.family.flow(y[: self.count])
+        return type(self)(self.family, self.unit, y[: self.d], flow / np.linalg.norm(flow))
+
+    def limit(self, y: np.ndarray) -> tuple[int, float] | None:
+        if y[-1] > LONGEST_PERIOD:
+            return len(y) - 1, LONGEST_PERIOD
+        if self.length(y) < FIRST_AMPLITUDE:
+            return 0, float(y[0])  # it has shrunk to an equilibrium
+        return super().limit(y)
+
+    def length(self, y: np.ndarray) -> float:
+        """About that of the cycle, in shares: of a small one 2π times its amplitude."""
+        return float(np.linalg.norm(self.family.flow(y[: self.count])) * y[-1] * self.unit)
+
+    def resolved(self, last: np.ndarray, y: np.ndarray) -> bool:
+        return True
+
+    def frequency(self, y: np.ndarray) -> float:
+        return float(2 * np.pi / (self.unit * y[-1]))
+
+    def eigenvalues(self, y: np.ndarray) -> np.ndarray:
+        values = np.linalg.eigvals(self.flow_of_period(y)[1][:, : self.d])
+        values = np.delete(values, np.abs(values - 1).argmin())  # that of a displacement along the cycle
+        exponents = np.log(np.maximum(np.abs(values), np.finfo(float).tiny)) / (self.unit * y[-1])
+        return np.asarray(np.sort(exponents)[::-1] + 0j)
+
+    def course(self, points: np.ndarray) -> np.ndarray:
+        """States in natural units around each of some cycles ``(n, d + 2)``: shape ``(k, n, d)``."""
+        x, whole = self.family.natural(points[:, : self.count]).T, self.family.whole
+        step, kept = points[:, -1] * self.unit / COURSE, [x]
+        for _ in range(COURSE):
+            kept.append(runge_kutta_step(whole, kept[-1], step))
+        return np.array(kept)[:, : self.d].transpose(0, 2, 1)
+
+
 # Newton's method, and curves of one equation fewer than unknowns.
 
 
@@ -319,7 +436,7 @@ def _one_way(
 ) -> tuple[list[np.ndarray], bool, _Stop]:
     """Points of a curve from one on, whether it came back to it, and what stopped it: nothing at an end."""
     count = equations.count
-    points, tangent, length = [start], ahead, LONGEST_STEP / 4
+    points, tangent, length = [start], ahead, equations.longest / 4
     first = _tangent(equations.at(start), start, ahead)[:count]
     while len(points) < MAX_POINTS:
         last = points[-1]
@@ -340,7 +457,7 @@ def _one_way(
             component, value = limit
             guess = last + (value - last[component]) / (y[component] - last[component]) * (y - last)
             met = _across(here, guess, np.eye(len(y))[component])
-            near = met is not None and np.linalg.norm(met - guess) <= LONGEST_STEP
+            near = met is not None and np.linalg.norm(met - guess) <= equations.longest
             return [*points, met] if met is not None and near else points, False, {}
         points.append(y)
         # Whether the step passed the point from which the curve began, in the same direction.
@@ -350,7 +467,7 @@ def _one_way(
         same = after[:count] @ first > 0.9 * np.linalg.norm(after[:count]) * np.linalg.norm(first)
         if len(points) > 4 and 0 < share <= 1 and beside and same:
             return [*points[:-1], start], True, {}
-        length = min(1.5 * length, LONGEST_STEP)
+        length = min(1.5 * length, equations.longest)
     return points, False, {"most": MAX_POINTS}
 
 
@@ -361,7 +478,7 @@ def _one_way(
 class Bifurcation:
     """A point of a branch at which the number of equilibria or their stability changes."""
 
-    kind: str  #: ``fold``, ``Hopf`` or ``branch point``
+    kind: str  #: ``fold``, ``Hopf``, ``branch point`` or ``fold of cycles``
     value: float  #: of the parameter
     state: np.ndarray  #: (d,)
     branch: int  #: on which it was found
@@ -370,11 +487,11 @@ class Bifurcation:
 
 
 class Branch:
-    """Equilibria against a parameter; or folds, or Hopf points, along a curve in the plane of two."""
+    """Equilibria or cycles against a parameter; or folds, or Hopf points, along a curve over two."""
 
     def __init__(self, equations: _Equilibria, points: np.ndarray, tangents: np.ndarray) -> None:
         self._equations, self._points = equations, points
-        self.kind = equations.kind  #: ``equilibrium``, ``fold`` or ``Hopf``
+        self.kind = equations.kind  #: ``equilibrium``, ``cycle``, ``fold`` or ``Hopf``
         #: In shares of the domain and of the range, the parameter last: shape ``(n, d + 1)``. Those of curves
         #: go on with their further unknowns.
         self.tangents = tangents
@@ -385,9 +502,8 @@ class Branch:
 
     @cached_property
     def eigenvalues(self) -> np.ndarray:
-        """Of ∂f/∂x, by falling real part, shape ``(n, d)``."""
-        z = self._points[:, : self._equations.count]
-        return np.array([self._equations.family.eigenvalues(each) for each in z])
+        """Of ∂f/∂x, by falling real part, shape ``(n, d)``; of cycles Floquet exponents, ``(n, d - 1)``."""
+        return np.array([self._equations.eigenvalues(each) for each in self._points])
 
     @property
     def unstable(self) -> np.ndarray:
@@ -396,8 +512,28 @@ class Branch:
 
     @property
     def frequencies(self) -> np.ndarray:
-        """ω at Hopf points, in radian per unit of time; zero elsewhere. Shape ``(n,)``."""
+        """ω at Hopf points and 2π/T of cycles, in radian per unit of time; else zero. Shape ``(n,)``."""
         return np.array([self._equations.frequency(each) for each in self._points])
+
+    @cached_property
+    def extents(self) -> np.ndarray:
+        """The least and the largest of each state, around cycles: shape ``(2, n, d)``."""
+        if not isinstance(self._equations, _Cycles):
+            return np.stack([self.states, self.states])
+        course = self._equations.course(self._points)
+        return np.stack([course.min(axis=0), course.max(axis=0)])
+
+    def index_of_cycle(self, state: np.ndarray, value: float) -> int | None:
+        """The point before a cycle that passes a state ``(d,)`` at a value; None where none of these does."""
+        assert isinstance(self._equations, _Cycles)
+        family, nearest, found = self._equations.family, LONGEST_STEP_OF_CYCLES / 2, None
+        for k in np.flatnonzero((self.values[:-1] - value) * (self.values[1:] - value) <= 0):
+            share = (value - self.values[k]) / ((self.values[k + 1] - self.values[k]) or 1.0)
+            y = self._points[k] + share * (self._points[k + 1] - self._points[k])
+            away = (self._equations.course(y[None])[:, 0] - state) / family.width[: family.d]
+            if (distance := float(np.linalg.norm(away, axis=1).min())) < nearest:
+                nearest, found = distance, int(k)
+        return found
 
     def index_of(self, state: np.ndarray, values: float | np.ndarray) -> int | None:
         """The point next to a state ``(d,)`` at values of the parameters; None where it is not on it."""
@@ -449,11 +585,17 @@ def follow_branches(
     parameter: str,
     limits: tuple[float, float],
     seeds: Sequence[tuple[float, np.ndarray]],
+    *,
+    cycles: Sequence[tuple[float, np.ndarray, float]] | None = None,
 ) -> tuple[list[Branch], list[Bifurcation], list[Remark]]:
-    """Branches of equilibria within a range of a parameter λ and within the domain of the states.
+    """Branches of equilibria, and of cycles if asked for, within a range of a parameter λ and the domain.
 
     Seeds are known equilibria: the value of λ and the state, shape ``(d,)``. A branch through none of them is
     not found. Each branch is given once; the bifurcations, by the value of λ; and what could not be followed.
+
+    Branches of cycles come after those of equilibria, from Hopf points and from the `cycles` that are known:
+    value of λ, a state of the cycle, and its period. Each fold of cycles is given at the state whose first
+    component is largest.
 
     Raises
     ------
@@ -470,6 +612,15 @@ def follow_branches(
     >>> _, found, _ = follow_branches(cusp, "h", (-1.0, 1.0), [(0.0, np.array([1.0]))])
     >>> [(one.kind, round(one.value, 10)) for one in found]
     [('fold', -0.3849001795), ('fold', 0.3849001795)]
+
+    Cycles ``r² = (1 ± √(1 + 4a))/2`` of a normal form begin at ``a = 0``, and fold at ``a = -1/4``:
+
+    >>> a, x, y = sympy.symbols("a x y", real=True)
+    >>> grow = a + (x**2 + y**2) - (x**2 + y**2) ** 2
+    >>> form = Dynamics.of((x, y), (x * grow - y, y * grow + x), domain=[(-2, 2)] * 2, parameters={a: 0.0})
+    >>> _, found, _ = follow_branches(form, "a", (-0.5, 0.5), [(0.1, np.zeros(2))], cycles=())
+    >>> [(one.kind, round(one.value, 8)) for one in found]
+    [('fold of cycles', -0.25), ('Hopf', 0.0)]
     """
     family = _Family(dynamics, {parameter: limits})
     equations, along = _Equilibria(family), np.eye(family.count)[-1]
@@ -491,8 +642,74 @@ def follow_branches(
             if all(np.abs(place_of_one - other).max() > BIFURCATION_MERGE_TOLERANCE for other in others):
                 found.append(one)
         branches.append(branch)
+    if cycles is not None:
+        _follow_cycles(family, parameter, branches, found, remarks, cycles)
     found.sort(key=lambda one: one.value)
     return branches, found, remarks
+
+
+def _follow_cycles(
+    family: _Family,
+    parameter: str,
+    branches: list[Branch],
+    found: list[Bifurcation],
+    remarks: list[Remark],
+    seeds: Sequence[tuple[float, np.ndarray, float]],
+) -> None:
+    """Add branches of cycles to those of equilibria, folds of cycles to what was found, and remarks."""
+    first = len(branches)
+    starts: list[tuple[_Cycles, np.ndarray, np.ndarray]] = []
+    for one in found:
+        z = family.shares(one.state, one.value)
+        if one.kind == "Hopf" and (start := _Cycles.from_hopf(family, z)) is not None:
+            starts.append(start)
+    for known, passed, period in seeds:
+        z = family.shares(passed, known)
+        cycles = _Cycles(family, period, z[: family.d], z[: family.d])
+        starts.append((cycles.at(z), np.append(z, 1.0), np.eye(family.count + 1)[family.d]))
+    for equations, guess, ahead in starts:
+        state, value = np.split(family.natural(guess[: family.count]), [family.d])
+        ends = [one._points[place] for one in branches[first:] for place in (0, -1)]
+        begun = any(np.linalg.norm((end - guess)[: family.count]) < 5 * FIRST_AMPLITUDE for end in ends)
+        if begun or any(one.index_of_cycle(state, float(value[0])) is not None for one in branches[first:]):
+            continue
+        branch, stop = _branch_through(equations, _across(equations, guess, ahead), ahead, [])
+        if branch is None or stop:
+            place = {"state": np.round(state, 4).tolist(), "parameter": parameter, "value": float(value[0])}
+            remarks.append(Remark("systems.branch_not_followed", place | (stop or {"most": None})))
+        if branch is None:
+            continue
+        for k in np.flatnonzero(branch.tangents[:-1, family.d] * branch.tangents[1:, family.d] < 0):
+            y = _fold_of_cycles(equations, branch, int(k))
+            if equations.length(y) < 2 * np.pi * FIRST_AMPLITUDE:
+                continue  # at a Hopf point λ turns back, too, as the cycle goes on with its other side
+            states = equations.course(y[None])[:, 0]
+            fold = family.natural(y[: family.count])[-1]
+            place_of_fold = states[np.argmax(states[:, 0])]
+            gap = float(np.abs(equations.at(y).residual(y)).max())
+            found.append(
+                Bifurcation("fold of cycles", float(fold), place_of_fold, len(branches),
+                            equations.frequency(y), gap)
+            )  # fmt: skip
+        branches.append(branch)
+
+
+def _fold_of_cycles(equations: _Cycles, branch: Branch, k: int) -> np.ndarray:
+    """Where the tangent turns back in λ between points k and k + 1."""
+    last, tangent = branch._points[k], branch.tangents[k]
+    whole, here = (branch._points[k + 1] - last) @ tangent, equations.at(last)
+
+    def at(share: float) -> np.ndarray:
+        moved = _across(here, last + share * whole * tangent, tangent)
+        return last + share * (branch._points[k + 1] - last) if moved is None else moved
+
+    def turning(share: float) -> float:
+        y = at(share)
+        return float(_tangent(equations.at(y), y, tangent)[equations.d])
+
+    if turning(0.0) * turning(1.0) >= 0:
+        return at(0.5)
+    return at(float(brentq(turning, 0.0, 1.0, xtol=1e-6)))  # λ is stationary there: it is known to 1e-12
 
 
 def _bifurcations(equations: _Equilibria, branch: Branch, number: int) -> list[Bifurcation]:

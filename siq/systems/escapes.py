@@ -89,6 +89,11 @@ class Neighbourhood:
         cycle = None if self.cycle is None else replace(self.cycle, points=self.cycle.points + shift)
         return replace(self, center=self.center + shift, cycle=cycle)
 
+    def evenly(self, count: int) -> np.ndarray:
+        """So many states of the attractor, evenly spread in time along a cycle: shape ``(d, count)``."""
+        states = self.center[None] if self.cycle is None else self.cycle.points
+        return states[np.arange(count) * len(states) // count].T.copy()
+
     @cached_property
     def _nearest(self) -> Callable[[np.ndarray], np.ndarray]:
         assert self.cycle is not None
@@ -310,9 +315,10 @@ def split_escapes(
         return np.where(reached, np.inf, found)
 
     # Σ lies where few walkers have been after a short time.
-    x = np.repeat(start.center[:, None], PILOTS, axis=1)
+    x = start.evenly(PILOTS)
     highest = np.full(PILOTS, -np.inf)
-    for _ in range(int(np.ceil(PILOT_TIME / slowest / step))):
+    longest = max(1 / slowest, 0.0 if start.cycle is None else start.cycle.period)
+    for _ in range(int(np.ceil(PILOT_TIME * longest / step))):
         x = advance(x)
         highest = np.maximum(highest, heights(x))
     first = min(float(np.quantile(highest, 1 - PILOT_SHARE, method="nearest")), top - 1.0)
@@ -330,7 +336,7 @@ def split_escapes(
     walkers = max(int(np.ceil(WALKERS * (top - first) / RUNS)), LEAST_WALKERS)
 
     def result(walkers: int) -> _SplitTime:
-        x, cycles = _at_sigma(advance, levels, start.center, runs * walkers, count)
+        x, cycles = _at_sigma(advance, levels, start.evenly(runs * walkers), count)
         chances = _split(advance, levels, x, count, walkers, generator)
         return _SplitTime.of(step * cycles.reshape(runs, -1).mean(axis=1), chances)
 
@@ -341,11 +347,12 @@ def split_escapes(
     return result(int(walkers * min((found.relative_error / AIMED_ERROR) ** 2, MOST_MORE)))
 
 
-def _at_sigma(
-    advance: Field, levels: Field, center: np.ndarray, walkers: int, count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """States at Σ, ``(d, walkers)``, and how many steps each has made from one Σ to the next."""
-    x = np.repeat(center[:, None], walkers, axis=1)
+def _at_sigma(advance: Field, levels: Field, center: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """States at Σ, ``(d, walkers)``, and how many steps each has made from one Σ to the next.
+
+    They begin at states of the attractor, of the same shape.
+    """
+    x, walkers = center.copy(), center.shape[1]
     states, begun, ended = np.empty_like(x), np.zeros(walkers), np.zeros(walkers)
     who, away, visits = np.arange(walkers), np.zeros(walkers, dtype=bool), np.zeros(walkers, dtype=int)
     step = 0
@@ -357,7 +364,7 @@ def _at_sigma(
         visits[arrived] += 1
         begun[who[arrived & (visits == CYCLES)]] = step
         away = (away | arrived) & (level > -2) & (level < count)
-        x[:, level == count] = center[:, None]
+        x[:, level == count] = center[:, who[level == count]]
         done = arrived & (visits == 2 * CYCLES)
         if done.any():
             states[:, who[done]], ended[who[done]] = x[:, done], step

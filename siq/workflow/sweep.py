@@ -5,7 +5,8 @@ point, so that a change of the range, or of the noise, leaves those that there a
 equilibria are joined to branches by continuation (`siq.systems.continuation`), and a well is a stable stretch
 of a branch that does not turn back: it ends at a fold, at a Hopf point, and where branches meet. Of two,
 folds and Hopf points along rows and columns of the map are points of curves, which are followed through the
-plane. Times and weights follow from barriers and prefactors for a noise.
+plane. Limit cycles are followed from Hopf points, and from where they were found. Times and weights follow
+from barriers and prefactors for a noise.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from siq.quasipotential.rates import EscapeRate, NoiseStrength, mean_residence_t
 from siq.remarks import Remark, sentence
 from siq.systems.cards import ParameterEntry, SystemCard, build_system, load_system
 from siq.systems.continuation import Bifurcation, Branch, follow_branches, follow_curves
+from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import all_equilibria
 from siq.systems.phase_portrait import MOST_SEARCHED, UNSETTLED
@@ -41,10 +43,11 @@ PLAIN = ConfigDict(extra="forbid", ser_json_inf_nan="constants")
 
 @pydantic_dataclass(frozen=True, config=PLAIN)
 class _SweptWell:
-    """An attractor at a point: its state, and the slowest rate at which f leads back to it."""
+    """An attractor at a point: its state, the slowest rate at which f leads back to it, a cycle's period."""
 
     state: tuple[float, ...]
     relaxation: float
+    period: float | None = None
 
 
 @pydantic_dataclass(frozen=True, config=PLAIN)
@@ -56,11 +59,14 @@ class _SweptWay:
     barrier: float | None
     prefactor: float | None
     note: str = ""
+    power: float = 0.0
+    phases: tuple[tuple[float, ...], ...] | None = None
 
     def as_exit(self) -> EscapeRate:
         """What its time follows from."""
         barrier, prefactor = (np.nan if one is None else one for one in (self.barrier, self.prefactor))
-        return EscapeRate(barrier, prefactor)
+        phases = None if self.phases is None else np.array(self.phases)
+        return EscapeRate(barrier, prefactor, power=self.power, phases=phases)
 
 
 @pydantic_dataclass(frozen=True, config=PLAIN)
@@ -117,7 +123,11 @@ def point_at(
         values,
         tuple(tuple(map(float, one.position)) for one in found.equilibria),
         tuple(
-            _SweptWell(tuple(map(float, one.position)), float(-one.eigenvalues.real.max()))
+            _SweptWell(
+                tuple(map(float, one.position)),
+                float(-one.eigenvalues.real.max()),
+                one.period if isinstance(one, Cycle) else None,
+            )
             for one in found.attractors
         ),
         tuple(
@@ -127,6 +137,8 @@ def point_at(
                 float(way.barrier) if np.isfinite(way.barrier) else None,
                 None if way.rate is None else float(way.rate.prefactor),
                 "; ".join(way.notes),
+                way.exit.power,
+                None if way.exit.phases is None else tuple(map(tuple, way.exit.phases.tolist())),
             )
             for way in found.transitions
         ),
@@ -154,7 +166,8 @@ def _wells_along(branches: Sequence[Branch]) -> list[np.ndarray]:
     """For each branch the well of each of its points, -1 where it is unstable; in the order of the states."""
     stretches = []
     for index, branch in enumerate(branches):
-        kind = np.where(branch.unstable == 0, np.where(branch.tangents[:, -1] > 0, 1, -1), 0)
+        rises = branch.tangents[:, branch.states.shape[1]] > 0
+        kind = np.where(branch.unstable == 0, np.where(rises, 1, -1), 0)
         ends = [*(np.flatnonzero(np.diff(kind)) + 1), len(kind)]
         starts = [0, *ends[:-1]]
         stretches += [
@@ -174,11 +187,15 @@ def _wells_along(branches: Sequence[Branch]) -> list[np.ndarray]:
 
 
 def _well_of(
-    branches: Sequence[Branch], numbers: Sequence[np.ndarray], state: np.ndarray, value: float
+    branches: Sequence[Branch], numbers: Sequence[np.ndarray], well: _SweptWell, value: float
 ) -> int:
     """Which well an attractor is at a value; -1 for one that is on no branch."""
     for branch, number in zip(branches, numbers, strict=True):
-        place = branch.index_of(state, value)
+        place = None
+        if branch.kind == "cycle" and well.period is not None:
+            place = branch.index_of_cycle(np.array(well.state), value)
+        elif branch.kind != "cycle" and well.period is None:
+            place = branch.index_of(np.array(well.state), value)
         if place is not None:
             # Next to a fold the nearest point of the branch may lie behind it.
             beside = number[max(place - 1, 0) : place + 2]
@@ -191,12 +208,15 @@ def _branch_rows(branches: Sequence[Branch], numbers: Sequence[np.ndarray]) -> l
     return [
         {
             "branch": index,
+            "kind": branch.kind,
             "well": int(number[k]),
             "value": branch.values[k],
             "position": _position_text(branch.states[k]),
             "unstable": int(branch.unstable[k]),
             "growth": branch.eigenvalues[k, 0].real,
-            "frequency": abs(branch.eigenvalues[k, 0].imag),
+            "frequency": branch.frequencies[k] or abs(branch.eigenvalues[k, 0].imag),
+            "least": _position_text(branch.extents[0, k]),
+            "largest": _position_text(branch.extents[1, k]),
         }
         for index, (branch, number) in enumerate(zip(branches, numbers, strict=True))
         for k in range(len(branch.values))
@@ -328,7 +348,7 @@ def _weights(point: SweptPoint, noise: float | None) -> np.ndarray:
         return np.full(count, np.nan)
     if count == 1:
         return np.ones(1)
-    listed = [(way.start, way.end, way.barrier, way.prefactor) for way in between]
+    listed = [(way.start, way.end, way.barrier, way.as_exit().prefactor_at(noise)) for way in between]
     return shares_by_rates(listed, count, intensity=noise)
 
 
@@ -379,9 +399,9 @@ class Sweep:
         One row for every value and way out of a well, barrier and prefactor; what
         `siq.probability_of_tipping` reads.
     branches
-        Equilibria along their branches, stable or not; empty for two parameters.
+        Equilibria and limit cycles along their branches, stable or not; empty for two parameters.
     bifurcations
-        Folds, Hopf points and branch points; empty for two parameters.
+        Folds, also of cycles, Hopf points and branch points; empty for two parameters.
     notes
         What could not be done, in words.
     units
@@ -509,11 +529,16 @@ def collected(
     if len(names) == 1 and min(values) < max(values):
         limits = (min(values), max(values))
         seeds = [(point.values[0], np.array(one)) for point in points for one in point.equilibria]
-        branches, bifurcations, remarks = follow_branches(system, names[0], limits, seeds)
+        known = [
+            (point.values[0], np.array(well.state), well.period)
+            for point in points
+            for well in point.wells
+            if well.period is not None
+        ]
+        branches, bifurcations, remarks = follow_branches(system, names[0], limits, seeds, cycles=known)
         stretches = _wells_along(branches)
         numbers = [
-            [_well_of(branches, stretches, np.array(well.state), point.values[0]) for well in point.wells]
-            for point in points
+            [_well_of(branches, stretches, well, point.values[0]) for well in point.wells] for point in points
         ]
     else:
         numbers = [list(range(len(point.wells))) for point in points]

@@ -122,7 +122,7 @@ _TYPES = {  # of a column, wherever it stands; of all others float64
     ),
     "str": (
         "method component term test reason item kind position eigenvalues note attractor state source "
-        "region quantity transition step status"
+        "region quantity transition step status least largest"
     ),
     "bool": "passed chosen certified",
     "Int64": "exit",
@@ -155,7 +155,7 @@ _TABLES = {
         "value second_value well attractor relaxation barrier exit noise mean_time law_error weight note"
     ),
     "sweep_ways": "value second_value well exit barrier prefactor relaxation note",
-    "branches": "branch well value position unstable growth frequency",
+    "branches": "branch kind well value position unstable growth frequency least largest",
     "bifurcations": "kind value position branch frequency residual",
     "bifurcation_curves": "curve kind value second_value position frequency",
     "escape": "transition intensity predicted simulated simulated_error escapes note",

@@ -231,7 +231,7 @@ def _formula(number: int, well: Well, dynamics: Dynamics, x: np.ndarray) -> Iter
 def _barrier(landscape: Landscape | None, x: np.ndarray) -> Iterator[Finding]:
     """The lowest barrier by another method: a quadrature, a mesh over the states, the action of its path."""
     ways = () if landscape is None else landscape.transitions
-    known = [way for way in ways if np.isfinite(way.barrier) and not way.from_cycle]
+    known = [way for way in ways if np.isfinite(way.barrier) and way.cycle is None]
     way = min(known, key=lambda one: one.barrier, default=None)
     if landscape is None or way is None or not landscape.dynamics.diffusion.regular:
         yield _open("barrier")

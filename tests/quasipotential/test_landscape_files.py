@@ -18,7 +18,7 @@ from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape, landscape_from_equations
 from siq.quasipotential.landscape_files import landscape_data, read_landscape, write_landscape
 from siq.quasipotential.occupancy import VisitTest
-from siq.quasipotential.rates import NoiseStrength
+from siq.quasipotential.rates import EscapeRate, NoiseStrength
 from siq.quasipotential.refinement import RefinementOptions
 from siq.remarks import Remark
 from siq.systems.cycles import Cycle
@@ -51,7 +51,10 @@ def with_cycles() -> Landscape:
         parting=(unstable, Cycle(circle / 2, 7.0, np.array([-2.0 + 1j]))), certificate=None,
         transitions=(
             replace(first, saddle=unstable, rate=None, end=None, remarks=remarks),
-            replace(second, from_cycle=True, path=None, barrier=np.nan, rate=None),
+            replace(
+                second, cycle=stable, barrier=0.5,
+                rate=EscapeRate(0.5, np.nan, power=-0.5, phases=np.array([[0.0, 0.1], [0.2, 0.3]])),
+            ),
         ),
     )  # fmt: skip
 
@@ -77,7 +80,8 @@ def test_a_landscape_comes_back_as_the_object_that_it_was(made, tmp_path: Path) 
     pd.testing.assert_frame_equal(again.escape_times(noise=0.1), landscape.escape_times(noise=0.1))
     pd.testing.assert_frame_equal(again.dwell_times(noise=0.1), landscape.dwell_times(noise=0.1))
     for way, back in zip(landscape.transitions, again.transitions, strict=True):
-        assert (back.end, back.from_cycle, back.remarks) == (way.end, way.from_cycle, way.remarks)
+        assert (back.end, back.remarks) == (way.end, way.remarks)
+        assert (back.cycle is None) == (way.cycle is None)
         np.testing.assert_array_equal([back.barrier, back.error], [way.barrier, way.error])
         assert (way.path is None) == (back.path is None)
         if way.path is None or back.path is None:

@@ -17,7 +17,7 @@ from siq.quasipotential.rates import (
     _covariance_axes,
     prefactor_error,
 )
-from siq.quasipotential.transitions import noise_leverage
+from siq.quasipotential.transitions import _noise_leverage
 from siq.systems.dynamics import Dynamics
 
 X, Y = sympy.symbols("x y", real=True)
@@ -68,7 +68,7 @@ def test_an_estimated_noise_counts_by_the_states_that_the_path_takes(
     well: tuple[FieldEstimate, MinimumActionPath],
 ) -> None:
     found, path = well
-    assert noise_leverage(path, found.dynamics) == pytest.approx(np.sqrt(2), rel=1e-3)
+    assert _noise_leverage(path, found.dynamics) == pytest.approx(np.sqrt(2), rel=1e-3)
     way = EscapeRate(0.5, 4.0, prefactor_error=0.0, leverage=float(np.sqrt(2)))
     time = way.mean_exit_time(NoiseStrength(0.1, 0.001))
     assert time is not None and time.data_error == pytest.approx(5 * 0.01 * np.sqrt(2))
@@ -77,4 +77,4 @@ def test_an_estimated_noise_counts_by_the_states_that_the_path_takes(
 def test_one_state_has_the_error_of_its_noise() -> None:
     dynamics = Dynamics.of((X,), (X - X**3,))
     path = minimum_action_path(dynamics, np.array([1.0]), np.zeros(1))
-    assert noise_leverage(path, dynamics) == pytest.approx(1.0)
+    assert _noise_leverage(path, dynamics) == pytest.approx(1.0)

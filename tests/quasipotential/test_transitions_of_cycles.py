@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import sympy
-from scipy.integrate import solve_ivp
+from scipy.integrate import quad, solve_ivp
 from scipy.interpolate import CubicSpline
 
 from siq.errors import NumericalFailure
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.path_chains import MinimumActionPath
 from siq.quasipotential.paths import minimum_action_path
+from siq.quasipotential.transitions import escape_rate_over_cycle
 from siq.systems.cycles import Cycle, closed_orbit, hessians_along
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
@@ -98,10 +99,47 @@ def test_the_way_out_of_a_cycle_over_a_saddle_is_exact(turn: float) -> None:
     assert cycle.stable and cycle is landscape.attractors[0]
     assert way.barrier == pytest.approx(exact, rel=1e-6)
     assert way.end is None and way.path is not None and way.path.converged
-    assert way.rate is None and any("no law is implemented" in note for note in way.notes)
-    assert np.isnan(landscape.dwell_times(noise=exact / 10)["mean_time"]).all()
+    # g has no divergence, so that the density is exp(-U/ε), and its integral along the cycle ∮ dx/|∇h|.
+    steep, noise = 20 * (1 / 6 - 0.08), exact / 10
+    unstable = np.linalg.eigvals(system.jacobian(np.array([[1.0, 0.0]]))[0]).real.max()
+    time = 2 * np.pi / unstable * steep * np.sqrt(1 / (20 * np.pi * noise)) * turn * cycle.period
+    assert way.exit.prefactor_at(noise) == pytest.approx(time, rel=0.005)
+    assert landscape.dwell_times(noise=noise)["mean_time"][0] == pytest.approx(time * np.exp(10), rel=0.005)
     assert "one attractor, a limit cycle of period" in landscape.report()
     assert landscape.certificate is None and any("not written as a formula" in one for one in landscape.notes)
+
+
+def time_by_quadrature(begin: float, end: float, noise: float) -> float:
+    """Mean time from one radius of the rings to another one."""
+
+    def density(radius: float) -> float:
+        return float(-height(radius) / noise + np.log(radius))
+
+    far = 2.0 if end < begin else 0.0
+
+    def slowness(radius: float) -> float:
+        low, high = sorted((far, radius))
+        known = [one for one in (INNER, OUTER) if low < one < high]
+        behind = quad(lambda r: np.exp(density(r) - density(radius)), low, high, points=known, limit=400)[0]
+        return 2 / noise * behind
+
+    return abs(quad(slowness, begin, end, points=[INNER], limit=400)[0])
+
+
+@pytest.mark.parametrize("outwards", [True, False])
+def test_the_law_of_ways_over_a_cycle_errs_as_the_noise_does(outwards: bool) -> None:
+    """From the point, and from the outer ring, whose laws go with other powers of ε."""
+    system = rings(2.0)
+    path, start = (into(2.0), np.zeros(2)) if outwards else (out_of(2.0), ring(system, OUTER, 2.0))
+    law, errors = escape_rate_over_cycle(system, path, start, ring(system, INNER, 2.0)), []
+    assert law.power == (0.5 if outwards else 0.0) and law.phases is not None
+    assert law.phases[0].max() < 1e-5 * path.action  # every phase is as good as any other
+    for share in (10, 20, 40):
+        noise = path.action / share
+        exact = time_by_quadrature(*((1e-6, OUTER) if outwards else (OUTER, 0.05)), noise)
+        errors.append(share * (law.mean_time(noise) / exact - 1))
+    assert np.abs(errors).max() < 1.3
+    np.testing.assert_allclose(errors, errors[-1], rtol=0.25)
 
 
 @pytest.mark.slow

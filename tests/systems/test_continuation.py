@@ -235,3 +235,23 @@ def test_what_could_not_be_followed_is_remarked(monkeypatch):
     curves, (remark,) = follow_curves(cusp(), LIMITS, [fold(2 / np.sqrt(27), 1.0, -1 / np.sqrt(3))])
     assert len(curves) == 1 and sentence(remark).endswith("has more than 5 points")
     assert sentence(remark).startswith("the curve of folds through a = ")
+
+
+def test_cycles_begin_at_a_hopf_point_as_roots_and_fold() -> None:
+    """``r² = (1 ± √(1 + 4a))/2``: fold and amplitudes are exact, and a known cycle is no second branch."""
+    grow = a + (x**2 + y**2) - (x**2 + y**2) ** 2
+    form = Dynamics.of((x, y), (x * grow - y, y * grow + x), domain=[(-2, 2)] * 2, parameters={a: 0.0})
+    radius = np.sqrt((1 + np.sqrt(1.4)) / 2)
+    known = [(0.1, np.array([0.0, radius]), 2 * np.pi)]
+    seeds = [(0.1, np.zeros(2))]
+    (_, branch), found, remarks = follow_branches(form, "a", (-0.4, 0.2), seeds, cycles=known)
+    assert [one.kind for one in found] == ["fold of cycles", "Hopf"] and not remarks
+    assert found[0].value == pytest.approx(-0.25, abs=1e-9)
+    assert np.linalg.norm(found[0].state) == pytest.approx(np.sqrt(0.5), abs=1e-5)
+    square = branch.extents[1, :, 0] ** 2
+    np.testing.assert_allclose(square - square**2, -branch.values, atol=1e-5)
+    np.testing.assert_allclose(branch.frequencies, 1.0, rtol=1e-8)
+    np.testing.assert_array_equal(branch.unstable, square < 0.5)
+    np.testing.assert_allclose(branch.eigenvalues[:, 0].real, 2 * square - 4 * square**2, atol=1e-5)
+    assert branch.index_of_cycle(np.array([radius, 0.0]), 0.1) is not None
+    assert branch.index_of_cycle(np.array([0.5, 0.0]), 0.1) is None

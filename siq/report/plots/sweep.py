@@ -27,7 +27,7 @@ from siq.report.plots.style import (
 )
 from siq.report.summary import well_name
 
-BIFURCATIONS = {"fold": "o", "Hopf": "s", "branch point": "D"}
+BIFURCATIONS = {"fold": "o", "Hopf": "s", "branch point": "D", "fold of cycles": "^"}
 PANEL = 2.2  # inches
 BEYOND = 1e30  # for infinite ends of intervals, which go on beyond the panel
 CURVES = {"fold": "-", "Hopf": "--"}
@@ -65,10 +65,10 @@ def plot_sweep(
     Returns
     -------
     matplotlib.figure.Figure
-        Of one parameter: equilibria, stable ones as lines of their well's colour and unstable ones dashed,
-        with folds, Hopf points and branch points; below it the lowest barrier of every well, and, where the
-        noise is known, how long each lasts and its share of time in the long run. Of two: maps of the number
-        of wells and of the lowest barrier, with curves of folds and of Hopf points.
+        Of one parameter: equilibria and the extents of cycles, stable ones as lines of their well's colour
+        and unstable ones dashed, with folds, Hopf points and branch points; below it the lowest barrier of
+        every well, and, where the noise is known, how long each lasts and its share of time in the long run.
+        Of two: maps of the number of wells and of the lowest barrier, with curves of folds and Hopf points.
     """
     units = units or {}
     if len(parameters) > 1:
@@ -150,12 +150,12 @@ def plot_early_warning(
 
 
 def _draw_branches(axes: Axes, branches: pd.DataFrame, bifurcations: pd.DataFrame, place: int) -> None:
-    positions = np.array([ast.literal_eval(text)[place] for text in branches["position"]], dtype=float)
-    for _, rows in branches.assign(state=positions).groupby("branch"):
+    ends = pd.concat([branches.assign(end=name, at=branches[name]) for name in ("least", "largest")])
+    ends["state"] = [float(ast.literal_eval(text)[place]) for text in ends["at"]]
+    for _, rows in ends.groupby(["branch", "end"]):
         # Neighbouring stretches share a point, or a gap would part them.
         change = np.flatnonzero(np.diff(rows["well"].to_numpy())) + 1
-        ends = [0, *change, len(rows)]
-        for first, last in pairwise(ends):
+        for first, last in pairwise([0, *change, len(rows)]):
             some = rows.iloc[first : last + 1]
             well = int(rows["well"].iloc[first])
             colour, line, width = (look(well)[0], "-", 1.6) if well >= 0 else (GREY, "--", 0.8)
