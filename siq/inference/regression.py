@@ -214,12 +214,14 @@ class _PairRegression:
     ) -> np.ndarray:
         """Mean velocity over a step less f(X0), of components ``(d, n)``."""
 
+        begin = matrix @ self._terms(x0)
+
         def field(x: np.ndarray) -> np.ndarray:
-            return matrix @ self._terms(x)
+            return begin if x is x0 else matrix @ self._terms(x)  # which every rule asks for first
 
         if flow.coarse and rate is not None:
-            return np.asarray((flow.moments(field, x0, h, rate)[0] - x0) / h - field(x0))
-        shift = (flow(field, x0, h) - x0) / h - field(x0)
+            return np.asarray((flow.moments(field, x0, h, rate)[0] - x0) / h - begin)
+        shift = (flow(field, x0, h) - x0) / h - begin
         if rate is not None and np.any(rate):
             # Σ_jk (εD)_jk ∂²θ/∂x_j∂x_k of the active functions, shape (active, n).
             second = self._second(x0).reshape(*rate.shape, len(self.active), -1)
