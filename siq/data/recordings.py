@@ -419,8 +419,7 @@ class StreamedPairs:
                 self.pair_step = LONGEST_STEP * float(np.quantile(block.h, 0.5, method="lower"))
             count, squares = count + len(block), squares + block.mean_square_speed * len(block)
         self._count, self.mean_square_speed = count, squares / max(count, 1)
-        nothing = np.empty(0)
-        self._taken = nothing, SnapshotPairs(nothing, nothing, nothing, nothing)
+        self._wanted: np.ndarray | None = None
 
     def __len__(self) -> int:
         """How many there are."""
@@ -432,7 +431,7 @@ class StreamedPairs:
 
         t, x, which = np.empty(0), np.empty((0, len(self.names))), np.empty(0, dtype=np.int64)
         label, seen = None, 0
-        with parquet.ParquetFile(self.path) as file:
+        with parquet.ParquetFile(self.path, pre_buffer=False) as file:
             for batch in file.iter_batches(batch_size=self.rows):
                 new = np.zeros(len(batch), dtype=np.int64)
                 if "recording" in self._columns:
@@ -457,16 +456,16 @@ class StreamedPairs:
     def take(self, rows: np.ndarray | slice) -> SnapshotPairs:
         """Some of the pairs, by their indices in ascending order."""
         wanted = np.arange(*rows.indices(len(self))) if isinstance(rows, slice) else rows
-        if np.array_equal(wanted, self._taken[0]):  # several ask for the same, and to read takes long
-            return self._taken[1]
-        parts, first = [], 0
-        for block in self.blocks():
-            low, high = np.searchsorted(wanted, [first, first + len(block)])
-            parts.append(block.take(wanted[low:high] - first))
-            first += len(block)
-        x0, xh, h = (np.concatenate([getattr(one, name) for one in parts]) for name in ("x0", "xh", "h"))
-        self._taken = wanted, SnapshotPairs(x0, xh, h, np.zeros(len(wanted), dtype=np.int64))
-        return self._taken[1]
+        if self._wanted is None or not np.array_equal(wanted, self._wanted):  # several ask for the same
+            parts, first = [], 0
+            for block in self.blocks():
+                low, high = np.searchsorted(wanted, [first, first + len(block)])
+                parts.append(block.take(wanted[low:high] - first))
+                first += len(block)
+            x0, xh, h = (np.concatenate([getattr(one, name) for one in parts]) for name in ("x0", "xh", "h"))
+            self._taken = SnapshotPairs(x0, xh, h, np.zeros(len(wanted), dtype=np.int64))
+            self._wanted = wanted
+        return self._taken
 
 
 def read_recordings(
