@@ -8,7 +8,7 @@ import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -61,7 +61,7 @@ class Configuration(BaseModel):
 WORKFLOW_KEYS = (*Configuration.model_fields, "cases", "keys", "proof", "origin")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CheckedStudy:
     """A study with its system, as the rules use it.
 
@@ -174,7 +174,8 @@ class CheckedStudy:
         """The settings of all steps."""
         return settings_of(self.study, self.system)
 
-    def options(self, names: Sequence[str]) -> dict[str, Any]:
+    @cache  # noqa: B019 (every run asks for the same, and a study lives as long as its workflow)
+    def options(self, names: tuple[str, ...]) -> dict[str, Any]:
         """What a task depends on as plain data, which Snakemake compares: parts of the settings, and others.
 
         ``card`` is what a simulation takes from the card, so that another title makes nothing anew;

@@ -14,7 +14,6 @@ import keyword
 import re
 import unicodedata
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -176,42 +175,6 @@ class _Layout(NamedTuple):
     titles: tuple[str, ...]  # ... and to people
     units: tuple[dict[str, str | None], ...]  # of all columns: what each place says
     remarks: tuple[Remark, ...]
-
-
-def stacked(source: ColumnFile) -> ColumnFile:
-    """Columns that are called ``cell 1``, ``cell 2``, … one below the other: recordings of one quantity x."""
-    parts = [read_heading(heading) for heading in source.headings]
-    words = [re.fullmatch(r"(.*?[^\W\d])[\W_]*\d+", part.title) for part in parts]
-    own = [place for place, word in enumerate(words) if word is not None and _plain(word[1]) in LABEL_NAMES]
-    kinds = {(_plain(words[place][1]), parts[place].unit) for place in own}  # type: ignore[index]
-    if len(own) < 2 or len(kinds) > 1 or any(part.is_label for part in parts):
-        return source
-    titles, unit = [parts[place].title for place in own], parts[own[0]].unit
-    rest = [place for place in range(len(parts)) if place not in own]
-
-    def load(positions: Sequence[int]) -> list[pa.Array]:
-        loaded = []
-        for position in positions:
-            places = (
-                own if position == len(rest) + 1 else [rest[position] if position < len(rest) else own[0]]
-            )
-            columns = [one.to_pandas() for one in source.load(places)] * (len(own) if len(places) == 1 else 1)
-            if position == len(rest):
-                columns = [
-                    pd.Series(title, range(len(one))) for title, one in zip(titles, columns, strict=True)
-                ]
-            loaded.append(pa.array(pd.concat(columns, ignore_index=True), from_pandas=True))
-        return loaded
-
-    values = {"first": titles[0], "last": titles[-1]}
-    return replace(
-        source,
-        headings=(*(source.headings[place] for place in rest), "recording", f"x [{unit}]" if unit else "x"),
-        units=(*(source.units[place] for place in rest), None, source.units[own[0]]),
-        load=load,
-        titles=(),
-        remarks=(*source.remarks, Remark("data.columns_of_recordings", values)),
-    )
 
 
 def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _Layout:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from scipy import optimize, special
+from scipy import special
 
 from siq.data.correlation import markov_lag, noise_floors
 from siq.data.recordings import (
@@ -27,7 +27,7 @@ from siq.data.recordings import (
     snapshot_pairs,
 )
 from siq.data.states import switching
-from siq.data.stationarity import background_of, correlated_samples, line_in, runs_of, usual_step
+from siq.data.stationarity import background_of, correlated_samples, hum_of, runs_of
 from siq.errors import InputError
 from siq.remarks import Remark
 
@@ -39,8 +39,6 @@ STRETCH_LENGTH = 10  # correlation times: what is left of its first sample at it
 BLOCK = 200  # steps, whose median says how large steps are thereabouts
 FALSE_FAULT_RATE = 1e-3  # probability with which a record of white noise has a step that stands out
 FEW_JUMPS, MOST_APART = 0.05, 0.01  # that stay, a sample that does not; of all samples
-QUARTERS, SAME_WAVE = 4, 0.5  # of a recording, in which a hum has one amplitude and phase, to a half of it
-SLIGHT_HUM = 0.1  # of the variance of a state: what moves it more may be the state itself, which circulates
 _STRETCH_LABEL = re.compile(r"(?P<label>.*) \((?P<number>\d+) of (?P<of>\d+)\)")
 SINGLE_RECORDING = (
     "there is one recording, and it shows no process noise: it leads into one stable state and tells nothing"
@@ -229,10 +227,10 @@ def without_faults(recordings: Recordings) -> Recordings:
             remarks.append(
                 Remark("data.samples_apart", {"column": recordings.titles[state], "samples": count})
             )
-    kept = {"t": recordings.t, "recording": recordings.recording, "values": recordings.values}
-    found = replace(recordings, **{name: array[~apart] for name, array in kept.items()})
+    t, recording, measured = (one[~apart] for one in (recordings.t, recordings.recording, recordings.values))
+    found = replace(recordings, t=t, recording=recording, values=measured)
     for state in noisy:
-        hum, period = _hum_of(found, found.values[:, state])
+        hum, period = hum_of(found, found.values[:, state])
         if hum.any():
             found.values[:, state] -= hum
             told = {
@@ -243,39 +241,6 @@ def without_faults(recordings: Recordings) -> Recordings:
             units = {"unit": found.units[state], "time_unit": found.time_unit}
             remarks.append(Remark("data.hum_taken_off", told | units))
     return replace(found, remarks=tuple(remarks)) if len(remarks) > len(recordings.remarks) else recordings
-
-
-def _hum_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, float]:
-    """The hum in a series, ``(n,)`` and zero where there is none, and its period in the unit of time."""
-    bounds = np.searchsorted(recordings.recording, np.arange(len(recordings.labels) + 1))
-    parts = [slice(int(a), int(b)) for a, b in pairwise(bounds) if b - a > QUARTERS]
-    nothing, steps = np.zeros(len(values)), np.append(np.diff(values), 0.0)
-    steps[bounds[1:] - 1] = 0.0
-    if not parts or (period := line_in(parts, steps[:, None])) is None:
-        return nothing, 0.0
-    about = 2 * np.pi / (period * usual_step(recordings))
-    width = np.pi / max(float(np.ptp(recordings.t[part])) for part in parts)
-
-    def amplitude(frequency: float, part: slice) -> complex:
-        """That of the hum, by the steps of a part: those of ``exp(iωt)`` are known."""
-        wave = np.diff(np.exp(1j * frequency * recordings.t[part]))
-        columns = np.column_stack([wave.real, -wave.imag])
-        return complex(*np.linalg.lstsq(columns, steps[part][:-1], rcond=None)[0])
-
-    def lost(frequency: float) -> float:
-        return -sum(abs(amplitude(frequency, part)) ** 2 * (part.stop - part.start) for part in parts)
-
-    bounds_of_line = (about - width, about + width)
-    frequency = float(optimize.minimize_scalar(lost, bounds=bounds_of_line, method="bounded").x)
-    hum = nothing.copy()
-    for part in parts:
-        whole, length = amplitude(frequency, part), part.stop - part.start
-        cuts = part.start + length * np.arange(QUARTERS + 1) // QUARTERS
-        each = [amplitude(frequency, slice(int(a), int(b))) for a, b in pairwise(cuts)]
-        if max(abs(one - whole) for one in each) > SAME_WAVE * abs(whole):
-            return nothing, 0.0
-        hum[part] = (whole * np.exp(1j * frequency * recordings.t[part])).real
-    return (hum, 2 * np.pi / frequency) if hum.var() < SLIGHT_HUM * values.var() else (nothing, 0.0)
 
 
 def without_background(recordings: Recordings) -> Recordings:
@@ -296,7 +261,7 @@ def without_background(recordings: Recordings) -> Recordings:
     hops = found is not None and found.supported
     flat, remarks = recordings.values.copy(), list(recordings.remarks)
     for state, (title, values) in enumerate(zip(recordings.titles, recordings.values.T, strict=True)):
-        background = background_of(recordings, values)[0] if single else np.zeros(len(values))
+        background = background_of(recordings, values) if single else np.zeros(len(values))
         if found is not None and hops and title == found.state:
             background = found.background if single else found.baseline
         if not background.any():

@@ -7,6 +7,7 @@ is refused with its row and column; rows are counted from 1 without the header.
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -406,7 +407,7 @@ class StreamedPairs:
 
     copies = 1.0
 
-    def __init__(self, path: str | Path, *, pair_step: float | None = None, rows: int = 1 << 18) -> None:
+    def __init__(self, path: str | Path, *, pair_step: float | None = None, rows: int = 1 << 16) -> None:
         from pyarrow import parquet
 
         self.path, self.rows, self.pair_step = Path(path), rows, pair_step
@@ -417,7 +418,7 @@ class StreamedPairs:
             if self.pair_step is None:
                 self.pair_step = LONGEST_STEP * float(np.quantile(block.h, 0.5, method="lower"))
             count, squares = count + len(block), squares + block.mean_square_speed * len(block)
-        self._count, self.mean_square_speed = count, squares / max(count, 1)
+        self._count, self.mean_square_speed, self._wanted = count, squares / max(count, 1), np.array([])
 
     def __len__(self) -> int:
         """How many there are."""
@@ -427,9 +428,8 @@ class StreamedPairs:
         """The pairs, block by block; each begins with the last sample of the one before."""
         from pyarrow import parquet
 
-        t, x, which = np.empty(0), np.empty((0, len(self.names))), np.empty(0, dtype=np.int64)
-        label, seen = None, 0
-        with parquet.ParquetFile(self.path) as file:
+        t, x, label, seen = np.empty(0), np.empty((0, len(self.names))), None, 0
+        with parquet.ParquetFile(self.path, pre_buffer=False) as file:
             for batch in file.iter_batches(batch_size=self.rows):
                 new = np.zeros(len(batch), dtype=np.int64)
                 if "recording" in self._columns:
@@ -437,30 +437,32 @@ class StreamedPairs:
                     new[1:] = labels[1:] != labels[:-1]
                     new[0], label = label is not None and labels[0] != label, labels[-1]
                 states = [batch.column(name).to_numpy(zero_copy_only=False) for name in self.names]
+                own = np.concatenate([np.zeros_like(new[: len(t[-1:])]), np.cumsum(new)])
                 t = np.concatenate([t[-1:], batch.column("t").to_numpy(zero_copy_only=False)])
                 x = np.concatenate([x[-1:], np.stack(states, axis=1)])
-                which = np.concatenate([which[-1:], (which[-1] if len(which) else 0) + np.cumsum(new)])
-                if not np.isfinite(x).all() or not (np.diff(t)[np.diff(which) == 0] > 0).all():
+                if not np.isfinite(x).all() or not (np.diff(t)[np.diff(own) == 0] > 0).all():
                     fault = "a number is missing, or the times of a recording do not increase"
                     place = f"rows {seen + 1} to {seen + len(batch)}"
                     raise InputError(self.path, place, fault, "write it by siq.write_recordings")
                 seen += len(batch)
-                own = which - which[0]
                 numbers = tuple(map(str, range(own[-1] + 1)))
                 part = Recordings(self.names, (None,) * len(self.names), numbers, own, t, x)
-                if len(t) > 1:
+                with contextlib.suppress(ValueError):  # a block without a pair
                     yield snapshot_pairs(part, pair_step=self.pair_step)
 
     def take(self, rows: np.ndarray | slice) -> SnapshotPairs:
         """Some of the pairs, by their indices in ascending order."""
         wanted = np.arange(*rows.indices(len(self))) if isinstance(rows, slice) else rows
-        parts, first = [], 0
-        for block in self.blocks():
-            low, high = np.searchsorted(wanted, [first, first + len(block)])
-            parts.append(block.take(wanted[low:high] - first))
-            first += len(block)
-        x0, xh, h = (np.concatenate([getattr(one, name) for one in parts]) for name in ("x0", "xh", "h"))
-        return SnapshotPairs(x0, xh, h, np.zeros(len(wanted), dtype=np.int64))
+        if not len(self._wanted) or not np.array_equal(wanted, self._wanted):  # several ask for the same
+            parts, first = [], 0
+            for block in self.blocks():
+                low, high = np.searchsorted(wanted, [first, first + len(block)])
+                parts.append(block.take(wanted[low:high] - first))
+                first += len(block)
+            x0, xh, h = (np.concatenate([getattr(one, name) for one in parts]) for name in ("x0", "xh", "h"))
+            whose, self._wanted = np.zeros(len(wanted), dtype=np.int64), wanted
+            self._taken = SnapshotPairs(x0, xh, h, whose)
+        return self._taken
 
 
 def read_recordings(
@@ -575,9 +577,10 @@ def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) ->
     if not keep.any():
         limit = "" if pair_step is None else f" that are at most pair_step = {pair_step} apart"
         raise ValueError(f"no recording has two consecutive samples{limit}")
-    parents, copies = parents_of(recordings, recording[:-1][keep])
-    x0, xh = recordings.values[:-1][keep], recordings.values[1:][keep]
-    return SnapshotPairs(x0, xh, gap[keep], parents, copies=copies)
+    chosen = slice(None) if keep.all() else keep  # no copies where there is nothing to leave out
+    parents, copies = parents_of(recordings, recording[:-1][chosen])
+    x0, xh = recordings.values[:-1][chosen], recordings.values[1:][chosen]
+    return SnapshotPairs(x0, xh, gap[chosen], parents, copies=copies)
 
 
 def parents_of(recordings: Recordings, recording: np.ndarray) -> tuple[np.ndarray, float]:
@@ -587,8 +590,9 @@ def parents_of(recordings: Recordings, recording: np.ndarray) -> tuple[np.ndarra
     mean of m.
     """
     parents = parent_recordings(recordings.labels)
-    among = np.unique(recording)
-    return parents[recording], float(np.bincount(parents[among])[parents[recording]].mean())
+    count = np.bincount(recording, minlength=len(parents))
+    copies = np.bincount(parents[count > 0], minlength=len(parents))[parents]
+    return parents[recording], float(count @ copies / count.sum())
 
 
 @lru_cache(maxsize=16)

@@ -52,7 +52,6 @@ from siq.data.stationarity import (
     correlated_samples,
     relaxation_samples,
     runs_of,
-    slow_part,
     stretches_of,
     usual_step,
 )
@@ -460,7 +459,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     # Each as it is, and less what a drift in one direction would have moved it by: hops may hide that.
     drifts = np.zeros((2, *recorded.shape))
     for place in tried:
-        drifts[1, :, place] = slow_part(recordings, recorded[:, place], 1)
+        drifts[1, :, place] = background_of(recordings, recorded[:, place], functions=1)
     apart = np.array(
         [
             [
@@ -494,12 +493,12 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     wells, levels = 1, False
     if probability >= SIGNIFICANCE:
         background[:] = 0.0
-        background[:, column] = background_of(recordings, values[:, column])[0]
+        background[:, column] = background_of(recordings, values[:, column])
     for _ in range(MOST_PASSES if probability < SIGNIFICANCE else 0):
         flat = values - background
         places, path, expected, wells, levels = path_of(flat, runs, relaxation, column=column)
         level = np.where(path[:, None] >= 0, places[path], np.median(flat, axis=0))
-        slow = np.array([background_of(recordings, one)[0] for one in (values - level).T]).T
+        slow = np.array([background_of(recordings, one) for one in (values - level).T]).T
         baseline = _baselines(recordings, values - level - slow)
         moved = slow + baseline - background
         background = slow + baseline

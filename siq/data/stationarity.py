@@ -18,7 +18,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage, special
+from scipy import ndimage, optimize, special
 
 from siq.data.recordings import LONGEST_STEP, Recordings
 
@@ -35,6 +35,8 @@ MOST_SLOW_FUNCTIONS = 8  # of the background in a record: what returns more ofte
 NEIGHBOURS, FEWEST_NEIGHBOURS = 10, 3  # frequencies on either side to compare one with, of all recordings
 HARMLESS_LINE = 0.01  # of the variance: it changes -log p by a hundredth
 FALSE_CHANGE_RATE = 0.01  # probability with which a stationary record is said to change
+QUARTERS, SAME_WAVE = 4, 0.5  # of a recording, in which a hum has one amplitude and phase, to a half of it
+SLIGHT_HUM = 0.1  # of the variance of a state: what moves it more may be the state itself, which circulates
 FALSE_DRIFT_RATE = 1e-3  # probability with which a record without a background is said to have one
 
 
@@ -188,10 +190,10 @@ def change_of(recordings: Recordings, values: np.ndarray, path: np.ndarray) -> f
             chance = 2 * float(special.stdtr(freedom, -abs(slope) / max(error, 1e-300)))
             if chance * len(lines) * series.shape[1] < FALSE_CHANGE_RATE / 2:
                 return np.inf
-    return line_in(parts, series)
+    return _line_in(parts, series)
 
 
-def line_in(parts: Sequence[slice], series: np.ndarray) -> float | None:
+def _line_in(parts: Sequence[slice], series: np.ndarray) -> float | None:
     """The period, in samples, of a line that stands out of the spectra of series ``(n, k)``, if one does.
 
     With power P there and L at the frequencies around, ``P/L`` has the F distribution in any stationary
@@ -219,48 +221,75 @@ def line_in(parts: Sequence[slice], series: np.ndarray) -> float | None:
     return None
 
 
-def background_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, int]:
+def hum_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, float]:
+    """The hum in a series, ``(n,)`` and zero where there is none, and its period in the unit of time."""
+    bounds = np.searchsorted(recordings.recording, np.arange(len(recordings.labels) + 1))
+    parts = [slice(int(a), int(b)) for a, b in pairwise(bounds) if b - a > QUARTERS]
+    nothing, steps = np.zeros(len(values)), np.append(np.diff(values), 0.0)
+    steps[bounds[1:] - 1] = 0.0
+    if not parts or (period := _line_in(parts, steps[:, None])) is None:
+        return nothing, 0.0
+    about = 2 * np.pi / (period * usual_step(recordings))
+    width = np.pi / max(float(np.ptp(recordings.t[part])) for part in parts)
+
+    def amplitude(frequency: float, part: slice) -> complex:
+        """That of the hum, by the steps of a part: those of ``exp(iωt)`` are known."""
+        wave = np.diff(np.exp(1j * frequency * recordings.t[part]))
+        columns = np.column_stack([wave.real, -wave.imag])
+        return complex(*np.linalg.lstsq(columns, steps[part][:-1], rcond=None)[0])
+
+    def lost(frequency: float) -> float:
+        return -sum(abs(amplitude(frequency, part)) ** 2 * (part.stop - part.start) for part in parts)
+
+    bounds_of_line = (about - width, about + width)
+    frequency = float(optimize.minimize_scalar(lost, bounds=bounds_of_line, method="bounded").x)
+    hum = nothing.copy()
+    for part in parts:
+        whole, length = amplitude(frequency, part), part.stop - part.start
+        cuts = part.start + length * np.arange(QUARTERS + 1) // QUARTERS
+        each = [amplitude(frequency, slice(int(a), int(b))) for a, b in pairwise(cuts)]
+        if max(abs(one - whole) for one in each) > SAME_WAVE * abs(whole):
+            return nothing, 0.0
+        hum[part] = (whole * np.exp(1j * frequency * recordings.t[part])).real
+    return (hum, 2 * np.pi / frequency) if hum.var() < SLIGHT_HUM * values.var() else (nothing, 0.0)
+
+
+def background_of(recordings: Recordings, values: np.ndarray, *, functions: int | None = None) -> np.ndarray:
     """The slow drift of a series, common to all that it does: of a hopping record, less its levels.
 
-    Every recording has a straight line of its own, and cosines ``cos(πkt/T)`` with k from 1 on. Gives the
-    drift ``(n,)``, less its mean over the record, and how many such functions a recording has; both are zero
-    where none is seen.
+    Every recording has a straight line of its own, and cosines ``cos(πkt/T)`` with k from 1 on: so many
+    `functions`, or else those that are seen. Gives the drift ``(n,)``, of mean zero; zero where none is seen.
     """
-    runs, counts = runs_of(recordings, bridged=True), np.bincount(recordings.recording)
-    best, found = 0.0, (np.zeros(len(values)), 0)
-    spread = float(np.var(values))
-    if spread <= 0:
+    bounds = np.searchsorted(recordings.recording, np.arange(len(recordings.labels) + 1))
+
+    def fitted(count: int) -> np.ndarray:
+        found = np.zeros(len(values))
+        for first, last in pairwise(bounds):
+            if last - first > count:
+                t = recordings.t[first:last]
+                phase = np.pi * (t - t[0]) / (t[-1] - t[0])
+                waves = np.column_stack([phase, np.cos(phase[:, None] * np.arange(count))])
+                found[first:last] = waves @ np.linalg.lstsq(waves, values[first:last], rcond=None)[0]
+                found[first:last] -= found[first:last].mean()
         return found
-    for functions in range(1, MOST_SLOW_FUNCTIONS + 1):
-        fitted = slow_part(recordings, values, functions)
-        rest = values - fitted
+
+    if functions is not None:
+        return fitted(functions)
+    runs, counts = runs_of(recordings, bridged=True), np.bincount(recordings.recording)
+    best, drift, spread = 0.0, np.zeros(len(values)), float(np.var(values))
+    for count in range(1, MOST_SLOW_FUNCTIONS + 1 if spread > 0 else 0):
+        slow = fitted(count)
+        rest = values - slow
         independent = len(values) / (2 * correlated_samples(rest, runs))
-        used = functions * int((counts > functions).sum())
+        used = count * int((counts > count).sum())
         if independent <= 4 * used:
             break
         gain = independent * np.log(spread / max(float(np.var(rest)), 1e-300))
         # Twice the gain in the logarithm of the likelihood, less what chance gives it with this probability.
         surplus = gain - used * np.log(independent) - 2 * np.log(1 / FALSE_DRIFT_RATE)
         if surplus > best:
-            best, found = surplus, (fitted - fitted.mean(), functions)
-    return found
-
-
-def slow_part(recordings: Recordings, values: np.ndarray, functions: int) -> np.ndarray:
-    """A straight line and cosines in each recording, fitted to a series: ``(n,)``, of mean zero."""
-    fitted = np.empty(len(values))
-    bounds = np.searchsorted(recordings.recording, np.arange(len(recordings.labels) + 1))
-    for first, last in pairwise(bounds):
-        part = values[first:last]
-        if last - first <= functions:
-            fitted[first:last] = 0.0
-            continue
-        t = recordings.t[first:last]
-        phase = np.pi * (t - t[0]) / (t[-1] - t[0])
-        waves = np.column_stack([phase, np.cos(phase[:, None] * np.arange(functions))])
-        fitted[first:last] = waves @ np.linalg.lstsq(waves, part, rcond=None)[0]
-        fitted[first:last] -= fitted[first:last].mean()
-    return fitted
+            best, drift = surplus, slow - slow.mean()
+    return drift
 
 
 class Stretches(NamedTuple):

@@ -14,6 +14,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -23,8 +24,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from siq.data.correlation import FEWEST_VALUES, MIN_REPETITIONS
-from siq.data.formats import Column, open_columns
-from siq.data.layout import layout_of, stacked
+from siq.data.formats import Column, ColumnFile, open_columns
+from siq.data.layout import layout_of, read_heading
 from siq.data.recordings import TABLE, Recordings
 from siq.errors import InputError
 from siq.numerics.files import files_of
@@ -89,7 +90,7 @@ def _checked(
     """Read and check a table; raises InputError for the first thing that cannot be used."""
     file, source = str(table) if isinstance(table, str | Path) else TABLE, open_columns(table)
     if columns is None:
-        source = stacked(source)
+        source = _stacked(source)
     layout = layout_of(file, source, columns)
     used = [layout.time, *layout.states]
     cells = source.load([*([] if layout.recording is None else [layout.recording]), *used])
@@ -149,6 +150,42 @@ def _checked(
         remarks=tuple(remarks),
     )
     return found if columns is not None else _without_clocks_and_labels(found)
+
+
+def _stacked(source: ColumnFile) -> ColumnFile:
+    """Columns that are called ``cell 1``, ``cell 2``, … one below the other: recordings of one quantity x."""
+    parts = [read_heading(heading) for heading in source.headings]
+    words = [re.fullmatch(r"(.*?[^\W\d])[\W_]*\d+", part.title) for part in parts]
+    own = [place for place, word in enumerate(words) if word is not None and read_heading(word[1]).is_label]
+    kinds = {(words[place][1].casefold(), parts[place].unit) for place in own}  # type: ignore[index]
+    if len(own) < 2 or len(kinds) > 1 or any(part.is_label for part in parts):
+        return source
+    titles, unit = [parts[place].title for place in own], parts[own[0]].unit
+    rest = [place for place in range(len(parts)) if place not in own]
+
+    def load(positions: Sequence[int]) -> list[pa.Array]:
+        loaded = []
+        for position in positions:
+            places = (
+                own if position == len(rest) + 1 else [rest[position] if position < len(rest) else own[0]]
+            )
+            columns = [one.to_pandas() for one in source.load(places)] * (len(own) if len(places) == 1 else 1)
+            if position == len(rest):
+                columns = [
+                    pd.Series(title, range(len(one))) for title, one in zip(titles, columns, strict=True)
+                ]
+            loaded.append(pa.array(pd.concat(columns, ignore_index=True), from_pandas=True))
+        return loaded
+
+    values = {"first": titles[0], "last": titles[-1]}
+    return replace(
+        source,
+        headings=(*(source.headings[place] for place in rest), "recording", f"x [{unit}]" if unit else "x"),
+        units=(*(source.units[place] for place in rest), None, source.units[own[0]]),
+        load=load,
+        titles=(),
+        remarks=(*source.remarks, Remark("data.columns_of_recordings", values)),
+    )
 
 
 def _without_clocks_and_labels(recordings: Recordings) -> Recordings:

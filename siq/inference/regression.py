@@ -167,10 +167,8 @@ class _PairRegression:
 
     def _parts(self) -> Iterator[_PairRegression]:
         """Itself where the pairs are in memory; else one for each block of them."""
-        if isinstance(self.pairs, SnapshotPairs):
-            yield self
-        else:
-            yield from (_PairRegression(self.library, block, self.support) for block in self.pairs.blocks())
+        for block in self.pairs.blocks():
+            yield self if block is self.pairs else _PairRegression(self.library, block, self.support)
 
     @cached_property
     def _sample(self) -> tuple[np.ndarray, np.ndarray]:
@@ -214,13 +212,14 @@ class _PairRegression:
         self, matrix: np.ndarray, flow: FlowMap, x0: np.ndarray, h: np.ndarray, rate: np.ndarray | None
     ) -> np.ndarray:
         """Mean velocity over a step less f(X0), of components ``(d, n)``."""
+        begin = matrix @ self._terms(x0)
 
         def field(x: np.ndarray) -> np.ndarray:
-            return matrix @ self._terms(x)
+            return begin if x is x0 else matrix @ self._terms(x)  # which every rule asks for first
 
         if flow.coarse and rate is not None:
-            return np.asarray((flow.moments(field, x0, h, rate)[0] - x0) / h - field(x0))
-        shift = (flow(field, x0, h) - x0) / h - field(x0)
+            return np.asarray((flow.moments(field, x0, h, rate)[0] - x0) / h - begin)
+        shift = (flow(field, x0, h) - x0) / h - begin
         if rate is not None and np.any(rate):
             # Σ_jk (εD)_jk ∂²θ/∂x_j∂x_k of the active functions, shape (active, n).
             second = self._second(x0).reshape(*rate.shape, len(self.active), -1)
@@ -446,8 +445,7 @@ def identify_vector_field(
 def _fit_support(found: FieldEstimate, regression: _PairRegression) -> FieldEstimate:
     """Generalised least squares on a support, with flow, noise and covariance brought up to date."""
     d, n, active = found.library.dimension, len(regression.pairs), len(regression.active)
-    values, rate, flow = found.values, found.noise_rate, found.flow
-    rest = rate
+    values, rate, rest, flow = found.values, found.noise_rate, found.noise_rate, found.flow
     if not flow.euler:
         forced = None if found.noise_free else rate
         flow = regression.flow(values, forced, tolerance=1e-11 if found.noise_free else 1e-6)
@@ -564,8 +562,7 @@ def _identify_weighted(found: FieldEstimate, pairs: SnapshotPairs, *, false_term
     library, (triangle, intensity) = found.library, weighted_triangle(found, pairs, None)
     critical = np.tile(critical_values(library, false_terms=false_terms), library.dimension)
     everything = all_coefficients(range(library.dimension), library.size)
-    variance = intensity * pairs.copies
-    problem = LinearProblem(triangle[:, :-1], triangle[:, -1], variance, critical, everything)
+    problem = LinearProblem(triangle[:, :-1], triangle[:, -1], intensity * pairs.copies, critical, everything)
     support = chosen_terms([problem], library)
     start = np.linalg.lstsq(triangle[:, problem.places(support)], triangle[:, -1], rcond=None)[0]
     found = refit(found.with_values(support, start, covariance=np.eye(len(support))), pairs)
@@ -666,7 +663,6 @@ def _fit_by_instruments(
     assert flow is not None
     size, rate = positive(((pairs.xh - pairs.x0) ** 2).mean(axis=0)), spread / float(np.median(pairs.h))
     ratio, covariance = np.sqrt(((rest**2).mean(axis=0) / size).mean()), inverse @ inverse.T * pairs.copies
-    support = regression.support
     return FieldEstimate.on_support(
-        regression.library, support, values, covariance, rate, float(ratio), flow, diffusion
+        regression.library, regression.support, values, covariance, rate, float(ratio), flow, diffusion
     )

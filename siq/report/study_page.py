@@ -659,7 +659,7 @@ def _bifurcations(
                 "what": one.kind,
                 with_unit(options.parameter, unit): f"{one.value:.10g}",
                 "state": ", ".join(f"{name} = {x:.5g}" for name, x in states),
-                "frequency": f"{one.frequency:.6g}" if one.frequency else "",
+                "frequency": f"{float(str(one.frequency)):.6g}" if one.frequency else "",
             }
         )
     return pd.DataFrame(rows)

@@ -57,6 +57,13 @@ def test_streamed_and_in_memory_are_the_same(noise: float, rows: int, tmp_path: 
         assert two.matrix == pytest.approx(one.matrix, rel=1e-9)
 
 
+def test_a_block_may_hold_no_pair(tmp_path: Path) -> None:
+    t, x = np.array([0.0, 1, 2, 50, 90, 91, 92, 93]), np.arange(8.0)
+    parquet.write_table(pa.table({"t": t, "x": x}), tmp_path / "a.parquet")
+    streamed = StreamedPairs(tmp_path / "a.parquet", pair_step=1.0, rows=1)
+    assert streamed.take(slice(None)).x0.ravel().tolist() == [0, 1, 4, 5, 6]
+
+
 @pytest.mark.parametrize("fault", ["order", "missing"])
 def test_what_cannot_be_streamed_is_refused(fault: str, tmp_path: Path) -> None:
     t, x = np.arange(10.0), np.arange(10.0)

@@ -43,8 +43,7 @@ with bad_input_told():
 
 
 REPRODUCED = ["archetype3d", "archetype3d-noise", "archetype4d", "resonator"]
-RUN_TABLES = ["coefficients", "rrmse", "prediction", "certificates"]
-RUN_TABLES += ["record", "record_density"]
+RUN_TABLES = "coefficients rrmse prediction certificates record record_density".split()
 FIGURES = texts("captions")["figures"]
 CAPTIONS = {name: caption["text"] for name, caption in FIGURES.items()}
 

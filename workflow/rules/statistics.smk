@@ -43,7 +43,7 @@ use rule run_task as identify with:
     params:
         **task("identify"),
     message:
-        "{wildcards.study}, run {wildcards.run}: identifying the vector field"
+        "{wildcards.study}, run {wildcards.run}: rungs 4 and 5, the vector field and its noise"
 
 
 use rule run_task as train with:
@@ -102,7 +102,7 @@ use rule run_task as refine with:
     params:
         **task("refine"),
     message:
-        "{wildcards.study}, run {wildcards.run}: refining and certifying the formulas"
+        "{wildcards.study}, run {wildcards.run}: rungs 1 to 3, states of the record, and 6, certified formulas"
 
 
 use rule run_task as score with:
