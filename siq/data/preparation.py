@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from scipy import special
+from scipy import optimize, special
 
 from siq.data.correlation import markov_lag, noise_floors
 from siq.data.recordings import (
@@ -27,7 +27,7 @@ from siq.data.recordings import (
     snapshot_pairs,
 )
 from siq.data.states import switching
-from siq.data.stationarity import background_of, correlated_samples, hum_of, runs_of
+from siq.data.stationarity import background_of, change_of, correlated_samples, runs_of, usual_step
 from siq.errors import InputError
 from siq.remarks import Remark
 
@@ -39,6 +39,8 @@ STRETCH_LENGTH = 10  # correlation times: what is left of its first sample at it
 BLOCK = 200  # steps, whose median says how large steps are thereabouts
 FALSE_FAULT_RATE = 1e-3  # probability with which a record of white noise has a step that stands out
 FEW_JUMPS, MOST_APART = 0.05, 0.01  # that stay, a sample that does not; of all samples
+QUARTERS, SAME_WAVE = 4, 0.5  # of a recording, in which a hum has one amplitude and phase, to a half of it
+SLIGHT_HUM = 0.1  # of the variance of a state: what moves it more may be the state itself, which circulates
 _STRETCH_LABEL = re.compile(r"(?P<label>.*) \((?P<number>\d+) of (?P<of>\d+)\)")
 SINGLE_RECORDING = (
     "there is one recording, and it shows no process noise: it leads into one stable state and tells nothing"
@@ -230,7 +232,7 @@ def without_faults(recordings: Recordings) -> Recordings:
     t, recording, measured = (one[~apart] for one in (recordings.t, recordings.recording, recordings.values))
     found = replace(recordings, t=t, recording=recording, values=measured)
     for state in noisy:
-        hum, period = hum_of(found, found.values[:, state])
+        hum, period = _hum_of(found, found.values[:, state])
         if hum.any():
             found.values[:, state] -= hum
             told = {
@@ -241,6 +243,40 @@ def without_faults(recordings: Recordings) -> Recordings:
             units = {"unit": found.units[state], "time_unit": found.time_unit}
             remarks.append(Remark("data.hum_taken_off", told | units))
     return replace(found, remarks=tuple(remarks)) if len(remarks) > len(recordings.remarks) else recordings
+
+
+def _hum_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, float]:
+    """The hum in a series, ``(n,)`` and zero where there is none, and its period in the unit of time."""
+    bounds = np.searchsorted(recordings.recording, np.arange(len(recordings.labels) + 1))
+    parts = [slice(int(a), int(b)) for a, b in pairwise(bounds) if b - a > QUARTERS]
+    nothing, steps = np.zeros(len(values)), np.append(np.diff(values), 0.0)
+    steps[bounds[1:] - 1] = 0.0
+    period = change_of(recordings, steps, np.zeros(len(steps), dtype=int)) if parts else None
+    if period is None or not np.isfinite(period):
+        return nothing, 0.0
+    about = 2 * np.pi / (period * usual_step(recordings))
+    width = np.pi / max(float(np.ptp(recordings.t[part])) for part in parts)
+
+    def amplitude(frequency: float, part: slice) -> complex:
+        """That of the hum, by the steps of a part: those of ``exp(iωt)`` are known."""
+        wave = np.diff(np.exp(1j * frequency * recordings.t[part]))
+        columns = np.column_stack([wave.real, -wave.imag])
+        return complex(*np.linalg.lstsq(columns, steps[part][:-1], rcond=None)[0])
+
+    def lost(frequency: float) -> float:
+        return -sum(abs(amplitude(frequency, part)) ** 2 * (part.stop - part.start) for part in parts)
+
+    bounds_of_line = (about - width, about + width)
+    frequency = float(optimize.minimize_scalar(lost, bounds=bounds_of_line, method="bounded").x)
+    hum = nothing.copy()
+    for part in parts:
+        whole, length = amplitude(frequency, part), part.stop - part.start
+        cuts = part.start + length * np.arange(QUARTERS + 1) // QUARTERS
+        each = [amplitude(frequency, slice(int(a), int(b))) for a, b in pairwise(cuts)]
+        if max(abs(one - whole) for one in each) > SAME_WAVE * abs(whole):
+            return nothing, 0.0
+        hum[part] = (whole * np.exp(1j * frequency * recordings.t[part])).real
+    return (hum, 2 * np.pi / frequency) if hum.var() < SLIGHT_HUM * values.var() else (nothing, 0.0)
 
 
 def without_background(recordings: Recordings) -> Recordings:

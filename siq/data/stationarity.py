@@ -13,12 +13,11 @@ Three times of a record differ by orders of magnitude, and each has its use:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage, optimize, special
+from scipy import ndimage, special
 
 from siq.data.recordings import LONGEST_STEP, Recordings
 
@@ -35,8 +34,6 @@ MOST_SLOW_FUNCTIONS = 8  # of the background in a record: what returns more ofte
 NEIGHBOURS, FEWEST_NEIGHBOURS = 10, 3  # frequencies on either side to compare one with, of all recordings
 HARMLESS_LINE = 0.01  # of the variance: it changes -log p by a hundredth
 FALSE_CHANGE_RATE = 0.01  # probability with which a stationary record is said to change
-QUARTERS, SAME_WAVE = 4, 0.5  # of a recording, in which a hum has one amplitude and phase, to a half of it
-SLIGHT_HUM = 0.1  # of the variance of a state: what moves it more may be the state itself, which circulates
 FALSE_DRIFT_RATE = 1e-3  # probability with which a record without a background is said to have one
 
 
@@ -161,7 +158,8 @@ def change_of(recordings: Recordings, values: np.ndarray, path: np.ndarray) -> f
 
     The state at each sample, `path` ``(n,)`` with -1 where it is not known, the distance of the `values`
     ``(n,)`` from the mean of their state, and its square are asked for a straight line, in the course of all
-    recordings and of each, and for a frequency that stands out from its neighbours, see `line_in`.
+    recordings and of each, and for a frequency that stands out from its neighbours: with power P there and
+    L at these, ``P/L`` has the F distribution in any stationary process whose spectrum is smooth.
     """
     inside = (path[:, None] == np.arange(path.max() + 1)).astype(float)
     shares = np.maximum(inside.sum(axis=0), 1.0)
@@ -190,15 +188,6 @@ def change_of(recordings: Recordings, values: np.ndarray, path: np.ndarray) -> f
             chance = 2 * float(special.stdtr(freedom, -abs(slope) / max(error, 1e-300)))
             if chance * len(lines) * series.shape[1] < FALSE_CHANGE_RATE / 2:
                 return np.inf
-    return _line_in(parts, series)
-
-
-def _line_in(parts: Sequence[slice], series: np.ndarray) -> float | None:
-    """The period, in samples, of a line that stands out of the spectra of series ``(n, k)``, if one does.
-
-    With power P there and L at the frequencies around, ``P/L`` has the F distribution in any stationary
-    process whose spectrum is smooth. What is less than `HARMLESS_LINE` of the variance is none.
-    """
     longest = max(one.stop - one.start for one in parts)
     used = [one for one in parts if one.stop - one.start > 4 * NEIGHBOURS]
     # At half the distance of independent frequencies, so that none falls between two of them.
@@ -219,39 +208,6 @@ def _line_in(parts: Sequence[slice], series: np.ndarray) -> float | None:
         if chance.min() < FALSE_CHANGE_RATE / 2:
             return float(2 * longest / frequencies[chance.argmin()])
     return None
-
-
-def hum_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, float]:
-    """The hum in a series, ``(n,)`` and zero where there is none, and its period in the unit of time."""
-    bounds = np.searchsorted(recordings.recording, np.arange(len(recordings.labels) + 1))
-    parts = [slice(int(a), int(b)) for a, b in pairwise(bounds) if b - a > QUARTERS]
-    nothing, steps = np.zeros(len(values)), np.append(np.diff(values), 0.0)
-    steps[bounds[1:] - 1] = 0.0
-    if not parts or (period := _line_in(parts, steps[:, None])) is None:
-        return nothing, 0.0
-    about = 2 * np.pi / (period * usual_step(recordings))
-    width = np.pi / max(float(np.ptp(recordings.t[part])) for part in parts)
-
-    def amplitude(frequency: float, part: slice) -> complex:
-        """That of the hum, by the steps of a part: those of ``exp(iωt)`` are known."""
-        wave = np.diff(np.exp(1j * frequency * recordings.t[part]))
-        columns = np.column_stack([wave.real, -wave.imag])
-        return complex(*np.linalg.lstsq(columns, steps[part][:-1], rcond=None)[0])
-
-    def lost(frequency: float) -> float:
-        return -sum(abs(amplitude(frequency, part)) ** 2 * (part.stop - part.start) for part in parts)
-
-    bounds_of_line = (about - width, about + width)
-    frequency = float(optimize.minimize_scalar(lost, bounds=bounds_of_line, method="bounded").x)
-    hum = nothing.copy()
-    for part in parts:
-        whole, length = amplitude(frequency, part), part.stop - part.start
-        cuts = part.start + length * np.arange(QUARTERS + 1) // QUARTERS
-        each = [amplitude(frequency, slice(int(a), int(b))) for a, b in pairwise(cuts)]
-        if max(abs(one - whole) for one in each) > SAME_WAVE * abs(whole):
-            return nothing, 0.0
-        hum[part] = (whole * np.exp(1j * frequency * recordings.t[part])).real
-    return (hum, 2 * np.pi / frequency) if hum.var() < SLIGHT_HUM * values.var() else (nothing, 0.0)
 
 
 def background_of(recordings: Recordings, values: np.ndarray, *, functions: int | None = None) -> np.ndarray:

@@ -220,14 +220,13 @@ def formula_mathml(expression: sympy.Expr, *, decimals: int = 3) -> Markup:
     return _typeset([[expression]], decimals, brackets=False)
 
 
-def vector_mathml(expressions: Sequence[sympy.Expr], *, decimals: int = 3) -> Markup:
-    """Typeset the components of a vector as a column in brackets, as `formula_mathml` does."""
-    return _typeset([[entry] for entry in expressions], decimals, flush=True)
-
-
-def matrix_mathml(rows: Sequence[Sequence[sympy.Expr | float]], *, decimals: int = 3) -> Markup:
-    """Typeset a matrix of numbers or formulas in brackets; an entry that stands alone without them."""
-    return _typeset(rows, decimals, brackets=len(rows) > 1)
+def array_mathml(
+    entries: Sequence[sympy.Expr] | Sequence[Sequence[sympy.Expr | float]], *, decimals: int = 3
+) -> Markup:
+    """Typeset a vector, as a column, or a matrix in brackets; an entry that stands alone without them."""
+    if isinstance(entries[0], sympy.Expr):
+        return _typeset([[entry] for entry in entries], decimals, flush=True)
+    return _typeset(entries, decimals, brackets=len(entries) > 1)
 
 
 def _typeset(

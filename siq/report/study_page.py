@@ -29,14 +29,13 @@ from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.landscape import sentences_without_landscape
 from siq.quasipotential.wells import Well
 from siq.report.formatting import (
+    array_mathml,
     formula_mathml,
-    matrix_mathml,
     paragraphs,
     predicted_text,
     term_text,
     texts,
     time_text,
-    vector_mathml,
     with_unit,
 )
 from siq.report.landscape import answer_lines, comparison_table, in_words, landscape_tables, record_table
@@ -348,7 +347,7 @@ def _formulas(results: StudyResults) -> list[FormulaRow]:
     if record is None:
         return rows
     if not rows:
-        rows.append(FormulaRow("f", vector_mathml(record.dynamics.formulas), words["f"]))
+        rows.append(FormulaRow("f", array_mathml(record.dynamics.formulas), words["f"]))
     noise, note = record.diffusion, words["D"][record.diffusion_source]
     note = note if noise.constant else f"{note} {words['by_state']}"
     return [*rows, FormulaRow("D", _diffusion_mathml(noise), note)]
@@ -356,7 +355,7 @@ def _formulas(results: StudyResults) -> list[FormulaRow]:
 
 def _diffusion_mathml(noise: Diffusion) -> Markup:
     """D, typeset."""
-    return matrix_mathml(noise.matrix.tolist() if noise.constant else noise.formulas)
+    return array_mathml(noise.matrix.tolist() if noise.constant else noise.formulas)
 
 
 def _formulas_by(results: StudyResults, method: Method) -> list[FormulaRow]:
@@ -383,9 +382,9 @@ def _formula_rows(
             constant, rest = whole.as_coeff_Add()
             rounded = rest != 0 and abs(float(constant)) < ROUNDED_CONSTANT * depth
             formulas = {
-                "U": formula_mathml(rest if rounded else whole), "g": vector_mathml(one.circulatory),
+                "U": formula_mathml(rest if rounded else whole), "g": array_mathml(one.circulatory),
             }  # fmt: skip
-        return formulas | {"f": vector_mathml(one.vector_field)}
+        return formulas | {"f": array_mathml(one.vector_field)}
 
     truths, notes = {} if exact is None else typeset(exact), texts("formulas")
     rows = [

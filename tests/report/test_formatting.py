@@ -3,7 +3,7 @@ from xml.etree import ElementTree
 import pytest
 import sympy
 
-from siq.report.formatting import _formula_text, formula_mathml, matrix_mathml, vector_mathml
+from siq.report.formatting import _formula_text, array_mathml, formula_mathml
 
 x, y, z = sympy.symbols("x y z", real=True)
 IDENTIFIED = 0.9991 * y**2 + 1.0009 - 2.0012 * x**2 + 0.9991 * z**2 + 1.0001 * x**4
@@ -73,7 +73,7 @@ def test_a_long_sum_stands_on_several_lines() -> None:
 
 
 def test_a_vector_is_a_column_in_brackets() -> None:
-    root = ElementTree.fromstring(vector_mathml([2.001 * x**3 - 2.001 * x, 0.999 * y, 0.999 * z], decimals=2))
+    root = ElementTree.fromstring(array_mathml([2.001 * x**3 - 2.001 * x, 0.999 * y, 0.999 * z], decimals=2))
     assert ["".join(row.itertext()).replace("\u2062", "") for row in root.iter("mtr")] == [
         "2.00x3−2.00x",
         "1.00y",
@@ -90,5 +90,5 @@ def test_hostile_names_are_escaped() -> None:
 
 
 def test_a_matrix_has_brackets_unless_it_is_one_entry() -> None:
-    assert shown(matrix_mathml([[1.0, -0.5], [-0.5, 2.0]])) == "[1−0.5000−0.50002]"
-    assert shown(matrix_mathml([[2.0]])) == "2" and shown(matrix_mathml([[x + 1]])) == "x+1"
+    assert shown(array_mathml([[1.0, -0.5], [-0.5, 2.0]])) == "[1−0.5000−0.50002]"
+    assert shown(array_mathml([[2.0]])) == "2" and shown(array_mathml([[x + 1]])) == "x+1"
