@@ -254,6 +254,8 @@ def repetitions(recordings: Recordings, column: int) -> list[tuple[float, str, f
     step = resolution_step(x) or resolution_step(ALIKE * size * np.round(bends / (ALIKE * size)))
     found, width = [], ALIKE * size if step is None else step
     for kind, changes in (("held", moves[same]), ("straight", bends)):
+        if not len(changes):
+            continue
         sizes, spread = np.abs(changes), max(float(np.sqrt((changes**2).mean())), 1e-300)
         count = int((sizes < ALIKE * size).sum())
         usual = len(changes) * min(width / (np.sqrt(2 * np.pi) * spread), 1.0)

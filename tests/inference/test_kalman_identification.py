@@ -81,13 +81,13 @@ def test_terms_and_noises_are_found(found: tuple[FieldEstimate, Recordings, np.n
 def test_many_short_recordings_leave_white_innovations() -> None:
     """An initial state fitted to each seven samples would leave correlations of about minus one in seven."""
     whole, _ = double_well(1)
-    count = len(whole.t) // 7
+    count = len(whole.t) // 21
     cut = Recordings.from_arrays(
         STEP * np.arange(7), whole.values[: 7 * count].reshape(count, 7, 1), names=["x"]
     )
     noise = identified(cut, degree=3).diagnosis
     assert noise is not None and noise.kind == "process"
-    assert abs(noise.correlation) < 0.02 and noise.measurement[0] == pytest.approx(SENSOR, rel=0.05)
+    assert abs(noise.correlation) < 0.04 and noise.measurement[0] == pytest.approx(SENSOR, rel=0.05)
 
 
 def test_noise_that_depends_on_the_state_behind_a_noisy_sensor_is_kept(tmp_path: Path) -> None:
