@@ -179,7 +179,7 @@ class _Increments(NamedTuple):
         for place, one in enumerate(lags):
             count = len(seen.rest) - one
             carried = seen.rest[:count].T @ self.functions[one:] / seen.size @ seen.inverse
-            further = (carried**2).sum(axis=1) * run / seen.size / size**2
+            further = (carried**2).sum(axis=1) * run / seen.size / positive(size**2)
             error = np.sqrt(errors[one - 1] ** 2 + further)
             limit = STANDARD_ERRORS if place == 0 else STANDARD_ERRORS_LATER
             if (np.abs(values[one - 1]) > limit * error).any():

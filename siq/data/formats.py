@@ -15,8 +15,10 @@ from __future__ import annotations
 import codecs
 import csv
 import difflib
+import gzip
 import json
 import re
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -47,6 +49,7 @@ _NUMERIC = re.compile(f"{_NUMBER.pattern}|{_DECIMAL_COMMA.pattern}", re.IGNORECA
 _GROUPED = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d+")
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", "|": "vertical bars", " ": "spaces"}
 _COMMENTS = ("#", "%", "//")
+GZIP = b"\x1f\x8b"  # with which packed files begin
 _END_OF_HEADER, LARGEST_HEADER = b"***End_of_Header***", 20_000  # of LabVIEW's tables; bytes of the largest
 
 
@@ -86,6 +89,8 @@ def open_columns(path: str | Path | pd.DataFrame | xarray.Dataset) -> ColumnFile
     file, path = str(path), Path(path)
     suffix, exists, begin = path.suffix.lower(), path.exists(), b""
     reader = READERS.get(suffix)
+    if suffix == ".gz" and READERS.get(Path(path.stem).suffix.lower()) is _open_text:
+        reader = _open_text
     if not exists and (reader or not suffix):
         raise _missing_file(file)
     try:
@@ -153,7 +158,12 @@ def _reading(file: str, kind: str) -> Iterator[None]:
 
 def _open_text(file: str) -> ColumnFile:
     """Recognise how a table of text is written: encoding, comments, headings, units, separator, decimals."""
-    content, remarks = _in_utf8(file, Path(file).read_bytes())
+    content = Path(file).read_bytes()
+    try:
+        content = gzip.decompress(content) if content.startswith(GZIP) else content
+    except (OSError, EOFError, zlib.error):
+        raise InputError(file, "", "it cannot be unpacked", "write the recordings again") from None
+    content, remarks = _in_utf8(file, content)
     header = content[:LARGEST_HEADER].rfind(_END_OF_HEADER)
     begin, comments, separator = 0 if header < 0 else _after_line(content, header), [], ""
     while begin < len(content):
@@ -171,6 +181,9 @@ def _open_text(file: str) -> ColumnFile:
     lines = [line for line in sample if line.strip() and not line.lstrip().startswith(_COMMENTS)]
     if not lines:
         raise InputError(file, "", "the table has no headings and no rows", "write the recordings again")
+    before = _preamble(lines, separator)
+    comments += lines[:before]
+    begin, lines = begin if not before else content.index(lines[before].encode(), begin), lines[before:]
     separator = separator or _separator(lines)
     headings, rows = _split(lines[0], separator), [_split(line, separator) for line in lines[1:]]
     if all(map(_NUMERIC.fullmatch, headings)):
@@ -257,6 +270,17 @@ def _separator(lines: list[str]) -> str:
     if any(separator in row for separator in ";\t,|") or len(row.split()) == 1:
         return next((separator for separator in ";\t,|" if separator in row), ",")
     return " "
+
+
+def _preamble(lines: list[str], separator: str) -> int:
+    """How many lines stand before the headings, such as ``Operator: Ann``, of another width than all rows."""
+    separator = separator or _separator(lines[-2:])
+    widths = [len(_split(line, separator)) for line in lines]
+    rows = next((place for place in range(len(lines)) if len(set(widths[place:])) == 1), 0)
+    headings = _split(lines[rows], separator)
+    if widths[0] == widths[-1] or widths[-1] < 2 or len(lines) - rows <= FEWEST_UNNAMED:
+        return 0
+    return 0 if any(map(_NUMERIC.fullmatch, headings)) else rows
 
 
 def _split(line: str, separator: str) -> list[str]:

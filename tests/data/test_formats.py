@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from pathlib import Path
 
 import h5py
@@ -86,3 +87,21 @@ def test_a_dataset_is_read_back(version: str, tmp_path: Path) -> None:
     assert (found.names, found.units, found.labels) == (made.names, made.units, made.labels)
     assert found.time_unit == made.time_unit
     assert np.array_equal(found.values, made.values) and np.array_equal(found.t, made.t)
+
+
+def test_lines_before_the_headings_are_no_headings(tmp_path: Path) -> None:
+    rows = "".join(f"{0.1 * k:.1f}\t{k % 5}\t{k % 3}\n" for k in range(30))
+    text = "Instrument: HF2, no. 3\nOperator: Ann\n\nTime (s)\tX (V)\tY (V)\n" + rows
+    path = tmp_path / "lock-in.txt"
+    path.write_text(text, encoding="utf-8")
+    read = read_recordings(path)
+    assert (read.names, read.units, read.time_unit, len(read.t)) == (("X", "Y"), ("V", "V"), "s", 30)
+
+
+def test_packed_text_is_read(tmp_path: Path) -> None:
+    packed = gzip.compress(b"t,x\n0,1\n1,3\n2,2\n")
+    (tmp_path / "small.csv.gz").write_bytes(packed)
+    assert read_recordings(tmp_path / "small.csv.gz").values.ravel().tolist() == [1, 3, 2]
+    (tmp_path / "torn.csv.gz").write_bytes(packed[:20])
+    with pytest.raises(InputError, match="cannot be unpacked"):
+        read_recordings(tmp_path / "torn.csv.gz")
