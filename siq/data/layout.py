@@ -37,15 +37,15 @@ RESERVED = _words("sin cos tan exp log sqrt tanh atan Abs sign Max Min pi record
 
 TIME_NAMES = _words(
     "t time times zeit temps tiempo tempo timestamp timestamps datetime date elapsed elapsedtime clock"
-    " clocktime uhrzeit seconds xvalue age ages alter"
+    " clocktime uhrzeit seconds xvalue"
 )
+AGE_NAMES = _words("age ages alter")
 LABEL_NAMES = _words(
     "recording recordings record run runs trial trials id rec experiment measurement series trajectory traj"
     " track trackid runid recordingid trialid recid trajectoryid replicate repetition rep file filename sweep"
     " ringdown label particle particleid messung versuch aufnahme cell molecule roi animal mouse subject"
     " patient replica realization realisation"
 )
-AGE_NAMES = _words("age ages alter")
 INDEX_NAMES = _words("index idx row rowid rownumber unnamed")
 TIME_UNITS = _words(
     "ns us µs μs ms s sec secs second seconds min minute minutes h hr hrs hour hours d day days week weeks"
@@ -157,7 +157,7 @@ def usable_name(title: str) -> str:
 
 def _is_time(title: str) -> bool:
     """Whether a column of this title is the time."""
-    return _plain(title) in TIME_NAMES or title.casefold() in _UNITS_AS_TITLES
+    return _plain(title) in TIME_NAMES | AGE_NAMES or title.casefold() in _UNITS_AS_TITLES
 
 
 def _plain(title: str) -> str:

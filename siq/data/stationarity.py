@@ -244,7 +244,7 @@ def background_of(recordings: Recordings, values: np.ndarray, *, functions: int 
         # Twice the gain in the logarithm of the likelihood, less what chance gives it with this probability.
         surplus = gain - used * np.log(independent) - 2 * np.log(1 / FALSE_DRIFT_RATE)
         if surplus > best:
-            best, drift = surplus, slow - slow.mean()
+            best, drift = surplus, slow
     return drift
 
 

@@ -164,18 +164,11 @@ def _stacked(source: ColumnFile) -> ColumnFile:
     rest = [place for place in range(len(parts)) if place not in own]
 
     def load(positions: Sequence[int]) -> list[pa.Array]:
-        loaded = []
-        for position in positions:
-            places = (
-                own if position == len(rest) + 1 else [rest[position] if position < len(rest) else own[0]]
-            )
-            columns = [one.to_pandas() for one in source.load(places)] * (len(own) if len(places) == 1 else 1)
-            if position == len(rest):
-                columns = [
-                    pd.Series(title, range(len(one))) for title, one in zip(titles, columns, strict=True)
-                ]
-            loaded.append(pa.array(pd.concat(columns, ignore_index=True), from_pandas=True))
-        return loaded
+        *others, first = (one.to_pandas() for one in source.load([*rest, own[0]]))
+        quantity = pd.concat([first, *(one.to_pandas() for one in source.load(own[1:]))])
+        below = [pd.concat([one] * len(own)) for one in others]
+        below += [pd.Series(np.repeat(titles, len(first))), quantity]
+        return [pa.array(below[position], from_pandas=True) for position in positions]
 
     values = {"first": titles[0], "last": titles[-1]}
     return replace(
