@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict
 from siq.inference.library import linear_combination
 from siq.numerics.files import read_document, validate
 from siq.numerics.text import number_text
-from siq.quasipotential.formulas import SymbolicDecomposition, _downhill_formulas
+from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import parse_formula
@@ -193,7 +193,8 @@ def published_decomposition(
     if quasipotential is None or any(one is None for one in circulatory):
         return None
     potential = sympy.expand(quasipotential / 2)
-    downhill = _downhill_formulas(diffusion, [potential.diff(symbol) for symbol in symbols])
+    gradient = sympy.Matrix([potential.diff(symbol) for symbol in symbols])
+    downhill = sympy.Matrix(diffusion.formulas) * gradient
     return SymbolicDecomposition(
         symbols=tuple(symbols),
         potential=potential,

@@ -104,18 +104,11 @@ class SymbolicDecomposition:
 def exact_decomposition(dynamics: Dynamics, quasipotential: sympy.Expr) -> SymbolicDecomposition:
     """The decomposition of known dynamics with a known U = 2V; g = f + D∇V. For scoring only."""
     potential = sympy.expand(quasipotential / 2)
-    downhill = _downhill_formulas(dynamics.diffusion, [potential.diff(one) for one in dynamics.symbols])
+    gradient = sympy.Matrix([potential.diff(one) for one in dynamics.symbols])
+    downhill = sympy.Matrix(dynamics.diffusion.formulas) * gradient
     circulatory = tuple(sympy.expand(f + v) for f, v in zip(dynamics.formulas, downhill, strict=True))
     flow = tuple(map(sympy.expand, dynamics.formulas))
     return SymbolicDecomposition(dynamics.symbols, potential, circulatory, flow)
-
-
-def _downhill_formulas(diffusion: Diffusion, gradient: Sequence[sympy.Expr]) -> tuple[sympy.Expr, ...]:
-    """D∇V as formulas, from those of ∇V."""
-    return tuple(
-        sum((entry * slope for entry, slope in zip(row, gradient, strict=True)), sympy.S.Zero)
-        for row in diffusion.formulas
-    )
 
 
 def decomposition_from_coefficients(

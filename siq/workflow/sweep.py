@@ -299,10 +299,6 @@ def _curve_rows(curves: Sequence[Branch]) -> list[dict[str, object]]:
     ]
 
 
-ALONE = "it is the only stable state, and no way leads out of it"
-UNKNOWN = "no way out was found"
-
-
 def _well_rows(point: SweptPoint, number: Sequence[int], noise: float | None) -> list[dict[str, object]]:
     """One row for every well of a point; one that says why where there is none."""
     if not point.wells:
@@ -353,14 +349,16 @@ def _weights(point: SweptPoint, noise: float | None) -> np.ndarray:
 
 
 def _exits(point: SweptPoint, index: int, number: Sequence[int], noise: float | None) -> dict[str, object]:
-    """The lowest way out of a well, and its time over all ways."""
+    """The lowest way out of a well, and its time over all ways; an infinite barrier where there is none."""
     mine = [way for way in point.ways if way.start == index]
     known = [way for way in mine if way.barrier is not None]
     if not known:
         # Beside a limit cycle, or another well, it can be left in an unknown way.
         alone = len(point.wells) == 1 and not point.notes and not mine
-        told = "; ".join(dict.fromkeys(way.note for way in mine if way.note))
-        return {"note": ALONE if alone else told or "; ".join(point.notes) or UNKNOWN}
+        if alone:
+            return {"barrier": np.inf, "note": sentence(Remark("workflow.only_stable_state"))}
+        told = "; ".join(dict.fromkeys(way.note for way in mine if way.note)) or "; ".join(point.notes)
+        return {"note": told or sentence(Remark("workflow.no_way_out"))}
     lowest = min(known, key=lambda way: np.inf if way.barrier is None else way.barrier)
     notes = [way.note for way in mine if way.note]
     time = mean_residence_time(

@@ -56,7 +56,7 @@ from siq.quasipotential.rates import MIN_BARRIER_OVER_NOISE
 from siq.remarks import Remark, sentence
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import TIME, Dynamics, Parameter, symbol
-from siq.workflow.sweep import ALONE, Sweep
+from siq.workflow.sweep import Sweep
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -188,7 +188,7 @@ def _regimes(
     lowest = ways.groupby("value")["barrier"].min().reindex(at).to_numpy(float)
     rated = ways["barrier"].notna() & ways["prefactor"].notna()
     known = rated.groupby(ways["value"]).all().reindex(at, fill_value=False).to_numpy(bool)
-    alone = (mine["note"] == ALONE).to_numpy(bool)
+    alone = np.isposinf(mine["barrier"].to_numpy(float))
     left = np.clip(np.searchsorted(at, value, side="right") - 1, 0, len(at) - 1)
     right = np.where((value < at[0]) | (value > at[-1]), left, np.minimum(left + 1, len(at) - 1))
     right = np.where(value == at[left], left, right)

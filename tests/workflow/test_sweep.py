@@ -13,7 +13,7 @@ from siq.systems.cards import load_system
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
 from siq.workflow.study import PipelineSettings
-from siq.workflow.sweep import ALONE, Sweep, SweptPoint, _with_parameters, collected, point_at, sweep
+from siq.workflow.sweep import Sweep, SweptPoint, _with_parameters, collected, point_at, sweep
 from workflow.files import write
 
 h, a, x, y = sympy.symbols("h a x y", real=True)
@@ -155,5 +155,7 @@ def test_beside_a_limit_cycle_nobody_says_that_a_well_is_never_left(monkeypatch)
         parameters={a: 1.0},
     )  # fmt: skip
     row = sweep(ring, "a", [1.0], noise=0.01).table.iloc[0]
-    assert np.isnan(row["weight"]) and row["well"] == 0 and "cycle" in row["note"] and row["note"] != ALONE
-    assert sweep(cusp(), "h", [0.5]).table["note"].iloc[0] == ALONE
+    assert (
+        np.isnan(row["weight"]) and row["well"] == 0 and "cycle" in row["note"] and row["barrier"] != np.inf
+    )
+    assert sweep(cusp(), "h", [0.5]).table["barrier"].iloc[0] == np.inf

@@ -8,7 +8,7 @@ import pytest
 import sympy
 
 from siq.systems.dynamics import Dynamics
-from siq.workflow.sweep import ALONE, Sweep, sweep
+from siq.workflow.sweep import Sweep, sweep
 from siq.workflow.tables import as_table
 from siq.workflow.tipping import probability_of_tipping
 
@@ -73,7 +73,7 @@ def test_where_no_law_holds_the_last_rate_is_kept_and_never_believed():
 
 def test_a_well_without_a_way_out_is_not_left():
     found = made(lambda h: 0.5 - h, values=[0.2, 0.3, 0.4])
-    alone = pd.DataFrame([{"value": value, "well": 0, "note": ALONE} for value in (0.0, 0.1)])
+    alone = pd.DataFrame([{"value": value, "well": 0, "barrier": np.inf} for value in (0.0, 0.1)])
     found = replace(found, table=as_table("sweep", pd.concat([alone, found.table], ignore_index=True)))
     told = probability_of_tipping(
         found, lambda t: 1e-4 * t, np.array([0, 1000.0, 3000.0]), well=0, noise=NOISE
