@@ -46,7 +46,7 @@ SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".xlsb", ".ods")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 _NUMERIC = re.compile(f"{_NUMBER.pattern}|{_DECIMAL_COMMA.pattern}", re.IGNORECASE)
-_GROUPED = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d+")
+_GROUPED = re.compile(r"[+-]?\d{1,3}((\.\d{3})+,\d+|(,\d{3})+\.\d+|,\d{3}(,\d{3})+)")
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", "|": "vertical bars", " ": "spaces"}
 _COMMENTS = ("#", "%", "//")
 GZIP = b"\x1f\x8b"  # with which packed files begin
@@ -185,8 +185,17 @@ def _open_text(file: str) -> ColumnFile:
     comments += lines[:before]
     begin, lines = begin if not before else content.index(lines[before].encode(), begin), lines[before:]
     separator = separator or _separator(lines)
-    headings, rows = _split(lines[0], separator), [_split(line, separator) for line in lines[1:]]
-    if all(map(_NUMERIC.fullmatch, headings)):
+    headings, title = _split(lines[0], separator), lines[0].strip()
+    unnamed = all(map(_NUMERIC.fullmatch, headings))
+    if (
+        not unnamed and content.count(title.encode(), begin) > 1
+    ):  # tables put one below the other repeat theirs
+        first, *others = content[begin:].splitlines()
+        kept = [line for line in others if line.strip() != title.encode()]
+        content, begin = b"\n".join([first, *kept]), 0
+        lines = [lines[0], *(line for line in lines[1:] if line.strip() != title)]
+    rows = [_split(line, separator) for line in lines[1:]]
+    if unnamed:
         # Of several comments the last one with a word for each column.
         split = (_split(comment, separator) for comment in reversed(comments))
         above = next((cells for cells in split if len(cells) == len(headings)), [])
@@ -301,17 +310,17 @@ def _line_of_units(cells: list[str], width: int) -> list[str | None] | None:
 
 
 def _decimal_mark(file: str, rows: list[list[str]], width: int, separator: str) -> str:
-    if separator == ",":
-        if rows and len(rows[0]) > width and all(len(row) == len(rows[0]) for row in rows):
-            fault = f"the headings name {width} columns and the rows have {len(rows[0])} cells"
-            remedy = "write decimal points, or separate the columns by semicolons if decimals have commas"
-            raise InputError(file, "", fault, remedy)
-        return "."
+    if separator == "," and rows and len(rows[0]) > width and all(len(row) == len(rows[0]) for row in rows):
+        fault = f"the headings name {width} columns and the rows have {len(rows[0])} cells"
+        remedy = "write decimal points, or separate the columns by semicolons if decimals have commas"
+        raise InputError(file, "", fault, remedy)
     cells = [cell for row in rows for cell in row]
-    grouped = next((cell for cell in cells if _GROUPED.fullmatch(cell)), None)
-    if grouped is not None:
-        fault = f"'{grouped}' has both a point and a comma"
-        raise InputError(file, "", fault, "write numbers without marks between thousands")
+    quoted = [cell for cell in cells if "," in cell and _NUMBER.fullmatch(cell.replace(",", ""))]
+    grouped = quoted if separator == "," else [cell for cell in cells if _GROUPED.fullmatch(cell)]
+    if grouped:
+        fault = f"'{grouped[0]}' has a mark between thousands, or a decimal comma"
+        remedy = "write numbers with a decimal point, and without marks between thousands"
+        raise InputError(file, "", fault, remedy)
     commas = next((cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell)), None)
     points = next((cell for cell in cells if "." in cell and _NUMBER.fullmatch(cell)), None)
     if commas is not None and points is not None:

@@ -98,6 +98,13 @@ def test_lines_before_the_headings_are_no_headings(tmp_path: Path) -> None:
     assert (read.names, read.units, read.time_unit, len(read.t)) == (("X", "Y"), ("V", "V"), "s", 30)
 
 
+def test_tables_below_each_other_repeat_their_headings(tmp_path: Path) -> None:
+    path = tmp_path / "all.csv"
+    path.write_text("t [s],x\n0,1\n1,2\nt [s],x\n0,3\n1,4\n", encoding="utf-8")
+    read = read_recordings(path)
+    assert read.values.ravel().tolist() == [1, 2, 3, 4] and read.recording.tolist() == [0, 0, 1, 1]
+
+
 def test_packed_text_is_read(tmp_path: Path) -> None:
     packed = gzip.compress(b"t,x\n0,1\n1,3\n2,2\n")
     (tmp_path / "small.csv.gz").write_bytes(packed)

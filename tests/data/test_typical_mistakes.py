@@ -99,7 +99,10 @@ REFUSED: dict[str, tuple[str, str | bytes, str, str]] = {
     # what: (name, content, fault, remedy)
     "two meanings of a comma": ("a.csv", "t,x\n0,5,1,25\n1,0,2,5\n", "rows have 4 cells", "decimal points"),
     "points between thousands": (
-        "a.csv", "t;x\n0;1.234,5\n1;2,0\n", "both a point and a comma", "without marks",
+        "a.csv", "t;x\n0;1.234,5\n1;2,0\n", "a mark between thousands", "without marks",
+    ),
+    "thousands in quotation marks": (
+        "a.csv", 't,x\n0,"1,234"\n1,"1,240"\n', "a mark between thousands", "decimal point",
     ),
     "two decimal marks": (
         "a.csv", "t;x\n0;1,5\n1;1.2\n", "with commas ('1,5') and with points", "the same way",
