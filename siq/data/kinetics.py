@@ -52,8 +52,12 @@ FORGOTTEN_STAYS = 4  # after so many of the longest a Markov process hardly know
 REGULAR = 2.58 + 1.28
 
 
-def _wells_of(values: np.ndarray, relaxation: float) -> np.ndarray:
-    """Places of the wells of the density of points ``(n, d)``, a row for each: shape ``(k, d)``."""
+def _wells_of(values: np.ndarray, relaxation: float, *, visited: bool = False) -> np.ndarray:
+    """Places of the wells of the density of points ``(n, d)``, a row for each: shape ``(k, d)``.
+
+    With `visited`, densities at a well and at its saddle have the errors of the visits to each, which may be
+    far more at the saddle, and not all those of the relaxation.
+    """
     scale = np.maximum(values.std(axis=0), np.finfo(float).tiny)
     every = -(-len(values) // MOST_NODES)
     nodes = (values[::every] - values.mean(axis=0)) / scale
@@ -77,13 +81,19 @@ def _wells_of(values: np.ndarray, relaxation: float) -> np.ndarray:
             node = parent[node]
         return node
 
+    def error(node: int) -> float:
+        inside = np.zeros(count)
+        inside[near[node]] = 1.0
+        return float(np.sqrt(2 * correlated_samples(inside, [slice(0, count)]) / neighbours))
+
     for node in np.argsort(-density).tolist():
         tops = sorted(
             {top(other) for other in links[node] if parent[other] >= 0}, key=lambda one: -height[one]
         )
         parent[node] = tops[0] if tops else node
         for lower in tops[1:]:
-            if height[lower] - height[node] < needed:
+            depth = height[lower] - height[node]
+            if depth < needed or (visited and depth < FALSE_WELL * np.hypot(error(lower), error(node))):
                 parent[lower] = tops[0]
     well = np.array([top(node) for node in range(count)])
     kept = [one for one in np.unique(well) if (well == one).sum() >= neighbours / 2]
@@ -252,7 +262,9 @@ def path_of(
         # What hops from well to well for long before it is anywhere else knows a valley by all its passages.
         # Not in averages, though: halfway between two levels these have a peak of hops.
         fine = _wells_apart(values + steps * (draw.random(values.shape) - 0.5), runs)
-        wells = fine if len(wells) < len(fine) <= MOST_STATES else wells
+    else:
+        fine = _wells_of(spread_out, relaxation, visited=True)
+    wells = fine if len(wells) < len(fine) <= MOST_STATES else wells
     each = (
         [wells]
         if len(longest) == 1

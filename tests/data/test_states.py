@@ -255,3 +255,12 @@ def test_ten_seasons_are_a_period() -> None:
     assert change_of(recorded(x), x, (x > 1.5).astype(int)) == pytest.approx(season, rel=0.05)
     hops = chain(6, np.array([[-0.04, 0.04], [0.04, -0.04]]), len(t))
     assert change_of(recorded(hops), hops + 0.2 * noise(7, len(t)), hops) is None
+
+
+def test_few_visits_in_two_dimensions_are_three_states() -> None:
+    """Some forty visits to each: the wells are known by these less well than the valleys between them."""
+    places = np.array([[2.0, 0.5], [1.4, 1.4], [0.5, 2.0]])
+    path = chain(8, np.array([[-2.0, 2.0, 0.0], [2.5, -5.0, 2.5], [0.0, 2.0, -2.0]]) * 1e-3, 40_000)
+    about = np.column_stack([noise(seed, len(path), memory=0.9) for seed in (1, 2)])
+    found = found_in(places[path] + 0.22 * about)
+    assert found.places[found.places[:, 0].argsort()] == pytest.approx(places[::-1], abs=0.1)
