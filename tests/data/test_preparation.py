@@ -102,7 +102,7 @@ def test_a_noisy_limit_cycle_is_no_hum() -> None:
 
 def test_a_state_far_from_zero_is_moved_by_a_round_number_and_called_so() -> None:
     near = np.random.default_rng(0).uniform(-3, 3, (500, 2))
-    values = near + [101325.4, 5.0]
+    values = near + np.array([101325.4, 5.0])
     table = Recordings.from_arrays(np.arange(500.0), values, names=["p", "x"])
     found = centred(table, degree=5)
     assert found.names == ("p_minus_101325", "x") and found.titles == ("p − 101325", "x")
