@@ -282,7 +282,7 @@ def repetitions(recordings: Recordings, column: int) -> list[tuple[float, str, f
 
 
 def _last_digits(values: np.ndarray) -> np.ndarray:
-    """What one more in the last digit of each value ``(n,)`` is, where all have so many; zero where they do not."""
+    """One in the last digit of each value ``(n,)``, where all have so many digits; zero where they do not."""
     exponents = np.floor(np.log10(positive(np.abs(values))))
     for digits in range(1, MOST_DIGITS + 1):
         last = 10.0 ** (exponents + 1 - digits)

@@ -214,8 +214,7 @@ def test_what_rounding_repeats_is_no_sign_of_values_filled_in() -> None:
     for x in (walk, walk.round(3), walk.round(3) - 1e-4 * t, inert.round(3)):
         assert straight(x) > 0.01
     assert straight(filled) < 1e-9 and straight(filled.round(3)) < 1e-3
-    five = np.array(
-        [float(f"{one:.5g}") for one in np.abs(np.sin(0.3 * np.cumsum(generator.random(len(t)))))]
-    )
+    wave = np.abs(np.sin(0.3 * np.cumsum(generator.random(len(t)))))
+    five = np.array([float(f"{one:.5g}") for one in wave])
     five *= np.where(five < 0.01, 1.0, 10.0)  # nearly all have one step, and a few a hundred times finer ones
     assert min(chances(five).values()) > 0.01
