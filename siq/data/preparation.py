@@ -46,8 +46,8 @@ QUARTERS, SAME_WAVE = 4, 0.5  # of a recording, in which a hum has one amplitude
 SLIGHT_HUM = 0.1  # of the variance of a state: what moves it more may be the state itself, which circulates
 _STRETCH_LABEL = re.compile(r"(?P<label>.*) \((?P<number>\d+) of (?P<of>\d+)\)")
 SINGLE_RECORDING = (
-    "there is one recording, and it shows no process noise, from which the state returns, but at most that of a"
-    " sensor: a way that was gone once tells nothing of other stable states, nor of barriers"
+    "there is one recording, and it shows no process noise, from which the state returns, but at most that of"
+    " a sensor: a way that was gone once tells nothing of other stable states, nor of barriers"
 )
 
 

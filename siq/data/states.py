@@ -503,7 +503,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         flat = values - background
         places, path, expected, wells, levels = path_of(flat, runs, relaxation, column=column)
         level = np.where(path[:, None] >= 0, places[path], np.median(flat, axis=0))
-        slow = np.array([background_of(recordings, one) for one in (values - level).T]).T
+        slow = np.array([background_of(recordings, one, path=path) for one in (values - level).T]).T
         baseline = _baselines(recordings, values - level - slow)
         moved = slow + baseline - background
         background = slow + baseline

@@ -264,3 +264,10 @@ def test_few_visits_in_two_dimensions_are_three_states() -> None:
     about = np.column_stack([noise(seed, len(path), memory=0.9) for seed in (1, 2)])
     found = found_in(places[path] + 0.22 * about)
     assert found.places[found.places[:, 0].argsort()] == pytest.approx(places[::-1], abs=0.1)
+
+
+def test_three_hops_are_no_drift() -> None:
+    path = np.repeat([0.0, 1.0, 0.0, 1.0], [2300, 3200, 1500, 3000])
+    found = found_in(0.412 + 0.018 * path + 0.0015 * noise(9, len(path)))
+    assert found.levels == pytest.approx((0.412, 0.430), abs=2e-4)
+    assert found.rung == 2 and found.limit is not None and found.limit.code == "data.few_hops"
