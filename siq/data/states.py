@@ -492,7 +492,10 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     columns, state = sorted(tried[one] for one in order[:MOST_COLUMNS]), tried[order[0]]
     values, column = recordings.values[:, columns], columns.index(state)
     relaxation = min(relaxations[place] for place in columns)
-    drifting = apart[[tried.index(place) for place in columns], :, :, 1].min(axis=2).argmin(axis=1)
+    found_apart = count * apart[[tried.index(place) for place in columns], :, :, 1].min(axis=2) < SIGNIFICANCE
+    drifting = (~found_apart[:, 0] & found_apart[:, 1]).astype(
+        int
+    )  # what looks like a drift may be a few hops
     background, baseline = drifts[drifting, :, columns].T, np.zeros_like(values)
     places, path, expected = np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None
     wells, levels = 1, False
@@ -503,7 +506,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         flat = values - background
         places, path, expected, wells, levels = path_of(flat, runs, relaxation, column=column)
         level = np.where(path[:, None] >= 0, places[path], np.median(flat, axis=0))
-        slow = np.array([background_of(recordings, one, path=path) for one in (values - level).T]).T
+        slow = np.array([background_of(recordings, one) for one in (values - level).T]).T
         baseline = _baselines(recordings, values - level - slow)
         moved = slow + baseline - background
         background = slow + baseline

@@ -212,48 +212,32 @@ def change_of(recordings: Recordings, values: np.ndarray, path: np.ndarray) -> f
     return None
 
 
-def background_of(
-    recordings: Recordings,
-    values: np.ndarray,
-    *,
-    functions: int | None = None,
-    path: np.ndarray | None = None,
-) -> np.ndarray:
+def background_of(recordings: Recordings, values: np.ndarray, *, functions: int | None = None) -> np.ndarray:
     """The slow drift of a series, common to all that it does: of a hopping record, less its levels.
 
     Every recording has a straight line of its own, and cosines ``cos(πkt/T)`` with k from 1 on: so many
-    `functions`, or else those that are seen. With the state at each sample, `path` ``(n,)``, levels are
-    fitted along with these, since a few hops look like a drift. Gives the drift ``(n,)``, of mean zero; zero
-    where none is seen.
+    `functions`, or else those that are seen. Gives the drift ``(n,)``, of mean zero; zero where none is seen.
     """
     bounds = np.searchsorted(recordings.recording, np.arange(len(recordings.labels) + 1))
-    inside = np.zeros((len(values), 0))
-    if path is not None:
-        inside = (path[:, None] == np.arange(path.max() + 1)).astype(float)
 
-    def fitted(count: int) -> tuple[np.ndarray, np.ndarray]:
-        """The drift, and what it leaves together with the levels."""
-        found, rest = np.zeros(len(values)), values.copy()
+    def fitted(count: int) -> np.ndarray:
+        found = np.zeros(len(values))
         for first, last in pairwise(bounds):
-            if last - first > count and (count or inside.size):
-                t, levels = recordings.t[first:last], inside[first:last]
+            if last - first > count:
+                t = recordings.t[first:last]
                 phase = np.pi * (t - t[0]) / (t[-1] - t[0])
-                waves = np.column_stack([phase, np.cos(phase[:, None] * np.arange(count))])[
-                    :, : count and None
-                ]
-                columns = np.column_stack([waves, levels])
-                weights = np.linalg.lstsq(columns, values[first:last], rcond=None)[0]
-                rest[first:last] -= columns @ weights
-                found[first:last] = waves @ weights[: waves.shape[1]]
+                waves = np.column_stack([phase, np.cos(phase[:, None] * np.arange(count))])
+                found[first:last] = waves @ np.linalg.lstsq(waves, values[first:last], rcond=None)[0]
                 found[first:last] -= found[first:last].mean()
-        return found, rest if inside.size else values - found
+        return found
 
     if functions is not None:
-        return fitted(functions)[0]
+        return fitted(functions)
     runs, counts = runs_of(recordings, bridged=True), np.bincount(recordings.recording)
-    best, drift, spread = 0.0, np.zeros(len(values)), float(np.var(fitted(0)[1]))
+    best, drift, spread = 0.0, np.zeros(len(values)), float(np.var(values))
     for count in range(1, MOST_SLOW_FUNCTIONS + 1 if spread > 0 else 0):
-        slow, rest = fitted(count)
+        slow = fitted(count)
+        rest = values - slow
         independent = len(values) / (2 * correlated_samples(rest, runs))
         used = count * int((counts > count).sum())
         if independent <= 4 * used:
