@@ -248,6 +248,7 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
         low, high = float(x.min()), float(x.max())
         states.append(_StateFacts(name, title, unit, low, high, resolution_step(x), noise, label))
     memory = markov_lag(recordings)
+    turns = any(one.code == "data.wrapped_angle" for one in unusual(recordings))  # it is where it was, turned
     # Of the cells over the range of one state or two, those that were visited.
     some = recordings.values[:, :2]
     low, high = np.quantile(some, [OUTLIER_SHARE, 1 - OUTLIER_SHARE], axis=0)
@@ -264,7 +265,7 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
         gaps=len(gaps) - near,
         memory=memory,
         coverage=float((visits >= VISITED_SAMPLES).mean()),
-        switching=switching(recordings) if memory.may_hop else None,
+        switching=switching(recordings) if memory.may_hop and not turns else None,
     )
 
 

@@ -37,6 +37,7 @@ FALSE_WELL = 3.5  # standard errors by which a well has to stand out: of the man
 LEAST_NEIGHBOURS = 16  # independent ones: a density is then known to a quarter
 NO_VARIANCE = 1e-6  # of columns that repeat each other
 LINKS = 24  # neighbours that a sample is linked with
+MOST_FILTERED = 20  # samples in which the memory of a filter is sought; beyond half of them there is none
 MOST_ITERATIONS = 200  # of a hidden Markov model
 DRAWS = 200  # of the transition matrix: ends of intervals are then known to a tenth of their width
 REFUSED = 0.01  # probability with which a Markov process is refused at a lag
@@ -51,8 +52,12 @@ FORGOTTEN_STAYS = 4  # after so many of the longest a Markov process hardly know
 REGULAR = 2.58 + 1.28
 
 
-def _wells_of(values: np.ndarray, relaxation: float) -> np.ndarray:
-    """Places of the wells of the density of points ``(n, d)``, a row for each: shape ``(k, d)``."""
+def _wells_of(values: np.ndarray, relaxation: float, *, visited: bool = False) -> np.ndarray:
+    """Places of the wells of the density of points ``(n, d)``, a row for each: shape ``(k, d)``.
+
+    With `visited`, densities at a well and at its saddle have the errors of the visits to each, which may be
+    far more at the saddle, and not all those of the relaxation.
+    """
     scale = np.maximum(values.std(axis=0), np.finfo(float).tiny)
     every = -(-len(values) // MOST_NODES)
     nodes = (values[::every] - values.mean(axis=0)) / scale
@@ -76,13 +81,19 @@ def _wells_of(values: np.ndarray, relaxation: float) -> np.ndarray:
             node = parent[node]
         return node
 
+    def error(node: int) -> float:
+        inside = np.zeros(count)
+        inside[near[node]] = 1.0
+        return float(np.sqrt(2 * correlated_samples(inside, [slice(0, count)]) / neighbours))
+
     for node in np.argsort(-density).tolist():
         tops = sorted(
             {top(other) for other in links[node] if parent[other] >= 0}, key=lambda one: -height[one]
         )
         parent[node] = tops[0] if tops else node
         for lower in tops[1:]:
-            if height[lower] - height[node] < needed:
+            depth = height[lower] - height[node]
+            if depth < needed or (visited and depth < FALSE_WELL * np.hypot(error(lower), error(node))):
                 parent[lower] = tops[0]
     well = np.array([top(node) for node in range(count)])
     kept = [one for one in np.unique(well) if (well == one).sum() >= neighbours / 2]
@@ -102,6 +113,9 @@ def _wells_apart(values: np.ndarray, runs: list[slice]) -> np.ndarray:
     # With errors as if all samples were independent: what these do not tell, nothing does.
     peaks = peaks[shape["prominences"] > FALSE_WELL * np.sqrt(1 / padded[peaks] + 1 / valleys)]
     wells = ((edges[1:] + edges[:-1]) / 2)[peaks - 1, None]
+    # Pulses of one shape have a peak wherever one is sampled, and are at the next place a sample later.
+    if len(wells) > 1:
+        wells = wells[_held(np.abs(values - wells.T).argmin(axis=1), runs, len(wells)) > 0.5]
     while len(wells) > 1:
         path, _ = _path_between(values, runs, wells)
         profile = Profile.of(values[:, 0], runs, path, wells[:, 0])
@@ -113,6 +127,13 @@ def _wells_apart(values: np.ndarray, runs: list[slice]) -> np.ndarray:
         lower = place if depth[place, 0] < depth[place, 1] else place + 1
         wells = np.delete(wells, lower, axis=0)
     return wells
+
+
+def _held(near: np.ndarray, runs: list[slice], states: int) -> np.ndarray:
+    """How many of the samples nearest to each state are followed by one more, as a share ``(k,)``."""
+    pairs = np.concatenate([np.stack([near[run][:-1], near[run][1:]]) for run in runs], axis=1)
+    counts = np.bincount(pairs[0], minlength=states)
+    return np.bincount(pairs[0], weights=pairs[0] == pairs[1], minlength=states) / np.maximum(counts, 1)
 
 
 def _path_between(values: np.ndarray, runs: list[slice], wells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -132,19 +153,43 @@ class _Levels(NamedTuple):
     path: np.ndarray  # (n,): the likeliest, -1 where there is none
     counts: np.ndarray  # (k, k): expected transitions
 
-    def left(self, series: np.ndarray, runs: list[slice]) -> tuple[float, float]:
+    def left(self, series: np.ndarray, runs: list[slice], *, every: int = 1) -> tuple[float, float]:
         """What levels leave of a series: its share of the covariance of neighbours, and their correlation."""
-        known, mean = self.path >= 0, float(series.mean())
-        own = self.weights.T @ series / np.maximum(self.weights.sum(axis=0), 1e-300)
-        moved, rest = (np.where(known, series - one, 0.0) for one in (mean, self.weights @ own))
-        whole, left = (sum(float(one[run][:-1] @ one[run][1:]) for run in runs) for one in (moved, rest))
+        moved, rest = np.where(self.path >= 0, series - float(series.mean()), 0.0), self.rest(series)
+        whole, left = (
+            sum(float(one[run][:-every] @ one[run][every:]) for run in runs) for one in (moved, rest)
+        )
         return left / max(whole, 1e-300), left / max(float(rest @ rest), 1e-300)
 
+    def rest(self, series: np.ndarray) -> np.ndarray:
+        """What levels leave of a series ``(n,)``, zero where there is none."""
+        own = self.weights.T @ series / np.maximum(self.weights.sum(axis=0), 1e-300)
+        return np.where(self.path >= 0, series - self.weights @ own, 0.0)
 
-def _levels_of(series: np.ndarray, runs: list[slice], centre: np.ndarray) -> _Levels | None:
+    def filtered(self, series: np.ndarray, runs: list[slice]) -> int:
+        """From how many samples on the noise about the levels is white, 1 where no filter correlates it.
+
+        What relaxes forgets the same share in every step. A filter before sampling forgets little at first,
+        then all.
+        """
+        rest = self.rest(series)
+        sums = [
+            sum(float(rest[run][: -k or None] @ rest[run][k:]) for run in runs if run.stop - run.start > k)
+            for k in range(MOST_FILTERED + 1)
+        ]
+        memory = np.array(sums) / max(sums[0], 1e-300)
+        from_here = 1 + int(np.flatnonzero(np.abs(memory) >= WHITE_CORRELATION)[-1])
+        quick = memory[2] < memory[1] ** 2 - FALSE_WELL * 2 / np.sqrt(len(series))
+        return from_here if quick and 2 * from_here <= MOST_FILTERED else 1
+
+
+def _levels_of(
+    series: np.ndarray, runs: list[slice], centre: np.ndarray, *, every: int = 1
+) -> _Levels | None:
     """Levels of a series ``(n,)``, from a first guess ``(k,)``, by deeptime's hidden Markov model.
 
-    None where it is degenerate.
+    None where it is degenerate. With `every`, only one of so many samples is looked at, and stands for those
+    up to the next.
     """
     from deeptime.markov.hmm import GaussianOutputModel, HiddenMarkovModel, MaximumLikelihoodHMM
     from deeptime.markov.msm import MarkovStateModel
@@ -161,12 +206,12 @@ def _levels_of(series: np.ndarray, runs: list[slice], centre: np.ndarray) -> _Le
         GaussianOutputModel(states, (centre - shift) / scale, np.array(spread) / scale),
         initial_distribution=np.full(states, 1 / states),
     )
-    used = [run for run in runs if run.stop - run.start > 1]
+    used = [run for run in runs if run.stop - run.start > every]
     estimator = MaximumLikelihoodHMM(
         guess, 1, reversible=False, accuracy=1e-6 * len(series) ** 0.5, maxit=MOST_ITERATIONS
     )
     try:
-        fitted = estimator.fit([(series[run] - shift) / scale for run in used]).fetch_model()
+        fitted = estimator.fit([(series[run][::every] - shift) / scale for run in used]).fetch_model()
     except (AssertionError, RuntimeError, ValueError):  # a state of hardly any samples, whose spread is lost
         return None
     order = np.argsort(fitted.output_model.means)
@@ -174,7 +219,9 @@ def _levels_of(series: np.ndarray, runs: list[slice], centre: np.ndarray) -> _Le
     for run, own, likeliest in zip(
         used, fitted.state_probabilities, fitted.hidden_state_trajectories, strict=True
     ):
-        weights[run], path[run] = own[:, order], np.argsort(order)[likeliest]
+        size = run.stop - run.start
+        weights[run] = np.repeat(own[:, order], every, axis=0)[:size]
+        path[run] = np.repeat(np.argsort(order)[likeliest], every)[:size]
     model = fitted.output_model
     centre, spread = model.means[order] * scale + shift, model.sigmas[order] * scale
     return _Levels(centre, spread, weights, path, fitted.transition_counts[order][:, order])
@@ -215,7 +262,9 @@ def path_of(
         # What hops from well to well for long before it is anywhere else knows a valley by all its passages.
         # Not in averages, though: halfway between two levels these have a peak of hops.
         fine = _wells_apart(values + steps * (draw.random(values.shape) - 0.5), runs)
-        wells = fine if len(wells) < len(fine) <= MOST_STATES else wells
+    else:
+        fine = _wells_of(spread_out, relaxation, visited=True)
+    wells = fine if len(wells) < len(fine) <= MOST_STATES else wells
     each = (
         [wells]
         if len(longest) == 1
@@ -237,19 +286,23 @@ def path_of(
             if (levels := _levels_of(one, most, guess(states, place))) is None:
                 break
             share, correlation = levels.left(one, most)
+            every = levels.filtered(one, most)
+            if every > 1 and (thin := _levels_of(one, most, levels.centre, every=every)) is not None:
+                levels, (share, correlation) = thin, thin.left(one, most, every=every)
             # With levels enough any motion is cut into pieces that look white; wells of the density are none.
             limit = SMOOTH if states == len(each[place]) else 2 * WHITE_CORRELATION
             if correlation > SMOOTH and states > fewest:
                 break
             others = [levels.left(other, most) for other in np.delete(values, place, axis=1).T]
             white = all(part < WHITE_CORRELATION or rest < 2 * WHITE_CORRELATION for part, rest in others)
-            if white and share < WHITE_CORRELATION and correlation < limit:
-                levels = _levels_of(one, runs, levels.centre) or levels
+            # Levels in excess leave less than nothing of what neighbours share.
+            if white and share < WHITE_CORRELATION and abs(correlation) < limit:
+                levels = _levels_of(one, runs, levels.centre, every=every) or levels
                 places = _places(values, levels.path, states)
                 order = np.argsort(places[:, column])
                 whole = np.where(levels.path >= 0, np.argsort(order)[levels.path], -1)
                 path, blurred = _without_blurred(whole, runs, states)
-                counts = None if blurred else levels.counts[order][:, order]
+                counts = None if blurred or every > 1 else levels.counts[order][:, order]
                 return places[order], path, counts, len(wells), True
     if len(wells) <= max(len(alone), 2):
         states = max(len(alone), 2)

@@ -281,16 +281,31 @@ def _runs_evenly(values: np.ndarray | None) -> bool:
     return bool(usual > 0 and (np.abs(steps - usual) > EVEN * usual).mean() <= EVEN)
 
 
+def _tells_time(title: str, source: ColumnFile, place: int) -> bool:
+    """Whether cells are dates, or numbers that rise under a heading with a word of time: ``decimal_year``."""
+    try:
+        cells = source.load([place])[0]
+    except InputError:
+        return False
+    if (values := _numbers(source, place)) is None or pa.types.is_temporal(cells.type):
+        first = next((str(one) for one in cells.to_pylist() if one), "")
+        return re.match(r"\d{4}-\d\d-\d\d|\d\d?\.\d\d?\.\d{4}", first) is not None
+    rises = len(values) > 1 and bool((np.diff(values[np.isfinite(values)]) <= 0).mean() <= EVEN)
+    return rises and any(_is_time(word) for word in re.split(r"[\W_]+", title) if len(word) > 1)
+
+
 def _time_column(
     file: str, source: ColumnFile, parts: list[_Heading], free: list[int], remarks: list[Remark]
 ) -> int:
-    """The column ``t``; else the only one called like a time; else the only one that rises evenly."""
+    """The column ``t``; else the only one called like a time, that rises evenly, or that holds times."""
     found = [place for place in free if parts[place].title == "t"]
     if found:
         return found[0]
     found = [place for place in free if _may_be_time(parts[place])]
     if not found:
         found = [place for place in free if _runs_evenly(_numbers(source, place))]
+    if len(found) != 1:
+        found = [place for place in free if _tells_time(parts[place].title, source, place)] or found
     if len(found) > 1:
         # "T" is a temperature rather than a time, and an age that of what is measured.
         found = [place for place in found if parts[place].title != "T"]

@@ -55,6 +55,7 @@ from siq.data.stationarity import (
     stretches_of,
     usual_step,
 )
+from siq.numerics.randomness import positive
 from siq.remarks import Remark, sentence
 
 if TYPE_CHECKING:
@@ -361,9 +362,13 @@ class RecordStates:
         """What was found as a remark."""
         model = [] if self.markov is None else self.markov.stays.tolist()
         apart = any(high < one.limits[0] for (_, _, high), one in zip(model, self.counts, strict=False))
+        places = self.places if self.places.size else np.array(self.levels)[:, None]
+        # Three digits, and as many more as all places have in common.
+        common = np.log10(np.abs(places).max(axis=0) / positive(np.ptp(places, axis=0)))
         values = {
             "columns": self.columns or (self.state,), "unit": self.unit, "time_unit": self.time_unit,
-            "places": self.places.tolist() or [[one] for one in self.levels], "levels": self.levels,
+            "places": places.tolist(), "levels": self.levels,
+            "digits": np.maximum(np.ceil(common).astype(int) + 2, 3).tolist(),
             "transitions": self.transitions, "means": [one.mean for one in self.counts],
             "limits": [one.limits for one in self.counts], "visits": [one.visits for one in self.counts],
             "rung": self.rung, "lag": None if self.markov is None else self.markov.lag,
@@ -487,7 +492,10 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     columns, state = sorted(tried[one] for one in order[:MOST_COLUMNS]), tried[order[0]]
     values, column = recordings.values[:, columns], columns.index(state)
     relaxation = min(relaxations[place] for place in columns)
-    drifting = apart[[tried.index(place) for place in columns], :, :, 1].min(axis=2).argmin(axis=1)
+    found_apart = count * apart[[tried.index(place) for place in columns], :, :, 1].min(axis=2) < SIGNIFICANCE
+    drifting = (~found_apart[:, 0] & found_apart[:, 1]).astype(
+        int
+    )  # what looks like a drift may be a few hops
     background, baseline = drifts[drifting, :, columns].T, np.zeros_like(values)
     places, path, expected = np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None
     wells, levels = 1, False

@@ -17,7 +17,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage, special
+from scipy import special
 
 from siq.data.recordings import LONGEST_STEP, Recordings
 
@@ -190,21 +190,23 @@ def change_of(recordings: Recordings, values: np.ndarray, path: np.ndarray) -> f
                 return np.inf
     longest = max(one.stop - one.start for one in parts)
     used = [one for one in parts if one.stop - one.start > 4 * NEIGHBOURS]
-    # At half the distance of independent frequencies, so that none falls between two of them.
+    # At half the distance of independent frequencies, so that none falls between two of them; slow ones are
+    # compared with fewer, so that none of these is that of the mean, which was taken off.
     near = 2 * max(-(-NEIGHBOURS // max(len(used), 1)), FEWEST_NEIGHBOURS)
-    window = np.ones(2 * near + 1)
-    window[near - 3 : near + 4] = 0.0
-    frequencies = np.arange(near + 1, longest - near)
+    frequencies = np.arange(2 * FEWEST_NEIGHBOURS + 3, longest - near)
     if not used or not len(frequencies):
         return None
+    reach = np.minimum(near, frequencies - 2)
     # Each octave is as likely to hold a line, which may be any of its frequencies.
     price = np.log2(2 * frequencies[-1] / frequencies[0]) * frequencies * series.shape[1]
     for one in series.T:
         power = np.sum([np.abs(np.fft.rfft(one[part], n=2 * longest)) ** 2 for part in used], axis=0)
-        level = ndimage.correlate1d(power, window / window.sum(), mode="nearest")
-        ratio = power / np.maximum(level, 1e-300)
-        ratio[2 * (power - level) < HARMLESS_LINE * power[1:].sum()] = 0.0
-        chance = price * special.fdtrc(2 * len(used), len(used) * window.sum(), ratio[frequencies])
+        below = np.append(0.0, np.cumsum(power))
+        around = below[frequencies + reach + 1] - below[frequencies - reach]
+        others, own = 2 * reach - 6, power[frequencies]
+        level = (around - below[frequencies + 4] + below[frequencies - 3]) / others
+        chance = price * special.fdtrc(2 * len(used), len(used) * others, own / np.maximum(level, 1e-300))
+        chance[2 * (own - level) < HARMLESS_LINE * power[1:].sum()] = 1.0
         if chance.min() < FALSE_CHANGE_RATE / 2:
             return float(2 * longest / frequencies[chance.argmin()])
     return None

@@ -51,6 +51,7 @@ CHANCE_TESTS = (  # of a certificate: those that chance can refuse
 SMALL_CHANGE = 0.3  # standard deviations: up to there a distribution is flat
 ROUNDED_LINE = 2  # steps by which a straight line that is rounded is bent at most
 COPIED = 12  # samples of a stretch that is sought a second time
+MOST_DIGITS = 12  # of numbers that were rounded: those of floating point have sixteen
 ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 UNPREDICTED = "f does not predict held-out recordings"
 
@@ -252,18 +253,21 @@ def repetitions(recordings: Recordings, column: int) -> list[tuple[float, str, f
     # Less a straight drift, what was rounded has no step: its second differences do.
     bends = np.diff(moves)[same[1:] & same[:-1]]
     step = resolution_step(x) or resolution_step(ALIKE * size * np.round(bends / (ALIKE * size)))
-    found, width = [], ALIKE * size if step is None else step
+    # Of numbers written with so many digits in all, large ones have a coarser step.
+    widths = np.maximum(ALIKE * size if step is None else step, _last_digits(x))
+    found, width = [], float(widths.max())
     for kind, changes in (("held", moves[same]), ("straight", bends)):
         if not len(changes):
             continue
         sizes, spread = np.abs(changes), max(float(np.sqrt((changes**2).mean())), 1e-300)
         count = int((sizes < ALIKE * size).sum())
-        usual = len(changes) * min(width / (np.sqrt(2 * np.pi) * spread), 1.0)
+        share = float(widths.mean()) / width
+        usual = len(changes) * min(share * width / (np.sqrt(2 * np.pi) * spread), 1.0)
         # As many are zero as any other small number of steps; a line that is rounded is bent by one or two.
         most = int(SMALL_CHANGE * spread / width)
         if most >= 2 * ROUNDED_LINE:
             small = (sizes > (ROUNDED_LINE + 0.5) * width) & (sizes < (most + 0.5) * width)
-            usual = max(usual, float(small.sum()) / (2 * (most - ROUNDED_LINE)))
+            usual = max(usual, share * float(small.sum()) / (2 * (most - ROUNDED_LINE)))
         found.append((float(scipy.special.gammainc(count, usual)), kind, count / len(moves)))
     # A stretch is another one by chance where each of its steps is.
     begins = np.arange(len(x) - COPIED + 1)
@@ -275,6 +279,16 @@ def repetitions(recordings: Recordings, column: int) -> list[tuple[float, str, f
     alike = min(width / (2 * np.sqrt(np.pi) * size), 1.0) ** (COPIED - 1)
     chance = float(scipy.special.gammainc(count, len(begins) ** 2 / 2 * alike))
     return [*found, (chance, "copied", count / max(len(begins), 1))]
+
+
+def _last_digits(values: np.ndarray) -> np.ndarray:
+    """One in the last digit of each value ``(n,)``, where all have so many digits; zero where they do not."""
+    exponents = np.floor(np.log10(positive(np.abs(values))))
+    for digits in range(1, MOST_DIGITS + 1):
+        last = 10.0 ** (exponents + 1 - digits)
+        if np.allclose(np.round(values / last) * last, values, rtol=1e-14, atol=0.0):
+            return last
+    return np.zeros(len(values))
 
 
 def unexplained_probability(

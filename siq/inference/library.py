@@ -19,14 +19,12 @@ import sympy
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
+from siq.data.preparation import FAR, told_apart
 from siq.errors import Fault, NumericalFailure
-from siq.numerics.randomness import positive
 from siq.systems.cards import Limit
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter, symbol
 from siq.systems.formulas import FormulaError, compile_formulas, exact_number, parse_formula
-
-FAR = 10.0  # half ranges from the origin within which powers are alike for other reasons
 
 
 @dataclass(frozen=True)
@@ -132,11 +130,7 @@ class CandidateLibrary:
         middle, half = (low + high) / 2, (high - low) / 2
         if not (np.abs(middle) > FAR * half).any():
             return
-        columns = self.evaluate(x)
-        size = np.linalg.norm(columns, axis=0)
-        values = np.linalg.svd(np.linalg.qr(columns / positive(size), mode="r"), compute_uv=False)
-        # Covariances lose twice the digits that coefficients lose.
-        if values[-1] > np.sqrt(np.finfo(float).eps) * values[0]:
+        if told_apart(self.evaluate(x)):
             return
         worst = int(np.argmax(np.abs(middle) / np.where(half > 0, half, np.inf)))
         digits = int(np.floor(np.log10(half[worst])))

@@ -33,16 +33,17 @@ from siq.systems.cycles import Cycle
 MOST_COLUMNS = 4  # wells that are columns of a table; more are rows
 
 
-def answer_lines(
-    summary: LandscapeSummary, *, seen: RecordStates | None = None, certified: bool = False
-) -> list[str]:
+def answer_lines(summary: LandscapeSummary, *, seen: RecordStates | None = None, rung: int = 4) -> list[str]:
     """The answer in one sentence, and what has to be known of it; nothing is added where it is certified.
 
-    `seen` are the two states that the recordings show without any formula.
+    `seen` are the states that the recordings show without any formula; they lead up to `rung` 3 of the
+    ladder, which is that of the whole answer.
     """
+    certified = rung == 6
     elsewhere = seen is not None and not certified and _stays_elsewhere(summary, seen)
     said = "" if seen is None else seen.sentence()
-    return paragraphs("answer.j2", s=summary, seen=said, certified=certified, elsewhere=elsewhere)
+    values = {"certified": certified, "elsewhere": elsewhere, "refused": rung < 4}
+    return paragraphs("answer.j2", s=summary, seen=said, **values)
 
 
 def _stays_elsewhere(summary: LandscapeSummary, seen: RecordStates) -> bool:
@@ -336,7 +337,7 @@ def landscape_html(landscape: Landscape) -> str:
 def _report(landscape: Landscape) -> tuple[list[str], list[tuple[str, pd.DataFrame]]]:
     summary = summarise(landscape)
     certificate = None if landscape.certificate is None else landscape.certificate.as_data()
-    answer, *further = answer_lines(summary, seen=landscape.seen, certified=landscape.rung == 6)
+    answer, *further = answer_lines(summary, seen=landscape.seen, rung=landscape.rung)
     written = certificate is not None or any(well is not None for well in landscape.wells)
     verdict = "U is not written as a formula."
     if written:

@@ -261,7 +261,7 @@ def _answer(results: StudyResults) -> list[str]:
         )
         return sentences_without_landscape(reason, results.seen)
     assert summary is not None
-    return answer_lines(summary, seen=results.seen, certified=results.rung == 6)
+    return answer_lines(summary, seen=results.seen, rung=results.rung)
 
 
 def answer_data(page: ReportContent, study: Study, results: StudyResults) -> dict[str, Any]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from siq.data.inspection import Inspection
 from siq.data.inspection import inspect as inspect_recordings
+from siq.data.preparation import unusual
 from siq.data.recordings import read_recordings
 from siq.errors import DISTRIBUTION, Fault, InputError
 from siq.numerics.files import whole_file
@@ -48,9 +49,13 @@ def write_generated(path: Path, name: str) -> tuple[Path, str]:
 
     Returned are the study, and the path of the recordings as one writes it in the folder in which one is.
     """
-    read_recordings(path)  # before anything starts or is written
+    found = unusual(read_recordings(path))  # before anything starts or is written
     study = GENERATED / f"{name}.yaml"
     text = f"name: {_scalar(name)}\nrecordings: {{file: {_scalar(_own_path(path, start=study.parent))}}}\n"
+    turns = [one.values for one in found if one.code == "data.wrapped_angle"]
+    if turns:
+        angles = ", ".join(f"{one['name']}: [0, {str(one['turn']).replace('2π', '2*pi')}]" for one in turns)
+        text += f"identification: {{angles: {{{angles}}}}}\n"
     with whole_file(study) as partial:
         partial.write_text(text, encoding="utf-8")
     return study, _own_path(path)

@@ -17,7 +17,15 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from siq.data.preparation import in_stretches, joined, read_pairs, unusual, without_background, without_faults
+from siq.data.preparation import (
+    centred,
+    in_stretches,
+    joined,
+    read_pairs,
+    unusual,
+    without_background,
+    without_faults,
+)
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.data.states import RecordStates
 from siq.errors import NumericalFailure
@@ -76,6 +84,8 @@ def _prepared(settings: PipelineSettings, recordings: Recordings) -> Recordings:
     recordings = recordings.unwrapped(options.angles)
     if settings.sampling.background and not options.angles:  # an angle that turns on drifts by itself
         recordings = without_background(without_faults(recordings))
+    if settings.space.names is None and not options.functions:  # which know states by their names
+        recordings = centred(recordings, degree=options.degree)
     return in_stretches(recordings, hidden_velocities=options.hidden_velocities)
 
 

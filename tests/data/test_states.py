@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from remembering import double_wells
+from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
 from siq.data.inspection import inspect
@@ -16,7 +17,7 @@ from siq.data.kinetics import MarkovModel
 from siq.data.preparation import without_background
 from siq.data.recordings import Recordings
 from siq.data.states import DwellCount, RecordStates, switching
-from siq.data.stationarity import relaxation_samples, runs_of
+from siq.data.stationarity import change_of, relaxation_samples, runs_of
 from siq.remarks import Remark
 
 RATES = np.array([[-0.10, 0.06, 0.04], [0.10, -0.15, 0.05], [0.05, 0.10, -0.15]])
@@ -227,3 +228,46 @@ def test_a_rare_state_between_two_is_one() -> None:
     found = switching(recorded(path + about))
     assert found is not None and found.supported
     assert np.round(found.levels, 1).tolist() == [0.0, 1.0, 2.0]
+
+
+def test_pulses_of_one_shape_are_no_states() -> None:
+    """A pulse of four samples has a peak of the histogram at each of them, where the record never stays."""
+    path = np.repeat(np.tile([0.0, 1.0], 10), 600)
+    x = path + 0.1 * noise(4, len(path), memory=0.9)
+    for begin in np.flatnonzero(path > 0.5)[20::80]:
+        x[begin : begin + 4] += [2.0, 6.0, 3.0, -0.5]
+    assert np.round(found_in(x).levels, 1).tolist() == [0.0, 1.0]
+
+
+def test_three_levels_behind_a_filter() -> None:
+    """A filter before sampling correlates the noise about the levels over two or three samples."""
+    path = chain(5, 0.1 * RATES, 8000)
+    x = gaussian_filter1d(2.0 * path + 1.0 * noise(5, len(path)), 0.66)
+    found = found_in(x)
+    assert np.round(found.levels).tolist() == [0.0, 2.0, 4.0]
+    for rate, one in zip(-0.1 * np.diag(RATES), found.counts, strict=True):
+        assert one.limits[0] * 0.8 < 1 / rate < one.limits[1] * 1.2
+
+
+def test_ten_seasons_are_a_period() -> None:
+    t, season = np.arange(520.0), 52.0
+    x = np.exp(1.5 * np.cos(2 * np.pi * t / season)) + 0.2 * noise(6, len(t), memory=0.5)
+    assert change_of(recorded(x), x, (x > 1.5).astype(int)) == pytest.approx(season, rel=0.05)
+    hops = chain(6, np.array([[-0.04, 0.04], [0.04, -0.04]]), len(t))
+    assert change_of(recorded(hops), hops + 0.2 * noise(7, len(t)), hops) is None
+
+
+def test_few_visits_in_two_dimensions_are_three_states() -> None:
+    """Some forty visits to each: the wells are known by these less well than the valleys between them."""
+    places = np.array([[2.0, 0.5], [1.4, 1.4], [0.5, 2.0]])
+    path = chain(8, np.array([[-2.0, 2.0, 0.0], [2.5, -5.0, 2.5], [0.0, 2.0, -2.0]]) * 1e-3, 40_000)
+    about = np.column_stack([noise(seed, len(path), memory=0.9) for seed in (1, 2)])
+    found = found_in(places[path] + 0.22 * about)
+    assert found.places[found.places[:, 0].argsort()] == pytest.approx(places[::-1], abs=0.1)
+
+
+def test_three_hops_are_no_drift() -> None:
+    path = np.repeat([0.0, 1.0, 0.0, 1.0], [2300, 3200, 1500, 3000])
+    found = found_in(0.412 + 0.018 * path + 0.0015 * noise(9, len(path)))
+    assert found.levels == pytest.approx((0.412, 0.430), abs=2e-4)
+    assert found.rung == 2 and found.limit is not None and found.limit.code == "data.few_hops"

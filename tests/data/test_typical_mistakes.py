@@ -54,6 +54,14 @@ READ: dict[str, tuple[str, str | bytes, tuple[str, ...], list[list[float]], str]
     ),
     "a line of units": ("a.csv", "Time,X\n[s],[µm]\n0,1\n1,2\n", ("X",), [[1], [2]], "read as the units"),
     "other words": ("a.csv", "run,Time,x\nA,0,1\nA,1,2\n", ("x",), [[1], [2]], "'run' says which recording"),
+    "the day of each week": (
+        "a.csv", "week_start,cases\n2024-01-01,7\n2024-01-08,5\n2024-01-15,6\n", ("cases",), [[7], [5], [6]],
+        "'week_start' is the time",
+    ),
+    "years": (
+        "a.csv", "decimal_year,x\n2001.04,1\n2001.09,2\n2001.13,4\n", ("x",), [[1], [2], [4]],
+        "'decimal_year' is the time",
+    ),
     "a time in ms": ("a.csv", "time_ms,x\n0,1\n1,2\n", ("x",), [[1], [2]], "'time' is the time"),
     "x(t), lambda, exp": (
         "a.csv", "t,x(t),lambda,exp\n0,1,3,5\n1,2,4,6\n", ("x", "lambda_", "exp_"), [[1, 3, 5], [2, 4, 6]],

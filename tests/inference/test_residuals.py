@@ -204,10 +204,17 @@ def test_what_rounding_repeats_is_no_sign_of_values_filled_in() -> None:
     for begin in range(0, len(t), 1000):
         filled[begin : begin + 6] = np.linspace(*filled[[begin, begin + 5]], 6)
 
-    def straight(x: np.ndarray) -> float:
+    def chances(x: np.ndarray) -> dict[str, float]:
         found = repetitions(Recordings.from_arrays(t, x[:, None], names=["x"]), 0)
-        return next(chance for chance, kind, _ in found if kind == "straight")
+        return {kind: chance for chance, kind, _ in found}
+
+    def straight(x: np.ndarray) -> float:
+        return chances(x)["straight"]
 
     for x in (walk, walk.round(3), walk.round(3) - 1e-4 * t, inert.round(3)):
         assert straight(x) > 0.01
     assert straight(filled) < 1e-9 and straight(filled.round(3)) < 1e-3
+    wave = np.abs(np.sin(0.3 * np.cumsum(generator.random(len(t)))))
+    five = np.array([float(f"{one:.5g}") for one in wave])
+    five *= np.where(five < 0.01, 1.0, 10.0)  # nearly all have one step, and a few a hundred times finer ones
+    assert min(chances(five).values()) > 0.01

@@ -54,7 +54,7 @@ def test_states_elsewhere_than_the_wells_come_first(shift: float) -> None:
     )
     first = answer_lines(two, seen=moved)[0]
     assert (first == moved.sentence()) == (shift > 0.5)
-    assert answer_lines(two, seen=moved, certified=True)[0] == answer_lines(two)[0]
+    assert answer_lines(two, seen=moved, rung=6)[0] == answer_lines(two)[0]
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")  # the root is what f is refused for
@@ -97,10 +97,13 @@ def test_states_of_a_record_come_back_from_plain_data() -> None:
 def test_nothing_is_added_to_what_is_certified() -> None:
     seen = inspect(telegraph()).seen
     two = summarise(told(landscape([[-0.5], [0.5]], [0.25, 0.35])))
-    (answer, *further) = answer_lines(two, seen=seen, certified=True)
+    (answer, *further) = answer_lines(two, seen=seen, rung=6)
     assert answer_lines(two) == [answer, *further]
     last = answer_lines(two, seen=seen)[-1]
     assert last.startswith("Without any formula: the record has two states of x")
+    first, second, *_ = answer_lines(two, seen=replace(seen, levels=(-0.5, 0.5)), rung=3)
+    assert first.startswith("The record has two states of x")
+    assert second.startswith("What was identified failed a test against the record: the recordings show two")
 
 
 def test_the_reason_is_that_of_the_step_that_failed() -> None:

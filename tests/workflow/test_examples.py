@@ -41,6 +41,10 @@ def test_the_shortest_study_names_the_file_from_its_own_folder(
     options = load_study(study).recordings
     assert options is not None
     assert (study.parent / options.file).resolve() == tmp_path / "data" / "my: bead.csv"
+    turns = "".join(f"{0.1 * k:.1f},{(7 * k) % 360},{k % 7}\n" for k in range(200))
+    (tmp_path / "motor.csv").write_text("t,angle,x\n" + turns)
+    study, _ = write_generated(Path("motor.csv"), "motor")
+    assert load_study(study).identification.angles == {"angle": (0.0, 360.0)}
 
 
 def test_a_study_that_was_begun_runs_as_it_is_and_with_every_comment_taken_away(
