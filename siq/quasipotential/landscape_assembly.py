@@ -30,6 +30,7 @@ from siq.quasipotential.certificate import (
 )
 from siq.quasipotential.certificate_tests import CertificateOptions
 from siq.quasipotential.global_formula import heights_of_attractors
+from siq.quasipotential.hamilton_jacobi import MAX_POWERS
 from siq.quasipotential.landscape import Landscape, LandscapeOptions, NoLandscape
 from siq.quasipotential.path_chains import evenly
 from siq.quasipotential.rates import NoiseStrength
@@ -37,13 +38,19 @@ from siq.quasipotential.refinement import RefinementOptions
 from siq.quasipotential.transitions import Transition, position_standard_errors, transitions, ways_out
 from siq.quasipotential.wells import Well, local_well
 from siq.remarks import Remark, sentence
-from siq.systems.basins import follow
+from siq.systems.basins import basin_of, follow
 from siq.systems.cards import load_system
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, hessian_at, spread_evenly, unreached_states
 from siq.systems.formulas import FormulaError, compile_formulas, formulas_in_time
-from siq.systems.phase_portrait import MOST_SEARCHED, PhasePortrait, phase_portrait
+from siq.systems.phase_portrait import (
+    LEVEL_BEYOND_SADDLE,
+    MOST_SEARCHED,
+    STARTS_NEAR_ATTRACTOR,
+    PhasePortrait,
+    phase_portrait,
+)
 
 ATTRACTOR_MATCH_TOLERANCE = 1e-6  # of the recorded box: one attractor, from different starts
 STATES_ALONG_PATH = 300  # from the neighbourhood of which further descents start
@@ -305,8 +312,16 @@ def _with_states_along_paths(
     for index, (one, way) in enumerate(zip(portrait.attractors, lowest, strict=True)):
         if way is None or way.path is None or system.dimension == 1:
             continue
-        extent = np.linalg.inv(np.linalg.cholesky(hessian_at(system, one.position)))
-        extent *= np.sqrt(way.path.action)
+        metric = np.linalg.cholesky(hessian_at(system, one.position))
+        depth, places = way.path.action / 2, basins[index].points(np.arange(len(basins[index].chosen)))
+        heights = np.sum(((places - one.position) @ metric) ** 2, axis=1) / 2
+        if (heights < depth).sum() < 2 * MAX_POWERS:  # V at the saddle is far lower than M alone had it
+            near = (STARTS_NEAR_ATTRACTOR, LEVEL_BEYOND_SADDLE * depth)
+            basins[index] = basin_of(
+                system, portrait.descents, index, portrait.attractors, box=portrait.box, generator=draw,
+                near=near,
+            )  # fmt: skip
+        extent = np.linalg.inv(metric) * np.sqrt(way.path.action)
         along = evenly(way.path.points, STATES_ALONG_PATH)
         starts = [along + share * draw.standard_normal(along.shape) @ extent for share in PATH_NEIGHBOURHOOD]
         ways = follow(system, np.concatenate(starts), portrait.attractors, box=portrait.box)

@@ -274,8 +274,10 @@ def descent(dynamics: Dynamics, saddle: np.ndarray, target: np.ndarray, nodes: i
         return float(np.linalg.norm(problem.force(y[None])) - REST_SPEED)
 
     begin = UNSTABLE_START * upwards / np.linalg.norm(upwards)
+    # On an invariant boundary f leads to a further saddle; a little towards the target, on.
+    starts = [begin, -begin, *(side * begin + UNSTABLE_START * problem.end for side in (1, -1))]
     way = _arriving(
-        lambda _, y: problem.force(y[None])[0], [begin, -begin], LONGEST_DESCENT, [arrives, leaves, rests],
+        lambda _, y: problem.force(y[None])[0], starts, LONGEST_DESCENT, [arrives, leaves, rests],
         method="DOP853", rtol=STEP_PRECISION, atol=1e-12, dense_output=True,
     )  # fmt: skip
     if way is None:

@@ -305,9 +305,9 @@ def local_well(
     rows = np.arange(len(basin.chosen))
     kept = rows[rows % HELD_OUT_STRIDE != 0]
     wells: list[Well] = []
-    failure, idle = NumericalFailure("no degree is affordable"), 0
+    failure, idle = NumericalFailure(""), 0
     for degree in options.degrees:
-        if wells and affordable_degree(dynamics.dimension, degree) < degree:
+        if degree > options.degrees[0] and affordable_degree(dynamics.dimension, degree) < degree:
             break
         generator = np.random.default_rng(seed)
         try:
@@ -436,8 +436,9 @@ def _grow_well(
     # The first level has points enough for all coefficients.
     reached = np.sort(basin.highest(values.reshape(basin.states.shape[:2]))[tuple(basin.chosen.T)])
     level = float(reached[min(4 * basis.size, len(reached) - 1)])
-    if depth is not None:
-        level = min(level, FIRST_LEVEL_SHARE * depth)
+    if depth is not None:  # low, but with as many points as a fit needs
+        enough = float(reached[min(2 * basis.size, len(reached) - 1)])
+        level = min(level, max(FIRST_LEVEL_SHARE * depth, min(enough, depth / 2)))
     return grown(
         dynamics, basin, saddles, basis, coefficients, free=free, metric=hessian, level=level,
         fitted=np.zeros(0, dtype=int), generator=generator, depth=depth,
@@ -498,9 +499,9 @@ def grown(
         points = basin.points(rows)
         if len(points) < 2 * basis.size:
             if not before:
-                raise NumericalFailure(f"only {len(points)} recorded states lead to {place}")
+                raise NumericalFailure(f"only {len(points)} states lead to {place}")
             raise NumericalFailure(
-                f"V about {place} leaves the recorded states: it came from {before} to {len(points)} and"
+                f"V about {place} leaves the states: it came from {before} to {len(points)} and"
                 f" needs {2 * basis.size}"
             )
         equation = HamiltonJacobi.at(basis, points, dynamics, attractor=attractor)

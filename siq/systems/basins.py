@@ -33,6 +33,7 @@ STEP_ACCURACY = 1e-7  # of the recorded box: local error of a step
 SETTLED_DISTANCE = 0.02  # of the domain: so close to its cycle is what has been followed for long
 CYCLE_DISTANCE = 1e-3  # of the domain: and one so close to a cycle stays with it
 STEPS_PER_CYCLE_CHECK = 10  # steps after which trajectories are asked whether they are on a cycle
+INWARDS = 1e-6  # of the distance to the middle of the domain: beside an invariant boundary
 ATTRACTOR_DISTANCE = 1e-4  # of the recorded box: trajectories so close to an attractor end there
 
 
@@ -137,7 +138,12 @@ def sides_of(
     """Where f leads from both sides of a saddle, or of an unstable cycle, see `_ends_of`."""
     place = over if isinstance(over, Cycle) else over.position
     starts = states_on_both_sides(dynamics, place, width=np.ptp(box, axis=1))
-    return _ends_of(dynamics, starts, attractors, cycles, box=box)
+    ends = _ends_of(dynamics, starts, attractors, cycles, box=box)
+    if (nowhere := ends < 0).any():
+        # On an invariant boundary, such as that of no predators, f leads to a further saddle; beside it, on.
+        inner = starts[nowhere] + INWARDS * (box.mean(axis=1) - starts[nowhere])
+        ends[nowhere] = _ends_of(dynamics, inner, attractors, cycles, box=box)
+    return ends
 
 
 def _ends_of(

@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import scipy.linalg
 from scipy.spatial import cKDTree
 
 from siq.errors import NumericalFailure
@@ -38,6 +39,7 @@ from siq.systems.basins import (
 from siq.systems.cycles import PARTS, Cycle, Recurrence, closed_orbit, recurrence_of
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import (
+    BOUNDARY_TOLERANCE,
     Equilibrium,
     all_equilibria,
     classify,
@@ -120,9 +122,9 @@ class PhasePortrait:
             place = np.array2string(degenerate[0].position, precision=4)
             return Remark("systems.degenerate_equilibrium", {"place": place})
         alone = not (self.attractors or self.cycles)
-        running = [one for one in self.remarks if one.code == "systems.running"]
-        if alone and running:
-            return running[0]
+        instead = [one for one in self.remarks if one.code in ("systems.running", "systems.absorbing")]
+        if alone and instead:
+            return instead[0]
         if self.unsettled <= UNSETTLED:
             return Remark("systems.no_stable_equilibrium") if alone else None
         values: dict[str, object] = {"share": None if alone else self.unsettled, "kind": None}
@@ -206,7 +208,15 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
         resting_there = np.linalg.norm(dynamics.drift(last) / width, axis=1) < RESTING_SPEED * rate
         outside = ((last < box[:, 0]) | (last > box[:, 1])).any(axis=1) & resting_there
         descents = replace(descents, escaped=descents.escaped | (outside & (descents.ends < 0)))
-    reached = [index for index in range(len(stable)) if (descents.ends == index).any()]
+    # What noise does not move away from again, such as extinction, is no well: who comes there has left.
+    absorbing = [
+        index
+        for index, one in enumerate(stable)
+        if not (recorded or _reached_by_noise(dynamics, one.position))
+    ]
+    descents = replace(descents, escaped=descents.escaped | np.isin(descents.ends, absorbing))
+    ended = np.unique(descents.ends)
+    reached = [index for index in range(len(stable)) if index in ended and index not in absorbing]
     renumbered = np.full(len(stable) + 1, -1)
     renumbered[reached] = np.arange(len(reached))
     descents = replace(descents, ends=renumbered[descents.ends])
@@ -227,7 +237,7 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
     around: list[list[Equilibrium]] = [[] for _ in (*attractors, *cycles)]
     for one in equilibria:
         # Over a saddle of a domain with several unstable directions no way is lowest.
-        if one.kind == "saddle":
+        if one.kind == "saddle" and (recorded or _crossed_by_noise(dynamics, one.position, width)):
             for index in set(sides_of(dynamics, one, attractors, box=box, cycles=cycles).tolist()) - {-1}:
                 if one.unstable == 1 or not searched:
                     around[index].append(one)
@@ -255,9 +265,13 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
                 "systems.attractor_left_out",
                 {"states": len(points), "place": one.position.round(4).tolist()},
             )
-            for one in stable
-            if all(one is not other for other in attractors)
+            for index, one in enumerate(stable)
+            if index not in (*reached, *absorbing)
         ]
+    remarks += [
+        Remark("systems.absorbing", {"place": stable[index].position.round(4).tolist()})
+        for index in absorbing
+    ]
     recurrence = None
     unsettled = np.flatnonzero((descents.ends < 0) & ~descents.escaped)
     if len(unsettled) > UNSETTLED * len(descents.ends):
@@ -267,6 +281,34 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
         recurrence, harmless, tuple(remarks), cycles, unstable_cycles,
         np.array([float((descents.ends == index).mean()) for index in range(len(around))]),
     )  # fmt: skip
+
+
+def _reached_by_noise(dynamics: Dynamics, equilibrium: np.ndarray) -> bool:
+    """Whether noise does not fade so that it fails to reach some state about an equilibrium."""
+    try:
+        hessian_at(dynamics, equilibrium)
+    except NumericalFailure:
+        return dynamics.diffusion.constant  # nor elsewhere then, which is a fault of the card
+    return True
+
+
+def _crossed_by_noise(dynamics: Dynamics, saddle: np.ndarray, width: np.ndarray) -> bool:
+    """Whether noise leads over a saddle with one unstable direction, in a domain of a width ``(d,)``.
+
+    With l for the left eigenvector, ``s = l·(x - saddle)`` grows as ``λs + l·noise``. Where ``l·D l`` vanishes
+    like s², as of populations with noise in proportion to their number, ``∫ λs/(l·D l) ds`` is infinite.
+    """
+    values, left, right = scipy.linalg.eig(dynamics.jacobian(saddle[None])[0], left=True)
+    if dynamics.diffusion.constant or (values.real > 0).sum() != 1:
+        return True
+    place = int(np.argmax(values.real))
+    across, along = left[:, place].real, right[:, place].real
+    along = along / (across @ along)
+    noise, off = dynamics.diffusion, BOUNDARY_TOLERANCE * float(np.abs(across) @ width)
+    size = noise.contract(saddle[None], across[None])[0]
+    slope = abs(noise.contract(saddle[None], across[None], 1)[0] @ along)
+    bend = abs(along @ noise.contract(saddle[None], across[None], 2)[0] @ along)
+    return not (size <= off**2 * bend < np.inf and slope <= off * bend)
 
 
 def _at_home(cover: PhasePortrait, dynamics: Dynamics) -> PhasePortrait:

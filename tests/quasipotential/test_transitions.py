@@ -285,3 +285,41 @@ def test_where_d_is_missing_there_are_barriers_with_the_words_of_the_landscape()
     given = damped.with_diffusion(Diffusion(np.diag([1e-3, 1.0])))
     assert missing_diffusion(given) is None
     assert missing_diffusion(maier_stein(1).dynamics) is None
+
+
+def test_extinction_that_noise_does_not_leave_is_no_well_and_the_way_there_has_its_barrier() -> None:
+    prey, predators = sympy.symbols("n p", real=True)
+    growth = 4 * (prey - sympy.Rational(1, 10)) * (1 - prey)
+    alone = Dynamics.of((prey,), (prey * growth,), diffusion=[[prey**2]], domain=[(0, 1.4)])
+    # Predators follow their prey and do not act on it. All saddles lie where there are none, and noise in
+    # proportion to their number never leads over the one at (1, 0).
+    both = Dynamics.of(
+        (prey, predators),
+        (prey * growth, predators * (prey - sympy.Rational(1, 2) - predators / 2)),
+        diffusion=[[prey**2, 0], [0, predators**2]],
+        domain=[(0, 1.4), (0, 1.5)],
+    )
+    # U = -2∫f/D from 1 down to 1/10.
+    exact = float(sympy.integrate(2 * growth / prey, (prey, sympy.Rational(1, 10), 1)))
+    for system in (alone, both):
+        portrait = phase_portrait(system)
+        assert {one.code for one in portrait.remarks} == {"systems.absorbing"}
+        (way,) = ways_out(system, portrait, beyond_region=True)
+        assert way.path is not None and way.end is None
+        assert way.path.action == pytest.approx(exact, rel=1e-4)
+        np.testing.assert_allclose(way.saddle.position, [0.1, 0][: system.dimension], atol=1e-9)
+    dying = Dynamics.of((prey,), (-prey,), diffusion=[[prey]], domain=[(0, 1)])
+    assert getattr(phase_portrait(dying).fault(), "code", None) == "systems.absorbing"
+
+
+def test_a_saddle_on_an_invariant_boundary_leads_to_the_attractor_behind_the_next_one() -> None:
+    prey, predators = sympy.symbols("n p", real=True)
+    # Without predators f leads from (1/10, 0) to the saddle (1, 0), and from there to both at (1, 1).
+    system = Dynamics.of(
+        (prey, predators),
+        (4 * prey * (prey - 0.1) * (1 - prey), predators * (prey - 0.5 - predators / 2)),
+        domain=[(-0.1, 1.4), (-0.3, 1.5)],
+    )
+    found = ways_out(system, phase_portrait(system), beyond_region=True)
+    ends = {(way.start, way.end) for way in found if way.saddle.position[0] < 0.5 and way.path is not None}
+    assert ends == {(0, 1), (1, 0)}

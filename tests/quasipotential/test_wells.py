@@ -27,8 +27,10 @@ from pydantic import ValidationError
 from siq.errors import NumericalFailure
 from siq.quasipotential.characteristics import adapted_fan
 from siq.quasipotential.hamilton_jacobi import HamiltonJacobi
+from siq.quasipotential.landscape_assembly import _with_states_along_paths
 from siq.quasipotential.power_series import quasipotential_series
 from siq.quasipotential.refinement import RefinementOptions, refine
+from siq.quasipotential.transitions import ways_out
 from siq.quasipotential.wells import (
     DegreeTrial,
     Well,
@@ -157,7 +159,7 @@ def test_without_recorded_states_there_is_no_well() -> None:
     found = portrait_of(known)
     basin = found.basins[0]
     few = Basin(basin.states[:3], basin.chosen[basin.chosen[:, 0] < 3][:10])
-    with pytest.raises(NumericalFailure, match="recorded states lead to the attractor"):
+    with pytest.raises(NumericalFailure, match="states lead to the attractor"):
         _grow_well(
             known.dynamics, found.attractors[0], few, found.saddles[0],
             degree=4, generator=np.random.default_rng(0),
@@ -557,12 +559,43 @@ def test_degrees_beyond_what_is_affordable_are_not_tried() -> None:
     assert [one.degree for one in trials] == [4]
 
 
+def test_nor_where_a_lower_degree_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    known, tried = double_well(3), []
+
+    def fails(*_: object, degree: int, **__: object) -> Well:
+        tried.append(degree)
+        raise NumericalFailure("too few states")
+
+    monkeypatch.setattr("siq.quasipotential.wells._grow_well", fails)
+    with pytest.raises(NumericalFailure, match="too few states"):
+        local_well(known.dynamics, landscape(known), 1, options=RefinementOptions(degrees=(4, 16)))
+    assert tried == [4]
+
+
+def test_a_well_far_lower_than_its_curvature_says_has_states_enough() -> None:
+    # A laser with a saturable absorber is dark where noise on its intensity is a hundredth of that at I = 1.
+    light, gain, loss = sympy.symbols("I n m", real=True)
+    laser = Dynamics.of(
+        (light, gain, loss),
+        (light * (gain - loss - 1), 2.6 - gain * (1 + light), 1.8 - loss * (1 + 3 * light)),
+        diffusion=[[0.01 + light, 0, 0], [0, 0.1, 0], [0, 0, 0.1]],
+        domain=[(0, 8), (0, 4), (0, 4)],
+    )
+    portrait = phase_portrait(laser)
+    lowest = ways_out(laser, portrait)
+    more = _with_states_along_paths(laser, portrait, lowest, np.random.default_rng(0))
+    options = RefinementOptions(degrees=(4,), about="powers")
+    for index, way in enumerate(lowest):
+        well = local_well(laser, more, index, options=options, saddle=way.saddle, path=way.path)
+        assert len(well.points) > 2 * well.basis.size
+
+
 def test_without_recorded_states_there_is_no_formula() -> None:
     known = SYSTEMS["archetype"]
     found = landscape(known)
     basin = found.basins[0]
     few = Basin(basin.states[:3], basin.chosen[basin.chosen[:, 0] < 3][:10])
-    with pytest.raises(NumericalFailure, match="recorded states lead to the attractor"):
+    with pytest.raises(NumericalFailure, match="states lead to the attractor"):
         local_well(
             known.dynamics, replace(found, basins=(few, found.basins[1])), 0,
             options=RefinementOptions(degrees=(4, 6)),
