@@ -307,16 +307,10 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     shifted = investigation.verdict is MismatchVerdict.PARAMETER_SHIFT
     unmended = not errors.at_noise("before") and errors.change("before", "recalibrated") != "better"
     return HeldOutRuns(
-        before=before,
-        recalibrated=refitted,
-        augmented=augmented,
-        recalibration=recalibrated,
-        fit=fit,
-        errors=errors,
-        independent=not set(learned.labels) & set(data.labels),
-        described=described,
+        before=before, recalibrated=refitted, augmented=augmented, recalibration=recalibrated, fit=fit,
+        errors=errors, independent=not set(learned.labels) & set(data.labels), described=described,
         together=shifted and unmended and _one_set_of_parameters(investigation, data),
-    )
+    )  # fmt: skip
 
 
 def _one_set_of_parameters(investigation: Investigation, data: Measurements) -> bool:
