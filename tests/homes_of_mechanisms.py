@@ -327,6 +327,18 @@ HOMES: Mapping[str, Home] = {
         lambda rng: rng.uniform(1.0, 4.0, size=2),
         lambda rng, t: inflow(rng, t, size=1.5),
     ),
+    "laser": Home(
+        {
+            "time_unit": "us",
+            "states": states(p="W"),
+            "inputs": {"u": {"unit": "1", "interpolation": "zero_order"}},
+            "parameters": numbers(g=0.5, c=0.4, s=0.05),
+            "equations": {"p": "g*u*p - c*p + s"},
+        },
+        0.3,
+        lambda rng: rng.uniform(0.1, 2.0, size=1),
+        inflow,
+    ),
     "basins": Home(
         {
             "time_unit": "s",
@@ -457,6 +469,7 @@ RESIDENTS: Sequence[Resident] = (
     Resident("seasonality", "crop", {"c": 0.3, "d": 0.2, "w": 3.0}),
     Resident("seasonality", "epidemic", {"c": 0.3, "d": 0.2, "w": 0.5}, "of meetings"),
     Resident("saturation", "crop", {"h": 0.3}, "of growth"),
+    Resident("saturation", "laser", {"h": 0.5}, "of the gain"),
     Resident("cogging or gear ripple", "arm", {"c": 1.0, "d": 0.5, "n": 3.0}),
     Resident("clock offset and drift", "mass", {"o": 0.06}),
     Resident("clock offset and drift", "mass", {"o": 0.05, "r": 0.01}),

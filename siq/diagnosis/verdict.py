@@ -479,14 +479,11 @@ def _locate(investigation: Investigation, described: AugmentedModel | None = Non
         affected = tuple(label for label, own, fair in zip(data.labels, *shares, strict=True) if own > fair)
     return Location(
         equations={name: float(min(max(gains.get(name, 0.0) / total, 0.0), 1.0)) for name in equations},
-        coordinate=coordinate,
-        region=region,
+        coordinate=coordinate, region=region, outputs=outputs,
         time=(float(data.t.min()), float(data.t.max())) if coordinate == "t" else None,
-        recordings=affected,
-        recordings_total=len(data.labels),
-        outputs=outputs,
+        recordings=affected, recordings_total=len(data.labels),
         unit=units_of(investigation.context.model).get(coordinate, "1"),
-    )
+    )  # fmt: skip
 
 
 def _most_telling(structure: Structure, roles: Roles) -> tuple[tuple[str, ...], str]:

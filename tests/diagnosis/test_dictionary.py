@@ -418,3 +418,11 @@ def test_what_only_decays_is_no_population_where_it_has_a_unit() -> None:
     lost = {"equations": {"s": "-s*i", "i": "s*i - i"}, "states": states(s="1/km**2", i="1/km**2")}
     assert roles_of(model_of(lost)).contagion == (("s", "i"),)
     assert roles_of(HOMES["prey and predator"].model).contagion == ()  # prey are born
+
+
+def test_the_gain_of_a_laser_saturates_and_its_losses_do_not() -> None:
+    # Siegman (1986): g0 u / (1 + I/Is) times I.
+    truth = the("saturation", "laser", "of the gain")
+    by_name = {each.name: each for each in truth.model.equations[0].free_symbols}
+    g, u, p, c, s, h = (by_name[name] for name in ("g", "u", "p", "c", "s", "h_1"))
+    assert sympy.simplify(truth.model.equations[0] - (g * u * p / (1 + h * p) - c * p + s)) == 0
