@@ -426,3 +426,12 @@ def test_the_gain_of_a_laser_saturates_and_its_losses_do_not() -> None:
     by_name = {each.name: each for each in truth.model.equations[0].free_symbols}
     g, u, p, c, s, h = (by_name[name] for name in ("g", "u", "p", "c", "s", "h_1"))
     assert sympy.simplify(truth.model.equations[0] - (g * u * p / (1 + h * p) - c * p + s)) == 0
+
+
+def test_the_activity_of_a_catalyst_dies_away() -> None:
+    # Fogler (2016), chapter 10: da/dt = -r a, from one.
+    truth = the("parameter drift", "mass", "as a decay in v (k)")
+    by_name = {each.name: each for each in truth.model.equations[1].free_symbols}
+    rate = sympy.simplify(truth.model.equations[1].diff(by_name["x"]) * by_name["m"] / -by_name["k"])
+    assert sympy.simplify(rate.diff(by_name["t"]) + by_name["r_1"] * rate) == 0
+    assert rate.subs(by_name["t"], 0) == 1
