@@ -327,6 +327,18 @@ HOMES: Mapping[str, Home] = {
         lambda rng: rng.uniform(1.0, 4.0, size=2),
         lambda rng, t: inflow(rng, t, size=1.5),
     ),
+    "circuit": Home(
+        {
+            "time_unit": "ms",
+            "states": states(s="V"),
+            "inputs": {"u": {"unit": "V"}},
+            "parameters": numbers(g=0.4),
+            "equations": {"s": "g*(u - s)"},
+        },
+        0.2,
+        lambda rng: rng.uniform(-2.0, 2.0, size=1),
+        lambda rng, t: waves(rng, t, size=1.5),
+    ),
     "laser": Home(
         {
             "time_unit": "us",
@@ -337,6 +349,30 @@ HOMES: Mapping[str, Home] = {
         },
         0.3,
         lambda rng: rng.uniform(0.1, 2.0, size=1),
+        inflow,
+    ),
+    "furnace": Home(
+        {
+            "time_unit": "s",
+            "states": states(s="K"),
+            "inputs": {"u": {"unit": "W", "interpolation": "zero_order"}},
+            "parameters": numbers(g=100.0, h=0.1),
+            "equations": {"s": "g*u - h*(s - 300)"},
+        },
+        0.5,
+        lambda rng: rng.uniform(300.0, 1000.0, size=1),
+        inflow,
+    ),
+    "kettle": Home(
+        {
+            "time_unit": "s",
+            "states": states(s="°C"),
+            "inputs": {"u": {"unit": "W", "interpolation": "zero_order"}},
+            "parameters": numbers(g=20.0, h=0.1),
+            "equations": {"s": "g*u - h*s"},
+        },
+        0.5,
+        lambda rng: rng.uniform(20.0, 300.0, size=1),
         inflow,
     ),
     "basins": Home(
@@ -459,7 +495,10 @@ RESIDENTS: Sequence[Resident] = (
     Resident("maturation delay", "crop", {"tau": 2.0}, "three stages"),
     Resident("maturation delay", "crop", {"tau": 2.0}, "one length"),
     Resident("saturated elimination", "heat", {"c": 1.0, "w": 1.0}, "in s"),
-    Resident("diode or exponential loss", "heat", {"c": 0.05, "w": 0.8}, "in s"),
+    Resident("diode or exponential loss", "circuit", {"c": 0.05, "w": 0.3}),
+    Resident("thermal radiation", "furnace", {"c": 2e-10}),
+    Resident("thermal radiation", "kettle", {"c": 1e-9}),
+    Resident("overflow", "basins", {"c": 1.0, "L": 3.0}, "in h"),
     Resident("outflow through an opening", "basins", {"c": 0.4}, "in h"),
     Resident("linear coupling", "basins", {"c": 0.3, "d": 0.3}),
     Resident("reverse reaction or backflow", "two bodies", {"c": 0.3}),

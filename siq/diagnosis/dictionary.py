@@ -163,6 +163,8 @@ class Form(_Part):
         roles in braces are what fills them.
     symmetric
         Whether exchanging the roles gives the same mechanism.
+    units
+        Regular expressions of the units that fill a role.
     one_unit
         Whether the states and inputs that fill the roles must have one unit, and not be mere numbers.
     family
@@ -182,6 +184,7 @@ class Form(_Part):
     coordinate: str
     variant: str = ""
     symmetric: bool = False
+    units: dict[Name, str] = {}
     one_unit: bool = False
     family: str = ""
     turning: bool = False
@@ -311,7 +314,6 @@ def _parse(unit: str, words: dict[str, sympy.Symbol]) -> sympy.Expr:
 FORMULA_TOLERANCE = 1e-9  # relative difference of values of formulas that are the same
 TRIAL_POINTS = 12
 SPEED = re.compile(r"([cdkmnuµμ]?m|m?rad|deg|°|rev|ft|in) ?/ ?([mnuµμ]?s|min|h)|rpm")  # units of speeds
-HEIGHT = re.compile(r"[cdm]?m|ft|in")  # units of what stands in a vessel
 ANYWHERE = (0.5, 1.5)  # where formulas of a state without a domain are compared, as those of inputs are
 
 
@@ -334,8 +336,8 @@ class Roles:
         predator, whose meetings make the one fewer and the other more; and those of them in which the one
         becomes the other, and is not born.
     levels, cascades
-        States whose own outflow goes with their square root, and others that are heights by their unit; and
-        pairs of which the first flows into the second by its root.
+        States whose own outflow goes with their square root; and pairs of which the first flows into the
+        second.
     stores
         All others that have a unit: a charge, a temperature, a concentration. Of a mere number nothing is
         known that a mechanism could be written for.
@@ -369,11 +371,9 @@ def roles_of(model: Dynamics) -> Roles:
     units = dict(zip(model.states, model.units, strict=True))
     speeds = tuple(name for name in others if name not in in_pairs and SPEED.fullmatch(units[name]))
     alone = [name for name in others if name not in in_pairs and name not in speeds]
-    rooted = [name for name in alone if _has_root(equations[name], name)]
+    levels = tuple(name for name in alone if _has_root(equations[name], name))
     living = [name for name in alone if units[name] == "1" or not _decays(model, name)]
-    populations = tuple(name for name in living if name not in rooted and _stays_zero(model, name))
-    heights = {name for name in alone if HEIGHT.fullmatch(units[name])}.difference(populations)
-    levels = tuple(name for name in alone if name in heights or name in rooted)
+    populations = tuple(name for name in living if name not in levels and _stays_zero(model, name))
     feeding = tuple(pair for pair in itertools.permutations(populations, 2) if _feeds(model, *pair))
     formulas = (*model.equations, *dict(model.outputs).values())
     sines = {each for formula in formulas for each in formula.atoms(sympy.sin, sympy.cos)}
@@ -563,7 +563,12 @@ def assignments(form: Form, model: Dynamics, roles: Roles) -> Iterator[dict[str,
         ordered = sorted(filled, key=lambda name: order.get(name, -1))
         if len(set(filled)) < len(filled) or (form.symmetric and filled != ordered):
             continue
-        found = {units.get(name, "1") for name in filled} if form.one_unit else set()
-        if len(found) > 1 or "1" in found:
+        alike = {units.get(name, "1") for name in filled} if form.one_unit else set()
+        if len(alike) > 1 or "1" in alike:
             continue
-        yield {role: name for part in combination for role, name in part.items()}
+        found = {role: name for part in combination for role, name in part.items()}
+        fits = (
+            re.fullmatch(form.units.get(role, ".*"), units.get(name, "1")) for role, name in found.items()
+        )
+        if all(fits):
+            yield found

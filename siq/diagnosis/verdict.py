@@ -290,10 +290,7 @@ def _stated(trial: FittedCandidate, fit: Fit, *, log_odds: float | None = None, 
     candidate, errors = trial.candidate, fit.error_of
     known = {entry.name: entry for entry in fit.model.parameters}
     return StatedTerm(
-        name=candidate.name,
-        label=candidate.label,
-        family=candidate.family,
-        variant=candidate.variant,
+        name=candidate.name, label=candidate.label, family=candidate.family, variant=candidate.variant,
         terms={name: str(formula) for name, formula in candidate.changes},
         parameters={
             name: Estimate(known[name].value, errors.get(name), known[name].unit)
@@ -301,9 +298,8 @@ def _stated(trial: FittedCandidate, fit: Fit, *, log_odds: float | None = None, 
             if name in known
         },
         evidence=Evidence(trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster, log_odds),
-        equations=candidate.equations,
-        **further,
-    )
+        equations=candidate.equations, **further,
+    )  # fmt: skip
 
 
 def _stated_function(

@@ -250,7 +250,8 @@ SCREENED = (
     "thermal drift", "sensor lag", "quantisation", "clipping", "clock offset and drift",
     "input gain", "thrust of a propeller", "actuator lag", "hidden capacity", "maturation delay",
     "cogging or gear ripple", "saturated elimination", "diode or exponential loss",
-    "outflow through an opening", "reverse reaction or backflow", "adaptation", "waning immunity or births",
+    "outflow through an opening", "thermal radiation",
+    "reverse reaction or backflow", "adaptation", "waning immunity or births",
 )  # fmt: skip
 
 
@@ -365,7 +366,7 @@ def test_an_enzyme_removes_half_of_what_it_can_at_its_constant() -> None:
 
 def test_a_junction_conducts_one_way() -> None:
     # Shockley (1949): I0 (exp(V/V0) - 1), whose conductance at rest is I0/V0.
-    change = dict(the("diode or exponential loss", "heat", "in s").changes)["s"]
+    change = dict(the("diode or exponential loss", "circuit").changes)["s"]
     c, w, s = (
         next(each for each in change.free_symbols if each.name == name) for name in ("c_1", "w_1", "s")
     )
@@ -414,7 +415,6 @@ def test_what_only_decays_is_no_population_where_it_has_a_unit() -> None:
     card = {"parameters": numbers(k=1.0), "equations": {"a": "-k*a"}}
     assert roles_of(model_of({**card, "states": states(a="mol/L")})).stores == ("a",)
     assert roles_of(model_of({**card, "states": states(a="1")})).populations == ("a",)
-    assert roles_of(model_of({**card, "states": states(a="m")})).levels == ("a",)
     lost = {"equations": {"s": "-s*i", "i": "s*i - i"}, "states": states(s="1/km**2", i="1/km**2")}
     assert roles_of(model_of(lost)).contagion == (("s", "i"),)
     assert roles_of(HOMES["prey and predator"].model).contagion == ()  # prey are born
@@ -435,3 +435,18 @@ def test_the_activity_of_a_catalyst_dies_away() -> None:
     rate = sympy.simplify(truth.model.equations[1].diff(by_name["x"]) * by_name["m"] / -by_name["k"])
     assert sympy.simplify(rate.diff(by_name["t"]) + by_name["r_1"] * rate) == 0
     assert rate.subs(by_name["t"], 0) == 1
+
+
+def test_a_body_radiates_with_the_fourth_power_of_its_absolute_temperature() -> None:
+    # Boltzmann (1884). At 0 °C it is 273.15 K.
+    in_kelvin = dict(the("thermal radiation", "furnace").changes)["s"]
+    in_celsius = dict(the("thermal radiation", "kettle").changes)["s"]
+    c, s = sympy.Symbol("c_1", real=True), sympy.Symbol("s", real=True)
+    assert in_kelvin == -c * s**4
+    assert float(in_celsius.subs({c: 1, s: 20})) == pytest.approx(float(in_kelvin.subs({c: 1, s: 293.15})))
+
+
+def test_forms_ask_for_units() -> None:
+    assert "diode or exponential loss" in names(HOMES["circuit"].model)
+    assert not {"thermal radiation", "outflow through an opening"} & names(HOMES["circuit"].model)
+    assert not {"diode or exponential loss", "outflow through an opening"} & names(HOMES["heat"].model)
