@@ -251,7 +251,7 @@ SCREENED = (
     "input gain", "thrust of a propeller", "actuator lag", "hidden capacity", "maturation delay",
     "cogging or gear ripple", "saturated elimination", "diode or exponential loss",
     "outflow through an opening", "thermal radiation",
-    "reverse reaction or backflow", "adaptation", "waning immunity or births",
+    "reverse reaction or backflow", "adaptation", "waning immunity",
 )  # fmt: skip
 
 
@@ -403,10 +403,10 @@ def test_adaptation_works_against_what_there_is() -> None:
 
 def test_those_who_recovered_are_the_rest_of_all() -> None:
     # Hethcote (2000): R = N - S - I.
-    change = dict(the("waning immunity or births", "epidemic", "have recovered").changes)["s"]
+    change = dict(the("waning immunity", "epidemic").changes)["s"]
     c, n, s, i = (next(e for e in change.free_symbols if e.name == k) for k in ("c_1", "N_1", "s", "i"))
     assert change.subs({c: 2, n: 1, s: sympy.Rational(1, 2), i: sympy.Rational(1, 4)}) == sympy.Rational(1, 2)
-    with_rest = the("waning immunity or births", "epidemic with those who recovered", "in s, r").model
+    with_rest = the("waning immunity", "epidemic with those who recovered", "in s, r").model
     before = HOMES["epidemic with those who recovered"].model
     assert sympy.expand(sum(with_rest.equations) - sum(before.equations)) == 0
 
@@ -450,3 +450,11 @@ def test_forms_ask_for_units() -> None:
     assert "diode or exponential loss" in names(HOMES["circuit"].model)
     assert not {"thermal radiation", "outflow through an opening"} & names(HOMES["circuit"].model)
     assert not {"diode or exponential loss", "outflow through an opening"} & names(HOMES["heat"].model)
+
+
+def test_recruitment_makes_up_for_what_is_lost() -> None:
+    # Hethcote (2000): births of mu N, deaths of mu S, so that S tends to N.
+    change = dict(the("recruitment", "epidemic").changes)["s"]
+    by_name = {each.name: each for each in change.free_symbols}
+    assert sympy.solve(change, by_name["s"]) == [by_name["N_1"]]
+    assert change.diff(by_name["s"]) == -by_name["c_1"]

@@ -23,9 +23,10 @@ NAMES = (
     "saturation", "parametric drive", "parameter drift", "periodic forcing", "overflow", "leak",
     "input delay", "hysteresis", "saturated elimination", "diode or exponential loss",
     "outflow through an opening", "thermal radiation", "reverse reaction or backflow", "adaptation",
-    "waning immunity or births", "seasonality", "process noise", "sensor gain or offset", "thermal drift",
-    "sensor lag", "quantisation", "clipping", "input gain", "thrust of a propeller", "actuator lag",
-    "hidden capacity", "maturation delay", "cogging or gear ripple", "clock offset and drift",
+    "waning immunity", "recruitment", "seasonality", "process noise", "sensor gain or offset",
+    "thermal drift", "sensor lag", "quantisation", "clipping", "input gain", "thrust of a propeller",
+    "actuator lag", "hidden capacity", "maturation delay", "cogging or gear ripple",
+    "clock offset and drift",
 )  # fmt: skip
 
 
