@@ -29,8 +29,9 @@ from siq.systems.formulas import FormulaError, compile_values, parse_formula
 from siq.systems.simulation import Simulated
 
 Role = Literal[
-    "position", "displacement", "angle", "velocity", "amplitude", "population", "prey", "predator", "level",
-    "upper level", "lower level", "store", "stock", "state", "input", "parameter", "output",
+    "position", "displacement", "angle", "velocity", "amplitude", "population", "prey", "predator",
+    "susceptible", "infectious", "level", "upper level", "lower level", "store", "stock", "state", "input",
+    "parameter", "output",
 ]  # fmt: skip
 
 
@@ -162,6 +163,8 @@ class Form(_Part):
         roles in braces are what fills them.
     symmetric
         Whether exchanging the roles gives the same mechanism.
+    units
+        Regular expressions of the units that fill a role.
     one_unit
         Whether the states and inputs that fill the roles must have one unit, and not be mere numbers.
     family
@@ -181,6 +184,7 @@ class Form(_Part):
     coordinate: str
     variant: str = ""
     symmetric: bool = False
+    units: dict[Name, str] = {}
     one_unit: bool = False
     family: str = ""
     turning: bool = False
@@ -327,9 +331,10 @@ class Roles:
     amplitudes
         Pairs of quadratures: but for a constant drive, the equations look the same from every angle, and turn
         the state.
-    populations, feeding
-        States that stay zero once they are; and pairs of prey and predator, whose meetings make the one fewer
-        and the other more.
+    populations, feeding, contagion
+        States that stay zero once they are, and that do not only decay if they have a unit; pairs of prey and
+        predator, whose meetings make the one fewer and the other more; and those of them in which the one
+        becomes the other, and is not born.
     levels, cascades
         States whose own outflow goes with their square root; and pairs of which the first flows into the
         second.
@@ -346,6 +351,7 @@ class Roles:
     amplitudes: tuple[tuple[str, str], ...] = ()
     populations: tuple[str, ...] = ()
     feeding: tuple[tuple[str, str], ...] = ()
+    contagion: tuple[tuple[str, str], ...] = ()
     levels: tuple[str, ...] = ()
     cascades: tuple[tuple[str, str], ...] = ()
     stores: tuple[str, ...] = ()
@@ -366,7 +372,9 @@ def roles_of(model: Dynamics) -> Roles:
     speeds = tuple(name for name in others if name not in in_pairs and SPEED.fullmatch(units[name]))
     alone = [name for name in others if name not in in_pairs and name not in speeds]
     levels = tuple(name for name in alone if _has_root(equations[name], name))
-    populations = tuple(name for name in alone if name not in levels and _stays_zero(model, name))
+    living = [name for name in alone if units[name] == "1" or not _decays(model, name)]
+    populations = tuple(name for name in living if name not in levels and _stays_zero(model, name))
+    feeding = tuple(pair for pair in itertools.permutations(populations, 2) if _feeds(model, *pair))
     formulas = (*model.equations, *dict(model.outputs).values())
     sines = {each for formula in formulas for each in formula.atoms(sympy.sin, sympy.cos)}
     turning = {name for each in sines for name in each.free_symbols}
@@ -376,7 +384,13 @@ def roles_of(model: Dynamics) -> Roles:
         speeds=speeds,
         amplitudes=amplitudes,
         populations=populations,
-        feeding=tuple(pair for pair in itertools.permutations(populations, 2) if _feeds(model, *pair)),
+        feeding=feeding,
+        contagion=tuple(
+            (one, other)
+            for one, other in feeding
+            if births(model, one) == 0
+            and sympy.expand(sum(meetings(equations[name], one, other) for name in (one, other))) == 0
+        ),
         levels=levels,
         cascades=tuple(
             (upper, lower)
@@ -481,6 +495,13 @@ def _stays_zero(model: Dynamics, name: str) -> bool:
     )
 
 
+def _decays(model: Dynamics, name: str) -> bool:
+    """Whether nothing makes a state more, and no other state makes it less."""
+    equation = dict(zip(model.states, model.equations, strict=True))[name]
+    alone = equation.free_symbols.isdisjoint(map(symbol, {*model.states} - {name}))
+    return alone and births(model, name) == 0
+
+
 def _has_root(equation: sympy.Expr, name: str) -> bool:
     return any(
         power.exp == sympy.Rational(1, 2) and symbol(name) in power.base.free_symbols
@@ -492,7 +513,8 @@ def assignments(form: Form, model: Dynamics, roles: Roles) -> Iterator[dict[str,
     """Every way of filling a form's roles: from each role to the name that fills it.
 
     Position (or displacement, or angle) and velocity, the two quadratures of a rotating frame, prey and
-    predator, and upper and lower level are filled in pairs where the form names them one after the other.
+    predator, susceptible and infectious, and upper and lower level are filled in pairs where the form names
+    them one after the other.
     Nothing fills two roles, and of a symmetric form's ways only one is kept.
     """
     kinds = list(form.roles.values())
@@ -505,6 +527,7 @@ def assignments(form: Form, model: Dynamics, roles: Roles) -> Iterator[dict[str,
         ("angle", "velocity"): tuple(pair for pair in roles.motions if pair[0] in roles.angles),
         ("amplitude", "amplitude"): roles.amplitudes,
         ("prey", "predator"): roles.feeding,
+        ("susceptible", "infectious"): roles.contagion,
         ("upper level", "lower level"): roles.cascades,
     }
     alone: dict[str, tuple[str, ...]] = {}
@@ -540,7 +563,12 @@ def assignments(form: Form, model: Dynamics, roles: Roles) -> Iterator[dict[str,
         ordered = sorted(filled, key=lambda name: order.get(name, -1))
         if len(set(filled)) < len(filled) or (form.symmetric and filled != ordered):
             continue
-        found = {units.get(name, "1") for name in filled} if form.one_unit else set()
-        if len(found) > 1 or "1" in found:
+        alike = {units.get(name, "1") for name in filled} if form.one_unit else set()
+        if len(alike) > 1 or "1" in alike:
             continue
-        yield {role: name for part in combination for role, name in part.items()}
+        found = {role: name for part in combination for role, name in part.items()}
+        fits = (
+            re.fullmatch(form.units.get(role, ".*"), units.get(name, "1")) for role, name in found.items()
+        )
+        if all(fits):
+            yield found

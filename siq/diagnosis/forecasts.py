@@ -25,6 +25,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.special import logsumexp
@@ -223,7 +224,7 @@ def _horizons_of(fit: Fit, context: FitContext) -> list[Horizon]:
             return found
         begin = found[-1].fit if found else fit
         try:
-            there = _fitted(fit.model, some, begin, budget=context.budget)
+            there = _fitted(fit.model, some, begin, begin.x, data.roughness, budget=context.budget)
             # Where f jumps its derivatives are never exact, and steps may go to and fro about the best fit.
             if not (there.converged or there.model.edges):
                 raise NumericalFailure(UNSETTLED)
@@ -237,21 +238,24 @@ def _horizons_of(fit: Fit, context: FitContext) -> list[Horizon]:
 
 
 def _fitted(
-    model: Dynamics, data: Measurements, begin: Fit, x: np.ndarray | None = None, *, budget: Budget
+    model: Dynamics, data: Measurements, begin: Fit, states: np.ndarray, rough: np.ndarray, *, budget: Budget
 ) -> Fit:
-    """A model fitted with forces at random, from the states and the noise of a fit.
+    """A model fitted with forces at random, from states, a fit's noise, and third differences of outputs.
 
-    One that does not settle, as where shapes stand in for each other, leads nothing. As a rival
-    it promises no more than it foresees.
+    A simulation that lacks much may take all noise of its sensors for forces, and what begins there may stay.
+    One that does not settle, as where shapes stand in for each other, leads nothing. As a rival it promises
+    no more than it foresees.
     """
-    states, substeps = begin.x if x is None else x, begin.substeps
+    substeps, noise = begin.substeps, begin.noise.of_states(model.dimension)
     if jumps_of(model):
         substeps = max(substeps, EDGE_SUBSTEPS)
         model = spread_edges(model, data, states, substeps=substeps)
-    noise = begin.noise.of_states(model.dimension)
-    fit = fit_by_multiple_shooting(
-        model, data, x=states, noise=noise, estimate_process=True, substeps=substeps, budget=budget
-    )
+    shown = replace(noise, measurement=data.with_known_noise(np.maximum(noise.measurement, rough)))
+    known: dict[str, Any] = {"x": states, "estimate_process": True, "substeps": substeps, "budget": budget}
+    fit = fit_by_multiple_shooting(model, data, noise=shown, **known)
+    if not fit.converged and (shown.measurement > noise.measurement).any():
+        other = fit_by_multiple_shooting(model, data, noise=noise, **known)
+        fit = max(other, fit, key=lambda each: (each.converged, each.log_likelihood))
     if fit.fault:
         raise NumericalFailure(fit.fault)
     return fit
@@ -541,13 +545,14 @@ def _fitted_at(
     for each in horizons:
         try:
             x = probe.states_along(each.fit, each.data, each.fit.x)
-            fit = _fitted(candidate.begun(each.fit.model, known), each.data, each.fit, x, budget=budget)
+            model, rough = candidate.begun(each.fit.model, known), horizons[0].data.roughness
+            fit = _fitted(model, each.data, each.fit, x, rough, budget=budget)
             if not candidate.admits(fit):
                 raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
             if candidate.generalises and candidate.idle(fit):
                 raise NumericalFailure("it is no more than the special case of it")
             found.append(Horizon.of(fit, each.data))
-            known |= {one.name: one.value for one in fit.model.parameters if one.name in candidate.new}
+            known |= {one.name: one.value for one in fit.model.parameters}
         except NUMERICAL_ERRORS as error:
             LOGGER.info("%s at a horizon: %s", candidate.label, error)
             untried[candidate.label] = NotFitted.of(candidate, error)
@@ -555,13 +560,9 @@ def _fitted_at(
     untried.pop(candidate.label, None)
     if not all(each.fit.converged or each.fit.model.edges for each in found):
         untried[candidate.label] = NotFitted.of(candidate, NumericalFailure(UNSETTLED))
-    gain = np.mean(
-        [
-            (one.log_density - other.log_density) / min(one.correlated, other.correlated)
-            for one, other in zip(found, horizons, strict=True)
-        ]
-    )
-    return found, float(gain)
+    pairs = list(zip(found, horizons, strict=True))
+    gains = [(a.log_density - b.log_density) / min(a.correlated, b.correlated) for a, b in pairs]
+    return found, float(np.mean(gains))
 
 
 def _next_rung(
@@ -578,8 +579,12 @@ def _next_rung(
     fitted, leading = dict[str, _Leader](), list[_Leader]()
 
     def attempt(site: _Site) -> None:
-        if (another := _fitted_at(horizons, site, budget, untried)) is not None:
-            fitted[site.label] = _Leader(site, *another)
+        for term in site.terms:  # from the next shape, where the best one leads nowhere
+            another = _fitted_at(horizons, replace(site, terms=(term,)), budget, untried)
+            if another is not None and not (site.label in untried and site.label in fitted):
+                fitted[site.label] = _Leader(site, *another)
+            if site.label not in untried:
+                break
 
     weights = gains + np.array([site.prior for site in sites])
     order = [place for place in np.argsort(-weights) if sites[place].candidate is not None]

@@ -212,11 +212,7 @@ def _refits_left_out(
                 wrong = {p.name for p in again.model.parameters if p.name in signed and p.value < 0}
                 if wrong:
                     LOGGER.info("without rows of one part, %s would be negative", ", ".join(sorted(wrong)))
-                    absent = (
-                        replace(each, value=0.0, fixed=True) if each.name in wrong else each
-                        for each in model.parameters
-                    )
-                    model = replace(model, parameters=tuple(absent))
+                    model = model.held(wrong, zero=wrong)
             run = simulated(again, out, noise=noise, substeps=fit.substeps)
             own = squared_errors(run, out, spread)
         except NumericalFailure:
@@ -287,8 +283,8 @@ def preferred_recalibration(
     learned, noise
         What is left out in turn, and how much is trusted in where free runs begin.
     """
-    parameters = tuple(replace(each, fixed=True) for each in card.model.parameters)
-    still = replace(card, model=replace(card.model, parameters=parameters), noise=noise.without_process())
+    model = card.model.held([each.name for each in card.model.parameters])
+    still = replace(card, model=model, noise=noise.without_process())
     alone = errors_left_out(still, learned, noise=noise)
     chosen, least = card, None if alone is None else in_blocks(alone)
     for fit, shown in refits:

@@ -297,26 +297,17 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
     unit = units_of(fit.model).get(str(fit.model.outputs[0][1]), "1") if len(spread) == 1 else "1"
     rungs = [errors_of(each.best.fit, data) for each in search.found[:-1]] if named else []
     errors = HeldOutErrors.of(
-        squares,
-        noise_floor=noise_floor,
-        floor=floor,
+        squares, noise_floor=noise_floor, floor=floor, unit=unit,
         rungs=tuple(None if each is None else float(np.sqrt(each.mean())) for each in rungs),
         spread=None if unit == "1" else float(np.sqrt(spread[0])),
-        unit=unit,
-    )
+    )  # fmt: skip
     shifted = investigation.verdict is MismatchVerdict.PARAMETER_SHIFT
     unmended = not errors.at_noise("before") and errors.change("before", "recalibrated") != "better"
     return HeldOutRuns(
-        before=before,
-        recalibrated=refitted,
-        augmented=augmented,
-        recalibration=recalibrated,
-        fit=fit,
-        errors=errors,
-        independent=not set(learned.labels) & set(data.labels),
-        described=described,
+        before=before, recalibrated=refitted, augmented=augmented, recalibration=recalibrated, fit=fit,
+        errors=errors, independent=not set(learned.labels) & set(data.labels), described=described,
         together=shifted and unmended and _one_set_of_parameters(investigation, data),
-    )
+    )  # fmt: skip
 
 
 def _one_set_of_parameters(investigation: Investigation, data: Measurements) -> bool:

@@ -20,7 +20,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -254,15 +254,13 @@ class MechanismCandidate:
 
     def admits(self, fit: Fit) -> bool:
         """Whether parameters of a fit that may have one sign only have it, or are zero within errors."""
-        free = (fit.model.parameters[place] for place in fit.model.free)
-        pairs = zip(free, fit.standard_errors, strict=True)
-        return not any(each.value < -2 * error for each, error in pairs if each.name in self.positive)
+        value_of, errors = {each.name: each.value for each in fit.model.parameters}, fit.error_of
+        return not any(value_of[name] < -2 * errors[name] for name in self.positive & errors.keys())
 
-    def idle(self, fit: Fit) -> bool:
-        """Whether an amplitude of a fit is zero within errors, so that this is a special case of itself."""
-        free = (fit.model.parameters[place] for place in fit.model.free)
-        pairs = zip(free, fit.standard_errors, strict=True)
-        return any(abs(each.value) < 2 * error for each, error in pairs if each.name in self.amplitudes)
+    def idle(self, fit: Fit, of: Callable[[Iterable[bool]], bool] = any) -> bool:
+        """Whether any amplitude of a fit, or all, is zero within errors: a special case of itself, then."""
+        value_of, errors = {each.name: each.value for each in fit.model.parameters}, fit.error_of
+        return of(abs(value_of[name]) < 2 * errors[name] for name in errors.keys() & self.amplitudes)
 
     def repeats(self, found: MechanismCandidate) -> bool:
         """Whether it is what was found already: the same, or in another form at the same place.
@@ -409,7 +407,8 @@ def _vocabulary(
         names[f"{one}_rate"] = equations[assignment[one]]
         if f"{one}_births" in wanted:
             names[f"{one}_births"] = births(model, assignment[one])
-    for one, other in itertools.permutations(states, 2):
+    others = [role for role, kind in form.roles.items() if kind == "input"]
+    for one, other in (*itertools.permutations(states, 2), *itertools.product(states, others)):
         if f"{one}_with_{other}" in wanted:
             names[f"{one}_with_{other}"] = meetings(
                 equations[assignment[one]], assignment[one], assignment[other]
@@ -606,7 +605,8 @@ def candidates_of(
     models: dict[object, tuple[MechanismCandidate, str]] = {}
     for each, (_, filled) in zip(reduced, found, strict=True):
         if each is not None:
-            models.setdefault((each.name, each.model.equations, each.model.outputs), (each, filled))
+            key = (each.name, each.model.equations, each.model.outputs, each.begins)
+            models.setdefault(key, (each, filled))
     # Labels occur once, where needed with what fills the roles, and then with what is added: two parameters
     # of one equation may drift, each of two species be satiated, and a coupling have two forms.
     by_label = Counter(each.label for each, _ in models.values())

@@ -183,10 +183,8 @@ def remaining_forces(fit: Fit, data: Measurements, roles: Roles) -> list[Remark]
         name, force = fit.model.states[place], forces[:, place]
         there = (each for each in remainder.curves if each.term.targets == (name,))
         best = max(there, key=lambda each: each.gain, default=None) if remainder.p_curves < DOUBTFUL else None
-        size, lasts = (
-            float(np.sqrt(np.mean(force**2))),
-            correlation_time_of(force, data.recording[rows], outputs=1),
-        )
+        size = float(np.sqrt(np.mean(force**2)))
+        lasts = correlation_time_of(force, data.recording[rows], outputs=1)
         values = {
             "state": name,
             "size": size,

@@ -285,13 +285,8 @@ def _stands_together(
     on_trial, fit = progress.found[place], progress.fit
     candidate, without = on_trial.best.candidate, None
     if candidate.amplitudes and set(candidate.new) <= {each.name for each in fit.model.parameters}:
-        absent = tuple(
-            replace(each, value=0.0 if each.name in candidate.amplitudes else each.value, fixed=True)
-            if each.name in candidate.new
-            else each
-            for each in fit.model.parameters
-        )
-        refit = fit_with_process_noise_as_needed(replace(fit.model, parameters=absent), data, fit)
+        model = fit.model.held(candidate.new, zero=candidate.amplitudes)
+        refit = fit_with_process_noise_as_needed(model, data, fit)
         without = refit if refit.converged else None
     p_cluster = probability_by_chance(fit, without, data, candidate, blocks=blocks)
     LOGGER.info("%s on trial: p %.1e clustered", candidate.label, p_cluster)
@@ -299,6 +294,20 @@ def _stands_together(
         return None
     stands = replace(on_trial, best=replace(on_trial.best, p_cluster=p_cluster))
     return replace(progress, found=(*progress.found[:place], stands, *progress.found[place + 1 :]))
+
+
+def _last_alone(search: Search, context: FitContext) -> Search:
+    """A search with the last of its mechanisms only, if that explains as much by itself."""
+    last, fit, options = search.found[-1], search.fit, context.study.search
+    (candidate,) = (each for each in context.candidates if each.label == last.best.candidate.label)
+    known = {each.name: each.value for each in fit.model.parameters}
+    known |= {new: known[old] for new, old in zip(candidate.new, last.best.candidate.new, strict=True)}
+    begun = candidate.begun(context.model, known)
+    again = fit_with_process_noise_as_needed(begun, context.data, fit, x=fit.x, budget=context.budget)
+    if not again.converged or 2 * (fit.log_likelihood - again.log_likelihood) > options.same:
+        return search
+    best = FittedCandidate.of(again, search.recalibrated, context.data, candidate, blocks=options.blocks)
+    return replace(search, found=(replace(last, best=best),), fit=again)
 
 
 def search_mechanisms(progress: Search, context: FitContext, *, on_trial: bool = True) -> Search:
@@ -372,3 +381,5 @@ def search_mechanisms(progress: Search, context: FitContext, *, on_trial: bool =
             return progress
         LOGGER.info("found %s, chi2 better by %.1f", stands.best.candidate.label, stands.best.delta_chi2)
         progress = replace(progress, found=(*found, stands), fit=stands.best.fit)
+        if len(found) == 1 and found[0].best.candidate.idle(progress.fit, all):
+            progress = _last_alone(progress, context)

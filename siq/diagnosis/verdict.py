@@ -85,7 +85,7 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
     names = tuple(each.best.candidate.label for each in search.found) if named else ()
     parts = () if described is None else described.parts
     labels = [each.candidate.label for each in parts]
-    errors = _standard_errors(final)
+    errors = final.error_of
     remarks, errors_seen = list(investigation.remarks), shown.errors
     left, context = investigation.remainder.after, investigation.context
     if verdict is MismatchVerdict.UNEXPLAINED and described is not None:
@@ -202,12 +202,6 @@ def _variation_of(name: str, fit: Fit, labels: Sequence[str]) -> Remark:
     return Remark("diagnosis.varies", {"name": name, "labels": list(labels)} | known)
 
 
-def _standard_errors(fit: Fit) -> dict[str, float]:
-    """Standard error of every free parameter, by name."""
-    names = [fit.model.parameters[place].name for place in fit.model.free]
-    return dict(zip(names, map(float, fit.standard_errors), strict=True))
-
-
 def _explanations(investigation: Investigation, names: tuple[str, ...]) -> dict[str, float]:
     """Whole explanations with their evidence: parameters, with forces, with mechanisms, with functions."""
     search, data = investigation.search, investigation.context.data
@@ -274,39 +268,29 @@ def _found_mechanisms(investigation: Investigation, card: Fit) -> tuple[StatedTe
         trial, candidate = found.best, found.best.candidate
         rivals = [
             Alternative(
-                other.candidate.name,
-                other.candidate.label,
-                other.delta_chi2,
-                len(other.candidate.new) - len(candidate.new),
-                standing,
+                other.candidate.name, other.candidate.label, other.delta_chi2,
+                len(other.candidate.new) - len(candidate.new), standing,
             )
             for standing, others in found.others.items()
             for other in others
-        ]
+        ]  # fmt: skip
         alike = {each.name for each in rivals if each.standing == "same"} - {candidate.name}
         stated.append(
             _stated(
-                trial,
-                card,
-                log_odds=odds,
-                share_of_excess=investigation.remainder.share,
+                trial, card, log_odds=odds, share_of_excess=investigation.remainder.share,
                 indistinguishable_from=tuple(sorted(alike)) if investigation.verdict.names else None,
-                beside=tuple(labels[:place]),
-                rivals=tuple(sorted(rivals, key=lambda each: -each.delta_chi2)),
+                beside=tuple(labels[:place]), rivals=tuple(sorted(rivals, key=lambda each: -each.delta_chi2)),
             )
-        )
+        )  # fmt: skip
     return tuple(stated)
 
 
 def _stated(trial: FittedCandidate, fit: Fit, *, log_odds: float | None = None, **further: Any) -> StatedTerm:
     """What was fitted, with the estimates of a fit that has it."""
-    candidate, errors = trial.candidate, _standard_errors(fit)
+    candidate, errors = trial.candidate, fit.error_of
     known = {entry.name: entry for entry in fit.model.parameters}
     return StatedTerm(
-        name=candidate.name,
-        label=candidate.label,
-        family=candidate.family,
-        variant=candidate.variant,
+        name=candidate.name, label=candidate.label, family=candidate.family, variant=candidate.variant,
         terms={name: str(formula) for name, formula in candidate.changes},
         parameters={
             name: Estimate(known[name].value, errors.get(name), known[name].unit)
@@ -314,19 +298,17 @@ def _stated(trial: FittedCandidate, fit: Fit, *, log_odds: float | None = None, 
             if name in known
         },
         evidence=Evidence(trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster, log_odds),
-        equations=candidate.equations,
-        **further,
-    )
+        equations=candidate.equations, **further,
+    )  # fmt: skip
 
 
 def _stated_function(
     part: FittedCandidate, fit: Fit, beside: tuple[str, ...], context: FitContext
 ) -> StatedTerm:
     """A part of the model of what has no name, with its curve or surface and their standard errors."""
-    candidate = part.candidate
-    place, smooth = candidate.place, candidate.smooth
+    place, smooth = (candidate := part.candidate).place, candidate.smooth
     known = {entry.name: entry.value for entry in fit.model.parameters}
-    errors = _standard_errors(fit)
+    errors = fit.error_of
     amplitudes = np.array([known[name] for name in candidate.amplitudes])
     curve = surface = None
     shape: dict[str, Any] = {}
@@ -493,14 +475,11 @@ def _locate(investigation: Investigation, described: AugmentedModel | None = Non
         affected = tuple(label for label, own, fair in zip(data.labels, *shares, strict=True) if own > fair)
     return Location(
         equations={name: float(min(max(gains.get(name, 0.0) / total, 0.0), 1.0)) for name in equations},
-        coordinate=coordinate,
-        region=region,
+        coordinate=coordinate, region=region, outputs=outputs,
         time=(float(data.t.min()), float(data.t.max())) if coordinate == "t" else None,
-        recordings=affected,
-        recordings_total=len(data.labels),
-        outputs=outputs,
+        recordings=affected, recordings_total=len(data.labels),
         unit=units_of(investigation.context.model).get(coordinate, "1"),
-    )
+    )  # fmt: skip
 
 
 def _most_telling(structure: Structure, roles: Roles) -> tuple[tuple[str, ...], str]:

@@ -331,6 +331,12 @@ class Fit:
         return np.sqrt(np.diag(self.covariance))
 
     @property
+    def error_of(self) -> dict[str, float]:
+        """Standard error of every free parameter, by name."""
+        names = (self.model.parameters[place].name for place in self.model.free)
+        return dict(zip(names, map(float, self.standard_errors), strict=True))
+
+    @property
     def has_process_noise(self) -> bool:
         """Whether the states were let deviate from their equations."""
         return bool((self.noise.process > 0).any())

@@ -14,7 +14,7 @@ tape is made in no time, and one compiled loop runs all tapes (`siq.inference.tr
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -492,6 +492,12 @@ class Dynamics:
             if name in self.__dict__:
                 result.__dict__[name] = self.__dict__[name]
         return result
+
+    def held(self, names: Collection[str], *, zero: Collection[str] = ()) -> Dynamics:
+        """The dynamics with some of its parameters fixed, and some of these at zero."""
+        entries = (replace(p, value=0.0) if p.name in zero else p for p in self.parameters)
+        held = tuple(replace(p, fixed=True) if p.name in names else p for p in entries)
+        return replace(self, parameters=held)
 
     def with_diffusion(self, diffusion: Diffusion) -> Dynamics:
         """The dynamics with another diffusion."""

@@ -249,7 +249,9 @@ SCREENED = (
     "sigmoid functional response", "predator interference", "decay or leakage", "delayed response",
     "thermal drift", "sensor lag", "quantisation", "clipping", "clock offset and drift",
     "input gain", "thrust of a propeller", "actuator lag", "hidden capacity", "maturation delay",
-    "cogging or gear ripple",
+    "cogging or gear ripple", "saturated elimination", "diode or exponential loss",
+    "outflow through an opening", "thermal radiation",
+    "reverse reaction or backflow", "adaptation", "waning immunity",
 )  # fmt: skip
 
 
@@ -307,7 +309,7 @@ def test_an_actuator_that_lags_has_the_transfer_function_of_first_order() -> Non
 
 def test_who_matures_in_three_stages_does_so_after_tau_with_a_variance_of_a_third_of_its_square() -> None:
     # MacDonald (1978): the Laplace transform of the ages is (1 + s tau/3)**-3.
-    model = the("maturation delay", "crop").model
+    model = the("maturation delay", "crop", "in three stages").model
     rates = dict(zip(model.states, model.equations, strict=True))
     by_name = {each.name: each for formula in rates.values() for each in formula.free_symbols}
     stages = [by_name[name] for name in ("z1_1", "z2_1", "z3_1")]
@@ -323,9 +325,136 @@ def test_who_matures_in_three_stages_does_so_after_tau_with_a_variance_of_a_thir
 def test_a_hidden_capacity_takes_up_what_it_gives_back() -> None:
     # Bacher and Madsen (2011), model TiTe: Ci dTi = (Te - Ti)/R dt, Ce dTe = (Ti - Te)/R dt; c = 1/(Ci R) and
     # tau = Ce R, so that c tau = Ce/Ci and Ti + c tau Te is kept.
-    model = the("hidden capacity", "heat", "in s").model
+    model = the("hidden capacity", "heat", "capacity in s").model
     before = HOMES["heat"].model.equations[0]
     rates = dict(zip(model.states, model.equations, strict=True))
     by_name = {each.name: each for formula in rates.values() for each in formula.free_symbols}
     kept = rates["s"] - before + by_name["c_1"] * by_name["tau_1"] * rates["z_1"]
     assert sympy.simplify(kept) == 0
+
+
+def test_who_matures_after_one_time_is_born_that_long_before() -> None:
+    # Voelker and Eliasmith (2018): the transfer function is the Padé approximant [3/4] of exp(-s tau).
+    model = the("maturation delay", "crop", "of one length").model
+    rates = dict(zip(model.states, model.equations, strict=True))
+    by_name = {each.name: each for formula in rates.values() for each in formula.free_symbols}
+    stages = [by_name[f"z{k}_1"] for k in range(1, 5)]
+    tau, n, r, s, b = (*(by_name[name] for name in ("tau_1", "n", "r")), *sympy.symbols("s b"))
+    born = sympy.solve([s * z - rates[z.name].subs({r * n: b, tau: 1}) for z in stages], stages)
+    shown = sympy.cancel(sum(born[z] for z in stages) / b)
+    top, bottom = (
+        sum(
+            sign**k
+            * sympy.binomial(size, k)
+            * sympy.Rational(sympy.factorial(7 - k), sympy.factorial(7))
+            * s**k
+            for k in range(size + 1)
+        )
+        for sign, size in ((-1, 3), (1, 4))
+    )
+    assert sympy.cancel(shown - top / bottom) == 0
+
+
+def test_an_enzyme_removes_half_of_what_it_can_at_its_constant() -> None:
+    # Michaelis and Menten (1913): V s / (K + s).
+    change = dict(the("saturated elimination", "heat", "in s").changes)["s"]
+    c, w, s = (
+        next(each for each in change.free_symbols if each.name == name) for name in ("c_1", "w_1", "s")
+    )
+    assert change.subs({c: 3, w: 2, s: 2}) == sympy.Rational(-3, 2)
+
+
+def test_a_junction_conducts_one_way() -> None:
+    # Shockley (1949): I0 (exp(V/V0) - 1), whose conductance at rest is I0/V0.
+    change = dict(the("diode or exponential loss", "circuit").changes)["s"]
+    c, w, s = (
+        next(each for each in change.free_symbols if each.name == name) for name in ("c_1", "w_1", "s")
+    )
+    assert change.diff(s).subs(s, 0) == -c
+    assert sympy.simplify(change - -c * w * (sympy.exp(s / w) - 1)) == 0
+    assert float(change.subs({c: 1, w: 0.1, s: -2})) == pytest.approx(0.1)
+
+
+def test_a_basin_empties_in_a_time_that_goes_with_the_root_of_its_height() -> None:
+    # Torricelli (1644): sqrt(h) falls evenly, so that it is empty after 2 sqrt(h0)/c.
+    change = dict(the("outflow through an opening", "basins", "in h").changes)["h"]
+    h, t, c = sympy.Symbol("h", real=True), *sympy.symbols("t c", positive=True)
+    (new,) = (each for each in change.free_symbols if each.name == "c_1")
+    falling = (2 - c * t / 2) ** 2
+    left = (falling.diff(t) - change.subs({new: c, h: falling})).subs({c: 0.5})
+    assert all(abs(float(left.subs(t, at))) < 1e-12 for at in (0.0, 3.0, 7.9))
+
+
+def test_what_comes_back_is_not_lost() -> None:
+    # Guldberg and Waage (1879): s and r become each other; the sum stays.
+    model, before = the("reverse reaction or backflow", "two bodies").model, HOMES["two bodies"].model
+    change = [sympy.expand(new - old) for new, old in zip(model.equations, before.equations, strict=True)]
+    assert sum(change) == 0 and len(change[0].free_symbols) == 2
+
+
+def test_adaptation_works_against_what_there_is() -> None:
+    # Benda and Herz (2003): at rest a current -c s, at first only the part that was there before.
+    model, before = the("adaptation", "heat", "in s").model, HOMES["heat"].model.equations[0]
+    rates = dict(zip(model.states, model.equations, strict=True))
+    by_name = {each.name: each for formula in rates.values() for each in formula.free_symbols}
+    (rest,) = sympy.solve(rates["z_1"], by_name["z_1"])
+    assert sympy.expand((rates["s"] - before).subs(by_name["z_1"], rest) + by_name["c_1"] * by_name["s"]) == 0
+
+
+def test_those_who_recovered_are_the_rest_of_all() -> None:
+    # Hethcote (2000): R = N - S - I.
+    change = dict(the("waning immunity", "epidemic").changes)["s"]
+    c, n, s, i = (next(e for e in change.free_symbols if e.name == k) for k in ("c_1", "N_1", "s", "i"))
+    assert change.subs({c: 2, n: 1, s: sympy.Rational(1, 2), i: sympy.Rational(1, 4)}) == sympy.Rational(1, 2)
+    with_rest = the("waning immunity", "epidemic with those who recovered", "in s, r").model
+    before = HOMES["epidemic with those who recovered"].model
+    assert sympy.expand(sum(with_rest.equations) - sum(before.equations)) == 0
+
+
+def test_what_only_decays_is_no_population_where_it_has_a_unit() -> None:
+    card = {"parameters": numbers(k=1.0), "equations": {"a": "-k*a"}}
+    assert roles_of(model_of({**card, "states": states(a="mol/L")})).stores == ("a",)
+    assert roles_of(model_of({**card, "states": states(a="1")})).populations == ("a",)
+    lost = {"equations": {"s": "-s*i", "i": "s*i - i"}, "states": states(s="1/km**2", i="1/km**2")}
+    assert roles_of(model_of(lost)).contagion == (("s", "i"),)
+    assert roles_of(HOMES["prey and predator"].model).contagion == ()  # prey are born
+
+
+def test_the_gain_of_a_laser_saturates_and_its_losses_do_not() -> None:
+    # Siegman (1986): g0 u / (1 + I/Is) times I.
+    truth = the("saturation", "laser", "of the gain")
+    by_name = {each.name: each for each in truth.model.equations[0].free_symbols}
+    g, u, p, c, s, h = (by_name[name] for name in ("g", "u", "p", "c", "s", "h_1"))
+    assert sympy.simplify(truth.model.equations[0] - (g * u * p / (1 + h * p) - c * p + s)) == 0
+
+
+def test_the_activity_of_a_catalyst_dies_away() -> None:
+    # Fogler (2016), chapter 10: da/dt = -r a, from one.
+    truth = the("parameter drift", "mass", "as a decay in v (k)")
+    by_name = {each.name: each for each in truth.model.equations[1].free_symbols}
+    rate = sympy.simplify(truth.model.equations[1].diff(by_name["x"]) * by_name["m"] / -by_name["k"])
+    assert sympy.simplify(rate.diff(by_name["t"]) + by_name["r_1"] * rate) == 0
+    assert rate.subs(by_name["t"], 0) == 1
+
+
+def test_a_body_radiates_with_the_fourth_power_of_its_absolute_temperature() -> None:
+    # Boltzmann (1884). At 0 °C it is 273.15 K.
+    in_kelvin = dict(the("thermal radiation", "furnace").changes)["s"]
+    in_celsius = dict(the("thermal radiation", "kettle").changes)["s"]
+    c, s = sympy.Symbol("c_1", real=True), sympy.Symbol("s", real=True)
+    assert in_kelvin == -c * s**4
+    assert float(in_celsius.subs({c: 1, s: 20})) == pytest.approx(float(in_kelvin.subs({c: 1, s: 293.15})))
+
+
+def test_forms_ask_for_units() -> None:
+    assert "diode or exponential loss" in names(HOMES["circuit"].model)
+    assert not {"thermal radiation", "outflow through an opening"} & names(HOMES["circuit"].model)
+    assert not {"diode or exponential loss", "outflow through an opening"} & names(HOMES["heat"].model)
+
+
+def test_recruitment_makes_up_for_what_is_lost() -> None:
+    # Hethcote (2000): births of mu N, deaths of mu S, so that S tends to N.
+    change = dict(the("recruitment", "epidemic").changes)["s"]
+    by_name = {each.name: each for each in change.free_symbols}
+    assert sympy.solve(change, by_name["s"]) == [by_name["N_1"]]
+    assert change.diff(by_name["s"]) == -by_name["c_1"]

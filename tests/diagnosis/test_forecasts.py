@@ -14,8 +14,10 @@ from homes_of_mechanisms import model_of, numbers, states
 from siq.data.recordings import Recordings
 from siq.diagnosis import forecasts, mechanisms
 from siq.diagnosis.dictionary import roles_of, standard_dictionary
+from siq.diagnosis.evidence import NotFitted
 from siq.diagnosis.forecasts import (
     FOLDS,
+    Horizon,
     _fold_of,
     _Foreseen,
     _gained,
@@ -23,6 +25,7 @@ from siq.diagnosis.forecasts import (
     _log_priors,
     _next_rung,
     _Rung,
+    _Site,
     _thinned,
     climb,
 )
@@ -30,8 +33,9 @@ from siq.diagnosis.holdout import preferred_recalibration
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
 from siq.diagnosis.screening import Probe, Term, linearised_with
 from siq.diagnosis.search import FitContext
+from siq.errors import NumericalFailure
 from siq.inference.budget import Budget
-from siq.inference.kalman_filter import Linearisation, Whitened, whiten
+from siq.inference.kalman_filter import Linearisation, Noise, Whitened, whiten
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, measurements
 from siq.inference.recalibration import recalibrate
@@ -361,3 +365,43 @@ def test_values_of_the_card_stay_where_a_refit_follows_nothing_but_forces_at_ran
 
 def test_values_of_the_card_are_refitted_where_they_are_wrong() -> None:
     assert all(refitted(8.0, force=0.3, seed=seed) for seed in range(4))
+
+
+def test_sensors_begin_with_what_their_recordings_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A simulation that lacks much takes the noise of its sensors for forces; what comes after must not."""
+    data = recorded(0.15, 0.0, count=3)
+    context = context_of(pendulum(), data, CLOSE[:1])
+    fit, _ = recalibrate(context.model, data)
+    blind = replace(fit, noise=replace(fit.noise, measurement=1e-9 * data.roughness))
+    begun = []
+
+    def settled(*_: object, noise: Noise, **__: object) -> Fit:
+        begun.append(noise.measurement)
+        return replace(blind, converged=len(begun) > 1)
+
+    monkeypatch.setattr(forecasts, "fit_by_multiple_shooting", settled)
+    forecasts._fitted(pendulum(), data, blind, blind.x, data.roughness, budget=Budget())
+    # From where the fit before ended only where that leads nowhere.
+    np.testing.assert_allclose(begun, [data.roughness, blind.noise.measurement])
+
+
+def test_another_shape_is_begun_with_where_the_best_one_leads_nowhere(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    context = context_of(pendulum(), recorded(0.15, 0.2), ("Stribeck friction",))
+    fit, _ = recalibrate(context.model, context.data)
+    horizons, begun = _horizons_of(fit, context)[:1], []
+
+    def fitted(horizons: list[Horizon], site: _Site, budget: Budget, untried: dict) -> tuple | None:
+        assert site.candidate is not None
+        begun.append(site.terms)
+        if len(begun) == 1:
+            untried[site.label] = NotFitted.of(site.candidate, NumericalFailure(forecasts.UNSETTLED))
+            return None
+        untried.pop(site.label, None)
+        return list(horizons), 0.0
+
+    monkeypatch.setattr(forecasts, "_fitted_at", fitted)
+    monkeypatch.setattr(forecasts, "_gains", lambda horizons, sites, *_: (sites, np.ones(len(sites))))
+    _next_rung(horizons, context.candidates, context, {})
+    assert len(begun) == 2 and begun[0] != begun[1] and len(begun[0]) == 1

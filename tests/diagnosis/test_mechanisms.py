@@ -21,10 +21,12 @@ NAMES = (
     "nonlinear coupling", "self-limitation", "mortality", "harvest", "Allee effect", "prey refuge",
     "sigmoid functional response", "predator interference", "decay or leakage", "delayed response",
     "saturation", "parametric drive", "parameter drift", "periodic forcing", "overflow", "leak",
-    "input delay",
-    "hysteresis", "process noise", "sensor gain or offset", "thermal drift", "sensor lag", "quantisation",
-    "clipping", "input gain", "thrust of a propeller", "actuator lag", "hidden capacity",
-    "maturation delay", "cogging or gear ripple", "clock offset and drift",
+    "input delay", "hysteresis", "saturated elimination", "diode or exponential loss",
+    "outflow through an opening", "thermal radiation", "reverse reaction or backflow", "adaptation",
+    "waning immunity", "recruitment", "seasonality", "process noise", "sensor gain or offset",
+    "thermal drift", "sensor lag", "quantisation", "clipping", "input gain", "thrust of a propeller",
+    "actuator lag", "hidden capacity", "maturation delay", "cogging or gear ripple",
+    "clock offset and drift",
 )  # fmt: skip
 
 

@@ -9,22 +9,30 @@ import numpy as np
 import pytest
 import scipy.stats
 import sympy
+from homes_of_mechanisms import HOMES, RESIDENTS, recorded
 
 from siq.data.recordings import Recordings
 from siq.diagnosis import naming, screening
-from siq.diagnosis.dictionary import Roles, Shape
+from siq.diagnosis.dictionary import Roles, Shape, roles_of, standard_dictionary
 from siq.diagnosis.evidence import FittedCandidate, _blocks_of, _correlated_probability, _correlation_time
-from siq.diagnosis.mechanisms import MechanismCandidate
+from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
 from siq.diagnosis.naming import Investigation, _judge_mechanisms
 from siq.diagnosis.residual_structure import Remainder, Structure
 from siq.diagnosis.screening import Ranked, by_likelihood, rank
-from siq.diagnosis.search import AcceptedMechanism, FitContext, Search, _accepted, _better_without
+from siq.diagnosis.search import (
+    AcceptedMechanism,
+    FitContext,
+    Search,
+    _accepted,
+    _better_without,
+    _last_alone,
+)
 from siq.diagnosis.study import MismatchStudy, SearchOptions
 from siq.diagnosis.terms import ONE, Place
 from siq.diagnosis.verdict import _most_telling
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements, measurements
-from siq.inference.recalibration import recalibrate
+from siq.inference.recalibration import fit_with_process_noise_as_needed, recalibrate
 from siq.remarks import sentence
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter
@@ -318,3 +326,26 @@ def test_nothing_is_missing_where_its_fit_only_found_better_parameters(decaying:
     found = _better_without(trial, missed, context)
     assert found is not None and found.model.values == pytest.approx(right.model.values, rel=1e-3)
     assert _better_without(trial, right, context) is None
+
+
+def test_what_a_later_mechanism_makes_idle_is_not_named() -> None:
+    """A periodic force was the best there was before the store that the recordings come from was tried."""
+    home, resident = HOMES["heat"], next(each for each in RESIDENTS if each.name == "decay or leakage")
+    model, data = home.model, recorded(resident)
+    roles = roles_of(model)
+    some = [each for each in standard_dictionary() if each.name in ("decay or leakage", "periodic forcing")]
+    candidates = candidates_of(model, roles, some)
+    force = next(each for each in candidates if each.label == "periodic forcing in s")
+    leak = next(each for each in candidates if each.label.startswith("decay or leakage to nothing in s"))
+    context, (fit, _) = FitContext(model, data, roles, tuple(candidates)), recalibrate(model, data)
+    found, current = [], fit
+    for each in (force, leak.rebased(model, force.model)):
+        begun = each.begun(current.model, {"w_1": 2.0})
+        before, current = current, fit_with_process_noise_as_needed(begun, data, current)
+        trial = FittedCandidate.of(current, before, data, each, blocks=10)
+        found.append(AcceptedMechanism(trial, {"same": (), "needless": (), "less": ()}))
+    assert force.idle(current, all)
+    alone = _last_alone(Search(fit, tuple(found), current, ()), context)
+    assert [each.best.candidate.label for each in alone.found] == [leak.label]
+    assert [each.name for each in alone.fit.model.parameters][len(model.parameters) :] == ["c_1"]
+    assert alone.fit.model.values[-1] == pytest.approx(resident.values["c"], rel=0.05)
