@@ -295,7 +295,7 @@ def _reached_by_noise(dynamics: Dynamics, equilibrium: np.ndarray) -> bool:
 def _crossed_by_noise(dynamics: Dynamics, saddle: np.ndarray, width: np.ndarray) -> bool:
     """Whether noise leads over a saddle with one unstable direction, in a domain of a width ``(d,)``.
 
-    With l for the left eigenvector, ``s = l·(x - saddle)`` grows as ``λs + l·noise``. Where ``l·D l`` vanishes
+    With l for the left eigenvector, ``s = l·(x - saddle)`` grows as ``λs + l·noise``. If ``l·D l`` vanishes
     like s², as of populations with noise in proportion to their number, ``∫ λs/(l·D l) ds`` is infinite.
     """
     values, left, right = scipy.linalg.eig(dynamics.jacobian(saddle[None])[0], left=True)

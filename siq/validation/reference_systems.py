@@ -70,6 +70,10 @@ DOUBLY_COMPUTED: Mapping[str, tuple[_KnownBarrier, ...]] = {
         _computed(_ON, _EVEN, _OFF, value=0.1767588206),
         _computed(_OFF, _EVEN, _ON, value=0.1767588206),
     ),
+    "van-der-pol": (
+        _computed((-1.0, 0.0), (0.0, 0.0), (1.0, 0.0), value=0.2139804892),
+        _computed((1.0, 0.0), (0.0, 0.0), (-1.0, 0.0), value=0.2139804892),
+    ),
 }
 """By name of the system. Saddles and attractors are given to 1e-8."""
 
@@ -252,6 +256,17 @@ def reference_systems() -> dict[str, _ReferenceSystem]:
             ),
             2 * friction * (V**2 / 2 + place),
             tuple(tuple((*each, 0) for each in way) for way in over_and_back),
+        ),
+        _computed_twice(
+            "van-der-pol",
+            "A particle in a double well with friction as of van der Pol, and noise on its velocity alone.",
+            "a test of CriticalTransitions.jl, which knows the barrier as 0.15 to 0.24",
+            Dynamics.of(
+                (X, V),
+                (V, X - X**3 - V * (1 - 3 * tenth * (1 - X**2))),
+                diffusion=[[0, 0], [0, 2]],
+                domain=[(-2, 2)] * 2,
+            ),
         ),
         _point_and_cycle(),
     ]
