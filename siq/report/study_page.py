@@ -300,7 +300,8 @@ def _states_table(seen: RecordStates, summary: LandscapeSummary | None = None) -
     tops = [] if seen.profile is None or len(seen.columns) > 1 else seen.profile.tops.tolist()
     cells: dict[str, list[str]] = defaultdict(list)
     for number, row in enumerate(found.to_dict("records")):
-        cells["place"].append(", ".join(value_text(one, digits=3) for one in seen.places[number]))
+        place = zip(seen.places[number], seen.remark().values["digits"], strict=True)
+        cells["place"].append(", ".join(value_text(one, digits=digits) for one, digits in place))
         cells["share of the time"].append(f"{100 * row['share']:.0f} %")
         cells["visits seen to end"].append(str(row["visits"]))
         stay = f"more than {value_text(row['lowest'], digits=2)}"
