@@ -24,7 +24,10 @@ if TYPE_CHECKING:
 
 @task(
     "source", "files",
-    options=("seed", "space", "sampling", "simulation", "identification.hidden_velocities", "card"),
+    options=(
+        "seed", "space", "sampling", "simulation", "card", "identification.hidden_velocities",
+        "identification.angles", "identification.degree", "identification.functions",
+    ),
 )  # fmt: skip
 def draw(given: Given, settings: PipelineSettings) -> Any:
     """Trajectories of a run: a simulation of the card, or recordings resampled."""

@@ -17,7 +17,6 @@ import numpy as np
 from scipy import optimize, special
 
 from siq.data.correlation import markov_lag, noise_floors
-from siq.data.layout import usable_name
 from siq.data.recordings import (
     MOST_WIDE_STEPS,
     ROUNDED_TURN,
@@ -30,12 +29,10 @@ from siq.data.recordings import (
 from siq.data.states import switching
 from siq.data.stationarity import background_of, change_of, correlated_samples, runs_of, usual_step
 from siq.errors import InputError
-from siq.numerics.randomness import positive
 from siq.remarks import Remark
 
 FULL_TURNS = {2 * np.pi: "2π", 360.0: "360"}  # of an angle, in radians and in degrees
 ENDS_OF_TURN = 0.05  # of a turn, within which a column that jumps by one comes to 0 and 1 of it, or to ±½
-FAR = 10.0  # half ranges from the origin within which powers are alike for other reasons
 FEWEST_STRETCHES = 10  # of a single recording, at least, two of which are held out
 MOST_STRETCHES = 40  # more make no error better known
 STRETCH_LENGTH = 10  # correlation times: what is left of its first sample at its end is then nothing
@@ -280,38 +277,6 @@ def _hum_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, flo
             return nothing, 0.0
         hum[part] = (whole * np.exp(1j * frequency * recordings.t[part])).real
     return (hum, 2 * np.pi / frequency) if hum.var() < SLIGHT_HUM * values.var() else (nothing, 0.0)
-
-
-def centred(recordings: Recordings, *, degree: int) -> Recordings:
-    """Recordings of which a round number was taken off states too far from zero to tell their powers apart.
-
-    Such a state is called by what was taken off: ``T_minus_273``.
-    """
-    names, headings, values = list(recordings.names), list(recordings.titles), recordings.values.copy()
-    remarks = list(recordings.remarks)
-    for state, x in enumerate(recordings.values.T):
-        middle, half = (float(x.max()) + float(x.min())) / 2, float(np.ptp(x)) / 2
-        if abs(middle) <= FAR * half or not half > 0 or told_apart(np.vander(x, degree + 1)):
-            continue
-        origin = round(middle, -int(np.floor(np.log10(half))))
-        sign, size = ("−", "minus") if origin > 0 else ("+", "plus")
-        values[:, state] -= origin
-        headings[state] = f"{headings[state]} {sign} {abs(origin):.10g}"
-        names[state] = usable_name(f"{names[state]}_{size}_{abs(origin):.10g}")
-        values_told = {"column": recordings.titles[state], "origin": f"{origin:.10g}", "name": names[state]}
-        remarks.append(Remark("data.centred", values_told))
-    if len(remarks) == len(recordings.remarks):
-        return recordings
-    return replace(
-        recordings, names=tuple(names), headings=tuple(headings), values=values, remarks=tuple(remarks)
-    )
-
-
-def told_apart(columns: np.ndarray) -> bool:
-    """Whether columns ``(n, q)`` are known apart to half of all digits: covariances lose twice as many."""
-    size = np.linalg.norm(columns, axis=0)
-    values = np.linalg.svd(np.linalg.qr(columns / positive(size), mode="r"), compute_uv=False)
-    return bool(values[-1] > np.sqrt(np.finfo(float).eps) * values[0])
 
 
 def without_background(recordings: Recordings) -> Recordings:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -19,6 +20,7 @@ import numpy as np
 
 from siq.errors import InputError, NumericalFailure, needs_extra
 from siq.numerics.files import whole_file
+from siq.numerics.randomness import positive
 from siq.remarks import Remark, sentence
 
 if TYPE_CHECKING:
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 TABLE = "the table"  # what messages call what is in no file
 LONGEST_STEP = 1.5  # of the median step: a missing sample makes two of it, jitter rarely a half more
 HELD_OUT_SHARE = 0.2
+FAR = 10.0  # half ranges from the origin within which powers are alike for other reasons
 ROUNDED_TURN = 1e-6  # of a period, by which a wrapped angle may exceed it
 MOST_WIDE_STEPS = 0.01  # of normal steps as many are beyond 2.6 deviations, and twice as far 2 in 10 million
 SINGLE_RECORDING_REMEDY = (
@@ -251,6 +254,37 @@ class Recordings:
                 raise InputError(TABLE, f"column {self.titles[place]}", fault, "record it more often")
             values[1:, place] -= period * np.cumsum(turns)
         return replace(self, values=values)
+
+    def centred(self, *, degree: int) -> Recordings:
+        """These recordings less a round number, of states too far from zero to tell their powers apart.
+
+        Such a state is called by what was taken off: ``T_minus_273``.
+        """
+        names, headings, values = list(self.names), list(self.titles), self.values.copy()
+        remarks = list(self.remarks)
+        for state, x in enumerate(self.values.T):
+            middle, half = (float(x.max()) + float(x.min())) / 2, float(np.ptp(x)) / 2
+            if abs(middle) <= FAR * half or not half > 0 or self.told_apart(np.vander(x, degree + 1)):
+                continue
+            origin = round(middle, -int(np.floor(np.log10(half))))
+            sign, word = ("−", "minus") if origin > 0 else ("+", "plus")
+            values[:, state] -= origin
+            headings[state] = f"{headings[state]} {sign} {abs(origin):.10g}"
+            names[state] = names[state] + re.sub(r"\W", "_", f"_{word}_{abs(origin):.10g}")
+            told = {"column": self.titles[state], "origin": f"{origin:.10g}", "name": names[state]}
+            remarks.append(Remark("data.centred", told))
+        if len(remarks) == len(self.remarks):
+            return self
+        return replace(
+            self, names=tuple(names), headings=tuple(headings), values=values, remarks=tuple(remarks)
+        )
+
+    @staticmethod
+    def told_apart(columns: np.ndarray) -> bool:
+        """Whether columns ``(n, q)`` are apart to half of all digits: covariances lose twice as many."""
+        size = np.linalg.norm(columns, axis=0)
+        values = np.linalg.svd(np.linalg.qr(columns / positive(size), mode="r"), compute_uv=False)
+        return bool(values[-1] > np.sqrt(np.finfo(float).eps) * values[0])
 
     def to_xarray(self) -> xarray.Dataset:
         """An `xarray.Dataset` over the dimension ``sample``, with units; ``Recordings.of`` reads it back.

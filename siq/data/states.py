@@ -492,10 +492,9 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     columns, state = sorted(tried[one] for one in order[:MOST_COLUMNS]), tried[order[0]]
     values, column = recordings.values[:, columns], columns.index(state)
     relaxation = min(relaxations[place] for place in columns)
-    found_apart = count * apart[[tried.index(place) for place in columns], :, :, 1].min(axis=2) < SIGNIFICANCE
-    drifting = (~found_apart[:, 0] & found_apart[:, 1]).astype(
-        int
-    )  # what looks like a drift may be a few hops
+    chances = count * apart[[tried.index(place) for place in columns], :, :, 1].min(axis=2)
+    # What looks like a drift may be a few hops.
+    drifting = ((chances >= SIGNIFICANCE) == [True, False]).all(axis=1).astype(int)
     background, baseline = drifts[drifting, :, columns].T, np.zeros_like(values)
     places, path, expected = np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None
     wells, levels = 1, False

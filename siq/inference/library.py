@@ -19,7 +19,7 @@ import sympy
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
-from siq.data.preparation import FAR, told_apart
+from siq.data.recordings import FAR, Recordings
 from siq.errors import Fault, NumericalFailure
 from siq.systems.cards import Limit
 from siq.systems.diffusion import Diffusion
@@ -130,7 +130,7 @@ class CandidateLibrary:
         middle, half = (low + high) / 2, (high - low) / 2
         if not (np.abs(middle) > FAR * half).any():
             return
-        if told_apart(self.evaluate(x)):
+        if Recordings.told_apart(self.evaluate(x)):
             return
         worst = int(np.argmax(np.abs(middle) / np.where(half > 0, half, np.inf)))
         digits = int(np.floor(np.log10(half[worst])))

@@ -18,6 +18,7 @@ from siq.data.states import RecordStates
 from siq.numerics.text import MINUS, range_text, unit_text, value_text
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.rates import NoiseStrength
+from siq.remarks import sentence
 from siq.report.formatting import (
     counted_text,
     paragraphs,
@@ -34,16 +35,11 @@ MOST_COLUMNS = 4  # wells that are columns of a table; more are rows
 
 
 def answer_lines(summary: LandscapeSummary, *, seen: RecordStates | None = None, rung: int = 4) -> list[str]:
-    """The answer in one sentence, and what has to be known of it; nothing is added where it is certified.
-
-    `seen` are the states that the recordings show without any formula; they lead up to `rung` 3 of the
-    ladder, which is that of the whole answer.
-    """
-    certified = rung == 6
-    elsewhere = seen is not None and not certified and _stays_elsewhere(summary, seen)
-    said = "" if seen is None else seen.sentence()
-    values = {"certified": certified, "elsewhere": elsewhere, "refused": rung < 4}
-    return paragraphs("answer.j2", s=summary, seen=said, **values)
+    """The answer, and what is to be known of it; `seen` states lead up to `rung` 3, and are left out at 6."""
+    elsewhere = seen is not None and rung < 6 and _stays_elsewhere(summary, seen)
+    alone = rung < 4 and len(summary.wells) > 1
+    said = "" if seen is None else seen.sentence() or (sentence(seen.rest()) if alone else "")
+    return paragraphs("answer.j2", s=summary, seen=said, rung=rung, elsewhere=elsewhere)
 
 
 def _stays_elsewhere(summary: LandscapeSummary, seen: RecordStates) -> bool:

@@ -295,12 +295,13 @@ def _states_table(seen: RecordStates, summary: LandscapeSummary | None = None) -
 
     Wells of one quantity are those of f and D, where they are as many as the states.
     """
-    found, time_unit = seen.dwell_times(), seen.time_unit or "1"
+    found, time_unit, digits = seen.dwell_times(), seen.time_unit or "1", seen.remark().values["digits"]
     law = {True: "exponential", False: "not exponential"}
     tops = [] if seen.profile is None or len(seen.columns) > 1 else seen.profile.tops.tolist()
     cells: dict[str, list[str]] = defaultdict(list)
     for number, row in enumerate(found.to_dict("records")):
-        cells["place"].append(", ".join(value_text(one, digits=3) for one in seen.places[number]))
+        place = (value_text(x, digits=digits[k]) for k, x in enumerate(seen.places[number]))
+        cells["place"].append(", ".join(place))
         cells["share of the time"].append(f"{100 * row['share']:.0f} %")
         cells["visits seen to end"].append(str(row["visits"]))
         stay = f"more than {value_text(row['lowest'], digits=2)}"

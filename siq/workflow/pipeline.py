@@ -17,15 +17,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from siq.data.preparation import (
-    centred,
-    in_stretches,
-    joined,
-    read_pairs,
-    unusual,
-    without_background,
-    without_faults,
-)
+from siq.data.preparation import in_stretches, joined, read_pairs, unusual, without_background, without_faults
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.data.states import RecordStates
 from siq.errors import NumericalFailure
@@ -85,7 +77,7 @@ def _prepared(settings: PipelineSettings, recordings: Recordings) -> Recordings:
     if settings.sampling.background and not options.angles:  # an angle that turns on drifts by itself
         recordings = without_background(without_faults(recordings))
     if settings.space.names is None and not options.functions:  # which know states by their names
-        recordings = centred(recordings, degree=options.degree)
+        recordings = recordings.centred(degree=options.degree)
     return in_stretches(recordings, hidden_velocities=options.hidden_velocities)
 
 

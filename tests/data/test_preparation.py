@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from remembering import double_wells
 
-from siq.data.preparation import centred, in_stretches, joined, without_faults
+from siq.data.preparation import in_stretches, joined, without_faults
 from siq.data.recordings import Recordings
 from siq.data.stationarity import runs_of
 
@@ -104,7 +104,7 @@ def test_a_state_far_from_zero_is_moved_by_a_round_number_and_called_so() -> Non
     near = np.random.default_rng(0).uniform(-3, 3, (500, 2))
     values = near + np.array([101325.4, 5.0])
     table = Recordings.from_arrays(np.arange(500.0), values, names=["p", "x"])
-    found = centred(table, degree=5)
+    found = table.centred(degree=5)
     assert found.names == ("p_minus_101325", "x") and found.titles == ("p − 101325", "x")
     assert found.values == pytest.approx(values - [101325, 0])
-    assert centred(table, degree=1) is table  # a line through zero tells no more of its origin
+    assert table.centred(degree=1) is table  # a line through zero tells no more of its origin

@@ -104,6 +104,8 @@ def test_nothing_is_added_to_what_is_certified() -> None:
     first, second, *_ = answer_lines(two, seen=replace(seen, levels=(-0.5, 0.5)), rung=3)
     assert first.startswith("The record has two states of x")
     assert second.startswith("What was identified failed a test against the record: the recordings show two")
+    first, *_ = answer_lines(two, seen=replace(seen, supported=False), rung=0)
+    assert first.startswith("By itself the record shows one state of x")
 
 
 def test_the_reason_is_that_of_the_step_that_failed() -> None:

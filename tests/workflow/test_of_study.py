@@ -59,6 +59,14 @@ def test_settings_survive_the_parameters_of_a_rule(task: str, study: tuple[Study
         assert attrgetter(name)(again) == attrgetter(name)(settings)
 
 
+def test_recordings_are_drawn_with_the_angles_of_the_study(write: Write) -> None:
+    text = "name: turns\nrecordings: {file: turns.csv}\nidentification: {angles: {phi: [0, 360]}}\n"
+    settings = settings_of(load_study(write(text)), None)
+    options = [name for name in TASKS["draw"].options if name.partition(".")[0] in KNOWN]
+    again = PipelineSettings(**json.loads(json.dumps(settings.parts(options))))
+    assert again.identification.angles == settings.identification.angles == {"phi": (0.0, 360.0)}
+
+
 def test_sampling_is_that_of_the_simulation_or_of_the_recordings(write: Write, archetype: Dynamics) -> None:
     simulated = settings_of(load_study(write(SIMULATED)), archetype)
     assert simulated.sampling == Sampling(0.01, 0.002)
