@@ -494,6 +494,7 @@ RESIDENTS: Sequence[Resident] = (
     Resident("hidden capacity", "heat", {"c": 0.5, "tau": 3.0}, "empty at first in s"),
     Resident("maturation delay", "crop", {"tau": 2.0}, "three stages"),
     Resident("maturation delay", "crop", {"tau": 2.0}, "one length"),
+    Resident("delayed self-limitation", "crop", {"tau": 0.8}),
     Resident("saturated elimination", "heat", {"c": 1.0, "w": 1.0}, "in s"),
     Resident("diode or exponential loss", "circuit", {"c": 0.05, "w": 0.3}),
     Resident("thermal radiation", "furnace", {"c": 2e-10}),

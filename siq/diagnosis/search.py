@@ -251,7 +251,12 @@ def _fit_most_promising(
             attempt(promised, better.fit)
     most_gained = max((each.delta_chi2 for each in trials.values()), default=0.0)
     for label, trial in trials.items():
-        if trial.fit.model.edges and trial.delta_chi2 >= SHARPENED_GAIN * most_gained:
+        near = trial.delta_chi2 >= SHARPENED_GAIN * most_gained
+        if near and trial.candidate.scales:  # a state of its own makes several maxima of the likelihood
+            for other in screened:
+                if other.term.candidate.label == label and other.gain > 0 and other is not best[label]:
+                    attempt(other, current)
+        if near and trial.fit.model.edges:
             try:
                 budget.says(f"following the jumps of {label}")
                 sharp = sharpened(trial.fit, data, budget=budget)

@@ -85,8 +85,7 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
     names = tuple(each.best.candidate.label for each in search.found) if named else ()
     parts = () if described is None else described.parts
     labels = [each.candidate.label for each in parts]
-    errors = final.error_of
-    remarks, errors_seen = list(investigation.remarks), shown.errors
+    errors, remarks, errors_seen = final.error_of, list(investigation.remarks), shown.errors
     left, context = investigation.remainder.after, investigation.context
     if verdict is MismatchVerdict.UNEXPLAINED and described is not None:
         # A model that leaves no more than sensor and randomness do, and not most of the recordings, is an
@@ -247,21 +246,17 @@ def _found_mechanisms(investigation: Investigation, card: Fit) -> tuple[StatedTe
         driven = [entry for entry in entries if entry[2] > 0]
         return (
             StatedTerm(
-                name=PROCESS_NOISE,
-                label=PROCESS_NOISE,
-                terms={},
+                name=PROCESS_NOISE, label=PROCESS_NOISE, terms={},
                 parameters={
                     f"intensity_{name}": Estimate(
                         float(value), None, unit_of("_x**2/_t", {"_x": unit, "_t": fit.model.time_unit})
                     )
                     for name, unit, value in driven
                 },
-                evidence=Evidence(None, None, None, None),
-                share_of_excess=1.0,
-                indistinguishable_from=(),
+                evidence=Evidence(None, None, None, None), share_of_excess=1.0, indistinguishable_from=(),
                 equations=tuple(name for name, _, _ in driven),
             ),
-        )
+        )  # fmt: skip
     labels = [each.best.candidate.label for each in search.found]
     stated = []
     for place, (found, odds) in enumerate(zip(search.found, investigation.log_odds, strict=True)):

@@ -458,3 +458,12 @@ def test_recruitment_makes_up_for_what_is_lost() -> None:
     by_name = {each.name: each for each in change.free_symbols}
     assert sympy.solve(change, by_name["s"]) == [by_name["N_1"]]
     assert change.diff(by_name["s"]) == -by_name["c_1"]
+
+
+def test_a_population_is_limited_by_what_it_was() -> None:
+    # Hutchinson (1948): n' = r n - c n n(t - tau), n(t - tau) being the sum of the states.
+    model = the("delayed self-limitation", "crop").model
+    by_name = {each.name: each for each in model.equations[0].free_symbols}
+    late = sum(by_name[f"z{k}_1"] for k in range(1, 5))
+    expected = by_name["r"] * by_name["n"] - by_name["c"] * by_name["n"] * late
+    assert sympy.simplify(model.equations[0] - expected) == 0

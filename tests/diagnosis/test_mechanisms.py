@@ -25,8 +25,8 @@ NAMES = (
     "outflow through an opening", "thermal radiation", "reverse reaction or backflow", "adaptation",
     "waning immunity", "recruitment", "seasonality", "process noise", "sensor gain or offset",
     "thermal drift", "sensor lag", "quantisation", "clipping", "input gain", "thrust of a propeller",
-    "actuator lag", "hidden capacity", "maturation delay", "cogging or gear ripple",
-    "clock offset and drift",
+    "actuator lag", "hidden capacity", "maturation delay", "delayed self-limitation",
+    "cogging or gear ripple", "clock offset and drift",
 )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,19 +13,20 @@ import sympy
 from homes_of_mechanisms import HOMES, RESIDENTS, recorded
 
 from siq.data.recordings import Recordings
-from siq.diagnosis import naming, screening
+from siq.diagnosis import naming, screening, search
 from siq.diagnosis.dictionary import Roles, Shape, roles_of, standard_dictionary
 from siq.diagnosis.evidence import FittedCandidate, _blocks_of, _correlated_probability, _correlation_time
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
 from siq.diagnosis.naming import Investigation, _judge_mechanisms
 from siq.diagnosis.residual_structure import Remainder, Structure
-from siq.diagnosis.screening import Ranked, by_likelihood, rank
+from siq.diagnosis.screening import Ranked, by_likelihood, rank, screen_all
 from siq.diagnosis.search import (
     AcceptedMechanism,
     FitContext,
     Search,
     _accepted,
     _better_without,
+    _fit_most_promising,
     _last_alone,
 )
 from siq.diagnosis.study import MismatchStudy, SearchOptions
@@ -349,3 +351,23 @@ def test_what_a_later_mechanism_makes_idle_is_not_named() -> None:
     assert [each.best.candidate.label for each in alone.found] == [leak.label]
     assert [each.name for each in alone.fit.model.parameters][len(model.parameters) :] == ["c_1"]
     assert alone.fit.model.values[-1] == pytest.approx(resident.values["c"], rel=0.05)
+
+
+def test_what_brings_a_state_is_fitted_from_every_shape(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Delays that are too long by half explain nearly as much, and no fit leads from one to the other."""
+    model = HOMES["crop"].model
+    data = recorded(next(each for each in RESIDENTS if each.label == "one length"))
+    some = [each for each in standard_dictionary() if each.name == "maturation delay"]
+    late = [each for each in candidates_of(model, roles_of(model), some) if each.variant == "of one length"]
+    context, (fit, _) = FitContext(model, data, roles_of(model), tuple(late)), recalibrate(model, data)
+    screened, _ = screen_all(data, fit, late)
+    begun = []
+
+    def noted(model: Dynamics, *rest: Any, **options: Any) -> Fit:
+        begun.append(float(model.values[-1]))
+        return fit_with_process_noise_as_needed(model, *rest, **options)
+
+    monkeypatch.setattr(search, "fit_with_process_noise_as_needed", noted)
+    (trial,), _ = _fit_most_promising(context, fit, screened)
+    assert len(set(begun)) == sum(each.gain > 0 for each in screened) > 1
+    assert trial.fit.model.values[-1] == pytest.approx(2.0, rel=0.1)
