@@ -301,7 +301,8 @@ def _stated_function(
     part: FittedCandidate, fit: Fit, beside: tuple[str, ...], context: FitContext
 ) -> StatedTerm:
     """A part of the model of what has no name, with its curve or surface and their standard errors."""
-    place, smooth = (candidate := part.candidate).place, candidate.smooth
+    candidate = part.candidate
+    place, smooth = candidate.place, candidate.smooth
     known = {entry.name: entry.value for entry in fit.model.parameters}
     errors = fit.error_of
     amplitudes = np.array([known[name] for name in candidate.amplitudes])
