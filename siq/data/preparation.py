@@ -41,6 +41,7 @@ FALSE_FAULT_RATE = 1e-3  # probability with which a record of white noise has a 
 FEW_JUMPS, MOST_APART = 0.05, 0.01  # that stay, a sample that does not; of all samples
 QUARTERS, SAME_WAVE = 4, 0.5  # of a recording, in which a hum has one amplitude and phase, to a half of it
 SLIGHT_HUM = 0.1  # of the variance of a state: what moves it more may be the state itself, which circulates
+KNOWN_SCALE = 0.01  # relative error to which a velocity has to tell how its position moves
 _STRETCH_LABEL = re.compile(r"(?P<label>.*) \((?P<number>\d+) of (?P<of>\d+)\)")
 SINGLE_RECORDING = (
     "there is one recording, and it shows no process noise, from which the state returns, but at most that of"
@@ -277,6 +278,37 @@ def _hum_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, flo
             return nothing, 0.0
         hum[part] = (whole * np.exp(1j * frequency * recordings.t[part])).real
     return (hum, 2 * np.pi / frequency) if hum.var() < SLIGHT_HUM * values.var() else (nothing, 0.0)
+
+
+def without_velocity(recordings: Recordings) -> Recordings:
+    """Recordings of a position and its velocity less the velocity, where noise acts on that alone.
+
+    D then has no inverse, and f with its noise is found from the position, whose velocity is a state again.
+    Over a step h a position moves by ``c h (v + v') / 2``, off that by ``c² h² q / 12`` in the mean square
+    where v moves by q (Brownian bridge), and by errors of its sensor, which the next step takes back. What
+    has noise of its own moves by more.
+    """
+    floors = noise_floors(recordings) if len(recordings.names) == 2 else None
+    inside = np.diff(recordings.recording) == 0
+    steps, moves = np.diff(recordings.t), np.diff(recordings.values, axis=0)
+    for velocity in (0, 1):
+        if floors is None or not floors[velocity].process:
+            continue
+        values = recordings.values[:, velocity]
+        swept = np.where(inside, steps * (values[1:] + values[:-1]) / 2, 0.0)
+        moved = np.where(inside, moves[:, 1 - velocity], 0.0)
+        scale = float(moved @ swept) / float(swept @ swept)
+        rest = moved - scale * swept
+        error = 4 * float(rest @ rest) / np.sqrt(inside.sum())
+        apart = max(float(rest @ rest + 2 * rest[1:] @ rest[:-1]), error)
+        free = scale**2 * float(((steps * moves[:, velocity])[inside] ** 2).sum())
+        known = KNOWN_SCALE**2 * scale**2 * float(swept @ swept)
+        if apart < free and apart / inside.sum() < known:
+            told = {"column": recordings.titles[velocity], "position": recordings.titles[1 - velocity]}
+            found = recordings.of_states([1 - velocity], [Remark("data.velocity_found_again", told)])
+            enough = len(found.labels) > 1 or turns_back(found) or not _shows_no_process_noise(found)
+            return found if enough else recordings
+    return recordings
 
 
 def without_background(recordings: Recordings) -> Recordings:

@@ -17,7 +17,15 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from siq.data.preparation import in_stretches, joined, read_pairs, unusual, without_background, without_faults
+from siq.data.preparation import (
+    in_stretches,
+    joined,
+    read_pairs,
+    unusual,
+    without_background,
+    without_faults,
+    without_velocity,
+)
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.data.states import RecordStates
 from siq.errors import NumericalFailure
@@ -77,6 +85,8 @@ def _prepared(settings: PipelineSettings, recordings: Recordings) -> Recordings:
     if settings.sampling.background and not options.angles:  # an angle that turns on drifts by itself
         recordings = without_background(without_faults(recordings))
     if settings.space.names is None and not options.functions:  # which know states by their names
+        if options.hidden_velocities == "auto" and settings.space.diffusion is None:
+            recordings = without_velocity(recordings)
         recordings = recordings.centred(degree=options.degree)
     return in_stretches(recordings, hidden_velocities=options.hidden_velocities)
 
@@ -119,8 +129,6 @@ def identify_run(
     for one in unusual(recordings):
         if one.code == "data.wrapped_angle":
             return StepResult(None, Outcome(number, Step.IDENTIFY, Status.FAILED, sentence(one)))
-    if settings.training is not None:  # networks know recorded states only
-        options = replace(options, hidden_velocities=False)
     try:
         found = identify(
             recordings, options=options, limits=settings.certificate,

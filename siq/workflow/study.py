@@ -532,10 +532,14 @@ class PipelineSettings:
     invariant: tuple[Annotated[float, Field(gt=0)], ...] = ()
 
     def __post_init__(self) -> None:
-        if self.training is not None and self.identification.hidden_velocities is True:
+        if self.training is None:
+            return
+        if self.identification.hidden_velocities is True:
             raise Fault(
                 "networks know recorded states only, and velocities are hidden", "leave 'training' out"
             )
+        recorded = replace(self.identification, hidden_velocities=False)
+        object.__setattr__(self, "identification", recorded)
 
     @property
     def methods(self) -> tuple[Method, ...]:

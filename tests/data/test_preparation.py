@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from remembering import double_wells
 
-from siq.data.preparation import in_stretches, joined, without_faults
+from siq.data.preparation import in_stretches, joined, without_faults, without_velocity
 from siq.data.recordings import Recordings
 from siq.data.stationarity import runs_of
 
@@ -108,3 +108,34 @@ def test_a_state_far_from_zero_is_moved_by_a_round_number_and_called_so() -> Non
     assert found.names == ("p_minus_101325", "x") and found.titles == ("p − 101325", "x")
     assert found.values == pytest.approx(values - [101325, 0])
     assert table.centred(degree=1) is table  # a line through zero tells no more of its origin
+
+
+def oscillator(position_noise: float, velocity_noise: float, sensor: float = 0.0) -> Recordings:
+    """Two recordings of a damped oscillator at random, by steps a twentieth of the sampling."""
+    draw = np.random.default_rng(2)
+    x, v = np.array([1.0, -0.5]), np.zeros(2)
+    rows = []
+    for step in range(1500 * 20):
+        if step % 20 == 0:
+            rows.append([x, v])
+        x, v = (
+            x + 0.005 * v + position_noise * np.sqrt(0.005) * draw.standard_normal(2),
+            v + 0.005 * (-x - 0.5 * v) + velocity_noise * np.sqrt(0.005) * draw.standard_normal(2),
+        )
+    values = np.moveaxis(np.array(rows), (0, 1, 2), (1, 2, 0))
+    values[:, :, 0] += sensor * draw.standard_normal(values.shape[:2])
+    return Recordings.from_arrays(0.1 * np.arange(1500), values, names=["x", "v"])
+
+
+def test_a_velocity_on_which_all_noise_acts_is_found_again_from_its_position() -> None:
+    found = without_velocity(oscillator(0, 0.6))
+    assert found.names == ("x",) and found.remarks[-1].code == "data.velocity_found_again"
+    assert without_velocity(oscillator(0, 0.6, sensor=0.005)).names == ("x",)
+    exchanged = oscillator(0, 0.6)
+    exchanged = replace(exchanged, names=("v", "x"), values=exchanged.values[:, ::-1])
+    assert without_velocity(exchanged).names == ("x",)
+
+
+@pytest.mark.parametrize("noises", [(0.3, 0.6), (0.3, 0), (0, 0)])
+def test_noise_of_a_position_and_relaxations_keep_the_velocity(noises: tuple[float, float]) -> None:
+    assert without_velocity(oscillator(*noises)).names == ("x", "v")
