@@ -315,12 +315,12 @@ def _decimal_mark(file: str, rows: list[list[str]], width: int, separator: str) 
         remedy = "write decimal points, or separate the columns by semicolons if decimals have commas"
         raise InputError(file, "", fault, remedy)
     cells = [cell for row in rows for cell in row]
-    quoted = [cell for cell in cells if "," in cell and _NUMBER.fullmatch(cell.replace(",", ""))]
-    grouped = quoted if separator == "," else [cell for cell in cells if _GROUPED.fullmatch(cell)]
-    if grouped:
-        fault = f"'{grouped[0]}' has a mark between thousands, or a decimal comma"
-        remedy = "write numbers with a decimal point, and without marks between thousands"
-        raise InputError(file, "", fault, remedy)
+    for number, cell in ((number, cell) for number, row in enumerate(rows, 1) for cell in row):
+        quoted = separator == "," and "," in cell and _NUMBER.fullmatch(cell.replace(",", ""))
+        if quoted or (separator != "," and _GROUPED.fullmatch(cell)):
+            fault = f"'{cell}' has a mark between thousands, or a decimal comma"
+            remedy = "write numbers with a decimal point, and without marks between thousands"
+            raise InputError(file, f"row {number}", fault, remedy)
     commas = next((cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell)), None)
     points = next((cell for cell in cells if "." in cell and _NUMBER.fullmatch(cell)), None)
     if commas is not None and points is not None:

@@ -110,8 +110,8 @@ def read_heading(heading: str) -> _Heading:
 
     Examples
     --------
-    >>> [tuple(read_heading(text)[:2]) for text in ("bead x (µm)", "x(t)", "time_ms", "year")]
-    [('bead x', 'µm'), ('x', None), ('time', 'ms'), ('year', 'year')]
+    >>> [tuple(read_heading(text)[:2]) for text in ("bead x (µm)", "x(t)", "U/mV", "time_ms", "year")]
+    [('bead x', 'µm'), ('x', None), ('U', 'mV'), ('time', 'ms'), ('year', 'year')]
     >>> read_heading("age (yr b2k)")
     _Heading(title='age', unit='yr', before_present=True)
     """
@@ -123,11 +123,17 @@ def read_heading(heading: str) -> _Heading:
     text = heading.strip()
     if match := re.fullmatch(r"(.*?)\s*\[\s*(.*?)\s*\]", text):
         return _Heading(_TIME_ARGUMENT.sub("", match[1]), match[2] or None)
+    if (
+        (match := re.fullmatch(r"([^/]*[^/\s])\s*/\s*(\S.*)", text))
+        and is_unit(match[2])
+        and not is_unit(text)
+    ):
+        return _Heading(match[1], match[2].removeprefix("(").removesuffix(")"))
     if match := re.fullmatch(r"(.*?\S)\s*\(\s*(.*?)\s*\)", text):
         if is_unit(match[2]):
             return _Heading(_TIME_ARGUMENT.sub("", match[1]), match[2])
         return _Heading(_TIME_ARGUMENT.sub("", text), None)
-    for pattern in (r"(.*?\S)\s+/\s*(\S.*)", r"(.*?\S)\s+in\s+(\S.*)", r"(.*?\S)\s*,\s*(\S.*)"):
+    for pattern in (r"(.*?\S)\s+in\s+(\S.*)", r"(.*?\S)\s*,\s*(\S.*)"):
         if (match := re.fullmatch(pattern, text)) and is_unit(match[2]):
             return _Heading(match[1], match[2])
     if (

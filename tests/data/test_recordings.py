@@ -234,7 +234,12 @@ def test_a_clock_is_known_by_its_unit_or_by_its_even_steps(
         ("recording,t,x\na,inf,1\na,1,2\n", "row 1, column t", "infinite", "finite"),
         ("recording,t,x\na,0,1\na,1,-1e999\n", "row 2, column x", "infinite", "finite"),
         ("recording,t,x\na,0,1\n,1,2\n", "row 2, column recording", "label is missing", "label"),
-        ('recording,t,x\na,0,1\na,1,"2,5"\n', "row 2, column x", "'2,5' is no number", "decimal point"),
+        (
+            'recording,t,x\na,0,1\na,1,"2,5"\n',
+            "row 2",
+            "'2,5' has a mark between thousands, or a decimal comma",
+            "decimal point",
+        ),
         ("recording,t,x\na,0,1\na,noon,2\na,2,n/a!\n", "row 2, column t", "'noon' is no number", "number"),
         ("recording,t,x,y\na,0,1,\na,1,z,2\n", "row 2, column x", "'z' is no number", "remove the row"),
         ("recording,t,x\na,0,1 mm\na,1,2 cm\na,2,\n", "row 2, column x", "mixed units, cm", "one unit"),
