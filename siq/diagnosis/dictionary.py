@@ -372,7 +372,9 @@ def roles_of(model: Dynamics) -> Roles:
     speeds = tuple(name for name in others if name not in in_pairs and SPEED.fullmatch(units[name]))
     alone = [name for name in others if name not in in_pairs and name not in speeds]
     levels = tuple(name for name in alone if _has_root(equations[name], name))
-    living = [name for name in alone if units[name] == "1" or not _decays(model, name)]
+    # What nothing makes more, and no other state less, only decays.
+    mixed = {name for name in alone if len(equations[name].free_symbols & {*map(symbol, model.states)}) > 1}
+    living = [name for name in alone if units[name] == "1" or births(model, name) != 0 or name in mixed]
     populations = tuple(name for name in living if name not in levels and _stays_zero(model, name))
     feeding = tuple(pair for pair in itertools.permutations(populations, 2) if _feeds(model, *pair))
     formulas = (*model.equations, *dict(model.outputs).values())
@@ -493,13 +495,6 @@ def _stays_zero(model: Dynamics, name: str) -> bool:
         and np.abs(rate).max() <= FORMULA_TOLERANCE * np.abs(moving).max()
         and moving.any()
     )
-
-
-def _decays(model: Dynamics, name: str) -> bool:
-    """Whether nothing makes a state more, and no other state makes it less."""
-    equation = dict(zip(model.states, model.equations, strict=True))[name]
-    alone = equation.free_symbols.isdisjoint(map(symbol, {*model.states} - {name}))
-    return alone and births(model, name) == 0
 
 
 def _has_root(equation: sympy.Expr, name: str) -> bool:

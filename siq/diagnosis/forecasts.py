@@ -286,10 +286,7 @@ class _Site:
 
 
 def _sites(
-    candidates: Sequence[MechanismCandidate],
-    along: Fit,
-    context: FitContext,
-    untried: dict[str, NotFitted],
+    candidates: Sequence[MechanismCandidate], along: Fit, context: FitContext, untried: dict[str, NotFitted]
 ) -> list[_Site]:
     """All explanations on top of a fit, with their priors.
 
@@ -597,12 +594,18 @@ def _next_rung(
     if not leading:
         return None
     alone = {site.label: site for site in sites if site.candidate is not None}
+    d, outdone = base.model.dimension, set[str]()
+    if max(leading, key=lambda each: each.weight).candidate.model.dimension > d:
+        # States of its own may follow any motion: what needs none is fitted first, whatever it promises.
+        stateless = {each.label for each in candidates if each.model.dimension == d} - {*fitted, *untried}
+        for place in [place for place in order if sites[place].label in stateless][:ATTEMPTS]:
+            attempt(sites[place])
+        leading = [each for label, each in fitted.items() if label not in untried and each.gain > 0]
     # Of those that are not told apart, the one with the fewest parameters.
     heaviest = max(each.weight for each in leading)
     plausible = [each for each in leading if each.weight > heaviest + np.log(PLAUSIBLE)]
     leader = min(plausible, key=lambda each: (len(each.candidate.new), -each.weight))
     # All others are compared in the place of one that brings no states of its own.
-    d, outdone = base.model.dimension, set[str]()
     steady = [each for each in leading if each.candidate.model.dimension == d]
     if steady:
         ground = leader if leader in steady else max(steady, key=lambda each: each.weight)

@@ -195,7 +195,7 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
     return ways
 
 
-def escape_rate_over_cycle(
+def _escape_rate_over_cycle(
     dynamics: Dynamics, path: MinimumActionPath, start: LimitSet, over: Cycle
 ) -> EscapeRate:
     """The law of escape of two states over an unstable cycle, from a stable point or cycle.
@@ -423,7 +423,7 @@ def transitions(
                 raise NumericalFailure(missing)
             if isinstance(way.saddle, Cycle):
                 begin = path.points[0] if way.cycle is None else way.cycle
-                rate = escape_rate_over_cycle(dynamics, path, begin, way.saddle)
+                rate = _escape_rate_over_cycle(dynamics, path, begin, way.saddle)
             else:
                 rate = escape_rate(dynamics, path, beyond=way.end is not None, cycle=way.cycle)
             remarks += rate.remarks

@@ -481,7 +481,7 @@ def sweep(
     1    0.0     1   0.5000     0
     2    0.2     0   0.1634     1
     3    0.2     1   0.9592     0
-    4    0.5     1      NaN  <NA>
+    4    0.5     1      inf  <NA>
     >>> found.bifurcations[["kind", "value"]].round(6)
        kind   value
     0  fold  0.3849

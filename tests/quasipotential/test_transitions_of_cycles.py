@@ -12,7 +12,7 @@ from siq.errors import NumericalFailure
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.path_chains import MinimumActionPath
 from siq.quasipotential.paths import minimum_action_path
-from siq.quasipotential.transitions import escape_rate_over_cycle
+from siq.quasipotential.transitions import _escape_rate_over_cycle
 from siq.systems.cycles import Cycle, closed_orbit, hessians_along
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import hessian_at
@@ -131,7 +131,7 @@ def test_the_law_of_ways_over_a_cycle_errs_as_the_noise_does(outwards: bool) -> 
     """From the point, and from the outer ring, whose laws go with other powers of ε."""
     system = rings(2.0)
     path, start = (into(2.0), np.zeros(2)) if outwards else (out_of(2.0), ring(system, OUTER, 2.0))
-    law, errors = escape_rate_over_cycle(system, path, start, ring(system, INNER, 2.0)), []
+    law, errors = _escape_rate_over_cycle(system, path, start, ring(system, INNER, 2.0)), []
     assert law.power == (0.5 if outwards else 0.0) and law.phases is not None
     assert law.phases[0].max() < 1e-5 * path.action  # every phase is as good as any other
     for share in (10, 20, 40):
