@@ -323,11 +323,11 @@ def _sites(
 
 
 def _kind_of(candidate: MechanismCandidate, model: Dynamics) -> tuple[str, tuple[str, ...]]:
-    """The family of a mechanism, and where it acts: along a state, wherever that acts back, or in equations.
-
-    In a machine of several joints, friction in one of them acts on all.
-    """
+    """A mechanism's family, and where it acts: in a sensor, along a state that acts back, in equations."""
+    # In a machine of several joints, friction in one of them acts on all.
     along = candidate.coordinate
+    if not candidate.equations:
+        return candidate.family, tuple(name for name, _ in candidate.changes if name in dict(model.outputs))
     return candidate.family, (along,) if along in model.states else (along, *candidate.equations)
 
 
