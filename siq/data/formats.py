@@ -187,9 +187,8 @@ def _open_text(file: str) -> ColumnFile:
     separator = separator or _separator(lines)
     headings, title = _split(lines[0], separator), lines[0].strip()
     unnamed = all(map(_NUMERIC.fullmatch, headings))
-    if (
-        not unnamed and content.count(title.encode(), begin) > 1
-    ):  # tables put one below the other repeat theirs
+    # Tables put one below the other repeat their headings.
+    if not unnamed and content.count(title.encode(), begin) > 1:
         first, *others = content[begin:].splitlines()
         kept = [line for line in others if line.strip() != title.encode()]
         content, begin = b"\n".join([first, *kept]), 0

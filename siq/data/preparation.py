@@ -41,7 +41,7 @@ FALSE_FAULT_RATE = 1e-3  # probability with which a record of white noise has a 
 FEW_JUMPS, MOST_APART = 0.05, 0.01  # that stay, a sample that does not; of all samples
 QUARTERS, SAME_WAVE = 4, 0.5  # of a recording, in which a hum has one amplitude and phase, to a half of it
 SLIGHT_HUM = 0.1  # of the variance of a state: what moves it more may be the state itself, which circulates
-KNOWN_SCALE = 0.01  # relative error to which a velocity has to tell how its position moves
+KNOWN_SCALE = 0.01  # a choice: relative error to which a velocity tells how its position moves
 _STRETCH_LABEL = re.compile(r"(?P<label>.*) \((?P<number>\d+) of (?P<of>\d+)\)")
 SINGLE_RECORDING = (
     "there is one recording, and it shows no process noise, from which the state returns, but at most that of"
@@ -286,7 +286,7 @@ def without_velocity(recordings: Recordings) -> Recordings:
     D then has no inverse, and f with its noise is found from the position, whose velocity is a state again.
     Over a step h a position moves by ``c h (v + v') / 2``, off that by ``c² h² q / 12`` in the mean square
     where v moves by q (Brownian bridge), and by errors of its sensor, which the next step takes back. What
-    has noise of its own moves by more.
+    has noise of its own moves by more; twelve times the bridge is let pass.
     """
     floors = noise_floors(recordings) if len(recordings.names) == 2 else None
     inside = np.diff(recordings.recording) == 0
