@@ -575,12 +575,12 @@ def _next_rung(
     # The mechanisms that promise most, fitted at every horizon; those that foresee better than nothing.
     fitted, leading = dict[str, _Leader](), list[_Leader]()
 
-    def attempt(site: _Site) -> None:
-        for term in site.terms:  # from the next shape, where the best one leads nowhere
+    def attempt(site: _Site, promise: float = np.inf) -> None:
+        for term in site.terms:  # until one settles, or fails while others gain more than it promised
             another = _fitted_at(horizons, replace(site, terms=(term,)), budget, untried)
             if another is not None and not (site.label in untried and site.label in fitted):
                 fitted[site.label] = _Leader(site, *another)
-            if site.label not in untried:
+            if site.label not in untried or (another is None and any(e.weight > promise for e in leading)):
                 break
 
     weights = gains + np.array([site.prior for site in sites])
@@ -589,7 +589,7 @@ def _next_rung(
         if not gains[place] > 0 or len(leading) == LEADERS:
             break
         budget.says(f"candidate {number} of at most {min(ATTEMPTS, len(order))}: {sites[place].label}")
-        attempt(sites[place])
+        attempt(sites[place], weights[place])
         leading = [each for label, each in fitted.items() if label not in untried and each.gain > 0]
     if not leading:
         return None
@@ -599,7 +599,7 @@ def _next_rung(
         # States of its own may follow any motion: what needs none is fitted first, whatever it promises.
         stateless = {each.label for each in candidates if each.model.dimension == d} - {*fitted, *untried}
         for place in [place for place in order if sites[place].label in stateless][:ATTEMPTS]:
-            attempt(sites[place])
+            attempt(sites[place], weights[place])
         leading = [each for label, each in fitted.items() if label not in untried and each.gain > 0]
     # Of those that are not told apart, the one with the fewest parameters.
     heaviest = max(each.weight for each in leading)

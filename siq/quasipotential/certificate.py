@@ -510,8 +510,8 @@ def _level(
             continue
         if known is not None:
             return known
-        if not len(tops):  # then V, to second order, of most recorded starts
-            return level / LEVEL_SHARE
+        if not len(tops):  # then V, to second order, of most recorded starts, or what any curve comes to
+            return min(level, float(ends.max())) / LEVEL_SHARE
         if not (fan.ends == End.LEVEL).any():
             return float(ends.max())
         level *= 2

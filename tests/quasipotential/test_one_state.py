@@ -11,9 +11,10 @@ import pytest
 import sympy
 from known_escapes import line_exit_time
 from known_systems import KnownSystem, double_well, exact_field, portrait_of, potential_values
-from scipy.integrate import solve_ivp
+from scipy.integrate import quad, solve_ivp
 
 from siq.data.recordings import Recordings
+from siq.quasipotential.certificate import references_about
 from siq.quasipotential.invariant_density import SampledPotential, marginal_density
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
@@ -21,6 +22,7 @@ from siq.quasipotential.landscape_comparison import reference_landscape
 from siq.quasipotential.refinement import RefinementOptions
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import find_equilibria
+from siq.systems.phase_portrait import phase_portrait
 
 X = sympy.Symbol("x", real=True)
 ROOTS = (-1.0, 0.3, 1.5)  # of f: a well, the saddle, a well
@@ -146,6 +148,19 @@ def test_characteristics_are_the_reference_of_one_state() -> None:
     values, exact = reference.values, 2 * potential_values(known, reference.points) - left
     low = exact < top - left
     np.testing.assert_allclose(values[low], exact[low], atol=1e-4)
+
+
+def test_the_level_of_characteristics_is_no_higher_than_they_come_within_the_domain() -> None:
+    """Noise is weak at the stable state and strong elsewhere, so that its curvature promises a high level."""
+    made, lost = sympy.Rational(1, 50) + X**2 / (X**2 + sympy.Rational(1, 4)), sympy.Rational(21, 20) * X
+    system = Dynamics.of((X,), (made - lost,), diffusion=[[made + lost]])
+    portrait = phase_portrait(system, np.linspace(0, 2, 400)[:, None])
+    (reference,) = references_about(system, portrait)
+    highest = quad(
+        lambda x: float(-system.drift(np.array([[x]]))[0, 0] / (made + lost).subs(X, x)), 0.0207, 2
+    )[0]
+    assert not reference.fault
+    assert reference.level < 1.2 * highest
 
 
 def test_the_density_of_one_state_is_exact_from_either_formula() -> None:
