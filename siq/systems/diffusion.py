@@ -404,15 +404,10 @@ class _InUnits(Diffusion):
     def derivatives(self, y: np.ndarray, order: int = 1) -> np.ndarray:
         if self._constant is not None and order == 0:
             return np.broadcast_to(self._constant, (len(y), *self._constant.shape))
-        inner = self.noise.derivatives(self.center + y @ self.units.T, order)
-        if order == 0:
-            return np.asarray(self.factor * self._inverse @ inner @ self._inverse.T)
-        left, units = self._inverse, self.units
-        if order == 1:
-            turned = np.einsum("ai,bj,nijk,kl->nabl", left, left, inner, units, optimize=True)
-        else:
-            turned = np.einsum("ai,bj,nijkl,kc,ld->nabcd", left, left, inner, units, units, optimize=True)
-        return np.asarray(self.factor * turned)
+        turned = self.factor * self.noise.derivatives(self.center + y @ self.units.T, order)
+        for matrix in (self._inverse.T, self._inverse.T, *[self.units] * order):  # each index comes to the end
+            turned = np.tensordot(turned, matrix, axes=(1, 0))
+        return turned
 
     def push(self, y: np.ndarray, momenta: np.ndarray) -> np.ndarray:
         return super().push(y, momenta) if self._constant is None else momenta @ self._constant
