@@ -16,14 +16,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import sympy
 
 from siq.errors import Fault
 from siq.systems.diffusion import Diffusion
-from siq.systems.formulas import compile_formulas, compile_values, delay, exact_number
+from siq.systems.formulas import MAX_COMPILED, compile_formulas, compile_values, delay, exact_number
 
 TIME = sympy.Symbol("t", real=True)
 Compiled = Callable[..., Sequence[np.ndarray | float]]
@@ -31,6 +31,7 @@ TURN_TOLERANCE = 1e-9  # numerical, of a period: a state at the lower end of the
 JUMP_WIDTHS = 30.0  # widths of a jump over which its derivative is spread
 
 
+@lru_cache(maxsize=MAX_COMPILED)  # sympy looks through the assumptions each time
 def symbol(name: str) -> sympy.Symbol:
     """The symbol that stands for a name in every formula of a dynamics."""
     return TIME if name == "t" else sympy.Symbol(name, real=True)
@@ -200,12 +201,27 @@ class ParametricFunctions:
             smooth, formulas = [_without_teeth(each) for each in self._measured], self._measured
         # u(t - τ) depends on a parameter in τ through the slope of u, backwards.
         delays = [(_delayed(k), _slope(k), each.args[1]) for k, each in enumerate(self._delays)]
-        by_state = [each.diff(state) for each in smooth for state in self._states]
+        by_state = [_derivative(each, state) for each in smooth for state in self._states]
         return by_state + [
-            each.diff(one) - sum(each.diff(u) * slope * time.diff(one) for u, slope, time in delays)
+            _derivative(each, one)
+            - sum(_derivative(each, u) * slope * time.diff(one) for u, slope, time in delays)
             for each in formulas
             for one in self._free
         ]
+
+
+@lru_cache(maxsize=4 * MAX_COMPILED)
+def _derivative(formula: sympy.Expr, by: sympy.Symbol) -> sympy.Expr:
+    """Its derivative, part by part of sums and products: candidates have all parts but one in common."""
+    if by not in formula.free_symbols:
+        return sympy.Integer(0)
+    parts = formula.args
+    if formula.is_Add:
+        return sympy.Add(*(_derivative(each, by) for each in parts))
+    if formula.is_Mul:
+        derived = ((place, _derivative(each, by)) for place, each in enumerate(parts))
+        return sympy.Add(*(sympy.Mul(*parts[:k], one, *parts[k + 1 :]) for k, one in derived if one != 0))
+    return formula.diff(by)
 
 
 def _without_teeth(formula: sympy.Expr) -> sympy.Expr:
@@ -265,7 +281,7 @@ class JointExpectation:
     weight: float = 1.0
 
 
-COMPILED = ("functions", "delays", "_lags")
+COMPILED = ("functions", "delays", "free", "symbols", "_lags")
 """Cached properties that do not depend on the values of the parameters."""
 
 
@@ -566,7 +582,7 @@ class Dynamics:
         """∂f_i/∂x_j by (i, j), those that vanish left out: in many states most of them do."""
         number = {symbol: place for place, symbol in enumerate(self.symbols)}
         found = {
-            (i, number[symbol]): formula.diff(symbol)
+            (i, number[symbol]): _derivative(formula, symbol)
             for i, formula in enumerate(self._autonomous_formulas())
             for symbol in sorted(formula.free_symbols & set(self.symbols), key=number.__getitem__)
         }
@@ -585,7 +601,7 @@ class Dynamics:
             (i, j, k): second
             for (i, j), first in self._derivatives.items()
             for k, symbol in enumerate(self.symbols)
-            if k >= j and symbol in first.free_symbols and (second := first.diff(symbol)) != 0
+            if k >= j and symbol in first.free_symbols and (second := _derivative(first, symbol)) != 0
         }
         places = np.array(list(found), dtype=int).reshape(-1, 3).T
         return places, compile_formulas(list(found.values()), self.symbols)
