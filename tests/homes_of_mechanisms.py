@@ -268,6 +268,16 @@ HOMES: Mapping[str, Home] = {
         0.3,
         lambda rng: np.array([3.0, 1.5]) * np.exp(rng.normal(size=2) * 0.6),
     ),
+    "fermenter": Home(
+        {
+            "time_unit": "h",
+            "states": states(s="g/L", n="g/L", q="g/L"),
+            "parameters": {"m": {"value": 0.5, "unit": "1/h"}, **numbers(k=1.0, y=0.5, a=2.0)},
+            "equations": {"s": "-m*s/(k + s)*n/y", "n": "m*s/(k + s)*n", "q": "a*m*s/(k + s)*n"},
+        },
+        0.15,
+        lambda rng: np.array([rng.uniform(6, 14), rng.uniform(0.3, 2), rng.uniform(0, 4)]),
+    ),
     "crop": Home(
         {
             "time_unit": "a",
@@ -433,6 +443,7 @@ RESIDENTS: Sequence[Resident] = (
     Resident("quadratic drag", "mass", {"c": 0.4}),
     Resident("quadratic drag", "rotating frame", {"c": 0.2}),
     Resident("cubic damping", "mass", {"c": 0.2}),
+    Resident("eddy-current brake", "mass without damping", {"c": 1.5, "w": 0.5}),
     Resident("amplitude-dependent damping", "rotating frame", {"c": 0.1}),
     Resident("dry friction", "mass", {"c": 0.4}),
     Resident("dry friction", "rotating frame", {"c": 0.03}),
@@ -451,6 +462,8 @@ RESIDENTS: Sequence[Resident] = (
     Resident("mortality", "crop of known growth", {"c": 0.3}),
     Resident("harvest", "crop", {"c": 1.0, "w": 0.8}),
     Resident("Allee effect", "crop", {"c": 1.6, "w": 1.0}),
+    Resident("product inhibition", "fermenter", {"w": 4.0}, "of m in"),
+    Resident("product inhibition", "fermenter", {"c": 0.05}, "in proportion"),
     Resident("prey refuge", "prey and predator", {"m": 0.8}),
     Resident("sigmoid functional response", "prey with limits and predator", {"w": 1.5}, "with satiation"),
     Resident("sigmoid functional response", "prey and predator", {"w": 0.8}, "without satiation"),
@@ -510,6 +523,7 @@ RESIDENTS: Sequence[Resident] = (
     Resident("seasonality", "crop", {"c": 0.3, "d": 0.2, "w": 3.0}),
     Resident("seasonality", "epidemic", {"c": 0.3, "d": 0.2, "w": 0.5}, "of meetings"),
     Resident("saturation", "crop", {"h": 0.3}, "of growth"),
+    Resident("Allee effect", "crop", {"a": 1.5}, "threshold"),
     Resident("saturation", "laser", {"h": 0.5}, "of the gain"),
     Resident("cogging or gear ripple", "arm", {"c": 1.0, "d": 0.5, "n": 3.0}),
     Resident("clock offset and drift", "mass", {"o": 0.06}),

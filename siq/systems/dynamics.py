@@ -176,6 +176,14 @@ class ParametricFunctions:
         """Derivatives of h by states and by free parameters: ``(m, d, n)`` and ``(m, p, n)``."""
         return self._parted(len(self._measured), self._evaluated("output_slopes", x, signals, values))
 
+    def sides(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
+        """On which side of each pole of f all states lie: 1 or -1, and 0 of one that lies among them, ``(k,)``.
+
+        Of poles that move with a free parameter, as that of s/(K + s) does.
+        """
+        side = np.sign(self._evaluated("denominators", x, signals, values))
+        return np.where((side == side[:, :1]).all(axis=1), side[:, 0], 0.0)
+
     def _parted(self, count: int, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         ends, n = count * len(self._states), flat.shape[1]
         return flat[:ends].reshape(count, -1, n), flat[ends:].reshape(count, len(self._free), n)
@@ -195,6 +203,11 @@ class ParametricFunctions:
     def _formulas(self, what: str) -> list[sympy.Expr]:
         if what in ("rates", "outputs"):
             return self._equations if what == "rates" else self._measured
+        if what == "denominators":
+            powers = set[sympy.Pow]().union(*(each.atoms(sympy.Pow) for each in self._equations))
+            beside = {*self._states}, {*self._free}
+            below = {each.base for each in powers if each.exp.is_negative}
+            return sorted((one for one in below if all(one.free_symbols & each for each in beside)), key=str)
         smooth, formulas = self._smooth, self._equations
         if what == "output_slopes":
             smooth, formulas = [_without_teeth(each) for each in self._measured], self._measured

@@ -251,7 +251,7 @@ SCREENED = (
     "input gain", "thrust of a propeller", "actuator lag", "hidden capacity", "maturation delay",
     "cogging or gear ripple", "saturated elimination", "diode or exponential loss",
     "outflow through an opening", "thermal radiation",
-    "reverse reaction or backflow", "adaptation", "waning immunity",
+    "reverse reaction or backflow", "adaptation", "waning immunity", "eddy-current brake", "product inhibition",
 )  # fmt: skip
 
 
@@ -467,3 +467,27 @@ def test_a_population_is_limited_by_what_it_was() -> None:
     late = sum(by_name[f"z{k}_1"] for k in range(1, 5))
     expected = by_name["r"] * by_name["n"] - by_name["c"] * by_name["n"] * late
     assert sympy.simplify(model.equations[0] - expected) == 0
+
+
+def test_a_magnet_brakes_most_at_its_own_speed() -> None:
+    # Wouterse (1991): T = 2 T0/(v/w + w/v), largest at v = w, and viscous at low speed.
+    change = dict(the("eddy-current brake", "mass", "in v").changes)["v"]
+    c, w, v = (next(e for e in change.free_symbols if e.name == k) for k in ("c_1", "w_1", "v"))
+    assert sympy.simplify(change + 2 * (c * w / 2) / (v / w + w / v)) == 0
+
+
+def test_below_its_threshold_a_population_dies_out() -> None:
+    # Lewis and Kareiva (1993): r n (1 - n/K)(n/A - 1).
+    candidate, before = the("Allee effect", "crop", "threshold"), HOMES["crop"].model.equations[0]
+    a, n = (next(e for e in candidate.model.equations[0].free_symbols if e.name == k) for k in ("a_1", "n"))
+    assert sympy.simplify(candidate.model.equations[0] - before * (n / a - 1)) == 0
+
+
+def test_a_product_stops_those_who_make_it() -> None:
+    # Levenspiel (1980): growth ends at a concentration of the product; yields stay as they are.
+    candidate, before = the("product inhibition", "fermenter", "in proportion"), HOMES["fermenter"].model
+    c, q = (next(e for e in candidate.model.equations[1].free_symbols if e.name == k) for k in ("c_1", "q"))
+    for after, rate in zip(candidate.model.equations, before.equations, strict=True):
+        assert sympy.simplify(after - rate * (1 - c * q)) == 0
+    # In a chain of reactions without organisms it would be saturated elimination by another name.
+    assert not {"product inhibition"} & names(HOMES["two bodies"].model)

@@ -17,7 +17,7 @@ NAMES = (
     "linear stiffness", "geometric stiffness", "preload", "backlash", "gravity", "added mass",
     "moment of inertia", "linear damping", "quadratic stiffness", "cubic stiffness", "quintic stiffness",
     "quadratic drag", "cubic damping", "amplitude-dependent damping", "dry friction", "asymmetric friction",
-    "Stribeck friction", "position-dependent damping", "constant bias", "linear coupling",
+    "Stribeck friction", "eddy-current brake", "product inhibition", "position-dependent damping", "constant bias", "linear coupling",
     "nonlinear coupling", "self-limitation", "mortality", "harvest", "Allee effect", "prey refuge",
     "sigmoid functional response", "predator interference", "decay or leakage", "delayed response",
     "saturation", "parametric drive", "parameter drift", "periodic forcing", "overflow", "leak",
