@@ -278,6 +278,18 @@ HOMES: Mapping[str, Home] = {
         0.15,
         lambda rng: np.array([rng.uniform(6, 14), rng.uniform(0.3, 2), rng.uniform(0, 4)]),
     ),
+    "inducible gene": Home(
+        {
+            "time_unit": "h",
+            "states": states(s="nM"),
+            "inputs": {"u": {"unit": "nM", "interpolation": "zero_order"}},
+            "parameters": numbers(b=2.0, d=0.5),
+            "equations": {"s": "b*u - d*s"},
+        },
+        0.3,
+        lambda rng: rng.uniform(0.0, 4.0, size=1),
+        lambda rng, t: np.abs(inflow(rng, t)),
+    ),
     "crop": Home(
         {
             "time_unit": "a",
@@ -525,6 +537,10 @@ RESIDENTS: Sequence[Resident] = (
     Resident("saturation", "crop", {"h": 0.3}, "of growth"),
     Resident("Allee effect", "crop", {"a": 1.5}, "threshold"),
     Resident("saturation", "laser", {"h": 0.5}, "of the gain"),
+    Resident("saturation", "inducible gene", {"w": 1.0}, "threshold"),
+    Resident("attached oscillator", "mass", {"m": 0.3, "tau": 0.6, "z": 0.1}),
+    Resident("thermal radiation", "furnace", {"c": 2e-10, "d": 5.0}, "to surroundings"),
+    Resident("thermal radiation", "kettle", {"c": 1e-9, "d": 6.0}, "to surroundings"),
     Resident("cogging or gear ripple", "arm", {"c": 1.0, "d": 0.5, "n": 3.0}),
     Resident("clock offset and drift", "mass", {"o": 0.06}),
     Resident("clock offset and drift", "mass", {"o": 0.05, "r": 0.01}),

@@ -428,8 +428,8 @@ class _Shooting:
 
     def crosses(self, values: np.ndarray, x: np.ndarray) -> bool:
         """Whether a pole of f lies among states that were all on one side of it where the fit began."""
-        apart = self.sides != 0
-        return bool((_sides(self.model.with_values(values), self.grid.data, x)[apart] != self.sides[apart]).any())
+        sides = _sides(self.model.with_values(values), self.grid.data, x)
+        return bool((sides != self.sides)[self.sides != 0].any())
 
     def change_of(self, now: Fit, white: Whitened, expected: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         """The change of the free parameters that is asked for; what stands before a pole of f stays there."""

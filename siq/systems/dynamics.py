@@ -177,7 +177,7 @@ class ParametricFunctions:
         return self._parted(len(self._measured), self._evaluated("output_slopes", x, signals, values))
 
     def sides(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
-        """On which side of each pole of f all states lie: 1 or -1, and 0 of one that lies among them, ``(k,)``.
+        """On which side of each pole of f all states lie: 1 or -1, and 0 where it lies among them, ``(k,)``.
 
         Of poles that move with a free parameter, as that of s/(K + s) does.
         """

@@ -251,7 +251,8 @@ SCREENED = (
     "input gain", "thrust of a propeller", "actuator lag", "hidden capacity", "maturation delay",
     "cogging or gear ripple", "saturated elimination", "diode or exponential loss",
     "outflow through an opening", "thermal radiation",
-    "reverse reaction or backflow", "adaptation", "waning immunity", "eddy-current brake", "product inhibition",
+    "reverse reaction or backflow", "adaptation", "waning immunity", "eddy-current brake",
+    "product inhibition", "attached oscillator",
 )  # fmt: skip
 
 
@@ -491,3 +492,30 @@ def test_a_product_stops_those_who_make_it() -> None:
         assert sympy.simplify(after - rate * (1 - c * q)) == 0
     # In a chain of reactions without organisms it would be saturated elimination by another name.
     assert not {"product inhibition"} & names(HOMES["two bodies"].model)
+
+
+def test_an_absorber_stills_what_it_is_tuned_to() -> None:
+    # Ormondroyd and Den Hartog (1928): without damping of its own a body stands still where it is driven at
+    # the frequency of what is attached, and both push each other alike.
+    candidate = the("attached oscillator", "mass", "in v")
+    rates = dict(zip(candidate.model.states, candidate.model.equations, strict=True))
+    by_name = {each.name: each for formula in rates.values() for each in formula.free_symbols}
+    added = dict(candidate.changes)["v"]
+    assert sympy.simplify(added + by_name["m_1"] * rates["w_1"]) == 0
+    held = rates["w_1"].subs({by_name["x"]: 0, by_name["v"]: 0, by_name["z_1"]: 0})
+    assert sympy.simplify(held + by_name["y_1"] / by_name["tau_1"] ** 2) == 0
+
+
+def test_a_receptor_is_half_bound_at_its_constant() -> None:
+    # Hill (1910), two at a time: u²/(w² + u²), of which nothing is left in proportion where u is small.
+    change = the("saturation", "inducible gene", "threshold").model.equations[0]
+    u, w, b, s = (next(e for e in change.free_symbols if e.name == k) for k in ("u", "w_1", "b", "s"))
+    response = change.subs({s: 0, b: 1}) / w
+    assert response.subs(u, w) == sympy.Rational(1, 2) and sympy.limit(response.diff(u), u, 0) == 0
+
+
+def test_what_is_as_hot_as_its_surroundings_radiates_nothing() -> None:
+    # Boltzmann (1884): c (s⁴ - a⁴).
+    change = dict(the("thermal radiation", "furnace", "to surroundings").changes)["s"]
+    c, d, s = (next(e for e in change.free_symbols if e.name == k) for k in ("c_1", "d_1", "s"))
+    assert change.subs({d: c * 300**4, s: 300}) == 0
