@@ -252,7 +252,8 @@ SCREENED = (
     "cogging or gear ripple", "saturated elimination", "diode or exponential loss",
     "outflow through an opening", "thermal radiation",
     "reverse reaction or backflow", "adaptation", "waning immunity", "eddy-current brake",
-    "product inhibition", "attached oscillator",
+    "product inhibition", "attached oscillator", "asymmetric damping", "rate limit", "magnetic saturation",
+    "photoinhibition", "Gompertz growth", "second-order reaction",
 )  # fmt: skip
 
 
@@ -501,9 +502,9 @@ def test_an_absorber_stills_what_it_is_tuned_to() -> None:
     rates = dict(zip(candidate.model.states, candidate.model.equations, strict=True))
     by_name = {each.name: each for formula in rates.values() for each in formula.free_symbols}
     added = dict(candidate.changes)["v"]
-    assert sympy.simplify(added + by_name["m_1"] * rates["w_1"]) == 0
-    held = rates["w_1"].subs({by_name["x"]: 0, by_name["v"]: 0, by_name["z_1"]: 0})
-    assert sympy.simplify(held + by_name["y_1"] / by_name["tau_1"] ** 2) == 0
+    assert sympy.simplify(added + by_name["m_1"] * rates["z2_1"]) == 0
+    held = rates["z2_1"].subs({by_name["x"]: 0, by_name["v"]: 0, by_name["d_1"]: 0})
+    assert sympy.simplify(held + by_name["z1_1"] / by_name["tau_1"] ** 2) == 0
 
 
 def test_a_receptor_is_half_bound_at_its_constant() -> None:
@@ -519,3 +520,44 @@ def test_what_is_as_hot_as_its_surroundings_radiates_nothing() -> None:
     change = dict(the("thermal radiation", "furnace", "to surroundings").changes)["s"]
     c, d, s = (next(e for e in change.free_symbols if e.name == k) for k in ("c_1", "d_1", "s"))
     assert change.subs({d: c * 300**4, s: 300}) == 0
+
+
+def test_what_meets_its_like_is_half_gone_in_a_time_that_goes_with_its_amount() -> None:
+    # Guldberg and Waage (1879): 1/s grows evenly. Where two kinds meet, as much is lost of each.
+    home = HOMES["two substances"].model
+    change = dict(the("second-order reaction", "two substances", "in s").changes)["s"]
+    c, s = (next(e for e in change.free_symbols if e.name == k) for k in ("c_1", "s"))
+    assert sympy.simplify(-change / s**2 - c) == 0
+    both = the("second-order reaction", "two substances", "in s, r").model.equations
+    one, other = (sympy.expand(after - before) for after, before in zip(both, home.equations, strict=True))
+    assert one == other and one != 0
+    # Heat does not meet its like.
+    assert "second-order reaction" not in names(HOMES["heat"].model) | names(HOMES["furnace"].model)
+
+
+def test_growth_ends_where_its_logarithm_does() -> None:
+    # Laird (1964): V' = V (A - α log V), which ends at exp(A/α).
+    change = dict(the("Gompertz growth", "crop of known growth").changes)["n"]
+    c, n = (next(e for e in change.free_symbols if e.name == k) for k in ("c_1", "n"))
+    assert float((change / n).subs({c: 0.5, n: np.exp(2.0)})) == pytest.approx(-1.0)
+
+
+def test_light_is_best_at_its_own_strength() -> None:
+    # Steele (1962): u exp(1 - u/w), largest at w.
+    grown = the("photoinhibition", "algae").model.equations[0]
+    h, u = (next(e for e in grown.free_symbols if e.name == k) for k in ("h_1", "u"))
+    assert sympy.simplify(grown.diff(u).subs(u, 1 / h)) == 0
+
+
+def test_a_motor_goes_no_faster_than_it_can() -> None:
+    home = HOMES["circuit"].model
+    rate = the("rate limit", "circuit").model.equations[0]
+    (r,) = (e for e in rate.free_symbols if e.name == "r_1")
+    at = {e: 0.01 for e in home.equations[0].free_symbols if e.name == "s"}
+    at |= {e: 0.4 for e in home.equations[0].free_symbols if e.name == "g"}
+    for drive, slow in ((5.0, 0.25), (-5.0, -0.25), (0.1, None)):
+        (u,) = (e for e in home.equations[0].free_symbols if e.name == "u")
+        free = home.equations[0].subs({**at, u: drive})
+        assert float(rate.subs({**at, u: drive, r: 0.25})) == pytest.approx(
+            float(free) if slow is None else slow
+        )
