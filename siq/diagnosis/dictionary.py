@@ -551,7 +551,7 @@ def assignments(form: Form, model: Dynamics, roles: Roles) -> Iterator[dict[str,
         else:
             choices.append([{names[place]: name} for name in alone[kinds[place]]])
             place += 1
-    units = units_of(model)
+    units = units_of(model) | {entry.name: entry.unit for entry in model.parameters}
     order = {name: place for place, name in enumerate(model.states)}
     for combination in itertools.product(*choices):
         filled = [name for part in combination for name in part.values()]

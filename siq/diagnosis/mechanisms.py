@@ -335,9 +335,9 @@ def _build_candidate(
         known.setdefault(name, known.get(str(formula), "1"))
     units = {role: known.get(name, "1") for role, name in assignment.items()} | {"T": model.time_unit}
     shapes = {name: entry.shape for name, entry in form.parameters.items() if entry.shape is not None}
-    fixed = {name for name, shape in shapes.items() if shape.lattice_of is not None}
+    values = {symbol(each.name): each.value for each in model.parameters}  # as they are to begin with
     parameters = tuple(
-        Parameter(fresh[name], 0.0, unit_of(entry.unit, units), fixed=name in fixed)
+        Parameter(fresh[name], 0.0, unit_of(entry.unit, units), bool(entry.shape and entry.shape.lattice_of))
         for name, entry in form.parameters.items()
     )
     further = tuple((fresh[name], parse(entry.equation)) for name, entry in form.states.items())
@@ -355,7 +355,7 @@ def _build_candidate(
     searches = [  # with the system's own names in their formulas
         shape.model_copy(
             update={
-                key: assignment[text] if key in recorded else str(parse_formula(text, names))
+                key: assignment[text] if key in recorded else str(parse_formula(text, names).subs(values))
                 for key, text in shape.model_dump().items()
                 if isinstance(text, str)
             }

@@ -187,7 +187,7 @@ def _fit_most_promising(
             start = dict(promised.term.shapes)
             # Linearised amplitudes can be far off, and a fit that begins there may diverge: they are a start
             # only where shapes need one.
-            if candidate.amplitudes and candidate.shapes:
+            if candidate.amplitudes and candidate.shapes and promised.amplitudes.any():
                 start |= dict(zip(candidate.amplitudes, map(float, promised.amplitudes), strict=True))
             model = candidate.begun(begin.model, start)
             fit = fit_with_process_noise_as_needed(

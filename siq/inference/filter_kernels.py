@@ -22,57 +22,82 @@ from siq.numerics.integration import machine_code
 @machine_code
 def carry_linearly(
     step: np.ndarray,
-    jacobians: np.ndarray,
-    forcings: np.ndarray,
+    by_state: np.ndarray,
+    by_parameter: np.ndarray,
+    begin: int,
     transition: np.ndarray,
     response: np.ndarray,
 ) -> None:
     """Carry deviations of the state over one substep, in place: ``S' = J S + F`` by the Runge–Kutta rule.
 
+    The four stages are multiplied out: with A, B, C for J at the start, the middle and the end,
+
+        ``h/6 (1 + h B + h²/2 B² + h³/4 C B²)``, ``h/6 (4 + h (B + C) + h²/2 C B)`` and ``h/6``
+
+    are the weights of what drives S at these places, J S at the start of the substep and F there. All
+    intervals lie side by side in memory, and are worked out together.
+
     Parameters
     ----------
     step
         Lengths of the substeps, shape ``(n,)``.
-    jacobians
-        J at the start, the middle and the end of each, shape ``(3, n, d, d)``.
-    forcings
-        F at the same places, shape ``(3, n, d, p)``: the derivatives by parameters.
+    by_state, by_parameter
+        J and F, the derivatives by parameters, ``(d, d, 3 n)`` or more and ``(d, p, 3 n)``: all n
+        starts from `begin` on, then all middles, then all ends.
     transition
-        Shape ``(n, d, d)``: derivative of the state by the state at the start of the interval.
+        Shape ``(d, d, n)``: derivative of the state by the state at the start of the interval.
     response
-        Shape ``(n, d, p)``: derivative of the state by the parameters.
+        Shape ``(d, p, n)``: derivative of the state by the parameters.
     """
-    intervals, dimension, columns = forcings.shape[1:]
-    slope = np.empty(dimension)
-    weights = (1.0, 2.0, 2.0, 1.0)
-    reach = (0.0, 0.5, 0.5, 1.0)
-    node = (0, 1, 1, 2)
-    begin = np.empty(dimension)
-    at = np.empty(dimension)
-    total = np.empty(dimension)
-    for k in range(intervals):
+    d, columns = by_parameter.shape[:2]
+    count = len(step)
+    middle, end = begin + count, begin + 2 * count
+    bent = np.empty((d, d))
+    first, second, whole = np.empty((d, d, count)), np.empty((d, d, count)), np.empty((d, d, count))
+    for k in range(count):
         h = step[k]
-        for c in range(dimension + columns):
-            for i in range(dimension):
-                begin[i] = transition[k, i, c] if c < dimension else response[k, i, c - dimension]
-                total[i] = 0.0
-                slope[i] = 0.0
-            for stage in range(4):
-                place = node[stage]
-                for i in range(dimension):
-                    at[i] = begin[i] + reach[stage] * h * slope[i]
-                for i in range(dimension):
-                    value = forcings[place, k, i, c - dimension] if c >= dimension else 0.0
-                    for j in range(dimension):
-                        value += jacobians[place, k, i, j] * at[j]
-                    slope[i] = value
-                    total[i] += weights[stage] * value
-            for i in range(dimension):
-                value = begin[i] + h / 6.0 * total[i]
-                if c < dimension:
-                    transition[k, i, c] = value
-                else:
-                    response[k, i, c - dimension] = value
+        for i in range(d):
+            for j in range(d):
+                value = 0.0
+                for m in range(d):
+                    value += by_state[i, m, end + k] * by_state[m, j, middle + k]
+                bent[i, j] = by_state[i, j, middle + k] + 0.5 * h * value
+                second[i, j, k] = h / 6.0 * h * (by_state[i, j, end + k] + bent[i, j])
+            second[i, i, k] += h / 6.0 * 4.0
+        for i in range(d):
+            for j in range(d):
+                value = 0.0
+                for m in range(d):
+                    value += bent[i, m] * by_state[m, j, middle + k]
+                first[i, j, k] = h / 6.0 * h * (by_state[i, j, middle + k] + 0.5 * h * value)
+            first[i, i, k] += h / 6.0
+        for i in range(d):
+            for j in range(d):
+                value = h / 6.0 * by_state[i, j, end + k]
+                for m in range(d):
+                    value += first[i, m, k] * by_state[m, j, begin + k]
+                    value += second[i, m, k] * by_state[m, j, middle + k]
+                whole[i, j, k] = value
+            whole[i, i, k] += 1.0
+    held = np.empty((d, count))
+    for c in range(d + columns):
+        state = transition[:, c] if c < d else response[:, c - d]
+        held[:] = state
+        for i in range(d):
+            if c < d:
+                state[i] = 0.0
+            else:
+                for k in range(count):
+                    state[i, k] = step[k] / 6.0 * by_parameter[i, c - d, end + k]
+            for j in range(d):
+                for k in range(count):
+                    state[i, k] += whole[i, j, k] * held[j, k]
+                if c >= d:
+                    forcing = by_parameter[j, c - d]
+                    for k in range(count):
+                        state[i, k] += (
+                            first[i, j, k] * forcing[begin + k] + second[i, j, k] * forcing[middle + k]
+                        )
 
 
 @machine_code

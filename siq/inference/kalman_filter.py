@@ -313,10 +313,10 @@ def _carried(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """States ``(d, k)`` at the ends of intervals, and their derivatives ``(k, d, d)``, ``(k, d, width)``."""
     delays, step, (d, count) = model.lags(values), grid.step, state.shape
-    transition, response = np.broadcast_to(np.eye(d), (count, d, d)).copy(), np.zeros((count, d, width))
+    transition, response = np.repeat(np.eye(d)[:, :, None], count, axis=2), np.zeros((d, width, count))
     for place in grid.data.restarting:
         state[place] = 0.0
-        transition[:, place, place] = 0.0
+        transition[place, place] = 0.0
 
     # All derivatives at once, or of so many substeps as are not too much to keep.
     together = 1 if columns is not None else max(INTERVALS // max(count, 1), 1)
@@ -338,13 +338,9 @@ def _carried(
         if columns is not None:
             further = [columns.rates(x, values, node) for x, node in zip(places, nodes, strict=True)]
             by_parameter = np.concatenate([by_parameter, np.concatenate(further, axis=2)], axis=1)
-        jacobians, forcings = (
-            np.ascontiguousarray(each.transpose(2, 0, 1)).reshape(len(places) // 3, 3, count, *each.shape[:2])
-            for each in (by_state, by_parameter)
-        )
-        for jacobian, forcing in zip(jacobians, forcings, strict=True):
-            carry_linearly(step, jacobian, forcing, transition, response)
-    return state, transition, response
+        for begin in range(0, len(places) * count, 3 * count):
+            carry_linearly(step, by_state, by_parameter, begin, transition, response)
+    return state, transition.transpose(2, 0, 1), response.transpose(2, 0, 1)
 
 
 def substeps_needed(

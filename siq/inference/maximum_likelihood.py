@@ -31,6 +31,7 @@ from siq.inference.kalman_filter import (
     Grid,
     Linearisation,
     Noise,
+    Whitened,
     linearise,
     solve,
     substeps_needed,
@@ -375,8 +376,11 @@ def _ended(at: Fit, data: Measurements, *, converged: bool, resolution: float) -
     innovations = np.append(white.innovations, expected[1])
     total = float(innovations @ innovations)
     together = sum(len(each.roots) for each in at.model.expected_together)
+    there = _changed(at.model, change) if converged else at.model
+    if (_sides(there, data, at.x) != _sides(at.model, data, at.x)).any():
+        there = at.model  # before a pole of f, where what is likeliest lies beyond it
     return replace(
-        at, model=_changed(at.model, change) if converged else at.model, covariance=covariance,
+        at, model=there, covariance=covariance,
         log_likelihood=white.log_likelihood(total), sum_of_squares=total,
         degrees_of_freedom=white.degrees_of_freedom + together - len(at.model.free), converged=converged,
     )  # fmt: skip
@@ -420,6 +424,27 @@ class _Shooting:
         resting = RESTING * np.where(np.isfinite(wide), wide, about_zero)
         self.model, self.grid, self.scale = model, Grid(data, substeps), np.maximum(x.std(axis=0), resting)
         self.filtered, self.closed, self.budget = filtered, closed, budget
+        self.sides = _sides(model, data, x)
+
+    def crosses(self, values: np.ndarray, x: np.ndarray) -> bool:
+        """Whether a pole of f lies among states that were all on one side of it where the fit began."""
+        sides = _sides(self.model.with_values(values), self.grid.data, x)
+        return bool((sides != self.sides)[self.sides != 0].any())
+
+    def change_of(self, now: Fit, white: Whitened, expected: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        """The change of the free parameters that is asked for; what stands before a pole of f stays there."""
+        at, free = now.model.values, list(self.model.free)
+        moves = np.ones(len(free))
+        while True:
+            rows = (expected[0] * moves, expected[1])
+            change = replace(white, columns=white.columns * moves).solve(rows, least=self.resolution)[0]
+            stuck = self.sides.any() and [
+                self.crosses(at + np.eye(len(at))[place] * SHORTEST_STEP * one, now.linearised_at)
+                for place, one in zip(free, change * moves, strict=True)
+            ]
+            if not np.any(stuck):
+                return change
+            moves = np.where(stuck, 0.0, moves)
 
     @property
     def resolution(self) -> float:
@@ -468,7 +493,7 @@ class _Shooting:
         while length >= SHORTEST_STEP:
             model, x = _changed(now.model, length * change), now.linearised_at + length * deviation
             along = self.linearised(model.values, x, spread, noise)
-            if along.finite:
+            if along.finite and not self.crosses(model.values, x):
                 expected = (1 - length) * here.gap[rows] + length * foreseen
                 unforeseen = np.sqrt(np.mean(((along.gap[rows] - expected) / scale) ** 2))
                 if unforeseen <= NONLINEAR * length * effect + HARMLESS * usual + 1e-9:
@@ -505,7 +530,7 @@ class _Shooting:
             now = replace(now, noise=noise)
             self.charge()
             white = whiten(now.linearisation, data, noise)
-            change, _ = white.solve(expected, least=self.resolution)
+            change = self.change_of(now, white, expected)
             explained = white.columns @ change
             left = white.innovations - explained
             settled = SETTLED * len(left) * max(1.0, (left**2).sum() / len(left))
@@ -603,6 +628,12 @@ def fit_by_filter(
         shooting = _Shooting(model, data, x, substeps, filtered=True, closed=closed, budget=budget)
         along = shooting.linearised(model.values, x, None, noise)
         return shooting.fit(x, along, noise, estimate_process=estimate_process, most=iterations)
+
+
+def _sides(model: Dynamics, data: Measurements, x: np.ndarray) -> np.ndarray:
+    """On which side of each pole of f states ``(n, d)`` lie."""
+    signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
+    return model.functions.sides(x.T, signals, model.values)
 
 
 def _stands_still(totals: list[float]) -> bool:

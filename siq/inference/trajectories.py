@@ -232,19 +232,22 @@ def fit_trajectories(
     work, free = substeps * evaluation(model, data), np.array(model.free, dtype=int)
     count = int(np.isfinite(data.outputs).sum())
     slightest = min(ACCURACY, SETTLED / max(count, 1))
-    grid = Grid(data, substeps)
+    grid, sides = Grid(data, substeps), None
 
     def followed(values: np.ndarray, begin: np.ndarray) -> tuple[np.ndarray, float]:
         """States at all samples, and the sum of squares, not finite where the simulation runs away."""
         states = run(model.with_values(values), grid, begin)
-        outputs = model.functions.outputs(states.T, grid.at_samples(model.lags(values)), values).T
+        signals = grid.at_samples(model.lags(values))
+        outputs = model.functions.outputs(states.T, signals, values).T
         left = ((outputs - data.outputs) / np.sqrt(noise.measurement))[np.isfinite(data.outputs)]
         _, expected = expectations(model, values)
-        return states, float(left @ left + expected @ expected)
+        aside = sides is None or (model.functions.sides(states.T, signals, values) == sides)[sides != 0].all()
+        return states, float(left @ left + expected @ expected) if aside else np.inf
 
     with np.errstate(all="ignore"):
         values, converged, damping, normal = model.values, False, FIRST_DAMPING, None
         states, total = followed(values, begin)
+        sides = model.functions.sides(states.T, grid.at_samples(model.lags(values)), values)
         for _ in range(max(TRIALS, WORK // max(count, 1)) if np.isfinite(total) else 0):
             if budget is not None:
                 budget.charge(work * (RUN if normal is not None else 1.0 + RUN))

@@ -16,14 +16,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import sympy
 
 from siq.errors import Fault
 from siq.systems.diffusion import Diffusion
-from siq.systems.formulas import compile_formulas, compile_values, delay, exact_number
+from siq.systems.formulas import MAX_COMPILED, compile_formulas, compile_values, delay, exact_number
 
 TIME = sympy.Symbol("t", real=True)
 Compiled = Callable[..., Sequence[np.ndarray | float]]
@@ -31,6 +31,7 @@ TURN_TOLERANCE = 1e-9  # numerical, of a period: a state at the lower end of the
 JUMP_WIDTHS = 30.0  # widths of a jump over which its derivative is spread
 
 
+@lru_cache(maxsize=MAX_COMPILED)  # sympy looks through the assumptions each time
 def symbol(name: str) -> sympy.Symbol:
     """The symbol that stands for a name in every formula of a dynamics."""
     return TIME if name == "t" else sympy.Symbol(name, real=True)
@@ -176,6 +177,14 @@ class ParametricFunctions:
         """Derivatives of h by states and by free parameters: ``(m, d, n)`` and ``(m, p, n)``."""
         return self._parted(len(self._measured), self._evaluated("output_slopes", x, signals, values))
 
+    def sides(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
+        """On which side of each pole of f all states lie: 1 or -1, and 0 where it lies among them, ``(k,)``.
+
+        Of poles that move with a free parameter, as that of s/(K + s) does.
+        """
+        side = np.sign(self._evaluated("denominators", x, signals, values))
+        return np.where((side == side[:, :1]).all(axis=1), side[:, 0], 0.0)
+
     def _parted(self, count: int, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         ends, n = count * len(self._states), flat.shape[1]
         return flat[:ends].reshape(count, -1, n), flat[ends:].reshape(count, len(self._free), n)
@@ -195,17 +204,37 @@ class ParametricFunctions:
     def _formulas(self, what: str) -> list[sympy.Expr]:
         if what in ("rates", "outputs"):
             return self._equations if what == "rates" else self._measured
+        if what == "denominators":
+            powers = set[sympy.Pow]().union(*(each.atoms(sympy.Pow) for each in self._equations))
+            beside = {*self._states}, {*self._free}
+            below = {each.base for each in powers if each.exp.is_negative}
+            return sorted((one for one in below if all(one.free_symbols & each for each in beside)), key=str)
         smooth, formulas = self._smooth, self._equations
         if what == "output_slopes":
             smooth, formulas = [_without_teeth(each) for each in self._measured], self._measured
         # u(t - τ) depends on a parameter in τ through the slope of u, backwards.
         delays = [(_delayed(k), _slope(k), each.args[1]) for k, each in enumerate(self._delays)]
-        by_state = [each.diff(state) for each in smooth for state in self._states]
+        by_state = [_derivative(each, state) for each in smooth for state in self._states]
         return by_state + [
-            each.diff(one) - sum(each.diff(u) * slope * time.diff(one) for u, slope, time in delays)
+            _derivative(each, one)
+            - sum(_derivative(each, u) * slope * time.diff(one) for u, slope, time in delays)
             for each in formulas
             for one in self._free
         ]
+
+
+@lru_cache(maxsize=4 * MAX_COMPILED)
+def _derivative(formula: sympy.Expr, by: sympy.Symbol) -> sympy.Expr:
+    """Its derivative, part by part of sums and products: candidates have all parts but one in common."""
+    if by not in formula.free_symbols:
+        return sympy.Integer(0)
+    parts = formula.args
+    if formula.is_Add:
+        return sympy.Add(*(_derivative(each, by) for each in parts))
+    if formula.is_Mul:
+        derived = ((place, _derivative(each, by)) for place, each in enumerate(parts))
+        return sympy.Add(*(sympy.Mul(*parts[:k], one, *parts[k + 1 :]) for k, one in derived if one != 0))
+    return formula.diff(by)
 
 
 def _without_teeth(formula: sympy.Expr) -> sympy.Expr:
@@ -265,7 +294,7 @@ class JointExpectation:
     weight: float = 1.0
 
 
-COMPILED = ("functions", "delays", "_lags")
+COMPILED = ("functions", "delays", "free", "symbols", "_lags")
 """Cached properties that do not depend on the values of the parameters."""
 
 
@@ -566,7 +595,7 @@ class Dynamics:
         """∂f_i/∂x_j by (i, j), those that vanish left out: in many states most of them do."""
         number = {symbol: place for place, symbol in enumerate(self.symbols)}
         found = {
-            (i, number[symbol]): formula.diff(symbol)
+            (i, number[symbol]): _derivative(formula, symbol)
             for i, formula in enumerate(self._autonomous_formulas())
             for symbol in sorted(formula.free_symbols & set(self.symbols), key=number.__getitem__)
         }
@@ -585,7 +614,7 @@ class Dynamics:
             (i, j, k): second
             for (i, j), first in self._derivatives.items()
             for k, symbol in enumerate(self.symbols)
-            if k >= j and symbol in first.free_symbols and (second := first.diff(symbol)) != 0
+            if k >= j and symbol in first.free_symbols and (second := _derivative(first, symbol)) != 0
         }
         places = np.array(list(found), dtype=int).reshape(-1, 3).T
         return places, compile_formulas(list(found.values()), self.symbols)

@@ -29,6 +29,7 @@ from typing import Literal
 import jinja2
 import numpy as np
 import sympy
+from sympy.functions.elementary.piecewise import ExprCondPair
 from sympy.printing.c import C99CodePrinter, reserved_words
 from sympy.printing.codeprinter import CodePrinter
 from sympy.printing.julia import JuliaCodePrinter
@@ -273,7 +274,7 @@ def _compiled(
         list(expressions),
         modules=[{"integer_power": _integer_power}, "numpy"],
         printer=_ProductPrinter(),
-        cse=common,
+        cse=_common_parts if common else False,
         docstring_limit=0,  # to write the formulas out once more would take a third of the time
         # Renaming is slow, and needed only for names that the generated code may use itself.
         dummify=any(
@@ -281,6 +282,48 @@ def _compiled(
             for each in variables
         ),
     )
+
+
+def _common_parts(
+    expressions: Sequence[sympy.Expr],
+) -> tuple[list[tuple[sympy.Symbol, sympy.Expr]], list[sympy.Expr]]:
+    """What stands in expressions more than once, by the symbols that are put in its place.
+
+    `sympy.cse` simplifies anew whatever it has put a symbol into, which takes ten times as long.
+    """
+    taken = {each.name for formula in expressions for each in formula.free_symbols}
+    symbols = (each for each in sympy.numbered_symbols("_part", real=True) if each.name not in taken)
+    seen: set[sympy.Basic] = set()
+    twice: set[sympy.Basic] = set()
+    named: dict[sympy.Basic, sympy.Symbol] = {}
+    parts: list[tuple[sympy.Symbol, sympy.Expr]] = []
+
+    def look(at: sympy.Basic) -> None:
+        if at.args and at in seen:
+            twice.add(at)
+        elif at.args:
+            seen.add(at)
+            for each in at.args:
+                look(each)
+
+    def written(formula: sympy.Basic) -> sympy.Basic:
+        if not formula.args or formula in named:
+            return named.get(formula, formula)
+        put = [written(each) for each in formula.args]
+        if any(new is not old for new, old in zip(put, formula.args, strict=True)):
+            kept = {} if isinstance(formula, ExprCondPair) else {"evaluate": False}
+            result = formula.func(*put, **kept)
+        else:
+            result = formula
+        if formula in twice and isinstance(formula, sympy.Expr):
+            named[formula] = next(symbols)
+            parts.append((named[formula], result))
+            return named[formula]
+        return result
+
+    for formula in expressions:
+        look(formula)
+    return parts, [written(formula) for formula in expressions]
 
 
 def exact_number(value: float) -> sympy.Expr:

@@ -251,7 +251,9 @@ SCREENED = (
     "input gain", "thrust of a propeller", "actuator lag", "hidden capacity", "maturation delay",
     "cogging or gear ripple", "saturated elimination", "diode or exponential loss",
     "outflow through an opening", "thermal radiation",
-    "reverse reaction or backflow", "adaptation", "waning immunity",
+    "reverse reaction or backflow", "adaptation", "waning immunity", "eddy-current brake",
+    "product inhibition", "attached oscillator", "asymmetric damping", "rate limit", "magnetic saturation",
+    "photoinhibition", "Gompertz growth", "second-order reaction",
 )  # fmt: skip
 
 
@@ -467,3 +469,95 @@ def test_a_population_is_limited_by_what_it_was() -> None:
     late = sum(by_name[f"z{k}_1"] for k in range(1, 5))
     expected = by_name["r"] * by_name["n"] - by_name["c"] * by_name["n"] * late
     assert sympy.simplify(model.equations[0] - expected) == 0
+
+
+def test_a_magnet_brakes_most_at_its_own_speed() -> None:
+    # Wouterse (1991): T = 2 T0/(v/w + w/v), largest at v = w, and viscous at low speed.
+    change = dict(the("eddy-current brake", "mass", "in v").changes)["v"]
+    c, w, v = (next(e for e in change.free_symbols if e.name == k) for k in ("c_1", "w_1", "v"))
+    assert sympy.simplify(change + 2 * (c * w / 2) / (v / w + w / v)) == 0
+
+
+def test_below_its_threshold_a_population_dies_out() -> None:
+    # Lewis and Kareiva (1993): r n (1 - n/K)(n/A - 1).
+    candidate, before = the("Allee effect", "crop", "threshold"), HOMES["crop"].model.equations[0]
+    a, n = (next(e for e in candidate.model.equations[0].free_symbols if e.name == k) for k in ("a_1", "n"))
+    assert sympy.simplify(candidate.model.equations[0] - before * (n / a - 1)) == 0
+
+
+def test_a_product_stops_those_who_make_it() -> None:
+    # Levenspiel (1980): growth ends at a concentration of the product; yields stay as they are.
+    candidate, before = the("product inhibition", "fermenter", "in proportion"), HOMES["fermenter"].model
+    c, q = (next(e for e in candidate.model.equations[1].free_symbols if e.name == k) for k in ("c_1", "q"))
+    for after, rate in zip(candidate.model.equations, before.equations, strict=True):
+        assert sympy.simplify(after - rate * (1 - c * q)) == 0
+    # In a chain of reactions without organisms it would be saturated elimination by another name.
+    assert not {"product inhibition"} & names(HOMES["two bodies"].model)
+
+
+def test_an_absorber_stills_what_it_is_tuned_to() -> None:
+    # Ormondroyd and Den Hartog (1928): without damping of its own a body stands still where it is driven at
+    # the frequency of what is attached, and both push each other alike.
+    candidate = the("attached oscillator", "mass", "in v")
+    rates = dict(zip(candidate.model.states, candidate.model.equations, strict=True))
+    by_name = {each.name: each for formula in rates.values() for each in formula.free_symbols}
+    added = dict(candidate.changes)["v"]
+    assert sympy.simplify(added + by_name["m_1"] * rates["z2_1"]) == 0
+    held = rates["z2_1"].subs({by_name["x"]: 0, by_name["v"]: 0, by_name["d_1"]: 0})
+    assert sympy.simplify(held + by_name["z1_1"] / by_name["tau_1"] ** 2) == 0
+
+
+def test_a_receptor_is_half_bound_at_its_constant() -> None:
+    # Hill (1910), two at a time: u²/(w² + u²), of which nothing is left in proportion where u is small.
+    change = the("saturation", "inducible gene", "threshold").model.equations[0]
+    u, w, b, s = (next(e for e in change.free_symbols if e.name == k) for k in ("u", "w_1", "b", "s"))
+    response = change.subs({s: 0, b: 1}) / w
+    assert response.subs(u, w) == sympy.Rational(1, 2) and sympy.limit(response.diff(u), u, 0) == 0
+
+
+def test_what_is_as_hot_as_its_surroundings_radiates_nothing() -> None:
+    # Boltzmann (1884): c (s⁴ - a⁴).
+    change = dict(the("thermal radiation", "furnace", "to surroundings").changes)["s"]
+    c, d, s = (next(e for e in change.free_symbols if e.name == k) for k in ("c_1", "d_1", "s"))
+    assert change.subs({d: c * 300**4, s: 300}) == 0
+
+
+def test_what_meets_its_like_is_half_gone_in_a_time_that_goes_with_its_amount() -> None:
+    # Guldberg and Waage (1879): 1/s grows evenly. Where two kinds meet, as much is lost of each.
+    home = HOMES["two substances"].model
+    change = dict(the("second-order reaction", "two substances", "in s").changes)["s"]
+    c, s = (next(e for e in change.free_symbols if e.name == k) for k in ("c_1", "s"))
+    assert sympy.simplify(-change / s**2 - c) == 0
+    both = the("second-order reaction", "two substances", "in s, r").model.equations
+    one, other = (sympy.expand(after - before) for after, before in zip(both, home.equations, strict=True))
+    assert one == other and one != 0
+    # Heat does not meet its like.
+    assert "second-order reaction" not in names(HOMES["heat"].model) | names(HOMES["furnace"].model)
+
+
+def test_growth_ends_where_its_logarithm_does() -> None:
+    # Laird (1964): V' = V (A - α log V), which ends at exp(A/α).
+    change = dict(the("Gompertz growth", "crop of known growth").changes)["n"]
+    c, n = (next(e for e in change.free_symbols if e.name == k) for k in ("c_1", "n"))
+    assert float((change / n).subs({c: 0.5, n: np.exp(2.0)})) == pytest.approx(-1.0)
+
+
+def test_light_is_best_at_its_own_strength() -> None:
+    # Steele (1962): u exp(1 - u/w), largest at w.
+    grown = the("photoinhibition", "algae").model.equations[0]
+    h, u = (next(e for e in grown.free_symbols if e.name == k) for k in ("h_1", "u"))
+    assert sympy.simplify(grown.diff(u).subs(u, 1 / h)) == 0
+
+
+def test_a_motor_goes_no_faster_than_it_can() -> None:
+    home = HOMES["circuit"].model
+    rate = the("rate limit", "circuit").model.equations[0]
+    (r,) = (e for e in rate.free_symbols if e.name == "r_1")
+    at = {e: 0.01 for e in home.equations[0].free_symbols if e.name == "s"}
+    at |= {e: 0.4 for e in home.equations[0].free_symbols if e.name == "g"}
+    for drive, slow in ((5.0, 0.25), (-5.0, -0.25), (0.1, None)):
+        (u,) = (e for e in home.equations[0].free_symbols if e.name == "u")
+        free = home.equations[0].subs({**at, u: drive})
+        assert float(rate.subs({**at, u: drive, r: 0.25})) == pytest.approx(
+            float(free) if slow is None else slow
+        )

@@ -15,6 +15,7 @@ from siq.inference import maximum_likelihood, recalibration
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit, _Shooting, fit_by_multiple_shooting
 from siq.inference.measurements import Measurements
+from siq.inference.trajectories import fit_trajectories
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Parameter
 
@@ -115,3 +116,26 @@ def test_trajectories_are_not_followed_where_no_simulation_comes_near_the_sensor
             changed.setattr(recalibration, "fit_trajectories", counted)
             fit = recalibration.fit_with_process_noise_as_needed(decay, data, begin)
         assert sum(calls) == expected and fit.has_process_noise == (data is pushed)
+
+
+def test_no_pole_is_put_among_the_states() -> None:
+    """Of an enzyme that much substrate inhibits: what a fit without that asks for lies beyond a pole."""
+    n, m, k = sympy.symbols("n m K", real=True)
+    parameters = (Parameter("m", 1.0, expected=1.0), Parameter("K", 1.0, expected=1.0))
+    enzyme = Dynamics(("n",), (-m * n / (k + n),), Diffusion.identity(1), parameters=parameters)
+    t, generator, step = np.arange(0, 12, 0.1), np.random.default_rng(3), 0.005
+    tables = []
+    for begin in (2.0, 3.0, 4.0):
+        course = [begin]
+        for _ in range(round(12 / step)):
+            s = course[-1]
+            course.append(s - step * 2 * s / (0.1 + s + s**2))
+        values = np.array(course)[:-1:20] + generator.normal(0, 0.02, len(t))
+        tables.append(pd.DataFrame({"recording": str(begin), "t": t, "n": values}))
+    data = _measurements_of(pd.concat(tables), enzyme)
+    x = recalibration.first_states(enzyme, data)
+    noise = Noise(np.full(1, 4e-4), np.zeros(1))
+    damped = fit_trajectories(enzyme, data, begin=x[data.first[:-1]], noise=noise, substeps=4)
+    for fit in (*recalibration.recalibrate(enzyme, data), damped):
+        assert np.isfinite(fit.log_likelihood) and (fit.model.values > 0).all()
+        assert (fit.model.values[1] + fit.x > 0).all()
