@@ -402,17 +402,14 @@ class _InUnits(Diffusion):
         self._constant = factor * self._inverse @ noise.matrix @ self._inverse.T if noise.constant else None
 
     def derivatives(self, y: np.ndarray, order: int = 1) -> np.ndarray:
-        if self._constant is not None and order == 0:
-            return np.broadcast_to(self._constant, (len(y), *self._constant.shape))
-        inner = self.noise.derivatives(self.center + y @ self.units.T, order)
-        if order == 0:
-            return np.asarray(self.factor * self._inverse @ inner @ self._inverse.T)
-        left, units = self._inverse, self.units
-        if order == 1:
-            turned = np.einsum("ai,bj,nijk,kl->nabl", left, left, inner, units, optimize=True)
-        else:
-            turned = np.einsum("ai,bj,nijkl,kc,ld->nabcd", left, left, inner, units, units, optimize=True)
-        return np.asarray(self.factor * turned)
+        if self._constant is not None:  # in any unit of the states its derivatives are zero
+            whole = np.broadcast_to(self._constant, (len(y), *self._constant.shape))
+            return self.noise.derivatives(y, order) if order else whole
+        turned = self.noise.derivatives(self.center + y @ self.units.T, order)
+        for axis in range(3, 3 + order):
+            turned = np.moveaxis(np.moveaxis(turned, axis, -1) @ self.units, -1, axis)
+        entries = np.moveaxis(turned, (1, 2), (-2, -1))
+        return np.moveaxis(self.factor * self._inverse @ entries @ self._inverse.T, (-2, -1), (1, 2))
 
     def push(self, y: np.ndarray, momenta: np.ndarray) -> np.ndarray:
         return super().push(y, momenta) if self._constant is None else momenta @ self._constant

@@ -340,7 +340,9 @@ class _ProductPrinter(NumPyPrinter):
     def _print_Pow(self, expr: sympy.Pow, rational: bool = False) -> str:  # noqa: N802 (sympy's name)
         base, exponent = expr.args
         if exponent.is_Integer and 2 <= abs(exponent) <= LARGEST_EXPONENT:
-            power = f"integer_power({self._print(base)}, {abs(int(exponent))})"
+            whole, printed = abs(int(exponent)), self._print(base)
+            product = f"({'*'.join([printed] * whole)})"  # of a name: a call takes longer for a few points
+            power = product if base.is_Symbol else f"integer_power({printed}, {whole})"
             return power if exponent > 0 else f"(1.0/{power})"
         return super()._print_Pow(expr, rational=rational)
 
