@@ -64,30 +64,24 @@ def carry_linearly(
                 bent[i, j] = by_state[i, j, middle + k] + 0.5 * h * value
                 second[i, j, k] = h / 6.0 * h * (by_state[i, j, end + k] + bent[i, j])
             second[i, i, k] += h / 6.0 * 4.0
-        for i in range(d):
             for j in range(d):
                 value = 0.0
                 for m in range(d):
                     value += bent[i, m] * by_state[m, j, middle + k]
                 first[i, j, k] = h / 6.0 * h * (by_state[i, j, middle + k] + 0.5 * h * value)
             first[i, i, k] += h / 6.0
-        for i in range(d):
             for j in range(d):
-                value = h / 6.0 * by_state[i, j, end + k]
+                value = h / 6.0 * by_state[i, j, end + k] + (1.0 if i == j else 0.0)
                 for m in range(d):
                     value += first[i, m, k] * by_state[m, j, begin + k]
                     value += second[i, m, k] * by_state[m, j, middle + k]
                 whole[i, j, k] = value
-            whole[i, i, k] += 1.0
     for c in range(d + columns):
         state = transition[:, c] if c < d else response[:, c - d]
         held = state.copy()
         for i in range(d):
-            if c < d:
-                state[i] = 0.0
-            else:
-                for k in range(count):
-                    state[i, k] = step[k] / 6.0 * by_parameter[i, c - d, end + k]
+            for k in range(count):
+                state[i, k] = step[k] / 6.0 * by_parameter[i, c - d, end + k] if c >= d else 0.0
             for j in range(d):
                 for k in range(count):
                     state[i, k] += whole[i, j, k] * held[j, k]
