@@ -168,12 +168,13 @@ class _Residuals:
 @machine_code
 def _foreseen(values: np.ndarray, push: np.ndarray, fade: float) -> np.ndarray:
     """The mean, before each value, of a gate ±1 that adds ±push to noise of variance one (Wonham 1965)."""
-    seen, mean = np.zeros_like(values), np.zeros(values.shape[1])
-    for k in range(len(values)):
-        mean = mean * fade
-        seen[k] = mean
-        told = np.tanh(push[k] * values[k])
-        mean = (mean + told) / (1 + mean * told)
+    seen = np.zeros_like(values)
+    for column in range(values.shape[1]):
+        mean = 0.0
+        for k in range(len(values)):
+            seen[k, column] = mean = mean * fade
+            told = np.tanh(push[k] * values[k, column])
+            mean = (mean + told) / (1 + mean * told)
     return seen
 
 

@@ -64,31 +64,24 @@ def carry_linearly(
                 bent[i, j] = by_state[i, j, middle + k] + 0.5 * h * value
                 second[i, j, k] = h / 6.0 * h * (by_state[i, j, end + k] + bent[i, j])
             second[i, i, k] += h / 6.0 * 4.0
-        for i in range(d):
             for j in range(d):
                 value = 0.0
                 for m in range(d):
                     value += bent[i, m] * by_state[m, j, middle + k]
                 first[i, j, k] = h / 6.0 * h * (by_state[i, j, middle + k] + 0.5 * h * value)
             first[i, i, k] += h / 6.0
-        for i in range(d):
             for j in range(d):
-                value = h / 6.0 * by_state[i, j, end + k]
+                value = h / 6.0 * by_state[i, j, end + k] + (1.0 if i == j else 0.0)
                 for m in range(d):
                     value += first[i, m, k] * by_state[m, j, begin + k]
                     value += second[i, m, k] * by_state[m, j, middle + k]
                 whole[i, j, k] = value
-            whole[i, i, k] += 1.0
-    held = np.empty((d, count))
     for c in range(d + columns):
         state = transition[:, c] if c < d else response[:, c - d]
-        held[:] = state
+        held = state.copy()
         for i in range(d):
-            if c < d:
-                state[i] = 0.0
-            else:
-                for k in range(count):
-                    state[i, k] = step[k] / 6.0 * by_parameter[i, c - d, end + k]
+            for k in range(count):
+                state[i, k] = step[k] / 6.0 * by_parameter[i, c - d, end + k] if c >= d else 0.0
             for j in range(d):
                 for k in range(count):
                     state[i, k] += whole[i, j, k] * held[j, k]
@@ -186,7 +179,6 @@ def filter_recursion(
     variances = np.ones((stored, outputs))
     state = np.empty((dimension, width))
     carried = np.empty((dimension, width))
-    covariance = np.empty((dimension, dimension))
     half = np.empty((dimension, dimension))
     gain = np.empty(dimension)
     shown = np.empty(width)
@@ -201,7 +193,7 @@ def filter_recursion(
                     break
     for recording in range(len(first) - 1):
         state[:] = 0.0
-        covariance[:] = begin_covariance
+        covariance = begin_covariance.copy()
         slopes[:] = 0.0
         bends[:] = 0.0
         for i in range(dimension):
@@ -209,8 +201,10 @@ def filter_recursion(
             state[i, 1 + columns + i] = 1.0
         for k in range(first[recording], first[recording + 1]):
             if kept:
-                predicted[k] = state[:, 0]
-                before[k] = covariance
+                for i in range(dimension):
+                    predicted[k, i] = state[i, 0]
+                    for j in range(dimension):
+                        before[k, i, j] = covariance[i, j]
             for o in range(outputs):
                 if np.isnan(residual[k, o]):
                     continue
@@ -236,7 +230,8 @@ def filter_recursion(
                     whitened[k, o, c] = shown[c] * scale
                 log_determinant += np.log(spread)
                 if kept:
-                    gains[k, o] = gain
+                    for i in range(dimension):
+                        gains[k, o, i] = gain[i]
                     variances[k, o] = spread
                 surprise = innovation * innovation / spread
                 for c in range(size):
@@ -274,8 +269,10 @@ def filter_recursion(
                     for j in range(dimension):
                         covariance[i, j] -= share * gain[j]
             if kept:
-                filtered[k] = state[:, 0]
-                after[k] = covariance
+                for i in range(dimension):
+                    filtered[k, i] = state[i, 0]
+                    for j in range(dimension):
+                        after[k, i, j] = covariance[i, j]
             if k + 1 == first[recording + 1]:
                 break
             for i in range(dimension):
@@ -287,7 +284,7 @@ def filter_recursion(
                 carried[i, 0] += gap[k, i]
                 for c in range(columns):
                     carried[i, 1 + c] += response[k, i, c]
-            state[:] = carried
+            state, carried = carried, state
             # As a function of its own this was slower by a fifth.
             row = 0 if len(intensity) == 1 else k
             for i in range(dimension):
@@ -316,7 +313,8 @@ def filter_recursion(
                     for j in range(dimension):
                         value += transition[k, i, j] * slopes[c, j]
                     gain[i] = value
-                slopes[c] = gain
+                for i in range(dimension):
+                    slopes[c, i] = gain[i]
                 _carry(transition[k], bends[c], half)
                 if c < count:
                     m, n = places[c, 0], places[c, 1]
@@ -376,7 +374,7 @@ def smooth_backwards(
                     for j in range(dimension):
                         value += transition[k, j, i] * adjoint[j]
                     carried[i] = value
-                adjoint[:] = carried
+                adjoint, carried = carried, adjoint
             for o in range(outputs - 1, -1, -1):
                 if np.isnan(residual[k, o]):
                     continue

@@ -49,15 +49,15 @@ def _run_tape(
     node = (0, 1, 1, 2)
     reach = (0.0, 0.5, 0.5, 1.0)
     weight = (1.0, 2.0, 2.0, 1.0)
-    now = np.empty(dimension)
     slope = np.empty(dimension)
     total = np.empty(dimension)
     interval = 0
     for recording in range(len(first) - 1):
         last = interval + first[recording + 1] - first[recording] - 1
-        now[:] = begin[recording]
-        states[first[recording]] = now
+        now = begin[recording].copy()
         row = first[recording]
+        for i in range(dimension):
+            states[row, i] = now[i]
         alive = True
         while interval < last and alive:
             h = step[interval]
@@ -125,7 +125,8 @@ def _run_tape(
             interval += 1
             row += 1
             if alive:
-                states[row] = now
+                for i in range(dimension):
+                    states[row, i] = now[i]
         interval = last
 
 

@@ -402,8 +402,9 @@ class _InUnits(Diffusion):
         self._constant = factor * self._inverse @ noise.matrix @ self._inverse.T if noise.constant else None
 
     def derivatives(self, y: np.ndarray, order: int = 1) -> np.ndarray:
-        if self._constant is not None and order == 0:
-            return np.broadcast_to(self._constant, (len(y), *self._constant.shape))
+        if self._constant is not None:  # in any unit of the states its derivatives are zero
+            whole = np.broadcast_to(self._constant, (len(y), *self._constant.shape))
+            return self.noise.derivatives(y, order) if order else whole
         turned = self.factor * self.noise.derivatives(self.center + y @ self.units.T, order)
         for matrix in (self._inverse.T, self._inverse.T, *[self.units] * order):  # each index comes to the end
             turned = np.tensordot(turned, matrix, axes=(1, 0))

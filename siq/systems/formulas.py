@@ -285,13 +285,13 @@ def _compiled(
 
 
 def _common_parts(
-    expressions: Sequence[sympy.Expr],
+    formulas: Sequence[sympy.Expr],
 ) -> tuple[list[tuple[sympy.Symbol, sympy.Expr]], list[sympy.Expr]]:
-    """What stands in expressions more than once, by the symbols that are put in its place.
+    """What stands in formulas more than once, and these with symbols in its place.
 
-    `sympy.cse` simplifies anew whatever it has put a symbol into, which takes ten times as long.
+    `sympy.cse` simplifies anew whatever it has put a symbol into, which takes longer than all else.
     """
-    taken = {each.name for formula in expressions for each in formula.free_symbols}
+    taken = {each.name for formula in formulas for each in formula.free_symbols}
     symbols = (each for each in sympy.numbered_symbols("_part", real=True) if each.name not in taken)
     seen: set[sympy.Basic] = set()
     twice: set[sympy.Basic] = set()
@@ -299,7 +299,7 @@ def _common_parts(
     parts: list[tuple[sympy.Symbol, sympy.Expr]] = []
 
     def look(at: sympy.Basic) -> None:
-        if at.args and at in seen:
+        if at in seen:
             twice.add(at)
         elif at.args:
             seen.add(at)
@@ -309,21 +309,18 @@ def _common_parts(
     def written(formula: sympy.Basic) -> sympy.Basic:
         if not formula.args or formula in named:
             return named.get(formula, formula)
-        put = [written(each) for each in formula.args]
-        if any(new is not old for new, old in zip(put, formula.args, strict=True)):
+        put, result = tuple(map(written, formula.args)), formula
+        if put != formula.args:
             kept = {} if isinstance(formula, ExprCondPair) else {"evaluate": False}
             result = formula.func(*put, **kept)
-        else:
-            result = formula
         if formula in twice and isinstance(formula, sympy.Expr):
-            named[formula] = next(symbols)
-            parts.append((named[formula], result))
-            return named[formula]
+            parts.append((next(symbols), result))
+            result = named[formula] = parts[-1][0]
         return result
 
-    for formula in expressions:
+    for formula in formulas:
         look(formula)
-    return parts, [written(formula) for formula in expressions]
+    return parts, [written(formula) for formula in formulas]
 
 
 def exact_number(value: float) -> sympy.Expr:
@@ -340,7 +337,9 @@ class _ProductPrinter(NumPyPrinter):
     def _print_Pow(self, expr: sympy.Pow, rational: bool = False) -> str:  # noqa: N802 (sympy's name)
         base, exponent = expr.args
         if exponent.is_Integer and 2 <= abs(exponent) <= LARGEST_EXPONENT:
-            power = f"integer_power({self._print(base)}, {abs(int(exponent))})"
+            whole, printed = abs(int(exponent)), self._print(base)
+            product = f"({'*'.join([printed] * whole)})"  # of a name: a call takes longer for a few points
+            power = product if base.is_Symbol else f"integer_power({printed}, {whole})"
             return power if exponent > 0 else f"(1.0/{power})"
         return super()._print_Pow(expr, rational=rational)
 

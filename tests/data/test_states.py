@@ -16,7 +16,7 @@ from siq.data.inspection import inspect
 from siq.data.kinetics import MarkovModel
 from siq.data.preparation import without_background
 from siq.data.recordings import Recordings
-from siq.data.states import DwellCount, RecordStates, switching
+from siq.data.states import DwellCount, RecordStates, _valley_depths, switching
 from siq.data.stationarity import change_of, relaxation_samples, runs_of
 from siq.remarks import Remark
 
@@ -271,3 +271,15 @@ def test_three_hops_are_no_drift() -> None:
     found = found_in(0.412 + 0.018 * path + 0.0015 * noise(9, len(path)))
     assert found.levels == pytest.approx((0.412, 0.430), abs=2e-4)
     assert found.rung == 2 and found.limit is not None and found.limit.code == "data.few_hops"
+
+
+@pytest.mark.parametrize("digits", [1, 16])
+def test_valleys_are_those_of_histograms_between_quantiles(digits: int) -> None:
+    series = np.random.default_rng(3).normal(size=(3, 2500)).round(digits)
+    series[1] += 2 * np.sign(series[2])
+    numbers = [12, 40, 25]
+    for row, number, depth in zip(series, numbers, _valley_depths(series, numbers), strict=True):
+        counts = np.histogram(row, number, np.quantile(row, [0.001, 0.999]).tolist())[0]
+        above = [(np.maximum(counts - valley, 0), place) for place, valley in enumerate(counts)]
+        lesser = max(min(peaks[:place].sum(), peaks[place:].sum()) for peaks, place in above)
+        assert depth == lesser / 2500

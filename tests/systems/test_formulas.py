@@ -240,11 +240,11 @@ def test_numbers_keep_all_their_digits(number: float) -> None:
     assert compiled(f"{number!r}*x", np.array([1.0, 0.0])) == number
 
 
-def test_names_such_as_those_of_common_parts_do_not_clash() -> None:
-    x0, x1 = sympy.Symbol("x0", real=True), sympy.Symbol("x1", real=True)
-    names = {"x0": x0, "x1": x1}
+@pytest.mark.parametrize("name", ["x", "_part"])
+def test_names_such_as_those_of_common_parts_do_not_clash(name: str) -> None:
+    x0, x1 = (sympy.Symbol(f"{name}{place}", real=True) for place in range(2))
     texts = ["sin(x0*x1) + x1", "sin(x0*x1)**2 + exp(x1 - x0)", "exp(x1 - x0)*x0"]
-    function = compile_formulas([parse_formula(text, names) for text in texts], (x0, x1))
+    function = compile_formulas([parse_formula(text, {"x0": x0, "x1": x1}) for text in texts], (x0, x1))
     a, b = TINY_POINTS
     expected = [np.sin(a * b) + b, np.sin(a * b) ** 2 + np.exp(b - a), np.exp(b - a) * a]
     np.testing.assert_allclose(function(TINY_POINTS), expected, rtol=1e-14)
@@ -254,6 +254,14 @@ def test_compiled_values_equal_those_of_sympy_on_a_random_formula() -> None:
     formula = parse_formula("-2*(x**3 - x)*exp(-y**2/3) + tanh(x*y)/(1 + x**2)**2 - 0.7*Abs(y)", NAMES)
     values = compile_formulas([formula], (x, y))(TINY_POINTS)[0]
     expected = [float(formula.subs({x: a, y: b}).evalf(20)) for a, b in TINY_POINTS.T]
+    np.testing.assert_allclose(values, expected, rtol=1e-13)
+
+
+def test_parts_under_a_condition_are_worked_out_as_without_it() -> None:
+    part = sympy.exp(x * y) + sympy.sqrt(1 + x**2)
+    formulas = [sympy.Piecewise((part, x > y), (-part, True)), x * part**-2, part]
+    values = compile_formulas(formulas, (x, y))(TINY_POINTS)
+    expected = [[float(each.subs({x: a, y: b})) for a, b in TINY_POINTS.T] for each in formulas]
     np.testing.assert_allclose(values, expected, rtol=1e-13)
 
 
