@@ -576,7 +576,6 @@ RESIDENTS: Sequence[Resident] = (
     Resident("second-order reaction", "two substances", {"c": 0.2}, "in s, r"),
     Resident("saturation", "inducible gene", {"w": 1.0}, "threshold"),
     Resident("attached oscillator", "mass", {"m": 0.3, "tau": 0.6, "d": 0.1}),
-    Resident("asymmetric damping", "mass without damping", {"c": 0.9, "d": 0.3}),
     Resident("rate limit", "circuit", {"r": 0.25}),
     Resident("magnetic saturation", "coil", {"c": 0.4}),
     Resident("photoinhibition", "algae", {"h": 0.4}),

@@ -612,13 +612,14 @@ def _next_rung(
         there = ground.horizons[0].fit
         rebased = [each.rebased(base.model, there.model) for each in candidates]
         remaining = _sites(rebased, there, context, untried)
-        if leader is not ground:
+        near = [each for each in plausible if each not in steady]
+        if near:
             # A state that follows the motion may be a simple mechanism and something simple at a time.
             plain = [one for one in remaining if one.candidate is None or one.candidate.model.dimension == d]
-            above, further = _gains(ground.horizons, plain, None, budget, untried)
-            both = max(gain + site.prior for site, gain in zip(above, further, strict=True))
-            if ground.weight + max(both, 0.0) > leader.weight:
-                outdone, leader = {leader.site.label}, ground
+            above, more = _gains(ground.horizons, plain, None, budget, untried)
+            both = ground.weight + max([0.0, *(more + np.array([site.prior for site in above]))])
+            outdone = {each.site.label for each in near if both > each.weight}
+            leader = ground if leader.site.label in outdone else leader
         sites, gains = _gains(ground.horizons, remaining, ground.candidate, budget, untried)
         gains = gains + ground.gain
 

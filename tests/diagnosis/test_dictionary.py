@@ -252,7 +252,7 @@ SCREENED = (
     "cogging or gear ripple", "saturated elimination", "diode or exponential loss",
     "outflow through an opening", "thermal radiation",
     "reverse reaction or backflow", "adaptation", "waning immunity", "eddy-current brake",
-    "product inhibition", "attached oscillator", "asymmetric damping", "rate limit", "magnetic saturation",
+    "product inhibition", "attached oscillator", "rate limit", "magnetic saturation",
     "photoinhibition", "Gompertz growth", "second-order reaction",
 )  # fmt: skip
 

@@ -405,3 +405,29 @@ def test_another_shape_is_begun_with_where_the_best_one_leads_nowhere(
     monkeypatch.setattr(forecasts, "_gains", lambda horizons, sites, *_: (sites, np.ones(len(sites))))
     _next_rung(horizons, context.candidates, context, {})
     assert len(begun) == 2 and begun[0] != begun[1] and len(begun[0]) == 1
+
+
+def test_what_follows_any_motion_is_no_rival_where_something_simple_on_top_does_as_much(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As an oscillator that is attached to the recorded pendulum arm, whose limit is linear damping."""
+    context = context_of(pendulum(), recorded(0.15, 0.2), ("linear damping", "attached oscillator"))
+    fit, _ = recalibrate(context.model, context.data)
+    horizons, gains = _horizons_of(fit, context)[:1], {"linear damping": 100.0, "attached oscillator": 103.0}
+
+    def fitted(horizons: list[Horizon], site: _Site, *_: object) -> tuple[list[Horizon], float]:
+        assert site.candidate is not None
+        return list(horizons), gains[site.candidate.name]
+
+    def promised(_: object, sites: Sequence[_Site], leading: object, *__: object) -> tuple:
+        if leading is not None:  # in its place
+            return list(sites), np.full(len(sites), -50.0)
+        return list(sites), np.array([on_top if each.candidate is None else 0.1 for each in sites])
+
+    monkeypatch.setattr(forecasts, "_fitted_at", fitted)
+    monkeypatch.setattr(forecasts, "_gains", promised)
+    monkeypatch.setattr(forecasts, "_containing", lambda *_: set())
+    monkeypatch.setattr(forecasts.FittedCandidate, "of", lambda *given, **_: given[3])
+    for on_top in (50.0, 0.0):
+        rung = _next_rung(horizons, context.candidates, context, {})
+        assert (rung is not None) == (on_top > 0)
