@@ -45,6 +45,8 @@ SAMPLED_LINES = 200  # of a table, from which its separator and decimal mark are
 SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".xlsb", ".ods")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
+_DASHES = ("-", "--", "---")  # where nothing was measured
+_FORTRAN = re.compile(rb"(?<=[0-9.])[dD](?=[+-]\d\d)")  # the exponent of 1.5D+03
 _NUMERIC = re.compile(f"{_NUMBER.pattern}|{_DECIMAL_COMMA.pattern}", re.IGNORECASE)
 _GROUPED = re.compile(r"[+-]?\d{1,3}((\.\d{3})+,\d+|(,\d{3})+\.\d+|,\d{3}(,\d{3})+)")
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", "|": "vertical bars", " ": "spaces"}
@@ -164,6 +166,7 @@ def _open_text(file: str) -> ColumnFile:
     except (OSError, EOFError, zlib.error):
         raise InputError(file, "", "it cannot be unpacked", "write the recordings again") from None
     content, remarks = _in_utf8(file, content)
+    content = _FORTRAN.sub(b"E", content.replace("\u2212".encode(), b"-"))  # the minus of typesetters, too
     header = content[:LARGEST_HEADER].rfind(_END_OF_HEADER)
     begin, comments, separator = 0 if header < 0 else _after_line(content, header), [], ""
     while begin < len(content):
@@ -348,6 +351,7 @@ def _read_cells(
     converting = arrow_csv.ConvertOptions(
         column_types={name: pa.float64() if name in numbers else pa.string() for name in names},
         decimal_point=decimal_mark,
+        null_values=[*arrow_csv.ConvertOptions().null_values, *_DASHES],
         strings_can_be_null=True,
         quoted_strings_can_be_null=True,
     )

@@ -37,7 +37,7 @@ RESERVED = _words("sin cos tan exp log sqrt tanh atan Abs sign Max Min pi record
 
 TIME_NAMES = _words(
     "t time times zeit temps tiempo tempo timestamp timestamps datetime date elapsed elapsedtime clock"
-    " clocktime uhrzeit seconds xvalue"
+    " clocktime uhrzeit datum seconds xvalue"
 )
 AGE_NAMES = _words("age ages alter")
 LABEL_NAMES = _words(
@@ -118,7 +118,7 @@ def read_heading(heading: str) -> _Heading:
     text = _BEFORE_PRESENT.sub("", heading).strip()
     if text != heading.strip():
         age = _Heading("age", text) if text in TIME_UNITS else read_heading(text)
-        if _may_be_time(age):
+        if may_be_time(age):
             return age._replace(before_present=True)
     text = heading.strip()
     if match := re.fullmatch(r"(.*?)\s*\[\s*(.*?)\s*\]", text):
@@ -264,7 +264,8 @@ def _numbers(source: ColumnFile, place: int) -> np.ndarray | None:
         return None
 
 
-def _may_be_time(part: _Heading) -> bool:
+def may_be_time(part: _Heading) -> bool:
+    """Whether a column of this heading may be the time."""
     return _is_time(part.title) and (
         part.unit is None or part.unit.casefold() in {unit.casefold() for unit in TIME_UNITS}
     )
@@ -272,7 +273,7 @@ def _may_be_time(part: _Heading) -> bool:
 
 def _is_second_time(source: ColumnFile, parts: list[_Heading], place: int) -> bool:
     """Whether a column is another clock: called so, and ever increasing but where recordings begin."""
-    if not _may_be_time(parts[place]) or parts[place].title == "T":
+    if not may_be_time(parts[place]) or parts[place].title == "T":
         return False
     values = _numbers(source, place)
     return values is None or bool((np.diff(values) > 0).mean() > 0.5)
@@ -307,7 +308,7 @@ def _time_column(
     found = [place for place in free if parts[place].title == "t"]
     if found:
         return found[0]
-    found = [place for place in free if _may_be_time(parts[place])]
+    found = [place for place in free if may_be_time(parts[place])]
     if not found:
         found = [place for place in free if _runs_evenly(_numbers(source, place))]
     if len(found) != 1:

@@ -207,8 +207,9 @@ def without_faults(recordings: Recordings) -> Recordings:
     """Recordings less what only the sensor can have added: samples that stand apart, and the hum of mains.
 
     A sample stands apart whose steps from the last and to the next are both larger than noise makes one in
-    all of the record, and lead back to where it came from. Where more than a few such steps do not lead back,
-    the state itself jumps, and nothing is left out. A hum is a line in the spectrum of the steps that keeps
+    all of the record, and lead back to where it came from; so do several of one value, where most such faults
+    last one sample only. Where more than a few such steps do not lead back, the state itself jumps, and
+    nothing is left out. A hum is a line in the spectrum of the steps that keeps
     its amplitude and its phase in every quarter of a recording, and that hardly moves the state.
     """
     floors = noise_floors(recordings)
@@ -217,16 +218,22 @@ def without_faults(recordings: Recordings) -> Recordings:
     noisy = [state for state, floor in enumerate(floors) if floor.process]  # what else jumps was measured
     apart, remarks = np.zeros(len(recordings.t), dtype=bool), list(recordings.remarks)
     for state in noisy:
-        steps = np.where(np.diff(recordings.recording) == 0, np.diff(recordings.values[:, state]), 0.0)
+        same, moves = np.diff(recordings.recording) == 0, np.diff(recordings.values[:, state])
+        begins = np.flatnonzero(np.r_[True, ~same | (moves != 0)])  # of stretches of one value
+        lasts = np.diff(np.r_[begins, len(recordings.t)])
+        steps = np.where(same, moves, 0.0)[begins[1:] - 1]
         blocks = [np.abs(one) for one in np.array_split(steps, max(len(steps) // BLOCK, 1))]
         usual = np.repeat([np.median(one) for one in blocks], [len(one) for one in blocks])
         scale = np.maximum(usual, np.median(usual)) / special.ndtri(0.75)
         largest = -special.ndtri(FALSE_FAULT_RATE / 2 / len(steps)) * scale
         large = np.abs(steps) > largest
         alone = large[:-1] & large[1:] & (np.abs(steps[:-1] + steps[1:]) <= largest[1:])
-        jumps, count = int(large.sum()) - 2 * int(alone.sum()), int(alone.sum())
-        if jumps <= FEW_JUMPS * count and 0 < count <= MOST_APART * len(steps):
-            apart[1:-1] |= alone
+        if 2 * (alone & (lasts[1:-1] == 1)).sum() < alone.sum():
+            alone &= lasts[1:-1] == 1
+        left_out = np.repeat(np.r_[False, alone, False], lasts)
+        jumps, count = int(large.sum()) - 2 * int(alone.sum()), int(left_out.sum())
+        if jumps <= FEW_JUMPS * alone.sum() and 0 < count <= MOST_APART * len(recordings.t):
+            apart |= left_out
             remarks.append(
                 Remark("data.samples_apart", {"column": recordings.titles[state], "samples": count})
             )

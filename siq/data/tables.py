@@ -25,8 +25,8 @@ import pyarrow.compute as pc
 
 from siq.data.correlation import FEWEST_VALUES, MIN_REPETITIONS
 from siq.data.formats import Column, ColumnFile, open_columns
-from siq.data.layout import layout_of, read_heading
-from siq.data.recordings import TABLE, Recordings
+from siq.data.layout import layout_of, may_be_time, read_heading
+from siq.data.recordings import LONGEST_STEP, TABLE, Recordings
 from siq.errors import InputError
 from siq.numerics.files import files_of
 from siq.remarks import Remark, sentence
@@ -37,10 +37,11 @@ if TYPE_CHECKING:
 # Text that holds a number, and what may follow as its unit: "1.2mm", "5 %", but "3 1/s" only after a space.
 _NUMBER = r"(?:[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?(?i:nan|infinity|inf))"
 _UNIT = r"(?:\s*[^\W\d_]|\s*[%°‰]|\s+1/)[^,;]*"
-_ISO_DATE = re.compile(r"\d{4}-\d{2}-\d{2}([T ]\d{2}:\d{2}(:\d{2}([.,]\d+)?)?\s*(Z|[+-]\d{2}:?\d{2})?)?")
-_TIME_OF_DAY = re.compile(r"\d{1,3}:\d{2}(:\d{2}([.,]\d+)?)?")
+_ISO_DATE = re.compile(r"\d{4}-\d{2}(-\d{2}([T ]\d{2}:\d{2}(:\d{2}([.,]\d+)?)?\s*(Z|[+-]\d{2}:?\d{2})?)?)?")
+_TIME_OF_DAY = re.compile(r"\d{1,3}:\d{2}(:\d{2})?([.,]\d+)?")
 _GERMAN_DATE = re.compile(r"\d{1,2}\.\d{1,2}\.\d{4}( \d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?)?")
-_SLASHED_DATE = re.compile(r"\d{1,4}/\d{1,2}/\d{1,4}.*")
+_SLASHED_DATE = re.compile(r"(\d{1,4})/(\d{1,2})/\d{1,4}.*")
+_DAY_ALONE = re.compile(r"\d+(-\d+-|\.\d+\.|/\d+/)\d+")
 _NUMERIC = (
     pa.types.is_floating, pa.types.is_integer, pa.types.is_boolean, pa.types.is_decimal, pa.types.is_null,
 )  # fmt: skip
@@ -91,6 +92,7 @@ def _checked(
     file, source = str(table) if isinstance(table, str | Path) else TABLE, open_columns(table)
     if columns is None:
         source = _stacked(source)
+    source = _with_one_clock(source)
     layout = layout_of(file, source, columns)
     used = [layout.time, *layout.states]
     cells = source.load([*([] if layout.recording is None else [layout.recording]), *used])
@@ -179,6 +181,37 @@ def _stacked(source: ColumnFile) -> ColumnFile:
         titles=(),
         remarks=(*source.remarks, Remark("data.columns_of_recordings", values)),
     )
+
+
+def _with_one_clock(source: ColumnFile) -> ColumnFile:
+    """Days that stand in one column and the times of day in another, as one column of both."""
+    called = [place for place, one in enumerate(source.headings) if may_be_time(read_heading(one))]
+    if len(called) != 2:
+        return source
+    texts = [one.to_pandas().astype(str).str.strip() for one in source.load(called)]
+    alike = [tuple(text.str.fullmatch(one).all() for one in (_DAY_ALONE, _TIME_OF_DAY)) for text in texts]
+    if sorted(alike) != [(False, True), (True, False)]:
+        return source
+    day = called[alike.index((True, False))]
+    of_day = next(place for place in called if place != day)
+    rest = [place for place in range(len(source.headings)) if place != of_day]
+    joined = pa.array(texts[called.index(day)] + " " + texts[called.index(of_day)])
+
+    def load(positions: Sequence[int]) -> list[Column]:
+        loaded = source.load([rest[position] for position in positions])
+        return [joined if rest[at] == day else one for at, one in zip(positions, loaded, strict=True)]
+
+    kept = {field: tuple(getattr(source, field)[place] for place in rest) for field in ("headings", "units")}
+    titles = tuple(source.titles[place] for place in rest) if source.titles else ()
+    return replace(source, **kept, load=load, titles=titles)
+
+
+def _past_midnight(times: pd.Series) -> pd.Series:
+    """Times of day that go on: where a day is all that they fall short of the usual step, a new one began."""
+    steps = times.dt.total_seconds().diff()
+    usual = steps.median()
+    midnight = (steps < 0) & (steps + DAY > 0) & (steps + DAY <= LONGEST_STEP * usual)
+    return times + pd.to_timedelta(DAY * midnight.cumsum(), unit="s")
 
 
 def _without_clocks_and_labels(recordings: Recordings) -> Recordings:
@@ -345,18 +378,26 @@ def _seconds_of_clock(file: str, name: str, cells: Column) -> tuple[np.ndarray, 
     if pa.types.is_string(kind) or pa.types.is_large_string(kind):
         text = cells.to_pandas().str.strip().replace("", None)
         first = next(iter(text.dropna()), "")
-        if _SLASHED_DATE.fullmatch(first):
+        points, slashed = text.str.replace(",", "."), _SLASHED_DATE.fullmatch(first)
+        if slashed and len(slashed[1]) == 4:
+            first, points, slashed = first.replace("/", "-"), points.str.replace("/", "-"), None
+        # A number that is no month tells which of the two is, for all of the column.
+        numbers = text.str.extract(_SLASHED_DATE).astype(float) if slashed else pd.DataFrame()
+        no_month = (numbers > 12).any()
+        if slashed and no_month.all() == no_month.any():
             fault = f"the date '{first}' can be read in two ways"
             remedy = "write dates as 2024-12-31 12:00:00, or the time as seconds"
             raise InputError(file, f"column {name}", fault, remedy)
-        points = text.str.replace(",", ".")
         try:
             if _ISO_DATE.fullmatch(first):
                 values = pd.to_datetime(points, format="ISO8601", utc=True)
             elif _GERMAN_DATE.fullmatch(first):
                 values = pd.to_datetime(points, dayfirst=True, format="mixed")
+            elif slashed:
+                values = pd.to_datetime(points, dayfirst=bool(no_month[0]), format="mixed")
             elif _TIME_OF_DAY.fullmatch(first):
-                values = pd.to_timedelta(points.where(points.str.count(":") != 1, points + ":00"))
+                short = "00:" + points if "." in points[text.notna()].iloc[0] else points + ":00"
+                values = _past_midnight(pd.to_timedelta(points.where(points.str.count(":") != 1, short)))
             else:
                 return None
         except (ValueError, TypeError):
@@ -364,7 +405,7 @@ def _seconds_of_clock(file: str, name: str, cells: Column) -> tuple[np.ndarray, 
             remedy = "write every time in the same way, or as seconds"
             raise InputError(file, f"column {name}", fault, remedy) from None
     elif pa.types.is_time(kind):
-        values = pd.to_timedelta(cells.to_pandas().astype(str))
+        values = _past_midnight(pd.to_timedelta(cells.to_pandas().astype(str)))
     elif pa.types.is_date(kind):
         values = pd.to_datetime(cells.to_pandas())
     elif pa.types.is_timestamp(kind) or pa.types.is_duration(kind):

@@ -70,6 +70,20 @@ def test_samples_that_stand_apart_are_left_out_and_nothing_else() -> None:
     assert without_faults(seen(x)).values.shape == x.shape
 
 
+def test_one_number_for_a_fault_is_left_out_where_it_stands_twice_in_a_row_too() -> None:
+    x = 10 + hopping()
+    lost = np.random.default_rng(0).random(len(x)) < 0.005
+    lost[[0, 1, -2, -1, 100, 101]] = [False, False, False, False, True, True]
+    found = without_faults(seen(np.where(lost[:, None], 0.0, x)))
+    np.testing.assert_array_equal(found.values, x[~lost])
+
+
+def test_a_state_without_noise_is_no_fault() -> None:
+    x = 10 + hopping()
+    closed = np.arange(len(x)) // 40 % 100 == 50
+    assert len(without_faults(seen(np.where(closed[:, None], 0.0, x))).t) == len(x)
+
+
 def test_what_jumps_and_stays_is_the_states_own() -> None:
     x = hopping()
     jumps = 3.0 * (np.arange(len(x)) // 1500 % 2)

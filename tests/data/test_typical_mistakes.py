@@ -310,6 +310,33 @@ def test_dates_are_days_and_times_of_day_seconds(tmp_path: Path) -> None:
     assert (hours.t.tolist(), hours.time_unit) == ([0, 3600], "s")
 
 
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [
+        ("Date,Time,x\n27.10.2024,23:59:50,1\n28.10.2024,00:00:00,3\n", [0, 10]),
+        ("date,x\n02/03/2024 11:59:50 PM,1\n02/13/2024 12:00:00 AM,3\n", [0, 777610]),
+        ("date,x\n02/03/2024 10:00,1\n13/03/2024 10:30,3\n", [0, 952200]),
+        ("time,x\n01:30.000,1\n01:30.500,3\n", [0, 0.5]),
+        ("time,x\n23:59:40,1\n23:59:50,2\n00:00:00,3\n00:00:10,2\n", [0, 10, 20, 30]),
+        # The clock was set back, or begins again: nothing tells that a day has passed.
+        ("time,x\n09:00:00,1\n09:00:10,2\n08:00:00,3\n08:00:10,2\n", [0, 10, -3600, -3590]),
+    ],
+)
+def test_clocks_as_people_write_them(tmp_path: Path, text: str, seconds: list[float]) -> None:
+    read = read_recordings(put(tmp_path, "clock.csv", text))
+    assert (read.names, read.t.tolist(), read.time_unit) == (("x",), seconds, "s")
+
+
+def test_months_are_dates(tmp_path: Path) -> None:
+    read = read_recordings(put(tmp_path, "months.csv", "date,x\n2023-12,1\n2024-01,3\n2024-02,2\n"))
+    assert (read.t.tolist(), read.time_unit) == ([0, 31, 62], "d")
+
+
+def test_dashes_are_missing_and_minus_signs_and_exponents_are_read_as_written(tmp_path: Path) -> None:
+    read = read_recordings(put(tmp_path, "signs.csv", "t,x\n0,−1.5\n1,--\n2,2.5D-01\n3,1\n4,-\n5,2\n"))
+    assert (read.t.tolist(), read.values[:, 0].tolist()) == ([0, 2, 3, 5], [-1.5, 0.25, 1, 2])
+
+
 def test_words_that_are_no_label_are_left_out(tmp_path: Path) -> None:
     flags = ["ok", "ok", "bad", "ok", "ok", "ok", "bad", "ok"]
     text = "t,x,flag\n" + "".join(f"{t},{t % 3},{flag}\n" for t, flag in enumerate(flags))
