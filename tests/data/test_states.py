@@ -271,3 +271,11 @@ def test_three_hops_are_no_drift() -> None:
     found = found_in(0.412 + 0.018 * path + 0.0015 * noise(9, len(path)))
     assert found.levels == pytest.approx((0.412, 0.430), abs=2e-4)
     assert found.rung == 2 and found.limit is not None and found.limit.code == "data.few_hops"
+
+
+def test_short_recordings_beside_a_long_one_make_no_period() -> None:
+    for seed in range(4):
+        x = lfilter([1], [1, -0.9], np.random.default_rng(seed).standard_normal(4680))[200:]
+        parts = [one[:, None] for one in np.split(x, np.arange(60, 481, 60))]
+        given = Recordings.from_arrays([0.1 * np.arange(len(one)) for one in parts], parts, names=["x"])
+        assert change_of(given, x, np.zeros(len(x), dtype=int)) is None
