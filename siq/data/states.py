@@ -264,13 +264,9 @@ def _valleys(
 def _valley_depths(series: np.ndarray, bins: Sequence[int]) -> list[float]:
     """Of each row ``(c, n)``, in so many bins, the largest share of its samples in a lesser peak."""
     count = series.shape[1]
-    low, high = 0.001 * (count - 1), 0.999 * (count - 1)
+    limits = np.quantile(series, [0.001, 0.999], axis=1).T
     depths = []
-    for row, number in zip(series, bins, strict=True):
-        # Both quantiles from the samples next to them: to sort all takes far longer.
-        under, over = _smallest(row, int(low) + 2)[-2:], -_smallest(-row, count - int(high))[-2:]
-        least = under[0] + low % 1 * (under[1] - under[0])
-        most = over[1] + high % 1 * (over[0] - over[1])
+    for row, number, (least, most) in zip(series, bins, limits, strict=True):
         if not most > least:
             depths.append(0.0)
             continue
@@ -279,20 +275,6 @@ def _valley_depths(series: np.ndarray, bins: Sequence[int]) -> list[float]:
         left = above.diagonal()
         depths.append(float(np.minimum(left, above[-1] - left).max()) / count)
     return depths
-
-
-@machine_code
-def _smallest(values: np.ndarray, count: int) -> np.ndarray:
-    """So few of the smallest values, in order."""
-    found = np.full(count, np.inf)
-    for value in values:
-        place = count - 1
-        if value < found[place]:
-            while place > 0 and value < found[place - 1]:
-                found[place] = found[place - 1]
-                place -= 1
-            found[place] = value
-    return found
 
 
 @machine_code

@@ -190,9 +190,12 @@ def change_of(recordings: Recordings, values: np.ndarray, path: np.ndarray) -> f
                 return np.inf
     longest = max(one.stop - one.start for one in parts)
     used = [one for one in parts if one.stop - one.start > 4 * NEIGHBOURS]
+    # As many of one length have a power that is as sure as that of these: short ones hardly add to it.
+    lengths = np.array([one.stop - one.start for one in used], dtype=float)
+    count = lengths.sum() ** 2 / max(float(lengths @ lengths), 1.0)
     # At half the distance of independent frequencies, so that none falls between two of them; slow ones are
     # compared with fewer, so that none of these is that of the mean, which was taken off.
-    near = 2 * max(-(-NEIGHBOURS // max(len(used), 1)), FEWEST_NEIGHBOURS)
+    near = 2 * max(int(np.ceil(NEIGHBOURS / max(count, 1.0))), FEWEST_NEIGHBOURS)
     frequencies = np.arange(2 * FEWEST_NEIGHBOURS + 3, longest - near)
     if not used or not len(frequencies):
         return None
@@ -205,7 +208,7 @@ def change_of(recordings: Recordings, values: np.ndarray, path: np.ndarray) -> f
         around = below[frequencies + reach + 1] - below[frequencies - reach]
         others, own = 2 * reach - 6, power[frequencies]
         level = (around - below[frequencies + 4] + below[frequencies - 3]) / others
-        chance = price * special.fdtrc(2 * len(used), len(used) * others, own / np.maximum(level, 1e-300))
+        chance = price * special.fdtrc(2 * count, count * others, own / np.maximum(level, 1e-300))
         chance[2 * (own - level) < HARMLESS_LINE * power[1:].sum()] = 1.0
         if chance.min() < FALSE_CHANGE_RATE / 2:
             return float(2 * longest / frequencies[chance.argmin()])

@@ -463,9 +463,9 @@ def _one_way(
         # Whether the step passed the point from which the curve began, in the same direction.
         step = (y - last)[:count]
         share = (start - last)[:count] @ step / (step @ step)
-        beside = np.linalg.norm((start - last)[:count] - share * step) < 0.1 * np.linalg.norm(step)
+        aligned = np.linalg.norm((start - last)[:count] - share * step) < 0.1 * np.linalg.norm(step)
         same = after[:count] @ first > 0.9 * np.linalg.norm(after[:count]) * np.linalg.norm(first)
-        if len(points) > 4 and 0 < share <= 1 and beside and same:
+        if len(points) > 4 and 0 < share <= 1 and aligned and same:
             return [*points[:-1], start], True, {}
         length = min(1.5 * length, equations.longest)
     return points, False, {"most": MAX_POINTS}

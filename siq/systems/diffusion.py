@@ -406,7 +406,7 @@ class _InUnits(Diffusion):
             whole = np.broadcast_to(self._constant, (len(y), *self._constant.shape))
             return self.noise.derivatives(y, order) if order else whole
         turned = self.factor * self.noise.derivatives(self.center + y @ self.units.T, order)
-        for matrix in (self._inverse.T, self._inverse.T, *[self.units] * order):  # each index comes to the end
+        for matrix in (self._inverse.T, self._inverse.T, *[self.units] * order):  # each index goes last
             turned = np.tensordot(turned, matrix, axes=(1, 0))
         return turned
 

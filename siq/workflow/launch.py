@@ -375,9 +375,9 @@ def diagnose_cases(folder: str, asked: Request) -> Exit:
 def _not_there(given: str) -> InputError:
     """A wrong path, with where it was looked for and what is there of a similar name."""
     place = given_path(given).absolute()
-    beside = [entry.name for entry in place.parent.iterdir()] if place.parent.is_dir() else []
+    neighbours = [entry.name for entry in place.parent.iterdir()] if place.parent.is_dir() else []
     otherwise = suggestion(given, _known_studies(), otherwise="correct the path")
-    remedy = suggestion(place.name, beside, otherwise=otherwise)
+    remedy = suggestion(place.name, neighbours, otherwise=otherwise)
     if not place.parent.is_dir():
         return InputError(given, "", f"there is no folder {place.parent}", remedy)
     return InputError(given, "", f"there is no file or folder of that name in {place.parent}", remedy)

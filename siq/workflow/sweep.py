@@ -198,8 +198,8 @@ def _well_of(
             place = branch.index_of(np.array(well.state), value)
         if place is not None:
             # Next to a fold the nearest point of the branch may lie behind it.
-            beside = number[max(place - 1, 0) : place + 2]
-            return int(number[place]) if number[place] >= 0 else int(beside.max())
+            neighbours = number[max(place - 1, 0) : place + 2]
+            return int(number[place]) if number[place] >= 0 else int(neighbours.max())
     return -1
 
 
