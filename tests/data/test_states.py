@@ -273,7 +273,6 @@ def test_three_hops_are_no_drift() -> None:
     assert found.rung == 2 and found.limit is not None and found.limit.code == "data.few_hops"
 
 
-<<<<<<< HEAD
 @pytest.mark.parametrize("digits", [1, 16])
 def test_valleys_are_those_of_histograms_between_quantiles(digits: int) -> None:
     series = np.random.default_rng(3).normal(size=(3, 2500)).round(digits)
@@ -284,11 +283,11 @@ def test_valleys_are_those_of_histograms_between_quantiles(digits: int) -> None:
         above = [(np.maximum(counts - valley, 0), place) for place, valley in enumerate(counts)]
         lesser = max(min(peaks[:place].sum(), peaks[place:].sum()) for peaks, place in above)
         assert depth == lesser / 2500
-=======
+
+
 def test_short_recordings_beside_a_long_one_make_no_period() -> None:
     for seed in range(4):
         x = lfilter([1], [1, -0.9], np.random.default_rng(seed).standard_normal(4680))[200:]
         parts = [one[:, None] for one in np.split(x, np.arange(60, 481, 60))]
         given = Recordings.from_arrays([0.1 * np.arange(len(one)) for one in parts], parts, names=["x"])
         assert change_of(given, x, np.zeros(len(x), dtype=int)) is None
->>>>>>> rec
