@@ -115,7 +115,10 @@ def _wells_apart(values: np.ndarray, runs: list[slice]) -> np.ndarray:
     wells = ((edges[1:] + edges[:-1]) / 2)[peaks - 1, None]
     # Pulses of one shape have a peak wherever one is sampled, and are at the next place a sample later.
     if len(wells) > 1:
-        wells = wells[_held(np.abs(values - wells.T).argmin(axis=1), runs, len(wells)) > 0.5]
+        near = np.abs(values - wells.T).argmin(axis=1)
+        first, then = np.concatenate([np.stack([near[run][:-1], near[run][1:]]) for run in runs], axis=1)
+        held = np.bincount(first, weights=first == then, minlength=len(wells))
+        wells = wells[held > 0.5 * np.bincount(first, minlength=len(wells))]
     while len(wells) > 1:
         path, _ = _path_between(values, runs, wells)
         profile = Profile.of(values[:, 0], runs, path, wells[:, 0])
@@ -127,13 +130,6 @@ def _wells_apart(values: np.ndarray, runs: list[slice]) -> np.ndarray:
         lower = place if depth[place, 0] < depth[place, 1] else place + 1
         wells = np.delete(wells, lower, axis=0)
     return wells
-
-
-def _held(near: np.ndarray, runs: list[slice], states: int) -> np.ndarray:
-    """How many of the samples nearest to each state are followed by one more, as a share ``(k,)``."""
-    pairs = np.concatenate([np.stack([near[run][:-1], near[run][1:]]) for run in runs], axis=1)
-    counts = np.bincount(pairs[0], minlength=states)
-    return np.bincount(pairs[0], weights=pairs[0] == pairs[1], minlength=states) / np.maximum(counts, 1)
 
 
 def _path_between(values: np.ndarray, runs: list[slice], wells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -277,7 +273,11 @@ def path_of(
         evenly = np.linspace(low, high, states)
         return np.sort(each[place][:, 0]) if len(each[place]) == states else evenly
 
-    most = _first(runs, MOST_SAMPLES)
+    most, further = list[slice](), MOST_SAMPLES
+    for run in runs:
+        if further > 1:
+            most.append(slice(run.start, min(run.stop, run.start + further)))
+            further -= run.stop - run.start
     for place in sorted(range(len(each)), key=lambda one: one != column):
         one = values[:, place]
         # One level may hide among the wells of the density; with more, any motion is cut into pieces.
@@ -367,17 +367,6 @@ def _without_blurred(path: np.ndarray, runs: list[slice], states: int) -> tuple[
         passed = blurred[part] & (before != part) & (after != part) & (before != after)
         core[run] = np.where(passed, -1, part)
     return continued_visits(core, runs), True
-
-
-def _first(runs: list[slice], most: int) -> list[slice]:
-    """The first runs that have so many samples together, the last of them cut."""
-    found: list[slice] = []
-    for run in runs:
-        if most <= 1:
-            break
-        found.append(slice(run.start, min(run.stop, run.start + most)))
-        most -= run.stop - run.start
-    return found
 
 
 def _places(values: np.ndarray, core: np.ndarray, states: int) -> np.ndarray:

@@ -89,6 +89,13 @@ class _Heading(NamedTuple):
         return self.before_present or _plain(self.title) in AGE_NAMES
 
     @property
+    def may_be_time(self) -> bool:
+        """Whether such a column may be the time."""
+        return _is_time(self.title) and (
+            self.unit is None or self.unit.casefold() in {unit.casefold() for unit in TIME_UNITS}
+        )
+
+    @property
     def is_label(self) -> bool:
         """Whether such a column says which recording a row belongs to."""
         return _plain(self.title) in LABEL_NAMES
@@ -118,7 +125,7 @@ def read_heading(heading: str) -> _Heading:
     text = _BEFORE_PRESENT.sub("", heading).strip()
     if text != heading.strip():
         age = _Heading("age", text) if text in TIME_UNITS else read_heading(text)
-        if may_be_time(age):
+        if age.may_be_time:
             return age._replace(before_present=True)
     text = heading.strip()
     if match := re.fullmatch(r"(.*?)\s*\[\s*(.*?)\s*\]", text):
@@ -264,16 +271,9 @@ def _numbers(source: ColumnFile, place: int) -> np.ndarray | None:
         return None
 
 
-def may_be_time(part: _Heading) -> bool:
-    """Whether a column of this heading may be the time."""
-    return _is_time(part.title) and (
-        part.unit is None or part.unit.casefold() in {unit.casefold() for unit in TIME_UNITS}
-    )
-
-
 def _is_second_time(source: ColumnFile, parts: list[_Heading], place: int) -> bool:
     """Whether a column is another clock: called so, and ever increasing but where recordings begin."""
-    if not may_be_time(parts[place]) or parts[place].title == "T":
+    if not parts[place].may_be_time or parts[place].title == "T":
         return False
     values = _numbers(source, place)
     return values is None or bool((np.diff(values) > 0).mean() > 0.5)
@@ -308,7 +308,7 @@ def _time_column(
     found = [place for place in free if parts[place].title == "t"]
     if found:
         return found[0]
-    found = [place for place in free if may_be_time(parts[place])]
+    found = [place for place in free if parts[place].may_be_time]
     if not found:
         found = [place for place in free if _runs_evenly(_numbers(source, place))]
     if len(found) != 1:

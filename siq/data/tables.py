@@ -25,7 +25,7 @@ import pyarrow.compute as pc
 
 from siq.data.correlation import FEWEST_VALUES, MIN_REPETITIONS
 from siq.data.formats import Column, ColumnFile, open_columns
-from siq.data.layout import layout_of, may_be_time, read_heading
+from siq.data.layout import layout_of, read_heading
 from siq.data.recordings import LONGEST_STEP, TABLE, Recordings
 from siq.errors import InputError
 from siq.numerics.files import files_of
@@ -185,32 +185,33 @@ def _stacked(source: ColumnFile) -> ColumnFile:
 
 def _with_one_clock(source: ColumnFile) -> ColumnFile:
     """Days that stand in one column and the times of day in another, as one column of both."""
-    called = [place for place, one in enumerate(source.headings) if may_be_time(read_heading(one))]
+    called = [place for place, one in enumerate(source.headings) if read_heading(one).may_be_time]
     if len(called) != 2:
         return source
     texts = [one.to_pandas().astype(str).str.strip() for one in source.load(called)]
     alike = [tuple(text.str.fullmatch(one).all() for one in (_DAY_ALONE, _TIME_OF_DAY)) for text in texts]
     if sorted(alike) != [(False, True), (True, False)]:
         return source
-    day = called[alike.index((True, False))]
-    of_day = next(place for place in called if place != day)
+    (day, of_day), joined = called, texts[0] + " " + texts[1]
+    if alike[1][0]:
+        (of_day, day), joined = called, texts[1] + " " + texts[0]
     rest = [place for place in range(len(source.headings)) if place != of_day]
-    joined = pa.array(texts[called.index(day)] + " " + texts[called.index(of_day)])
 
     def load(positions: Sequence[int]) -> list[Column]:
         loaded = source.load([rest[position] for position in positions])
-        return [joined if rest[at] == day else one for at, one in zip(positions, loaded, strict=True)]
+        return [
+            pa.array(joined) if rest[at] == day else one for at, one in zip(positions, loaded, strict=True)
+        ]
 
-    kept = {field: tuple(getattr(source, field)[place] for place in rest) for field in ("headings", "units")}
-    titles = tuple(source.titles[place] for place in rest) if source.titles else ()
-    return replace(source, **kept, load=load, titles=titles)
+    fields = [each for each in ("headings", "units", "titles") if getattr(source, each)]
+    kept = {each: tuple(getattr(source, each)[place] for place in rest) for each in fields}
+    return replace(source, **kept, load=load)
 
 
 def _past_midnight(times: pd.Series) -> pd.Series:
     """Times of day that go on: where a day is all that they fall short of the usual step, a new one began."""
     steps = times.dt.total_seconds().diff()
-    usual = steps.median()
-    midnight = (steps < 0) & (steps + DAY > 0) & (steps + DAY <= LONGEST_STEP * usual)
+    midnight = (steps < 0) & (steps + DAY > 0) & (steps + DAY <= LONGEST_STEP * steps.median())
     return times + pd.to_timedelta(DAY * midnight.cumsum(), unit="s")
 
 

@@ -14,7 +14,6 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import as_file, files
-from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
@@ -252,11 +251,7 @@ class _Dictionary(BaseModel):
 def standard_dictionary() -> tuple[Mechanism, ...]:
     """The mechanisms that come with the library."""
     with as_file(files("siq.diagnosis") / "mechanisms.yaml") as path:
-        return _read_dictionary(path)
-
-
-def _read_dictionary(path: str | Path) -> tuple[Mechanism, ...]:
-    return validate(read_document(path), _Dictionary).mechanisms
+        return validate(read_document(path), _Dictionary).mechanisms
 
 
 def dictionary_of(
@@ -457,7 +452,7 @@ def _among_many(model: Dynamics, formulas: Sequence[sympy.Expr]) -> list[np.ndar
     x, signals = trial_points(model)
     at = (*np.abs(x), *signals.inputs, *signals.delayed, *signals.slopes, signals.t, *model.values)
     written = [model.evaluable(each) for each in formulas]
-    return [np.asarray(each) for each in compile_values(written, model.arguments, common=False)(*at)]
+    return [np.asarray(each) for each in compile_values(written, model.arguments)(*at)]
 
 
 def _turns(model: Dynamics, one: str, other: str) -> bool:

@@ -119,7 +119,7 @@ def along(formulas: Sequence[sympy.Expr], model: Dynamics, data: Measurements, x
     known = {symbol(each.name): each.value for each in model.parameters}
     signals = data.signals(data.t, data.recording, delays=())
     arguments = list(coordinates_of(model).values())
-    compiled = compile_values([each.subs(known) for each in formulas], arguments, common=False)
+    compiled = compile_values([each.subs(known) for each in formulas], arguments)
     values = compiled(*x.T[: model.dimension], *signals.inputs, signals.t)
     return np.stack([np.broadcast_to(each, data.t.shape) for each in values])
 
@@ -527,12 +527,12 @@ def _columns(
         text = shape and (shape.scale_of or shape.inverse_scale_of or shape.quantiles_of)
         if shape and text:
             formula, arguments = parse_formula(text, model.names), list(coordinates_of(model).values())
-            (course,) = compile_values([formula], arguments, common=False)(*x, *signals.inputs, signals.t)
+            (course,) = compile_values([formula], arguments)(*x, *signals.inputs, signals.t)
             typical = float(_sized(shape, np.array(typical), np.broadcast_to(course, x.shape[1:])))
         new.append(typical)
     entries = candidate.columns(model)
     result = np.zeros((model.dimension + len(model.outputs), count, max(len(candidate.amplitudes), 1)))
-    functions = compile_values([each for _, _, each in entries], augmented.arguments, common=False)
+    functions = compile_values([each for _, _, each in entries], augmented.arguments)
     with np.errstate(all="ignore"):
         found = functions(*at, *values, *new)
     for (row, column, _), value in zip(entries, found, strict=True):

@@ -153,7 +153,7 @@ class Probe:
                 some = [one for one in columns if (one[0] >= d) is measured]
                 entries = [(row - d * measured, column) for row, column, _ in some]
                 formulas = [one for _, _, one in some]
-                compiled.append((entries, compile_values(formulas, candidate.model.arguments, common=False)))
+                compiled.append((entries, compile_values(formulas, candidate.model.arguments)))
             trajectories.compiled[id(candidate)] = compiled
         of_rates, of_outputs = trajectories.compiled[id(candidate)]
         nodes = self._carried(trajectories) if candidate.scales else []
@@ -194,7 +194,7 @@ class Probe:
         formulas = [augmented.evaluable(each) for each in augmented.equations[model.dimension :]]
         own = augmented.symbols[model.dimension :]
         arguments = [*own, *(each for each in augmented.arguments if each not in own)]
-        rates, tape = compile_values(formulas, arguments, common=False), Tape.of(formulas, arguments)
+        rates, tape = compile_values(formulas, arguments), Tape.of(formulas, arguments)
         if tape is None:
             names = ", ".join(map(str, formulas))
             raise NumericalFailure(f"a state of its own has a formula that cannot be followed: {names}")

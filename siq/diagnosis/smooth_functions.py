@@ -517,7 +517,7 @@ def _fitting(
         if fitting and len(form.formula.free_symbols) > 1 + fitting[0][0]:  # z is none of its coefficients
             break
         linear = [each for each in (A, B, D) if each in form.formula.free_symbols]
-        slopes = compile_values([form.formula.diff(each) for each in linear], [Z, C], common=False)
+        slopes = compile_values([form.formula.diff(each) for each in linear], [Z, C])
 
         def solved(c: float, slopes: Any = slopes) -> tuple[float, np.ndarray, np.ndarray]:
             """χ² at its best, linear coefficients, and the form, weighted."""

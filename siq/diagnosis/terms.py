@@ -106,7 +106,7 @@ class Place:
         model, grid = trajectories.model, trajectories.grid
         targets = (*self.equations, *self.outputs)  # it has either
         formulas = [*self.coordinates, *(factor for _, factor in targets)]
-        compiled = compile_values(formulas, list(coordinates_of(model).values()), common=False)
+        compiled = compile_values(formulas, list(coordinates_of(model).values()))
 
         def evaluated(x: np.ndarray, values: np.ndarray, node: int | None) -> Iterator[Entry]:
             if bool(self.outputs) is (node is None):

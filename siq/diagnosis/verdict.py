@@ -319,7 +319,7 @@ def _stated_function(
         factor = dict((*place.equations, *place.outputs))[name]
         slopes = (formula.diff(symbol(amplitude)) / factor for amplitude in candidate.amplitudes)
         terms = [_in_coordinate(each, place.coordinates[0]) for each in slopes]
-        columns = compile_values(terms, [COORDINATE], common=False)(at[0])
+        columns = compile_values(terms, [COORDINATE])(at[0])
         weights = np.stack([np.broadcast_to(each, at[0].shape) for each in columns], axis=1).astype(float)
         values = weights @ amplitudes
     if place is not None and at:

@@ -477,7 +477,7 @@ def spread_edges(model: Dynamics, data: Measurements, x: np.ndarray, *, substeps
         return model
     formulas = [model.evaluable(each) for each in arguments]
     signals = data.signals(data.t, data.recording, delays=model.lags(model.values))
-    function = compile_values(formulas, model.arguments, common=False)
+    function = compile_values(formulas, model.arguments)
     further = np.zeros((model.dimension - x.shape[1], len(x)))  # states that a mechanism brings
     along = function(
         *x.T, *further, *signals.inputs, *signals.delayed, *signals.slopes, signals.t, *model.values

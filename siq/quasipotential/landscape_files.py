@@ -140,7 +140,11 @@ def landscape_data(landscape: Landscape) -> dict[str, Any]:
                 "standard_errors": None if errors is None else [_number(one) for one in errors[index]],
                 "basin": float(basin),
                 "height": _number(height),
-                "V": None if well is None else _well_data(well),
+                "V": None
+                if well is None
+                else well.powers
+                | _written(well, WELL)
+                | {"elsewhere": [] if well.elsewhere is None else _rounded(well.elsewhere)},
             }
             | ({"cycle": _written(attractor, CYCLE)} if isinstance(attractor, Cycle) else {})
             for index, (attractor, basin, height, well) in enumerate(
@@ -164,11 +168,6 @@ def landscape_data(landscape: Landscape) -> dict[str, Any]:
         parting = [_written(one, CYCLE) for one in landscape.parting]
         data |= {"parting": parting} if parting else {}
     return data
-
-
-def _well_data(well: Well) -> dict[str, Any]:
-    elsewhere = [] if well.elsewhere is None else _rounded(well.elsewhere)
-    return well.powers | _written(well, WELL) | {"elsewhere": elsewhere}
 
 
 def _transition_data(one: Transition) -> dict[str, Any]:

@@ -206,9 +206,9 @@ class ParametricFunctions:
             return self._equations if what == "rates" else self._measured
         if what == "denominators":
             powers = set[sympy.Pow]().union(*(each.atoms(sympy.Pow) for each in self._equations))
-            kinds = {*self._states}, {*self._free}
-            below = {each.base for each in powers if each.exp.is_negative}
-            return sorted((one for one in below if all(one.free_symbols & each for each in kinds)), key=str)
+            below = {each.base: each.base.free_symbols for each in powers if each.exp.is_negative}
+            both = [one for one, names in below.items() if names & {*self._states} and names & {*self._free}]
+            return sorted(both, key=str)
         smooth, formulas = self._smooth, self._equations
         if what == "output_slopes":
             smooth, formulas = [_without_teeth(each) for each in self._measured], self._measured

@@ -252,21 +252,20 @@ def compile_formulas(
 
 
 def compile_values(
-    expressions: Sequence[sympy.Expr], variables: Sequence[sympy.Symbol], *, common: bool = True
+    expressions: Sequence[sympy.Expr], variables: Sequence[sympy.Symbol]
 ) -> Callable[..., Sequence[np.ndarray | float]]:
     """Turn expressions into a function of as many arguments as there are variables.
 
     Compare `compile_formulas`, whose argument is one array: here some variables may be arrays and others,
     such as parameters, numbers. It gives one value for each expression: an array, or a number where only
-    numbers stand in it. To find the parts that are `common` to several takes longer than it saves for a few
-    short ones.
+    numbers stand in it.
     """
-    return _compiled(tuple(expressions), tuple(variables), common)
+    return _compiled(tuple(expressions), tuple(variables))
 
 
 @functools.lru_cache(maxsize=MAX_COMPILED)
 def _compiled(
-    expressions: tuple[sympy.Expr, ...], variables: tuple[sympy.Symbol, ...], common: bool
+    expressions: tuple[sympy.Expr, ...], variables: tuple[sympy.Symbol, ...]
 ) -> Callable[..., Sequence[np.ndarray | float]]:
     """`compile_values`, once for the same formulas: a diagnosis asks for many of them often."""
     return sympy.lambdify(
@@ -274,7 +273,7 @@ def _compiled(
         list(expressions),
         modules=[{"integer_power": _integer_power}, "numpy"],
         printer=_ProductPrinter(),
-        cse=_common_parts if common else False,
+        cse=_common_parts,
         docstring_limit=0,  # to write the formulas out once more would take a third of the time
         # Renaming is slow, and needed only for names that the generated code may use itself.
         dummify=any(
@@ -293,8 +292,7 @@ def _common_parts(
     """
     taken = {each.name for formula in formulas for each in formula.free_symbols}
     symbols = (each for each in sympy.numbered_symbols("_part", real=True) if each.name not in taken)
-    seen: set[sympy.Basic] = set()
-    twice: set[sympy.Basic] = set()
+    seen, twice = set[sympy.Basic](), set[sympy.Basic]()
     named: dict[sympy.Basic, sympy.Symbol] = {}
     parts: list[tuple[sympy.Symbol, sympy.Expr]] = []
 

@@ -141,4 +141,4 @@ def test_derivatives_of_clearances_take_numbers_beside_arrays() -> None:
         (1.0, (a > 0) & (x > a)), (0.0, True)
     )
     at = np.array([-1.0, 0.2, 2.0])
-    assert np.isfinite(compile_values([slope], [x, a], common=False)(at, 0.5)[0]).all()
+    assert np.isfinite(compile_values([slope], [x, a])(at, 0.5)[0]).all()

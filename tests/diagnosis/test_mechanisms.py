@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.diagnosis.dictionary import _read_dictionary, dictionary_of, roles_of, standard_dictionary, unit_of
+from siq.diagnosis.dictionary import _Dictionary, dictionary_of, roles_of, standard_dictionary, unit_of
 from siq.diagnosis.mechanisms import candidates_of
 from siq.errors import InputError
-from siq.numerics.files import Document, validate
+from siq.numerics.files import Document, read_document, validate
 from siq.systems.cards import SystemCard, build_system, load_system
 from siq.systems.dynamics import Dynamics
 
@@ -197,7 +197,7 @@ def test_entries_that_cannot_be_used_are_refused(text: str, message: str, tmp_pa
     path = tmp_path / "mechanisms.yaml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=message):
-        _read_dictionary(path)
+        validate(read_document(path), _Dictionary)
 
 
 def test_a_formula_outside_the_whitelist_is_refused(oscillator: Dynamics, tmp_path) -> None:
@@ -208,7 +208,12 @@ def test_a_formula_outside_the_whitelist_is_refused(oscillator: Dynamics, tmp_pa
         encoding="utf-8",
     )
     with pytest.raises(InputError, match="evil"):
-        candidates_of(oscillator, roles_of(oscillator), _read_dictionary(path), file="mechanisms.yaml")
+        candidates_of(
+            oscillator,
+            roles_of(oscillator),
+            validate(read_document(path), _Dictionary).mechanisms,
+            file="mechanisms.yaml",
+        )
 
 
 @pytest.mark.parametrize("inertia, offered", [({}, False), ({"fixed": True}, True)])
