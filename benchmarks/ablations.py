@@ -163,7 +163,9 @@ def row(ablation: Ablation, number: int, *, seconds: float) -> dict[str, Any]:
 
 def kept() -> pd.DataFrame:
     """All rows that there are."""
-    tables = [pd.read_csv(path, keep_default_na=False) for path in sorted(TABLES.glob("*.csv"))]
+    texts = {"first_check": str}  # "false" is the name of a branch here
+    paths = sorted(TABLES.glob("*.csv"))
+    tables = [pd.read_csv(path, keep_default_na=False, dtype=texts) for path in paths]
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame({"ablation": [], "run": []})
 
 
