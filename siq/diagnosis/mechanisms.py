@@ -48,6 +48,7 @@ from siq.inference.measurements import Measurements
 from siq.numerics.randomness import positive
 from siq.systems.dynamics import TIME, Dynamics, Parameter, Signals, symbol
 from siq.systems.formulas import FormulaError, compile_values, parse_formula
+from siq.systems.simulation import Simulated
 
 if TYPE_CHECKING:
     from siq.diagnosis.smooth_functions import SmoothFunction
@@ -352,16 +353,16 @@ def _build_candidate(
         outputs=tuple(outputs.items()),
     )
     recorded = ("lattice_of", "top_of", "bottom_of")
-    searches = [  # with the system's own names in their formulas
-        shape.model_copy(
-            update={
-                key: assignment[text] if key in recorded else str(parse_formula(text, names).subs(values))
-                for key, text in shape.model_dump().items()
-                if isinstance(text, str)
-            }
-        )
-        for shape in shapes.values()
-    ]
+    searches = []  # with the system's own names in their formulas
+    for shape in shapes.values():
+        update = dict[str, str]()
+        for key, text in shape.model_dump().items():
+            if isinstance(text, str):
+                formula = symbol(assignment[text]) if key in recorded else parse_formula(text, names)
+                if formula.has(Simulated):  # what only values tell has no text
+                    return None
+                update[key] = str(formula.subs(values))
+        searches.append(shape.model_copy(update=update))
     candidate = MechanismCandidate(
         name=mechanism.name,
         label="",

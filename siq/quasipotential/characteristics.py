@@ -432,6 +432,14 @@ def characteristics(
     )  # fmt: skip
 
 
+def _join(first: Fan, second: Fan) -> Fan:
+    """Two fans of the same attractor and level as one; the curves of the second are counted on."""
+    second = replace(second, curve=second.curve + len(first.directions))
+    names = [one.name for one in fields(Fan)[3:]]  # all but the attractor, the Hessian and the level
+    joined: dict[str, Any] = {n: np.concatenate([getattr(first, n), getattr(second, n)]) for n in names}
+    return replace(first, **joined)
+
+
 def crossed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Whether X has become singular between two tangent frames, ``(n, d, d)``.
 
@@ -502,11 +510,7 @@ def adapted_fan(
         between = _between(fan, gap)[: most - len(fan.directions)]
         if not len(between):
             break
-        more = follow(between)
-        fans = fan, replace(more, curve=more.curve + len(fan.directions))
-        names = [one.name for one in fields(Fan)[3:]]  # all but the attractor, the Hessian and the level
-        joined: dict[str, Any] = {n: np.concatenate([getattr(one, n) for one in fans]) for n in names}
-        fan = replace(fan, **joined)
+        fan = _join(fan, follow(between))
     return fan
 
 

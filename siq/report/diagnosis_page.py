@@ -160,7 +160,11 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str], or
         look_alikes=[(name, names) for name, names in alike if names],
         evidence=_evidence(findings.named),
         explanations=_explanations(statement),
-        wells=_wells(findings.wells),
+        wells=None
+        if findings.wells.empty
+        else findings.wells.replace({"": None})
+        .replace({"simulation": texts("tables")["simulations"]})
+        .dropna(axis=1, how="all"),
         escape=_escape_times(findings.escape),
         bounds=pd.DataFrame(
             [
@@ -384,13 +388,6 @@ def _explanations(statement: Statement) -> pd.DataFrame:
             for what, value in (statement.explanations.items() if told else ())
         ]
     )
-
-
-def _wells(wells: pd.DataFrame) -> pd.DataFrame | None:
-    if wells.empty:
-        return None
-    words = texts("tables")["simulations"]
-    return wells.replace({"": None}).replace({"simulation": words}).dropna(axis=1, how="all")
 
 
 def _escape_times(escape: pd.DataFrame) -> pd.DataFrame | None:
