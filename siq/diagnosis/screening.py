@@ -268,10 +268,12 @@ AnyTerm = TypeVar("AnyTerm", bound=Term)
 def portions(fit: Fit, data: Measurements, terms: Sequence[AnyTerm]) -> list[list[AnyTerm]]:
     """Terms divided so that the response to a portion fits into the memory."""
     most = LARGEST_PORTION // (len(data.t) * (fit.model.dimension + len(fit.model.outputs)))
-    found: list[list[AnyTerm]] = []
+    found, columns = list[list[AnyTerm]](), 0
     for term in terms:
-        if not found or sum(each.width for each in found[-1]) + term.width > max(most, LEAST_PORTION):
+        columns += term.width
+        if not found or columns > max(most, LEAST_PORTION):
             found.append([])
+            columns = term.width
         found[-1].append(term)
     return found
 
