@@ -488,8 +488,7 @@ def by_likelihood(
             break
         kept[worst] = False
         amplitudes[worst] = errors[worst] = 0.0
-    value = problem.likelihood(after if kept.any() else total)
-    return value if amplitudes.any() else -np.inf, amplitudes, errors
+    return problem.likelihood(after) if amplitudes.any() else -np.inf, amplitudes, errors
 
 
 def screen_all(
