@@ -46,7 +46,7 @@ SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".xlsb", ".ods")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 _DASHES = ("-", "--", "---")  # where nothing was measured
-_FORTRAN = re.compile(rb"(?<=[0-9.])[dD](?=[+-]\d\d)")  # the exponent of 1.5D+03
+_FORTRAN = re.compile(rb"(?<=\d)(\.\d*)[dD](?=[+-]\d\d)")  # 1.5D+03, and not the label 7d-01
 _NUMERIC = re.compile(f"{_NUMBER.pattern}|{_DECIMAL_COMMA.pattern}", re.IGNORECASE)
 _GROUPED = re.compile(r"[+-]?\d{1,3}((\.\d{3})+,\d+|(,\d{3})+\.\d+|,\d{3}(,\d{3})+)")
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", "|": "vertical bars", " ": "spaces"}
@@ -166,7 +166,7 @@ def _open_text(file: str) -> ColumnFile:
     except (OSError, EOFError, zlib.error):
         raise InputError(file, "", "it cannot be unpacked", "write the recordings again") from None
     content, remarks = _in_utf8(file, content)
-    content = _FORTRAN.sub(b"E", content.replace("\u2212".encode(), b"-"))  # the minus of typesetters, too
+    content = _FORTRAN.sub(rb"\1E", content.replace("\u2212".encode(), b"-"))  # the minus of typesetters, too
     header = content[:LARGEST_HEADER].rfind(_END_OF_HEADER)
     begin, comments, separator = 0 if header < 0 else _after_line(content, header), [], ""
     while begin < len(content):

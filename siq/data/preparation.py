@@ -209,8 +209,8 @@ def without_faults(recordings: Recordings) -> Recordings:
     A sample stands apart whose steps from the last and to the next are both larger than noise makes one in
     all of the record, and lead back to where it came from; so do several of one value, where most such faults
     last one sample only. Where more than a few such steps do not lead back, the state itself jumps, and
-    nothing is left out. A hum is a line in the spectrum of the steps that keeps
-    its amplitude and its phase in every quarter of a recording, and that hardly moves the state.
+    nothing is left out. A hum is a line in the spectrum of the steps that keeps its amplitude and its phase
+    in every quarter of a recording, and that hardly moves the state.
     """
     floors = noise_floors(recordings)
     if floors is None:

@@ -190,7 +190,7 @@ def change_of(recordings: Recordings, values: np.ndarray, path: np.ndarray) -> f
                 return np.inf
     longest = max(one.stop - one.start for one in parts)
     used = [one for one in parts if one.stop - one.start > 4 * NEIGHBOURS]
-    # As many of one length have a power that is as sure as that of these: short ones hardly add to it.
+    # So many of equal length would tell as much (Satterthwaite): short ones hardly add to a long one.
     lengths = np.array([one.stop - one.start for one in used], dtype=float)
     count = lengths.sum() ** 2 / max(float(lengths @ lengths), 1.0)
     # At half the distance of independent frequencies, so that none falls between two of them; slow ones are

@@ -428,7 +428,7 @@ class _Shooting:
 
     def crosses(self, values: np.ndarray, x: np.ndarray) -> bool:
         """Whether a pole of f lies among states that were all on one side of it where the fit began."""
-        sides = _sides(self.model.with_values(values), self.grid.data, x)
+        sides = _sides(self.model.with_values(values), self.grid.data, x) if self.sides.any() else self.sides
         return bool((sides != self.sides)[self.sides != 0].any())
 
     def change_of(self, now: Fit, white: Whitened, expected: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
@@ -438,7 +438,7 @@ class _Shooting:
         while True:
             rows = (expected[0] * moves, expected[1])
             change = replace(white, columns=white.columns * moves).solve(rows, least=self.resolution)[0]
-            stuck = self.sides.any() and [
+            stuck = [
                 self.crosses(at + np.eye(len(at))[place] * SHORTEST_STEP * one, now.linearised_at)
                 for place, one in zip(free, change * moves, strict=True)
             ]

@@ -288,7 +288,7 @@ def _common_parts(
 ) -> tuple[list[tuple[sympy.Symbol, sympy.Expr]], list[sympy.Expr]]:
     """What stands in formulas more than once, and these with symbols in its place.
 
-    `sympy.cse` simplifies anew whatever it has put a symbol into, which takes longer than all else.
+    `sympy.cse` simplifies anew whatever it has put a symbol into, which is slow.
     """
     taken = {each.name for formula in formulas for each in formula.free_symbols}
     symbols = (each for each in sympy.numbered_symbols("_part", real=True) if each.name not in taken)

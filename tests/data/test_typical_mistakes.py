@@ -337,6 +337,11 @@ def test_dashes_are_missing_and_minus_signs_and_exponents_are_read_as_written(tm
     assert (read.t.tolist(), read.values[:, 0].tolist()) == ([0, 2, 3, 5], [-1.5, 0.25, 1, 2])
 
 
+def test_a_label_with_a_d_is_no_exponent(tmp_path: Path) -> None:
+    text = "recording,t,x\n7d-01,0,1\n7d-01,1,3\n7d-02,0,2\n7d-02,1,1\n"
+    assert read_recordings(put(tmp_path, "days.csv", text)).labels == ("7d-01", "7d-02")
+
+
 def test_words_that_are_no_label_are_left_out(tmp_path: Path) -> None:
     flags = ["ok", "ok", "bad", "ok", "ok", "ok", "bad", "ok"]
     text = "t,x,flag\n" + "".join(f"{t},{t % 3},{flag}\n" for t, flag in enumerate(flags))
