@@ -588,15 +588,15 @@ RESIDENTS: Sequence[Resident] = (
 )  # fmt: skip
 
 
-@cache
-def _candidates(home: str) -> tuple[MechanismCandidate, ...]:
-    model = HOMES[home].model
+@cache  # of homes, which are there once
+def candidates(model: Dynamics) -> tuple[MechanismCandidate, ...]:
+    """All that the dictionary has for a model."""
     return tuple(candidates_of(model, roles_of(model), standard_dictionary()))
 
 
 def truth_of(resident: Resident) -> MechanismCandidate:
     """The candidate whose model is the truth, with its parameters' values in it."""
-    for candidate in _candidates(resident.home):
+    for candidate in candidates(HOMES[resident.home].model):
         stems = {name.rsplit("_", 1)[0]: name for name in candidate.new}
         said = f"{candidate.label} {candidate.changes}"
         if candidate.name == resident.name and set(stems) == set(resident.values) and resident.label in said:

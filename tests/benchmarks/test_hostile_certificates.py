@@ -12,7 +12,7 @@ REFUSED = (
     "hysteresis", "swinging_tilt", "projected_wells", "growing_noise", "force_with_memory",
     "relaxation_oscillator", "lost_buffers", "square_wave", "feedback_with_delay", "growing_oscillation",
 )  # fmt: skip
-NAMED = ("held_values", "quantised")  # values that repeat themselves are no copies of recordings
+NAMED = ("held_values",)  # values that repeat themselves are no copies of recordings
 HONEST = ("gate", "swinging_tilt", "two_offsets", "growing_noise")
 
 

@@ -109,6 +109,15 @@ def nothing(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
     return np.zeros_like(x)
 
 
+OF_OSCILLATORS = (
+    "linear stiffness", "cubic stiffness", "quintic stiffness", "linear damping", "quadratic drag",
+    "dry friction", "asymmetric friction", "backlash", "hysteresis", "constant bias",
+    "sensor gain or offset", "sensor lag", "process noise", "parameter drift", "periodic forcing",
+    "hidden capacity",
+)  # fmt: skip
+"""What a test asks for that is not about the dictionary as a whole; each further entry is fitted, too."""
+
+
 def among(*kept: str, **study: Any) -> dict[str, Any]:
     """A study whose dictionary has these mechanisms and no others."""
     without = [each.name for each in standard_dictionary() if each.name not in kept]
@@ -176,7 +185,7 @@ def test_a_hardening_spring_is_named_measured_and_located(tmp_path: Path) -> Non
 
 def test_a_mechanism_that_is_not_certain_enough_is_described_but_not_named(tmp_path: Path) -> None:
     table = recordings_of(lambda x, v, t: -0.03 * x**3)
-    study = {"held_out": ["r2"], "search": {"wrong_names": 1e-200}}
+    study = among(*OF_OSCILLATORS, search={"wrong_names": 1e-200})
     diagnosis = solved(tmp_path, table, study=study)
     assert said(diagnosis)["outcome"] == "modelled" and names(diagnosis) == []
     assert (
@@ -237,7 +246,7 @@ def test_dry_friction_is_told_from_other_friction(tmp_path: Path) -> None:
 
 def test_random_forces_are_no_mechanism_with_a_formula(tmp_path: Path) -> None:
     # They drive the velocity, and the augmented card says so, though D is singular then.
-    diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.05))
+    diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.05), study=among(*OF_OSCILLATORS))
     np.testing.assert_allclose(diagnosis.augmented.diffusion.matrix, np.diag([0, 0.05]), rtol=0.3)
     path = tmp_path / "augmented.yaml"
     path.write_text(diagnosis.to_card(), encoding="utf-8")
@@ -260,7 +269,7 @@ def test_random_forces_are_no_noise_where_a_function_beside_them_is_likelier(
     monkeypatch.setattr(investigation, "fit_unnamed_models", models)
     monkeypatch.setattr(investigation, "predicts_better", lambda *_, **__: False)
     monkeypatch.setattr(investigation, "errors_left_out", lambda *_, **__: None)
-    diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.05))
+    diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.05), study=among(*OF_OSCILLATORS))
     assert said(diagnosis)["verdict"] == "unexplained" and names(diagnosis) == []
     # It is located where the likeliest function stands.
     place = said(diagnosis)["location"]
@@ -268,7 +277,9 @@ def test_random_forces_are_no_noise_where_a_function_beside_them_is_likelier(
 
 
 def test_random_forces_that_follow_the_motion_are_not_those_of_surroundings(tmp_path: Path) -> None:
-    diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.03, fading=True))
+    diagnosis = solved(
+        tmp_path, recordings_of(nothing, drive=0.03, fading=True), study=among(*OF_OSCILLATORS)
+    )
     assert said(diagnosis)["verdict"] == "unexplained"
     assert any("hidden state" in remark for remark in said(diagnosis)["remarks"])
     # No function foresees them: the card stays as it was, and this is said.
@@ -280,7 +291,7 @@ def test_unequal_friction_is_found_though_its_first_fit_may_lead_nowhere(tmp_pat
     def force(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
         return -np.where(v > 0, 0.25, 0.1) * np.tanh(v / 1e-3)
 
-    diagnosis = solved(tmp_path, recordings_of(force, noise=0.03))
+    diagnosis = solved(tmp_path, recordings_of(force, noise=0.03), study=among(*OF_OSCILLATORS))
     assert names(diagnosis) == ["asymmetric friction"]
     assert diagnosis.investigation.search.fit.substeps > 12  # the jump was made sharp enough
 
@@ -307,7 +318,7 @@ def test_a_function_of_a_sensor_is_located_in_what_is_measured(tmp_path: Path) -
 
 def test_what_the_dictionary_lacks_is_modelled_without_a_name(tmp_path: Path) -> None:
     table = recordings_of(lambda x, v, t: 1.5 * np.exp(-(((x - 0.5) / 0.15) ** 2)), count=8)
-    diagnosis = solved(tmp_path, table, study={"held_out": ["r2", "r5"]})
+    diagnosis = solved(tmp_path, table, study=among(*OF_OSCILLATORS, held_out=["r2", "r5"]))
     assert said(diagnosis)["verdict"] == "missing physics" and said(diagnosis)["mechanisms"] == []
     assert said(diagnosis)["outcome"] == "modelled"
     assert said(diagnosis)["location"]["coordinate"] == "x"
@@ -346,7 +357,8 @@ def test_what_a_name_leaves_is_described_and_no_sample_of_a_test_chooses_it(
     monkeypatch.setattr(investigation, "named_by_forecasts", lambda *_: (None, ()))
     monkeypatch.setattr("siq.diagnosis.naming._judge_mechanisms", the_first_alone)
     table = recordings_of(lambda x, v, t: -2.0 * x**3 - 0.1 * v * np.abs(v), count=6)
-    study = {"held_out": ["r2", "r4"], "tests": ["r2", "r4"], "search": {"mechanisms": 2}}
+    parts = {"held_out": ["r2", "r4"], "tests": ["r2", "r4"], "search": {"mechanisms": 2}}
+    study = among(*OF_OSCILLATORS, **parts)
     diagnosis = solved(tmp_path, table, study=study)
     verdict = said(diagnosis)
     assert verdict["verdict"] == "missing physics" and names(diagnosis) == ["cubic stiffness"]
@@ -367,7 +379,9 @@ def test_what_a_name_leaves_is_described_and_no_sample_of_a_test_chooses_it(
 
 
 def test_a_bias_and_an_offset_of_the_sensor_are_one_class(tmp_path: Path) -> None:
-    diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: np.full_like(x, 0.4)))
+    diagnosis = solved(
+        tmp_path, recordings_of(lambda x, v, t: np.full_like(x, 0.4)), study=among(*OF_OSCILLATORS)
+    )
     first = said(diagnosis)["mechanisms"][0]
     assert {first["name"], *first["indistinguishable_from"]} == {"constant bias", "sensor gain or offset"}
 
@@ -503,7 +517,7 @@ def test_a_name_that_misleads_on_recordings_held_out_is_withdrawn(tmp_path: Path
         return np.where(np.arange(len(x)) % 4 == 2, 0.0, 0.4)  # r2 and r6 are level
 
     table = recordings_of(tilted, count=8)
-    diagnosis = solved(tmp_path, table, study={"held_out": ["r2", "r6"]})
+    diagnosis = solved(tmp_path, table, study=among(*OF_OSCILLATORS, held_out=["r2", "r6"]))
     verdict = said(diagnosis)
     assert verdict["verdict"] == "unexplained" and names(diagnosis) == []
     assert verdict["description"]["misleading"] and verdict["description"]["by"][0]["name"] == "constant bias"
@@ -513,7 +527,8 @@ def test_a_name_that_misleads_on_recordings_held_out_is_withdrawn(tmp_path: Path
     # Nothing that was found is put into the card that would make it worse.
     assert verdict["described"] == [] and verdict["fit"]["before"] < verdict["fit"]["augmented"]
     # Held out otherwise, the same recordings show the bias and nothing against it.
-    diagnosis = solved(tmp_path, table[~table["recording"].isin(["r2", "r6"])], study={"held_out": ["r1"]})
+    level = table["recording"].isin(["r2", "r6"])
+    diagnosis = solved(tmp_path, table[~level], study=among(*OF_OSCILLATORS, held_out=["r1"]))
     assert said(diagnosis)["verdict"] == "missing physics"
 
 

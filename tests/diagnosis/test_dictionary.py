@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
 import pytest
 import sympy
-from homes_of_mechanisms import HOMES, RESIDENTS, model_of, numbers, recorded, states, truth_of
+from homes_of_mechanisms import HOMES, RESIDENTS, candidates, model_of, numbers, recorded, states, truth_of
 
 from siq.data.correlation import resolution_step
 from siq.diagnosis.dictionary import Mechanism, Shape, roles_of, standard_dictionary
 from siq.diagnosis.mechanisms import (
     MechanismCandidate,
     _plateau,
-    candidates_of,
     places_of,
 )
 from siq.diagnosis.screening import screen_all
@@ -35,11 +33,6 @@ OSCILLATOR = {
 @cache
 def dictionary() -> tuple[Mechanism, ...]:
     return standard_dictionary()
-
-
-@cache  # of homes, which are there once
-def candidates(model: Dynamics) -> Sequence[MechanismCandidate]:
-    return candidates_of(model, roles_of(model), dictionary())
 
 
 def names(model: Dynamics) -> set[str]:

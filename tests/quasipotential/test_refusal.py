@@ -34,7 +34,7 @@ def telegraph() -> Recordings:
 
 def double_well() -> Recordings:
     draw = np.random.default_rng(1)
-    x = np.empty((20_000, 1))
+    x = np.empty((8_000, 1))
     x[0] = 1.0
     for before in range(len(x) - 1):
         kick = np.sqrt(0.25 * 0.05) * draw.standard_normal()

@@ -11,8 +11,6 @@ from siq.systems import continuation
 from siq.systems.continuation import follow_branches, follow_curves
 from siq.systems.dynamics import Dynamics
 
-pytestmark = pytest.mark.portable
-
 a, b, x, y, z, k, mu = sympy.symbols("a b x y z k mu", real=True)
 
 

@@ -17,8 +17,6 @@ from siq.remarks import Remark, sentence
 from siq.systems.dynamics import Dynamics
 from siq.systems.escapes import split_escapes
 
-pytestmark = pytest.mark.portable
-
 x, y, v = sympy.symbols("x y v", real=True)
 
 
