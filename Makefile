@@ -14,7 +14,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 
-.PHONY: help statistics examples test suite test-portable full untuned noise wheel test-pages newcomer laboratories coverage supports discrepancies \
+.PHONY: help statistics examples test suite test-portable full untuned noise slurm wheel test-pages newcomer laboratories coverage supports discrepancies \
         hostile golden mutants official docs docs-full schemas release-check lint format environment clean
 
 help:  ## this list, which plain `make` prints, too
@@ -49,6 +49,11 @@ untuned: environment  ## systems for which nothing was tuned, with networks
 
 noise: environment  ## statistics of the paper's system with noise, 50 runs
 	$(BIN)/pytest -m slow -s tests/slow/test_noise_statistics.py
+
+# Controller and two nodes on this machine, as root; see the docstring of the test for what has to be there.
+slurm: environment  ## a study on a small Slurm of its own, of which a node dies
+	$(INSTALL) --constraint requirements/pinned.txt --editable '.[dev,slurm]'
+	$(BIN)/pytest -m slow -s tests/slow/test_slurm.py
 
 # The wheel, and a small problem solved with it where neither the sources nor an extra are at hand.
 wheel: environment  ## the wheel in dist/, installed and used elsewhere without extras
