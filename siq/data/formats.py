@@ -184,6 +184,10 @@ def _open_text(file: str) -> ColumnFile:
     lines = [line for line in sample if line.strip() and not line.lstrip().startswith(_COMMENTS)]
     if not lines:
         raise InputError(file, "", "the table has no headings and no rows", "write the recordings again")
+    if beside := _beside_settings(lines):
+        cells = csv.reader(content[begin:].decode("utf-8", errors="ignore").splitlines())
+        kept = [",".join(row[place] for place in beside) for row in cells if row]
+        content, begin, lines = "\n".join(kept).encode(), 0, kept[: len(lines)]
     before = _preamble(lines, separator)
     comments += lines[:before]
     begin, lines = begin if not before else content.index(lines[before].encode(), begin), lines[before:]
@@ -204,6 +208,9 @@ def _open_text(file: str) -> ColumnFile:
         if not above and len(headings) > 1 and len(rows) >= FEWEST_UNNAMED:
             above = [f"column {number}" for number in range(1, len(headings) + 1)]
             remarks.append(Remark("data.no_headings", {}))
+        if not above and len(headings) == 1:
+            remedy = "add the time of every sample as a column, and a first line such as t,x"
+            raise InputError(file, "", "it is one column of numbers, without a time", remedy)
         if not above:
             example = ",".join(["t", *"xyzuvw"][: len(headings)])
             fault = "the first line holds numbers where the headings should stand"
@@ -284,14 +291,33 @@ def _separator(lines: list[str]) -> str:
 
 
 def _preamble(lines: list[str], separator: str) -> int:
-    """How many lines stand before the headings, such as ``Operator: Ann``, of another width than all rows."""
-    separator = separator or _separator(lines[-2:])
-    widths = [len(_split(line, separator)) for line in lines]
-    rows = next((place for place in range(len(lines)) if len(set(widths[place:])) == 1), 0)
-    headings = _split(lines[rows], separator)
-    if widths[0] == widths[-1] or widths[-1] < 2 or len(lines) - rows <= FEWEST_UNNAMED:
+    """How many lines stand before the headings, such as ``Operator: Ann`` or ``Horizontal scale,0.0004``.
+
+    Rows have numbers where the last one has. No line before the headings has them all.
+    """
+    rows = [_split(line, separator or _separator(lines[-2:])) for line in lines]
+    numbers = [place for place, cell in enumerate(rows[-1]) if _NUMERIC.fullmatch(cell)]
+    data = [
+        len(row) == len(rows[-1]) and all(_NUMERIC.fullmatch(row[place]) for place in numbers) for row in rows
+    ]
+    if not numbers or sum(data) < FEWEST_UNNAMED:
         return 0
-    return 0 if any(map(_NUMERIC.fullmatch, headings)) else rows
+    first = data.index(True)
+    units = first > 1 and _line_of_units(rows[first - 1], len(rows[-1])) is not None
+    headings = first - 1 - units
+    if headings <= 0 or len(rows[headings]) != len(rows[-1]) or any(map(_NUMERIC.fullmatch, rows[headings])):
+        return 0
+    return headings
+
+
+def _beside_settings(lines: list[str]) -> list[int]:
+    """Columns of numbers to the right of an oscilloscope's settings, which end after some lines."""
+    rows = [_split(line, ",") for line in lines]
+    used = [place for place, cell in enumerate(rows[-1]) if cell]
+    if len(rows) < FEWEST_UNNAMED or len(used) < 2 or used[0] == 0 or not rows[0][0]:
+        return []
+    numbers = (len(row) > used[-1] and all(_NUMERIC.fullmatch(row[place]) for place in used) for row in rows)
+    return used if all(numbers) else []
 
 
 def _split(line: str, separator: str) -> list[str]:

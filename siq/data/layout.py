@@ -37,14 +37,14 @@ RESERVED = _words("sin cos tan exp log sqrt tanh atan Abs sign Max Min pi record
 
 TIME_NAMES = _words(
     "t time times zeit temps tiempo tempo timestamp timestamps datetime date elapsed elapsedtime clock"
-    " clocktime uhrzeit datum seconds xvalue"
+    " clocktime uhrzeit datum seconds xvalue xaxis"
 )
 AGE_NAMES = _words("age ages alter")
 LABEL_NAMES = _words(
     "recording recordings record run runs trial trials id rec experiment measurement series trajectory traj"
     " track trackid runid recordingid trialid recid trajectoryid replicate repetition rep file filename sweep"
-    " ringdown label particle particleid messung versuch aufnahme cell molecule roi animal mouse subject"
-    " patient replica realization realisation"
+    " ringdown label particle particleid messung versuch aufnahme cell chunk molecule roi animal mouse"
+    " subject patient replica realization realisation"
 )
 INDEX_NAMES = _words("index idx row rowid rownumber unnamed")
 TIME_UNITS = _words(
@@ -63,7 +63,7 @@ _PREFIXED = "mol|Ohm|ohm|rad|bar|cal|cd|Hz|Pa|Wb|lm|lx|sr|Da|eV|px|Ω|m|s|g|A|K|
 _ALONE = (
     r"counts?|cts|pixels?|px|adu|ADU|a\.?u\.?|arb\.? ?u(?:nits?)?\.?|n\.?u\.?|atm|Torr|mmHg|rpm|ppm|ppb|dB"
     r"|deg|degrees?|radians?|°[CF]?|%|‰|permil|1|-|min|minutes?|hours?|hrs?|h|days?|d|weeks?|months?|years?|[kM]?yr|ka"
-    r"|sec(?:ond)?s?|volts?|meters?|metres?|k_?B ?T|kT|Å|u|LSB|lsb|bits?"
+    r"|sec(?:ond)?s?|[Vv]olts?|[Aa]mp(?:ere)?s?|meters?|metres?|k_?B ?T|kT|Å|u|LSB|lsb|bits?"
 )
 _POWER = r"(?:(?:\^|\*\*)?\{?[-−+]?\d+(?:[./]\d+)?\}?|[⁺⁻]?[⁰¹²³⁴⁵⁶⁷⁸⁹]+)?"
 _FACTOR = rf"(?:(?:{_ALONE}|{_PREFIX}(?:{_PREFIXED})){_POWER})"
@@ -297,7 +297,8 @@ def _tells_time(title: str, source: ColumnFile, place: int) -> bool:
     if (values := _numbers(source, place)) is None or pa.types.is_temporal(cells.type):
         first = next((str(one) for one in cells.to_pylist() if one), "")
         return re.match(r"\d{4}-\d\d-\d\d|\d\d?\.\d\d?\.\d{4}", first) is not None
-    rises = len(values) > 1 and bool((np.diff(values[np.isfinite(values)]) <= 0).mean() <= EVEN)
+    steps = np.diff(values[np.isfinite(values)])
+    rises = len(steps) > 0 and bool((steps <= 0).mean() <= EVEN)
     return rises and any(_is_time(word) for word in re.split(r"[\W_]+", title) if len(word) > 1)
 
 

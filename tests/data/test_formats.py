@@ -98,6 +98,45 @@ def test_lines_before_the_headings_are_no_headings(tmp_path: Path) -> None:
     assert (read.names, read.units, read.time_unit, len(read.t)) == (("X", "Y"), ("V", "V"), "s", 30)
 
 
+SETTINGS = ("Record Length,2.5e+03", "Sample Interval,0.1", "Trigger Point,0", ",", "Model Number,TDS2024B")
+SCOPES = {
+    "with headings": (
+        "Model,MDO3024\nHorizontal Scale,0.0004,\nGating,0.0% to 100.0%,\nLabel,,\nTIME,CH1,\n"
+        + "".join(f"{0.1 * k:.1f},{k % 5},\n" for k in range(30)),
+        "CH1",
+    ),
+    "settings as wide as rows": (
+        "Model,DPO4104\nHorizontal Scale,0.0004\nTIME,CH1\n"
+        + "".join(f"{0.1 * k:.1f},{k % 5}\n" for k in range(30)),
+        "CH1",
+    ),
+    "settings in columns": (
+        "".join(f"{SETTINGS[k] if k < len(SETTINGS) else ','},,{0.1 * k:.1f},{k % 5},\n" for k in range(30)),
+        "column_2",
+    ),
+    "x-axis": (
+        "x-axis,1\nsecond,Volt\n" + "".join(f"{0.1 * k:+.3E},{k % 5:+.2E}\n" for k in range(30)),
+        "x_1",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", SCOPES)
+def test_oscilloscopes_write_their_settings_above_or_to_the_left(kind: str, tmp_path: Path) -> None:
+    text, name = SCOPES[kind]
+    (tmp_path / "scope.csv").write_text(text, encoding="utf-8")
+    read = read_recordings(tmp_path / "scope.csv")
+    assert read.names == (name,) and read.values.ravel().tolist() == [k % 5 for k in range(30)]
+    np.testing.assert_allclose(read.t, 0.1 * np.arange(30))
+
+
+def test_rows_without_a_value_are_no_settings(tmp_path: Path) -> None:
+    rows = "".join(f"{k},{k % 5 if k > 2 else ''}\n" for k in range(30))
+    (tmp_path / "late.csv").write_text("t,x\n" + rows, encoding="utf-8")
+    read = read_recordings(tmp_path / "late.csv")
+    assert read.names == ("x",) and read.values.ravel().tolist() == [k % 5 for k in range(3, 30)]
+
+
 def test_tables_below_each_other_repeat_their_headings(tmp_path: Path) -> None:
     path = tmp_path / "all.csv"
     path.write_text("t [s],x\n0,1\n1,2\nt [s],x\n0,3\n1,4\n", encoding="utf-8")
