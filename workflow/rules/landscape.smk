@@ -15,8 +15,6 @@ use rule run_task as landscape with:
         "results/{study}/logs/{run}/landscape.log",
     benchmark:
         "results/{study}/benchmarks/{run}/landscape.tsv"
-    group:
-        "runs"
     params:
         **task("landscape"),
     message:

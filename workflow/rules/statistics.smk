@@ -24,8 +24,6 @@ use rule run_task as draw with:
         "results/{study}/logs/{run}/draw.log",
     benchmark:
         "results/{study}/benchmarks/{run}/draw.tsv"
-    group:
-        "runs"
     params:
         **task("draw"),
     message:
@@ -42,8 +40,6 @@ use rule run_task as identify with:
         "results/{study}/logs/{run}/identify.log",
     benchmark:
         "results/{study}/benchmarks/{run}/identify.tsv"
-    group:
-        "runs"
     params:
         **task("identify"),
     message:
@@ -62,8 +58,6 @@ use rule run_task as train with:
         "results/{study}/logs/{block}/train.log",
     benchmark:
         "results/{study}/benchmarks/{block}/train.tsv"
-    group:
-        "runs"
     params:
         **task("train"),
     message:
@@ -82,8 +76,6 @@ use rule run_task as regress with:
         "results/{study}/logs/{run}/regress.log",
     benchmark:
         "results/{study}/benchmarks/{run}/regress.tsv"
-    group:
-        "runs"
     params:
         **task("regress"),
     message:
@@ -107,8 +99,6 @@ use rule run_task as refine with:
         "results/{study}/logs/{run}/refine.log",
     benchmark:
         "results/{study}/benchmarks/{run}/refine.tsv"
-    group:
-        "runs"
     params:
         **task("refine"),
     message:
@@ -131,8 +121,6 @@ use rule run_task as score with:
         "results/{study}/logs/{run}/score.log",
     benchmark:
         "results/{study}/benchmarks/{run}/score.tsv"
-    group:
-        "runs"
     params:
         **task("score"),
     message:
