@@ -593,17 +593,11 @@ def _open_numpy(file: str) -> ColumnFile:
 
 READERS: dict[str, Callable[[str], ColumnFile]] = {
     ".parquet": _open_parquet,
-    ".csv": _open_text,
-    ".tsv": _open_text,
-    ".txt": _open_text,
-    ".dat": _open_text,
-    ".lvm": _open_text,
-    ".h5": _open_hdf5,
-    ".hdf5": _open_hdf5,
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".lvm"), _open_text),
+    **dict.fromkeys((".h5", ".hdf5"), _open_hdf5),
     ".nc": _open_netcdf,
     ".mat": _open_matlab,
-    ".npz": _open_numpy,
-    ".npy": _open_numpy,
+    **dict.fromkeys((".npz", ".npy"), _open_numpy),
 }
 """How the columns of a file are read, by the suffix of its name."""
 

@@ -201,10 +201,8 @@ def filter_recursion(
             state[i, 1 + columns + i] = 1.0
         for k in range(first[recording], first[recording + 1]):
             if kept:
-                for i in range(dimension):
-                    predicted[k, i] = state[i, 0]
-                    for j in range(dimension):
-                        before[k, i, j] = covariance[i, j]
+                predicted[k] = state[:, 0]
+                before[k] = covariance
             for o in range(outputs):
                 if np.isnan(residual[k, o]):
                     continue
@@ -230,8 +228,7 @@ def filter_recursion(
                     whitened[k, o, c] = shown[c] * scale
                 log_determinant += np.log(spread)
                 if kept:
-                    for i in range(dimension):
-                        gains[k, o, i] = gain[i]
+                    gains[k, o] = gain
                     variances[k, o] = spread
                 surprise = innovation * innovation / spread
                 for c in range(size):
@@ -269,10 +266,8 @@ def filter_recursion(
                     for j in range(dimension):
                         covariance[i, j] -= share * gain[j]
             if kept:
-                for i in range(dimension):
-                    filtered[k, i] = state[i, 0]
-                    for j in range(dimension):
-                        after[k, i, j] = covariance[i, j]
+                filtered[k] = state[:, 0]
+                after[k] = covariance
             if k + 1 == first[recording + 1]:
                 break
             for i in range(dimension):
