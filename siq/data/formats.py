@@ -208,13 +208,10 @@ def _open_text(file: str) -> ColumnFile:
         if not above and len(headings) > 1 and len(rows) >= FEWEST_UNNAMED:
             above = [f"column {number}" for number in range(1, len(headings) + 1)]
             remarks.append(Remark("data.no_headings", {}))
-        if not above and len(headings) == 1:
-            remedy = "add the time of every sample as a column, and a first line such as t,x"
-            raise InputError(file, "", "it is one column of numbers, without a time", remedy)
         if not above:
-            example = ",".join(["t", *"xyzuvw"][: len(headings)])
+            example = ",".join(["t", *"xyzuvw"][: max(len(headings), 2)])
             fault = "the first line holds numbers where the headings should stand"
-            remedy = f"add a first line that names the columns, such as {example}"
+            remedy = f"add a first line that names the columns, the time among them, such as {example}"
             raise InputError(file, "line 1" if begin == 0 else "", fault, remedy)
         headings, rows = above, [headings, *rows]
     else:
