@@ -55,6 +55,7 @@ from siq.data.stationarity import (
     stretches_of,
     usual_step,
 )
+from siq.errors import NumericalFailure
 from siq.numerics.integration import machine_code
 from siq.numerics.randomness import positive
 from siq.remarks import Remark, sentence
@@ -557,11 +558,15 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
             found, limit=Remark("data.not_stationary", {"period": known, "unit": recordings.time_unit})
         )
     found = replace(found, rung=2, profile=profile)
+    few = replace(found, limit=Remark("data.few_hops"))
     if min(one.visits for one in counts) < FEWEST_HOPS:
-        return replace(found, limit=Remark("data.few_hops", {"fewest": FEWEST_HOPS}))
+        return few
     if sparse.csgraph.connected_components(found.hops, connection="strong")[0] > 1:
         return replace(found, limit=Remark("data.states_apart"))
-    model = MarkovModel.of(path, runs, number, expected)
+    try:
+        model = MarkovModel.of(path, runs, number, expected)
+    except NumericalFailure:
+        return few
     if model is None:
         return replace(found, limit=Remark("data.not_markov"))
     model = model._replace(lag=step * model.lag, stays=step * model.stays, rates=model.rates / step)

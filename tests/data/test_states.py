@@ -161,6 +161,12 @@ def test_a_record_that_swings_ends_on_the_first_rung_with_its_period() -> None:
     assert found.limit.values["period"] == pytest.approx(25, rel=0.02)
 
 
+def test_a_dozen_hops_are_too_few_to_refute_a_markov_process() -> None:
+    lengths = [400, 900, 150, 700, 60, 1100, 300, 500, 800, 250, 600, 350]
+    found = states_of_noise(np.repeat(np.arange(12) % 2, lengths))
+    assert found.rung == 2 and found.limit == Remark("data.few_hops")
+
+
 def test_stays_that_are_too_regular_make_no_markov_model() -> None:
     lengths = np.ceil(np.random.default_rng(6).gamma(6, 15, 80)).astype(int)
     found = states_of_noise(np.repeat(np.arange(80) % 2, lengths))
