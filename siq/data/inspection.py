@@ -143,8 +143,7 @@ class Inspection:
 
     def _findings(self) -> list[Remark]:
         memory, titles, unit = self.memory, self.recordings.titles, self.recordings.time_unit
-        values: dict[str, Any]
-        values = {
+        values: dict[str, Any] = {
             "kind": memory.kind, "lag": memory.lag, "time": memory.time, "memory": memory.memory,
             "correlation": 0.0, "state": "", "unit": unit,
         }  # fmt: skip
