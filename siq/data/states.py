@@ -119,6 +119,7 @@ AVERAGED_SHARES = (0.0, 0.5, 1.0)  # of the relaxation time, over which samples 
 FEWEST_POINTS = 4  # of a run, with a spectrum
 MOST_POINTS = 8192  # of a series that surrogates are made of
 BINS = 40  # of a histogram, at most
+ATOM = 10  # times the samples at the number next to it: the last one is no place of a density, but an end
 FEWEST_BINS = 10  # in which a valley can be seen
 DEGREES = (5, 9)  # of f in the test: two attractors that differ need more than a cubic, three more than that
 STRETCH_TIMES = 40  # local relaxation times: shorter ones bias f towards one state, longer ones let drifts in
@@ -557,6 +558,15 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         return replace(
             found, limit=Remark("data.not_stationary", {"period": known, "unit": recordings.time_unit})
         )
+    numbers, times = np.unique(values[:, column], return_counts=True)
+    for end, next_to_it in ((0, 1), (-1, -2)):
+        if len(numbers) > BINS and times[end] > max(len(values) / BINS, ATOM * times[next_to_it]):
+            told = {
+                "value": float(numbers[end]),
+                "share": float(times[end] / len(values)),
+                "state": found.state,
+            }
+            return replace(found, limit=Remark("data.clipped", told | {"unit": found.unit or ""}))
     found = replace(found, rung=2, profile=profile)
     few = replace(found, limit=Remark("data.few_hops"))
     if min(one.visits for one in counts) < FEWEST_HOPS:
