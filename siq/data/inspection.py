@@ -96,11 +96,6 @@ class Inspection:
     switching: RecordStates | None  #: two states with the hops between them; None of recordings without noise
 
     @property
-    def seen(self) -> RecordStates | None:
-        """Another name of `switching`."""
-        return self.switching
-
-    @property
     def notes(self) -> tuple[str, ...]:
         """What was assumed or repaired in reading, and what is unusual, in words."""
         return tuple(map(sentence, (*self.recordings.remarks, *unusual(self.recordings))))
@@ -148,8 +143,7 @@ class Inspection:
 
     def _findings(self) -> list[Remark]:
         memory, titles, unit = self.memory, self.recordings.titles, self.recordings.time_unit
-        values: dict[str, Any]
-        values = {
+        values: dict[str, Any] = {
             "kind": memory.kind, "lag": memory.lag, "time": memory.time, "memory": memory.memory,
             "correlation": 0.0, "state": "", "unit": unit,
         }  # fmt: skip
@@ -248,7 +242,9 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
         low, high = float(x.min()), float(x.max())
         states.append(_StateFacts(name, title, unit, low, high, resolution_step(x), noise, label))
     memory = markov_lag(recordings)
-    turns = any(one.code == "data.wrapped_angle" for one in unusual(recordings))  # it is where it was, turned
+    turns = any(
+        one.code.endswith("wrapped_angle") for one in unusual(recordings)
+    )  # it is where it was, turned
     # Of the cells over the range of one state or two, those that were visited.
     some = recordings.values[:, :2]
     low, high = np.quantile(some, [OUTLIER_SHARE, 1 - OUTLIER_SHARE], axis=0)

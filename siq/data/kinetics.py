@@ -26,6 +26,7 @@ from scipy.spatial import cKDTree
 
 from siq.data.correlation import resolution_step
 from siq.data.stationarity import MOST_RUNS, WHITE_CORRELATION, correlated_samples
+from siq.errors import NumericalFailure
 from siq.numerics.randomness import positive
 
 MOST_STATES = 6  # looked for
@@ -465,6 +466,8 @@ class MarkovModel(NamedTuple):
     ) -> MarkovModel | None:
         """The Markov model of a path at the shortest lag that its test allows; None where there is none.
 
+        Where hops are too few to test one it is a NumericalFailure.
+
         `counts` are transitions from sample to sample, where a hidden Markov model knows them better.
         """
         from deeptime.markov import TransitionCountEstimator
@@ -484,6 +487,8 @@ class MarkovModel(NamedTuple):
             scores = _memoryless(path, runs, states, int(lag) - 1)
             tested = scores[scores[:, 1] > 0]
             if tested[:, 1].sum() < REGULAR**2:
+                if lag == 1:
+                    raise NumericalFailure("the hops are too few")
                 return None
             aged = min(_chance(*one) for one in (tested[:, :2].sum(axis=0), *tested[:, :2]))
             if aged * (len(tested) + 1) <= REFUSED:

@@ -29,9 +29,12 @@ from siq.data.recordings import (
 from siq.data.states import switching
 from siq.data.stationarity import background_of, change_of, correlated_samples, runs_of, usual_step
 from siq.errors import InputError
+from siq.numerics.randomness import positive
 from siq.remarks import Remark
 
 FULL_TURNS = {2 * np.pi: "2π", 360.0: "360"}  # of an angle, in radians and in degrees
+FEWEST_TURNS = 3  # that show f to be the same in each
+OF_A_TURN, NOT_OF_A_TURN = 1e-6, 0.01  # probabilities that f has no such period, and that it has it
 ENDS_OF_TURN = 0.05  # of a turn, within which a column that jumps by one comes to 0 and 1 of it, or to ±½
 FEWEST_STRETCHES = 10  # of a single recording, at least, two of which are held out
 MOST_STRETCHES = 40  # more make no error better known
@@ -39,6 +42,7 @@ STRETCH_LENGTH = 10  # correlation times: what is left of its first sample at it
 BLOCK = 200  # steps, whose median says how large steps are thereabouts
 FALSE_FAULT_RATE = 1e-3  # probability with which a record of white noise has a step that stands out
 FEW_JUMPS, MOST_APART = 0.05, 0.01  # that stay, a sample that does not; of all samples
+MOST_ALIKE = 0.1  # of all samples, where most that stand apart are one number, which noise never repeats
 QUARTERS, SAME_WAVE = 4, 0.5  # of a recording, in which a hum has one amplitude and phase, to a half of it
 SLIGHT_HUM = 0.1  # of the variance of a state: what moves it more may be the state itself, which circulates
 KNOWN_SCALE = 0.01  # a choice: relative error to which a velocity tells how its position moves
@@ -154,7 +158,24 @@ def unusual(recordings: Recordings) -> list[Remark]:
             if count and wide <= MOST_WIDE_STEPS and close:
                 told = {"column": title, "name": name, "turn": text, "count": count}
                 found.append(Remark("data.wrapped_angle", told))
+            far = wide <= MOST_WIDE_STEPS and np.ptp(values) > FEWEST_TURNS * turn
+            if far and _repeats_itself(values[:-1][inside], np.diff(values)[inside], turn):
+                found.append(Remark("data.unwrapped_angle", {"column": title, "name": name, "turn": text}))
     return found
+
+
+def _repeats_itself(x: np.ndarray, moves: np.ndarray, turn: float) -> bool:
+    """Whether what moves a state is the same a turn on: it depends on the phase, and not on the turn."""
+    waves = np.exp(2j * np.pi * np.outer(x, [1, 2]) / turn)
+    shapes = np.column_stack([np.ones(len(x)), waves.real, waves.imag])
+    quarter = np.searchsorted(np.quantile(x, np.arange(1, QUARTERS) / QUARTERS), x)
+    own = shapes[:, :, None] * (quarter[:, None] == np.arange(QUARTERS))[:, None]
+    designs = (shapes[:, :1], shapes, own.reshape(len(x), -1))
+    left = np.array([np.linalg.lstsq(one, moves, rcond=None)[1].sum() for one in designs])
+    sizes = np.array([one.shape[1] for one in designs])
+    more, free = np.diff(sizes), len(x) - sizes[1:]
+    of_phase, of_turn = special.fdtrc(more, free, -np.diff(left) / more * free / positive(left[1:]))
+    return bool(of_phase < OF_A_TURN and of_turn > NOT_OF_A_TURN and left[2] > 0)
 
 
 def in_stretches(recordings: Recordings, *, hidden_velocities: bool | Literal["auto"] = False) -> Recordings:
@@ -212,12 +233,15 @@ def without_faults(recordings: Recordings) -> Recordings:
     nothing is left out. A hum is a line in the spectrum of the steps that keeps its amplitude and its phase
     in every quarter of a recording, and that hardly moves the state.
     """
-    floors = noise_floors(recordings)
-    if floors is None:
+    if noise_floors(recordings) is None:
         return recordings
-    noisy = [state for state, floor in enumerate(floors) if floor.process]  # what else jumps was measured
+
+    def without(apart: np.ndarray) -> Recordings:
+        kept = {name: getattr(recordings, name)[~apart] for name in ("t", "recording", "values")}
+        return replace(recordings, **kept)
+
     apart, remarks = np.zeros(len(recordings.t), dtype=bool), list(recordings.remarks)
-    for state in noisy:
+    for state in range(len(recordings.names)):
         same, moves = np.diff(recordings.recording) == 0, np.diff(recordings.values[:, state])
         begins = np.flatnonzero(np.r_[True, ~same | (moves != 0)])  # of stretches of one value
         lasts = np.diff(np.r_[begins, len(recordings.t)])
@@ -231,15 +255,20 @@ def without_faults(recordings: Recordings) -> Recordings:
         if 2 * (alone & (lasts[1:-1] == 1)).sum() < alone.sum():
             alone &= lasts[1:-1] == 1
         left_out = np.repeat(np.r_[False, alone, False], lasts)
+        numbers, times = np.unique(recordings.values[left_out, state], return_counts=True)
+        if alike := times.max(initial=0) > max(times.sum() / 2, 1):  # what lies between two of them is right
+            left_out &= recordings.values[:, state] == numbers[np.argmax(times)]
         jumps, count = int(large.sum()) - 2 * int(alone.sum()), int(left_out.sum())
-        if jumps <= FEW_JUMPS * alone.sum() and 0 < count <= MOST_APART * len(recordings.t):
+        most = (MOST_ALIKE if alike else MOST_APART) * len(recordings.t)
+        few = jumps <= FEW_JUMPS * alone.sum() and 0 < count <= most
+        # What jumps where there is no noise was measured; large faults would hide the noise.
+        if few and any(floor.process for floor in (noise_floors(without(left_out)) or ())[state : state + 1]):
             apart |= left_out
             remarks.append(
                 Remark("data.samples_apart", {"column": recordings.titles[state], "samples": count})
             )
-    t, recording, measured = (one[~apart] for one in (recordings.t, recordings.recording, recordings.values))
-    found = replace(recordings, t=t, recording=recording, values=measured)
-    for state in noisy:
+    found = without(apart)
+    for state in [place for place, floor in enumerate(noise_floors(found) or ()) if floor.process]:
         hum, period = _hum_of(found, found.values[:, state])
         if hum.any():
             found.values[:, state] -= hum

@@ -55,6 +55,7 @@ from siq.data.stationarity import (
     stretches_of,
     usual_step,
 )
+from siq.errors import NumericalFailure
 from siq.numerics.integration import machine_code
 from siq.numerics.randomness import positive
 from siq.remarks import Remark, sentence
@@ -118,6 +119,7 @@ AVERAGED_SHARES = (0.0, 0.5, 1.0)  # of the relaxation time, over which samples 
 FEWEST_POINTS = 4  # of a run, with a spectrum
 MOST_POINTS = 8192  # of a series that surrogates are made of
 BINS = 40  # of a histogram, at most
+ATOM = 10  # times the samples at the number next to it: the last one is no place of a density, but an end
 FEWEST_BINS = 10  # in which a valley can be seen
 DEGREES = (5, 9)  # of f in the test: two attractors that differ need more than a cubic, three more than that
 STRETCH_TIMES = 40  # local relaxation times: shorter ones bias f towards one state, longer ones let drifts in
@@ -556,12 +558,25 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         return replace(
             found, limit=Remark("data.not_stationary", {"period": known, "unit": recordings.time_unit})
         )
+    numbers, times = np.unique(values[:, column], return_counts=True)
+    for end, next_to_it in ((0, 1), (-1, -2)):
+        if len(numbers) > BINS and times[end] > max(len(values) / BINS, ATOM * times[next_to_it]):
+            told = {
+                "value": float(numbers[end]),
+                "share": float(times[end] / len(values)),
+                "state": found.state,
+            }
+            return replace(found, limit=Remark("data.clipped", told | {"unit": found.unit or ""}))
     found = replace(found, rung=2, profile=profile)
+    few = replace(found, limit=Remark("data.few_hops"))
     if min(one.visits for one in counts) < FEWEST_HOPS:
-        return replace(found, limit=Remark("data.few_hops", {"fewest": FEWEST_HOPS}))
+        return few
     if sparse.csgraph.connected_components(found.hops, connection="strong")[0] > 1:
         return replace(found, limit=Remark("data.states_apart"))
-    model = MarkovModel.of(path, runs, number, expected)
+    try:
+        model = MarkovModel.of(path, runs, number, expected)
+    except NumericalFailure:
+        return few
     if model is None:
         return replace(found, limit=Remark("data.not_markov"))
     model = model._replace(lag=step * model.lag, stays=step * model.stays, rates=model.rates / step)

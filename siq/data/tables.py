@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     import xarray
 
 # Text that holds a number, and what may follow as its unit: "1.2mm", "5 %", but "3 1/s" only after a space.
+AN_HOUR = 3600.0  # in seconds, in which dates are read
 _NUMBER = r"(?:[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?(?i:nan|infinity|inf))"
 _UNIT = r"(?:\s*[^\W\d_]|\s*[%°‰]|\s+1/)[^,;]*"
 _ISO_DATE = re.compile(r"\d{4}-\d{2}(-\d{2}([T ]\d{2}:\d{2}(:\d{2}([.,]\d+)?)?\s*(Z|[+-]\d{2}:?\d{2})?)?)?")
@@ -542,6 +543,9 @@ def check_times(
     else:
         fault = f"the times of recording '{label}' are unsorted ({now} comes after {before})"
         remedy = "sort its rows by t, or begin a new label where a new recording begins"
+    if np.isclose(before + float(np.median(np.diff(t)[same])) - now, AN_HOUR):
+        fault += ", as where clocks go back an hour at the end of summer time"
+        remedy = f"write the offset from UTC behind each time, such as 02:10+01:00, else {remedy}"
     raise InputError(file, f"row {rows[earlier + 1] + 1}, column t", fault, remedy)
 
 

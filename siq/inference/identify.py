@@ -20,6 +20,7 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
+import scipy.special
 
 from siq.data.correlation import MarkovLag, markov_lag
 from siq.data.preparation import joined, turns_back
@@ -47,7 +48,6 @@ from siq.inference.diffusion_model import (
 from siq.inference.field_estimate import (
     HARMLESS_BIAS,
     HARMLESS_CORRELATION,
-    SIGNIFICANT_SCORE,
     DiffusionSource,
     FieldEstimate,
     NoiseDiagnosis,
@@ -241,21 +241,24 @@ class _Case:
         bias = bias_of_rounding(found, pairs, self.recordings, measured, correlation=least)
         if bias is not None and bias <= HARMLESS_BIAS:
             return None
-        share = np.clip(-correlation, MIN_SHARE, MAX_SHARE)
-        noise = Noise(share * variance, rate * (1 - 2 * share))
-        try:
-            again = self.by_likelihood(ObservationModel(self.library, found.diffusion), noise)
-            assert again.diagnosis is not None and again.diagnosis.sensor_evidence is not None
-            return self.finished(again) if again.diagnosis.sensor_evidence > 1 else None
-        except (NumericalFailure, np.linalg.LinAlgError) as error:
-            if ((score < -SIGNIFICANT_SCORE) & (correlation < -HARMLESS_CORRELATION)).any():
-                reason = f"the sensor is noisy, and f with it is not found: {error}"
-                claim = "gaussian_increments"
-                tests = check_claims(found, self.recordings, self.recordings, false_alarms=self.limits.each)
-                if tests[claim].passed:
-                    raise NumericalFailure(reason) from None
-                raise NumericalFailure(f"{tests[claim].reason}; {reason}", claim=claim) from None
+        # Over long steps f hides most of the correlation, and a search that begins low finds no way up.
+        fault = ""
+        for share in (np.clip(-correlation, MIN_SHARE, MAX_SHARE), np.full(len(rate), MAX_SHARE)):
+            noise = Noise(share * variance, rate * (1 - 2 * share))
+            try:
+                again = self.by_likelihood(ObservationModel(self.library, found.diffusion), noise)
+                assert again.diagnosis is not None and again.diagnosis.sensor_evidence is not None
+                return self.finished(again) if again.diagnosis.sensor_evidence > 1 else None
+            except (NumericalFailure, np.linalg.LinAlgError) as error:
+                fault = fault or str(error)
+        chance = scipy.special.ndtr(score) * len(score)
+        if not ((chance < self.limits.each) & (correlation < -HARMLESS_CORRELATION)).any():
             return None
+        reason, claim = f"the sensor is noisy, and f with it is not found: {fault}", "gaussian_increments"
+        tests = check_claims(found, self.recordings, self.recordings, false_alarms=self.limits.each)
+        if tests[claim].passed:
+            raise NumericalFailure(reason)
+        raise NumericalFailure(f"{tests[claim].reason}; {reason}", claim=claim)
 
     def by_exposure(self, observation: ObservationModel) -> FieldEstimate | None:
         """By the likelihood of samples that are means over an exposure; None where they are no such means.
@@ -372,10 +375,17 @@ class _Case:
             "kind": memory.kind, "memory": float(memory.memory), "lag": int(memory.lag),
             "time": float(memory.time), "unit": self.recordings.time_unit or "",
         }  # fmt: skip
+        lost = lost_time(found, pairs)
+        if lost < 0:  # forces with a memory, and exposures, delay what noise does; this adds to it at once
+            raise NumericalFailure(
+                f"the record takes back within {memory.lag} steps a part of what it moved, as where errors of"
+                " its sensor last so long, and f and D of such samples are too large; keep one sample of"
+                f" every {memory.lag}, so that the errors of any two are independent"
+            )
         noise = NoiseDiagnosis(
             "process", intensity, covariance, correlation, correlation / float(memory.errors[0, state]),
             np.zeros(len(covariance)), pairs=independent, diffusion=source, lag=memory.lag,
-            lost_time=lost_time(found, pairs), remarks=(Remark("inference.correlated", values),),
+            lost_time=lost, remarks=(Remark("inference.correlated", values),),
         ).with_deviation(whitening @ covariance @ whitening.T, independent)  # fmt: skip
         return self._tested_by_pairs(replace(found, diagnosis=noise), training, unseen)
 

@@ -339,7 +339,7 @@ def inspection_drawn(recordings: Recordings, *, folder: Path) -> dict[str, Figur
     from siq.report.plots.recordings import inspection_figures  # matplotlib
 
     found = inspect(joined(recordings))
-    seen = None if found.seen is None else found.seen.as_data()
+    seen = None if found.switching is None else found.switching.as_data()
     for file, data in ((INSPECTION, found.lines()), (SEEN, seen)):
         text = json.dumps(data, ensure_ascii=False, allow_nan=False)
         (folder / file).write_text(text + "\n", encoding="utf-8")

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.signal
 from remembering import double_wells
 
-from siq.data.preparation import in_stretches, joined, without_faults, without_velocity
+from siq.data.preparation import in_stretches, joined, unusual, without_faults, without_velocity
 from siq.data.recordings import Recordings
 from siq.data.stationarity import runs_of
 
@@ -76,6 +77,26 @@ def test_one_number_for_a_fault_is_left_out_where_it_stands_twice_in_a_row_too()
     lost[[0, 1, -2, -1, 100, 101]] = [False, False, False, False, True, True]
     found = without_faults(seen(np.where(lost[:, None], 0.0, x)))
     np.testing.assert_array_equal(found.values, x[~lost])
+
+
+@pytest.mark.parametrize("share", [0.02, 0.08])
+def test_one_number_for_a_fault_is_left_out_where_it_is_frequent_and_hides_the_noise(share: float) -> None:
+    x = hopping()
+    lost = np.random.default_rng(0).random(len(x)) < share
+    lost[[0, 1, -2, -1]] = False
+    found = without_faults(seen(np.where(lost[:, None], -99.0, x)))
+    np.testing.assert_array_equal(found.values, x[~lost])
+
+
+def test_an_angle_that_counts_its_turns_is_told_from_what_only_wanders() -> None:
+    generator, phase = np.random.default_rng(0), 0.4
+    steps = 0.3 * generator.standard_normal(20_000)
+    turning = np.zeros(len(steps))
+    for k, step in enumerate(steps):
+        turning[k] = phase = phase + 0.1 * (0.5 - np.sin(phase)) + step
+    wandering = scipy.signal.lfilter([1], [1, -0.999], steps)
+    found = unusual(seen(np.column_stack([turning, wandering])))
+    assert [(one.code, one.values["column"]) for one in found] == [("data.unwrapped_angle", "x")]
 
 
 def test_a_state_without_noise_is_no_fault() -> None:

@@ -161,6 +161,21 @@ def test_a_record_that_swings_ends_on_the_first_rung_with_its_period() -> None:
     assert found.limit.values["period"] == pytest.approx(25, rel=0.02)
 
 
+def test_a_record_that_a_sensor_cuts_off_has_no_profile() -> None:
+    path = chain(2, np.array([[-0.004, 0.004], [0.004, -0.004]]), 20_000)
+    x = path + 0.15 * noise(5, len(path), memory=0.8)
+    found = found_in(np.minimum(x, 1.1))
+    assert found.supported and found.rung == 1 and found.profile is None
+    assert found.limit is not None and found.limit.code == "data.clipped"
+    assert found_in(np.round(x, 2)).profile is not None
+
+
+def test_a_dozen_hops_are_too_few_to_refute_a_markov_process() -> None:
+    lengths = [400, 900, 150, 700, 60, 1100, 300, 500, 800, 250, 600, 350]
+    found = states_of_noise(np.repeat(np.arange(12) % 2, lengths))
+    assert found.rung == 2 and found.limit == Remark("data.few_hops")
+
+
 def test_stays_that_are_too_regular_make_no_markov_model() -> None:
     lengths = np.ceil(np.random.default_rng(6).gamma(6, 15, 80)).astype(int)
     found = states_of_noise(np.repeat(np.arange(80) % 2, lengths))

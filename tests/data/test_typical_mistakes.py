@@ -131,6 +131,12 @@ REFUSED: dict[str, tuple[str, str | bytes, str, str]] = {
     "a step back": (
         "a.csv", "t,x\n0,1\n1,2\n2,3\n1.5,2\n3,4\n", "unsorted (1.5 comes after 2.0)", "sort its rows",
     ),
+    "the end of summer time": (
+        "a.csv",
+        "time,x\n2024-10-27 01:20,1\n2024-10-27 01:40,2\n2024-10-27 02:00,3\n2024-10-27 02:20,2\n"
+        "2024-10-27 02:40,3\n2024-10-27 02:00,2\n2024-10-27 02:20,4\n",
+        "as where clocks go back an hour", "write the offset from UTC",
+    ),
     "other numbers": (
         "a.csv", "t,x,y\n0,1,1'234.5\n1,2,1'200.1\n", "'1'234.5' is no number", "name the states in",
     ),

@@ -7,20 +7,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.signal
 from remembering import STEP as TIME
 from remembering import double_wells
 
 from siq.data.correlation import markov_lag
+from siq.data.preparation import in_stretches
 from siq.data.recordings import Recordings, snapshot_pairs
+from siq.errors import NumericalFailure
+from siq.inference.checks import PredictionLimits
 from siq.inference.field_estimate import FieldEstimate, read_field, write_field
-from siq.inference.identify import _possible_exposures, identify
+from siq.inference.identify import _Case, _possible_exposures, identify
 from siq.inference.kalman_filter import Noise
 from siq.inference.kalman_identification import (
     filtered_recordings,
     held_out_innovations,
     identify_by_likelihood,
 )
-from siq.inference.library import IdentificationOptions, candidate_library
+from siq.inference.library import IdentificationOptions, candidate_library, field_library
 from siq.inference.observation import ObservationModel, unbroken
 from siq.inference.regression import identify_vector_field
 from siq.systems.diffusion import Diffusion
@@ -47,6 +51,15 @@ def double_well(seed: int, *, samples: int = 3000, records: int = 6) -> tuple[Re
     measured = x + SENSOR * generator.standard_normal(x.shape)
     recordings = Recordings.from_arrays(STEP * np.arange(samples), measured.T[:, :, None], names=["x"])
     return recordings, x.T.reshape(-1, 1)
+
+
+def case_of(recordings: Recordings) -> _Case:
+    options = IdentificationOptions()
+    library = field_library(recordings.names, options)
+    return _Case(
+        recordings, library, options, lambda purpose: np.random.default_rng(0), None, recordings.units, None,
+        None, PredictionLimits(),
+    )  # fmt: skip
 
 
 def identified(recordings: Recordings, *, degree: int) -> FieldEstimate:
@@ -209,6 +222,25 @@ def test_the_step_asks_the_likelihood_where_sensors_are_noisy() -> None:
     assert done.result.sensor_variance is not None
     assert np.sqrt(done.result.sensor_variance[0]) == pytest.approx(SENSOR, rel=0.1)
     assert "measurement noise" in done.outcome.reason
+
+
+def test_a_sensor_is_found_where_steps_are_nearly_as_long_as_the_state_relaxes() -> None:
+    # Neighbouring residuals are hardly correlated: a force that is too steep stands for the sensor's noise.
+    values = double_wells(1, samples=150_000, traces=1, intensity=0.16, sensor=0.14)[:, ::30]
+    coarse = in_stretches(Recordings.from_arrays(30 * TIME * np.arange(5000), values, names=["x"]))
+    found = case_of(coarse).identified()
+    assert found.sensor_variance is not None
+    assert np.sqrt(found.sensor_variance[0]) == pytest.approx(0.14, rel=0.15)
+    assert found.noise_rate[0, 0] == pytest.approx(0.16, rel=0.25)
+
+
+def test_errors_of_a_sensor_that_last_are_no_memory_of_the_forces() -> None:
+    values = double_wells(1, samples=100_000, traces=1, intensity=0.16)[:, ::5]
+    errors = 0.1 * np.random.default_rng(0).standard_normal(values.shape)
+    values += scipy.signal.lfilter([1], [1, -0.7], errors, axis=1)
+    recordings = in_stretches(Recordings.from_arrays(5 * TIME * np.arange(20_000), values, names=["x"]))
+    with pytest.raises(NumericalFailure, match="takes back within"):
+        case_of(recordings).by_instruments(markov_lag(recordings))
 
 
 @pytest.mark.parametrize(("steps", "kept", "rows"), [(0.4, 1, 2), (1.0, 1, 1), (1.5, 2, 2), (10.0, 10, 1)])
