@@ -233,8 +233,7 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
     recording = _label_column(source, parts, time, free, remarks)
     if columns is None:
         others = [place for place in free if place != recording and _is_second_time(source, parts, place)]
-        for place in others:
-            remarks.append(Remark("data.second_time", {"column": source.headings[place]}))
+        remarks += [Remark("data.second_time", {"column": source.headings[place]}) for place in others]
         states = [place for place in free if place not in (recording, *others)]
         names: list[str] = []
         for place in states:

@@ -289,16 +289,14 @@ def solve_case(
         raise
     except NUMERICAL_ERRORS as error:
         raise NumericalFailure(f"the simulation cannot be fitted to the recordings: {error}") from error
-    recalibrated = shown.recalibration
-    final, model = found.final, shown.fit.model
+    recalibrated, final, model = shown.recalibration, found.final, shown.fit.model
     if shown.described is not None:
         final = shown.fit
     elif not found.verdict.names:
         final, model = recalibrated, recalibrated.model
-    process = final.noise.process if found.process_noise else None
     return Diagnosis(
         statement=statement,
-        augmented=_completed(model, final.x, process=process),
+        augmented=_completed(model, final.x, process=final.noise.process if found.process_noise else None),
         recalibrated=_completed(recalibrated.model, recalibrated.x),
         case=case,
         investigation=found,

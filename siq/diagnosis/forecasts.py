@@ -48,7 +48,7 @@ from siq.diagnosis.search import AcceptedMechanism, FitContext, Standing
 from siq.diagnosis.terms import Place, places_in, products_in
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent, evaluation
-from siq.inference.kalman_filter import Whitened, whiten
+from siq.inference.kalman_filter import Noise, Whitened, whiten
 from siq.inference.maximum_likelihood import Fit, first_noise, fit_by_multiple_shooting
 from siq.inference.measurements import Measurements
 from siq.inference.trajectories import EDGE_SUBSTEPS, jumps_of, spread_edges
@@ -70,6 +70,7 @@ RIDGE = 1e-10  # numerical: of normal equations whose columns have unit length
 # Of the budget, for the first name, so that tests have something left where forecasts name nothing: a choice.
 FIRST_NAME_SHARE = 0.5
 EVEN = 0.5  # probability of a cause without a name, where nothing is known beforehand
+_Fits = Sequence[tuple[Fit, list[MechanismCandidate]]]  # with the mechanisms in each
 PLAUSIBLE = 0.05  # of the probability of a family, from which on a member is not ruled out
 
 
@@ -580,6 +581,7 @@ def _next_rung(
             another = _fitted_at(horizons, replace(site, terms=(term,)), budget, untried)
             if another is not None and not (site.label in untried and site.label in fitted):
                 fitted[site.label] = _Leader(site, *another)
+            leading[:] = [each for label, each in fitted.items() if label not in untried and each.gain > 0]
             if site.label not in untried or (another is None and any(e.weight > promise for e in leading)):
                 break
 
@@ -590,7 +592,6 @@ def _next_rung(
             break
         budget.says(f"candidate {number} of at most {min(ATTEMPTS, len(order))}: {sites[place].label}")
         attempt(sites[place], weights[place])
-        leading = [each for label, each in fitted.items() if label not in untried and each.gain > 0]
     if not leading:
         return None
     alone = {site.label: site for site in sites if site.candidate is not None}
@@ -600,7 +601,6 @@ def _next_rung(
         stateless = {each.label for each in candidates if each.model.dimension == d} - {*fitted, *untried}
         for place in [place for place in order if sites[place].label in stateless][:ATTEMPTS]:
             attempt(sites[place], weights[place])
-        leading = [each for label, each in fitted.items() if label not in untried and each.gain > 0]
     # Of those that are not told apart, the one with the fewest parameters.
     heaviest = max(each.weight for each in leading)
     plausible = [each for each in leading if each.weight > heaviest + np.log(PLAUSIBLE)]
@@ -614,11 +614,17 @@ def _next_rung(
         remaining = _sites(rebased, there, context, untried)
         near = [each for each in plausible if each not in steady]
         if near:
-            # A state that follows the motion may be a simple mechanism and something simple at a time.
+            # A state that follows the motion may be a simple mechanism and something simple at a time, or
+            # what lasts of an error of the model, for which white noise is all that is allowed.
             plain = [one for one in remaining if one.candidate is None or one.candidate.model.dimension == d]
             above, more = _gains(ground.horizons, plain, None, budget, untried)
             both = ground.weight + max([0.0, *(more + np.array([site.prior for site in above]))])
-            outdone = {each.site.label for each in near if both > each.weight}
+            pairs = [[(one.horizons[0].fit, [one.candidate]) for one in (ground, each)] for each in near]
+            outdone = {
+                each.site.label
+                for each, pair in zip(near, pairs, strict=True)
+                if both > each.weight or not _takes_most(pair, base.noise, context)
+            }
             leader = ground if leader.site.label in outdone else leader
         sites, gains = _gains(ground.horizons, remaining, ground.candidate, budget, untried)
         gains = gains + ground.gain
@@ -678,6 +684,21 @@ def _next_rung(
     return _Rung(AcceptedMechanism(best, others), tuple(leader.horizons), log_odds, flat_log_odds)
 
 
+def _takes_most(fits: _Fits, noise: Noise, context: FitContext) -> bool:
+    """Whether the second of two takes more than it leaves of the errors of free runs of parts left out.
+
+    That is b - a > a - s², with squared errors b of the first and a of the second, and s² of the sensors.
+    """
+    data, budget = context.data, context.budget
+    with budget.exempt():
+        both = [errors_left_out(fit, data, noise=noise, candidates=own, budget=budget) for fit, own in fits]
+    before, after = (None if each is None else np.array(in_blocks(each)) for each in both)
+    if before is None or after is None:
+        return after is not None
+    sensors = fits[1][0].noise.measurement / np.nanvar(data.outputs, axis=0)
+    return typically_better(before + sensors.mean(), 2 * after)
+
+
 def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], tuple[NotFitted, ...]]:
     """Mechanisms one on top of the other, as long as the next is likelier than what has no name.
 
@@ -713,24 +734,9 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], tu
     except (*NUMERICAL_ERRORS, BudgetSpent) as error:
         LOGGER.info("forecasts end: %s", error)
 
-    def errors(number: int) -> np.ndarray | None:
-        """Squares of free runs of parts left out, with the first so many mechanisms, by blocks."""
-        best = [each.accepted.best for each in found[:number]]
-        squares = errors_left_out(
-            best[-1].fit if best else alone[0].fit, context.data, noise=alone[0].fit.noise,
-            candidates=[each.candidate for each in best], budget=budget,
-        )  # fmt: skip
-        return None if squares is None else np.array(in_blocks(squares))
-
-    with budget.exempt():
-        last = errors(len(found)) if found else None
-        while found:
-            before = errors(len(found) - 1)
-            if last is not None:
-                noise = horizons[0].fit.noise.measurement / np.nanvar(context.data.outputs, axis=0)
-                # b - a > a - s² of errors b before and a after, and the sensors' noise s.
-                if before is None or typically_better(before + noise.mean(), 2 * last):
-                    break
-            LOGGER.info("%s makes no free run better", found[-1].accepted.best.candidate.label)
-            found, last = found[:-1], before
+    best = [each.accepted.best for each in found]
+    fits = [*(each.fit for each in alone[:1]), *(each.fit for each in best)]
+    stages = [(fit, [one.candidate for one in best[:place]]) for place, fit in enumerate(fits)]
+    while found and not _takes_most(stages[len(found) - 1 : len(found) + 1], alone[0].fit.noise, context):
+        LOGGER.info("%s makes no free run better", found.pop().accepted.best.candidate.label)
     return alone, found, tuple(untried.values())

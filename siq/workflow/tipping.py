@@ -214,11 +214,10 @@ def _extent(found: Sweep, well: int) -> tuple[float, float]:
     own = found.bifurcations[found.bifurcations["branch"].isin(mine["branch"])]["value"].to_numpy(float)
     # The next point of the branch lies before the fold, by a step at most.
     below, above = own[own <= low], own[own >= high]
-    ends = (
+    return (
         -np.inf if low <= whole.min() else float(below.max()) if len(below) else low,
         np.inf if high >= whole.max() else float(above.min()) if len(above) else high,
     )
-    return ends
 
 
 def _rates(ways: pd.DataFrame, well: int, noise: float) -> pd.DataFrame:
