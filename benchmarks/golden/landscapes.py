@@ -81,7 +81,7 @@ def records(results: Path) -> Iterator[tuple[str, dict[str, Any]]]:
         said = {
             each: getattr(found.memory, each) for each in ("kind", "lag", "memory", "relaxation", "sensor")
         }
-        yield f"{name}: inspected", said | {"pairs": found.pairs, "gaps": found.gaps} | states_of(found.seen)
+        yield f"{name}: inspected", said | {"pairs": found.pairs, "gaps": found.gaps} | states_of(found.switching)
         yield f"{name}: landscape", analysed(record)
 
 
