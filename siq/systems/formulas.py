@@ -18,6 +18,7 @@ import ast
 import builtins
 import functools
 import keyword
+import operator
 import re
 import signal
 import threading
@@ -271,7 +272,7 @@ def _compiled(
     return sympy.lambdify(
         list(variables),
         list(expressions),
-        modules=[{"integer_power": _integer_power}, "numpy"],
+        modules=[{"integer_power": lambda x, power: functools.reduce(operator.mul, [x] * power)}, "numpy"],
         printer=_ProductPrinter(),
         cse=_common_parts,
         docstring_limit=0,  # to write the formulas out once more would take a third of the time
@@ -353,13 +354,6 @@ class _ProductPrinter(NumPyPrinter):
 
     def _print_Or(self, expr: sympy.Basic) -> str:  # noqa: N802
         return self._print_And(expr, "logical_or")
-
-
-def _integer_power(base: np.ndarray, exponent: int) -> np.ndarray:
-    product = base
-    for _ in range(exponent - 1):
-        product = product * base
-    return product
 
 
 def _short(text: str) -> str:
