@@ -19,11 +19,11 @@ from siq.report.plots.quasipotential import (
     MOST_POINTS,
     POINTS,
     SADDLE,
-    add_legend,
     draw_equilibria,
     name_axes,
     name_energy,
     new_axes,
+    with_legend,
 )
 from siq.report.plots.style import (
     BLACK,
@@ -109,9 +109,7 @@ def plot_wells(
         name_axes(axes, shown, plane)
         axes.set_xlim(*shown.box[plane[0]])
         axes.set_ylim(*shown.box[plane[1]])
-    if legend:
-        add_legend(axes, handles)
-    return axes
+    return with_legend(axes, handles, legend=legend)
 
 
 def plot_paths(
@@ -182,9 +180,7 @@ def plot_paths(
     unit = shown.units[0] if one_unit else ""
     what = "distance from the saddle" if one_unit else "distance from the saddle / size of the region"
     axes.set_xlabel(f"{what} ({unit_text(unit)})" if unit not in ("", "1") else what)
-    if legend:
-        add_legend(axes, axes.get_legend_handles_labels()[0])
-    return axes
+    return with_legend(axes, axes.get_legend_handles_labels()[0], legend=legend)
 
 
 def _profile(
