@@ -298,10 +298,9 @@ def _draw_curve(axes: Axes, landscape: LandscapeSummary) -> list[Any]:
             markersize=6, alpha=0.25, linestyle="none", rasterized=True,
         )  # fmt: skip
         handles.append(Line2D([], [], linestyle="none", marker="|", color=GREY, label="recorded states"))
-    heights = {place: one.height for place, one in enumerate(landscape.wells)}
     for way in landscape.ways:
         if np.isfinite(way.barrier):
-            well, bottom = landscape.wells[way.start].position[0], heights[way.start]
+            well, bottom = landscape.wells[way.start].position[0], landscape.wells[way.start].height
             top_of_way = [bottom + way.barrier] * 2
             axes.plot([well, way.place[0]], top_of_way, color=GREY, linewidth=0.9, linestyle=(0, (2, 2)))
             axes.annotate(

@@ -155,6 +155,7 @@ def plot_paths(
     axes = new_axes() if ax is None else ax
     one_unit = len(set(shown.units)) == 1
     scale = np.ones(len(shown.names)) if one_unit else np.ptp(shown.box, axis=1)
+    seen: set[tuple[str, bool]] = set()
     for place, way in enumerate(ways):
         along, values = _profile(shown, way, scale)
         end = "outside" if way.end is None else shown.wells[way.end].label
@@ -162,9 +163,6 @@ def plot_paths(
             along, values, **_look(place, "color", "linestyle"), linewidth=2.2 - 0.6 * (place % 2),
             label=f"{shown.wells[way.start].label} to {end}",
         )  # fmt: skip
-    seen: set[tuple[str, bool]] = set()
-    for way in ways:
-        along, _ = _profile(shown, way, scale)
         mirrored = way.end is not None and way.end < way.start
         ends = [(along[-1 if mirrored else 0], shown.wells[way.start])]
         ends += [] if way.end is None else [(along[0 if mirrored else -1], shown.wells[way.end])]
