@@ -321,9 +321,15 @@ class CycleFormula(NamedTuple):
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """V at points ``(n, 2)``: shape ``(n,)``, NaN beyond where the formula holds."""
-        t, s = self._feet(x)
+        points, period = self.cycle.points, self.cycle.period
+        t = period / len(points) * cKDTree(points).query(x)[1]
+        for _ in range(FOOT_STEPS):
+            place, along, across, speed, bend = self._frame(t)
+            s = ((x - place) * across).sum(axis=1)
+            t = t + ((x - place) * along).sum(axis=1) / (speed * np.maximum(1 + s * bend, 1 - FARTHEST))
+        place, _, across, *_ = self._frame(t)  # about the foot on the cycle, at the time t
+        s = ((x - place) * across).sum(axis=1)
         value = self._at(t, s)[0]
-        place, _, across, *_ = self._frame(t)
         foot = (
             np.linalg.norm(place + s[:, None] * across - x, axis=1)
             <= FOOT_ERROR * np.ptp(place, axis=0).max()
@@ -374,17 +380,6 @@ class CycleFormula(NamedTuple):
         along = moved / speed
         across = np.stack([-along[1], along[0]])
         return place.T, along.T, across.T, speed, -(across * bent).sum(axis=0) / speed**2
-
-    def _feet(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Time on the cycle and distance of points ``(n, 2)``."""
-        points, period = self.cycle.points, self.cycle.period
-        t = period / len(points) * cKDTree(points).query(x)[1]
-        for _ in range(FOOT_STEPS):
-            place, along, across, speed, bend = self._frame(t)
-            s = ((x - place) * across).sum(axis=1)
-            t = t + ((x - place) * along).sum(axis=1) / (speed * np.maximum(1 + s * bend, 1 - FARTHEST))
-        place, _, across, *_ = self._frame(t)
-        return t, ((x - place) * across).sum(axis=1)
 
     def _at(self, t: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, ...]:
         """V, its slopes by t and s, and the relative residual."""

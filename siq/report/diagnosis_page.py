@@ -265,18 +265,16 @@ def _formulas(findings: Findings) -> list[FormulaRow]:
 
 def _rows_of(part: StatedTerm, findings: Findings) -> list[FormulaRow]:
     """The formulas of a mechanism or of what has no name, and what each is."""
-    entry, words, rows = findings.entry(part.name), texts("tables")["smooth"], []
-    kind = part.kind
-    for name, formula in part.terms.items():
-        rows.append(
-            FormulaRow(
-                part.label,
-                words[kind] if kind in words else _typeset_text(formula, findings.after, part.parameters),
-                _meaning(name, entry, findings),
-                whole=formula if kind in words else None,
-            )
+    entry, words, kind = findings.entry(part.name), texts("tables")["smooth"], part.kind
+    return [
+        FormulaRow(
+            part.label,
+            words[kind] if kind in words else _typeset_text(formula, findings.after, part.parameters),
+            _meaning(name, entry, findings),
+            whole=formula if kind in words else None,
         )
-    return rows
+        for name, formula in part.terms.items()
+    ]
 
 
 def _simplest_of(part: StatedTerm, findings: Findings) -> list[FormulaRow]:

@@ -234,19 +234,15 @@ def _typeset(
 ) -> Markup:
     """A table of formulas and numbers, in brackets, or the one entry; `flush` sets columns to the left."""
     printer = _MathMLPrinter(decimals)
-    spoken: list[list[str]] = []
-    nodes: list[list[Any]] = []
-    for row in rows:
-        spoken.append([])
-        nodes.append([])
-        for entry in row:
-            if isinstance(entry, sympy.Basic):
-                spoken[-1].append(_formula_text(entry, decimals=decimals))
-                nodes[-1].append(printer.lines(_with_integer_exponents(entry)))
-            else:
-                whole = float(entry).is_integer()
-                spoken[-1].append(str(int(entry)).replace("-", MINUS) if whole else value_text(entry))
-                nodes[-1].append(printer.leaf("mn", spoken[-1][-1]))
+
+    def text_and_node(entry: sympy.Expr | float) -> tuple[str, Any]:
+        if isinstance(entry, sympy.Basic):
+            return _formula_text(entry, decimals=decimals), printer.lines(_with_integer_exponents(entry))
+        whole = float(entry).is_integer()
+        text = str(int(entry)).replace("-", MINUS) if whole else value_text(entry)
+        return text, printer.leaf("mn", text)
+
+    spoken, nodes = zip(*(zip(*map(text_and_node, row), strict=True) for row in rows), strict=True)
     content = printer.bracketed(printer.table(nodes, flush=flush)) if brackets else nodes[0][0]
     element = printer.element("math", content)
     element.setAttribute("aria-label", "; ".join(", ".join(row) for row in spoken))
@@ -255,11 +251,9 @@ def _typeset(
 
 
 def _with_integer_exponents(expression: sympy.Expr) -> sympy.Expr:
-    def is_float_power(part: sympy.Basic) -> bool:
-        return bool(part.is_Pow and part.exp.is_Float and float(part.exp).is_integer())
-
     return sympy.sympify(expression).replace(
-        is_float_power, lambda part: sympy.Pow(part.base, int(part.exp), evaluate=False)
+        lambda part: part.is_Pow and part.exp.is_Float and float(part.exp).is_integer(),
+        lambda part: sympy.Pow(part.base, int(part.exp), evaluate=False),
     )
 
 
@@ -337,16 +331,16 @@ class _MathMLPrinter(MathMLPresentationPrinter):
             parent.appendChild(child)
         return parent
 
-    def leaf(self, tag: str, text: str) -> Any:
-        return self.element(tag, self.dom.createTextNode(text))
+    def leaf(self, tag: str, text: str, **attributes: str) -> Any:
+        made = self.element(tag, self.dom.createTextNode(text))
+        for name, value in attributes.items():
+            made.setAttribute(name, value)
+        return made
 
     def bracketed(self, content: Any) -> Any:
         """Brackets as high as what stands between them."""
-        brackets = [self.leaf("mo", text) for text in "[]"]
-        for bracket in brackets:
-            for attribute in ("fence", "stretchy", "symmetric"):
-                bracket.setAttribute(attribute, "true")
-        return self.element("mrow", brackets[0], content, brackets[1])
+        high = dict.fromkeys(("fence", "stretchy", "symmetric"), "true")
+        return self.element("mrow", self.leaf("mo", "[", **high), content, self.leaf("mo", "]", **high))
 
     def table(self, rows: Sequence[Sequence[Any]], *, flush: bool = True) -> Any:
         """A table of elements, by default flush left."""
@@ -373,16 +367,13 @@ class _MathMLPrinter(MathMLPresentationPrinter):
         negative, coefficient, rest = _sign_and_parts(term)
         nodes: list[Any] = []
         if negative or not first:
-            nodes.append(self.leaf("mo", MINUS if negative else "+"))
-            if first:
-                nodes[0].setAttribute("form", "prefix")
+            place = {"form": "prefix"} if first else {}
+            nodes.append(self.leaf("mo", MINUS if negative else "+", **place))
         if coefficient is not None:
             nodes.append(self._print(coefficient))
         if rest is not sympy.S.One:
             if coefficient is not None:
-                times = self.leaf("mo", _INVISIBLE_TIMES)
-                times.setAttribute("lspace", "0.17em")
-                nodes.append(times)
+                nodes.append(self.leaf("mo", _INVISIBLE_TIMES, lspace="0.17em"))
             nodes += self._factors(rest)
         return nodes
 

@@ -222,7 +222,8 @@ def render_template(name: str, content: object, *, folder: Path | None = None) -
         "cell": _cell_text,
         "is_number": _is_number_column,
         "kept_columns": _kept_columns,
-        "data_address": _data_address,
+        # An SVG inside <img> keeps its identifiers to itself and cannot run or load anything.
+        "data_address": lambda figure: _address(figure.kind, figure.image),
         "figure_download": _figure_download,
         "table_download": _table_download,
         "file_name": _file_name,
@@ -242,29 +243,24 @@ def _kept_columns(frame: pd.DataFrame) -> pd.DataFrame:
     return frame if all(said) or frame.empty else frame.loc[:, said]
 
 
+_KINDS = {"svg": "image/svg+xml", "png": "image/png", "csv": "text/csv;charset=utf-8"}
+
+
 def _address(kind: str, content: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
-
-
-_KINDS = {"svg": "image/svg+xml", "png": "image/png"}
-
-
-def _data_address(figure: Any) -> str:
-    # An SVG inside <img> keeps its identifiers to itself and cannot run or load anything.
-    return _address(_KINDS[figure.kind], figure.image)
+    return f"data:{_KINDS[kind]};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def _figure_download(figure: Any) -> tuple[str, str]:
     """What a figure is downloaded as: its kind and its address."""
     if figure.vector is not None and len(figure.vector) <= LARGEST_VECTOR:
-        return "svg", _address(_KINDS["svg"], figure.vector)
-    return figure.kind, _data_address(figure)
+        return "svg", _address("svg", figure.vector)
+    return figure.kind, _address(figure.kind, figure.image)
 
 
 def _table_download(table: Any) -> str:
     frame = table.frame if table.data is None else table.data
     text = frame.to_csv(index=False, lineterminator="\n")
-    return _address("text/csv;charset=utf-8", text.encode("utf-8"))
+    return _address("csv", text.encode("utf-8"))
 
 
 def _short_caption(caption: str) -> str:

@@ -18,6 +18,7 @@ import ast
 import builtins
 import functools
 import keyword
+import operator
 import re
 import signal
 import threading
@@ -271,7 +272,7 @@ def _compiled(
     return sympy.lambdify(
         list(variables),
         list(expressions),
-        modules=[{"integer_power": _integer_power}, "numpy"],
+        modules=[{"integer_power": lambda x, power: functools.reduce(operator.mul, [x] * power)}, "numpy"],
         printer=_ProductPrinter(),
         cse=_common_parts,
         docstring_limit=0,  # to write the formulas out once more would take a third of the time
@@ -353,13 +354,6 @@ class _ProductPrinter(NumPyPrinter):
 
     def _print_Or(self, expr: sympy.Basic) -> str:  # noqa: N802
         return self._print_And(expr, "logical_or")
-
-
-def _integer_power(base: np.ndarray, exponent: int) -> np.ndarray:
-    product = base
-    for _ in range(exponent - 1):
-        product = product * base
-    return product
 
 
 def _short(text: str) -> str:
@@ -610,10 +604,9 @@ class _Doubles:
 
 class _Julia(_Doubles, JuliaCodePrinter):
     def _print_Max(self, expr: sympy.Expr) -> str:  # noqa: N802
-        return f"max({', '.join(map(self._print, expr.args))})"
+        return f"{expr.func.__name__.lower()}({', '.join(map(self._print, expr.args))})"
 
-    def _print_Min(self, expr: sympy.Expr) -> str:  # noqa: N802
-        return f"min({', '.join(map(self._print, expr.args))})"
+    _print_Min = _print_Max  # noqa: N815
 
 
 _MODULES = {"numpy": "numpy", "jax": "jax.numpy", "torch": "torch"}
@@ -633,17 +626,14 @@ class _Arrays(_Doubles, NumPyPrinter):
 class _Torch(_Arrays):
     _module = "torch"
 
-    def _reduced(self, function: str, expr: sympy.Expr) -> str:
+    def _print_Max(self, expr: sympy.Expr) -> str:  # noqa: N802
+        function = "maximum" if isinstance(expr, sympy.Max) else "minimum"
         # Of tensors alone, so that numbers are made one.
         one = ("torch.as_tensor({}, dtype=torch.float64)" if each.is_number else "{}" for each in expr.args)
         args = (form.format(self._print(each)) for form, each in zip(one, expr.args, strict=True))
         return f"functools.reduce(torch.{function}, [{', '.join(args)}])"
 
-    def _print_Max(self, expr: sympy.Expr) -> str:  # noqa: N802
-        return self._reduced("maximum", expr)
-
-    def _print_Min(self, expr: sympy.Expr) -> str:  # noqa: N802
-        return self._reduced("minimum", expr)
+    _print_Min = _print_Max  # noqa: N815
 
 
 _PRINTERS: Mapping[str, type[CodePrinter | StrPrinter]] = {

@@ -24,7 +24,7 @@ from siq.inference.trajectories import scored_rows
 from siq.numerics.text import value_text
 from siq.report.diagnosis_page import largest_difference
 from siq.report.formatting import with_unit
-from siq.report.plots.quasipotential import add_legend, new_axes
+from siq.report.plots.quasipotential import new_axes, with_legend
 from siq.report.plots.style import (
     BLACK,
     BLUE,
@@ -374,9 +374,7 @@ def plot_diagnosis(
     room = DIAGNOSIS_BEYOND * ((high - low) or abs(high) or 1.0)
     axes.set_ylim(low - room, high + room)
     _name(axes, diagnosis, place, t, "")
-    if legend:
-        add_legend(axes, handles)
-    return axes
+    return with_legend(axes, handles, legend=legend)
 
 
 def draw_errors(axes: Axes, diagnosis: Diagnosis, *, output: str | None = None) -> list[Any]:

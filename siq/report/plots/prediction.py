@@ -17,10 +17,11 @@ from siq.data.recordings import Recordings, snapshot_pairs
 from siq.data.stationarity import lagged_covariances, long_run_covariance
 from siq.inference.field_estimate import NOISE_FREE
 from siq.inference.regression import lagged_pairs
-from siq.numerics.integration import runge_kutta_step
+from siq.numerics.integration import FlowMap
+from siq.quasipotential.characteristics import fastest_rate
 from siq.quasipotential.landscape import Landscape
 from siq.report.plots.diagnosis import draw_errors
-from siq.report.plots.quasipotential import add_legend, new_axes
+from siq.report.plots.quasipotential import new_axes, with_legend
 from siq.report.plots.style import (
     BLUE,
     COLUMN_WIDTH,
@@ -92,9 +93,7 @@ def plot_residuals(
     if not isinstance(found, Landscape):
         axes = new_axes() if ax is None else ax
         handles = draw_errors(axes, found, output=state)
-        if legend:
-            add_legend(axes, handles)
-        return axes
+        return with_legend(axes, handles, legend=legend)
     dynamics = found.dynamics
     if recordings is None or recordings.names != dynamics.states:
         have = "none are given" if recordings is None else f"these have {', '.join(recordings.names)}"
@@ -105,9 +104,7 @@ def plot_residuals(
     axes = new_axes() if ax is None else ax
     units = (dynamics.units[place], recordings.time_unit or dynamics.time_unit)
     handles = _draw(axes, *_binned_residuals(dynamics, recordings, place), dynamics.states[place], units)
-    if legend:
-        add_legend(axes, handles)
-    return axes
+    return with_legend(axes, handles, legend=legend)
 
 
 @drawn_in_style
@@ -156,14 +153,9 @@ def _binned_residuals(dynamics: Dynamics, recordings: Recordings, place: int) ->
         pairs, some = given, slice(0, PAIRS)  # one after the other, as their noise is correlated
         along = given.earlier[some, place]
     x0, xh, h = pairs.x0[some], pairs.xh[some], pairs.h[some]
-    width = np.where((span := np.ptp(x0, axis=0)) > 0, span, 1.0)
-    jacobian = dynamics.jacobian(x0) * width / width[:, None]
-    rate = float(np.quantile(np.linalg.norm(jacobian, axis=(1, 2)), 0.99))
+    rate = fastest_rate(dynamics, x0, np.ptp(x0, axis=0))
     steps = int(np.clip(np.ceil(h.max() * rate / ACCURACY), 1, 200))
-    x = np.ascontiguousarray(x0.T)
-    with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(steps):
-            x = runge_kutta_step(dynamics.drift_of_components, x, h / steps)
+    x = FlowMap(steps)(dynamics.drift_of_components, np.ascontiguousarray(x0.T), h)
     left = (xh[:, place] - x[place]) / h
     together = 1.0 if lag is None else _together(left, given.number[some], lag)
     known = np.isfinite(left)

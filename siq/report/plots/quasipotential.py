@@ -218,9 +218,7 @@ def plot_quasipotential(
     shown = summarise(landscape, recordings)
     axes = new_axes() if ax is None else ax
     handles = _draw_quasipotential(axes, shown, states=states, view=view)
-    if legend:
-        add_legend(axes, handles)
-    return axes
+    return with_legend(axes, handles, legend=legend)
 
 
 @drawn_in_style
@@ -232,7 +230,11 @@ def quasipotential_figure(landscape: LandscapeSummary) -> Figure | None:
     figure = Figure(figsize=(WIDTH, 3.6 if one else 4.5))
     axes = figure.add_subplot()
     handles = _draw_quasipotential(axes, landscape)
-    if not any(np.isfinite(_values_in(landscape))) and not landscape.cycles:
+    places = [one.position[None] for one in landscape.wells]
+    if landscape.points is not None:
+        places.append(landscape.points[:: max(len(landscape.points) // 500, 1)])
+    # Places that are drawn tell whether U is known at all.
+    if not np.isfinite(landscape.potential(np.concatenate(places))).any() and not landscape.cycles:
         return None
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
     return figure
@@ -246,12 +248,14 @@ def new_axes(**options: Any) -> Axes:
     return axes
 
 
-def add_legend(axes: Axes, handles: Sequence[Any]) -> None:
-    """A legend below the axes, beside nothing that is drawn."""
-    axes.legend(
-        handles=list(handles), loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False,
-        fontsize="small",
-    )  # fmt: skip
+def with_legend(axes: Axes, handles: Sequence[Any], *, legend: bool) -> Axes:
+    """The axes, with a legend below them where one is asked for, beside nothing that is drawn."""
+    if legend:
+        axes.legend(
+            handles=list(handles), loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False,
+            fontsize="small",
+        )  # fmt: skip
+    return axes
 
 
 def _draw_quasipotential(
@@ -270,14 +274,6 @@ def _draw_quasipotential(
     if sentence:
         axes.set_title(sentence, fontsize="medium", loc="left")
     return handles
-
-
-def _values_in(landscape: LandscapeSummary) -> np.ndarray:
-    """U at places that are drawn, to see whether it is known at all."""
-    places = [one.position[None] for one in landscape.wells]
-    if landscape.points is not None:
-        places.append(landscape.points[:: max(len(landscape.points) // 500, 1)])
-    return landscape.potential(np.concatenate(places)) if places else np.zeros(0)
 
 
 def _draw_curve(axes: Axes, landscape: LandscapeSummary) -> list[Any]:
@@ -302,10 +298,9 @@ def _draw_curve(axes: Axes, landscape: LandscapeSummary) -> list[Any]:
             markersize=6, alpha=0.25, linestyle="none", rasterized=True,
         )  # fmt: skip
         handles.append(Line2D([], [], linestyle="none", marker="|", color=GREY, label="recorded states"))
-    heights = {place: one.height for place, one in enumerate(landscape.wells)}
     for way in landscape.ways:
         if np.isfinite(way.barrier):
-            well, bottom = landscape.wells[way.start].position[0], heights[way.start]
+            well, bottom = landscape.wells[way.start].position[0], landscape.wells[way.start].height
             top_of_way = [bottom + way.barrier] * 2
             axes.plot([well, way.place[0]], top_of_way, color=GREY, linewidth=0.9, linestyle=(0, (2, 2)))
             axes.annotate(

@@ -19,11 +19,11 @@ from siq.report.plots.quasipotential import (
     MOST_POINTS,
     POINTS,
     SADDLE,
-    add_legend,
     draw_equilibria,
     name_axes,
     name_energy,
     new_axes,
+    with_legend,
 )
 from siq.report.plots.style import (
     BLACK,
@@ -109,9 +109,7 @@ def plot_wells(
         name_axes(axes, shown, plane)
         axes.set_xlim(*shown.box[plane[0]])
         axes.set_ylim(*shown.box[plane[1]])
-    if legend:
-        add_legend(axes, handles)
-    return axes
+    return with_legend(axes, handles, legend=legend)
 
 
 def plot_paths(
@@ -157,6 +155,7 @@ def plot_paths(
     axes = new_axes() if ax is None else ax
     one_unit = len(set(shown.units)) == 1
     scale = np.ones(len(shown.names)) if one_unit else np.ptp(shown.box, axis=1)
+    seen: set[tuple[str, bool]] = set()
     for place, way in enumerate(ways):
         along, values = _profile(shown, way, scale)
         end = "outside" if way.end is None else shown.wells[way.end].label
@@ -164,9 +163,6 @@ def plot_paths(
             along, values, **_look(place, "color", "linestyle"), linewidth=2.2 - 0.6 * (place % 2),
             label=f"{shown.wells[way.start].label} to {end}",
         )  # fmt: skip
-    seen: set[tuple[str, bool]] = set()
-    for way in ways:
-        along, _ = _profile(shown, way, scale)
         mirrored = way.end is not None and way.end < way.start
         ends = [(along[-1 if mirrored else 0], shown.wells[way.start])]
         ends += [] if way.end is None else [(along[0 if mirrored else -1], shown.wells[way.end])]
@@ -182,9 +178,7 @@ def plot_paths(
     unit = shown.units[0] if one_unit else ""
     what = "distance from the saddle" if one_unit else "distance from the saddle / size of the region"
     axes.set_xlabel(f"{what} ({unit_text(unit)})" if unit not in ("", "1") else what)
-    if legend:
-        add_legend(axes, axes.get_legend_handles_labels()[0])
-    return axes
+    return with_legend(axes, axes.get_legend_handles_labels()[0], legend=legend)
 
 
 def _profile(
