@@ -186,8 +186,8 @@ def _open_text(file: str) -> ColumnFile:
         raise InputError(file, "", "the table has no headings and no rows", "write the recordings again")
     if beside := _beside_settings(lines):
         cells = csv.reader(content[begin:].decode("utf-8", errors="ignore").splitlines())
-        kept = [",".join(row[place] for place in beside) for row in cells if row]
-        content, begin, lines = "\n".join(kept).encode(), 0, kept[: len(lines)]
+        columns = [",".join(row[place] for place in beside) for row in cells if row]
+        content, begin, lines = "\n".join(columns).encode(), 0, columns[: len(lines)]
     before = _preamble(lines, separator)
     comments += lines[:before]
     begin, lines = begin if not before else content.index(lines[before].encode(), begin), lines[before:]
