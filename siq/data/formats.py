@@ -93,8 +93,16 @@ def open_columns(path: str | Path | pd.DataFrame | xarray.Dataset) -> ColumnFile
     reader = READERS.get(suffix)
     if suffix == ".gz" and READERS.get(Path(path.stem).suffix.lower()) is _open_text:
         reader = _open_text
-    if not exists and (reader or not suffix):
-        raise _missing_file(file)
+    if not exists and (reader or not suffix):  # what has nearly this name, and where it was looked for
+        folder, remedy = path.parent, "check the name and the folder"
+        if folder.is_dir():
+            names = {one.name.casefold(): one for one in folder.iterdir() if not one.name.startswith(".")}
+            near = difflib.get_close_matches(path.name.casefold(), names, n=1)
+            near = near or [name for name in names if Path(name).stem == path.stem.casefold()]
+            remedy = f"perhaps you meant '{names[near[0]]}'" if near else remedy
+        else:
+            remedy = f"there is no folder '{folder}' either"
+        raise InputError(file, "", f"No such file; it was looked for at {path.absolute()}", remedy)
     try:
         if exists:
             with path.open("rb") as stream:
@@ -111,20 +119,6 @@ def open_columns(path: str | Path | pd.DataFrame | xarray.Dataset) -> ColumnFile
         remedy = f"use one of {', '.join(READERS)}"
         raise InputError(file, "", f"the suffix '{path.suffix}' is unknown", remedy)
     return reader(file)
-
-
-def _missing_file(file: str) -> InputError:
-    """What to say of a file as the user named it: where it was looked for, and what has nearly its name."""
-    path, remedy = Path(file), "check the name and the folder"
-    folder = path.parent
-    if folder.is_dir():
-        names = {each.name.casefold(): each for each in folder.iterdir() if not each.name.startswith(".")}
-        near = difflib.get_close_matches(path.name.casefold(), names, n=1)
-        near = near or [name for name in names if Path(name).stem == path.stem.casefold()]
-        remedy = f"perhaps you meant '{names[near[0]]}'" if near else remedy
-    else:
-        remedy = f"there is no folder '{folder}' either"
-    return InputError(file, "", f"No such file; it was looked for at {path.absolute()}", remedy)
 
 
 def _open_frame(frame: pd.DataFrame) -> ColumnFile:

@@ -232,7 +232,13 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
     free.remove(time)
     recording = _label_column(source, parts, time, free, remarks)
     if columns is None:
-        others = [place for place in free if place != recording and _is_second_time(source, parts, place)]
+        # Other clocks are called so, and ever increase but where recordings begin; "T" is a temperature.
+        others = [
+            place
+            for place in free
+            if place != recording and parts[place].may_be_time and parts[place].title != "T"
+            if (values := _numbers(source, place)) is None or (np.diff(values) > 0).mean() > 0.5
+        ]
         remarks += [Remark("data.second_time", {"column": source.headings[place]}) for place in others]
         states = [place for place in free if place not in (recording, *others)]
         names: list[str] = []
@@ -268,14 +274,6 @@ def _numbers(source: ColumnFile, place: int) -> np.ndarray | None:
         return np.asarray(cells.cast(pa.float64()).to_numpy(zero_copy_only=False))
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError, InputError):
         return None
-
-
-def _is_second_time(source: ColumnFile, parts: list[_Heading], place: int) -> bool:
-    """Whether a column is another clock: called so, and ever increasing but where recordings begin."""
-    if not parts[place].may_be_time or parts[place].title == "T":
-        return False
-    values = _numbers(source, place)
-    return values is None or bool((np.diff(values) > 0).mean() > 0.5)
 
 
 def _runs_evenly(values: np.ndarray | None) -> bool:

@@ -539,7 +539,10 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     profile = Profile.of(flat[:, column], runs, path, places[:, column]) if supported else None
     if profile is not None and wanted and wells == 1:
         supported = bool((profile.tops[:, ::2] > FALSE_WELL * profile.tops[:, 1::2]).all())
-    lengths = stays_of(path, runs, number)
+    lengths, hops = stays_of(path, runs, number), np.zeros((number, number))
+    for part in (path[run][path[run] >= 0] for run in runs):
+        turns = np.flatnonzero(np.diff(part))
+        np.add.at(hops, (part[turns], part[turns + 1]), 1)
     steps = np.concatenate([np.diff(recordings.t[run]) for run in runs])  # with what is missing in between
     step = float(steps.mean()) if len(steps) else usual_step(recordings)
     found = RecordStates(
@@ -549,7 +552,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         exponential=exponential(path, runs, number, 0 if levels else int(np.ceil(relaxation))),
         offset=float(np.ptp(baseline[:, column])),
         baseline=baseline[:, column],
-        stays=tuple(step * one for one in lengths), hops=_hops(path, runs, number),
+        stays=tuple(step * one for one in lengths), hops=hops,
     )  # fmt: skip
     if not rungs or not supported:
         return found
@@ -581,16 +584,6 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         return replace(found, limit=Remark("data.not_markov"))
     model = model._replace(lag=step * model.lag, stays=step * model.stays, rates=model.rates / step)
     return replace(found, rung=3, markov=model, limit=Remark("data.levels_alone") if levels else None)
-
-
-def _hops(path: np.ndarray, runs: list[slice], states: int) -> np.ndarray:
-    """How often each state followed each other one, ``(k, k)``."""
-    found = np.zeros((states, states))
-    for run in runs:
-        part = path[run][path[run] >= 0]
-        turns = np.flatnonzero(np.diff(part))
-        np.add.at(found, (part[turns], part[turns + 1]), 1)
-    return found
 
 
 def _baselines(recordings: Recordings, rest: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import scipy.interpolate
 import sympy
 
@@ -241,7 +242,8 @@ def first_states(model: Dynamics, data: Measurements) -> np.ndarray:
             # Of a constant slope the rest is what is left at zero: long formulas are never multiplied out.
             rest = known.xreplace({symbol(name): sympy.S.Zero})
             if rest.is_number:
-                measured[name] = (_filled(column) - float(rest)) / float(slope)
+                filled = pd.Series(column).interpolate(limit_direction="both").fillna(0.0)
+                measured[name] = (filled.to_numpy() - float(rest)) / float(slope)
     definitions = zip(model.states, model.equations, model.kinematic, strict=True)
     derivative_of = {str(equation): name for name, equation, defined in definitions if defined}
     for place, name in enumerate(model.states):
@@ -269,14 +271,6 @@ def _middle(model: Dynamics) -> np.ndarray:
         if np.isfinite(model.functions.slopes(at[:, None], signals, model.values)[0]).all():
             about = at
     return about
-
-
-def _filled(column: np.ndarray) -> np.ndarray:
-    """A measured column with gaps filled linearly."""
-    known = np.isfinite(column)
-    if known.all() or not known.any():
-        return np.nan_to_num(column)
-    return np.interp(np.arange(len(column)), np.flatnonzero(known), column[known])
 
 
 def expectations(model: Dynamics, values: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

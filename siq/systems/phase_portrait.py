@@ -209,11 +209,12 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
         outside = ((last < box[:, 0]) | (last > box[:, 1])).any(axis=1) & resting_there
         descents = replace(descents, escaped=descents.escaped | (outside & (descents.ends < 0)))
     # What noise does not move away from again, such as extinction, is no well: who comes there has left.
-    absorbing = [
-        index
-        for index, one in enumerate(stable)
-        if not (recorded or _reached_by_noise(dynamics, one.position))
-    ]
+    absorbing = list[int]()
+    for index, one in enumerate(() if recorded or dynamics.diffusion.constant else stable):
+        try:
+            hessian_at(dynamics, one.position)
+        except NumericalFailure:
+            absorbing.append(index)
     descents = replace(descents, escaped=descents.escaped | np.isin(descents.ends, absorbing))
     ended = np.unique(descents.ends)
     reached = [index for index in range(len(stable)) if index in ended and index not in absorbing]
@@ -281,15 +282,6 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
         recurrence, harmless, tuple(remarks), cycles, unstable_cycles,
         np.array([float((descents.ends == index).mean()) for index in range(len(around))]),
     )  # fmt: skip
-
-
-def _reached_by_noise(dynamics: Dynamics, equilibrium: np.ndarray) -> bool:
-    """Whether noise does not fade so that it fails to reach some state about an equilibrium."""
-    try:
-        hessian_at(dynamics, equilibrium)
-    except NumericalFailure:
-        return dynamics.diffusion.constant  # nor elsewhere then, which is a fault of the card
-    return True
 
 
 def _crossed_by_noise(dynamics: Dynamics, saddle: np.ndarray, width: np.ndarray) -> bool:
