@@ -86,5 +86,5 @@ def test_what_an_extra_is_for_names_it(statement: str, package: str, extra: str)
 
 def test_the_extras_are_those_of_the_distribution() -> None:
     assert PROJECT["name"] == DISTRIBUTION
-    extras = {"networks", "plots", "workflow", "sklearn", "netcdf", "docs", "pages", "dev"}
+    extras = {"networks", "plots", "workflow", "sklearn", "netcdf", "docs", "pages", "slurm", "dev"}
     assert extras == set(PROJECT["optional-dependencies"])

@@ -63,7 +63,7 @@ def test_a_refusal_carries_the_states_of_the_record() -> None:
     record = telegraph()
     with pytest.raises(NoLandscape) as refused:
         siq.Landscape.from_recordings(record, few)
-    states, seen = refused.value.states, inspect(record).seen
+    states, seen = refused.value.states, inspect(record).switching
     assert states is not None and seen is not None
     assert states.as_data() == seen.as_data()  # what the page is made of
     times = states.dwell_times()
@@ -88,14 +88,14 @@ def test_a_landscape_that_misses_the_states_says_so_as_the_page_does() -> None:
 
 
 def test_states_of_a_record_come_back_from_plain_data() -> None:
-    seen = inspect(telegraph()).seen
+    seen = inspect(telegraph()).switching
     assert seen is not None
     again = RecordStates.from_data(json.loads(json.dumps(seen.as_data())))
     assert again.as_data() == seen.as_data() and again.sentence() == seen.sentence()
 
 
 def test_nothing_is_added_to_what_is_certified() -> None:
-    seen = inspect(telegraph()).seen
+    seen = inspect(telegraph()).switching
     two = summarise(told(landscape([[-0.5], [0.5]], [0.25, 0.35])))
     (answer, *further) = answer_lines(two, seen=seen, rung=6)
     assert answer_lines(two) == [answer, *further]
