@@ -81,7 +81,8 @@ def records(results: Path) -> Iterator[tuple[str, dict[str, Any]]]:
         said = {
             each: getattr(found.memory, each) for each in ("kind", "lag", "memory", "relaxation", "sensor")
         }
-        yield f"{name}: inspected", said | {"pairs": found.pairs, "gaps": found.gaps} | states_of(found.switching)
+        said |= {"pairs": found.pairs, "gaps": found.gaps}
+        yield f"{name}: inspected", said | states_of(found.switching)
         yield f"{name}: landscape", analysed(record)
 
 
