@@ -53,7 +53,7 @@ noise: environment  ## statistics of the paper's system with noise, 50 runs
 # Controller and two nodes on this machine, as root; see the docstring of the test for what has to be there.
 slurm: environment  ## a study on a small Slurm of its own, of which a node dies
 	$(INSTALL) --constraint requirements/pinned.txt --editable '.[dev,slurm]'
-	$(BIN)/pytest -m slow -s tests/slow/test_slurm.py
+	$(BIN)/pytest -m slow -rs tests/slow/test_slurm.py
 
 # The wheel, and a small problem solved with it where neither the sources nor an extra are at hand.
 wheel: environment  ## the wheel in dist/, installed and used elsewhere without extras

@@ -286,7 +286,8 @@ def _preamble(lines: list[str], separator: str) -> int:
 
     Rows have numbers where the last one has. No line before the headings has them all.
     """
-    rows = [_split(line, separator or _separator(lines[-2:])) for line in lines]
+    separator = separator or _separator(lines[-2:])
+    rows = [_split(line, separator) for line in lines]
     numbers = [place for place, cell in enumerate(rows[-1]) if _NUMERIC.fullmatch(cell)]
     data = [
         len(row) == len(rows[-1]) and all(_NUMERIC.fullmatch(row[place]) for place in numbers) for row in rows

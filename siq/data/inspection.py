@@ -25,7 +25,7 @@ from siq.data.correlation import (
     resolution_step,
     rounding_error,
 )
-from siq.data.preparation import SINGLE_RECORDING, unusual, without_faults
+from siq.data.preparation import ANGLES, SINGLE_RECORDING, unusual, without_faults
 from siq.data.recordings import (
     LONGEST_STEP,
     SINGLE_RECORDING_REMEDY,
@@ -242,9 +242,7 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
         low, high = float(x.min()), float(x.max())
         states.append(_StateFacts(name, title, unit, low, high, resolution_step(x), noise, label))
     memory = markov_lag(recordings)
-    turns = any(
-        one.code.endswith("wrapped_angle") for one in unusual(recordings)
-    )  # it is where it was, turned
+    turns = any(one.code in ANGLES for one in unusual(recordings))  # it is where it was, turned
     # Of the cells over the range of one state or two, those that were visited.
     some = recordings.values[:, :2]
     low, high = np.quantile(some, [OUTLIER_SHARE, 1 - OUTLIER_SHARE], axis=0)

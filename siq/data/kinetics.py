@@ -466,9 +466,8 @@ class MarkovModel(NamedTuple):
     ) -> MarkovModel | None:
         """The Markov model of a path at the shortest lag that its test allows; None where there is none.
 
-        Where hops are too few to test one it is a NumericalFailure.
-
-        `counts` are transitions from sample to sample, where a hidden Markov model knows them better.
+        `counts` are transitions from sample to sample, where a hidden Markov model knows them better. Hops
+        that are too few to test a model raise NumericalFailure.
         """
         from deeptime.markov import TransitionCountEstimator
 

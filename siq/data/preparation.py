@@ -33,8 +33,9 @@ from siq.numerics.randomness import positive
 from siq.remarks import Remark
 
 FULL_TURNS = {2 * np.pi: "2π", 360.0: "360"}  # of an angle, in radians and in degrees
-FEWEST_TURNS = 3  # that show f to be the same in each
-OF_A_TURN, NOT_OF_A_TURN = 1e-6, 0.01  # probabilities that f has no such period, and that it has it
+ANGLES = ("data.wrapped_angle", "data.unwrapped_angle")  # codes of remarks on columns that are one
+# Choices: turns that show f to be the same in each; probabilities that f has no such period, and that it has.
+FEWEST_TURNS, OF_A_TURN, NOT_OF_A_TURN = 3, 1e-6, 0.01
 ENDS_OF_TURN = 0.05  # of a turn, within which a column that jumps by one comes to 0 and 1 of it, or to ±½
 FEWEST_STRETCHES = 10  # of a single recording, at least, two of which are held out
 MOST_STRETCHES = 40  # more make no error better known

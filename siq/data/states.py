@@ -119,7 +119,7 @@ AVERAGED_SHARES = (0.0, 0.5, 1.0)  # of the relaxation time, over which samples 
 FEWEST_POINTS = 4  # of a run, with a spectrum
 MOST_POINTS = 8192  # of a series that surrogates are made of
 BINS = 40  # of a histogram, at most
-ATOM = 10  # times the samples at the number next to it: the last one is no place of a density, but an end
+ATOM = 10  # a choice: with so many times the samples of the number next to it the last number is an end
 FEWEST_BINS = 10  # in which a valley can be seen
 DEGREES = (5, 9)  # of f in the test: two attractors that differ need more than a cubic, three more than that
 STRETCH_TIMES = 40  # local relaxation times: shorter ones bias f towards one state, longer ones let drifts in
@@ -564,22 +564,18 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     numbers, times = np.unique(values[:, column], return_counts=True)
     for end, next_to_it in ((0, 1), (-1, -2)):
         if len(numbers) > BINS and times[end] > max(len(values) / BINS, ATOM * times[next_to_it]):
-            told = {
-                "value": float(numbers[end]),
-                "share": float(times[end] / len(values)),
-                "state": found.state,
-            }
-            return replace(found, limit=Remark("data.clipped", told | {"unit": found.unit or ""}))
+            told = {"state": found.state, "value": float(numbers[end]), "unit": found.unit or ""}
+            told["share"] = float(times[end] / len(values))
+            return replace(found, limit=Remark("data.clipped", told))
     found = replace(found, rung=2, profile=profile)
-    few = replace(found, limit=Remark("data.few_hops"))
     if min(one.visits for one in counts) < FEWEST_HOPS:
-        return few
+        return replace(found, limit=Remark("data.few_hops", {"fewest": FEWEST_HOPS}))
     if sparse.csgraph.connected_components(found.hops, connection="strong")[0] > 1:
         return replace(found, limit=Remark("data.states_apart"))
     try:
         model = MarkovModel.of(path, runs, number, expected)
     except NumericalFailure:
-        return few
+        return replace(found, limit=Remark("data.few_hops"))
     if model is None:
         return replace(found, limit=Remark("data.not_markov"))
     model = model._replace(lag=step * model.lag, stays=step * model.stays, rates=model.rates / step)

@@ -286,24 +286,21 @@ def unit_of(formula: str, units: Mapping[str, str]) -> str:
 
     A number has the unit ``"1"``. What cannot be read as a product of powers (``"°C"``) is kept as one word.
     """
-    words: dict[str, sympy.Symbol] = {}
-    known = {name: _parse(unit, words) for name, unit in units.items()}
-    result = parse_formula(formula, known)
-    text = str(sympy.powsimp(result, force=True))
-    for word, stand_in in words.items():
-        text = re.sub(rf"\b{stand_in}\b", word, text)
-    return text
+    words, known = dict[str, sympy.Symbol](), dict[str, sympy.Expr]()
 
-
-def _parse(unit: str, words: dict[str, sympy.Symbol]) -> sympy.Expr:
     def stand_in(word: str) -> sympy.Symbol:
         return words.setdefault(word, sympy.Symbol(f"unit{len(words)}", positive=True))
 
-    names = {word: stand_in(word) for word in re.findall(r"[A-Za-z_]\w*", unit)}
-    try:
-        return parse_formula(unit, names)
-    except FormulaError:
-        return stand_in(unit)
+    for name, unit in units.items():
+        names = {word: stand_in(word) for word in re.findall(r"[A-Za-z_]\w*", unit)}
+        try:
+            known[name] = parse_formula(unit, names)
+        except FormulaError:
+            known[name] = stand_in(unit)
+    text = str(sympy.powsimp(parse_formula(formula, known), force=True))
+    for word, placeholder in words.items():
+        text = re.sub(rf"\b{placeholder}\b", word, text)
+    return text
 
 
 FORMULA_TOLERANCE = 1e-9  # relative difference of values of formulas that are the same
@@ -485,11 +482,8 @@ def _stays_zero(model: Dynamics, name: str) -> bool:
     moving = model.functions.rates(x, signals, model.values)[place]
     x[place] = 0.0
     rate = model.functions.rates(x, signals, model.values)[place]
-    return bool(
-        np.isfinite(rate).all()
-        and np.abs(rate).max() <= FORMULA_TOLERANCE * np.abs(moving).max()
-        and moving.any()
-    )
+    still = np.isfinite(rate).all() and np.abs(rate).max() <= FORMULA_TOLERANCE * np.abs(moving).max()
+    return bool(still and moving.any())
 
 
 def _has_root(equation: sympy.Expr, name: str) -> bool:

@@ -24,7 +24,7 @@ import logging
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -70,7 +70,6 @@ RIDGE = 1e-10  # numerical: of normal equations whose columns have unit length
 # Of the budget, for the first name, so that tests have something left where forecasts name nothing: a choice.
 FIRST_NAME_SHARE = 0.5
 EVEN = 0.5  # probability of a cause without a name, where nothing is known beforehand
-_Fits = Sequence[tuple[Fit, list[MechanismCandidate]]]  # with the mechanisms in each
 PLAUSIBLE = 0.05  # of the probability of a family, from which on a member is not ruled out
 
 
@@ -619,11 +618,12 @@ def _next_rung(
             plain = [one for one in remaining if one.candidate is None or one.candidate.model.dimension == d]
             above, more = _gains(ground.horizons, plain, None, budget, untried)
             both = ground.weight + max([0.0, *(more + np.array([site.prior for site in above]))])
-            pairs = [[(one.horizons[0].fit, [one.candidate]) for one in (ground, each)] for each in near]
+            errors = cache(lambda one: _left_out(one.horizons[0].fit, [one.candidate], base.noise, context))
             outdone = {
                 each.site.label
-                for each, pair in zip(near, pairs, strict=True)
-                if both > each.weight or not _takes_most(pair, base.noise, context)
+                for each in near
+                if both > each.weight
+                or not _takes_most(errors(ground), errors(each), each.horizons[0].fit, context.data)
             }
             leader = ground if leader.site.label in outdone else leader
         sites, gains = _gains(ground.horizons, remaining, ground.candidate, budget, untried)
@@ -684,18 +684,23 @@ def _next_rung(
     return _Rung(AcceptedMechanism(best, others), tuple(leader.horizons), log_odds, flat_log_odds)
 
 
-def _takes_most(fits: _Fits, noise: Noise, context: FitContext) -> bool:
-    """Whether the second of two takes more than it leaves of the errors of free runs of parts left out.
+def _left_out(
+    fit: Fit, added: Sequence[MechanismCandidate], noise: Noise, context: FitContext
+) -> np.ndarray | None:
+    """Squared errors of free runs of parts left out, by blocks; None where there are none."""
+    with context.budget.exempt():
+        squares = errors_left_out(fit, context.data, noise=noise, candidates=added, budget=context.budget)
+    return None if squares is None else np.array(in_blocks(squares))
 
-    That is b - a > a - s², with squared errors b of the first and a of the second, and s² of the sensors.
+
+def _takes_most(before: np.ndarray | None, after: np.ndarray | None, fit: Fit, data: Measurements) -> bool:
+    """Whether a fit takes more than it leaves of the errors of free runs of parts left out.
+
+    That is b - a > a - s², with squared errors b before it and a after it, and s² of the sensors.
     """
-    data, budget = context.data, context.budget
-    with budget.exempt():
-        both = [errors_left_out(fit, data, noise=noise, candidates=own, budget=budget) for fit, own in fits]
-    before, after = (None if each is None else np.array(in_blocks(each)) for each in both)
     if before is None or after is None:
         return after is not None
-    sensors = fits[1][0].noise.measurement / np.nanvar(data.outputs, axis=0)
+    sensors = fit.noise.measurement / np.nanvar(data.outputs, axis=0)
     return typically_better(before + sensors.mean(), 2 * after)
 
 
@@ -736,7 +741,8 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], tu
 
     best = [each.accepted.best for each in found]
     fits = [*(each.fit for each in alone[:1]), *(each.fit for each in best)]
-    stages = [(fit, [one.candidate for one in best[:place]]) for place, fit in enumerate(fits)]
-    while found and not _takes_most(stages[len(found) - 1 : len(found) + 1], alone[0].fit.noise, context):
+    own = [each.candidate for each in best]
+    errors = cache(lambda count: _left_out(fits[count], own[:count], alone[0].fit.noise, context))
+    while (last := len(found)) and not _takes_most(errors(last - 1), errors(last), fits[last], context.data):
         LOGGER.info("%s makes no free run better", found.pop().accepted.best.candidate.label)
     return alone, found, tuple(untried.values())

@@ -212,7 +212,7 @@ def _with_surfaces(fit: Fit, models: Sequence[AugmentedModel], context: FitConte
     # Where functions of one coordinate are, or would be; not in a rotating frame, nor in a sensor.
     single = [each for each in models if len(each.parts) == 1]
     likely = [(each.parts[0].candidate.place, each) for each in single[:FUNCTIONS_FITTED]]
-    begins: list[tuple[Place, AugmentedModel | None]] = [(a, b) for a, b in likely if a is not None]
+    begins: list[tuple[Place, AugmentedModel | None]] = [(at, one) for at, one in likely if at is not None]
     if not single:  # one of two may tell so little of either coordinate alone
         begins = [(each.term, None) for each in rank_places(fit, data, context.roles)[:FUNCTIONS_FITTED]]
     names = [name for name in coordinates_of(fit.model) if name != "t" and not name.startswith("_")]

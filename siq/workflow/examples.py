@@ -14,7 +14,7 @@ import numpy as np
 
 from siq.data.inspection import Inspection
 from siq.data.inspection import inspect as inspect_recordings
-from siq.data.preparation import unusual
+from siq.data.preparation import ANGLES, unusual
 from siq.data.recordings import read_recordings
 from siq.errors import DISTRIBUTION, Fault, InputError
 from siq.numerics.files import whole_file
@@ -52,7 +52,7 @@ def write_generated(path: Path, name: str) -> tuple[Path, str]:
     found = unusual(read_recordings(path))  # before anything starts or is written
     study = GENERATED / f"{name}.yaml"
     text = f"name: {_scalar(name)}\nrecordings: {{file: {_scalar(_own_path(path, start=study.parent))}}}\n"
-    turns = [one.values for one in found if one.code.endswith("wrapped_angle")]
+    turns = [one.values for one in found if one.code in ANGLES]
     if turns:
         angles = ", ".join(f"{one['name']}: [0, {str(one['turn']).replace('2π', '2*pi')}]" for one in turns)
         text += f"identification: {{angles: {{{angles}}}}}\n"

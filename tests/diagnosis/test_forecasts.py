@@ -431,6 +431,7 @@ def test_what_follows_any_motion_is_no_rival_where_something_simple_does_as_much
     monkeypatch.setattr(forecasts, "_gains", promised)
     monkeypatch.setattr(forecasts, "_containing", lambda *_: set())
     monkeypatch.setattr(forecasts.FittedCandidate, "of", lambda *given, **_: given[3])
+    monkeypatch.setattr(forecasts, "_left_out", lambda *_: None)
     for on_top, takes_most in ((50.0, True), (0.0, True), (0.0, False)):
         monkeypatch.setattr(forecasts, "_takes_most", lambda *_, most=takes_most: most)
         rung = _next_rung(horizons, context.candidates, context, {})

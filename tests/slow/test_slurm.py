@@ -72,7 +72,7 @@ def cluster(tmp_path: Path) -> Iterator[Path]:
     for name in ("state", *(f"spool-{node}" for node in NODES)):
         (folder / name).mkdir(parents=True)
     lines = [
-        f"NodeName={name} NodeHostname=localhost Port={port} CPUs=1 RealMemory=8000"
+        f"NodeName={name} NodeHostname=localhost Port={port} CPUs={OF_A_JOB} RealMemory=8000"
         for name, port in NODES.items()
     ]
     CONFIGURATION.write_text(SLURM.format(folder=folder, nodes="\n".join(lines)), encoding="utf-8")
@@ -109,9 +109,9 @@ def snakemake(folder: Path, *options: str) -> list[str]:
 
 def by_slurm(folder: Path) -> list[str]:
     return snakemake(
-        folder, "--profile", str(ROOT / "profiles" / "slurm"), "--latency-wait", "5", "--cores", "1",
-        "--group-components", f"runs={OF_A_JOB}", "--slurm-no-account", "--slurm-status-command", "squeue",
-        "--slurm-init-seconds-before-status-checks", "5",
+        folder, "--profile", str(ROOT / "profiles" / "slurm"), "--latency-wait", "5",
+        "--cores", f"{OF_A_JOB}", "--group-components", f"runs={OF_A_JOB}", "--slurm-no-account",
+        "--slurm-status-command", "squeue", "--slurm-init-seconds-before-status-checks", "5",
     )  # fmt: skip
 
 
