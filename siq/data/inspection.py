@@ -25,7 +25,7 @@ from siq.data.correlation import (
     resolution_step,
     rounding_error,
 )
-from siq.data.preparation import ANGLES, SINGLE_RECORDING, unusual, without_faults
+from siq.data.preparation import ANGLES, SINGLE_RECORDING, turns_back, unusual, without_faults
 from siq.data.recordings import (
     LONGEST_STEP,
     SINGLE_RECORDING_REMEDY,
@@ -163,8 +163,11 @@ class Inspection:
                 values = {"transitions": fewest.visits, "relative_error": fewest.relative_error}
                 found.append(Remark("data.few_transitions", values))
             values = {"state": hops.state, "range": float(np.ptp(hops.background))}
-            drifts = bool(hops.background.any())
-            found.append(Remark("data.drift", values) if drifts else Remark("data.stationary"))
+            taken = any(one.code == "data.drift_taken_off" for one in self.recordings.remarks)
+            if hops.background.any():
+                found.append(Remark("data.drift", values))
+            elif hops.limit is None or hops.limit.code != "data.not_stationary":
+                found.append(Remark("data.stationary", {"taken": taken}))
         sparse = self.coverage < SPARSE_COVERAGE and len(titles) > 1
         values = {"share": self.coverage, "states": list(titles[:2]), "sparse": sparse}
         return [*found, Remark("data.coverage", values)]
@@ -178,6 +181,8 @@ class Inspection:
         forced = forced or (self.switching is not None and self.switching.supported)
         if forced:
             found = [Remark("data.noise_seen")]
+        elif noises and turns_back(recordings):
+            found = [Remark("data.turns_back")]
         elif noises and len(recordings.labels) == 1:
             values = {"fault": SINGLE_RECORDING, "remedy": SINGLE_RECORDING_REMEDY}
             found = [Remark("data.single_recording", values)]

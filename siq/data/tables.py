@@ -223,8 +223,8 @@ def _without_clocks_and_labels(recordings: Recordings) -> Recordings:
     """Recordings without columns that are no states: another clock, a label, or what never changes.
 
     A clock is a straight line in time in every recording, with one slope, or it never turns back where noise
-    turns another column at every other step: the depth of a core, a count of days. A label has a few values, or
-    one in each recording. Nobody named the columns, and the last one stays.
+    turns another column, as the depth of a core or a count of days. A label has a few values, or one in
+    each recording. Nobody named the columns, and the last one stays.
     """
     elapsed, begins = np.diff(recordings.t), np.diff(recordings.recording) == 0
     ways = np.sign(np.diff(recordings.values, axis=0)[begins])

@@ -135,12 +135,9 @@ def identify(
         recordings, library, options, draw, diffusion, units or recordings.units, pair_step, integrator_step,
         limits or PredictionLimits(),
     )  # fmt: skip
-    if options.hidden_velocities == "auto" and diffusion is None and turns_back(recordings):
-        if (by_velocities := case.with_velocities()) is None:
-            raise NumericalFailure(
-                "the recording turns back as no force on the state alone would make it, and with the velocity"
-                " as a state f does not pass its test; record what else moves, or drives it"
-            )
+    # Without a velocity what turns back is moved by noise that a sensor's hides from sample to sample.
+    turning = options.hidden_velocities == "auto" and diffusion is None and turns_back(recordings)
+    if turning and (by_velocities := case.with_velocities()) is not None:
         return by_velocities
     try:
         if observation == "auto":

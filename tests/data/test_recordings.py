@@ -458,7 +458,7 @@ def test_other_clocks_and_labels_are_no_states() -> None:
     assert any("'age' runs along with the time" in note for note in found.notes)
     assert any("'state' has only 2 different values" in note for note in found.notes)
     assert Recordings.of(table[["t", "state"]]).names == ("state",)
-    # The depth of a core and the days of its samples never turn back; a cooling beside a swing does not either.
+    # The depth of a core and the days of its samples never turn back; nor does a cooling beside a swing.
     core = table[["t", "x"]].assign(depth=50 - t + 0.3 * np.sin(t), day=t // 4)
     assert Recordings.of(core).names == ("x",)
     assert Recordings.of(core.assign(x=np.cos(t / 5))).names == ("x", "depth", "day")
