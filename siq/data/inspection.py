@@ -160,14 +160,10 @@ class Inspection:
                 found.append(hops.limit)
             fewest = min(hops.counts, key=lambda count: count.visits)
             if hops.supported and fewest.visits:
-                values = {"transitions": fewest.visits, "relative_error": fewest.relative_error}
-                found.append(Remark("data.few_transitions", values))
-            values = {"state": hops.state, "range": float(np.ptp(hops.background))}
+                found.append(Remark("data.few_transitions", {"transitions": fewest.visits}))
             taken = any(one.code == "data.drift_taken_off" for one in self.recordings.remarks)
-            if hops.background.any():
-                found.append(Remark("data.drift", values))
-            elif hops.limit is None or hops.limit.code != "data.not_stationary":
-                found.append(Remark("data.stationary", {"taken": taken}))
+            values = {"state": hops.state, "range": float(np.ptp(hops.background)), "taken": taken}
+            found.append(Remark("data.drift" if hops.background.any() else "data.stationary", values))
         sparse = self.coverage < SPARSE_COVERAGE and len(titles) > 1
         values = {"share": self.coverage, "states": list(titles[:2]), "sparse": sparse}
         return [*found, Remark("data.coverage", values)]

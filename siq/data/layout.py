@@ -294,13 +294,9 @@ def _tells_time(title: str, source: ColumnFile, place: int) -> bool:
     if (values := _numbers(source, place)) is None or pa.types.is_temporal(cells.type):
         first = next((str(one) for one in cells.to_pylist() if one), "")
         return re.match(r"\d{4}-\d\d-\d\d|\d\d?\.\d\d?\.\d{4}", first) is not None
-    return _rises(values) and any(_is_time(word) for word in re.split(r"[\W_]+", title) if len(word) > 1)
-
-
-def _rises(values: np.ndarray | None) -> bool:
-    """Whether numbers rise nearly always, as no year does that is written beside each of its months."""
-    steps = np.diff(values[np.isfinite(values)]) if values is not None else np.empty(0)
-    return len(steps) > 0 and bool((steps <= 0).mean() <= EVEN)
+    steps = np.diff(values[np.isfinite(values)])
+    rises = len(steps) > 0 and bool((steps <= 0).mean() <= EVEN)
+    return rises and any(_is_time(word) for word in re.split(r"[\W_]+", title) if len(word) > 1)
 
 
 def _time_column(
@@ -313,7 +309,8 @@ def _time_column(
     found = [place for place in free if parts[place].may_be_time]
     if not found:
         found = [place for place in free if _runs_evenly(_numbers(source, place))]
-    if len(found) != 1 or not ((values := _numbers(source, found[0])) is None or _rises(values)):
+    values = _numbers(source, found[0]) if len(found) == 1 else None  # the year of a month stands still
+    if len(found) != 1 or (values is not None and (np.diff(values) == 0).mean() > 0.5):
         found = [place for place in free if _tells_time(parts[place].title, source, place)] or found
     if len(found) > 1:
         # "T" is a temperature rather than a time, and an age that of what is measured.

@@ -107,11 +107,10 @@ def _checked(
     faults: list[Fault] = []
     remarks = list(layout.remarks)
     for index, (name, place) in enumerate(zip(("t", *layout.names), used, strict=True)):
-        stated = dict(layout.units[place])
         if index == 0 and (clock := _seconds_of_clock(file, called[0], cells[0])) is not None:
             numbers[index], start = clock
             cell_unit: str | None = "s"
-            stated["name"] = None  # time_hour over dates says what they are rounded to
+            layout.units[place]["name"] = None  # time_hour over dates says what they are rounded to
             if not np.nan_to_num(numbers[index] % DAY).any():
                 numbers[index], cell_unit = numbers[index] / DAY, "d"
             remarks.append(Remark("data.time_of_clock", {"start": start, "unit": cell_unit}))
@@ -122,7 +121,7 @@ def _checked(
             if index and (mark := _mark_of_missing(numbers[index])) is not None:
                 numbers[index][numbers[index] == mark] = np.nan
                 remarks.append(Remark("data.mark_of_missing", {"column": shown, "value": mark}))
-        stated["cells"] = cell_unit
+        stated = {**layout.units[place], "cells": cell_unit}
         found_units.append(_agreed_unit(file, called[index], stated, (units or {}).get(name)))
     if layout.backwards:
         numbers[0] *= -1
