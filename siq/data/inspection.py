@@ -169,7 +169,6 @@ class Inspection:
         return [*found, Remark("data.coverage", values)]
 
     def _prospects(self) -> list[Remark]:
-        values: dict[str, Any]
         recordings, memory = self.recordings, self.memory
         noises = [state.noise for state in self.states if state.noise is not None]
         # Correlated forces fill the windows of the first look as a smooth motion does.
@@ -180,10 +179,10 @@ class Inspection:
         elif noises and turns_back(recordings):
             found = [Remark("data.turns_back")]
         elif noises and len(recordings.labels) == 1:
-            values = {"fault": SINGLE_RECORDING, "remedy": SINGLE_RECORDING_REMEDY}
-            found = [Remark("data.single_recording", values)]
+            told = {"fault": SINGLE_RECORDING, "remedy": SINGLE_RECORDING_REMEDY}
+            found = [Remark("data.single_recording", told)]
         else:
-            found = [Remark("data.no_noise") if noises else Remark("data.noise_unknown")]
+            found = [Remark("data.no_noise" if noises else "data.noise_unknown")]
         units = sorted({unit for unit in recordings.units if unit})
         if not forced and len(units) > 1:
             found.append(Remark("data.different_units", {"units": units}))

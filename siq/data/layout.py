@@ -302,15 +302,14 @@ def _tells_time(title: str, source: ColumnFile, place: int) -> bool:
 def _time_column(
     file: str, source: ColumnFile, parts: list[_Heading], free: list[int], remarks: list[Remark]
 ) -> int:
-    """The column ``t``; else the only one called like a time, that rises evenly, or that holds times."""
+    """The column ``t``; else the only one called like a time that goes on, rises evenly, or holds times."""
     found = [place for place in free if parts[place].title == "t"]
     if found:
         return found[0]
     found = [place for place in free if parts[place].may_be_time]
     if not found:
         found = [place for place in free if _runs_evenly(_numbers(source, place))]
-    values = _numbers(source, found[0]) if len(found) == 1 else None  # the year of a month stands still
-    if len(found) != 1 or (values is not None and (np.diff(values) == 0).mean() > 0.5):
+    if len(found) != 1 or ((x := _numbers(source, found[0])) is not None and (np.diff(x) == 0).mean() > 0.5):
         found = [place for place in free if _tells_time(parts[place].title, source, place)] or found
     if len(found) > 1:
         # "T" is a temperature rather than a time, and an age that of what is measured.

@@ -221,9 +221,8 @@ def _past_midnight(times: pd.Series) -> pd.Series:
 def _without_clocks_and_labels(recordings: Recordings) -> Recordings:
     """Recordings without columns that are no states: another clock, a label, or what never changes.
 
-    A clock is a straight line in time in every recording, with one slope, or it never turns back where noise
-    turns another column, as the depth of a core or a count of days. A label has a few values, or one in
-    each recording. Nobody named the columns, and the last one stays.
+    A clock is a straight line in time in every recording, or never turns back where noise turns another one,
+    as the depth of a core; a label has a few values, or one in each recording. The last column stays.
     """
     elapsed, begins = np.diff(recordings.t), np.diff(recordings.recording) == 0
     ways = np.sign(np.diff(recordings.values, axis=0)[begins])
