@@ -25,7 +25,7 @@ from siq.data.correlation import (
     resolution_step,
     rounding_error,
 )
-from siq.data.preparation import ANGLES, SINGLE_RECORDING, unusual, without_faults
+from siq.data.preparation import ANGLES, SINGLE_RECORDING, turns_back, unusual, without_faults
 from siq.data.recordings import (
     LONGEST_STEP,
     SINGLE_RECORDING_REMEDY,
@@ -160,17 +160,15 @@ class Inspection:
                 found.append(hops.limit)
             fewest = min(hops.counts, key=lambda count: count.visits)
             if hops.supported and fewest.visits:
-                values = {"transitions": fewest.visits, "relative_error": fewest.relative_error}
-                found.append(Remark("data.few_transitions", values))
-            values = {"state": hops.state, "range": float(np.ptp(hops.background))}
-            drifts = bool(hops.background.any())
-            found.append(Remark("data.drift", values) if drifts else Remark("data.stationary"))
+                found.append(Remark("data.few_transitions", {"transitions": fewest.visits}))
+            taken = any(one.code == "data.drift_taken_off" for one in self.recordings.remarks)
+            values = {"state": hops.state, "range": float(np.ptp(hops.background)), "taken": taken}
+            found.append(Remark("data.drift" if hops.background.any() else "data.stationary", values))
         sparse = self.coverage < SPARSE_COVERAGE and len(titles) > 1
         values = {"share": self.coverage, "states": list(titles[:2]), "sparse": sparse}
         return [*found, Remark("data.coverage", values)]
 
     def _prospects(self) -> list[Remark]:
-        values: dict[str, Any]
         recordings, memory = self.recordings, self.memory
         noises = [state.noise for state in self.states if state.noise is not None]
         # Correlated forces fill the windows of the first look as a smooth motion does.
@@ -178,11 +176,13 @@ class Inspection:
         forced = forced or (self.switching is not None and self.switching.supported)
         if forced:
             found = [Remark("data.noise_seen")]
+        elif noises and turns_back(recordings):
+            found = [Remark("data.turns_back")]
         elif noises and len(recordings.labels) == 1:
-            values = {"fault": SINGLE_RECORDING, "remedy": SINGLE_RECORDING_REMEDY}
-            found = [Remark("data.single_recording", values)]
+            told = {"fault": SINGLE_RECORDING, "remedy": SINGLE_RECORDING_REMEDY}
+            found = [Remark("data.single_recording", told)]
         else:
-            found = [Remark("data.no_noise") if noises else Remark("data.noise_unknown")]
+            found = [Remark("data.no_noise" if noises else "data.noise_unknown")]
         units = sorted({unit for unit in recordings.units if unit})
         if not forced and len(units) > 1:
             found.append(Remark("data.different_units", {"units": units}))

@@ -302,19 +302,22 @@ def _tells_time(title: str, source: ColumnFile, place: int) -> bool:
 def _time_column(
     file: str, source: ColumnFile, parts: list[_Heading], free: list[int], remarks: list[Remark]
 ) -> int:
-    """The column ``t``; else the only one called like a time, that rises evenly, or that holds times."""
+    """The column ``t``; else the only one called like a time that goes on, rises evenly, or holds times."""
     found = [place for place in free if parts[place].title == "t"]
     if found:
         return found[0]
     found = [place for place in free if parts[place].may_be_time]
     if not found:
         found = [place for place in free if _runs_evenly(_numbers(source, place))]
-    if len(found) != 1:
+    if len(found) != 1 or ((x := _numbers(source, found[0])) is not None and (np.diff(x) == 0).mean() > 0.5):
         found = [place for place in free if _tells_time(parts[place].title, source, place)] or found
     if len(found) > 1:
         # "T" is a temperature rather than a time, and an age that of what is measured.
         found = [place for place in found if parts[place].title != "T"]
         found = [place for place in found if not parts[place].is_age] or found
+        found = [
+            place for place in found if len(found) > 1 and _runs_evenly(_numbers(source, place))
+        ] or found
     if len(found) == 1:
         backwards = parts[found[0]].is_age
         remarks.append(Remark("data.time_column", {"column": parts[found[0]].title, "backwards": backwards}))

@@ -97,11 +97,6 @@ class DwellCount:
         return self.time / self.visits if self.visits else float("nan")
 
     @property
-    def relative_error(self) -> float:
-        """``1/√n``; infinite where no visit ended."""
-        return float(1 / np.sqrt(self.visits)) if self.visits else float("inf")
-
-    @property
     def limits(self) -> tuple[float, float]:
         """Interval of 95 % for exponential times; the upper end is infinite where no visit ended.
 

@@ -53,6 +53,7 @@ RESTART_SHARE = 0.1  # of the time that a recording took: where it starts over, 
 SHUFFLED_SHARE = 1 / 3
 DAY = 86_400.0  # seconds
 FEWEST_ON_A_LINE = 10  # steps: fewer may lie on one by themselves
+NOISY = 0.25  # share of the steps at which a column turns back, half of what white forces do
 
 Fault = tuple[int, InputError]
 """The row, counted from 1, of the first cell of a column that cannot be used, and what is wrong there."""
@@ -109,6 +110,7 @@ def _checked(
         if index == 0 and (clock := _seconds_of_clock(file, called[0], cells[0])) is not None:
             numbers[index], start = clock
             cell_unit: str | None = "s"
+            layout.units[place]["name"] = None  # time_hour over dates says what they are rounded to
             if not np.nan_to_num(numbers[index] % DAY).any():
                 numbers[index], cell_unit = numbers[index] / DAY, "d"
             remarks.append(Remark("data.time_of_clock", {"start": start, "unit": cell_unit}))
@@ -219,10 +221,12 @@ def _past_midnight(times: pd.Series) -> pd.Series:
 def _without_clocks_and_labels(recordings: Recordings) -> Recordings:
     """Recordings without columns that are no states: another clock, a label, or what never changes.
 
-    A clock is a straight line in time in every recording, with one slope; a label has a few values, or one in
-    each recording. Nobody named the columns, and the last one stays.
+    A clock is a straight line in time in every recording, or never turns back where noise turns another one,
+    as the depth of a core; a label has a few values, or one in each recording. The last column stays.
     """
     elapsed, begins = np.diff(recordings.t), np.diff(recordings.recording) == 0
+    ways = np.sign(np.diff(recordings.values, axis=0)[begins])
+    turns = max(((ways[1:] * ways[:-1]) < 0).sum(axis=0, initial=0), default=0) / max(len(ways), 1)
     kept, remarks = [], []
     for place, (title, x) in enumerate(zip(recordings.titles, recordings.values.T, strict=True)):
         steps, different = np.diff(x)[begins], np.unique(x)
@@ -231,7 +235,8 @@ def _without_clocks_and_labels(recordings: Recordings) -> Recordings:
         exact = 1e-9 * max(
             float(np.abs(different).max()), abs(slope) * float(elapsed[begins].max(initial=0.0))
         )
-        if len(steps) > FEWEST_ON_A_LINE and slope and off <= exact:
+        onwards = turns > NOISY and len(different) >= FEWEST_VALUES and np.ptp(ways[:, place]) <= 1
+        if len(steps) > FEWEST_ON_A_LINE and slope and (off <= exact or onwards):
             remarks.append(Remark("data.clock_left_out", {"column": title}))
         elif len(different) > 1 and (
             not steps.any() or len(different) < FEWEST_VALUES <= len(x) / MIN_REPETITIONS

@@ -6,7 +6,8 @@ import pytest
 from remembering import STEP, double_wells
 
 import siq
-from siq.data.inspection import Inspection
+from siq.data.inspection import Inspection, inspect
+from siq.data.preparation import without_background
 from siq.data.recordings import Recordings
 
 
@@ -68,3 +69,21 @@ def test_three_panels_show_it(blurred: Inspection) -> None:
     figure = blurred.plot()
     assert len(figure.axes) == 3
     assert figure.axes[2].get_xlabel() == "steps between two increments"
+
+
+def test_a_slow_state_behind_a_noisy_sensor_is_no_single_relaxation() -> None:
+    generator, x = np.random.default_rng(2), np.zeros((4000, 1))
+    for k in range(len(x) - 1):
+        x[k + 1] = 0.995 * x[k] + 0.1 * generator.standard_normal()
+    seen = Recordings.from_arrays(np.arange(4000.0), x + generator.standard_normal(x.shape), names=["x"])
+    codes = [one.code for one in inspect(seen).remarks()]
+    assert "data.turns_back" in codes
+    assert "data.single_recording" not in codes
+
+
+def test_a_record_is_not_called_stationary_whose_drift_was_taken_off() -> None:
+    generator, x = np.random.default_rng(3), np.zeros((1000, 1))
+    for k in range(len(x) - 1):
+        x[k + 1] = 0.8 * x[k] + 0.6 * generator.standard_normal()
+    seen = Recordings.from_arrays(np.arange(1000.0), x + np.linspace(0, 5, 1000)[:, None], names=["x"])
+    assert "Less what was taken off: no slow drift" in inspect(without_background(seen)).text()

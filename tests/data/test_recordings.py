@@ -458,3 +458,18 @@ def test_other_clocks_and_labels_are_no_states() -> None:
     assert any("'age' runs along with the time" in note for note in found.notes)
     assert any("'state' has only 2 different values" in note for note in found.notes)
     assert Recordings.of(table[["t", "state"]]).names == ("state",)
+    # The depth of a core and the days of its samples never turn back; nor does a cooling beside a swing.
+    core = table[["t", "x"]].assign(depth=50 - t + 0.3 * np.sin(t), day=t // 4)
+    assert Recordings.of(core).names == ("x",)
+    assert Recordings.of(core.assign(x=np.cos(t / 5))).names == ("x", "depth", "day")
+
+
+def test_of_several_clocks_the_one_that_tells_rows_apart_is_the_time() -> None:
+    month = np.arange(36)
+    years, x = 1950 + month // 12, np.random.default_rng(0).standard_normal(36)
+    table = pd.DataFrame({"year": years, "dec year": 1950 + month / 12, "x": x})
+    assert Recordings.of(table).names == ("x",)  # the year stands still for twelve months
+    table = pd.DataFrame({"Date": 100 * years + month % 12 + 1, "Year": 1950 + month / 12, "x": x})
+    np.testing.assert_allclose(Recordings.of(table).t, 1950 + month / 12)  # the other one leaps at New Year
+    hours = pd.date_range("2013-01-01", periods=36, freq="h").strftime("%Y-%m-%dT%H:%M:%SZ")
+    assert Recordings.of(pd.DataFrame({"time_hour": hours, "x": x})).time_unit == "s"

@@ -280,3 +280,14 @@ def test_exposures_that_are_tried_are_those_that_residuals_show() -> None:
     assert first == pytest.approx(0.1) and second == memory.memory == pytest.approx(0.1, rel=0.03)
     assert _possible_exposures(replace(memory, kind="either")) == [memory.step]
     assert _possible_exposures(replace(memory, kind="coloured")) == []
+
+
+def test_a_record_that_no_claim_can_be_made_of_is_refused_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A machine that is on in every fourth sample: of noise too small to see there are no claims.
+    x = np.tile([-0.58, -0.58, 1.73, -0.58], 100) + 0.01 * np.random.default_rng(0).standard_normal(400)
+    options = IdentificationOptions(hidden_velocities="auto")
+    seen = Recordings.from_arrays(10.0 * np.arange(400), x[:, None], names=["P"])
+    seen = in_stretches(seen, hidden_velocities="auto")
+    monkeypatch.setattr("siq.inference.identify.check_claims", lambda *_, **__: {})
+    with pytest.raises(NumericalFailure, match="the sensor is noisy, and f with it is not found"):
+        identify(seen, options=options, draw=lambda _: np.random.default_rng(0))
