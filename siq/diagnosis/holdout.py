@@ -36,7 +36,7 @@ Run = Literal["before", "recalibrated", "augmented", "named", "without"]
 # Of an effect, of what is gained, or of squared errors: a choice, made when two cases had been seen, 0.93 for
 # the linear damping of a pendulum arm, and 0.46 for a preload in the place of a bump.
 NEARLY_ALL = 0.9
-CONFIDENCE_95 = 1.96  # standard errors within which 95 % lie
+ABOVE_BY_CHANCE = 0.025  # probability that noise alone lies above: of 95 %, on one side
 BLOCKS = 12  # as many as tell an error of a ratio; fewer leave more samples that belong together in one
 CHANGE_BY_CHANCE = 0.05  # probability of a gain, or a loss, where there is none
 
@@ -152,13 +152,13 @@ class HeldOutErrors:
     def at_noise(self, run: Run, *, random: bool = False) -> bool:
         """Whether an error is that of measurement noise alone, or with the error of the model at random.
 
-        The root mean square of n independent values has the relative standard error 1/√(2n).
+        The mean square of n independent values, in units of the variance, has the distribution χ²(n)/n.
         """
         error, floor = self.error(run), self.floor if random else self.noise_floor
         if error is None or floor is None:
             return False
-        tolerance = CONFIDENCE_95 / float(np.sqrt(2 * self.values)) if self.values else 0.0
-        return error * (1 - tolerance) <= floor
+        limit = scipy.stats.chi2.isf(ABOVE_BY_CHANCE, self.values) / self.values if self.values else 1.0
+        return bool(error**2 <= limit * floor**2)
 
 
 def _change_between(
