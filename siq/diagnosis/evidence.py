@@ -36,6 +36,7 @@ AUTOCORRELATION_95 = 1.96  # standard deviations of an autocorrelation of white 
 SMOOTH_LENGTHS = (0.125, 0.25)
 PRIOR_JITTER = 1e-9  # numerical: on the diagonal of a prior's covariance
 BUDGET_SPENT, OVERFLOWS = Remark("diagnosis.not_reached"), Remark("diagnosis.overflows")
+WRONG_SIGN = Remark("diagnosis.wrong_sign")
 NUMERICAL_ERRORS = (ArithmeticError, ValueError, np.linalg.LinAlgError)
 """What ends a candidate, never the search: an overflow, a division by zero, a singular matrix."""
 
@@ -67,16 +68,20 @@ class FittedCandidate:
     def of(
         cls, trial: Fit, before: Fit, data: Measurements, candidate: MechanismCandidate, *, blocks: int
     ) -> FittedCandidate:
-        """A candidate's fit with its evidence over the fit without it."""
+        """A candidate's fit with its evidence over the fit without it.
+
+        Where each recording begins in a state that the candidate brings is a parameter, too.
+        """
         extra = len(trial.model.free) - len(before.model.free)
+        beginnings = (trial.model.dimension - before.model.dimension) * len(data.labels)
         gained = 2 * (trial.log_likelihood - before.log_likelihood)
         count = trial.degrees_of_freedom + len(trial.model.free)
         return cls(
             candidate=candidate,
             fit=trial,
             delta_chi2=gained,
-            delta_bic=-gained + extra * np.log(count),
-            p_white=float(scipy.stats.chi2.sf(max(gained, 0.0), extra)),
+            delta_bic=-gained + extra * np.log(count) + beginnings * np.log(max(count / len(data.labels), 2)),
+            p_white=float(scipy.stats.chi2.sf(max(gained, 0.0), extra + beginnings)),
             p_cluster=probability_by_chance(trial, before, data, candidate, blocks=blocks),
         )
 

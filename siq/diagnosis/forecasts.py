@@ -34,6 +34,7 @@ from siq.diagnosis.evidence import (
     NUMERICAL_ERRORS,
     OVERFLOWS,
     SMOOTH_LENGTHS,
+    WRONG_SIGN,
     FittedCandidate,
     NotFitted,
     correlation_time_of,
@@ -546,7 +547,8 @@ def _fitted_at(
             model, rough = candidate.begun(each.fit.model, known), horizons[0].data.roughness
             fit = _fitted(model, each.data, each.fit, x, rough, budget=budget)
             if not candidate.admits(fit):
-                raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
+                untried[candidate.label] = NotFitted.of(candidate, WRONG_SIGN)
+                return None
             if candidate.generalises and candidate.idle(fit):
                 raise NumericalFailure("it is no more than the special case of it")
             found.append(Horizon.of(fit, each.data))
@@ -648,8 +650,10 @@ def _next_rung(
     gains = np.append(gains[kept], [each.gain for each in fitted.values()])
     gains[[site.label in outdone for site in sites]] = -np.inf
     # The mechanism and hardly more is no rival, nor is what cannot be fitted; but what is clearly better says
-    # that it is another thing.
+    # that it is another thing, unless only with a sign that it cannot have.
     more = np.array([site.label in untried or site.label in contained for site in sites])
+    turned = {label for label, each in untried.items() if each.remark == WRONG_SIGN}
+    gains[[site.label in turned for site in sites]] = -np.inf
     clearly = (gains > leader.gain + options.least_log_odds) & (leader.gain < NEARLY_ALL * gains)
     rival = ~more | clearly
     weights = np.where(rival, gains + np.array([site.prior for site in sites]), -np.inf)

@@ -19,6 +19,7 @@ from siq.diagnosis.dictionary import Roles
 from siq.diagnosis.evidence import (
     BUDGET_SPENT,
     NUMERICAL_ERRORS,
+    WRONG_SIGN,
     FittedCandidate,
     NotFitted,
     probability_by_chance,
@@ -120,8 +121,8 @@ def _accepted(
     ]
     if not significant:
         return None
-    # By Schwarz's criterion with what is known beforehand: odds of weights are twice their logarithm in χ². Of
-    # fits that are equal but for rounding, what is in an equation leads.
+    # By Schwarz's criterion with what is known beforehand: twice the logarithm of a weight is as good as χ².
+    # Of fits that are equal but for rounding, what is in an equation leads.
     cost = {id(each): each.delta_bic - 2 * np.log(each.candidate.weight) for each in significant}
     leads = min(cost.values()) + ROUNDING * options.same
     equal = [each for each in significant if cost[id(each)] <= leads]
@@ -201,7 +202,8 @@ def _fit_most_promising(
             if 2 * (current.log_likelihood - fit.log_likelihood) > least_to_believe(current.noise):
                 raise NumericalFailure("its fit leads away, to less than without it")
             if not candidate.admits(fit):
-                raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
+                failed[candidate.label] = NotFitted.of(candidate, WRONG_SIGN)
+                return
             trial = FittedCandidate.of(fit, current, data, candidate, blocks=blocks)
         except BudgetSpent:
             failed.setdefault(candidate.label, NotFitted.of(candidate, BUDGET_SPENT))
