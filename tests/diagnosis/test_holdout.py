@@ -87,6 +87,13 @@ def test_what_ran_away_and_what_is_empty(first: tuple | None, second: tuple | No
     assert _change_between(first, second) == change
 
 
+def test_a_value_or_two_are_at_the_noise_only_if_noise_may_be_so_large() -> None:
+    for values, largest in ((1, 2.24), (2, 1.92), (300, 1.08)):
+        for error in (0.99 * largest, 1.01 * largest):
+            found = HeldOutErrors(before=error, noise_floor=1.0, values=values)
+            assert found.at_noise("before") == (error < largest)
+
+
 def test_without_what_was_found_is_the_better_of_two() -> None:
     squares = np.random.default_rng(4).chisquare(1, 300)
     errors = HeldOutErrors.of(
