@@ -34,7 +34,6 @@ from siq.diagnosis.evidence import (
     NUMERICAL_ERRORS,
     OVERFLOWS,
     SMOOTH_LENGTHS,
-    WRONG_SIGN,
     FittedCandidate,
     NotFitted,
     correlation_time_of,
@@ -65,7 +64,6 @@ FOLDS = 8  # parts of the recordings that are left out in turn: a choice
 ALONE, IN_PLACE = (0.1, 1.0), (1.0, 10.0)  # levels of process noise, relative to that of the fits
 PROMISING, SHAPES = 32, 3  # explanations, and shapes of each, that are asked at all horizons: a choice
 LEADERS, ATTEMPTS = 6, 12  # explanations that are fitted in earnest before none is said to lead: a choice
-RETRIES = 2  # after a first mechanism that makes no free run better: a choice
 SUSPECTS = 4  # rivals of the leader that are fitted in earnest before they count: a choice
 UNSETTLED = "its fit does not settle"
 RIDGE = 1e-10  # numerical: of normal equations whose columns have unit length
@@ -547,8 +545,7 @@ def _fitted_at(
             model, rough = candidate.begun(each.fit.model, known), horizons[0].data.roughness
             fit = _fitted(model, each.data, each.fit, x, rough, budget=budget)
             if not candidate.admits(fit):
-                untried[candidate.label] = NotFitted.of(candidate, WRONG_SIGN)
-                return None
+                raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
             if candidate.generalises and candidate.idle(fit):
                 raise NumericalFailure("it is no more than the special case of it")
             found.append(Horizon.of(fit, each.data))
@@ -650,10 +647,8 @@ def _next_rung(
     gains = np.append(gains[kept], [each.gain for each in fitted.values()])
     gains[[site.label in outdone for site in sites]] = -np.inf
     # The mechanism and hardly more is no rival, nor is what cannot be fitted; but what is clearly better says
-    # that it is another thing, unless only with a sign that it cannot have.
+    # that it is another thing.
     more = np.array([site.label in untried or site.label in contained for site in sites])
-    turned = {label for label, each in untried.items() if each.remark == WRONG_SIGN}
-    gains[[site.label in turned for site in sites]] = -np.inf
     clearly = (gains > leader.gain + options.least_log_odds) & (leader.gain < NEARLY_ALL * gains)
     rival = ~more | clearly
     weights = np.where(rival, gains + np.array([site.prior for site in sites]), -np.inf)
@@ -715,33 +710,16 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], tu
     A mechanism may take over a part of an error of the model, above all on top of others, and most causes
     that have no name look a little like one that has. So the last one has to take more than it leaves of what
     free runs of parts left out are off by, beyond the sensors' noise, or it is taken back, and then the one
-    before it is the last. If none is left, the first is no explanation, and no rival of others either: they
-    are compared without it, `RETRIES` times.
+    before it is the last.
 
     Returned are also the fits of the simulation alone, empty where it cannot be fitted, and what could not be
     judged.
     """
-    untried, alone, refused = dict[str, NotFitted](), list[Horizon](), set[str]()
+    model, found, untried = context.model, list[_Rung](), dict[str, NotFitted]()
+    alone, budget = list[Horizon](), context.budget
     try:
-        with context.budget.part(FIRST_NAME_SHARE):
-            alone = _horizons_of(fit, context)
-        while len(refused) <= RETRIES:
-            rungs = _rungs_on(alone, refused, context, untried)
-            found = _without_needless(rungs, alone, context)
-            if found or not rungs:
-                return alone, found, tuple(untried.values())
-            refused.add(rungs[0].accepted.best.candidate.label)
-    except (*NUMERICAL_ERRORS, BudgetSpent) as error:
-        LOGGER.info("forecasts end: %s", error)
-    return alone, [], tuple(untried.values())
-
-
-def _rungs_on(
-    alone: list[Horizon], refused: set[str], context: FitContext, untried: dict[str, NotFitted]
-) -> list[_Rung]:
-    """Mechanisms on top of the fits of the simulation alone, but for those refused."""
-    model, horizons, found = context.model, alone, list[_Rung]()
-    try:
+        with budget.part(FIRST_NAME_SHARE):
+            horizons = alone = _horizons_of(fit, context)
         while len(found) < context.study.search.mechanisms:
             base = horizons[0].fit.model
             if base.dimension > model.dimension:
@@ -750,9 +728,8 @@ def _rungs_on(
                 each.rebased(model, base) if found else each
                 for each in context.candidates
                 if not any(each.repeats(other.accepted.best.candidate) for other in found)
-                and each.label not in refused
             ]
-            with context.budget.part(1.0 if found else FIRST_NAME_SHARE):
+            with budget.part(1.0 if found else FIRST_NAME_SHARE):
                 rung = _next_rung(horizons, remaining, context, untried)
             if rung is None:
                 break
@@ -761,15 +738,11 @@ def _rungs_on(
             horizons = list(rung.horizons)
     except (*NUMERICAL_ERRORS, BudgetSpent) as error:
         LOGGER.info("forecasts end: %s", error)
-    return found
 
-
-def _without_needless(rungs: Sequence[_Rung], alone: Sequence[Horizon], context: FitContext) -> list[_Rung]:
-    """Mechanisms without the last ones, as long as these do not take more than they leave."""
-    found, best = list(rungs), [each.accepted.best for each in rungs]
+    best = [each.accepted.best for each in found]
     fits = [*(each.fit for each in alone[:1]), *(each.fit for each in best)]
     own = [each.candidate for each in best]
     errors = cache(lambda count: _left_out(fits[count], own[:count], alone[0].fit.noise, context))
     while (last := len(found)) and not _takes_most(errors(last - 1), errors(last), fits[last], context.data):
         LOGGER.info("%s makes no free run better", found.pop().accepted.best.candidate.label)
-    return found
+    return alone, found, tuple(untried.values())

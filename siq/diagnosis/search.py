@@ -19,7 +19,6 @@ from siq.diagnosis.dictionary import Roles
 from siq.diagnosis.evidence import (
     BUDGET_SPENT,
     NUMERICAL_ERRORS,
-    WRONG_SIGN,
     FittedCandidate,
     NotFitted,
     probability_by_chance,
@@ -202,8 +201,7 @@ def _fit_most_promising(
             if 2 * (current.log_likelihood - fit.log_likelihood) > least_to_believe(current.noise):
                 raise NumericalFailure("its fit leads away, to less than without it")
             if not candidate.admits(fit):
-                failed[candidate.label] = NotFitted.of(candidate, WRONG_SIGN)
-                return
+                raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
             trial = FittedCandidate.of(fit, current, data, candidate, blocks=blocks)
         except BudgetSpent:
             failed.setdefault(candidate.label, NotFitted.of(candidate, BUDGET_SPENT))

@@ -251,8 +251,7 @@ def drop_insignificant_process_noise(fit: Fit, data: Measurements) -> Fit | None
     """A fit without its process noise, where that does nothing in it; None where it does something.
 
     Their intensities may have gone towards zero. The fit without them has then been found already, and may be
-    likelier than the one that another way of fitting ends in. One that would be far likelier without them is
-    no maximum, such as of a motion that grows beyond all numbers.
+    likelier than the one that another way of fitting ends in. If it is far likelier, that is no maximum.
     """
     still = fit.noise.without_process()
     held = fit.linearisation.with_parameters_changed(np.zeros(len(fit.model.free)))

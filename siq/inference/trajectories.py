@@ -133,8 +133,7 @@ def _run_tape(
 ACCURACY = 1e-4  # relative change of the sum of squares at which a fit has converged
 SETTLED = 0.1  # the same in χ², which matters where there are many samples
 TRIALS = 25  # simulations of all recordings, at most,
-# or as many as have so many samples together, of which a short one counts as 1000: along a curved valley
-# steps are short, and calls take as long as some thousand evaluations.
+# or as many as have so many samples together, at least 1000 each: along a curved valley steps are short
 WORK, LEAST_WORK = 500_000, 1000
 # Of Levenberg and Marquardt's rule, the usual values; damping is relative to each direction's own square.
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-6, 1e4

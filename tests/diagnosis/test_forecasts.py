@@ -14,7 +14,7 @@ from homes_of_mechanisms import model_of, numbers, states
 from siq.data.recordings import Recordings
 from siq.diagnosis import forecasts, mechanisms
 from siq.diagnosis.dictionary import roles_of, standard_dictionary
-from siq.diagnosis.evidence import WRONG_SIGN, NotFitted
+from siq.diagnosis.evidence import NotFitted
 from siq.diagnosis.forecasts import (
     FOLDS,
     Horizon,
@@ -249,34 +249,6 @@ def test_a_last_mechanism_that_makes_no_free_run_better_is_taken_back(
     rungs = iter([damped(), damped(), None])
     monkeypatch.setattr(forecasts, "typically_better", lambda *_, **__: True)
     assert climb(fit, context)[1] == [damped(), damped()]
-
-
-def test_others_are_compared_without_a_first_mechanism_that_makes_no_free_run_better(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    context, asked = context_of(pendulum(), recorded(0.15, 0.2), CLOSE), []
-    label = damped().accepted.best.candidate.label
-
-    def next_rung(_: object, candidates: Sequence[MechanismCandidate], *__: object) -> _Rung | None:
-        asked.append([each.label for each in candidates])
-        return damped() if label in asked[-1] else None
-
-    monkeypatch.setattr(forecasts, "_next_rung", next_rung)
-    monkeypatch.setattr(forecasts, "typically_better", lambda *_, **__: False)
-    assert climb(recalibrate(context.model, context.data)[0], context)[1] == []
-    assert len(asked) == 3 and label in asked[0]
-    assert asked[-1] == [each for each in asked[0] if each != label]
-
-
-def test_what_has_only_a_sign_that_it_cannot_have_is_no_rival(monkeypatch: pytest.MonkeyPatch) -> None:
-    context, untried = context_of(pendulum(), recorded(0.15, 0.2), CLOSE), dict[str, NotFitted]()
-    leader = damped().accepted.best.candidate.label
-    monkeypatch.setattr(MechanismCandidate, "admits", lambda each, _: each.label == leader)
-    fit, _ = recalibrate(context.model, context.data)
-    rung = _next_rung(_horizons_of(fit, context), context.candidates, context, untried)
-    assert rung is not None and rung.accepted.best.candidate.label == leader
-    assert untried and all(each.remark == WRONG_SIGN for each in untried.values())
-    assert rung.log_odds >= damped().log_odds
 
 
 def test_a_general_form_whose_amplitude_is_zero_within_errors_is_its_special_case() -> None:
