@@ -53,8 +53,7 @@ def simulated(fit: Fit, data: Measurements, *, noise: Noise, substeps: int) -> n
     substeps
         Runge–Kutta steps between samples at least; a fit that needed more is run with its own.
     """
-    finer = max(substeps, fit.substeps)
-    return free_run(fit.model, data, noise=noise, substeps=finer, usual=fit.x)
+    return free_run(fit.model, data, noise=noise, substeps=max(substeps, fit.substeps), usual=fit.x)
 
 
 @dataclass(frozen=True)
@@ -291,8 +290,7 @@ def preferred_recalibration(
         What is left out in turn, and how much is trusted in where free runs begin.
     """
     model = card.model.held([each.name for each in card.model.parameters])
-    still = replace(card, model=model, noise=noise.without_process())
-    alone = errors_left_out(still, learned, noise=noise)
+    alone = errors_left_out(replace(card, model=model, noise=noise.without_process()), learned, noise=noise)
     chosen, least = card, None if alone is None else in_blocks(alone)
     for fit, shown in refits:
         known = _refits_left_out(fit, learned, noise=noise, shown=shown)

@@ -297,8 +297,7 @@ def _split(data: Measurements, study: MismatchStudy, *, file: str) -> tuple[Meas
                 raise InputError(file, "held_out", fault, remedy)
         chosen = {data.labels.index(label) for label in study.held_out}
         if not chosen or len(chosen) == count:
-            fault = "one side of the split is empty"
-            raise InputError(file, "held_out", fault, "hold out some, not all")
+            raise InputError(file, "held_out", "one side of the split is empty", "hold out some, not all")
     return data.select([each for each in range(count) if each not in chosen]), data.select(sorted(chosen))
 
 

@@ -216,8 +216,7 @@ def _explanations(investigation: Investigation, names: tuple[str, ...]) -> dict[
         for (what, fit), value in zip(known, log_evidences([fit for _, fit in known], data), strict=True)
     }
     best = max(evidence.values(), default=0.0)
-    ranked = sorted(evidence.items(), key=lambda each: -each[1])
-    return {what: value - best for what, value in ranked}
+    return {what: value - best for what, value in sorted(evidence.items(), key=lambda each: -each[1])}
 
 
 def _excluded(investigation: Investigation) -> dict[str, UpperBound]:
