@@ -69,14 +69,16 @@ class FittedCandidate:
     ) -> FittedCandidate:
         """A candidate's fit with its evidence over the fit without it."""
         extra = len(trial.model.free) - len(before.model.free)
+        # Where each recording begins in a state that the candidate brings is a parameter, too.
+        beginnings = (trial.model.dimension - before.model.dimension) * len(data.labels)
         gained = 2 * (trial.log_likelihood - before.log_likelihood)
         count = trial.degrees_of_freedom + len(trial.model.free)
         return cls(
             candidate=candidate,
             fit=trial,
             delta_chi2=gained,
-            delta_bic=-gained + extra * np.log(count),
-            p_white=float(scipy.stats.chi2.sf(max(gained, 0.0), extra)),
+            delta_bic=-gained + extra * np.log(count) + beginnings * np.log(max(count / len(data.labels), 2)),
+            p_white=float(scipy.stats.chi2.sf(max(gained, 0.0), extra + beginnings)),
             p_cluster=probability_by_chance(trial, before, data, candidate, blocks=blocks),
         )
 
@@ -194,8 +196,7 @@ def probability_by_chance(
     tested = np.array([names.index(name) for name in (candidate.amplitudes or candidate.shapes)], dtype=int)
     values = fit.model.values[[fit.model.free[place] for place in tested]] + change[tested]
     owner = _blocks_of(white.recording, left, least=blocks) if few else white.recording
-    others = np.setdiff1d(np.arange(white.columns.shape[1]), tested)
-    nuisance = np.linalg.qr(white.columns[:, others])[0] if len(others) else np.zeros((len(left), 0))
+    nuisance = orthonormal(np.delete(white.columns, tested, axis=1))
     columns = white.columns[:, tested] - nuisance @ (nuisance.T @ white.columns[:, tested])
     scale = positive(np.sqrt((columns**2).sum(axis=0)))
     columns = columns / scale
@@ -335,8 +336,7 @@ def _log_evidence_of(fit: Fit, data: Measurements, *, correlated: float = 1.0) -
     variances = int((fit.noise.process > 0).sum())
     count = max(float(white.known.sum()) / correlated, 2.0)
     price = 0.5 * (basis.shape[1] + variances) * np.log(count)
-    beginnings = fit.model.dimension * len(data.labels)
-    price += 0.5 * beginnings * np.log(max(count / len(data.labels), 2.0))
+    price += 0.5 * fit.model.dimension * len(data.labels) * np.log(max(count / len(data.labels), 2.0))
     if smooth:
         together = fit.model.expected_together
         own = white.columns[:, [names.index(name) for each in together for name in each.names]]

@@ -641,16 +641,17 @@ def _next_rung(
     for site in suspects[:SUSPECTS]:
         attempt(site)
     contained = _containing(leader.horizons[0], sites, leader.candidate) if leader in steady else set[str]()
-    # What was fitted in earnest counts as it was fitted.
+    # What was fitted in earnest counts as it was fitted; if it did not settle, at most as it promised.
+    limit = dict(zip((site.label for site in sites), gains, strict=True))
     kept = [place for place, site in enumerate(sites) if site.label not in fitted]
     sites = [*(sites[place] for place in kept), *(each.site for each in fitted.values())]
-    gains = np.append(gains[kept], [each.gain for each in fitted.values()])
+    own = [min(one.gain, limit.get(name, 0.0) if name in untried else np.inf) for name, one in fitted.items()]
+    gains = np.append(gains[kept], own)
     gains[[site.label in outdone for site in sites]] = -np.inf
     # The mechanism and hardly more is no rival, nor is what cannot be fitted; but what is clearly better says
     # that it is another thing.
     more = np.array([site.label in untried or site.label in contained for site in sites])
-    clearly = (gains > leader.gain + options.least_log_odds) & (leader.gain < NEARLY_ALL * gains)
-    rival = ~more | clearly
+    rival = ~more | ((gains > leader.gain + options.least_log_odds) & (leader.gain < NEARLY_ALL * gains))
     weights = np.where(rival, gains + np.array([site.prior for site in sites]), -np.inf)
     flat = np.where(rival, gains + np.array([site.flat for site in sites]), -np.inf)
     family = np.array([site.family == leader.site.family for site in sites])
@@ -662,8 +663,9 @@ def _next_rung(
         LOGGER.info("%s: gains %.1f", sites[place].label, gains[place])
     LOGGER.info("%s: log-odds of %s %.1f", leader.site.label, leader.site.family[0], log_odds)
     # The general form of a family may do more than any member of it: another physics then, of the same kind.
-    general = max((gains[k] for k in np.flatnonzero(family) if sites[k].candidate is None), default=0.0)
-    if log_odds < options.least_log_odds or leader.gain < NEARLY_ALL * general:
+    likelier = (weights > leader.weight + options.least_log_odds) & (leader.gain < NEARLY_ALL * gains)
+    general = np.array([site.candidate is None for site in sites]) & family & likelier
+    if log_odds < options.least_log_odds or general.any():
         return None
     members = {sites[k].label: weights[k] for k in np.flatnonzero(family) if sites[k].candidate is not None}
     alike = {label for label, weight in members.items() if weight > leader.weight + np.log(PLAUSIBLE)}
@@ -678,7 +680,6 @@ def _next_rung(
     best = known.pop(leader.site.label)
     others: dict[Standing, tuple[FittedCandidate, ...]] = {
         "same": tuple(each for label, each in known.items() if label in alike),
-        "needless": (),
         "less": tuple(each for label, each in known.items() if label not in alike),
     }
     return _Rung(AcceptedMechanism(best, others), tuple(leader.horizons), log_odds, flat_log_odds)

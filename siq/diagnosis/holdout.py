@@ -36,7 +36,7 @@ Run = Literal["before", "recalibrated", "augmented", "named", "without"]
 # Of an effect, of what is gained, or of squared errors: a choice, made when two cases had been seen, 0.93 for
 # the linear damping of a pendulum arm, and 0.46 for a preload in the place of a bump.
 NEARLY_ALL = 0.9
-CONFIDENCE_95 = 1.96  # standard errors within which 95 % lie
+ABOVE_BY_CHANCE = 0.025  # probability that noise alone lies above: of 95 %, on one side
 BLOCKS = 12  # as many as tell an error of a ratio; fewer leave more samples that belong together in one
 CHANGE_BY_CHANCE = 0.05  # probability of a gain, or a loss, where there is none
 
@@ -53,8 +53,7 @@ def simulated(fit: Fit, data: Measurements, *, noise: Noise, substeps: int) -> n
     substeps
         Runge–Kutta steps between samples at least; a fit that needed more is run with its own.
     """
-    finer = max(substeps, fit.substeps)
-    return free_run(fit.model, data, noise=noise, substeps=finer, usual=fit.x)
+    return free_run(fit.model, data, noise=noise, substeps=max(substeps, fit.substeps), usual=fit.x)
 
 
 @dataclass(frozen=True)
@@ -143,22 +142,29 @@ class HeldOutErrors:
 
     @property
     def takes_most(self) -> bool:
-        """Whether names take more than they leave of the squared errors, beyond the sensors' noise."""
-        before, after = self.error("without"), self.augmented if self.named is None else self.named
+        """Whether names take more than they leave of the squared errors, beyond the sensors' noise.
+
+        All in all or in most blocks: a run that passes a saddle on another side is far off from there on.
+        """
+        run: Run = "augmented" if self.named is None else "named"
+        before, after = self.error("without"), self.error(run)
         if before is None or after is None:
             return after is not None
-        return before**2 - after**2 >= after**2 - (self.noise_floor or 0.0) ** 2
+        was = np.array(self.squares.get(self.better_without, before**2))
+        now = np.array(self.squares.get(run, after**2))
+        left = 2 * now - was - (self.noise_floor or 0.0) ** 2
+        return bool(left.mean() <= 0 or np.median(left) <= 0)
 
     def at_noise(self, run: Run, *, random: bool = False) -> bool:
         """Whether an error is that of measurement noise alone, or with the error of the model at random.
 
-        The root mean square of n independent values has the relative standard error 1/√(2n).
+        The mean square of n independent values, in units of the variance, has the distribution χ²(n)/n.
         """
         error, floor = self.error(run), self.floor if random else self.noise_floor
         if error is None or floor is None:
             return False
-        tolerance = CONFIDENCE_95 / float(np.sqrt(2 * self.values)) if self.values else 0.0
-        return error * (1 - tolerance) <= floor
+        limit = scipy.stats.chi2.isf(ABOVE_BY_CHANCE, self.values) / self.values if self.values else 1.0
+        return bool(error**2 <= limit * floor**2)
 
 
 def _change_between(
@@ -284,8 +290,7 @@ def preferred_recalibration(
         What is left out in turn, and how much is trusted in where free runs begin.
     """
     model = card.model.held([each.name for each in card.model.parameters])
-    still = replace(card, model=model, noise=noise.without_process())
-    alone = errors_left_out(still, learned, noise=noise)
+    alone = errors_left_out(replace(card, model=model, noise=noise.without_process()), learned, noise=noise)
     chosen, least = card, None if alone is None else in_blocks(alone)
     for fit, shown in refits:
         known = _refits_left_out(fit, learned, noise=noise, shown=shown)

@@ -68,13 +68,13 @@ class _MissingEffect:
         linear = [n for each in candidates for n in (each.amplitudes or each.shapes) if n in names]
         others = [n for each in candidates for n in each.shapes if n in names and n not in linear]
         tested = [names.index(name) for name in (*linear, *others)]
-        rest = [place for place in range(len(names)) if place not in tested]
-        self._linear, self._values, self._basis = len(linear), values[tested], orthonormal(own[:, rest])
+        self._linear, self._values = len(linear), values[tested]
+        self._basis = orthonormal(np.delete(own, tested, axis=1))
         effect = own[:, tested[: len(linear)]] @ values[tested[: len(linear)]]
         left = white.innovations - own @ change
         self.correlated = correlation_time_of(left, white.recording, outputs=len(fit.model.outputs))
         self.target = self.projected((left + effect)[:, None])[:, 0]
-        self.freedom = (white.degrees_of_freedom - len(rest)) / self.correlated
+        self.freedom = (white.degrees_of_freedom - len(names) + len(tested)) / self.correlated
         self._columns = self.projected(own[:, tested])
 
     def projected(self, columns: np.ndarray) -> np.ndarray:

@@ -131,8 +131,7 @@ class Probe:
     @property
     def delays(self) -> tuple[tuple[int, float], ...]:
         """Of inputs in the candidate's formulas."""
-        shapes = dict(self.shapes)
-        values = [shapes.get(each.name, each.value) for each in self.candidate.model.parameters]
+        values = [dict(self.shapes).get(each.name, each.value) for each in self.candidate.model.parameters]
         return self.candidate.model.lags(np.array(values))
 
     def parameters(self, values: np.ndarray) -> tuple[float, ...]:
@@ -177,8 +176,7 @@ class Probe:
         if not self.candidate.scales:
             return x
         grid = Grid(data, fit.substeps)
-        further = _at_samples(self._carried(Trajectories(fit.model, grid, x)), grid)
-        return np.concatenate([x, further], axis=1)
+        return np.concatenate([x, _at_samples(self._carried(Trajectories(fit.model, grid, x)), grid)], axis=1)
 
     def _carried(self, trajectories: Trajectories) -> list[np.ndarray]:
         """Its further states at all nodes, carried along each recording from its begin.

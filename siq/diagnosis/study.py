@@ -182,9 +182,7 @@ def _measurements_of(recordings: Recordings | pd.DataFrame | str | Path, system:
     if isinstance(recordings, Recordings):
         for name in columns:
             if name not in recordings.names:
-                remedy = (
-                    f"the simulation measures or is driven by it; there are {', '.join(recordings.names)}"
-                )
+                remedy = f"the simulation needs it; there are {', '.join(recordings.names)}"
                 raise InputError(file, "", f"the column '{name}' is missing", remedy)
         places = [recordings.names.index(name) for name in columns]
         chosen = replace(
@@ -267,9 +265,8 @@ def comparison_of(
             fault = f"'{name}' is no parameter of the card that is free, with a value other than zero"
             raise InputError(file, "varies", fault, "name one that is")
         if len(learn.labels) < 2:
-            raise InputError(
-                file, "varies", "there is one recording to learn from", "give several, or leave it out"
-            )
+            fault = "there is one recording to learn from"
+            raise InputError(file, "varies", fault, "give several, or leave it out")
     if settings.varies:
         system, learn, kept = with_variation(system, settings.varies, learn, kept)
     dictionary = dictionary_of(without=settings.without, further=settings.mechanisms, file=file)
@@ -300,10 +297,8 @@ def _split(data: Measurements, study: MismatchStudy, *, file: str) -> tuple[Meas
                 raise InputError(file, "held_out", fault, remedy)
         chosen = {data.labels.index(label) for label in study.held_out}
         if not chosen or len(chosen) == count:
-            fault = "one side of the split is empty"
-            raise InputError(file, "held_out", fault, "hold out some, not all")
-    learn = data.select([place for place in range(count) if place not in chosen])
-    return learn, data.select(sorted(chosen))
+            raise InputError(file, "held_out", "one side of the split is empty", "hold out some, not all")
+    return data.select([each for each in range(count) if each not in chosen]), data.select(sorted(chosen))
 
 
 def read_case(card: str | Path, recordings: str | Path, study: str | Path | None) -> Comparison:

@@ -142,8 +142,7 @@ class Place:
     @property
     def without_factor(self) -> Place:
         """The same place, but that a function is not multiplied by the second coordinate."""
-        divided = tuple((name, each / self.factor) for name, each in self.equations)
-        return replace(self, equations=divided)
+        return replace(self, equations=tuple((name, each / self.factor) for name, each in self.equations))
 
     def added_to(
         self, model: Dynamics, formula: sympy.Expr, names: Sequence[str], units: Sequence[str]

@@ -119,8 +119,7 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
             remarks += remaining_forces(forced, context.data, context.roles)
     # What has no name is no mechanism to be told apart from others.
     remarks += _experiment_to_tell(investigation) if described is None or investigation.verdict.names else []
-    for name in context.study.varies:
-        remarks.append(_variation_of(name, final, context.data.labels))
+    remarks += [_variation_of(name, final, context.data.labels) for name in context.study.varies]
     if kept and errors:
         remarks.append(Remark("diagnosis.values_stay"))
     if not shown.independent:
@@ -217,8 +216,7 @@ def _explanations(investigation: Investigation, names: tuple[str, ...]) -> dict[
         for (what, fit), value in zip(known, log_evidences([fit for _, fit in known], data), strict=True)
     }
     best = max(evidence.values(), default=0.0)
-    ranked = sorted(evidence.items(), key=lambda each: -each[1])
-    return {what: value - best for what, value in ranked}
+    return {what: value - best for what, value in sorted(evidence.items(), key=lambda each: -each[1])}
 
 
 def _excluded(investigation: Investigation) -> dict[str, UpperBound]:

@@ -349,9 +349,11 @@ def substeps_needed(
     """Runge–Kutta steps in every interval, so that doubling them changes little.
 
     The tolerance is the root mean square change of the increments from states ``(n, d)`` that is allowed,
-    relative to the spread of the states.
+    relative to the spread of the states. One that rests, as a hidden one does at first, is asked elsewhere.
     """
-    steps, begins, scale = 1, x[data.begins].T, x.std(axis=0) + 1e-300
+    spread = x.std(axis=0)
+    aside = np.where(spread > 0, 0.0, np.where(x[0] != 0, np.abs(x[0]), 1.0))
+    steps, begins, scale = 1, (x[data.begins] + aside).T, spread + aside
     coarse = integrate_intervals(model, Grid(data, 1), values, begins)
     while steps < MAX_SUBSTEPS:
         fine = integrate_intervals(model, Grid(data, 2 * steps), values, begins)

@@ -58,8 +58,7 @@ class Measurements:
     @property
     def begins(self) -> np.ndarray:
         """Rows at which an interval between two samples begins, shape ``(n - recordings,)``."""
-        last = self.first[1:] - 1
-        return np.setdiff1d(np.arange(len(self.t)), last, assume_unique=True)
+        return np.setdiff1d(np.arange(len(self.t)), self.first[1:] - 1, assume_unique=True)
 
     @property
     def step(self) -> np.ndarray:

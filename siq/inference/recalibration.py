@@ -251,12 +251,12 @@ def drop_insignificant_process_noise(fit: Fit, data: Measurements) -> Fit | None
     """A fit without its process noise, where that does nothing in it; None where it does something.
 
     Their intensities may have gone towards zero. The fit without them has then been found already, and may be
-    likelier than the one that another way of fitting ends in.
+    likelier than the one that another way of fitting ends in. If it is far likelier, that is no maximum.
     """
     still = fit.noise.without_process()
     held = fit.linearisation.with_parameters_changed(np.zeros(len(fit.model.free)))
     with_them, alone = (held.log_likelihood(data.first, data.step, noise) for noise in (fit.noise, still))
-    if not 2 * (with_them - alone) <= least_to_believe(fit.noise):
+    if not 2 * abs(with_them - alone) <= least_to_believe(fit.noise):
         return None
     return replace(fit, noise=still, log_likelihood=fit.log_likelihood - (with_them - alone))
 

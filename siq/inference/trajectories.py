@@ -133,7 +133,8 @@ def _run_tape(
 ACCURACY = 1e-4  # relative change of the sum of squares at which a fit has converged
 SETTLED = 0.1  # the same in χ², which matters where there are many samples
 TRIALS = 25  # simulations of all recordings, at most,
-WORK = 500_000  # or as many as have so many samples together: along a curved valley steps are short
+# or as many as have so many samples together, at least 1000 each: along a curved valley steps are short
+WORK, LEAST_WORK = 500_000, 1000
 # Of Levenberg and Marquardt's rule, the usual values; damping is relative to each direction's own square.
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-6, 1e4
 EASIER, HARDER = 10.0, 5.0
@@ -249,7 +250,7 @@ def fit_trajectories(
         values, converged, damping, normal = model.values, False, FIRST_DAMPING, None
         states, total = followed(values, begin)
         sides = model.functions.sides(states.T, grid.at_samples(model.lags(values)), values)
-        for _ in range(max(TRIALS, WORK // max(count, 1)) if np.isfinite(total) else 0):
+        for _ in range(max(TRIALS, WORK // max(count, LEAST_WORK)) if np.isfinite(total) else 0):
             if budget is not None:
                 budget.charge(work * (RUN if normal is not None else 1.0 + RUN))
             if normal is None:

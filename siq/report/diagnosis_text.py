@@ -33,8 +33,8 @@ def _templates() -> Any:
     further: dict[str, Any] = {
         "p_equation": p_equation,
         "error": _error_text,
-        "estimate": lambda entry, digits=4: value_text(
-            entry.estimate, entry.standard_error, unit=entry.unit, digits=digits
+        "estimate": lambda entry, digits=4, error=True: value_text(
+            entry.estimate, entry.standard_error if error else None, unit=entry.unit, digits=digits
         ),
         "after": lambda each: value_text(each.after, each.standard_error, unit=each.unit),
         "before": lambda each: _card_value(each.before),

@@ -436,3 +436,58 @@ def test_what_follows_any_motion_is_no_rival_where_something_simple_does_as_much
         monkeypatch.setattr(forecasts, "_takes_most", lambda *_, most=takes_most: most)
         rung = _next_rung(horizons, context.candidates, context, {})
         assert (rung is not None) == (on_top > 0 or not takes_most)
+
+
+@pytest.mark.parametrize(("settles", "named"), [(False, True), (True, False)])
+def test_a_fit_that_does_not_settle_counts_for_no_more_than_it_promised(
+    settles: bool, named: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the gain of a sensor that ran away to 20 000, of a pendulum that hardly moves then."""
+    context = context_of(pendulum(), recorded(0.15, 0.2), ("linear damping", "sensor gain or offset"))
+    fit, _ = recalibrate(context.model, context.data)
+
+    def fitted(horizons: list[Horizon], site: _Site, _: Budget, untried: dict) -> tuple[list[Horizon], float]:
+        assert site.candidate is not None
+        damping = site.candidate.name == "linear damping"
+        if not (damping or settles):
+            untried[site.label] = NotFitted.of(site.candidate, NumericalFailure(forecasts.UNSETTLED))
+        return list(horizons), 100.0 if damping else 700.0
+
+    def promised(_: object, sites: Sequence[_Site], leading: object, *__: object) -> tuple:
+        one = 10.0 if leading is None else -50.0  # in its place
+        return list(sites), np.array([one - 10 * (each.candidate is None) for each in sites])
+
+    monkeypatch.setattr(forecasts, "_fitted_at", fitted)
+    monkeypatch.setattr(forecasts, "_gains", promised)
+    monkeypatch.setattr(forecasts, "_containing", lambda *_: set())
+    monkeypatch.setattr(forecasts.FittedCandidate, "of", lambda *given, **_: given[3])
+    rung = _next_rung(_horizons_of(fit, context)[:1], context.candidates, context, {})
+    best = "" if rung is None else rung.accepted.best.name
+    assert (best == "linear damping") == named
+
+
+@pytest.mark.parametrize(("more", "named"), [(3.0, True), (60.0, False)])
+def test_the_general_form_outdoes_a_member_only_if_it_is_likelier(
+    more: float, named: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As dry friction that gains 20 nats where an error of the model gives any function of the speed 23."""
+    context = context_of(pendulum(), recorded(0.15, 0.2), CLOSE)
+    fit, _ = recalibrate(context.model, context.data)
+    damping = damped().accepted.best.candidate.label
+
+    def fitted(horizons: list[Horizon], site: _Site, *_: object) -> tuple[list[Horizon], float] | None:
+        return (list(horizons), 20.0) if site.label == damping else None
+
+    def promised(_: object, sites: Sequence[_Site], leading: object, *__: object) -> tuple:
+        if leading is None:
+            return list(sites), np.array([float(each.label == damping) for each in sites])
+        general = np.array([each.candidate is None and each.family[0] != "" for each in sites])
+        assert general.any()
+        return list(sites), np.where(general, more, -50.0)
+
+    monkeypatch.setattr(forecasts, "_fitted_at", fitted)
+    monkeypatch.setattr(forecasts, "_gains", promised)
+    monkeypatch.setattr(forecasts, "_containing", lambda *_: set())
+    monkeypatch.setattr(forecasts.FittedCandidate, "of", lambda *given, **_: given[3])
+    rung = _next_rung(_horizons_of(fit, context)[:1], context.candidates, context, {})
+    assert (rung is not None) == named

@@ -13,7 +13,7 @@ import sympy
 from homes_of_mechanisms import HOMES, RESIDENTS, recorded
 
 from siq.data.recordings import Recordings
-from siq.diagnosis import naming, screening, search
+from siq.diagnosis import evidence, naming, screening, search
 from siq.diagnosis.dictionary import Roles, Shape, roles_of, standard_dictionary
 from siq.diagnosis.evidence import FittedCandidate, _blocks_of, _correlated_probability, _correlation_time
 from siq.diagnosis.mechanisms import MechanismCandidate, candidates_of
@@ -297,6 +297,39 @@ def test_of_equals_the_one_that_all_recordings_ask_for_where_white_errors_mean_l
     found = _accepted(trials, 50, 1e-4, options=SearchOptions())
     assert found is not None and found.best.candidate.name == expected
     assert {each.candidate.name for each in found.others["same"]} == {"better", "steadier"} - {expected}
+
+
+@pytest.mark.parametrize(("weights", "leads"), [((0.2, 5.0), "growth"), ((1.0, 1.0), "season")])
+def test_of_two_that_explain_alike_the_likelier_beforehand_leads(
+    weights: tuple[float, float], leads: str
+) -> None:
+    # Yeast that fills its vessel has no season of births, though that has two more numbers to fit.
+    def trial(name: str, gain: float, new: tuple[str, ...], weight: float) -> FittedCandidate:
+        fit = SimpleNamespace(has_process_noise=False)
+        candidate = SimpleNamespace(name=name, new=new, weight=weight, equations=("n",))
+        return FittedCandidate(candidate, fit, gain, len(new) * np.log(14) - gain, 0.0, 1e-9)
+
+    season, growth = weights
+    trials = [trial("season", 59.1, ("c", "d", "w"), season), trial("growth", 53.3, ("c",), growth)]
+    found = _accepted(trials, 20, 1e-4, options=SearchOptions())
+    assert found is not None and found.best.candidate.name == leads
+    assert len(found.others["same"]) == 1
+
+
+def test_where_recordings_begin_in_a_hidden_state_is_a_parameter(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evidence, "probability_by_chance", lambda *_, **__: 1.0)
+
+    def fit(states: int, parameters: int, log_likelihood: float) -> Any:
+        model = SimpleNamespace(free=range(parameters), dimension=states)
+        return SimpleNamespace(model=model, log_likelihood=log_likelihood, degrees_of_freedom=90 - parameters)
+
+    data, candidate = SimpleNamespace(labels=("a",) * 9), SimpleNamespace()
+    plain, hidden = (
+        FittedCandidate.of(fit(1 + states, 3, 20.0), fit(1, 2, 0.0), data, candidate, blocks=10)
+        for states in (0, 1)
+    )
+    assert hidden.delta_bic - plain.delta_bic == pytest.approx(9 * np.log(10))
+    assert hidden.p_white == pytest.approx(scipy.stats.chi2.sf(40, 10)) and plain.p_white < hidden.p_white
 
 
 def test_of_fits_that_are_equal_but_for_rounding_one_in_an_equation_leads() -> None:

@@ -27,6 +27,7 @@ from siq.diagnosis.study import MismatchVerdict
 from siq.diagnosis.verdict import statement_of_failure
 from siq.numerics.text import p_text, percent
 from siq.remarks import Remark
+from siq.report import diagnosis_text
 from siq.report.diagnosis_text import sentences_of
 
 NAMES = ("dry friction", "Stribeck friction", "hysteresis", "quadratic drag", "cubic damping", "input delay")
@@ -354,3 +355,10 @@ def test_a_statement_is_read_as_it_was_written(verdict):
         data = json.loads(json.dumps(statement.as_data(), allow_nan=False))
         assert Statement.from_data(data) == statement
         assert Statement.from_data(data).as_data() == data
+
+
+def test_a_value_below_its_error_is_said_to_be_uncertain_and_not_zero() -> None:
+    # Of two compartments of which one is measured the recordings tell two rates, and not the three.
+    sizes = {"c": Estimate(0.7655, 16083.5, "1/h"), "d": Estimate(2.2941, 0.0079, "1/s")}
+    said = " ".join(str(diagnosis_text._templates().numbers(sizes)).split())
+    assert said == "c ≈ 0.77 1/h (uncertain by more than that), d = 2.2941 ± 0.0079 1/s"

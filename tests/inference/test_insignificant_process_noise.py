@@ -10,7 +10,7 @@ import pytest
 import sympy
 
 from siq.diagnosis.study import comparison_of
-from siq.inference.kalman_filter import Noise
+from siq.inference.kalman_filter import Linearisation, Noise
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import (
@@ -53,6 +53,15 @@ def test_what_does_nothing_is_left_out() -> None:
     without = drop_insignificant_process_noise(idle, data)
     assert without is not None and not without.has_process_noise
     assert without.log_likelihood == pytest.approx(idle.log_likelihood, abs=1e-3)
+
+
+def test_what_would_be_far_likelier_without_its_noise_is_no_maximum(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = relaxations(driven=0.0)
+    fit = fitted(data)
+    idle = replace(fit, noise=Noise(fit.noise.measurement, np.array([1e-22])))
+    known = iter([-5e52, -2e52])  # along a motion that grows beyond all numbers
+    monkeypatch.setattr(Linearisation, "log_likelihood", lambda *_: next(known))
+    assert drop_insignificant_process_noise(idle, data) is None
 
 
 def test_what_drives_the_motion_is_kept() -> None:

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 import sympy
 
-from siq.inference.kalman_filter import Grid, Noise, integrate_intervals, linearise
+from siq.inference import trajectories
+from siq.inference.kalman_filter import (
+    MAX_SUBSTEPS,
+    Grid,
+    Noise,
+    integrate_intervals,
+    linearise,
+    substeps_needed,
+)
 from siq.inference.maximum_likelihood import fit_by_multiple_shooting
 from siq.inference.measurements import Measurements, course_of_input, expectations, first_states
 from siq.inference.recalibration import fit_with_and_without_process_noise
@@ -230,3 +238,34 @@ def test_jumps_are_found_in_formulas_and_not_in_their_spelling(formula: str, arg
     names = {"design": sympy.Symbol("design", real=True), "sigma": sympy.Symbol("sigma", positive=True)}
     moving = Dynamics.of((x, v), (v, sympy.sympify(formula, {"x": x, "v": v, **names})))
     assert [str(each) for each in jumps_of(moving)] == arguments
+
+
+STORES = {
+    "name": "stores",
+    "time_unit": "h",
+    "states": {"A": {"unit": "1"}, "C": {"unit": "1"}},
+    "parameters": {"k": {"value": 2.5}},
+    "equations": {"A": "-k*A", "C": "k*A"},
+    "outputs": {"c": "C"},
+}
+
+
+def test_steps_are_fine_enough_for_a_state_of_which_nothing_is_known_yet() -> None:
+    # A store that feeds another rests empty where a fit begins. Within a step of 12 h it would grow beyond
+    # all numbers, and no fit could fill it.
+    model, t = model_of(STORES), np.array([0.0, 0.5, 1, 2, 4, 8, 12, 24])
+    x = np.stack([np.zeros(8), 1 - np.exp(-2.5 * t)], axis=1)
+    data = Measurements(labels=("a",), first=np.array([0, 8]), t=t, outputs=x[:, 1:], courses=((),))
+    assert substeps_needed(model, data, model.values, x, tolerance=1e-3) == MAX_SUBSTEPS
+
+
+def test_a_fit_to_few_samples_that_never_settles_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trajectories, "ACCURACY", 0.0)
+    monkeypatch.setattr(trajectories, "SETTLED", 0.0)
+    monkeypatch.setattr(trajectories, "MOST_DAMPING", np.inf)
+    model, t, runs = model_of(STORES), np.linspace(0, 1, 8), []
+    monkeypatch.setattr(trajectories, "run", lambda *options: runs.append(0) or run(*options))
+    data = Measurements(labels=("a",), first=np.array([0, 8]), t=t, outputs=t[:, None] ** 2, courses=((),))
+    noise = Noise(np.ones(1), np.zeros(2))
+    found = fit_trajectories(model, data, begin=np.array([[1.0, 0.0]]), noise=noise, substeps=1)
+    assert not found.converged and len(runs) <= 501
