@@ -131,7 +131,8 @@ class Probe:
     @property
     def delays(self) -> tuple[tuple[int, float], ...]:
         """Of inputs in the candidate's formulas."""
-        values = [dict(self.shapes).get(each.name, each.value) for each in self.candidate.model.parameters]
+        shapes = dict(self.shapes)
+        values = [shapes.get(each.name, each.value) for each in self.candidate.model.parameters]
         return self.candidate.model.lags(np.array(values))
 
     def parameters(self, values: np.ndarray) -> tuple[float, ...]:
