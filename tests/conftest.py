@@ -9,11 +9,11 @@ import pytest
 
 # Before torch and numpy start their threads: arrays this small take thrice as long on two as on one.
 os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-# What imports make stays until the end; to look through it for garbage takes as long as the imports themselves.
-gc.disable()
 
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
+
+gc.disable()  # What imports make stays; looking through it for garbage takes as long as they do.
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("inference", "rules", "diagnosis", "quasipotential", "workflow", "")

@@ -245,6 +245,9 @@ def compile_formulas(
 
     def evaluate(components: np.ndarray) -> np.ndarray:
         values = np.empty((len(expressions), *components.shape[1:]))
+        if values.size == len(values) > 0:  # of one point, whose numbers take a fifth of the time of arrays
+            values.flat = function(*components.ravel())
+            return values
         for index, value in enumerate(function(*components)):
             values[index] = value
         return values
