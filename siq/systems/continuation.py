@@ -86,7 +86,6 @@ class _Family:
         box = np.vstack([dynamics.box, *limits.values()])
         self.d, self.count = dynamics.dimension, len(box)
         self.low, self.width = box[:, 0], np.ptp(box, axis=1)
-        self._units = self.width / self.width[: self.d, None]
         # Parameters as states that stay where they are: all derivatives are those of Dynamics.
         self._of_both = Dynamics.of(
             (*dynamics.symbols, *map(symbol, limits)), (*formulas, *[0] * len(limits)),
@@ -115,7 +114,7 @@ class _Family:
         """Its derivatives by states and parameters, shape ``(d, d + p)``."""
         with np.errstate(all="ignore"):
             found = self._of_both.jacobian(self.natural(z)[None])[0, : self.d]
-        return np.asarray(found * self._units)
+        return np.asarray(found * self.width / self.width[: self.d, None])
 
     def bends(self, z: np.ndarray) -> np.ndarray:
         """Its second derivatives, shape ``(d, d + p, d + p)``."""
@@ -326,8 +325,7 @@ class _Cycles(_Equilibria):
             return self._around[1:]
 
         def rates(_: float, s: np.ndarray) -> np.ndarray:
-            at = s[: d + 1].copy()
-            at[d] = y[d]
+            at = np.append(s[:d], y[d])
             slopes = self.family.slopes(at)
             change = slopes[:, :d] @ s[d:].reshape(d, d + 1)
             change[:, d] += slopes[:, d]
