@@ -266,9 +266,9 @@ def _valleys(
 def _valley_depths(series: np.ndarray, bins: Sequence[int]) -> list[float]:
     """Of each row ``(c, n)``, in so many bins, the largest share of its samples in a lesser peak."""
     count = series.shape[1]
+    limits = np.quantile(series, [0.001, 0.999], axis=1).T
     depths = []
-    for row, number in zip(series, bins, strict=True):
-        least, most = _tails(row, 0.001 * (count - 1))
+    for row, number, (least, most) in zip(series, bins, limits, strict=True):
         if not most > least:
             depths.append(0.0)
             continue
@@ -277,23 +277,6 @@ def _valley_depths(series: np.ndarray, bins: Sequence[int]) -> list[float]:
         left = above.diagonal()
         depths.append(float(np.minimum(left, above[-1] - left).max()) / count)
     return depths
-
-
-@machine_code
-def _tails(values: np.ndarray, rank: float) -> tuple[float, float]:
-    """The values at a rank from either end: quantiles next to the ends, in one pass."""
-    last = int(rank) + 1
-    ends = np.full((2, last + 1), np.inf)
-    for value in values:
-        for side, signed in enumerate((value, -value)):
-            place = last
-            if signed < ends[side, last]:
-                while place > 0 and ends[side, place - 1] > signed:
-                    ends[side, place] = ends[side, place - 1]
-                    place -= 1
-                ends[side, place] = signed
-    found = ends[:, last - 1] + (rank - last + 1) * (ends[:, last] - ends[:, last - 1])
-    return found[0], -found[1]
 
 
 @machine_code
@@ -444,19 +427,17 @@ class RecordStates:
         for name, kind in (("profile", Profile), ("markov", MarkovModel)):
             if (one := data[name]) is not None:
                 arrays: dict[str, Any] = {
-                    key: _array(value) if isinstance(value, list) else value for key, value in one.items()
+                    key: np.array(value, dtype=float) if isinstance(value, list) else value
+                    for key, value in one.items()
                 }
                 data[name] = kind(**arrays)
         data |= {name: tuple(data[name]) for name in ("levels", "columns", "exponential")}
-        data |= {name: _array(data[name]) for name in ("edges", "density", "places", "hops")}
+        # None is read as NaN.
+        data |= {name: np.array(data[name], dtype=float) for name in ("edges", "density", "places", "hops")}
         data["counts"] = tuple(DwellCount(**one) for one in data["counts"])
         data["stays"] = tuple(map(_array, data["stays"]))
         data["limit"] = None if data["limit"] is None else Remark.from_data(data["limit"])
         return cls(**data)
-
-
-def _array(values: Any) -> np.ndarray:
-    return np.array(values, dtype=float)  # None is read as NaN
 
 
 def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | None:
