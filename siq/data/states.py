@@ -427,17 +427,19 @@ class RecordStates:
         for name, kind in (("profile", Profile), ("markov", MarkovModel)):
             if (one := data[name]) is not None:
                 arrays: dict[str, Any] = {
-                    key: np.array(value, dtype=float) if isinstance(value, list) else value
-                    for key, value in one.items()
+                    key: _array(value) if isinstance(value, list) else value for key, value in one.items()
                 }
                 data[name] = kind(**arrays)
         data |= {name: tuple(data[name]) for name in ("levels", "columns", "exponential")}
-        # None is read as NaN.
-        data |= {name: np.array(data[name], dtype=float) for name in ("edges", "density", "places", "hops")}
+        data |= {name: _array(data[name]) for name in ("edges", "density", "places", "hops")}
         data["counts"] = tuple(DwellCount(**one) for one in data["counts"])
         data["stays"] = tuple(map(_array, data["stays"]))
         data["limit"] = None if data["limit"] is None else Remark.from_data(data["limit"])
         return cls(**data)
+
+
+def _array(values: Any) -> np.ndarray:
+    return np.array(values, dtype=float)  # None is read as NaN
 
 
 def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | None:
