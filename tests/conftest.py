@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,8 @@ os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
+
+gc.disable()  # What imports make stays; looking through it for garbage takes as long as they do.
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("inference", "rules", "diagnosis", "quasipotential", "workflow", "")
@@ -35,6 +38,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         alike = item.path.parent if "inference" in item.path.parts else item.path
         shared = "finished" in getattr(item, "fixturenames", ())
         item.add_marker(pytest.mark.xdist_group("finished" if shared else str(alike)))
+
+
+def pytest_collection_finish() -> None:
+    """From here on garbage is collected, among what tests make."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture

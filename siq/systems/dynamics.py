@@ -559,8 +559,7 @@ class Dynamics:
         """∂f_i/∂x_j at points: ``(n, d)`` to ``(n, d, d)``, i before j."""
         result = np.zeros((*x.shape, self.dimension))
         (i, j), compiled = self._first
-        if len(i):
-            result[:, i, j] = compiled(np.ascontiguousarray(x.T)).T
+        result[:, i, j] = compiled(np.ascontiguousarray(x.T)).T
         return result
 
     def hessian(self, x: np.ndarray) -> np.ndarray:

@@ -197,11 +197,11 @@ def test_hops_that_depend_on_what_was_not_recorded_end_on_the_second_rung() -> N
 
 def test_baselines_that_differ_are_given_one_each() -> None:
     pair = np.array([[-0.06, 0.06], [0.10, -0.10]])
-    path = np.array([chain(seed, pair, 2500) for seed in range(4)])
-    x = 3.0 * path + 0.2 * np.array([noise(seed, 2500) for seed in range(4)])
+    path = np.array([chain(seed, pair, 1500) for seed in range(4)])
+    x = 3.0 * path + 0.2 * np.array([noise(seed, 1500) for seed in range(4)])
     offsets = np.array([0.0, 0.1, -0.1, 0.15])
     names = ["x"]
-    together = Recordings.from_arrays(np.arange(2500.0), (x + offsets[:, None])[:, :, None], names=names)
+    together = Recordings.from_arrays(np.arange(1500.0), (x + offsets[:, None])[:, :, None], names=names)
     found = switching(together)
     assert found is not None and found.offset == pytest.approx(0.25, abs=0.05)
     assert "differ in their baselines" in found.sentence()
@@ -209,7 +209,7 @@ def test_baselines_that_differ_are_given_one_each() -> None:
     assert "differ in their baselines" in flat.notes[-1]
     taken = (together.values - flat.values)[:, 0].reshape(4, -1)
     np.testing.assert_allclose(taken.mean(axis=1), offsets - offsets.mean(), atol=0.02)
-    recordings = Recordings.from_arrays(np.arange(2500.0), x[:, :, None], names=names)
+    recordings = Recordings.from_arrays(np.arange(1500.0), x[:, :, None], names=names)
     alike = switching(recordings)
     assert alike is not None and alike.offset == 0
     assert without_background(recordings) is recordings
@@ -224,7 +224,7 @@ def test_an_inspection_tells_the_rungs() -> None:
 
 
 def test_states_are_seen_over_a_drift_as_large_as_their_distance() -> None:
-    x = double_wells(1, samples=120_000, traces=1, intensity=0.3)[0, ::5, 0]
+    x = double_wells(1, samples=60_000, traces=1, intensity=0.3)[0, ::5, 0]
     drift = np.linspace(-1, 1, len(x))
     found = switching(recorded(x + drift))
     assert found is not None and found.supported and len(found.levels) == 2

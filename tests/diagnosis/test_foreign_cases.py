@@ -27,7 +27,6 @@ from tests.diagnosis.foreign_cases import (
 )
 
 SMALL: dict[str, Callable[[], ForeignCase]] = {
-    "falling ball, drag": lambda: falling_ball(0.03),
     "falling ball, gravity free": lambda: falling_ball(0.3, fixed=False),
     "falling ball, linear drag": lambda: falling_ball(0.3, linear=True),
     "polynomial on the brink": lambda: polynomial_on_the_brink(samples=60, recordings=3),
@@ -43,11 +42,13 @@ LARGE: dict[str, Callable[[], ForeignCase]] = {
 }
 
 
-def answered(case: ForeignCase, folder: Path, **allowance: float) -> Diagnosis:
+def answered(
+    case: ForeignCase, folder: Path, *, tell: Callable[[str], object] | None = None, **allowance: float
+) -> Diagnosis:
     """A diagnosis, with everything that files have of it."""
     read = case.read(folder)
     settings = read.settings.model_copy(update={"budget": Allowance(**allowance)})
-    found = solve_case(replace(read, settings=settings))
+    found = solve_case(replace(read, settings=settings), tell=tell)
     said = found.statement.as_data()
     json.dumps(said, allow_nan=False)
     assert said["sentence"] and said["partial"] == bool(said["budget"]["stopped_by"])
@@ -85,8 +86,13 @@ def test_dry_friction_of_a_motor_is_named(tmp_path: Path) -> None:
 def followed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Diagnosis, list[str]]:
     """A diagnosis with all that was told while it was made."""
     told: list[str] = []
-    found = solve_case(falling_ball(0.3).read(tmp_path_factory.mktemp("followed")), tell=told.append)
+    found = answered(falling_ball(0.3), tmp_path_factory.mktemp("followed"), tell=told.append)
     return found, told
+
+
+def test_there_is_an_answer_to_a_ball_that_falls(followed: tuple[Diagnosis, list[str]]) -> None:
+    found, _ = followed
+    assert found.verdict.mismatch and not found.statement.partial
 
 
 def test_what_the_budget_does_not_reach_is_named(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from siq.systems.dynamics import Dynamics
 X, Y = sympy.symbols("x y", real=True)
 
 
+@cache
 def learned() -> Landscape:
     known = maier_stein(3)
     found = find_landscape(

@@ -31,7 +31,9 @@ def reference_of(known) -> ReferenceLandscape:
     return reference_landscape(
         known.dynamics, portrait_of(known), box=known.domain, reach=1.0,
         generator=np.random.default_rng(0),
-        mesh=lambda place, level: mesh_potential(known.dynamics, place, box=known.domain, level=level),
+        mesh=lambda place, level: mesh_potential(
+            known.dynamics, place, box=known.domain, level=level, nodes=256
+        ),
     )  # fmt: skip
 
 

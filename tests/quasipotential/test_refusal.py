@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -32,6 +33,22 @@ def telegraph() -> Recordings:
     return table
 
 
+@cache
+def of_telegraph() -> RecordStates:
+    """What is seen of it."""
+    seen = inspect(telegraph()).switching
+    assert seen is not None
+    return seen
+
+
+@cache
+def of_double_well() -> RecordStates:
+    """What is seen of the hops of a double well."""
+    seen = RecordStates.of(double_well())
+    assert seen is not None and seen.supported
+    return seen
+
+
 def double_well() -> Recordings:
     draw = np.random.default_rng(1)
     x = np.empty((8_000, 1))
@@ -44,8 +61,7 @@ def double_well() -> Recordings:
 
 @pytest.mark.parametrize("shift", [0.0, 0.3, 1.2])
 def test_states_elsewhere_than_the_wells_come_first(shift: float) -> None:
-    seen = RecordStates.of(double_well())
-    assert seen is not None and seen.supported
+    seen = of_double_well()
     two = summarise(told(landscape([[-0.5], [0.5]], [0.25, 0.35])))
     wells = np.array([one.position[0] for one in two.wells])
     name = two.names[0]
@@ -60,12 +76,11 @@ def test_states_elsewhere_than_the_wells_come_first(shift: float) -> None:
 @pytest.mark.filterwarnings("ignore:invalid value")  # the root is what f is refused for
 def test_a_refusal_carries_the_states_of_the_record() -> None:
     few = PipelineSettings(identification=IdentificationOptions(functions=("sqrt(x)",)))
-    record = telegraph()
     with pytest.raises(NoLandscape) as refused:
-        siq.Landscape.from_recordings(record, few)
-    states, seen = refused.value.states, inspect(record).switching
-    assert states is not None and seen is not None
-    assert states.as_data() == seen.as_data()  # what the page is made of
+        siq.Landscape.from_recordings(telegraph(), few)
+    states = refused.value.states
+    assert states is not None
+    assert states.as_data() == of_telegraph().as_data()  # what the page is made of
     times = states.dwell_times()
     for row in times.itertuples():
         assert row.lowest < LASTS * 0.5 < row.highest
@@ -88,14 +103,13 @@ def test_a_landscape_that_misses_the_states_says_so_as_the_page_does() -> None:
 
 
 def test_states_of_a_record_come_back_from_plain_data() -> None:
-    seen = inspect(telegraph()).switching
-    assert seen is not None
+    seen = of_telegraph()
     again = RecordStates.from_data(json.loads(json.dumps(seen.as_data())))
     assert again.as_data() == seen.as_data() and again.sentence() == seen.sentence()
 
 
 def test_nothing_is_added_to_what_is_certified() -> None:
-    seen = inspect(telegraph()).switching
+    seen = of_telegraph()
     two = summarise(told(landscape([[-0.5], [0.5]], [0.25, 0.35])))
     (answer, *further) = answer_lines(two, seen=seen, rung=6)
     assert answer_lines(two) == [answer, *further]
