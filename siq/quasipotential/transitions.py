@@ -17,6 +17,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -176,16 +177,16 @@ def ways_out(dynamics: Dynamics, portrait: PhasePortrait, *, beyond_region: bool
             Transition(number, target, over, path, remarks=remarks, turns=turns, cycle=at_cycle[start])
         )
 
-    for cycle in whole.parting:
-        ends = sides_of(dynamics, cycle, whole.attractors, box=box, cycles=cycles).tolist()
+    sides = partial(sides_of, dynamics, attractors=whole.attractors, box=box, cycles=cycles)
+    for cycle, away_from in zip(whole.parting, sides(whole.parting), strict=True):
+        ends = away_from.tolist()
         for start, beyond in (ends, ends[::-1]) if ends[0] != ends[1] else ():
             if start >= 0:
                 add(start, cycle, None if beyond < 0 else beyond)
     for index, (number, away) in enumerate(homes):
         if number is None or any(away):
             continue
-        for saddle in whole.saddles[index]:
-            reached = sides_of(dynamics, saddle, whole.attractors, box=box, cycles=cycles)
+        for saddle, reached in zip(whole.saddles[index], sides(whole.saddles[index]), strict=True):
             end = min(set(reached[reached >= 0].tolist()) - {index}, default=None)
             if end is None and not beyond_region:
                 remarks = (Remark("quasipotential.nothing_beyond_saddle"),)

@@ -129,21 +129,24 @@ def settled_on(
 
 def sides_of(
     dynamics: Dynamics,
-    over: Equilibrium | Cycle,
+    over: Sequence[Equilibrium | Cycle],
     attractors: Sequence[Equilibrium],
     *,
     box: np.ndarray,
     cycles: Sequence[Cycle] = (),
-) -> np.ndarray:
-    """Where f leads from both sides of a saddle, or of an unstable cycle, see `_ends_of`."""
-    place = over if isinstance(over, Cycle) else over.position
-    starts = states_on_both_sides(dynamics, place, width=np.ptp(box, axis=1))
+) -> list[np.ndarray]:
+    """Where f leads from both sides of saddles, or unstable cycles, followed together; see `_ends_of`."""
+    if not over:
+        return []
+    places = [one if isinstance(one, Cycle) else one.position for one in over]
+    pairs = [states_on_both_sides(dynamics, place, width=np.ptp(box, axis=1)) for place in places]
+    starts = np.concatenate(pairs)
     ends = _ends_of(dynamics, starts, attractors, cycles, box=box)
     if (nowhere := ends < 0).any():
         # On an invariant boundary, such as that of no predators, f leads to a further saddle; beside it, on.
         inner = starts[nowhere] + INWARDS * (box.mean(axis=1) - starts[nowhere])
         ends[nowhere] = _ends_of(dynamics, inner, attractors, cycles, box=box)
-    return ends
+    return np.split(ends, np.cumsum([len(each) for each in pairs])[:-1])
 
 
 def _ends_of(

@@ -236,12 +236,13 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
         equilibria = (*attractors, *saddles)
         remarks = [Remark("systems.domain_not_searched", {"states": len(points)}), *further]
     around: list[list[Equilibrium]] = [[] for _ in (*attractors, *cycles)]
-    for one in equilibria:
-        # Over a saddle of a domain with several unstable directions no way is lowest.
-        if one.kind == "saddle" and (recorded or _crossed_by_noise(dynamics, one.position, width)):
-            for index in set(sides_of(dynamics, one, attractors, box=box, cycles=cycles).tolist()) - {-1}:
-                if one.unstable == 1 or not searched:
-                    around[index].append(one)
+    # Over a saddle of a domain with several unstable directions no way is lowest.
+    crossed = [one for one in equilibria if one.kind == "saddle" and (one.unstable == 1 or not searched)]
+    crossed = [one for one in crossed if recorded or _crossed_by_noise(dynamics, one.position, width)]
+    sides = sides_of(dynamics, crossed, attractors, box=box, cycles=cycles)
+    for one, ends in zip(crossed, sides, strict=True):
+        for index in set(ends.tolist()) - {-1}:
+            around[index].append(one)
 
     basins: list[Basin] = []
     for index, one in enumerate(attractors if recorded or searched else ()):

@@ -120,7 +120,7 @@ def test_a_saddle_lies_between_the_attractors_next_to_it(known: KnownSystem) -> 
     assert [len(saddles) for saddles in found.saddles] == [1, 1]
     assert found.saddles[0] == found.saddles[1]
     attractors = list(found.attractors)
-    sides = sides_of(known.dynamics, found.saddles[0][0], attractors, box=found.box)
+    (sides,) = sides_of(known.dynamics, found.saddles[0][:1], attractors, box=found.box)
     assert set(sides) == {0, 1}
     np.testing.assert_allclose([one.position for one in attractors], known.attractors, atol=1e-9)
 
