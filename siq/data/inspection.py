@@ -163,7 +163,8 @@ class Inspection:
                 found.append(Remark("data.few_transitions", {"transitions": fewest.visits}))
             taken = any(one.code == "data.drift_taken_off" for one in self.recordings.remarks)
             values = {"state": hops.state, "range": float(np.ptp(hops.background)), "taken": taken}
-            found.append(Remark("data.drift" if hops.background.any() else "data.stationary", values))
+            drifts = bool(hops.background.any())
+            found.append(Remark("data.drift", values) if drifts else Remark("data.stationary", values))
         sparse = self.coverage < SPARSE_COVERAGE and len(titles) > 1
         values = {"share": self.coverage, "states": list(titles[:2]), "sparse": sparse}
         return [*found, Remark("data.coverage", values)]
@@ -182,7 +183,7 @@ class Inspection:
             told = {"fault": SINGLE_RECORDING, "remedy": SINGLE_RECORDING_REMEDY}
             found = [Remark("data.single_recording", told)]
         else:
-            found = [Remark("data.no_noise" if noises else "data.noise_unknown")]
+            found = [Remark("data.no_noise") if noises else Remark("data.noise_unknown")]
         units = sorted({unit for unit in recordings.units if unit})
         if not forced and len(units) > 1:
             found.append(Remark("data.different_units", {"units": units}))

@@ -89,7 +89,7 @@ def test_two_states_against_a_simulation() -> None:
     counts = DwellCount.of_visits(recordings.t, visits, runs_of(recordings))
     process = _VisitProcess(system, intensity, np.array([[-2.4, 2.4], [-2.2, 2.2]]), about, cells=100)
     for well, count in enumerate(counts):
-        error = np.hypot(count.relative_error, 0.03)  # of the simulation's own step, and of the cells
+        error = np.hypot(count.visits**-0.5, 0.03)  # of the simulation's own step, and of the cells
         assert process.means[well] == pytest.approx(count.mean, rel=3 * error)
 
 
