@@ -327,7 +327,7 @@ class Projection:
         own, further = white.columns[:, :parameters], white.columns[:, parameters:]
         if not np.isfinite(own).all():
             raise NumericalFailure("the effect of a parameter on what is measured is beyond all numbers")
-        finite = np.isfinite(further).all(axis=0)
+        finite = (np.abs(further) < 1e150).all(axis=0)  # so that squares can be summed
         further = np.where(finite, further, 0.0)
         basis = orthonormal(own)
         left = white.innovations - basis @ (basis.T @ white.innovations)
