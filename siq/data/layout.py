@@ -315,9 +315,8 @@ def _time_column(
         # "T" is a temperature rather than a time, and an age that of what is measured.
         found = [place for place in found if parts[place].title != "T"]
         found = [place for place in found if not parts[place].is_age] or found
-        found = [
-            place for place in found if len(found) > 1 and _runs_evenly(_numbers(source, place))
-        ] or found
+    if len(found) > 1:
+        found = [place for place in found if _runs_evenly(_numbers(source, place))] or found
     if len(found) == 1:
         backwards = parts[found[0]].is_age
         remarks.append(Remark("data.time_column", {"column": parts[found[0]].title, "backwards": backwards}))

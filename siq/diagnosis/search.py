@@ -122,9 +122,9 @@ def _accepted(
         return None
     # By Schwarz's criterion with what is known beforehand: twice the logarithm of a weight is as good as χ².
     # Of fits that are equal but for rounding, what is in an equation leads.
-    cost = {id(each): each.delta_bic - 2 * np.log(each.candidate.weight) for each in significant}
-    leads = min(cost.values()) + ROUNDING * options.same
-    equal = [each for each in significant if cost[id(each)] <= leads]
+    costs = np.array([each.delta_bic - 2 * np.log(each.candidate.weight) for each in significant])
+    near = costs <= costs.min() + ROUNDING * options.same
+    equal = [each for each, leads in zip(significant, near, strict=True) if leads]
     best = max(equal, key=lambda each: (each.candidate.weight, bool(each.candidate.equations)))
     if best.fit.has_process_noise:
         # What is left is no noise, and white errors mean little: of equals, what all recordings ask for.

@@ -349,7 +349,7 @@ def substeps_needed(
     """Runge–Kutta steps in every interval, so that doubling them changes little.
 
     The tolerance is the root mean square change of the increments from states ``(n, d)`` that is allowed,
-    relative to the spread of the states. One that rests, as a hidden one does at first, is asked elsewhere.
+    relative to their spread. One that rests, as hidden ones do at first, is displaced by its size, or by 1.
     """
     spread = x.std(axis=0)
     aside = np.where(spread > 0, 0.0, np.where(x[0] != 0, np.abs(x[0]), 1.0))

@@ -86,4 +86,4 @@ def test_a_record_is_not_called_stationary_whose_drift_was_taken_off() -> None:
     for k in range(len(x) - 1):
         x[k + 1] = 0.8 * x[k] + 0.6 * generator.standard_normal()
     seen = Recordings.from_arrays(np.arange(1000.0), x + np.linspace(0, 5, 1000)[:, None], names=["x"])
-    assert "Less what was taken off: no slow drift" in inspect(without_background(seen)).text()
+    assert "Beyond what was taken off, no slow drift" in inspect(without_background(seen)).text()
