@@ -465,6 +465,35 @@ LATTICE_BY_CHANCE, LATTICE_TOLERANCE = 1e-6, 0.05  # of levels: to lie on a latt
 VALUES_SAMPLED = 2000  # looked at before all are
 
 
+AUTOCORRELATION_95 = 1.96  # standard deviations of an autocorrelation of white errors, which are 1/√n
+
+
+def correlation_time_of(
+    left: np.ndarray, recording: np.ndarray, *, outputs: int = 1, least: float = AUTOCORRELATION_95
+) -> float:
+    """Integral correlation time of all residuals in samples, at least 1.
+
+    Of n residuals, n over it count as independent. Autocorrelations are means over recordings and outputs.
+    The sum ends at the first below `least` standard deviations of those of white errors: by default one that
+    these would have by chance, so that noise does not lengthen it. The residuals have the outputs of a sample
+    one behind the other, and come with the recording of each; shape ``(n·m,)``.
+    """
+    series = left.reshape(-1, outputs)
+    owner = recording.reshape(-1, outputs)[:, 0]
+    power = float((series**2).mean())
+    total = 1.0
+    for lag in range(1, len(series) // 4):
+        same = owner[lag:] == owner[:-lag]
+        pairs = int(same.sum()) * outputs
+        if not pairs or power <= 0:
+            break
+        correlation = float((series[lag:] * series[:-lag])[same].sum()) / pairs / power
+        if correlation <= least / np.sqrt(pairs):
+            break
+        total += 2 * correlation
+    return total
+
+
 def resolution_step(values: np.ndarray) -> float | None:
     """The step of which all known values ``(n,)`` are multiples, up to an offset; None where there is none.
 

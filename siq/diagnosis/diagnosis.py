@@ -31,6 +31,7 @@ from siq.errors import InputError, NumericalFailure
 from siq.inference.budget import Budget
 from siq.inference.kalman_filter import MAX_SUBSTEPS
 from siq.inference.measurements import first_states, without_variation
+from siq.inference.recalibration import most_varying
 from siq.inference.trajectories import scored_rows
 from siq.remarks import Remark
 from siq.systems.cards import load_system
@@ -245,6 +246,25 @@ def _completed(model: Dynamics, x: np.ndarray, *, process: np.ndarray | None = N
     return without_variation(replace(model, domain=domain, diffusion=noise))
 
 
+def _judged(case: Comparison, budget: Budget) -> tuple[Investigation, HeldOutRuns, Statement]:
+    """What the recordings to learn from say, what those held out leave of it, and both in words."""
+    found = investigate(case, budget=budget)
+    shown = held_out_runs(found, case.kept)
+    named = found.verdict.names and not found.process_noise
+    # Tests of somebody else may be among the recordings held out, and decide nothing.
+    incomplete = found.remainder.doubtful or found.search.fit.has_process_noise
+    worse = shown.errors.change("without", "augmented") == "worse"
+    if named and not case.settings.tests and (worse or (incomplete and not shown.errors.takes_most)):
+        found = _withdrawn(found)
+        shown = held_out_runs(found, case.kept)
+    elif found.too_faint and _is_what_was_found(shown.described, found.search):
+        others = (one for one in found.remarks if one.code != "diagnosis.not_certain")
+        verdict, remarks = MismatchVerdict.MISSING_PHYSICS, (*others, Remark("diagnosis.same_formula"))
+        found = replace(found, verdict=verdict, models=(), too_faint=False, remarks=remarks)
+        shown = held_out_runs(found, case.kept)
+    return found, shown, statement_of(found, shown)
+
+
 def solve_case(
     case: Comparison,
     *,
@@ -270,21 +290,16 @@ def solve_case(
     allowed = case.settings.budget
     budget = Budget(work=allowed.evaluations, seconds=allowed.seconds, tell=tell, clock=clock)
     try:
-        found = investigate(case, budget=budget)
-        shown = held_out_runs(found, case.kept)
-        named = found.verdict.names and not found.process_noise
-        # Tests of somebody else may be among the recordings held out, and decide nothing.
-        incomplete = found.remainder.doubtful or found.search.fit.has_process_noise
-        worse = shown.errors.change("without", "augmented") == "worse"
-        if named and not case.settings.tests and (worse or (incomplete and not shown.errors.takes_most)):
-            found = _withdrawn(found)
-            shown = held_out_runs(found, case.kept)
-        elif found.too_faint and _is_what_was_found(shown.described, found.search):
-            others = (one for one in found.remarks if one.code != "diagnosis.not_certain")
-            verdict, remarks = MismatchVerdict.MISSING_PHYSICS, (*others, Remark("diagnosis.same_formula"))
-            found = replace(found, verdict=verdict, models=(), too_faint=False, remarks=remarks)
-            shown = held_out_runs(found, case.kept)
-        statement = statement_of(found, shown)
+        found, shown, statement = _judged(case, budget)
+        if statement.verdict.mismatch and not (statement.mechanisms or case.settings.varies):
+            # Recordings may differ in a parameter: in place of a function without a name, if that leaves
+            # nothing; elsewhere a name may come to light behind it.
+            described, fit = statement.verdict.names, found.search.recalibrated
+            name = most_varying(case.system, case.learn, fit, budget=budget, completely=described)
+            varied = case if name is None else case.with_variation((name,))
+            again = None if name is None else _judged(varied, budget)
+            if again is not None and (again[0].verdict.names or not again[0].verdict.mismatch):
+                case, (found, shown, statement) = varied, again
     except InputError:
         raise
     except NUMERICAL_ERRORS as error:

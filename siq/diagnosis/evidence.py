@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.stats
 
+from siq.data.correlation import correlation_time_of
 from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.errors import NumericalFailure
 from siq.inference.kalman_filter import Noise, Whitened, solve, whiten
@@ -30,7 +31,6 @@ from siq.numerics.randomness import positive
 from siq.remarks import Remark, sentence
 
 BLOCK_CORRELATION_TIMES = 4.0  # correlation times in a block
-AUTOCORRELATION_95 = 1.96  # standard deviations of an autocorrelation of white errors, which are 1/√n
 # Of the range of the coordinate, over which a smooth function without a name changes. What is smoother is a
 # constant, a straight line or a parabola, for which there are names.
 SMOOTH_LENGTHS = (0.125, 0.25)
@@ -118,42 +118,6 @@ def residuals(
     return white, change, white.innovations - white.columns @ change
 
 
-def _correlation_time(series: np.ndarray) -> float:
-    """Integral correlation time in samples: one and twice the autocorrelations up to the first negative."""
-    power = float(series @ series)
-    total = 1.0
-    for lag in range(1, len(series) // 4):
-        correlation = float(series[lag:] @ series[:-lag]) / power if power > 0 else 0.0
-        if correlation <= 0:
-            break
-        total += 2 * correlation
-    return total
-
-
-def correlation_time_of(left: np.ndarray, recording: np.ndarray, *, outputs: int) -> float:
-    """Integral correlation time of all residuals in samples, at least 1.
-
-    Of n residuals, n over it count as independent. Autocorrelations are means over recordings and outputs.
-    The sum ends at the first that white errors would have by chance, so that noise does not lengthen it. The
-    residuals have the outputs of a sample one behind the other, and come with the recording of each; shape
-    ``(n·m,)``.
-    """
-    series = left.reshape(-1, outputs)
-    owner = recording.reshape(-1, outputs)[:, 0]
-    power = float((series**2).mean())
-    total = 1.0
-    for lag in range(1, len(series) // 4):
-        same = owner[lag:] == owner[:-lag]
-        pairs = int(same.sum()) * outputs
-        if not pairs or power <= 0:
-            break
-        correlation = float((series[lag:] * series[:-lag])[same].sum()) / pairs / power
-        if correlation <= AUTOCORRELATION_95 / np.sqrt(pairs):
-            break
-        total += 2 * correlation
-    return total
-
-
 def _blocks_of(recording: np.ndarray, left: np.ndarray, *, least: int) -> np.ndarray:
     """The block of each residual, numbered from 0; recordings are cut into at least so many."""
     recordings = np.unique(recording)
@@ -161,10 +125,8 @@ def _blocks_of(recording: np.ndarray, left: np.ndarray, *, least: int) -> np.nda
     begun = 0
     for place in recordings:
         rows = np.flatnonzero(recording == place)
-        parts = max(
-            -(-least // len(recordings)),
-            int(len(rows) / (BLOCK_CORRELATION_TIMES * _correlation_time(left[rows]))),
-        )
+        lasting = correlation_time_of(left[rows], recording[rows], least=0.0)
+        parts = max(-(-least // len(recordings)), int(len(rows) / (BLOCK_CORRELATION_TIMES * lasting)))
         block[rows] = begun + (np.arange(len(rows)) * parts) // len(rows)
         begun += parts
     return block
@@ -221,7 +183,8 @@ def _correlated_probability(
     """
     white, _, left = residuals(fit, data)
     weights = np.bincount(white.recording)
-    times = [_correlation_time(left[white.recording == place]) for place in range(len(weights))]
+    each = [white.recording == place for place in range(len(weights))]
+    times = [correlation_time_of(left[rows], white.recording[rows], least=0.0) for rows in each]
     together = float(np.average(times, weights=weights))
     places = [each.frequencies or len(each.at) for each in candidate.searches]
     alone = float(scipy.stats.chi2.sf(max(gained, 0.0) / together, max(len(candidate.new), 1)))

@@ -30,13 +30,13 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
+from siq.data.correlation import correlation_time_of
 from siq.diagnosis.evidence import (
     NUMERICAL_ERRORS,
     OVERFLOWS,
     SMOOTH_LENGTHS,
     FittedCandidate,
     NotFitted,
-    correlation_time_of,
     orthonormal,
     sizes_of_effects,
     smooth_prior,
@@ -544,8 +544,8 @@ def _fitted_at(
             x = probe.states_along(each.fit, each.data, each.fit.x)
             model, rough = candidate.begun(each.fit.model, known), horizons[0].data.roughness
             fit = _fitted(model, each.data, each.fit, x, rough, budget=budget)
-            if not candidate.admits(fit):
-                raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
+            if not candidate.admits(fit, each.data):
+                raise NumericalFailure("its best parameters have a sign or a period that it cannot have")
             if candidate.generalises and candidate.idle(fit):
                 raise NumericalFailure("it is no more than the special case of it")
             found.append(Horizon.of(fit, each.data))

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from siq.data.correlation import correlation_time_of
 from siq.diagnosis.dictionary import Mechanism, Roles, roles_of, units_of
-from siq.diagnosis.evidence import NotFitted, correlation_time_of, residuals
+from siq.diagnosis.evidence import NotFitted, residuals
 from siq.diagnosis.forecasts import Horizon
 from siq.diagnosis.holdout import (
     HeldOutErrors,

@@ -68,9 +68,8 @@ def places_of(search: Shape, data: Measurements, model: Dynamics, x: np.ndarray)
     if search.samples:
         return factors * np.median(steps)
     if search.frequencies is not None:
-        longest = (data.t[data.first[1:] - 1] - data.t[data.first[:-1]]).max()
-        # From one period in the longest recording to four samples a period.
-        return np.linspace(2 * np.pi / longest, np.pi / (2 * np.median(steps)), search.frequencies)
+        # To four samples a period.
+        return np.linspace(_lowest_frequency(data), np.pi / (2 * np.median(steps)), search.frequencies)
     if search.recorded is not None:
         place = model.output_names.index(search.recorded)
         values = data.outputs[:, place]
@@ -89,6 +88,11 @@ def places_of(search: Shape, data: Measurements, model: Dynamics, x: np.ndarray)
         rate = float(np.sqrt(np.mean(rates**2)))
         return factors * (float(course.std()) / rate if rate > 0 else float(np.median(steps)))
     return _sized(search, factors, course)
+
+
+def _lowest_frequency(data: Measurements) -> float:
+    """Angular frequency of two periods in the longest recording; fewer do not show that it comes back."""
+    return float(4 * np.pi / (data.t[data.first[1:] - 1] - data.t[data.first[:-1]]).max())
 
 
 def _sized(search: Shape, factors: np.ndarray, course: np.ndarray) -> np.ndarray:
@@ -253,10 +257,15 @@ class MechanismCandidate:
             found += [(row, column, each) for column, each in enumerate(columns) if each != 0]
         return found
 
-    def admits(self, fit: Fit) -> bool:
-        """Whether parameters of a fit that may have one sign only have it, or are zero within errors."""
+    def admits(self, fit: Fit, data: Measurements) -> bool:
+        """Whether a fit has signs that its parameters may have, within errors, and periods that come back."""
         value_of, errors = {each.name: each.value for each in fit.model.parameters}, fit.error_of
-        return not any(value_of[name] < -2 * errors[name] for name in self.positive & errors.keys())
+        signs = (value_of[name] >= -2 * errors[name] for name in self.positive & errors.keys())
+        searched = zip(self.shapes, self.searches, strict=False)
+        periodic = [name for name, each in searched if each.frequencies is not None and name in errors]
+        return all(signs) and all(
+            abs(value_of[name]) + 2 * errors[name] >= _lowest_frequency(data) for name in periodic
+        )
 
     def idle(self, fit: Fit, of: Callable[[Iterable[bool]], bool] = any) -> bool:
         """Whether any amplitude of a fit, or all, is zero within errors: a special case of itself, then."""

@@ -22,10 +22,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.special
 
+from siq.data.correlation import correlation_time_of
 from siq.diagnosis.evidence import (
     NUMERICAL_ERRORS,
     averaged_evidence,
-    correlation_time_of,
     evidence_of_function,
     log_evidences,
     orthonormal,

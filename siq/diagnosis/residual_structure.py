@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.stats
 
+from siq.data.correlation import correlation_time_of
 from siq.diagnosis.dictionary import Roles, roles_of, unit_of, units_of
-from siq.diagnosis.evidence import correlation_time_of
 from siq.diagnosis.screening import Projection, Ranked, linearised_with, portions
 from siq.diagnosis.terms import Place, places_in
 from siq.errors import NumericalFailure

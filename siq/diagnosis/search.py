@@ -200,8 +200,8 @@ def _fit_most_promising(
             # With no effect it would be what it is compared with, but for forces that are not believed.
             if 2 * (current.log_likelihood - fit.log_likelihood) > least_to_believe(current.noise):
                 raise NumericalFailure("its fit leads away, to less than without it")
-            if not candidate.admits(fit):
-                raise NumericalFailure("its best parameters have a sign that the mechanism cannot have")
+            if not candidate.admits(fit, data):
+                raise NumericalFailure("its best parameters have a sign or a period that it cannot have")
             trial = FittedCandidate.of(fit, current, data, candidate, blocks=blocks)
         except BudgetSpent:
             failed.setdefault(candidate.label, NotFitted.of(candidate, BUDGET_SPENT))

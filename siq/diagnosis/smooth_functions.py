@@ -34,7 +34,8 @@ import scipy.stats
 import sympy
 from scipy.spatial.distance import cdist
 
-from siq.diagnosis.evidence import FittedCandidate, correlation_time_of, evidences_by_size
+from siq.data.correlation import correlation_time_of
+from siq.diagnosis.evidence import FittedCandidate, evidences_by_size
 from siq.diagnosis.mechanisms import CURVE, SURFACE, Kind, MechanismCandidate, along, fresh_names
 from siq.diagnosis.screening import PROBE_SUBSTEPS, at_noise_levels, linearised_with
 from siq.diagnosis.terms import Place

@@ -21,6 +21,7 @@ from siq.diagnosis.dictionary import Mechanism, dictionary_of
 from siq.errors import Fault, InputError
 from siq.inference.budget import DEFAULT_SECONDS, DEFAULT_WORK
 from siq.inference.measurements import Measurements, columns_of, measurements, with_variation
+from siq.inference.trajectories import PREFIX, SHORTEST_PREFIX
 from siq.numerics.files import read_document, validate
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
@@ -224,6 +225,12 @@ class Comparison:
     settings: MismatchStudy
     dictionary: tuple[Mechanism, ...]
 
+    def with_variation(self, names: tuple[str, ...]) -> Comparison:
+        """The same where parameters differ from recording to recording."""
+        system, learn, kept = with_variation(self.system, names, self.learn, self.kept)
+        settings = self.settings.model_copy(update={"varies": names})
+        return Comparison(system, learn, kept, settings, self.dictionary)
+
 
 def comparison_of(
     system: Dynamics,
@@ -267,10 +274,9 @@ def comparison_of(
         if len(learn.labels) < 2:
             fault = "there is one recording to learn from"
             raise InputError(file, "varies", fault, "give several, or leave it out")
-    if settings.varies:
-        system, learn, kept = with_variation(system, settings.varies, learn, kept)
     dictionary = dictionary_of(without=settings.without, further=settings.mechanisms, file=file)
-    return Comparison(system, learn, kept, settings, dictionary)
+    case = Comparison(system, learn, kept, settings, dictionary)
+    return case.with_variation(settings.varies) if settings.varies else case
 
 
 def _split(data: Measurements, study: MismatchStudy, *, file: str) -> tuple[Measurements, Measurements]:
@@ -282,10 +288,13 @@ def _split(data: Measurements, study: MismatchStudy, *, file: str) -> tuple[Meas
             raise InputError(file, "tests", fault, remedy)
     if isinstance(study.held_out, float):
         if count == 1:
+            # What is held out goes on from the samples before it, which tell its state and are not scored.
             rows = len(data.t)
-            at = min(max(round((1 - study.held_out) * rows), MIN_SAMPLES), rows - MIN_SAMPLES)
-            at = rows // 2 if at < MIN_SAMPLES else at
-            last = replace(data, first=np.array([0, rows - at]), t=data.t[at:], outputs=data.outputs[at:])
+            at = max(round((1 - study.held_out) * rows), min(SHORTEST_PREFIX, rows - 1))
+            begin = max(at - max(int(PREFIX / (1 - PREFIX) * (rows - at)), SHORTEST_PREFIX), 0)
+            last = replace(
+                data, first=np.array([0, rows - begin]), t=data.t[begin:], outputs=data.outputs[begin:]
+            )
             return data.until(np.array([at])), last
         # Spread over all of them, so that a drift of the experiment is in both parts.
         out = min(max(round(study.held_out * count), 1), count - 1)

@@ -18,8 +18,9 @@ import numpy as np
 import scipy.interpolate
 import sympy
 
+from siq.data.correlation import correlation_time_of
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
-from siq.diagnosis.evidence import correlation_time_of, evidence_of_function
+from siq.diagnosis.evidence import evidence_of_function
 from siq.diagnosis.mechanisms import FORMULA, MechanismCandidate, added, along, coordinates_of, fresh_names
 from siq.diagnosis.screening import (
     Entry,

@@ -351,7 +351,7 @@ def _with_memories(fit: Fit, models: Sequence[AugmentedModel], context: FitConte
             continue
         for part in _fitted_term(candidate, each.level, fit, context, begin=replace(fit, x=x)):
             LOGGER.info("%s: chi2 better by %.1f", candidate.label, part.delta_chi2)
-            if candidate.admits(part.fit):
+            if candidate.admits(part.fit, context.data):
                 found.append(AugmentedModel((part,), part.fit))
     return found
 
@@ -468,7 +468,7 @@ def fit_models_of_remainder(named: Search, whole: Search, context: FitContext) -
     allowed = [
         each
         for each in models
-        if np.isfinite(each.fit.log_likelihood) and all(name.admits(each.fit) for name in names)
+        if np.isfinite(each.fit.log_likelihood) and all(name.admits(each.fit, data) for name in names)
     ]
     return _likeliest(allowed, base, data)
 

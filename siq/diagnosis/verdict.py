@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import sympy
 
+from siq.data.correlation import correlation_time_of
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
 from siq.diagnosis.evidence import (
     BUDGET_SPENT,
     NUMERICAL_ERRORS,
     FittedCandidate,
-    correlation_time_of,
     log_evidences,
     residuals,
 )
@@ -100,8 +100,9 @@ def statement_of(investigation: Investigation, shown: HeldOutRuns) -> Statement:
         nearly = nearly and change == "better" and errors_seen.share_gained >= NEARLY_ALL
         if most and (nearly or (certain and change != "worse")):
             verdict, left = MismatchVerdict.MISSING_PHYSICS, rest.after
-    elif verdict is MismatchVerdict.PARAMETER_SHIFT:
+    elif verdict is MismatchVerdict.PARAMETER_SHIFT and not context.study.varies:
         # Other parameters have to mend it, by more than chance or down to the noise, or leave only noise.
+        # Where each recording has its own, their mean mends none that was held out.
         seen, change = not errors_seen.at_noise("before"), errors_seen.change("before", "recalibrated")
         to_noise = seen and change == "same" and errors_seen.at_noise("recalibrated")
         if shown.together and not to_noise:

@@ -21,6 +21,8 @@ such forces fade with the motion that excites them. The likelihood tells the two
 
 from __future__ import annotations
 
+import logging
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -31,14 +33,16 @@ import scipy.stats
 
 from siq.data.correlation import resolution_step
 from siq.errors import NumericalFailure
-from siq.inference.budget import COMPILATION, Budget, evaluation
+from siq.inference.budget import COMPILATION, Budget, BudgetSpent, evaluation
 from siq.inference.kalman_filter import Grid, Noise, profile_likelihood, whiten
 from siq.inference.maximum_likelihood import Fit, first_noise, fit_by_multiple_shooting
-from siq.inference.measurements import Measurements, first_states
+from siq.inference.measurements import Measurements, first_states, with_expectations, with_variation
 from siq.inference.trajectories import EDGE_SUBSTEPS, fit_trajectories, jumps_of, run, sharpened, spread_edges
 from siq.numerics.randomness import positive
 from siq.systems.dynamics import Dynamics
 
+LOGGER = logging.getLogger(__name__)
+FEWEST_VARYING = 5  # recordings, as clusters of errors need: the spread of fewer is hardly known
 DECADES = 14  # of strengths that are looked through, downwards from noise that would make all of the motion
 POINTS = 16  # of the average
 UNLIKELY = 8.0  # logarithm of a likelihood, relative to the largest, that adds nothing to an average
@@ -128,6 +132,28 @@ def _average(
     for weight, change, own in zip(weights, changes, covariances, strict=True):
         covariance += weight * (own + np.outer(change, change))
     return covariance, float(weights @ sizes)
+
+
+def most_varying(
+    model: Dynamics, data: Measurements, recalibrated: Fit, *, budget: Budget, completely: bool = False
+) -> str | None:
+    """The free parameter that tells most by differing from recording to recording, if one does.
+
+    It has to gain more than deviations that are not there do on average, and to make process noise needless
+    if it is to explain the recordings ``completely``. Of fewer than `FEWEST_VARYING` recordings no spread of
+    a parameter can be known.
+    """
+    most, found = float(len(data.labels)), None
+    names = [each.name for each in model.parameters if each.value and not each.fixed]
+    for name in names if most >= FEWEST_VARYING else ():
+        varied, own, _ = with_variation(model, (name,), data, data)
+        with suppress(ArithmeticError, ValueError, np.linalg.LinAlgError, BudgetSpent):
+            fit, _ = recalibrate(with_expectations(varied), own, budget=budget)
+            gain = 2 * (fit.log_likelihood - recalibrated.log_likelihood)
+            LOGGER.info("%s differs from recording to recording: chi2 better by %.1f", name, gain)
+            if gain > most and not (completely and fit.has_process_noise):
+                most, found = gain, name
+    return found
 
 
 def fit_with_process_noise_as_needed(

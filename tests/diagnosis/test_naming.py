@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from siq.data.correlation import correlation_time_of
 from siq.data.recordings import Recordings
 from siq.diagnosis import naming
-from siq.diagnosis.evidence import correlation_time_of
 from siq.diagnosis.holdout import errors_left_out, predicts_better
 from siq.diagnosis.mechanisms import MECHANISM
 from siq.diagnosis.naming import Investigation, _MissingEffect, _one_cause_or_two
