@@ -26,6 +26,7 @@ from siq.diagnosis.study import Comparison, MismatchVerdict, read_case
 from siq.diagnosis.unnamed_models import AugmentedModel
 from siq.errors import InputError, NumericalFailure
 from siq.inference.budget import Budget
+from siq.inference.trajectories import scored_rows
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics, Signals
 from tests.diagnosis.foreign_cases import falling_ball
@@ -215,6 +216,17 @@ def test_the_later_part_of_a_single_recording_is_not_called_independent(tmp_path
     diagnosis = solved(tmp_path, table[table["recording"] == "r3"], study={"held_out": 0.3})
     assert names(diagnosis) == ["cubic stiffness"]
     assert "no independent recording" in said(diagnosis)["remarks"][-1]
+
+
+@pytest.mark.parametrize(("rows", "learned"), [(120, 90), (14, 10), (8, 7)])
+def test_what_is_held_out_of_a_single_recording_goes_on_from_what_was_learned(
+    rows: int, learned: int, tmp_path: Path
+) -> None:
+    """Samples of the part that was learned tell its state, and none of those held out is lost for that."""
+    table = recordings_of(nothing, count=1).head(rows)
+    case = compared(tmp_path, table, study={"held_out": 0.25})
+    assert len(case.learn.t) == learned
+    np.testing.assert_array_equal(case.kept.t[scored_rows(case.kept)], table["t"].to_numpy()[learned:])
 
 
 @pytest.mark.parametrize("drag", [0.005, 0.5])

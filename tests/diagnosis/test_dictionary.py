@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -231,6 +233,20 @@ def test_the_time_of_a_course_is_that_in_which_it_changes() -> None:
     wave = np.stack([np.sin(2.0 * data.t), 2.0 * np.cos(2.0 * data.t)], axis=1)
     places = places_of(Shape(time_of="x", at=(1.0, 3.0)), data, model, wave)
     np.testing.assert_allclose(places, [0.5, 1.5], rtol=0.03)  # 1/ω, less what straight lines cut off
+
+
+def test_a_period_has_to_come_back_within_a_recording() -> None:
+    resident = next(each for each in RESIDENTS if each.name == "periodic forcing")
+    data, model = recorded(resident), HOMES[resident.home].model
+    longest = float(np.ptp(data.t[data.recording == 0]))
+    lowest = places_of(Shape(frequencies=90), data, model, np.zeros((len(data.t), model.dimension))).min()
+    assert lowest == pytest.approx(4 * np.pi / longest)
+    candidate = next(each for each in candidates(model) if each.name == resident.name)
+    (name,) = candidate.shapes
+    for frequency in (1.2 * lowest, 0.95 * lowest, 0.6 * lowest):
+        fitted = candidate.begun(model, {name: frequency})
+        fit: Any = SimpleNamespace(model=fitted, error_of={name: 0.03 * lowest})
+        assert candidate.admits(fit, data) == (frequency > 0.9 * lowest)
 
 
 # Each is found at home

@@ -16,8 +16,12 @@ import sympy
 import siq
 from siq.diagnosis import diagnosis as module
 from siq.diagnosis.diagnosis import tables_of, tables_of_failure
-from siq.diagnosis.study import comparison_of
+from siq.diagnosis.dictionary import standard_dictionary
+from siq.diagnosis.study import _measurements_of, comparison_of
 from siq.diagnosis.verdict import statement_of_failure
+from siq.inference.budget import Budget
+from siq.inference.measurements import with_expectations
+from siq.inference.recalibration import most_varying, recalibrate
 from siq.numerics.text import value_text
 from siq.report.diagnosis_page import diagnosis_html, diagnosis_text
 from siq.systems.dynamics import Dynamics, Parameter
@@ -159,3 +163,20 @@ def test_parameters_that_differ_from_recording_to_recording_are_no_missing_physi
     assert diagnosis.recalibrated.equations == GROWTH.equations
     assert diagnosis.recalibrated.values == pytest.approx([0.8], abs=0.05)
     assert "differs from recording to recording" in diagnosis.report()
+
+
+def test_a_parameter_that_differs_from_recording_to_recording_is_found() -> None:
+    t = np.arange(0, 4, 0.4)
+    table = pd.concat(
+        pd.DataFrame({"recording": f"r{k}", "t": t, "n": 0.2 * np.exp(rate * t)})
+        for k, rate in enumerate(np.linspace(0.5, 1.1, 7))
+    )
+    table["n"] += 0.01 * np.random.default_rng(4).normal(size=len(table))
+    without = {each.name for each in standard_dictionary()} - {"self-limitation", "constant bias"}
+    diagnosis = siq.diagnose(GROWTH, table, settings=siq.MismatchStudy(without=tuple(without)))
+    assert diagnosis.verdict == "parameter shift" and not diagnosis.mechanisms
+    assert "each with its own r" in diagnosis.statement.sentence
+    assert "diagnosis.varies" in [each.code for each in diagnosis.statement.remarks]
+    few = _measurements_of(table[table["recording"] < "r4"], GROWTH)
+    fit, _ = recalibrate(with_expectations(GROWTH), few, budget=Budget())
+    assert most_varying(GROWTH, few, fit, budget=Budget()) is None  # whose spread could not be known
