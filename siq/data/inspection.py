@@ -25,7 +25,7 @@ from siq.data.correlation import (
     resolution_step,
     rounding_error,
 )
-from siq.data.preparation import ANGLES, SINGLE_RECORDING, turns_back, unusual, without_faults
+from siq.data.preparation import ANGLES, turns_back, unusual, without_faults
 from siq.data.recordings import (
     LONGEST_STEP,
     SINGLE_RECORDING_REMEDY,
@@ -47,6 +47,10 @@ SENSOR_SHARE = 0.02  # of the variance of a step, shared by neighbours: identifi
 VALUES_SAMPLED = 2000  # looked at, for how many of them differ
 NEGLIGIBLE_ROUNDING = 1e-6  # of the range of a state
 COARSE_STEP = 0.5  # relaxation times: over a longer step most of what f does is forgotten
+SINGLE_RECORDING = (
+    "there is one recording, and it shows no process noise, from which the state returns, but at most that of"
+    " a sensor: a way that was gone once tells nothing of other stable states, nor of barriers"
+)
 
 
 class _Span(NamedTuple):

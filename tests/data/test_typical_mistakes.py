@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,6 +20,9 @@ from siq.data.recordings import Recordings, read_recordings, write_recordings
 from siq.errors import InputError
 from siq.systems.cards import check_name
 from siq.systems.formulas import CONSTANTS, FUNCTIONS
+from siq.workflow.pipeline import draw_run, identify_run, source_of
+from siq.workflow.study import PipelineSettings
+from siq.workflow.tables import Status
 
 
 def put(folder: Path, name: str, content: str | bytes) -> Path:
@@ -474,14 +478,17 @@ def test_a_motion_without_noise_is_not_taken_for_noise() -> None:
         assert all(floor.process == floor.sensor == 0 for floor in floors)
 
 
-def test_one_relaxation_is_refused_before_anything_runs_and_one_hopping_record_is_not(tmp_path: Path) -> None:
+def test_one_relaxation_has_a_page_without_f_and_one_hopping_record_is_cut(tmp_path: Path) -> None:
     t = np.arange(500) * 0.01
     text = csv(pd.DataFrame({"recording": "a", "t": t, "x": np.exp(-t)}))
     path = put(tmp_path, "settling.csv", text)
-    with pytest.raises(
-        InputError, match=r"there is one recording, and it shows no process noise.*many starting"
-    ):
-        read_pairs(path, states=None, units=None, pair_step=None)
+    settings = PipelineSettings()
+    drawn = draw_run(settings, source_of(path, settings), number=0).result
+    found = identify_run(settings, drawn, number=0)
+    assert found.result is None and found.outcome.status is Status.FAILED
+    assert re.search(
+        r"there is one recording, and it shows no process noise.*many starting", found.outcome.reason
+    )
     hopping = noisy(0.0, 0.1)
     write_recordings(tmp_path / "hopping.parquet", hopping)
     read, _ = read_pairs(tmp_path / "hopping.parquet", states=None, units=None, pair_step=None)
