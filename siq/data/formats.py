@@ -49,6 +49,12 @@ _DASHES = ("-", "--", "---")  # where nothing was measured
 _FORTRAN = re.compile(rb"(?<=\d)(\.\d*)[dD](?=[+-]\d\d)")  # 1.5D+03, and not the label 7d-01
 _NUMERIC = re.compile(f"{_NUMBER.pattern}|{_DECIMAL_COMMA.pattern}", re.IGNORECASE)
 _GROUPED = re.compile(r"[+-]?\d{1,3}((\.\d{3})+,\d+|(,\d{3})+\.\d+|,\d{3}(,\d{3})+)")
+_LABELS = re.compile(r"(?i)^(labels|columns|channels|fields|names)\s*:=?\s*")
+_RATE_UNIT = "[kM]?Hz|[mµμu]?s"
+SAMPLING = re.compile(  # such as "Sampling Rate (Hz):= 1000.00", or "dt = 20 ms"
+    r"(?i:(sampl\w*|frame|acquisition)[ _-]*(rate|freq\w*|interval|period)|fs|sfreq|dt)\b[ \[(]*"
+    rf"(?P<before>{_RATE_UNIT})?\b[^\w.]*(?P<number>(?=[\d.]*[1-9])\d+\.?\d*([eE]-?\d+)?)[^\w.]*(?P<after>{_RATE_UNIT})?\W*"
+)
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", "|": "vertical bars", " ": "spaces"}
 _COMMENTS = ("#", "%", "//")
 GZIP = b"\x1f\x8b"  # with which packed files begin
@@ -68,6 +74,7 @@ class ColumnFile:
     load: Callable[[Sequence[int]], list[Column]]  #: columns of positions in `headings`, of one length
     titles: tuple[str | None, ...] = ()  #: what people call each, where a file that we wrote keeps that
     remarks: tuple[Remark, ...] = ()  #: what was recognised or assumed
+    sampling: str = ""  #: the line above the table, if there is one, that says how often it was sampled
 
 
 def open_columns(path: str | Path | pd.DataFrame | xarray.Dataset) -> ColumnFile:
@@ -186,6 +193,9 @@ def _open_text(file: str) -> ColumnFile:
     comments += lines[:before]
     begin, lines = begin if not before else content.index(lines[before].encode(), begin), lines[before:]
     separator = separator or _separator(lines)
+    stated = [comment for comment in comments if SAMPLING.match(comment)]
+    comments = [_LABELS.sub("", comment) for comment in comments if comment not in stated]
+    sampling = stated[0] if len(stated) == 1 else ""
     headings, title = _split(lines[0], separator), lines[0].strip()
     unnamed = all(map(_NUMERIC.fullmatch, headings))
     # Tables put one below the other repeat their headings.
@@ -199,7 +209,7 @@ def _open_text(file: str) -> ColumnFile:
         # Of several comments the last one with a word for each column.
         split = (_split(comment, separator) for comment in reversed(comments))
         above = next((cells for cells in split if len(cells) == len(headings)), [])
-        if not above and len(headings) > 1 and len(rows) >= FEWEST_UNNAMED:
+        if not above and (len(headings) > 1 or sampling) and len(rows) >= FEWEST_UNNAMED:
             above = [f"column {number}" for number in range(1, len(headings) + 1)]
             remarks.append(Remark("data.no_headings", {}))
         if not above:
@@ -241,7 +251,7 @@ def _open_text(file: str) -> ColumnFile:
             cells = _read_cells(file, body, names, separator, decimal_mark, set())
         return [cells.column(str(position)) for position in positions]
 
-    return ColumnFile(tuple(headings), tuple(units), load, remarks=tuple(remarks))
+    return ColumnFile(tuple(headings), tuple(units), load, remarks=tuple(remarks), sampling=sampling)
 
 
 def _in_utf8(file: str, content: bytes) -> tuple[bytes, list[Remark]]:

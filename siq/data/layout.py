@@ -46,6 +46,8 @@ LABEL_NAMES = _words(
     " ringdown label particle particleid messung versuch aufnahme cell chunk molecule roi animal mouse"
     " subject patient replica realization realisation"
 )
+ERROR_NAMES = _words("std stdev stddev stderr sd sem uncertainty standarderror standarddeviation")
+ERROR_WORDS = ERROR_NAMES | _words("± err error errors sigma σ se unc")  # beside what is measured
 INDEX_NAMES = _words("index idx row rowid rownumber unnamed")
 TIME_UNITS = _words(
     "ns us µs μs ms s sec secs second seconds min minute minutes h hr hrs hour hours d day days week weeks"
@@ -62,8 +64,8 @@ _PREFIX = "(?:da|[YZEPTGMkhdcmuµμnpfazy])?"
 _PREFIXED = "mol|Ohm|ohm|rad|bar|cal|cd|Hz|Pa|Wb|lm|lx|sr|Da|eV|px|Ω|m|s|g|A|K|N|J|W|V|C|F|H|T|S|L|l|M|B"
 _ALONE = (
     r"counts?|cts|pixels?|px|adu|ADU|a\.?u\.?|arb\.? ?u(?:nits?)?\.?|n\.?u\.?|atm|Torr|mmHg|rpm|ppm|ppb|dB"
-    r"|deg|degrees?|radians?|°[CF]?|%|‰|permil|1|-|min|minutes?|hours?|hrs?|h|days?|d|weeks?|months?|years?|[kM]?yr|ka"
-    r"|sec(?:ond)?s?|[Vv]olts?|[Aa]mp(?:ere)?s?|meters?|metres?|k_?B ?T|kT|Å|u|LSB|lsb|bits?"
+    r"|deg|degrees?|radians?|°[CF]?|%|‰|per ?mil|1|-|min|minutes?|hours?|hrs?|h|days?|d|weeks?|months?|years?"
+    r"|[kM]?yr|ka|sec(?:ond)?s?|[Vv]olts?|[Aa]mp(?:ere)?s?|meters?|metres?|k_?B ?T|kT|Å|u|LSB|lsb|bits?"
 )
 _POWER = r"(?:(?:\^|\*\*)?\{?[-−+]?\d+(?:[./]\d+)?\}?|[⁺⁻]?[⁰¹²³⁴⁵⁶⁷⁸⁹]+)?"
 _FACTOR = rf"(?:(?:{_ALONE}|{_PREFIX}(?:{_PREFIXED})){_POWER})"
@@ -173,6 +175,15 @@ def _is_time(title: str) -> bool:
     return _plain(title) in TIME_NAMES | AGE_NAMES or title.casefold() in _UNITS_AS_TITLES
 
 
+def _is_error(title: str, titles: Sequence[str]) -> bool:
+    """Whether a column is the error of another one by its title: ``x_err``, ``2σ of x``, ``Uncertainty``."""
+    spaced = re.sub(r"(?<=[a-z\d])(?=[A-Z])|\b[123] ?(?=s|σ)|\b(of|mean)\b|[(\[].*", " ", title)
+    words = re.findall(r"±|[^\W_]+", spaced.replace("+/-", "±").casefold())
+    others = {_plain(other) for other in titles if other != title}
+    cuts = [{"".join(words[:cut]), "".join(words[cut:])} for cut in range(1, len(words))]
+    return "".join(words) in ERROR_NAMES or any(cut & ERROR_WORDS and cut & others for cut in cuts)
+
+
 def _plain(title: str) -> str:
     return re.sub(r"[\W_]+", "", title).casefold()
 
@@ -241,6 +252,10 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
         ]
         remarks += [Remark("data.second_time", {"column": source.headings[place]}) for place in others]
         states = [place for place in free if place not in (recording, *others)]
+        errors = [place for place in states if _is_error(plain[place], plain)]
+        if len(errors) < len(states):
+            states = [place for place in states if place not in errors]
+            remarks += [Remark("data.error_left_out", {"column": plain[place]}) for place in errors]
         names: list[str] = []
         for place in states:
             if not plain[place]:
@@ -285,6 +300,11 @@ def _runs_evenly(values: np.ndarray | None) -> bool:
     return bool(usual > 0 and (np.abs(steps - usual) > EVEN * usual).mean() <= EVEN)
 
 
+def may_be_clock(source: ColumnFile, place: int) -> bool:
+    """Whether a column may be the time by what is in it."""
+    return _runs_evenly(_numbers(source, place)) or _tells_time(source.headings[place], source, place)
+
+
 def _tells_time(title: str, source: ColumnFile, place: int) -> bool:
     """Whether cells are dates, or numbers that rise under a heading with a word of time: ``decimal_year``."""
     try:
@@ -324,7 +344,10 @@ def _time_column(
     if found:
         names = " and ".join(f"'{source.headings[place].strip()}'" for place in found)
         raise InputError(file, "", f"the columns {names} all look like the time", "call the right one 't'")
-    raise InputError(file, "", "the column 't' is missing", "add the time of every sample as a column 't'")
+    remedy = "add the time of every sample as a column 't'"
+    if source.sampling:
+        remedy = f"write the unit into the line '{source.sampling}', such as Sampling Rate (Hz), or {remedy}"
+    raise InputError(file, "", "the column 't' is missing", remedy)
 
 
 def _label_column(

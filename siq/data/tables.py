@@ -16,7 +16,7 @@ import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -24,8 +24,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from siq.data.correlation import FEWEST_VALUES, MIN_REPETITIONS
-from siq.data.formats import Column, ColumnFile, open_columns
-from siq.data.layout import layout_of, read_heading
+from siq.data.formats import SAMPLING, Column, ColumnFile, open_columns
+from siq.data.layout import layout_of, may_be_clock, read_heading
 from siq.data.recordings import LONGEST_STEP, TABLE, Recordings
 from siq.errors import InputError
 from siq.numerics.files import files_of
@@ -52,6 +52,7 @@ RESTART_SHARE = 0.1  # of the time that a recording took: where it starts over, 
 # as many.
 SHUFFLED_SHARE = 1 / 3
 DAY = 86_400.0  # seconds
+RECIPROCALS = {"Hz": "s", "kHz": "ms", "MHz": "us"}
 FEWEST_ON_A_LINE = 10  # steps: fewer may lie on one by themselves
 NOISY = 0.25  # share of the steps at which a column turns back, half of what white forces do
 
@@ -187,8 +188,23 @@ def _stacked(source: ColumnFile) -> ColumnFile:
 
 
 def _with_one_clock(source: ColumnFile) -> ColumnFile:
-    """Days that stand in one column and the times of day in another, as one column of both."""
+    """Days and times of day in two columns as one; or, where none tells the time, what a stated rate says."""
     called = [place for place, one in enumerate(source.headings) if read_heading(one).may_be_time]
+    stated, width = SAMPLING.fullmatch(source.sampling), len(source.headings)
+    unit = (stated["before"] or stated["after"]) if stated else None
+    if stated and unit and not called and not any(may_be_clock(source, place) for place in range(width)):
+        step = 1 / float(stated["number"]) if unit.endswith("Hz") else float(stated["number"])
+
+        def timed(positions: Sequence[int]) -> list[Column]:
+            columns = source.load([min(position, width - 1) for position in positions])
+            times = pa.array(step * np.arange(len(columns[0])))
+            return [times if at == width else one for at, one in zip(positions, columns, strict=True)]
+
+        remark = Remark("data.time_by_rate", {"line": source.sampling})
+        return replace(
+            source, headings=(*source.headings, f"t [{RECIPROCALS.get(unit, unit)}]"), load=timed,
+            units=(*source.units, None), remarks=(*source.remarks, remark),
+        )  # fmt: skip
     if len(called) != 2:
         return source
     texts = [one.to_pandas().astype(str).str.strip() for one in source.load(called)]
@@ -207,7 +223,7 @@ def _with_one_clock(source: ColumnFile) -> ColumnFile:
         ]
 
     fields = [each for each in ("headings", "units", "titles") if getattr(source, each)]
-    kept = {each: tuple(getattr(source, each)[place] for place in rest) for each in fields}
+    kept: dict[str, Any] = {each: tuple(getattr(source, each)[place] for place in rest) for each in fields}
     return replace(source, **kept, load=load)
 
 
