@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from pyarrow import csv as arrow_csv
 
 from siq.data.layout import is_unit, read_heading
 from siq.data.recordings import TABLE
@@ -45,7 +46,8 @@ SAMPLED_LINES = 200  # of a table, from which its separator and decimal mark are
 SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".xlsb", ".ods")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
-_DASHES = ("-", "--", "---")  # where nothing was measured
+_MISSING = tuple(arrow_csv.ConvertOptions().null_values)
+_DASHES = ("-", "--", "---")  # where nothing was measured; among labels, one as any other
 _FORTRAN = re.compile(rb"(?<=\d)(\.\d*)[dD](?=[+-]\d\d)")  # 1.5D+03, and not the label 7d-01
 _NUMERIC = re.compile(f"{_NUMBER.pattern}|{_DECIMAL_COMMA.pattern}", re.IGNORECASE)
 _GROUPED = re.compile(r"[+-]?\d{1,3}((\.\d{3})+,\d+|(,\d{3})+\.\d+|,\d{3}(,\d{3})+)")
@@ -248,8 +250,14 @@ def _open_text(file: str) -> ColumnFile:
         try:
             cells = _read_cells(file, body, names, separator, decimal_mark, numbers)
         except pa.ArrowInvalid:  # text among the numbers, or a line of another length: find out where
-            cells = _read_cells(file, body, names, separator, decimal_mark, set())
-        return [cells.column(str(position)) for position in positions]
+            numbers = set()
+            cells = _read_cells(file, body, names, separator, decimal_mark, numbers)
+        missing = [pa.array([*_MISSING, *(() if place in labels else _DASHES)]) for place in positions]
+        return [
+            column if str(place) in numbers else pc.if_else(pc.is_in(column, none), None, column)
+            for place, none in zip(positions, missing, strict=True)
+            for column in [cells.column(str(place))]
+        ]
 
     return ColumnFile(tuple(headings), tuple(units), load, remarks=tuple(remarks), sampling=sampling)
 
@@ -363,8 +371,6 @@ def _read_cells(
     file: str, body: bytes, names: list[str], separator: str, decimal_mark: str, numbers: set[str]
 ) -> pa.Table:
     """Read the columns named `numbers` (by position, as text) as numbers, all others as text."""
-    from pyarrow import csv as arrow_csv
-
     if not body.strip():
         return pa.table({name: pa.array([], pa.string()) for name in names})
     ragged: list[arrow_csv.InvalidRow] = []
@@ -379,8 +385,7 @@ def _read_cells(
     converting = arrow_csv.ConvertOptions(
         column_types={name: pa.float64() if name in numbers else pa.string() for name in names},
         decimal_point=decimal_mark,
-        null_values=[*arrow_csv.ConvertOptions().null_values, *_DASHES],
-        strings_can_be_null=True,
+        null_values=[*_MISSING, *_DASHES],
         quoted_strings_can_be_null=True,
     )
     if numbers:

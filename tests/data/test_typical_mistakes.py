@@ -498,6 +498,14 @@ def test_times_follow_from_a_stated_rate(tmp_path: Path, line: str, unit: str, s
     assert read_recordings(timed).time_unit == "h"  # a column of times is what counts
 
 
+def test_a_dash_is_a_label_among_labels_and_a_missing_value_elsewhere(tmp_path: Path) -> None:
+    rows = [f"{strand},{k},{k % 3},-" for strand in "+-" for k in range(9)]
+    read = read_recordings(put(tmp_path, "a.csv", "\n".join(["run,t,x,y", *rows])), columns=["x"])
+    assert read.labels == ("+", "-") and len(read.t) == 18
+    gap = put(tmp_path, "b.csv", "t,x\n" + "".join(f"{k},{'-' if k == 5 else k % 3}\n" for k in range(20)))
+    assert len(read_recordings(gap).t) == 19
+
+
 def test_an_error_of_a_column_is_no_state(tmp_path: Path) -> None:
     lines = [f"{k},{np.sin(k)},{0.1 + 0.01 * np.cos(3 * k)}" for k in range(40)]
     path = put(tmp_path, "stack.csv", "\n".join(["t,d18O (per mil),Standard error (per mil)", *lines]))
