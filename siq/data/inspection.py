@@ -26,11 +26,7 @@ from siq.data.correlation import (
     rounding_error,
 )
 from siq.data.preparation import ANGLES, turns_back, unusual, without_faults
-from siq.data.recordings import (
-    LONGEST_STEP,
-    SINGLE_RECORDING_REMEDY,
-    Recordings,
-)
+from siq.data.recordings import LONGEST_STEP, SINGLE_RECORDING_REMEDY, Recordings
 from siq.data.states import RecordStates, switching
 from siq.numerics.randomness import positive
 from siq.remarks import Remark, sentence
@@ -47,10 +43,6 @@ SENSOR_SHARE = 0.02  # of the variance of a step, shared by neighbours: identifi
 VALUES_SAMPLED = 2000  # looked at, for how many of them differ
 NEGLIGIBLE_ROUNDING = 1e-6  # of the range of a state
 COARSE_STEP = 0.5  # relaxation times: over a longer step most of what f does is forgotten
-SINGLE_RECORDING = (
-    "there is one recording, and it shows no process noise, from which the state returns, but at most that of"
-    " a sensor: a way that was gone once tells nothing of other stable states, nor of barriers"
-)
 
 
 class _Span(NamedTuple):
@@ -184,8 +176,7 @@ class Inspection:
         elif noises and turns_back(recordings):
             found = [Remark("data.turns_back")]
         elif noises and len(recordings.labels) == 1:
-            told = {"fault": SINGLE_RECORDING, "remedy": SINGLE_RECORDING_REMEDY}
-            found = [Remark("data.single_recording", told)]
+            found = [Remark("data.single_recording", {"remedy": SINGLE_RECORDING_REMEDY})]
         else:
             found = [Remark("data.no_noise") if noises else Remark("data.noise_unknown")]
         units = sorted({unit for unit in recordings.units if unit})

@@ -16,7 +16,7 @@ import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -190,41 +190,31 @@ def _stacked(source: ColumnFile) -> ColumnFile:
 def _with_one_clock(source: ColumnFile) -> ColumnFile:
     """Days and times of day in two columns as one; or, where none tells the time, what a stated rate says."""
     called = [place for place, one in enumerate(source.headings) if read_heading(one).may_be_time]
-    stated, width = SAMPLING.fullmatch(source.sampling), len(source.headings)
+    rest = [place for place in range(len(source.headings)) if place not in called]
+    stated, remarks = SAMPLING.fullmatch(source.sampling), source.remarks
     unit = (stated["before"] or stated["after"]) if stated else None
-    if stated and unit and not called and not any(may_be_clock(source, place) for place in range(width)):
-        step = 1 / float(stated["number"]) if unit.endswith("Hz") else float(stated["number"])
-
-        def timed(positions: Sequence[int]) -> list[Column]:
-            columns = source.load([min(position, width - 1) for position in positions])
-            times = pa.array(step * np.arange(len(columns[0])))
-            return [times if at == width else one for at, one in zip(positions, columns, strict=True)]
-
-        remark = Remark("data.time_by_rate", {"line": source.sampling})
-        return replace(
-            source, headings=(*source.headings, f"t [{RECIPROCALS.get(unit, unit)}]"), load=timed,
-            units=(*source.units, None), remarks=(*source.remarks, remark),
-        )  # fmt: skip
-    if len(called) != 2:
+    if stated and unit and not called and not any(may_be_clock(source, place) for place in rest):
+        step = 1 / float(stated["number"]) if unit in RECIPROCALS else float(stated["number"])
+        times, heading = step * np.arange(len(source.load([0])[0])), f"t [{RECIPROCALS.get(unit, unit)}]"
+        remarks = (*remarks, Remark("data.time_by_rate", {"line": source.sampling}))
+    elif len(called) == 2:
+        texts = [one.to_pandas().astype(str).str.strip() for one in source.load(called)]
+        alike = [tuple(text.str.fullmatch(one).all() for one in (_DAY_ALONE, _TIME_OF_DAY)) for text in texts]
+        if sorted(alike) != [(False, True), (True, False)]:
+            return source
+        day = int(alike[1][0])
+        times, heading = texts[day] + " " + texts[1 - day], source.headings[called[day]]
+    else:
         return source
-    texts = [one.to_pandas().astype(str).str.strip() for one in source.load(called)]
-    alike = [tuple(text.str.fullmatch(one).all() for one in (_DAY_ALONE, _TIME_OF_DAY)) for text in texts]
-    if sorted(alike) != [(False, True), (True, False)]:
-        return source
-    (day, of_day), joined = called, texts[0] + " " + texts[1]
-    if alike[1][0]:
-        (of_day, day), joined = called, texts[1] + " " + texts[0]
-    rest = [place for place in range(len(source.headings)) if place != of_day]
 
     def load(positions: Sequence[int]) -> list[Column]:
-        loaded = source.load([rest[position] for position in positions])
-        return [
-            pa.array(joined) if rest[at] == day else one for at, one in zip(positions, loaded, strict=True)
-        ]
+        loaded = iter(source.load([rest[position] for position in positions if position < len(rest)]))
+        return [pa.array(times) if position == len(rest) else next(loaded) for position in positions]
 
-    fields = [each for each in ("headings", "units", "titles") if getattr(source, each)]
-    kept: dict[str, Any] = {each: tuple(getattr(source, each)[place] for place in rest) for each in fields}
-    return replace(source, **kept, load=load)
+    return replace(
+        source, headings=(*(source.headings[place] for place in rest), heading), load=load, titles=(),
+        units=(*(source.units[place] for place in rest), None), remarks=remarks,
+    )  # fmt: skip
 
 
 def _past_midnight(times: pd.Series) -> pd.Series:
