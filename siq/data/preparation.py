@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from scipy import optimize, special
 
-from siq.data.correlation import markov_lag, noise_floors
+from siq.data.correlation import markov_lag, noise_floors, resolution_step
 from siq.data.recordings import (
     MOST_WIDE_STEPS,
     ROUNDED_TURN,
@@ -255,13 +255,10 @@ def without_faults(recordings: Recordings) -> Recordings:
     found = without(apart)
     for state in [place for place, floor in enumerate(noise_floors(found) or ()) if floor.process]:
         hum, period = _hum_of(found, found.values[:, state])
-        if hum.any():
+        amplitude = float(np.sqrt(2) * hum.std())
+        if amplitude > (resolution_step(found.values[:, state]) or 0.0):
             found.values[:, state] -= hum
-            told = {
-                "column": found.titles[state],
-                "period": period,
-                "amplitude": float(np.sqrt(2) * hum.std()),
-            }
+            told = {"column": found.titles[state], "period": period, "amplitude": amplitude}
             units = {"unit": found.units[state], "time_unit": found.time_unit}
             remarks.append(Remark("data.hum_taken_off", told | units))
     return replace(found, remarks=tuple(remarks)) if len(remarks) > len(recordings.remarks) else recordings

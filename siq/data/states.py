@@ -34,7 +34,7 @@ import numpy as np
 from pydantic_core import to_jsonable_python
 from scipy import ndimage, sparse, special
 
-from siq.data.correlation import markov_lag
+from siq.data.correlation import FEWEST_VALUES, markov_lag, resolution_step
 from siq.data.kinetics import (
     CONFIDENCE,
     FALSE_WELL,
@@ -200,6 +200,10 @@ def _valleys(
     every = -(-len(values) // MOST_POINTS)
     spectra: list[list[np.ndarray]] = [[] for _ in runs]
     for one, relaxation in zip(values.T, relaxations, strict=True):
+        # Levels of a digitiser are no peaks, which bins that are as narrow would make of them.
+        step = resolution_step(one) if len(np.unique(one)) >= FEWEST_VALUES else None
+        if step is not None and BINS * step > np.ptp(one):
+            one = one + step * (generator.random(len(one)) - 0.5)
         # As it is, and less a straight line in every stretch, the last of a run longer: slow hops need the
         # one, quick hops over a drift the other.
         levelled = one.copy()

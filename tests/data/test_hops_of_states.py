@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 from siq.data.kinetics import continued_visits
 from siq.data.preparation import in_stretches, without_background
 from siq.data.recordings import Recordings
-from siq.data.states import DwellCount, switching
+from siq.data.states import SIGNIFICANCE, DwellCount, switching
 from siq.data.stationarity import background_of, correlated_samples, relaxation_samples, runs_of, usual_step
 
 STEP, COUNT = 0.05, 20_000
@@ -141,3 +141,11 @@ def test_hops_are_no_slow_drift() -> None:
 def test_a_long_trace_is_cut_by_its_own_correlation_time() -> None:
     quick, hopping = in_stretches(recorded(one_state(0))), in_stretches(recorded(two_states(3, 0.25)))
     assert len(quick.labels) == 40 and 10 <= len(hopping.labels) < 20
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_levels_of_a_digitiser_are_no_states(seed: int) -> None:
+    white = np.random.default_rng(seed).standard_normal(5000)
+    x = np.round(2 * lfilter([0.87], [1, -0.5], white))
+    found = switching(Recordings.from_arrays(np.arange(5000.0), x[:, None], names=["x"]), rungs=False)
+    assert found is not None and found.probability > SIGNIFICANCE and len(found.levels) == 1
