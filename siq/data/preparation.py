@@ -231,6 +231,8 @@ def without_faults(recordings: Recordings) -> Recordings:
         begins = np.flatnonzero(np.r_[True, ~same | (moves != 0)])  # of stretches of one value
         lasts = np.diff(np.r_[begins, len(recordings.t)])
         steps = np.where(same, moves, 0.0)[begins[1:] - 1]
+        if not len(steps):  # it never changes
+            continue
         blocks = [np.abs(one) for one in np.array_split(steps, max(len(steps) // BLOCK, 1))]
         usual = np.repeat([np.median(one) for one in blocks], [len(one) for one in blocks])
         scale = np.maximum(usual, np.median(usual)) / special.ndtri(0.75)

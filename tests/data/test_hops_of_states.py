@@ -10,7 +10,14 @@ from siq.data.kinetics import continued_visits
 from siq.data.preparation import in_stretches, without_background
 from siq.data.recordings import Recordings
 from siq.data.states import SIGNIFICANCE, DwellCount, switching
-from siq.data.stationarity import background_of, correlated_samples, relaxation_samples, runs_of, usual_step
+from siq.data.stationarity import (
+    background_of,
+    correlated_samples,
+    even_stretches,
+    relaxation_samples,
+    runs_of,
+    usual_step,
+)
 
 STEP, COUNT = 0.05, 20_000
 TIME = STEP * np.arange(COUNT)
@@ -149,3 +156,12 @@ def test_levels_of_a_digitiser_are_no_states(seed: int) -> None:
     x = np.round(2 * lfilter([0.87], [1, -0.5], white))
     found = switching(Recordings.from_arrays(np.arange(5000.0), x[:, None], names=["x"]), rungs=False)
     assert found is not None and found.probability > SIGNIFICANCE and len(found.levels) == 1
+
+
+def test_steps_that_a_clock_rounded_are_even() -> None:
+    times = np.round(0.015625 * np.arange(2000), 3)  # 64 Hz, in milliseconds
+    whole = even_stretches(Recordings.from_arrays(times, np.zeros((2000, 1)), names=["x"]))
+    assert set(whole.number) == {0}
+    uneven = np.cumsum(np.random.default_rng(0).uniform(0.9, 1.1, 2000))
+    apart = even_stretches(Recordings.from_arrays(uneven, np.zeros((2000, 1)), names=["x"]))
+    assert len(set(apart.number)) > 100
