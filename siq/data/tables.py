@@ -423,6 +423,11 @@ def _seconds_of_clock(file: str, name: str, cells: Column) -> tuple[np.ndarray, 
         values = pd.to_datetime(cells.to_pandas())
     elif pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
         values = cells.to_pandas()
+    elif any(is_kind(kind) for is_kind in _NUMERIC) and (days := cells.to_pandas()).between(1e7, 1e8).all():
+        texts = days.astype(str).str.removesuffix(".0")  # all of them days, such as 19580329
+        values = pd.to_datetime(texts, format="%Y%m%d", errors="coerce")
+        if values.isna().any():
+            return None
     else:
         return None
     present = values.dropna()

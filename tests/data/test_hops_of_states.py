@@ -165,3 +165,11 @@ def test_steps_that_a_clock_rounded_are_even() -> None:
     uneven = np.cumsum(np.random.default_rng(0).uniform(0.9, 1.1, 2000))
     apart = even_stretches(Recordings.from_arrays(uneven, np.zeros((2000, 1)), names=["x"]))
     assert len(set(apart.number)) > 100
+
+
+def test_a_trend_that_is_no_hop_is_a_drift() -> None:
+    t, generator = np.arange(600) / 52, np.random.default_rng(0)
+    x = 60 * t / t[-1] + 3 * np.sin(2 * np.pi * t) + lfilter([0.3], [1, -0.9], generator.standard_normal(600))
+    found = switching(Recordings.from_arrays(t, x[:, None], names=["x"]), rungs=False)
+    assert found is not None and found.probability < SIGNIFICANCE  # no single state at rest
+    assert not found.supported and np.ptp(found.background) == pytest.approx(60, rel=0.1)

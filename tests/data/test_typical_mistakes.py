@@ -45,6 +45,10 @@ READ: dict[str, tuple[str, str | bytes, tuple[str, ...], list[list[float]], str]
         "a.txt", "# Sampling Rate (Hz):= 50.00\n# Labels:= EEG\n" + "3\n1\n" * 8,
         ("EEG",), [[3], [1]] * 8, "the line 'Sampling Rate (Hz):= 50.00'",
     ),
+    "days as numbers": (
+        "a.csv", "date,x\n19580329,3\n19580405,1\n19580412,2\n", ("x",), [[3], [1], [2]],
+        "days since the first, 1958-03-29",
+    ),
     "a line sep=;": ("a.csv", "sep=;\nt;x\n0;1,5\n1;2\n", ("x",), [[1.5], [2]], "semicolons"),
     "comments above": ("a.csv", "# a logger, 7\n" * 3000 + "t,x\n0,1\n1,2\n", ("x",), [[1], [2]], ""),
     "numpy.savetxt": ("a.txt", "# t x y\n0 1 3\n1 2 4\n", ("x", "y"), [[1, 3], [2, 4]], "spaces"),
