@@ -168,7 +168,7 @@ def test_steps_that_a_clock_rounded_are_even() -> None:
 
 
 def test_a_trend_that_is_no_hop_is_a_drift() -> None:
-    t, generator = np.arange(600) / 52, np.random.default_rng(0)
+    t, generator = 7 * np.arange(600) / 365.25, np.random.default_rng(0)
     x = 60 * t / t[-1] + 3 * np.sin(2 * np.pi * t) + lfilter([0.3], [1, -0.9], generator.standard_normal(600))
     found = switching(Recordings.from_arrays(t, x[:, None], names=["x"]), rungs=False)
     assert found is not None and found.probability < SIGNIFICANCE  # no single state at rest
