@@ -14,11 +14,13 @@ import keyword
 import re
 import unicodedata
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+import yaml
 
 from siq.data.correlation import MIN_REPETITIONS
 from siq.errors import InputError, suggestion
@@ -35,23 +37,10 @@ def _words(text: str) -> frozenset[str]:
 RESERVED = _words("sin cos tan exp log sqrt tanh atan Abs sign Max Min pi recording t delay")
 """What no state may be called, since formulas have another meaning for it (`siq.systems.cards`)."""
 
-TIME_NAMES = _words(
-    "t time times zeit temps tiempo tempo timestamp timestamps datetime date elapsed elapsedtime clock"
-    " clocktime uhrzeit datum seconds xvalue xaxis"
-)
-AGE_NAMES = _words("age ages alter")
-LABEL_NAMES = _words(
-    "recording recordings record run runs trial trials id rec experiment measurement series trajectory traj"
-    " track trackid runid recordingid trialid recid trajectoryid replicate repetition rep file filename sweep"
-    " ringdown label particle particleid messung versuch aufnahme cell chunk molecule roi animal mouse"
-    " subject patient replica realization realisation"
-)
-ERROR_NAMES = _words("std stdev stddev stderr sd sem uncertainty standarderror standarddeviation")
-ERROR_WORDS = ERROR_NAMES | _words("± err error errors sigma σ se unc")  # beside what is measured
-INDEX_NAMES = _words("index idx row rowid rownumber unnamed")
-TIME_UNITS = _words(
-    "ns us µs μs ms s sec secs second seconds min minute minutes h hr hrs hour hours d day days week weeks"
-    " month months yr year years ka kyr myr"
+_CALLED = yaml.safe_load(Path(__file__).with_name("headings.yaml").read_text(encoding="utf-8"))
+TIME_NAMES, AGE_NAMES, LABEL_NAMES, INDEX_NAMES, TIME_UNITS, ERROR_NAMES, ERROR_WORDS = (
+    _words(_CALLED[each])
+    for each in ("time", "age", "label", "index", "units_of_time", "error", "error_beside")
 )
 
 _UNITS_AS_TITLES = TIME_UNITS - _words(
@@ -181,7 +170,9 @@ def _is_error(title: str, titles: Sequence[str]) -> bool:
     words = re.findall(r"±|[^\W_]+", spaced.replace("+/-", "±").casefold())
     others = {_plain(other) for other in titles if other != title}
     cuts = [{"".join(words[:cut]), "".join(words[cut:])} for cut in range(1, len(words))]
-    return "".join(words) in ERROR_NAMES or any(cut & ERROR_WORDS and cut & others for cut in cuts)
+    return "".join(words) in ERROR_NAMES or any(
+        cut & (ERROR_NAMES | ERROR_WORDS) and cut & others for cut in cuts
+    )
 
 
 def _plain(title: str) -> str:
