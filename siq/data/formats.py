@@ -30,7 +30,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from pyarrow import csv as arrow_csv
 
-from siq.data.layout import is_unit, read_heading
+from siq.data.layout import SAMPLING, is_unit, read_heading
 from siq.data.recordings import TABLE
 from siq.errors import InputError
 from siq.remarks import Remark
@@ -52,11 +52,6 @@ _FORTRAN = re.compile(rb"(?<=\d)(\.\d*)[dD](?=[+-]\d\d)")  # 1.5D+03, and not th
 _NUMERIC = re.compile(f"{_NUMBER.pattern}|{_DECIMAL_COMMA.pattern}", re.IGNORECASE)
 _GROUPED = re.compile(r"[+-]?\d{1,3}((\.\d{3})+,\d+|(,\d{3})+\.\d+|,\d{3}(,\d{3})+)")
 _LABELS = re.compile(r"(?i)^(labels|columns|channels|fields|names)\s*:=?\s*")
-_RATE_UNIT = "[kM]?Hz|[mµμu]?s"
-SAMPLING = re.compile(  # such as "Sampling Rate (Hz):= 1000.00", or "dt = 20 ms"
-    r"(?i:(sampl\w*|frame|acquisition)[ _-]*(rate|freq\w*|interval|period)|fs|sfreq|dt)\b[ \[(]*"
-    rf"(?P<before>{_RATE_UNIT})?\b[^\w.]*(?P<number>(?=[\d.]*[1-9])\d+\.?\d*([eE]-?\d+)?)[^\w.]*(?P<after>{_RATE_UNIT})?\W*"
-)
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", "|": "vertical bars", " ": "spaces"}
 _COMMENTS = ("#", "%", "//")
 GZIP = b"\x1f\x8b"  # with which packed files begin

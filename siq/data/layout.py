@@ -14,6 +14,7 @@ import keyword
 import re
 import unicodedata
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -27,7 +28,7 @@ from siq.errors import InputError, suggestion
 from siq.remarks import Remark
 
 if TYPE_CHECKING:
-    from siq.data.formats import ColumnFile
+    from siq.data.formats import Column, ColumnFile
 
 
 def _words(text: str) -> frozenset[str]:
@@ -42,6 +43,7 @@ TIME_NAMES, AGE_NAMES, LABEL_NAMES, INDEX_NAMES, TIME_UNITS, ERROR_NAMES, ERROR_
     _words(_CALLED[each])
     for each in ("time", "age", "label", "index", "units_of_time", "error", "error_beside")
 )
+ERROR_WORDS |= ERROR_NAMES
 
 _UNITS_AS_TITLES = TIME_UNITS - _words(
     "ns us µs μs ms s min h hr d yr ka"
@@ -59,7 +61,12 @@ _ALONE = (
 _POWER = r"(?:(?:\^|\*\*)?\{?[-−+]?\d+(?:[./]\d+)?\}?|[⁺⁻]?[⁰¹²³⁴⁵⁶⁷⁸⁹]+)?"
 _FACTOR = rf"(?:(?:{_ALONE}|{_PREFIX}(?:{_PREFIXED})){_POWER})"
 _UNIT = re.compile(rf"\(?{_FACTOR}(?:\s*(?:[·*⋅×/]|\s)\s*\(?{_FACTOR}\)?)*\)?")
-
+_RATE_UNIT = "[kM]?Hz|[mµμu]?s"
+SAMPLING = re.compile(  # such as "Sampling Rate (Hz):= 1000.00", or "dt = 20 ms"
+    r"(?i:(sampl\w*|frame|acquisition)[ _-]*(rate|freq\w*|interval|period)|fs|sfreq|dt)\b[ \[(]*"
+    rf"(?P<before>{_RATE_UNIT})?\b[^\w.]*(?P<number>(?=[\d.]*[1-9])\d+\.?\d*([eE]-?\d+)?)[^\w.]*(?P<after>{_RATE_UNIT})?\W*"
+)
+_RECIPROCALS = {"Hz": "s", "kHz": "ms", "MHz": "us"}
 
 _TIME_ARGUMENT = re.compile(r"\s*\(\s*t\s*\)$")  # x(t) is x
 _BEFORE_PRESENT = re.compile(
@@ -182,6 +189,7 @@ def _plain(title: str) -> str:
 class _Layout(NamedTuple):
     """The columns of a table by what they mean, as positions."""
 
+    source: ColumnFile  # which they are positions in
     recording: int | None  # None where all rows are one recording
     time: int
     backwards: bool  # an age, which falls as time goes on
@@ -204,6 +212,7 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
     """
     if columns is not None and (len(set(columns)) < len(columns) or {"recording", "t"} & set(columns)):
         raise ValueError(f"the columns {list(columns)} are not distinct measured columns")
+    source = _with_stated_times(source)
     parts = [read_heading(heading) for heading in source.headings]
     plain = [part.title for part in parts]
     titles = [title or name for title, name in zip(source.titles or (None,) * len(parts), plain, strict=True)]
@@ -268,7 +277,7 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
     units = tuple({"name": part.unit, "metadata": unit} for part, unit in pairs)
     shown = tuple(titles[place] for place in states)
     return _Layout(
-        recording, time, parts[time].is_age, tuple(states), tuple(names), shown, units, tuple(remarks)
+        source, recording, time, parts[time].is_age, tuple(states), tuple(names), shown, units, tuple(remarks)
     )
 
 
@@ -291,9 +300,29 @@ def _runs_evenly(values: np.ndarray | None) -> bool:
     return bool(usual > 0 and (np.abs(steps - usual) > EVEN * usual).mean() <= EVEN)
 
 
-def may_be_clock(source: ColumnFile, place: int) -> bool:
-    """Whether a column may be the time by what is in it."""
-    return _runs_evenly(_numbers(source, place)) or _tells_time(source.headings[place], source, place)
+def _with_stated_times(source: ColumnFile) -> ColumnFile:
+    """A table of which no column tells the time, with the times that a stated rate or interval gives."""
+    stated, places = SAMPLING.fullmatch(source.sampling), range(len(source.headings))
+    unit = (stated["before"] or stated["after"]) if stated else None
+    named = any(read_heading(one).may_be_time for one in source.headings)
+    if stated is None or unit is None or named:
+        return source
+    if any(
+        _runs_evenly(_numbers(source, at)) or _tells_time(source.headings[at], source, at) for at in places
+    ):
+        return source
+    step = 1 / float(stated["number"]) if unit in _RECIPROCALS else float(stated["number"])
+    times = pa.array(step * np.arange(len(source.load([0])[0])))
+
+    def load(positions: Sequence[int]) -> list[Column]:
+        loaded = iter(source.load([each for each in positions if each < len(places)]))
+        return [times if each == len(places) else next(loaded) for each in positions]
+
+    return replace(
+        source, headings=(*source.headings, f"t [{_RECIPROCALS.get(unit, unit)}]"), load=load,
+        units=(*source.units, None),
+        remarks=(*source.remarks, Remark("data.time_by_rate", {"line": source.sampling})),
+    )  # fmt: skip
 
 
 def _tells_time(title: str, source: ColumnFile, place: int) -> bool:

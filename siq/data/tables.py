@@ -24,8 +24,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from siq.data.correlation import FEWEST_VALUES, MIN_REPETITIONS
-from siq.data.formats import SAMPLING, Column, ColumnFile, open_columns
-from siq.data.layout import layout_of, may_be_clock, read_heading
+from siq.data.formats import Column, ColumnFile, open_columns
+from siq.data.layout import layout_of, read_heading
 from siq.data.recordings import LONGEST_STEP, TABLE, Recordings
 from siq.errors import InputError
 from siq.numerics.files import files_of
@@ -52,7 +52,6 @@ RESTART_SHARE = 0.1  # of the time that a recording took: where it starts over, 
 # as many.
 SHUFFLED_SHARE = 1 / 3
 DAY = 86_400.0  # seconds
-RECIPROCALS = {"Hz": "s", "kHz": "ms", "MHz": "us"}
 FEWEST_ON_A_LINE = 10  # steps: fewer may lie on one by themselves
 NOISY = 0.25  # share of the steps at which a column turns back, half of what white forces do
 
@@ -97,6 +96,7 @@ def _checked(
         source = _stacked(source)
     source = _with_one_clock(source)
     layout = layout_of(file, source, columns)
+    source = layout.source
     used = [layout.time, *layout.states]
     cells = source.load([*([] if layout.recording is None else [layout.recording]), *used])
     labels = cells.pop(0) if layout.recording is not None else None
@@ -188,33 +188,24 @@ def _stacked(source: ColumnFile) -> ColumnFile:
 
 
 def _with_one_clock(source: ColumnFile) -> ColumnFile:
-    """Days and times of day in two columns as one; or, where none tells the time, what a stated rate says."""
+    """Days that stand in one column and the times of day in another, as one column of both."""
     called = [place for place, one in enumerate(source.headings) if read_heading(one).may_be_time]
-    rest = [place for place in range(len(source.headings)) if place not in called]
-    stated, remarks = SAMPLING.fullmatch(source.sampling), source.remarks
-    unit = (stated["before"] or stated["after"]) if stated else None
-    if stated and unit and not called and not any(may_be_clock(source, place) for place in rest):
-        step = 1 / float(stated["number"]) if unit in RECIPROCALS else float(stated["number"])
-        times, heading = step * np.arange(len(source.load([0])[0])), f"t [{RECIPROCALS.get(unit, unit)}]"
-        remarks = (*remarks, Remark("data.time_by_rate", {"line": source.sampling}))
-    elif len(called) == 2:
-        texts = [one.to_pandas().astype(str).str.strip() for one in source.load(called)]
-        alike = [tuple(text.str.fullmatch(one).all() for one in (_DAY_ALONE, _TIME_OF_DAY)) for text in texts]
-        if sorted(alike) != [(False, True), (True, False)]:
-            return source
-        day = int(alike[1][0])
-        times, heading = texts[day] + " " + texts[1 - day], source.headings[called[day]]
-    else:
+    if len(called) != 2:
         return source
+    texts = [one.to_pandas().astype(str).str.strip() for one in source.load(called)]
+    alike = [tuple(text.str.fullmatch(one).all() for one in (_DAY_ALONE, _TIME_OF_DAY)) for text in texts]
+    if sorted(alike) != [(False, True), (True, False)]:
+        return source
+    day, rest = int(alike[1][0]), [place for place in range(len(source.headings)) if place not in called]
 
     def load(positions: Sequence[int]) -> list[Column]:
         loaded = iter(source.load([rest[position] for position in positions if position < len(rest)]))
-        return [pa.array(times) if position == len(rest) else next(loaded) for position in positions]
+        both = pa.array(texts[day] + " " + texts[1 - day])
+        return [both if position == len(rest) else next(loaded) for position in positions]
 
-    return replace(
-        source, headings=(*(source.headings[place] for place in rest), heading), load=load, titles=(),
-        units=(*(source.units[place] for place in rest), None), remarks=remarks,
-    )  # fmt: skip
+    headings = (*(source.headings[place] for place in rest), source.headings[called[day]])
+    units = (*(source.units[place] for place in rest), None)
+    return replace(source, headings=headings, units=units, titles=(), load=load)
 
 
 def _past_midnight(times: pd.Series) -> pd.Series:
