@@ -113,7 +113,7 @@ def test_docstrings_and_templates_name_what_there_is() -> None:
             if names and (path / f"{names[0]}.py").is_file():
                 source = path / f"{names.pop(0)}.py"
             else:
-                source = path / "__init__.py"
+                source = next(path.glob("__init__.pyi"), path / "__init__.py")
             if names and not re.search(rf"\b{names[0]}\b", source.read_text(encoding="utf-8")):
                 lost.append(f"{file.relative_to(ROOT)}: {name}")
     assert not lost

@@ -142,7 +142,6 @@ class CheckedStudy:
             states=space.names,
             units=space.units,
             pair_step=recordings.pair_step,
-            hidden_velocities=self.study.identification.hidden_velocities,
         )
         for name in found.names:
             try:

@@ -28,8 +28,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from pyarrow import csv as arrow_csv
 
-from siq.data.layout import is_unit, read_heading
+from siq.data.layout import SAMPLING, is_unit, read_heading
 from siq.data.recordings import TABLE
 from siq.errors import InputError
 from siq.remarks import Remark
@@ -45,10 +46,12 @@ SAMPLED_LINES = 200  # of a table, from which its separator and decimal mark are
 SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".xlsb", ".ods")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
-_DASHES = ("-", "--", "---")  # where nothing was measured
+_MISSING = tuple(arrow_csv.ConvertOptions().null_values)
+_DASHES = ("-", "--", "---")  # where nothing was measured; among labels, one as any other
 _FORTRAN = re.compile(rb"(?<=\d)(\.\d*)[dD](?=[+-]\d\d)")  # 1.5D+03, and not the label 7d-01
 _NUMERIC = re.compile(f"{_NUMBER.pattern}|{_DECIMAL_COMMA.pattern}", re.IGNORECASE)
 _GROUPED = re.compile(r"[+-]?\d{1,3}((\.\d{3})+,\d+|(,\d{3})+\.\d+|,\d{3}(,\d{3})+)")
+_LABELS = re.compile(r"(?i)^(labels|columns|channels|fields|names)\s*:=?\s*")
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", "|": "vertical bars", " ": "spaces"}
 _COMMENTS = ("#", "%", "//")
 GZIP = b"\x1f\x8b"  # with which packed files begin
@@ -68,6 +71,7 @@ class ColumnFile:
     load: Callable[[Sequence[int]], list[Column]]  #: columns of positions in `headings`, of one length
     titles: tuple[str | None, ...] = ()  #: what people call each, where a file that we wrote keeps that
     remarks: tuple[Remark, ...] = ()  #: what was recognised or assumed
+    sampling: str = ""  #: the line above the table, if there is one, that says how often it was sampled
 
 
 def open_columns(path: str | Path | pd.DataFrame | xarray.Dataset) -> ColumnFile:
@@ -186,6 +190,9 @@ def _open_text(file: str) -> ColumnFile:
     comments += lines[:before]
     begin, lines = begin if not before else content.index(lines[before].encode(), begin), lines[before:]
     separator = separator or _separator(lines)
+    stated = [comment for comment in comments if SAMPLING.match(comment)]
+    comments = [_LABELS.sub("", comment) for comment in comments if comment not in stated]
+    sampling = stated[0] if len(stated) == 1 else ""
     headings, title = _split(lines[0], separator), lines[0].strip()
     unnamed = all(map(_NUMERIC.fullmatch, headings))
     # Tables put one below the other repeat their headings.
@@ -199,7 +206,7 @@ def _open_text(file: str) -> ColumnFile:
         # Of several comments the last one with a word for each column.
         split = (_split(comment, separator) for comment in reversed(comments))
         above = next((cells for cells in split if len(cells) == len(headings)), [])
-        if not above and len(headings) > 1 and len(rows) >= FEWEST_UNNAMED:
+        if not above and (len(headings) > 1 or sampling) and len(rows) >= FEWEST_UNNAMED:
             above = [f"column {number}" for number in range(1, len(headings) + 1)]
             remarks.append(Remark("data.no_headings", {}))
         if not above:
@@ -238,10 +245,16 @@ def _open_text(file: str) -> ColumnFile:
         try:
             cells = _read_cells(file, body, names, separator, decimal_mark, numbers)
         except pa.ArrowInvalid:  # text among the numbers, or a line of another length: find out where
-            cells = _read_cells(file, body, names, separator, decimal_mark, set())
-        return [cells.column(str(position)) for position in positions]
+            numbers = set()
+            cells = _read_cells(file, body, names, separator, decimal_mark, numbers)
+        missing = [pa.array([*_MISSING, *(() if place in labels else _DASHES)]) for place in positions]
+        return [
+            column if str(place) in numbers else pc.if_else(pc.is_in(column, none), None, column)
+            for place, none in zip(positions, missing, strict=True)
+            for column in [cells.column(str(place))]
+        ]
 
-    return ColumnFile(tuple(headings), tuple(units), load, remarks=tuple(remarks))
+    return ColumnFile(tuple(headings), tuple(units), load, remarks=tuple(remarks), sampling=sampling)
 
 
 def _in_utf8(file: str, content: bytes) -> tuple[bytes, list[Remark]]:
@@ -353,8 +366,6 @@ def _read_cells(
     file: str, body: bytes, names: list[str], separator: str, decimal_mark: str, numbers: set[str]
 ) -> pa.Table:
     """Read the columns named `numbers` (by position, as text) as numbers, all others as text."""
-    from pyarrow import csv as arrow_csv
-
     if not body.strip():
         return pa.table({name: pa.array([], pa.string()) for name in names})
     ragged: list[arrow_csv.InvalidRow] = []
@@ -369,8 +380,7 @@ def _read_cells(
     converting = arrow_csv.ConvertOptions(
         column_types={name: pa.float64() if name in numbers else pa.string() for name in names},
         decimal_point=decimal_mark,
-        null_values=[*arrow_csv.ConvertOptions().null_values, *_DASHES],
-        strings_can_be_null=True,
+        null_values=[*_MISSING, *_DASHES],
         quoted_strings_can_be_null=True,
     )
     if numbers:

@@ -25,12 +25,8 @@ from siq.data.correlation import (
     resolution_step,
     rounding_error,
 )
-from siq.data.preparation import ANGLES, SINGLE_RECORDING, turns_back, unusual, without_faults
-from siq.data.recordings import (
-    LONGEST_STEP,
-    SINGLE_RECORDING_REMEDY,
-    Recordings,
-)
+from siq.data.preparation import ANGLES, turns_back, unusual, without_faults
+from siq.data.recordings import LONGEST_STEP, SINGLE_RECORDING_REMEDY, Recordings
 from siq.data.states import RecordStates, switching
 from siq.numerics.randomness import positive
 from siq.remarks import Remark, sentence
@@ -180,8 +176,7 @@ class Inspection:
         elif noises and turns_back(recordings):
             found = [Remark("data.turns_back")]
         elif noises and len(recordings.labels) == 1:
-            told = {"fault": SINGLE_RECORDING, "remedy": SINGLE_RECORDING_REMEDY}
-            found = [Remark("data.single_recording", told)]
+            found = [Remark("data.single_recording", {"remedy": SINGLE_RECORDING_REMEDY})]
         else:
             found = [Remark("data.no_noise") if noises else Remark("data.noise_unknown")]
         units = sorted({unit for unit in recordings.units if unit})

@@ -14,18 +14,21 @@ import keyword
 import re
 import unicodedata
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+import yaml
 
 from siq.data.correlation import MIN_REPETITIONS
 from siq.errors import InputError, suggestion
 from siq.remarks import Remark
 
 if TYPE_CHECKING:
-    from siq.data.formats import ColumnFile
+    from siq.data.formats import Column, ColumnFile
 
 
 def _words(text: str) -> frozenset[str]:
@@ -35,22 +38,12 @@ def _words(text: str) -> frozenset[str]:
 RESERVED = _words("sin cos tan exp log sqrt tanh atan Abs sign Max Min pi recording t delay")
 """What no state may be called, since formulas have another meaning for it (`siq.systems.cards`)."""
 
-TIME_NAMES = _words(
-    "t time times zeit temps tiempo tempo timestamp timestamps datetime date elapsed elapsedtime clock"
-    " clocktime uhrzeit datum seconds xvalue xaxis"
+_CALLED = yaml.safe_load(Path(__file__).with_name("headings.yaml").read_text(encoding="utf-8"))
+TIME_NAMES, AGE_NAMES, LABEL_NAMES, INDEX_NAMES, TIME_UNITS, ERROR_NAMES, ERROR_WORDS = (
+    _words(_CALLED[each])
+    for each in ("time", "age", "label", "index", "units_of_time", "error", "error_beside")
 )
-AGE_NAMES = _words("age ages alter")
-LABEL_NAMES = _words(
-    "recording recordings record run runs trial trials id rec experiment measurement series trajectory traj"
-    " track trackid runid recordingid trialid recid trajectoryid replicate repetition rep file filename sweep"
-    " ringdown label particle particleid messung versuch aufnahme cell chunk molecule roi animal mouse"
-    " subject patient replica realization realisation"
-)
-INDEX_NAMES = _words("index idx row rowid rownumber unnamed")
-TIME_UNITS = _words(
-    "ns us µs μs ms s sec secs second seconds min minute minutes h hr hrs hour hours d day days week weeks"
-    " month months yr year years ka kyr myr"
-)
+ERROR_WORDS |= ERROR_NAMES
 
 _UNITS_AS_TITLES = TIME_UNITS - _words(
     "ns us µs μs ms s min h hr d yr ka"
@@ -62,13 +55,18 @@ _PREFIX = "(?:da|[YZEPTGMkhdcmuµμnpfazy])?"
 _PREFIXED = "mol|Ohm|ohm|rad|bar|cal|cd|Hz|Pa|Wb|lm|lx|sr|Da|eV|px|Ω|m|s|g|A|K|N|J|W|V|C|F|H|T|S|L|l|M|B"
 _ALONE = (
     r"counts?|cts|pixels?|px|adu|ADU|a\.?u\.?|arb\.? ?u(?:nits?)?\.?|n\.?u\.?|atm|Torr|mmHg|rpm|ppm|ppb|dB"
-    r"|deg|degrees?|radians?|°[CF]?|%|‰|permil|1|-|min|minutes?|hours?|hrs?|h|days?|d|weeks?|months?|years?|[kM]?yr|ka"
-    r"|sec(?:ond)?s?|[Vv]olts?|[Aa]mp(?:ere)?s?|meters?|metres?|k_?B ?T|kT|Å|u|LSB|lsb|bits?"
+    r"|deg|degrees?|radians?|°[CF]?|%|‰|per ?mil|1|-|min|minutes?|hours?|hrs?|h|days?|d|weeks?|months?|years?"
+    r"|[kM]?yr|ka|sec(?:ond)?s?|[Vv]olts?|[Aa]mp(?:ere)?s?|meters?|metres?|k_?B ?T|kT|Å|u|LSB|lsb|bits?"
 )
 _POWER = r"(?:(?:\^|\*\*)?\{?[-−+]?\d+(?:[./]\d+)?\}?|[⁺⁻]?[⁰¹²³⁴⁵⁶⁷⁸⁹]+)?"
 _FACTOR = rf"(?:(?:{_ALONE}|{_PREFIX}(?:{_PREFIXED})){_POWER})"
 _UNIT = re.compile(rf"\(?{_FACTOR}(?:\s*(?:[·*⋅×/]|\s)\s*\(?{_FACTOR}\)?)*\)?")
-
+_RATE_UNIT = "[kM]?Hz|[mµμu]?s"
+SAMPLING = re.compile(  # such as "Sampling Rate (Hz):= 1000.00", or "dt = 20 ms"
+    r"(?i:(sampl\w*|frame|acquisition)[ _-]*(rate|freq\w*|interval|period)|fs|sfreq|dt)\b[ \[(]*"
+    rf"(?P<before>{_RATE_UNIT})?\b[^\w.]*(?P<number>(?=[\d.]*[1-9])\d+\.?\d*([eE]-?\d+)?)[^\w.]*(?P<after>{_RATE_UNIT})?\W*"
+)
+_RECIPROCALS = {"Hz": "s", "kHz": "ms", "MHz": "us"}
 
 _TIME_ARGUMENT = re.compile(r"\s*\(\s*t\s*\)$")  # x(t) is x
 _BEFORE_PRESENT = re.compile(
@@ -173,6 +171,17 @@ def _is_time(title: str) -> bool:
     return _plain(title) in TIME_NAMES | AGE_NAMES or title.casefold() in _UNITS_AS_TITLES
 
 
+def _is_error(title: str, titles: Sequence[str]) -> bool:
+    """Whether a column is the error of another one by its title: ``x_err``, ``2σ of x``, ``Uncertainty``."""
+    spaced = re.sub(r"(?<=[a-z\d])(?=[A-Z])|\b[123] ?(?=s|σ)|\b(of|mean)\b|[(\[].*", " ", title)
+    words = re.findall(r"±|[^\W_]+", spaced.replace("+/-", "±").casefold())
+    others = {_plain(other) for other in titles if other != title}
+    cuts = [{"".join(words[:cut]), "".join(words[cut:])} for cut in range(1, len(words))]
+    return "".join(words) in ERROR_NAMES or any(
+        cut & (ERROR_NAMES | ERROR_WORDS) and cut & others for cut in cuts
+    )
+
+
 def _plain(title: str) -> str:
     return re.sub(r"[\W_]+", "", title).casefold()
 
@@ -180,6 +189,7 @@ def _plain(title: str) -> str:
 class _Layout(NamedTuple):
     """The columns of a table by what they mean, as positions."""
 
+    source: ColumnFile  # which they are positions in
     recording: int | None  # None where all rows are one recording
     time: int
     backwards: bool  # an age, which falls as time goes on
@@ -202,6 +212,7 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
     """
     if columns is not None and (len(set(columns)) < len(columns) or {"recording", "t"} & set(columns)):
         raise ValueError(f"the columns {list(columns)} are not distinct measured columns")
+    source = _with_stated_times(source)
     parts = [read_heading(heading) for heading in source.headings]
     plain = [part.title for part in parts]
     titles = [title or name for title, name in zip(source.titles or (None,) * len(parts), plain, strict=True)]
@@ -241,6 +252,10 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
         ]
         remarks += [Remark("data.second_time", {"column": source.headings[place]}) for place in others]
         states = [place for place in free if place not in (recording, *others)]
+        errors = [place for place in states if _is_error(plain[place], plain)]
+        if len(errors) < len(states):
+            states = [place for place in states if place not in errors]
+            remarks += [Remark("data.error_left_out", {"column": plain[place]}) for place in errors]
         names: list[str] = []
         for place in states:
             if not plain[place]:
@@ -262,7 +277,7 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
     units = tuple({"name": part.unit, "metadata": unit} for part, unit in pairs)
     shown = tuple(titles[place] for place in states)
     return _Layout(
-        recording, time, parts[time].is_age, tuple(states), tuple(names), shown, units, tuple(remarks)
+        source, recording, time, parts[time].is_age, tuple(states), tuple(names), shown, units, tuple(remarks)
     )
 
 
@@ -283,6 +298,31 @@ def _runs_evenly(values: np.ndarray | None) -> bool:
     steps = np.diff(values)
     usual = np.median(steps)
     return bool(usual > 0 and (np.abs(steps - usual) > EVEN * usual).mean() <= EVEN)
+
+
+def _with_stated_times(source: ColumnFile) -> ColumnFile:
+    """A table of which no column tells the time, with the times that a stated rate or interval gives."""
+    stated, places = SAMPLING.fullmatch(source.sampling), range(len(source.headings))
+    unit = (stated["before"] or stated["after"]) if stated else None
+    named = any(read_heading(one).may_be_time for one in source.headings)
+    if stated is None or unit is None or named:
+        return source
+    if any(
+        _runs_evenly(_numbers(source, at)) or _tells_time(source.headings[at], source, at) for at in places
+    ):
+        return source
+    step = 1 / float(stated["number"]) if unit in _RECIPROCALS else float(stated["number"])
+    times = pa.array(step * np.arange(len(source.load([0])[0])))
+
+    def load(positions: Sequence[int]) -> list[Column]:
+        loaded = iter(source.load([each for each in positions if each < len(places)]))
+        return [times if each == len(places) else next(loaded) for each in positions]
+
+    return replace(
+        source, headings=(*source.headings, f"t [{_RECIPROCALS.get(unit, unit)}]"), load=load,
+        units=(*source.units, None),
+        remarks=(*source.remarks, Remark("data.time_by_rate", {"line": source.sampling})),
+    )  # fmt: skip
 
 
 def _tells_time(title: str, source: ColumnFile, place: int) -> bool:
@@ -324,7 +364,10 @@ def _time_column(
     if found:
         names = " and ".join(f"'{source.headings[place].strip()}'" for place in found)
         raise InputError(file, "", f"the columns {names} all look like the time", "call the right one 't'")
-    raise InputError(file, "", "the column 't' is missing", "add the time of every sample as a column 't'")
+    remedy = "add the time of every sample as a column 't'"
+    if source.sampling:
+        remedy = f"write the unit into the line '{source.sampling}', such as Sampling Rate (Hz), or {remedy}"
+    raise InputError(file, "", "the column 't' is missing", remedy)
 
 
 def _label_column(

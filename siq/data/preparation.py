@@ -16,11 +16,10 @@ from typing import Literal
 import numpy as np
 from scipy import optimize, special
 
-from siq.data.correlation import markov_lag, noise_floors
+from siq.data.correlation import markov_lag, noise_floors, resolution_step
 from siq.data.recordings import (
     MOST_WIDE_STEPS,
     ROUNDED_TURN,
-    SINGLE_RECORDING_REMEDY,
     Recordings,
     SnapshotPairs,
     read_recordings,
@@ -48,10 +47,6 @@ QUARTERS, SAME_WAVE = 4, 0.5  # of a recording, in which a hum has one amplitude
 SLIGHT_HUM = 0.1  # of the variance of a state: what moves it more may be the state itself, which circulates
 KNOWN_SCALE = 0.01  # a choice: relative error to which a velocity tells how its position moves
 _STRETCH_LABEL = re.compile(r"(?P<label>.*) \((?P<number>\d+) of (?P<of>\d+)\)")
-SINGLE_RECORDING = (
-    "there is one recording, and it shows no process noise, from which the state returns, but at most that of"
-    " a sensor: a way that was gone once tells nothing of other stable states, nor of barriers"
-)
 
 
 def read_pairs(
@@ -60,7 +55,6 @@ def read_pairs(
     states: Sequence[str] | None,
     units: Mapping[str, str] | None,
     pair_step: float | None,
-    hidden_velocities: bool | Literal["auto"] = False,
 ) -> tuple[Recordings, SnapshotPairs]:
     """Read recordings that something is to be learned from, and their pairs.
 
@@ -70,20 +64,15 @@ def read_pairs(
         See `read_recordings`.
     pair_step
         See `snapshot_pairs`.
-    hidden_velocities
-        Whether they are positions: these are smooth, however strong the process noise on velocities is.
-        ``"auto"``: where one of them `turns_back`.
 
     Raises
     ------
     InputError
-        As `read_recordings` does, for a single recording without noise, for a state that never changes, and
-        when no two samples are close enough to be a pair.
+        As `read_recordings` does, for a state that never changes, and when no two samples are close enough
+        to be a pair.
     """
     recordings = read_recordings(path, columns=states, units=units)
-    recordings = _checked_for_learning(
-        recordings, file=str(path), chosen=states is not None, hidden_velocities=hidden_velocities
-    )
+    recordings = _checked_for_learning(recordings, file=str(path), chosen=states is not None)
     try:
         pairs = snapshot_pairs(recordings, pair_step=pair_step)
     except ValueError as error:
@@ -97,9 +86,7 @@ def read_pairs(
     return recordings, pairs
 
 
-def _checked_for_learning(
-    recordings: Recordings, *, file: str, chosen: bool, hidden_velocities: bool | Literal["auto"] = False
-) -> Recordings:
+def _checked_for_learning(recordings: Recordings, *, file: str, chosen: bool) -> Recordings:
     """Refuse what nothing can be learned from; leave out columns that never change, unless `chosen`."""
     still = np.ptp(recordings.values, axis=0) == 0
     if still.any():
@@ -115,9 +102,6 @@ def _checked_for_learning(
             if still[place]
         ]
         recordings = recordings.of_states(kept, remarks)
-    smooth = hidden_velocities is not True and _shows_no_process_noise(recordings)
-    if smooth and len(recordings.labels) == 1 and not (hidden_velocities and turns_back(recordings)):
-        raise InputError(file, "", SINGLE_RECORDING, SINGLE_RECORDING_REMEDY)
     return replace(recordings, remarks=(*recordings.remarks, *unusual(recordings)))
 
 
@@ -247,6 +231,8 @@ def without_faults(recordings: Recordings) -> Recordings:
         begins = np.flatnonzero(np.r_[True, ~same | (moves != 0)])  # of stretches of one value
         lasts = np.diff(np.r_[begins, len(recordings.t)])
         steps = np.where(same, moves, 0.0)[begins[1:] - 1]
+        if not len(steps):  # it never changes
+            continue
         blocks = [np.abs(one) for one in np.array_split(steps, max(len(steps) // BLOCK, 1))]
         usual = np.repeat([np.median(one) for one in blocks], [len(one) for one in blocks])
         scale = np.maximum(usual, np.median(usual)) / special.ndtri(0.75)
@@ -271,13 +257,10 @@ def without_faults(recordings: Recordings) -> Recordings:
     found = without(apart)
     for state in [place for place, floor in enumerate(noise_floors(found) or ()) if floor.process]:
         hum, period = _hum_of(found, found.values[:, state])
-        if hum.any():
+        amplitude = float(np.sqrt(2) * hum.std())
+        if amplitude > (resolution_step(found.values[:, state]) or 0.0):
             found.values[:, state] -= hum
-            told = {
-                "column": found.titles[state],
-                "period": period,
-                "amplitude": float(np.sqrt(2) * hum.std()),
-            }
+            told = {"column": found.titles[state], "period": period, "amplitude": amplitude}
             units = {"unit": found.units[state], "time_unit": found.time_unit}
             remarks.append(Remark("data.hum_taken_off", told | units))
     return replace(found, remarks=tuple(remarks)) if len(remarks) > len(recordings.remarks) else recordings

@@ -379,7 +379,7 @@ class Recordings:
         names = np.unique(groups)
         if len(names) < 2:
             raise NumericalFailure(
-                "there is only one recording, and it shows no process noise or is too short to be divided, so"
+                "there is one recording, and it shows no process noise or is too short to be divided, so"
                 f" that none can be held out; {SINGLE_RECORDING_REMEDY}"
             )
         count = min(max(round(share * len(names)), 1), len(names) - 1)

@@ -34,7 +34,7 @@ import numpy as np
 from pydantic_core import to_jsonable_python
 from scipy import ndimage, sparse, special
 
-from siq.data.correlation import markov_lag
+from siq.data.correlation import FEWEST_VALUES, markov_lag, resolution_step
 from siq.data.kinetics import (
     CONFIDENCE,
     FALSE_WELL,
@@ -200,6 +200,10 @@ def _valleys(
     every = -(-len(values) // MOST_POINTS)
     spectra: list[list[np.ndarray]] = [[] for _ in runs]
     for one, relaxation in zip(values.T, relaxations, strict=True):
+        # Levels of a digitiser are no peaks, which bins that are as narrow would make of them.
+        step = resolution_step(one) if len(np.unique(one)) >= FEWEST_VALUES else None
+        if step is not None and BINS * step > np.ptp(one):
+            one = one + step * (generator.random(len(one)) - 0.5)
         # As it is, and less a straight line in every stretch, the last of a run longer: slow hops need the
         # one, quick hops over a drift the other.
         levelled = one.copy()
@@ -512,9 +516,6 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     background, baseline = drifts[drifting, :, columns].T, np.zeros_like(values)
     places, path, expected = np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None
     wells, levels = 1, False
-    if probability >= SIGNIFICANCE:
-        background[:] = 0.0
-        background[:, column] = background_of(recordings, values[:, column])
     for _ in range(MOST_PASSES if probability < SIGNIFICANCE else 0):
         flat = values - background
         places, path, expected, wells, levels = path_of(flat, runs, relaxation, column=column)
@@ -525,15 +526,20 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         background = slow + baseline
         if (np.abs(moved).max(axis=0) <= SETTLED_BACKGROUND * (values - level).std(axis=0)).all():
             break
-    flat, number = values - background, len(places)
+    number = len(places)
     counts = DwellCount.of_visits(recordings.t, path, runs, states=number)
-    density, edges = np.histogram(flat[:, column], bins=BINS, density=True)
     # A valley that is deeper than a linear system's may be the floor of one flat well.
     wanted = kinds * count * pushed[order[0]] >= SIGNIFICANCE
     supported = probability < SIGNIFICANCE and any(one.visits for one in counts)
-    profile = Profile.of(flat[:, column], runs, path, places[:, column]) if supported else None
+    own = values[:, column] - background[:, column]
+    profile = Profile.of(own, runs, path, places[:, column]) if supported else None
     if profile is not None and wanted and wells == 1:
         supported = bool((profile.tops[:, ::2] > FALSE_WELL * profile.tops[:, 1::2]).all())
+    if not supported:  # what was taken for hops may be a drift
+        background[:] = 0.0
+        background[:, column] = background_of(recordings, values[:, column])
+        own = values[:, column] - background[:, column]
+    density, edges = np.histogram(own, bins=BINS, density=True)
     lengths, hops = stays_of(path, runs, number), np.zeros((number, number))
     for part in (path[run][path[run] >= 0] for run in runs):
         turns = np.flatnonzero(np.diff(part))
@@ -551,7 +557,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     )  # fmt: skip
     if not rungs or not supported:
         return found
-    if (period := change_of(recordings, flat[:, column], path)) is not None:
+    if (period := change_of(recordings, own, path)) is not None:
         known = step * period if np.isfinite(period) else None
         return replace(
             found, limit=Remark("data.not_stationary", {"period": known, "unit": recordings.time_unit})

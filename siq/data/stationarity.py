@@ -27,6 +27,7 @@ SETTLED_GROWTH = 1.3  # with twice the length a walk's correlation lasts twice a
 SHORTEST_TIME = 0.5  # of a sample: shorter correlations are not told from none
 WHITE_CORRELATION = 0.05  # of the variance: a correlation of neighbours below is none
 STEP_TOLERANCE = 0.01  # of a step: stretches end where a step differs by more
+ROUNDED_STEP = 0.1  # of a step, by which the tick of a clock may change it
 MOST_STRETCHES = 4000  # looked at
 MOST_RUNS = 200  # without a gap, from which a correlation time is found
 BRIDGED = 0.1  # of the correlation time: so long a gap hides two hops in one case of a hundred
@@ -279,6 +280,9 @@ def even_stretches(recordings: Recordings, *, uneven: bool = False) -> Stretches
     usual = usual_step(recordings)
     # Times such as 0.1·k, or seconds since 1970, carry rounding errors into their differences.
     even = inside & (np.abs(gap - usual) <= STEP_TOLERANCE * usual + 4 * np.spacing(np.abs(recordings.t[1:])))
+    if not even.all():  # rounded to the tick of a clock, one step has two lengths, or three
+        near = inside & (np.abs(gap - usual) <= ROUNDED_STEP * usual)
+        even = near if len(np.unique(np.round(gap[near] / usual, 3))) <= 3 else even
     if uneven and 2 * even.sum() < inside.sum():
         even = inside & (gap <= LONGEST_STEP * usual * (1 + 1e-6))
     return Stretches(np.where(even, np.cumsum(~even), -1), usual)

@@ -96,6 +96,7 @@ def _checked(
         source = _stacked(source)
     source = _with_one_clock(source)
     layout = layout_of(file, source, columns)
+    source = layout.source
     used = [layout.time, *layout.states]
     cells = source.load([*([] if layout.recording is None else [layout.recording]), *used])
     labels = cells.pop(0) if layout.recording is not None else None
@@ -195,20 +196,16 @@ def _with_one_clock(source: ColumnFile) -> ColumnFile:
     alike = [tuple(text.str.fullmatch(one).all() for one in (_DAY_ALONE, _TIME_OF_DAY)) for text in texts]
     if sorted(alike) != [(False, True), (True, False)]:
         return source
-    (day, of_day), joined = called, texts[0] + " " + texts[1]
-    if alike[1][0]:
-        (of_day, day), joined = called, texts[1] + " " + texts[0]
-    rest = [place for place in range(len(source.headings)) if place != of_day]
+    day, rest = int(alike[1][0]), [place for place in range(len(source.headings)) if place not in called]
 
     def load(positions: Sequence[int]) -> list[Column]:
-        loaded = source.load([rest[position] for position in positions])
-        return [
-            pa.array(joined) if rest[at] == day else one for at, one in zip(positions, loaded, strict=True)
-        ]
+        loaded = iter(source.load([rest[position] for position in positions if position < len(rest)]))
+        both = pa.array(texts[day] + " " + texts[1 - day])
+        return [both if position == len(rest) else next(loaded) for position in positions]
 
-    fields = [each for each in ("headings", "units", "titles") if getattr(source, each)]
-    kept = {each: tuple(getattr(source, each)[place] for place in rest) for each in fields}
-    return replace(source, **kept, load=load)
+    headings = (*(source.headings[place] for place in rest), source.headings[called[day]])
+    units = (*(source.units[place] for place in rest), None)
+    return replace(source, headings=headings, units=units, titles=(), load=load)
 
 
 def _past_midnight(times: pd.Series) -> pd.Series:
@@ -417,6 +414,11 @@ def _seconds_of_clock(file: str, name: str, cells: Column) -> tuple[np.ndarray, 
         values = pd.to_datetime(cells.to_pandas())
     elif pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
         values = cells.to_pandas()
+    elif any(is_kind(kind) for is_kind in _NUMERIC) and (days := cells.to_pandas()).between(1e7, 1e8).all():
+        texts = days.astype(str).str.removesuffix(".0")  # all of them days, such as 19580329
+        values = pd.to_datetime(texts, format="%Y%m%d", errors="coerce")
+        if values.isna().any():
+            return None
     else:
         return None
     present = values.dropna()

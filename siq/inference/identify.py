@@ -48,6 +48,7 @@ from siq.inference.diffusion_model import (
 from siq.inference.field_estimate import (
     HARMLESS_BIAS,
     HARMLESS_CORRELATION,
+    STANDARD_ERRORS,
     DiffusionSource,
     FieldEstimate,
     NoiseDiagnosis,
@@ -372,8 +373,9 @@ class _Case:
             "kind": memory.kind, "memory": float(memory.memory), "lag": int(memory.lag),
             "time": float(memory.time), "unit": self.recordings.time_unit or "",
         }  # fmt: skip
-        lost = lost_time(found, pairs)
-        if lost < 0:  # forces with a memory, and exposures, delay what noise does; this adds to it at once
+        lost, error = lost_time(found, pairs)
+        # Forces with a memory, and exposures, delay what noise does; what adds to it at once does not.
+        if lost < -STANDARD_ERRORS * error:
             raise NumericalFailure(
                 f"the record takes back within {memory.lag} steps a part of what it moved, as where errors of"
                 " its sensor last so long, and f and D of such samples are too large; keep one sample of"
@@ -382,7 +384,7 @@ class _Case:
         noise = NoiseDiagnosis(
             "process", intensity, covariance, correlation, correlation / float(memory.errors[0, state]),
             np.zeros(len(covariance)), pairs=independent, diffusion=source, lag=memory.lag,
-            lost_time=lost, remarks=(Remark("inference.correlated", values),),
+            lost_time=max(lost, 0.0), remarks=(Remark("inference.correlated", values),),
         ).with_deviation(whitening @ covariance @ whitening.T, independent)  # fmt: skip
         return self._tested_by_pairs(replace(found, diagnosis=noise), training, unseen)
 

@@ -132,17 +132,20 @@ def coarse_pairs(recordings: Recordings, lag: int, *, lost: float) -> SnapshotPa
     return SnapshotPairs(x[at], x[at + lag], h, parents, copies=copies)
 
 
-def lost_time(found: FieldEstimate, given: LaggedPairs) -> float:
-    """By how much correlations delay what noise does: the time that a displacement lags behind a white one's.
+def lost_time(found: FieldEstimate, given: LaggedPairs) -> tuple[float, float]:
+    """By how much correlations delay what noise does, and the standard error that it has where they do not.
 
     Over k steps the residuals add up to the variance ``kΩ - 2Σ_j j C_j``, as if ``2Σ_j j C_j / Ω`` steps were
-    missing: the correlation time of coloured noise, a third of an integration time.
+    missing: the correlation time of coloured noise, a third of an integration time. Of n white residuals
+    ``C_j`` has the error ``Ω/√n``.
     """
     rest = residuals(found, given)
     covariances = lagged_covariances(rest - rest.mean(axis=0), given.number, given.lag)
-    weighted = 2 * np.einsum("k,kij->ij", np.arange(len(covariances), dtype=float), covariances)
+    steps = np.arange(len(covariances), dtype=float)
     whole = long_run_covariance(covariances, given.lag)
-    return float(np.trace(np.linalg.solve(whole, weighted))) / len(whole) * float(np.median(given.h))
+    missing = 2 * np.trace(np.linalg.solve(whole, np.einsum("k,kij->ij", steps, covariances)))
+    step, error = float(np.median(given.h)), 2 * np.linalg.norm(steps) / np.sqrt(rest.size)
+    return float(missing) / len(whole) * step, float(error) * step
 
 
 class _PairRegression:

@@ -80,14 +80,21 @@ def time_text(mean: MeanTime | None, unit: str = "") -> str:
 
 
 def with_unit(name: str, unit: str) -> str:
-    """A heading, or the name of an axis, with its unit in brackets; a plain number has none."""
+    """A heading, or the name of an axis, with its unit in brackets; a plain number has none.
+
+    ``T_minus_273``, from which `Recordings.centred` took 273, is ``T − 273`` as elsewhere on a page.
+    """
     shown = unit_text(unit)
+    name = re.sub(
+        r"_(?:(plus)|minus)_(\d+)(?:_(\d+))?$",
+        lambda one: f" {'+' if one[1] else MINUS} {'.'.join(filter(None, one.groups()[1:]))}", name,
+    )  # fmt: skip
     return f"{name} ({shown})" if shown else name
 
 
 def _position_text(well: WellSummary, summary: LandscapeSummary) -> str:
     """Where a well is: ``x = −0.996 ± 0.005 nm``, ``(x, y) = (−0.50, 0.00) µm``."""
-    names, units = summary.names, summary.units
+    names, units = [with_unit(name, "1") for name in summary.names], summary.units
     if len(names) > MOST_STATES_IN_A_SENTENCE:
         return "the place that the table gives"
     if len(names) == 1:

@@ -202,7 +202,7 @@ def _cycles_table(summary: LandscapeSummary) -> pd.DataFrame:
 def _equilibria_table(summary: LandscapeSummary) -> pd.DataFrame:
     kinds = texts("tables")["equilibria"]
     time = unit_text(summary.time_unit)
-    names = summary.names
+    names = [with_unit(name, "1") for name in summary.names]
     position = f"({', '.join(names)})" if len(names) > 1 else names[0]
     if len(set(summary.units)) == 1:
         position = with_unit(position, summary.units[0])

@@ -106,7 +106,6 @@ def source_of(path: str | Path, settings: PipelineSettings) -> Dynamics | Record
         states=settings.space.names,
         units=settings.space.units,
         pair_step=settings.sampling.pair_step,
-        hidden_velocities=settings.identification.hidden_velocities,
     )
     space = settings.space
     units = tuple(

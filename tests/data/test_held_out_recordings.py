@@ -46,8 +46,8 @@ def test_copies_of_a_resampled_recording_stay_together(seed: int) -> None:
 
 
 def test_one_recording_cannot_be_held_out() -> None:
-    with pytest.raises(NumericalFailure, match="there is only one recording"):
+    with pytest.raises(NumericalFailure, match="there is one recording"):
         held(recordings(1), 0)
     copies = recordings(3).select([1, 1, 1])
-    with pytest.raises(NumericalFailure, match="there is only one recording"):
+    with pytest.raises(NumericalFailure, match="there is one recording"):
         held(copies, 0)

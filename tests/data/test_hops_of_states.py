@@ -9,8 +9,15 @@ from scipy.signal import lfilter
 from siq.data.kinetics import continued_visits
 from siq.data.preparation import in_stretches, without_background
 from siq.data.recordings import Recordings
-from siq.data.states import DwellCount, switching
-from siq.data.stationarity import background_of, correlated_samples, relaxation_samples, runs_of, usual_step
+from siq.data.states import SIGNIFICANCE, DwellCount, switching
+from siq.data.stationarity import (
+    background_of,
+    correlated_samples,
+    even_stretches,
+    relaxation_samples,
+    runs_of,
+    usual_step,
+)
 
 STEP, COUNT = 0.05, 20_000
 TIME = STEP * np.arange(COUNT)
@@ -141,3 +148,28 @@ def test_hops_are_no_slow_drift() -> None:
 def test_a_long_trace_is_cut_by_its_own_correlation_time() -> None:
     quick, hopping = in_stretches(recorded(one_state(0))), in_stretches(recorded(two_states(3, 0.25)))
     assert len(quick.labels) == 40 and 10 <= len(hopping.labels) < 20
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_levels_of_a_digitiser_are_no_states(seed: int) -> None:
+    white = np.random.default_rng(seed).standard_normal(5000)
+    x = np.round(2 * lfilter([0.87], [1, -0.5], white))
+    found = switching(Recordings.from_arrays(np.arange(5000.0), x[:, None], names=["x"]), rungs=False)
+    assert found is not None and found.probability > SIGNIFICANCE and len(found.levels) == 1
+
+
+def test_steps_that_a_clock_rounded_are_even() -> None:
+    times = np.round(0.015625 * np.arange(2000), 3)  # 64 Hz, in milliseconds
+    whole = even_stretches(Recordings.from_arrays(times, np.zeros((2000, 1)), names=["x"]))
+    assert set(whole.number) == {0}
+    uneven = np.cumsum(np.random.default_rng(0).uniform(0.9, 1.1, 2000))
+    apart = even_stretches(Recordings.from_arrays(uneven, np.zeros((2000, 1)), names=["x"]))
+    assert len(set(apart.number)) > 100
+
+
+def test_a_trend_that_is_no_hop_is_a_drift() -> None:
+    t, generator = 7 * np.arange(600) / 365.25, np.random.default_rng(0)
+    x = 60 * t / t[-1] + 3 * np.sin(2 * np.pi * t) + lfilter([0.3], [1, -0.9], generator.standard_normal(600))
+    found = switching(Recordings.from_arrays(t, x[:, None], names=["x"]), rungs=False)
+    assert found is not None and found.probability < SIGNIFICANCE  # no single state at rest
+    assert not found.supported and np.ptp(found.background) == pytest.approx(60, rel=0.1)

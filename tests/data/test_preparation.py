@@ -122,6 +122,17 @@ def test_a_hum_is_taken_off_to_its_phase() -> None:
     assert told["amplitude"] == pytest.approx(0.2, rel=0.02)
 
 
+def test_a_column_at_rest_has_no_faults() -> None:
+    given = seen(np.column_stack([hopping()[:, 0], np.zeros(20_000)]))
+    assert without_faults(given) is given
+
+
+def test_a_hum_below_the_step_of_a_digitiser_is_left() -> None:
+    hum = 0.45 * np.sin(2 * np.pi * 0.04 * np.arange(20_000) / 0.313)
+    given = seen(np.round(5 * hopping() + hum[:, None]))
+    assert without_faults(given) is given  # less it, levels are apart by less than they were written with
+
+
 def test_a_noisy_limit_cycle_is_no_hum() -> None:
     generator, state = np.random.default_rng(2), np.array([1.0, 0.0])
     path = np.empty((8000, 2))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,12 +14,15 @@ import pytest
 
 from siq.data.correlation import decimals_of, noise_floors, resolution_step, rounding_error
 from siq.data.inspection import inspect as inspect_recordings
-from siq.data.layout import RESERVED, is_unit, read_heading, usable_name
+from siq.data.layout import RESERVED, _is_error, is_unit, read_heading, usable_name
 from siq.data.preparation import FEWEST_STRETCHES, _checked_for_learning, in_stretches, read_pairs
 from siq.data.recordings import Recordings, read_recordings, write_recordings
 from siq.errors import InputError
 from siq.systems.cards import check_name
 from siq.systems.formulas import CONSTANTS, FUNCTIONS
+from siq.workflow.pipeline import draw_run, identify_run, source_of
+from siq.workflow.study import PipelineSettings
+from siq.workflow.tables import Status
 
 
 def put(folder: Path, name: str, content: str | bytes) -> Path:
@@ -37,6 +41,14 @@ READ: dict[str, tuple[str, str | bytes, tuple[str, ...], list[list[float]], str]
     "UTF-16": ("a.csv", "t\tx\n0\t1,5\n1\t2\n".encode("utf-16"), ("x",), [[1.5], [2]], "UTF-16"),
     "tabs": ("a.txt", "t\tx\n0\t1\n1\t2\n", ("x",), [[1], [2]], "separated by tabs"),
     "spaces": ("a.dat", "  t (s)   x (mm)\n 0   1.5\n 1  2\n", ("x",), [[1.5], [2]], "separated by spaces"),
+    "a sampling rate": (
+        "a.txt", "# Sampling Rate (Hz):= 50.00\n# Labels:= EEG\n" + "3\n1\n" * 8,
+        ("EEG",), [[3], [1]] * 8, "the line 'Sampling Rate (Hz):= 50.00'",
+    ),
+    "days as numbers": (
+        "a.csv", "date,x\n19580329,3\n19580405,1\n19580412,2\n", ("x",), [[3], [1], [2]],
+        "days since the first, 1958-03-29",
+    ),
     "a line sep=;": ("a.csv", "sep=;\nt;x\n0;1,5\n1;2\n", ("x",), [[1.5], [2]], "semicolons"),
     "comments above": ("a.csv", "# a logger, 7\n" * 3000 + "t,x\n0,1\n1,2\n", ("x",), [[1], [2]], ""),
     "numpy.savetxt": ("a.txt", "# t x y\n0 1 3\n1 2 4\n", ("x", "y"), [[1, 3], [2, 4]], "spaces"),
@@ -122,6 +134,9 @@ REFUSED: dict[str, tuple[str, str | bytes, str, str]] = {
     "no common row": ("a.csv", "t,x,y\n0,1,\n1,,2\n2,3,\n", "no row has a value in every", "interpolate"),
     "no headings, and no clock": (
         "a.csv", "3,1\n1,2\n" * 6, "the column 't' is missing", "the time of every sample",
+    ),
+    "a rate without a unit": (
+        "a.txt", "# fs = 50\n" + "3\n1\n" * 8, "the column 't' is missing", "unit into the line 'fs = 50'",
     ),
     "no time": ("a.csv", "x,y\n1,2\n2,3\n", "the column 't' is missing", "the time of every sample"),
     "two clocks": (
@@ -474,14 +489,52 @@ def test_a_motion_without_noise_is_not_taken_for_noise() -> None:
         assert all(floor.process == floor.sensor == 0 for floor in floors)
 
 
-def test_one_relaxation_is_refused_before_anything_runs_and_one_hopping_record_is_not(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("line", "unit", "step"),
+    [("Sample rate: 2.5 kHz", "ms", 0.4), ("dt = 20 ms", "ms", 20.0), ("fs (Hz),250", "s", 0.004),
+     ("Sample interval,4.0e-1,s", "s", 0.4), ("sampling frequency [MHz]: 2", "us", 0.5)],
+)  # fmt: skip
+def test_times_follow_from_a_stated_rate(tmp_path: Path, line: str, unit: str, step: float) -> None:
+    read = read_recordings(put(tmp_path, "a.txt", f"# {line}\nx,y\n" + "3,1\n1,2\n2,2\n" * 8))
+    assert read.time_unit == unit and read.names == ("x", "y")
+    np.testing.assert_allclose(read.t, step * np.arange(24))
+    timed = put(tmp_path, "b.csv", f"# {line}\nt [h],x\n0,3\n1,1\n2,2\n")
+    assert read_recordings(timed).time_unit == "h"  # a column of times is what counts
+
+
+def test_a_dash_is_a_label_among_labels_and_a_missing_value_elsewhere(tmp_path: Path) -> None:
+    rows = [f"{strand},{k},{k % 3},-" for strand in "+-" for k in range(9)]
+    read = read_recordings(put(tmp_path, "a.csv", "\n".join(["run,t,x,y", *rows])), columns=["x"])
+    assert read.labels == ("+", "-") and len(read.t) == 18
+    gap = put(tmp_path, "b.csv", "t,x\n" + "".join(f"{k},{'-' if k == 5 else k % 3}\n" for k in range(20)))
+    assert len(read_recordings(gap).t) == 19
+
+
+def test_an_error_of_a_column_is_no_state(tmp_path: Path) -> None:
+    lines = [f"{k},{np.sin(k)},{0.1 + 0.01 * np.cos(3 * k)}" for k in range(40)]
+    path = put(tmp_path, "stack.csv", "\n".join(["t,d18O (per mil),Standard error (per mil)", *lines]))
+    read = read_recordings(path)
+    assert (read.names, read.units) == (("d18O",), ("per mil",))
+    assert "'Standard error' is the error of another one" in "; ".join(read.notes)
+    alone = put(tmp_path, "alone.csv", "t,std\n0,1\n1,2\n2,1.5\n")
+    assert read_recordings(alone).names == ("std",)  # which is what was measured
+    titles = ["t", "x", "lnCa", "CO2", "a"]
+    errors = ("x_err", "lnCaErr", "sigma mean CO2", "x ±", "+/- x", "x std", "x 2σ", "Uncertainty of x")
+    assert all(_is_error(each, titles) for each in errors)
+    assert not any(_is_error(each, titles) for each in ("error", "sigma", "Se", "asd", "y_err"))
+
+
+def test_one_relaxation_has_a_page_without_f_and_one_hopping_record_is_cut(tmp_path: Path) -> None:
     t = np.arange(500) * 0.01
     text = csv(pd.DataFrame({"recording": "a", "t": t, "x": np.exp(-t)}))
     path = put(tmp_path, "settling.csv", text)
-    with pytest.raises(
-        InputError, match=r"there is one recording, and it shows no process noise.*many starting"
-    ):
-        read_pairs(path, states=None, units=None, pair_step=None)
+    settings = PipelineSettings()
+    drawn = draw_run(settings, source_of(path, settings), number=0).result
+    found = identify_run(settings, drawn, number=0)
+    assert found.result is None and found.outcome.status is Status.FAILED
+    assert re.search(
+        r"there is one recording, and it shows no process noise.*many starting", found.outcome.reason
+    )
     hopping = noisy(0.0, 0.1)
     write_recordings(tmp_path / "hopping.parquet", hopping)
     read, _ = read_pairs(tmp_path / "hopping.parquet", states=None, units=None, pair_step=None)

@@ -26,7 +26,7 @@ from siq.inference.kalman_identification import (
 )
 from siq.inference.library import IdentificationOptions, candidate_library, field_library
 from siq.inference.observation import ObservationModel, unbroken
-from siq.inference.regression import identify_vector_field
+from siq.inference.regression import identify_vector_field, lagged_pairs, lost_time
 from siq.systems.diffusion import Diffusion
 from siq.workflow import pipeline
 from siq.workflow.pipeline import PipelineSettings
@@ -241,6 +241,21 @@ def test_errors_of_a_sensor_that_last_are_no_memory_of_the_forces() -> None:
     recordings = in_stretches(Recordings.from_arrays(5 * TIME * np.arange(20_000), values, names=["x"]))
     with pytest.raises(NumericalFailure, match="takes back within"):
         case_of(recordings).by_instruments(markov_lag(recordings))
+
+
+def test_a_lost_time_below_zero_within_its_error_is_none() -> None:
+    # White noise taken for one with a memory: what it adds up to over the lag is known to an error.
+    values = double_wells(2, samples=20_000, traces=1, intensity=0.16)[:, ::5]
+    case = case_of(in_stretches(Recordings.from_arrays(5 * TIME * np.arange(4000), values, names=["x"])))
+    pairs = lagged_pairs(case.recordings, 5)
+    lost, error = lost_time(identify_vector_field(case.library, pairs, options=case.options), pairs)
+    assert -2 * error < lost < 0
+    memory = replace(
+        markov_lag(case.recordings), kind="coloured", lag=5,
+        correlations=np.array([[0.02]]), errors=np.array([[0.01]]),
+    )  # fmt: skip
+    found = case.by_instruments(memory)
+    assert found.diagnosis is not None and found.diagnosis.lost_time == 0
 
 
 @pytest.mark.parametrize(("steps", "kept", "rows"), [(0.4, 1, 2), (1.0, 1, 1), (1.5, 2, 2), (10.0, 10, 1)])

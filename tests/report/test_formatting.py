@@ -1,9 +1,11 @@
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 import sympy
 
-from siq.report.formatting import _formula_text, array_mathml, formula_mathml
+from siq.data.recordings import Recordings
+from siq.report.formatting import _formula_text, array_mathml, formula_mathml, with_unit
 
 x, y, z = sympy.symbols("x y z", real=True)
 IDENTIFIED = 0.9991 * y**2 + 1.0009 - 2.0012 * x**2 + 0.9991 * z**2 + 1.0001 * x**4
@@ -92,3 +94,11 @@ def test_hostile_names_are_escaped() -> None:
 def test_a_matrix_has_brackets_unless_it_is_one_entry() -> None:
     assert shown(array_mathml([[1.0, -0.5], [-0.5, 2.0]])) == "[1−0.5000−0.50002]"
     assert shown(array_mathml([[2.0]])) == "2" and shown(array_mathml([[x + 1]])) == "x+1"
+
+
+@pytest.mark.parametrize("middle", [101325.2, -39.3, 0.3175])
+def test_a_state_moved_by_a_round_number_has_one_title_on_a_page(middle: float) -> None:
+    values = np.random.default_rng(0).uniform(-3, 3, (500, 1)) * abs(middle) / 1000
+    moved = Recordings.from_arrays(np.arange(500.0), middle + values, names=["p"]).centred(degree=5)
+    assert moved.names != ("p",) and with_unit(moved.names[0], "1") == moved.titles[0]
+    assert with_unit("x_minus_y", "mm") == "x_minus_y (mm)"

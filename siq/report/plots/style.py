@@ -14,7 +14,6 @@ import matplotlib.style
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.rcsetup import cycler
 from matplotlib.ticker import FuncFormatter
 
 from siq.numerics.files import whole_file
@@ -37,30 +36,7 @@ VERMILLION = "#D55E00"
 PURPLE = "#CC79A7"
 GREY = "#6E6E6E"
 
-_SETTINGS = {
-    "font.family": "DejaVu Sans",  # comes with matplotlib: the same on every machine
-    "font.size": 10,
-    "axes.titlesize": 10,
-    "axes.labelsize": 10,
-    "xtick.labelsize": SMALLEST,
-    "ytick.labelsize": SMALLEST,
-    "legend.fontsize": SMALLEST,
-    "legend.title_fontsize": SMALLEST,
-    "legend.frameon": False,
-    "figure.titlesize": 10,
-    "figure.labelsize": SMALLEST,
-    "figure.constrained_layout.use": True,
-    "axes.linewidth": 0.6,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.prop_cycle": cycler(color=[BLUE, VERMILLION, GREEN, ORANGE, PURPLE]),
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "lines.linewidth": 1.0,
-    "mathtext.fontset": "dejavusans",
-    "svg.fonttype": "path",
-    "svg.hashsalt": "siq",  # otherwise the identifiers in an SVG are drawn by lot
-}
+_STYLE = Path(__file__).with_name("figures.mplstyle")
 
 # A figure that had a layout keeps a placeholder of one otherwise, and is drawn twice whenever it is saved.
 _FROZEN = {"figure.constrained_layout.use": False}
@@ -75,8 +51,8 @@ Drawn = TypeVar("Drawn", Figure, Figure | None)
 
 
 def _drawing_style(settings: Mapping[str, object]) -> AbstractContextManager[None]:
-    """Make matplotlib's defaults, those of this module and some more settings hold for a ``with`` block."""
-    context: AbstractContextManager[None] = matplotlib.style.context(["default", {**_SETTINGS, **settings}])
+    """Make matplotlib's defaults, those of `_STYLE` and some more settings hold for a ``with`` block."""
+    context: AbstractContextManager[None] = matplotlib.style.context(["default", _STYLE, dict(settings)])
     return context
 
 
