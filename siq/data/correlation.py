@@ -468,13 +468,15 @@ VALUES_SAMPLED = 2000  # looked at before all are
 AUTOCORRELATION_95 = 1.96  # standard deviations of an autocorrelation of white errors, which are 1/√n
 
 
-def correlation_time_of(left: np.ndarray, recording: np.ndarray, *, outputs: int) -> float:
+def correlation_time_of(
+    left: np.ndarray, recording: np.ndarray, *, outputs: int = 1, least: float = AUTOCORRELATION_95
+) -> float:
     """Integral correlation time of all residuals in samples, at least 1.
 
     Of n residuals, n over it count as independent. Autocorrelations are means over recordings and outputs.
-    The sum ends at the first that white errors would have by chance, so that noise does not lengthen it. The
-    residuals have the outputs of a sample one behind the other, and come with the recording of each; shape
-    ``(n·m,)``. Of the samples of a single state see `siq.data.stationarity.correlated_samples`.
+    The sum ends at the first below `least` standard deviations of those of white errors: by default one that
+    these would have by chance, so that noise does not lengthen it. The residuals have the outputs of a sample
+    one behind the other, and come with the recording of each; shape ``(n·m,)``.
     """
     series = left.reshape(-1, outputs)
     owner = recording.reshape(-1, outputs)[:, 0]
@@ -486,7 +488,7 @@ def correlation_time_of(left: np.ndarray, recording: np.ndarray, *, outputs: int
         if not pairs or power <= 0:
             break
         correlation = float((series[lag:] * series[:-lag])[same].sum()) / pairs / power
-        if correlation <= AUTOCORRELATION_95 / np.sqrt(pairs):
+        if correlation <= least / np.sqrt(pairs):
             break
         total += 2 * correlation
     return total

@@ -22,7 +22,6 @@ import numpy as np
 import scipy.stats
 
 from siq.data.correlation import correlation_time_of
-from siq.data.stationarity import correlated_samples
 from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.errors import NumericalFailure
 from siq.inference.kalman_filter import Noise, Whitened, solve, whiten
@@ -126,7 +125,7 @@ def _blocks_of(recording: np.ndarray, left: np.ndarray, *, least: int) -> np.nda
     begun = 0
     for place in recordings:
         rows = np.flatnonzero(recording == place)
-        lasting = 2 * correlated_samples(left[rows], [slice(0, len(rows))])
+        lasting = correlation_time_of(left[rows], recording[rows], least=0.0)
         parts = max(-(-least // len(recordings)), int(len(rows) / (BLOCK_CORRELATION_TIMES * lasting)))
         block[rows] = begun + (np.arange(len(rows)) * parts) // len(rows)
         begun += parts
@@ -184,8 +183,8 @@ def _correlated_probability(
     """
     white, _, left = residuals(fit, data)
     weights = np.bincount(white.recording)
-    each = [left[white.recording == place] for place in range(len(weights))]
-    times = [2 * correlated_samples(series, [slice(0, len(series))]) for series in each]
+    each = [white.recording == place for place in range(len(weights))]
+    times = [correlation_time_of(left[rows], white.recording[rows], least=0.0) for rows in each]
     together = float(np.average(times, weights=weights))
     places = [each.frequencies or len(each.at) for each in candidate.searches]
     alone = float(scipy.stats.chi2.sf(max(gained, 0.0) / together, max(len(candidate.new), 1)))

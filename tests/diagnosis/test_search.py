@@ -12,8 +12,8 @@ import scipy.stats
 import sympy
 from homes_of_mechanisms import HOMES, RESIDENTS, recorded
 
+from siq.data.correlation import correlation_time_of
 from siq.data.recordings import Recordings
-from siq.data.stationarity import correlated_samples
 from siq.diagnosis import evidence, naming, screening, search
 from siq.diagnosis.dictionary import Roles, Shape, roles_of, standard_dictionary
 from siq.diagnosis.evidence import FittedCandidate, _blocks_of, _correlated_probability
@@ -53,7 +53,7 @@ def autoregressive(memory: float, size: int) -> np.ndarray:
 
 @pytest.mark.parametrize("memory", [0.0, 0.5, 0.9])
 def test_the_correlation_time_of_an_autoregressive_series(memory: float) -> None:
-    found = 2 * correlated_samples(autoregressive(memory, 40_000), [slice(0, 40_000)])
+    found = correlation_time_of(autoregressive(memory, 40_000), np.zeros(40_000), least=0.0)
     assert found == pytest.approx((1 + memory) / (1 - memory), rel=0.15)
 
 
