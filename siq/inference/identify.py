@@ -60,7 +60,7 @@ from siq.inference.kalman_identification import (
     identify_by_likelihood,
 )
 from siq.inference.library import CandidateLibrary, IdentificationOptions, field_library
-from siq.inference.observation import SLIGHT, ObservationModel, inertia_test, moved_by, velocity_names
+from siq.inference.observation import ObservationModel, inertia_test, moved_by, velocity_names
 from siq.inference.regression import (
     carries_noise,
     identify_vector_field,
@@ -516,8 +516,7 @@ class _Case:
             test = inertia_test(self.recordings, pair_step=self.pair_step, limit=hidden)
         except (NumericalFailure, np.linalg.LinAlgError):
             return None
-        # The position alone is not the state where its inertia is seen, and no slight matter.
-        if (test.seen and not test.frequency**2 <= SLIGHT * test.friction**2) == hidden:
+        if test.needs_velocity == hidden:
             return None
         said = test.sentence(self.recordings.time_unit or "")
         if hidden and not (test.seen or test.overdamped):

@@ -337,6 +337,11 @@ class _InertiaTest:
         return self.gain > INTERVAL * self.gain_error and self.gain > 0
 
     @property
+    def needs_velocity(self) -> bool:
+        """Whether inertia is seen, and is so large that x alone is not the state."""
+        return self.seen and not self.frequency**2 <= SLIGHT * self.friction**2
+
+    @property
     def overdamped(self) -> bool:
         """Whether inertia is slight enough to be left out: it is not seen, and would have been."""
         return not self.seen and self.relaxation <= SLIGHT * self.friction
