@@ -657,9 +657,9 @@ class Landscape:
 
     def report(self) -> str:
         """What was found, as text."""
-        from siq.report.landscape import landscape_text
+        from siq.report.landscape import landscape_report
 
-        return landscape_text(self)
+        return landscape_report(self)
 
     def __repr__(self) -> str:
         """One line: a landscape holds thousands of numbers, which `report` makes readable."""
@@ -667,9 +667,9 @@ class Landscape:
         return f"<Landscape of ({named}): {len(self.attractors)} attractors, {ways} ways out>"
 
     def _repr_html_(self) -> str:
-        from siq.report.landscape import landscape_html
+        from siq.report.landscape import landscape_report
 
-        return landscape_html(self)
+        return landscape_report(self, markup=True)
 
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw U with its wells, saddles and paths; see `siq.plot_quasipotential`, which this calls.

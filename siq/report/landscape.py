@@ -8,6 +8,7 @@ as it is shown, units in its headings, and, where that is more, as the numbers t
 from __future__ import annotations
 
 import html
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -312,18 +313,13 @@ def comparison_table(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def landscape_text(landscape: Landscape) -> str:
-    """The report of a landscape as text: the answer, whether it may be believed, wells, ways out, notes."""
+def landscape_report(landscape: Landscape, *, markup: bool = False) -> str:
+    """The answer, whether it may be believed, wells, ways out and notes: as text, or as plain HTML."""
     opening, tables = _report(landscape)
-    parts = list(opening)
-    for heading, table in tables:
-        parts += ["", heading, table.to_string(index=False, na_rep="-")]
-    return "\n".join([*parts, *(["", *landscape.notes] if landscape.notes else [])])
-
-
-def landscape_html(landscape: Landscape) -> str:
-    """The report of a landscape as HTML, without scripts or styles."""
-    opening, tables = _report(landscape)
+    if not markup:
+        shown = [("", heading, table.to_string(index=False, na_rep="-")) for heading, table in tables]
+        notes = ["", *landscape.notes] if landscape.notes else []
+        return "\n".join([*opening, *itertools.chain(*shown), *notes])
     parts = [f"<p>{html.escape(line)}</p>" for line in opening]
     for heading, table in tables:
         parts += [f"<p>{html.escape(heading)}</p>", table.to_html(index=False, na_rep="-", border=0)]
