@@ -48,7 +48,6 @@ from siq.inference.diffusion_model import (
 from siq.inference.field_estimate import (
     HARMLESS_BIAS,
     HARMLESS_CORRELATION,
-    STANDARD_ERRORS,
     DiffusionSource,
     FieldEstimate,
     NoiseDiagnosis,
@@ -60,7 +59,7 @@ from siq.inference.kalman_identification import (
     identify_by_likelihood,
 )
 from siq.inference.library import CandidateLibrary, IdentificationOptions, field_library
-from siq.inference.observation import ObservationModel, inertia_test, moved_by, velocity_names
+from siq.inference.observation import INTERVAL, ObservationModel, inertia_test, moved_by, velocity_names
 from siq.inference.regression import (
     carries_noise,
     identify_vector_field,
@@ -375,7 +374,7 @@ class _Case:
         }  # fmt: skip
         lost, error = lost_time(found, pairs)
         # Forces with a memory, and exposures, delay what noise does; what adds to it at once does not.
-        if lost < -STANDARD_ERRORS * error:
+        if lost < -INTERVAL * error:
             raise NumericalFailure(
                 f"the record takes back within {memory.lag} steps a part of what it moved, as where errors of"
                 " its sensor last so long, and f and D of such samples are too large; keep one sample of"
