@@ -292,10 +292,13 @@ def solve_case(
     try:
         found, shown, statement = _judged(case, budget)
         if statement.verdict.mismatch and not (statement.mechanisms or case.settings.varies):
-            # Recordings may differ in a parameter: in place of a function without a name, if that leaves
-            # nothing; elsewhere a name may come to light behind it.
-            described, fit = statement.verdict.names, found.search.recalibrated
-            name = most_varying(case.system, case.learn, fit, budget=budget, completely=described)
+            # Recordings may differ in a parameter. Where a function describes what is missing, that has to be
+            # as likely; elsewhere a name may come to light behind it.
+            fit, least = found.search.recalibrated, 0.0
+            if statement.verdict.names and shown.described is not None:
+                least = 2 * (shown.described.fit.log_likelihood - fit.log_likelihood)
+                least -= case.settings.search.same
+            name = most_varying(case.system, case.learn, fit, budget=budget, least=least)
             varied = case if name is None else case.with_variation((name,))
             again = None if name is None else _judged(varied, budget)
             if again is not None and (again[0].verdict.names or not again[0].verdict.mismatch):

@@ -134,13 +134,13 @@ def _average(
 
 
 def most_varying(
-    model: Dynamics, data: Measurements, recalibrated: Fit, *, budget: Budget, completely: bool = False
+    model: Dynamics, data: Measurements, recalibrated: Fit, *, budget: Budget, least: float = 0.0
 ) -> str | None:
     """The free parameter that tells most by differing from recording to recording, if it does.
 
     Linearly about the recalibrated fit it promises most. Fitted, it has to gain more than deviations that are
-    not there do on average, and to make process noise needless if it is to explain the recordings
-    ``completely``. Of fewer than `FEWEST_VARYING` recordings no spread of a parameter can be known.
+    not there do on average, and at `least` so much in twice the log-likelihood. Of fewer than
+    `FEWEST_VARYING` recordings no spread of a parameter can be known.
     """
     count, free = len(data.labels), recalibrated.model.free
     names = {each.name for each in model.parameters if each.value and not each.fixed}
@@ -161,7 +161,7 @@ def most_varying(
         return None
     gain = 2 * (fit.log_likelihood - recalibrated.log_likelihood)
     LOGGER.info("%s differs from recording to recording: chi2 better by %.1f", found, gain)
-    return found if gain > count and not (completely and fit.has_process_noise) else None
+    return found if gain > max(count, least) else None
 
 
 def fit_with_process_noise_as_needed(
