@@ -14,7 +14,7 @@ from particles import TEMPERATURE, particle
 from siq.data.correlation import noise_floors
 from siq.data.preparation import FEWEST_STRETCHES
 from siq.data.recordings import Recordings, write_recordings
-from siq.errors import InputError, NumericalFailure
+from siq.errors import NumericalFailure
 from siq.inference import identify
 from siq.inference.field_estimate import DiffusionSource, FieldEstimate, read_field, write_field
 from siq.inference.kalman_identification import identify_by_likelihood, of_all_states
@@ -161,8 +161,12 @@ def test_one_record_of_smooth_positions_is_enough(tmp_path: Path) -> None:
     )
     seen = pipeline.draw_run(auto, source_of(path, auto), number=0).result
     assert seen is not None and len(seen.labels) >= FEWEST_STRETCHES
-    with pytest.raises(InputError, match="positions of something that has inertia, set 'identification"):
-        source_of(path, alone)
+    whole = pipeline.draw_run(alone, source_of(path, alone), number=0).result
+    assert whole is not None
+    refused = pipeline.identify_run(alone, whole, number=0)
+    assert refused.result is None and "positions of something that has inertia, set 'identification" in str(
+        refused
+    )
     drawn = pipeline.draw_run(hidden, source_of(path, hidden), number=0).result
     assert drawn is not None and len(drawn.labels) >= FEWEST_STRETCHES
     done = pipeline.identify_run(SETTINGS, drawn, number=0)
