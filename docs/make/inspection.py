@@ -18,6 +18,7 @@ import numpy as np
 from matplotlib import pyplot
 
 import siq
+from siq.data.inspection import Inspection
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "images" / "inspection"
@@ -34,7 +35,7 @@ CASES: dict[str, dict[str, Any]] = {
 BLUE, BAND = "#3d5a80", "0.85"
 
 
-def inspected(given: dict[str, Any]) -> siq.data.inspection.Inspection:
+def inspected(given: dict[str, Any]) -> Inspection:
     """The inspection of one record."""
     values = double_wells(1, samples=10_000, **given)
     t = np.arange(values.shape[1]) * STEP

@@ -164,9 +164,8 @@ def test_one_record_of_smooth_positions_is_enough(tmp_path: Path) -> None:
     whole = pipeline.draw_run(alone, source_of(path, alone), number=0).result
     assert whole is not None
     refused = pipeline.identify_run(alone, whole, number=0)
-    assert refused.result is None and "positions of something that has inertia, set 'identification" in str(
-        refused
-    )
+    assert refused.result is None
+    assert "positions of something that has inertia, set 'identification" in str(refused)
     drawn = pipeline.draw_run(hidden, source_of(path, hidden), number=0).result
     assert drawn is not None and len(drawn.labels) >= FEWEST_STRETCHES
     done = pipeline.identify_run(SETTINGS, drawn, number=0)
