@@ -173,8 +173,7 @@ def mismatch_page(given: Given, settings: PipelineSettings) -> Any:
     from siq.diagnosis.dictionary import dictionary_of
     from siq.diagnosis.statement import Statement
     from siq.diagnosis.study import MismatchStudy, load_mismatch_study
-    from siq.report.diagnosis_page import Findings, mismatch_answer
-    from siq.report.diagnosis_page import mismatch_page as rendered
+    from siq.report.diagnosis_page import Findings, mismatch_answer, mismatch_page as rendered
 
     file, title = given.path("study"), given.options["title"]
     study = load_mismatch_study(file) if file else MismatchStudy()

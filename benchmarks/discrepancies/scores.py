@@ -16,8 +16,7 @@ from benchmarks.discrepancies.cases import CaseFiles
 from benchmarks.discrepancies.truth import TrueCase, true_case
 from benchmarks.proof.foreign_scores.scores import NEAR, first_states, name_error, true_place, unreal_names
 from benchmarks.proof.keys import CaseKey, read_key, read_truth
-from benchmarks.proof.scoring import NOISE, NOTHING_CONCEALED, judgement, model_of
-from benchmarks.proof.scoring import Answer as ProofAnswer
+from benchmarks.proof.scoring import NOISE, NOTHING_CONCEALED, Answer as ProofAnswer, judgement, model_of
 from siq.diagnosis.study import Comparison
 from siq.errors import NumericalFailure
 from siq.inference.recalibration import recalibrate

@@ -13,8 +13,7 @@ import numpy as np
 import sympy
 
 from benchmarks.proof.keys import CaseKey
-from siq.diagnosis.dictionary import Form, FurtherState, Mechanism, MechanismParameter
-from siq.diagnosis.dictionary import Role as RoleKind
+from siq.diagnosis.dictionary import Form, FurtherState, Mechanism, MechanismParameter, Role as RoleKind
 from siq.diagnosis.mechanisms import MechanismCandidate, _build_candidate
 from siq.diagnosis.study import Comparison
 from siq.errors import NumericalFailure

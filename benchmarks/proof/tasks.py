@@ -125,8 +125,7 @@ def score_batch(given: Given, settings: PipelineSettings) -> Any:
 @task("card", "recordings", "study", "key", "verdict", "system")
 def score_case(given: Given, settings: PipelineSettings) -> Any:
     """The diagnosis of a case that somebody else made."""
-    from benchmarks.proof.scoring import Answer
-    from benchmarks.proof.scoring import score_case as scored
+    from benchmarks.proof.scoring import Answer, score_case as scored
 
     source, verdict, key = given.files, given.verdict, given.files["key"]
     answer = Answer(None, "", failure="there is no verdict")
@@ -223,8 +222,13 @@ def _page(
 
     from benchmarks.proof.targets import target_table
     from siq.numerics.text import number_text
-    from siq.report.page import ReportContent as Content
-    from siq.report.page import ReportFigure, ReportSection, ReportTable, render_report
+    from siq.report.page import (
+        ReportContent as Content,
+        ReportFigure,
+        ReportSection,
+        ReportTable,
+        render_report,
+    )
     from siq.report.plots.style import save_figure
 
     stem, told = Path(given.outputs["figure"]).with_suffix(""), given.options["settings"]

@@ -39,8 +39,13 @@ from siq.quasipotential.certificate_tests import (
     Reference,
     check_existence,
 )
-from siq.quasipotential.characteristics import SHEET_MARGIN, End, Fan, adapted_fan
-from siq.quasipotential.characteristics import relative_error as field_error
+from siq.quasipotential.characteristics import (
+    SHEET_MARGIN,
+    End,
+    Fan,
+    adapted_fan,
+    relative_error as field_error,
+)
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.wells import MIN_EXPLAINED_ERROR, Well
 from siq.remarks import Remark, sentence

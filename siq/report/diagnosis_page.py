@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import sympy
-from markupsafe import Markup
-from markupsafe import escape as markup_escape
+from markupsafe import Markup, escape as markup_escape
 
 from siq.diagnosis.dictionary import Mechanism
 from siq.diagnosis.statement import METRIC, StatedTerm, Statement

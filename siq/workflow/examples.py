@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from siq.data.inspection import Inspection
-from siq.data.inspection import inspect as inspect_recordings
+from siq.data.inspection import Inspection, inspect as inspect_recordings
 from siq.data.preparation import ANGLES, unusual
 from siq.data.recordings import read_recordings
 from siq.errors import DISTRIBUTION, Fault, InputError

@@ -14,8 +14,7 @@ from siq.inference.field_estimate import FieldEstimate
 from siq.inference.library import IdentificationOptions, field_library
 from siq.inference.regression import coarse_pairs, identify_vector_field, lagged_pairs, lost_time, refit
 from siq.quasipotential.landscape import Landscape
-from siq.workflow.pipeline import PipelineSettings
-from siq.workflow.pipeline import identify_run as identify_step
+from siq.workflow.pipeline import PipelineSettings, identify_run as identify_step
 
 OPTIONS = IdentificationOptions(degree=3)
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.signal
-from remembering import STEP as TIME
-from remembering import double_wells
+from remembering import STEP as TIME, double_wells
 
 from siq.data.correlation import markov_lag
 from siq.data.preparation import in_stretches

@@ -38,8 +38,7 @@ from benchmarks.proof.foreign_scores.scores import (
     score_foreign_case,
     unreal_names,
 )
-from benchmarks.proof.keys import CaseKey, read_key, read_truth
-from benchmarks.proof.keys import Truth as KeyTruth
+from benchmarks.proof.keys import CaseKey, Truth as KeyTruth, read_key, read_truth
 from benchmarks.proof.oracle import true_model
 from benchmarks.proof.plots import plot_foreign_proof
 from benchmarks.proof.scoring import Answer, score_table
