@@ -35,6 +35,7 @@ def test_a_type_checker_is_told_the_same_names_from_the_same_modules() -> None:
         for alias in node.names
     }
     assert declared == siq._MODULES  # with `as`, without which a stub does not export
+    assert sorted(siq._MODULES) == sorted(siq.__all__)
 
 
 def test_importing_siq_loads_nothing_heavy() -> None:

@@ -177,9 +177,7 @@ def _is_error(title: str, titles: Sequence[str]) -> bool:
     words = re.findall(r"±|[^\W_]+", spaced.replace("+/-", "±").casefold())
     others = {_plain(other) for other in titles if other != title}
     cuts = [{"".join(words[:cut]), "".join(words[cut:])} for cut in range(1, len(words))]
-    return "".join(words) in ERROR_NAMES or any(
-        cut & (ERROR_NAMES | ERROR_WORDS) and cut & others for cut in cuts
-    )
+    return "".join(words) in ERROR_NAMES or any(cut & ERROR_WORDS and cut & others for cut in cuts)
 
 
 def _plain(title: str) -> str:

@@ -7,6 +7,7 @@ it, by more than appears by chance, or is off by most of what it was off by, it 
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from collections.abc import Callable, Mapping
@@ -28,7 +29,7 @@ from siq.diagnosis.study import Comparison, MismatchStudy, MismatchVerdict, comp
 from siq.diagnosis.unnamed_models import AugmentedModel, fit_unnamed_models
 from siq.diagnosis.verdict import statement_of
 from siq.errors import InputError, NumericalFailure
-from siq.inference.budget import Budget
+from siq.inference.budget import Budget, BudgetSpent
 from siq.inference.kalman_filter import MAX_SUBSTEPS
 from siq.inference.measurements import first_states, without_variation
 from siq.inference.recalibration import most_varying
@@ -296,13 +297,15 @@ def solve_case(
             # as likely; elsewhere a name may come to light behind it.
             fit, least = found.search.recalibrated, 0.0
             if statement.verdict.names and shown.described is not None:
-                least = 2 * (shown.described.fit.log_likelihood - fit.log_likelihood)
-                least -= case.settings.search.same
-            name = most_varying(case.system, case.learn, fit, budget=budget, least=least)
-            varied = case if name is None else case.with_variation((name,))
-            again = None if name is None else _judged(varied, budget)
-            if again is not None and (again[0].verdict.names or not again[0].verdict.mismatch):
-                case, (found, shown, statement) = varied, again
+                gained = 2 * (shown.described.fit.log_likelihood - fit.log_likelihood)
+                least = gained - case.settings.search.same
+            with contextlib.suppress(*NUMERICAL_ERRORS, BudgetSpent):  # the first answer stands
+                name = most_varying(case.system, case.learn, fit, budget=budget, least=least)
+                if name is not None:
+                    varied = case.with_variation((name,))
+                    again = _judged(varied, budget)
+                    if again[0].verdict.names or not again[0].verdict.mismatch:
+                        case, (found, shown, statement) = varied, again
     except InputError:
         raise
     except NUMERICAL_ERRORS as error:

@@ -183,8 +183,8 @@ def _correlated_probability(
     """
     white, _, left = residuals(fit, data)
     weights = np.bincount(white.recording)
-    each = [white.recording == place for place in range(len(weights))]
-    times = [correlation_time_of(left[rows], white.recording[rows], least=0.0) for rows in each]
+    parts = [white.recording == place for place in range(len(weights))]
+    times = [correlation_time_of(left[rows], white.recording[rows], least=0.0) for rows in parts]
     together = float(np.average(times, weights=weights))
     places = [each.frequencies or len(each.at) for each in candidate.searches]
     alone = float(scipy.stats.chi2.sf(max(gained, 0.0) / together, max(len(candidate.new), 1)))

@@ -68,7 +68,7 @@ def places_of(search: Shape, data: Measurements, model: Dynamics, x: np.ndarray)
     if search.samples:
         return factors * np.median(steps)
     if search.frequencies is not None:
-        # To four samples a period.
+        # From two periods in the longest recording to four samples a period.
         return np.linspace(_lowest_frequency(data), np.pi / (2 * np.median(steps)), search.frequencies)
     if search.recorded is not None:
         place = model.output_names.index(search.recorded)
@@ -263,9 +263,8 @@ class MechanismCandidate:
         signs = (value_of[name] >= -2 * errors[name] for name in self.positive & errors.keys())
         searched = zip(self.shapes, self.searches, strict=False)
         periodic = [name for name, each in searched if each.frequencies is not None and name in errors]
-        return all(signs) and all(
-            abs(value_of[name]) + 2 * errors[name] >= _lowest_frequency(data) for name in periodic
-        )
+        slowest = min((abs(value_of[name]) + 2 * errors[name] for name in periodic), default=np.inf)
+        return all(signs) and bool(slowest >= _lowest_frequency(data))
 
     def idle(self, fit: Fit, of: Callable[[Iterable[bool]], bool] = any) -> bool:
         """Whether any amplitude of a fit, or all, is zero within errors: a special case of itself, then."""

@@ -32,7 +32,7 @@ import scipy.stats
 
 from siq.data.correlation import resolution_step
 from siq.errors import NumericalFailure
-from siq.inference.budget import COMPILATION, Budget, BudgetSpent, evaluation
+from siq.inference.budget import COMPILATION, Budget, evaluation
 from siq.inference.kalman_filter import Grid, Noise, profile_likelihood, whiten
 from siq.inference.maximum_likelihood import Fit, first_noise, fit_by_multiple_shooting
 from siq.inference.measurements import Measurements, first_states, with_expectations, with_variation
@@ -140,25 +140,22 @@ def most_varying(
 
     Linearly about the recalibrated fit it promises most. Fitted, it has to gain more than deviations that are
     not there do on average, and at `least` so much in twice the log-likelihood. Of fewer than
-    `FEWEST_VARYING` recordings no spread of a parameter can be known.
+    `FEWEST_VARYING` recordings no spread of a parameter can be known. The errors of that fit are raised.
     """
-    count, free = len(data.labels), recalibrated.model.free
+    count, known = len(data.labels), recalibrated.model.parameters
     names = {each.name for each in model.parameters if each.value and not each.fixed}
+    if not names or count < FEWEST_VARYING:
+        return None
     white, left = whiten(recalibrated.linearisation, data, recalibrated.noise), {}
     owner = white.recording[:, None] == np.arange(count)
-    for place, name in enumerate(recalibrated.model.parameters[at].name for at in free):
-        if name in names and count >= FEWEST_VARYING:
+    for place, at in enumerate(recalibrated.model.free):
+        if (name := known[at].name) in names:
             own = np.column_stack([np.delete(white.columns, place, 1), white.columns[:, [place]] * owner])
             change = np.linalg.lstsq(own, white.innovations, rcond=None)[0]
             left[name] = float(((white.innovations - own @ change) ** 2).sum())
-    if not left:
-        return None
     found = min(left, key=left.__getitem__)
     varied, varying, _ = with_variation(model, (found,), data, data)
-    try:
-        fit, _ = recalibrate(with_expectations(varied), varying, budget=budget)
-    except (ArithmeticError, ValueError, BudgetSpent):
-        return None
+    fit, _ = recalibrate(with_expectations(varied), varying, budget=budget)
     gain = 2 * (fit.log_likelihood - recalibrated.log_likelihood)
     LOGGER.info("%s differs from recording to recording: chi2 better by %.1f", found, gain)
     return found if gain > max(count, least) else None

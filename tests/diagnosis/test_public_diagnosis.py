@@ -165,7 +165,9 @@ def test_parameters_that_differ_from_recording_to_recording_are_no_missing_physi
     assert "differs from recording to recording" in diagnosis.report()
 
 
-def test_a_parameter_that_differs_from_recording_to_recording_is_found() -> None:
+def test_a_parameter_that_differs_from_recording_to_recording_is_found(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     t = np.arange(0, 4, 0.4)
     table = pd.concat(
         pd.DataFrame({"recording": f"r{k}", "t": t, "n": 0.2 * np.exp(rate * t)})
@@ -177,6 +179,13 @@ def test_a_parameter_that_differs_from_recording_to_recording_is_found() -> None
     assert diagnosis.verdict == "parameter shift" and not diagnosis.mechanisms
     assert "each with its own r" in diagnosis.statement.sentence
     assert "diagnosis.varies" in [each.code for each in diagnosis.statement.remarks]
+
+    def fails(*_: object, **__: object) -> str:
+        raise siq.NumericalFailure("the second look has no result")
+
+    monkeypatch.setattr(module, "most_varying", fails)
+    first = siq.diagnose(GROWTH, table, settings=siq.MismatchStudy(without=tuple(without)))
+    assert first.verdict.mismatch  # the answer of the first look stands
     few = _measurements_of(table[table["recording"] < "r4"], GROWTH)
     fit, _ = recalibrate(with_expectations(GROWTH), few, budget=Budget())
     assert most_varying(GROWTH, few, fit, budget=Budget()) is None  # whose spread could not be known
