@@ -405,7 +405,7 @@ class Dynamics:
         Parameters
         ----------
         symbols
-            The d states, real symbols.
+            The d states. Symbols of any assumptions stand for the real ones of their names.
         equations
             The components of f.
         diffusion
@@ -413,17 +413,30 @@ class Dynamics:
         domain
             Two limits a state, where they are given.
         parameters
-            Real symbols of f that may take other values, with the values that they have.
+            Symbols of f that may take other values, with the values that they have.
         periodic
             Names of states whose domain is one period.
+
+        Raises
+        ------
+        ValueError
+            When a symbol of f is no state and no parameter, and as `Dynamics` itself.
         """
+        # SymPy tells x from a positive or complex x, by which all derivatives would be zero.
+        real = {each: symbol(each.name) for each in (*symbols, *(parameters or ()))}
         if diffusion is None:
             diffusion = Diffusion.identity(len(symbols))
         elif isinstance(diffusion, np.ndarray):
             diffusion = Diffusion(np.asarray(diffusion, dtype=float))
         elif not isinstance(diffusion, Diffusion):
-            diffusion = Diffusion.of_formulas(symbols, diffusion)
-        names, formulas = tuple(each.name for each in symbols), tuple(map(sympy.sympify, equations))
+            rows = [[sympy.sympify(entry).xreplace(real) for entry in row] for row in diffusion]
+            diffusion = Diffusion.of_formulas([real[each] for each in symbols], rows)
+        names = tuple(each.name for each in symbols)
+        formulas = tuple(sympy.sympify(each).xreplace(real) for each in equations)
+        for each in sorted(
+            set().union(*(f.free_symbols for f in formulas)) - {*real.values(), TIME}, key=str
+        ):
+            raise Fault(f"'{each}' is no state and no parameter", "give its value among the parameters")
         box = None if domain is None else np.asarray(domain, dtype=float)
         named = tuple(Parameter(each.name, float(value)) for each, value in (parameters or {}).items())
         return cls(names, formulas, diffusion, domain=box, parameters=named, periodic=tuple(periodic))

@@ -64,3 +64,18 @@ def test_what_does_not_fit_the_states_is_refused(change: dict[str, object], faul
 def test_a_domain_that_nobody_said_is_asked_for() -> None:
     with pytest.raises(ValueError, match="no domain of x, y is known"):
         _ = fitted().box
+
+
+def test_symbols_without_assumptions_are_the_states_all_the_same() -> None:
+    known = Dynamics.of((x, y), (a * x - x**3 + y, -y), diffusion=[[1 + x**2, 0], [0, 1]], parameters={a: 2})
+    u, v, c = sympy.symbols("x", positive=True), sympy.Symbol("y"), sympy.Symbol("a")
+    given = Dynamics.of((u, v), (c * u - u**3 + v, -v), diffusion=[[1 + u**2, 0], [0, 1]], parameters={c: 2})
+    states = np.array([[0.5, 1.0], [-1.0, 0.3]])
+    assert np.array_equal(given.jacobian(states), known.jacobian(states))
+    assert given.equations == known.equations
+    assert np.array_equal(given.diffusion.at(states), known.diffusion.at(states))
+
+
+def test_a_symbol_without_a_value_is_named() -> None:
+    with pytest.raises(ValueError, match="'b' is no state and no parameter"):
+        Dynamics.of((x,), (b * x - x**3,))

@@ -8,15 +8,15 @@ import sympy
 
 from siq.errors import InputError
 from siq.systems.cards import load_system
+from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics, Input, Parameter, Signals
 from siq.systems.formulas import delay
 from siq.systems.simulation import with_simulator
 
 x, v, u, k = sympy.symbols("x v u k", real=True)
 EQUATIONS = (v, -k * sympy.sin(x) - x * v + u)
-WRITTEN = Dynamics.of((x, v), EQUATIONS)
 WRITTEN = Dynamics(
-    ("x", "v"), EQUATIONS, WRITTEN.diffusion,
+    ("x", "v"), EQUATIONS, Diffusion.identity(2),
     inputs=(Input("u", "1", "linear"),), parameters=(Parameter("k", 2.0),),
 )  # fmt: skip
 POINTS = np.random.default_rng(0).normal(size=(2, 30))
@@ -98,8 +98,9 @@ def test_a_stiff_simulator_has_no_rate_above_eleven_sixths_of_a_step() -> None:
     def implicit(states, inputs, parameters, dt):
         return (states + dt * parameters[0] * inputs[0]) / (1 + dt * parameters[0])
 
-    card = Dynamics.of((x,), (k * (u - x),), parameters={k: 1e9})
-    card = Dynamics(("x",), card.equations, card.diffusion, inputs=WRITTEN.inputs, parameters=card.parameters)
+    relaxing = (k * (u - x),)
+    fast = (Parameter("k", 1e9),)
+    card = Dynamics(("x",), relaxing, Diffusion.identity(1), inputs=WRITTEN.inputs, parameters=fast)
     at = POINTS[:1]
     found = with_simulator(card, implicit, step=0.01, x=at, inputs=FORCE)
     rates = found.functions.rates(at, SIGNALS, found.values)
