@@ -155,7 +155,7 @@ class _HamiltonianProblem(HamiltonianFlow):
         """The solution with a condition at its end; raises NumericalFailure where none is found.
 
         As H is conserved, a condition at the saddle is one too many. A further unknown k makes up for it,
-        ``ż = F + k ∇H``, along which H would grow: it comes out as zero.
+        ``ż = F + k ∇H``, along which H would grow: of a solution it comes out as zero.
         """
         d, (matrix, right), (times, states) = self.dimension, last, guess
         further = len(matrix) - d
@@ -429,6 +429,8 @@ def _finished(problem: _HamiltonianProblem, solution: PPoly, tolerance: float) -
     values = np.r_[0.0, values[np.searchsorted(places, times)], values[-1]]
     z = fine(times).T
     residual = problem.residual(z[:, :d], z[:, d:])
+    if residual > SWITCHED:  # k is not zero: no solution comes to the saddle from this side
+        raise NumericalFailure("H is not zero along what solves the conditions at the saddle")
     z, times = np.vstack([np.zeros(2 * d), z]), np.r_[-np.inf, times]
     if problem.unstable is not None:
         z, times = np.vstack([z, np.r_[problem.end, np.zeros(d)]]), np.append(times, np.inf)

@@ -492,7 +492,10 @@ class _Across:
         slope = np.zeros_like(y)
         slope[1:] += by_middle / 2 + twice
         slope[:-1] += by_middle / 2 - twice
-        longer, share = -2 * forward / times[:, 0], (0.25 / (parts.speed * parts.length))[:, None, None]
+        longer, product = -2 * forward / times[:, 0], parts.speed * parts.length
+        share = np.divide(0.25, product, where=product > 1 / np.finfo(float).max, out=0 * product)[
+            :, None, None
+        ]
         pushed = metric @ turned
         # Second derivatives of the segments by middles, by differences and middles, and by differences.
         frozen = (times * turned.transpose(0, 2, 1) @ pushed, -pushed, metric / times)

@@ -42,14 +42,20 @@ class _KnownBarrier:
     how: str  #: how it is known
 
 
-def _computed(*states: tuple[float, float], value: float) -> _KnownBarrier:
+def _computed(*states: tuple[float, ...], value: float) -> _KnownBarrier:
     start, saddle, end = map(np.array, states)
-    return _KnownBarrier(start, saddle, end, value, 1e-9, float("nan"), TWO_METHODS)
+    return _KnownBarrier(start, saddle, end, value, 1e-9 * max(value, 1.0), float("nan"), TWO_METHODS)
 
 
 _LOW, _PASS, _HIGH = (1.40491203, 2.80807973), (4.20080731, 4.00388242), (4.90395384, 4.06187119)
 _ON, _OFF, _EVEN = (2.61803399, 0.38196601), (0.38196601, 2.61803399), (1.21341166, 1.21341166)
 _NORTH, _SOUTH = (0.0, 1.73205081), (0.0, -1.73205081)
+_BOTH, _BETWEEN, _ONE = (1.0, 1.0), (1.5115751550, 0.4884248450), (1.9960783970, 0.0039216030)
+_SILENT = (0.0402067142, 1.6082685693, 0.0002586528)
+_ACTIVE, _LEVER = (
+    (29.3768600806, 1175.0744032239, 138.0799853112),
+    (10.5829332052, 423.3173282068, 17.9197560360),
+)
 _UP, _DOWN = (0.81649658, 0.27216553), (-0.81649658, -0.27216553)
 DOUBLY_COMPUTED: Mapping[str, tuple[_KnownBarrier, ...]] = {
     "maier-stein-5": (_computed((-1.0, 0.0), (0.0, 0.0), (1.0, 0.0), value=0.4830697094),),
@@ -69,6 +75,14 @@ DOUBLY_COMPUTED: Mapping[str, tuple[_KnownBarrier, ...]] = {
     "toggle": (
         _computed(_ON, _EVEN, _OFF, value=0.1767588206),
         _computed(_OFF, _EVEN, _ON, value=0.1767588206),
+    ),
+    "two-genes": (
+        _computed(_BOTH, _BETWEEN, _ONE, value=0.0883607511),
+        _computed(_ONE, _BETWEEN, _BOTH, value=0.1123642170),
+    ),
+    "self-activation": (
+        _computed(_SILENT, _LEVER, _ACTIVE, value=325.52993),
+        _computed(_ACTIVE, _LEVER, _SILENT, value=4164.54132),
     ),
     "van-der-pol": (
         _computed((-1.0, 0.0), (0.0, 0.0), (1.0, 0.0), value=0.2139804892),
@@ -127,6 +141,11 @@ def reference_systems() -> dict[str, _ReferenceSystem]:
     units = sympy.symbols("x:10", real=True)
     wells = sum(((s**2 - 1) ** 2 / 4 for s in units), nothing)
     wells += sum((half * (a - b) ** 2 for a, b in itertools.pairwise(units)), nothing)
+    bound = Y**2 / 5000 - 2 * Z
+
+    def expressed(own: sympy.Expr, other: sympy.Expr) -> sympy.Expr:
+        return 16 * own**4 / (1 + 16 * own**4) + 1 / (1 + 16 * other**4) - own
+
     falls = [0, *(wells.diff(s) for s in units), 0]
     maier_and_stein = "Maier and Stein, Phys. Rev. Lett. 71, 1783 (1993)"
 
@@ -232,6 +251,22 @@ def reference_systems() -> dict[str, _ReferenceSystem]:
             "FitzHugh and Nagumo's system where it is bistable, with D = 1.",
             "FitzHugh, Biophysical Journal 1, 445 (1961)",
             Dynamics.of((X, Y), (X - X**3 - Y, X - 3 * Y), domain=[(-1.5, 1.5), (-0.8, 0.8)]),
+        ),
+        _computed_twice(
+            "two-genes",
+            "Two genes that activate themselves and suppress each other, with D = 1: three attractors.",
+            "Wang, Zhang, Xu and Wang, PNAS 108, 8257 (2011); an example of EPR-Net",
+            Dynamics.of((X, Y), tuple(map(expressed, (X, Y), (Y, X))), domain=[(0, 3)] * 2),
+        ),
+        _computed_twice(
+            "self-activation",
+            "A gene that its own dimers activate: messengers, proteins and dimers, with D = 1.",
+            "Roma et al., Physical Review E 71, 011902 (2005); an example of ordered line integrals in 3-D",
+            Dynamics.of(
+                (X, Y, Z),
+                ((20 + 400 * Z) / (50 + Z) - 10 * X, 40 * X - Y - 2 * bound, bound),
+                domain=[(0, 40), (0, 1500), (0, 200)],
+            ),
         ),
         _exact(
             "chain",

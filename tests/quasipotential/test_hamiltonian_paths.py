@@ -8,6 +8,7 @@ import sympy
 from scipy.integrate import quad, solve_ivp
 from scipy.optimize import fsolve, least_squares
 
+import siq
 from siq.errors import NumericalFailure
 from siq.quasipotential.hamiltonian_paths import hamiltonian_paths
 from siq.quasipotential.paths import descent, minimum_action_path, transition_path
@@ -189,3 +190,12 @@ def test_the_prefactor_is_that_of_kramers(friction: float) -> None:
     here, there = (np.sqrt(abs(stiffness(place[0]))) for place in (start, saddle))
     across = np.sqrt(friction**2 / 4 + there**2) - friction / 2
     assert rate.prefactor == pytest.approx(2 * np.pi / across * there / here, rel=1e-3)
+
+
+def test_a_curve_along_which_h_would_grow_is_no_path() -> None:
+    """As where states come to the saddle about as fast across the path: this one had an action of 0.0885."""
+    system = siq.reference_systems()["two-genes"]
+    known = system.barriers[0]
+    straight = np.linspace(known.start, known.saddle, 100)
+    found = hamiltonian_paths(system.dynamics, known.start, known.saddle, curves=[straight], tolerance=1e-3)
+    assert [one.action for one in found if one.smooth] == pytest.approx([known.value], rel=1e-5)
