@@ -447,6 +447,21 @@ class FieldEstimate:
         forgotten = means @ self.library.derivatives[:, components, terms] * 2 * self.flow.response_share / d
         return float(np.sqrt(2 / (len(h) * d) + forgotten @ self.covariance @ forgotten))
 
+    def with_rival(self, other: FieldEstimate, probability: float) -> FieldEstimate:
+        """With what another estimate, of some probability, leaves open in f and in ε.
+
+        Both have the same library. ε is compared by the determinants of both noises, whatever D stands for.
+        """
+        bias, spread = self.alternatives or (0 * self.coefficients, np.zeros((0, *self.coefficients.shape)))
+        change = np.sqrt(probability) * (other.coefficients - self.coefficients)
+        found = replace(self, alternatives=(bias, np.concatenate([spread, change[None]])))
+        strengths = [np.linalg.slogdet(one.noise_rate)[1] for one in (self, other)]
+        noise, share = self.diagnosis, probability * (np.diff(strengths)[0] / self.library.dimension) ** 2
+        if noise is None or noise.intensity_error is None or not np.isfinite(share):
+            return found
+        error = float(np.hypot(noise.intensity_error, noise.intensity * np.sqrt(share)))
+        return replace(found, diagnosis=replace(noise, intensity_error=error))
+
     def bias(self, slopes: np.ndarray) -> np.ndarray:
         """By how much alternative terms move what follows from f, by its derivatives ``(..., q, d)``."""
         if self.alternatives is None:

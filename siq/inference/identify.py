@@ -226,7 +226,9 @@ class _Case:
         """By likelihood, where the sensors are noisy; None where they are not.
 
         What could be sensor noise is asked of the likelihood from one standard error on: it would bias f long
-        before it is significant.
+        before it is significant. It is the answer where it is likelier than none, the share of each sensor in
+        the variance of n residuals being uniform from 0 to ½ beforehand, and known to ``1/√n`` (Laplace). The
+        other answer counts in the errors, as likely as it is.
         """
         pairs = self._pairs(self.recordings)
         correlation, score = neighbour_correlations(found, pairs)
@@ -245,7 +247,12 @@ class _Case:
             try:
                 again = self.by_likelihood(ObservationModel(self.library, found.diffusion), noise)
                 assert again.diagnosis is not None and again.diagnosis.sensor_evidence is not None
-                return self.finished(again) if again.diagnosis.sensor_evidence > 1 else None
+                sensors, count = int((score < SUSPECT_SCORE).sum()), len(pairs.h)
+                odds = again.diagnosis.sensor_evidence + sensors * np.log(8 * np.pi / count)
+                noisy = float(scipy.special.expit(odds / 2))
+                if noisy > 0.5:
+                    return self.finished(again).with_rival(found, 1 - noisy)
+                return self._finished_by_pairs(found).with_rival(again, noisy)
             except (NumericalFailure, np.linalg.LinAlgError) as error:
                 fault = fault or str(error)
         chance = scipy.special.ndtr(score) * len(score)

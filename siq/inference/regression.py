@@ -59,6 +59,7 @@ WEIGHT_ROUNDS = 2  # of D by the residuals of f, and f by the weights of D: each
 CHUNK, WEIGHTED_CHUNK = 4096, 20_000  # pairs worked on together
 MIN_INSTRUMENT_CORRELATION = 0.1  # of a function that its instrument tells less well nothing is known
 FORGOTTEN = 1e-3  # chance with which samples that know nothing of each other still pass for a motion
+LOCAL = 1e-3  # of what noise moves a state by within a step: there f is a straight line
 FLOW_SAMPLE = 500  # pairs by which the accuracy of the flow is judged
 
 
@@ -195,8 +196,9 @@ class _PairRegression:
     ) -> FlowMap:  # fmt: skip
         """The map over a step that is accurate enough, see `FlowMap.of`, for white noise of a rate.
 
-        It is coarse where the first order in h shifts the means of pairs by so much that a coefficient could
-        be off by more than is harmless: by ``√(Σ b² / variance)`` standard errors at most, of shifts b.
+        It is coarse where means or covariances of pairs are off by so much to the first order in h that a
+        coefficient of f or D could be off by more than is harmless: by ``√(Σ b² / variance)`` standard errors
+        at most, of shifts b of the mean, and ``√(Σ ½ tr (S⁻¹ΔS)²)`` of covariances S.
         """
         matrix, (x0, h) = self.matrix(values), self._sample
         found = FlowMap.of(
@@ -207,6 +209,17 @@ class _PairRegression:
         coarse = replace(found, coarse=True)
         first, second = (self._shift(matrix, one, x0, h, rate) for one in (found, coarse))
         squares = np.einsum("in,ij,jn->n", first - second, np.linalg.inv(rate), first - second) * h
+        spread, d = coarse.moments(lambda x: matrix @ self._terms(x), x0, h, rate)[1], len(rate)
+        away = LOCAL * np.sqrt(np.diag(rate)[:, None] * h)  # of states, to differentiate f
+        ways = [np.eye(d)[:, [k]] * away for k in range(d)]
+        ends = [[matrix @ self._terms(x0 + sign * way) for sign in (1, -1)] for way in ways]
+        step = np.stack([(one - two) / away[k] for k, (one, two) in enumerate(ends)]).transpose(2, 1, 0)
+        step = step * h[:, None, None] / 4  # a half, of differences over twice the way
+        kept = np.eye(d) + step + step @ step / 2
+        first_order = kept @ rate @ kept.transpose(0, 2, 1) * h[:, None, None]
+        with np.errstate(invalid="ignore"):
+            off = np.linalg.solve(np.where(np.isfinite(spread), spread, np.eye(d)), first_order) - np.eye(d)
+        squares += np.einsum("nij,nji->n", off, off) / 2
         usual = squares[np.isfinite(squares)]
         far = len(self.pairs) / max(len(usual), 1) * float(usual.sum()) > HARMLESS_BIAS**2
         return coarse if far else found

@@ -236,7 +236,8 @@ def test_a_held_input_that_lags_pushes_as_much_as_it_should() -> None:
 def test_jumps_are_found_in_formulas_and_not_in_their_spelling(formula: str, arguments: list[str]) -> None:
     x, v = sympy.symbols("x v", real=True)
     names = {"design": sympy.Symbol("design", real=True), "sigma": sympy.Symbol("sigma", positive=True)}
-    moving = Dynamics.of((x, v), (v, sympy.sympify(formula, {"x": x, "v": v, **names})))
+    force = sympy.sympify(formula, {"x": x, "v": v, **names})
+    moving = Dynamics.of((x, v), (v, force), parameters=dict.fromkeys(names.values(), 1.0))
     assert [str(each) for each in jumps_of(moving)] == arguments
 
 
