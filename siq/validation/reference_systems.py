@@ -13,8 +13,9 @@ U/2.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ import pandas as pd
 import scipy.optimize
 import scipy.stats.qmc
 import sympy
+import yaml
 
 from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import compile_formulas
@@ -40,56 +42,6 @@ class _KnownBarrier:
     error: float  #: by how much it may be wrong
     prefactor: float  #: of the law E[τ] = prefactor · exp(ΔU/ε) for small ε; NaN where it is not known
     how: str  #: how it is known
-
-
-def _computed(*states: tuple[float, ...], value: float) -> _KnownBarrier:
-    start, saddle, end = map(np.array, states)
-    return _KnownBarrier(start, saddle, end, value, 1e-9 * max(value, 1.0), float("nan"), TWO_METHODS)
-
-
-_LOW, _PASS, _HIGH = (1.40491203, 2.80807973), (4.20080731, 4.00388242), (4.90395384, 4.06187119)
-_ON, _OFF, _EVEN = (2.61803399, 0.38196601), (0.38196601, 2.61803399), (1.21341166, 1.21341166)
-_NORTH, _SOUTH = (0.0, 1.73205081), (0.0, -1.73205081)
-_BOTH, _BETWEEN, _ONE = (1.0, 1.0), (1.5115751550, 0.4884248450), (1.9960783970, 0.0039216030)
-_SILENT = (0.0402067142, 1.6082685693, 0.0002586528)
-_ACTIVE, _LEVER = (
-    (29.3768600806, 1175.0744032239, 138.0799853112),
-    (10.5829332052, 423.3173282068, 17.9197560360),
-)
-_UP, _DOWN = (0.81649658, 0.27216553), (-0.81649658, -0.27216553)
-DOUBLY_COMPUTED: Mapping[str, tuple[_KnownBarrier, ...]] = {
-    "maier-stein-5": (_computed((-1.0, 0.0), (0.0, 0.0), (1.0, 0.0), value=0.4830697094),),
-    "maier-stein-10": (_computed((-1.0, 0.0), (0.0, 0.0), (1.0, 0.0), value=0.3400414034),),
-    "consumer-resource": (
-        _computed(_LOW, _PASS, _HIGH, value=0.0122596486),
-        _computed(_HIGH, _PASS, _LOW, value=0.0018932179),
-    ),
-    "fitzhugh-nagumo": (
-        _computed(_UP, (0.0, 0.0), _DOWN, value=0.1788869290),
-        _computed(_DOWN, (0.0, 0.0), _UP, value=0.1788869290),
-    ),
-    "two-competitors": (
-        _computed(_NORTH, (1.5, 0.0), _SOUTH, value=1.4272291280),
-        _computed(_SOUTH, (-1.5, 0.0), _NORTH, value=1.4272291280),
-    ),
-    "toggle": (
-        _computed(_ON, _EVEN, _OFF, value=0.1767588206),
-        _computed(_OFF, _EVEN, _ON, value=0.1767588206),
-    ),
-    "two-genes": (
-        _computed(_BOTH, _BETWEEN, _ONE, value=0.0883607511),
-        _computed(_ONE, _BETWEEN, _BOTH, value=0.1123642170),
-    ),
-    "self-activation": (
-        _computed(_SILENT, _LEVER, _ACTIVE, value=325.52993),
-        _computed(_ACTIVE, _LEVER, _SILENT, value=4164.54132),
-    ),
-    "van-der-pol": (
-        _computed((-1.0, 0.0), (0.0, 0.0), (1.0, 0.0), value=0.2139804892),
-        _computed((1.0, 0.0), (0.0, 0.0), (-1.0, 0.0), value=0.2139804892),
-    ),
-}
-"""By name of the system. Saddles and attractors are given to 1e-8."""
 
 
 X, Y, Z, V = sympy.symbols("x y z v", real=True)
@@ -353,7 +305,13 @@ def _exact(
 
 def _computed_twice(name: str, about: str, source: str, dynamics: Dynamics) -> _ReferenceSystem:
     """A system without a known formula of U, of which two methods give the barriers."""
-    return _ReferenceSystem(name, about, source, dynamics, None, DOUBLY_COMPUTED[name])
+    known = yaml.safe_load(Path(__file__).with_name("reference_barriers.yaml").read_text(encoding="utf-8"))
+    barriers = []
+    for each in known[name]:
+        start, saddle, end = (np.array(each[place], dtype=float) for place in ("start", "saddle", "end"))
+        value, error = each["value"], 1e-9 * max(each["value"], 1.0)
+        barriers.append(_KnownBarrier(start, saddle, end, value, error, np.nan, TWO_METHODS))
+    return _ReferenceSystem(name, about, source, dynamics, None, tuple(barriers))
 
 
 def _point_and_cycle() -> _ReferenceSystem:
