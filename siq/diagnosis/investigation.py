@@ -314,12 +314,13 @@ def held_out_runs(investigation: Investigation, data: Measurements) -> HeldOutRu
 def _one_set_of_parameters(investigation: Investigation, data: Measurements) -> bool:
     """Whether all recordings together leave nothing but noise with other parameters."""
     both = (context := investigation.context).data.followed_by(data)
-    try:
-        fit, still = recalibrate(context.model, both, budget=context.budget)
-        left = Remainder.of(both, fit, fit, context.roles)
-    except NumericalFailure:
-        return False
-    rounded = explained_by_quantisation(both, still, context.roles, budget=context.budget)
+    with context.budget.exempt():
+        try:
+            fit, still = recalibrate(context.model, both, budget=context.budget)
+            left = Remainder.of(both, fit, fit, context.roles)
+        except NumericalFailure:
+            return False
+        rounded = explained_by_quantisation(both, still, context.roles, budget=context.budget)
     return not (fit.has_process_noise or left.structured) or rounded is not None
 
 

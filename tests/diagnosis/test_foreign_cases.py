@@ -12,7 +12,7 @@ import pytest
 
 from siq.diagnosis import forecasts, screening
 from siq.diagnosis.diagnosis import Diagnosis, solve_case, tables_of
-from siq.diagnosis.study import Allowance
+from siq.diagnosis.study import Allowance, read_case
 from siq.errors import NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent
 from siq.systems.cards import load_system
@@ -161,3 +161,36 @@ def test_a_candidate_that_overflows_ends_itself_and_not_the_case(
     found = answered(falling_ball(0.3), tmp_path)
     assert {each.reason for each in found.statement.not_fitted} == {"it runs away"}
     assert not found.statement.partial and np.isfinite(found.statement.errors.recalibrated or 0.0)
+
+
+def test_a_spent_budget_leaves_what_a_shift_is_judged_by(tmp_path: Path) -> None:
+    """The census of the United States and the logistic equation: a prediction that a refit ruins."""
+    count = (
+        3.93,
+        5.31,
+        7.24,
+        9.64,
+        12.9,
+        17.1,
+        23.2,
+        31.4,
+        39.8,
+        50.2,
+        62.9,
+        76.0,
+        92.0,
+        105.7,
+        122.8,
+        131.7,
+    )
+    rows = [f"a,{1790 + 10 * place},{value}" for place, value in enumerate((*count, 151.3, 179.3, 203.2))]
+    (tmp_path / "census.csv").write_text("\n".join(["recording,t,n", *rows]), encoding="utf-8")
+    (tmp_path / "card.yaml").write_text(
+        "name: census\ntime_unit: year\nstates: {N: {unit: '1'}}\noutputs: {n: N}\n"
+        "parameters: {r: {value: 0.03, unit: 1/year}, K: {value: 200, unit: '1'}}\n"
+        "equations: {N: r*N*(1 - N/K)}\n",
+        encoding="utf-8",
+    )
+    read = read_case(tmp_path / "card.yaml", tmp_path / "census.csv", None)
+    settings = read.settings.model_copy(update={"budget": Allowance(evaluations=1000)})
+    assert solve_case(replace(read, settings=settings)).statement.partial
