@@ -183,7 +183,9 @@ def test_a_spent_budget_leaves_what_a_shift_is_judged_by(tmp_path: Path) -> None
         122.8,
         131.7,
     )
-    rows = [f"a,{1790 + 10 * place},{value}" for place, value in enumerate((*count, 151.3, 179.3, 203.2))]
+    rows = [
+        f"a,{1790 + 10 * place},{value}" for place, value in enumerate((*people, 131.7, 151.3, 179.3, 203.2))
+    ]
     (tmp_path / "census.csv").write_text("\n".join(["recording,t,n", *rows]), encoding="utf-8")
     (tmp_path / "card.yaml").write_text(
         "name: census\ntime_unit: year\nstates: {N: {unit: '1'}}\noutputs: {n: N}\n"
