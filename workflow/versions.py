@@ -15,6 +15,7 @@ import ast
 import hashlib
 import inspect
 import json
+import re
 from functools import cache
 from pathlib import Path
 
@@ -147,7 +148,11 @@ def _code(text: str) -> str:
 @cache
 def _named_code(file: Path) -> str:
     place = file.relative_to(BASE if file.is_relative_to(BASE) else LIBRARY).as_posix()
-    return f"{place} {hashlib.sha256(_code(file.read_text(encoding='utf-8')).encode()).hexdigest()}"
+    text = file.read_text(encoding="utf-8")
+    # What stands in a file beside the code counts as the code that reads it.
+    read = (file.with_name(name) for name in re.findall(r'with_name\("([^"]+)"\)', text))
+    parts = [_code(text), *(one.read_text(encoding="utf-8") for one in read if one.is_file())]
+    return f"{place} {hashlib.sha256(''.join(parts).encode()).hexdigest()}"
 
 
 @cache

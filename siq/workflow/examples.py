@@ -88,37 +88,17 @@ def _commented_study(found: Inspection, path: Path, study: Path) -> str:
         if len(units) > 1
         else ""
     )
-    return f"""\
-# A study: what siq is to answer, from which recordings. Run it by: siq run {_own_path(study)}
-# Relative paths start from the folder of this file. What is left out takes its default.
-#
-{looked_at}
-name: {_scalar(name_for(path))}                # names the folder of the results
-title: {_scalar("Landscape of " + name_for(path))}      # what the page is headed
+    return _text("commented").format(
+        study=_own_path(study), looked_at=looked_at, name=_scalar(name_for(path)),
+        title=_scalar("Landscape of " + name_for(path)), unit=unit, step=step, needed=needed,
+        file=_scalar(_own_path(path, start=study.resolve().parent)), states=", ".join(states),
+        diffusion=diffusion, distribution=DISTRIBUTION,
+    )  # fmt: skip
 
-recordings:
-  file: {_scalar(_own_path(path, start=study.resolve().parent))}
-  # The columns to use, in this order; by default all of them.
-  # states: [{", ".join(states)}]
-  # Samples further apart than this ({unit}) are no neighbours; by default 1.5 usual steps.
-  # pair_step: {step}
-  # How noise acts on the states: D, one number for each state, or a matrix. By default it is estimated from
-  # the noise in the recordings, or taken as one for each state where they show none.{needed}
-  # diffusion: [{diffusion}]
 
-# More runs, each on recordings drawn anew from yours, show how far the answer depends on the sample.
-# runs: 5
-# seed: 0
-
-# Formulas of a higher degree than what is tried by default, where the page says that none is certified.
-# refinement: {{formula_degree: 6}}
-
-# Only the formula, no wells, barriers and paths:
-# landscape: false
-
-# The published method with two networks, beside ours; needs pip install '{DISTRIBUTION}[networks]'.
-# training: {{}}
-"""
+def _text(name: str) -> str:
+    """One of the studies that are written, as it stands in the folder beside this module."""
+    return next(Path(__file__).with_name("studies").glob(f"{name}.*")).read_text(encoding="utf-8")
 
 
 def _scalar(text: str) -> str:
@@ -128,35 +108,6 @@ def _scalar(text: str) -> str:
     return text if plain and text.lower() not in words else json.dumps(text, ensure_ascii=False)
 
 
-DOUBLE_WELL = """\
-# A bead hops between two optical traps at -0.5 um and 0.5 um, and the camera adds an error of 0.01 um to each
-# value. The recordings were simulated, so that the answer is known: dx = (8 x - 32 x**3) dt + noise of
-# strength 0.3 um**2/s, and a barrier of 1 um**2/s in U, which is 3.3 times the noise.
-name: double-well
-title: A bead in two optical traps
-recordings:
-  file: double-well.csv
-"""
-
-SPRING = """\
-# A mass on a spring, as a simulation has it. The recordings beside it are of a spring that hardens, and its
-# stiffness is a little different, too.
-name: spring
-title: A mass on a spring
-time_unit: s
-states:
-  x: {unit: mm, domain: [-2, 2]}
-  v: {unit: mm/s, domain: [-2, 2]}
-parameters:
-  stiffness: {value: 1.05, unit: 1/s**2}
-  damping: {value: 0.2, unit: 1/s}
-equations:
-  x: v
-  v: -stiffness*x - damping*v
-outputs: {x: x, v: v}
-"""
-
-
 def write_example(name: str, folder: Path, *, replace: bool = False) -> tuple[list[Path], str]:
     """Write the example ``double-well`` or ``mismatch`` into a folder: its files, and what to try with them.
 
@@ -164,11 +115,11 @@ def write_example(name: str, folder: Path, *, replace: bool = False) -> tuple[li
     """
     if name == "double-well":
         study = folder / "double-well.yaml"
-        files = {folder / "double-well.csv": double_well_recordings(), study: DOUBLE_WELL}
+        files = {folder / "double-well.csv": double_well_recordings(), study: _text("double-well")}
         command = f"siq run {study}"
     else:
         case = folder / "spring"
-        files = {case / "recordings.csv": _spring_recordings(), case / "system.yaml": SPRING}
+        files = {case / "recordings.csv": _spring_recordings(), case / "system.yaml": _text("spring")}
         command = f"siq diagnose {case}"
     _write(files, replace=replace, remedy="name another --folder, or give --force")
     return list(files), command

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import pandas as pd
+import yaml
 
 if TYPE_CHECKING:
     from siq.quasipotential.formulas import SymbolicDecomposition
@@ -116,67 +117,18 @@ def why_no_landscape(outcomes: Iterable[Outcome]) -> str:
     return "the recorded states lead to no stable state"
 
 
-_TYPES = {  # of a column, wherever it stands; of all others float64
-    "int64": (
-        "run trajectory well degree terms visits held_out_visits points branch unstable curve escapes runs"
-    ),
-    "str": (
-        "method component term test reason item kind position eigenvalues note attractor state source "
-        "region quantity transition step status least largest"
-    ),
-    "bool": "passed chosen certified",
-    "Int64": "exit",
-    "boolean": "support_correct",
-}
-_TABLES = {
-    "coefficients": "run method component term estimate exact standard_error",
-    "prediction": "run method trajectory error",
-    "certificates": "run method test value limit passed tested reason",
-    "invariant": (
-        "run method intensity bessel quadrature simulated_distance sampling_floor published unknown_at_most "
-        "simulated_unknown"
-    ),
-    "well_shares": "run intensity well:str share by_rates simulated changed",
-    "landscape": (
-        "run item kind position eigenvalues U basin barrier standard_error formula_share minimum_action "
-        "prefactor noise barrier_over_noise mean_time mean_time_error note"
-    ),
-    "degrees": "run attractor degree terms residual covered chosen",
-    "record": (
-        "run attractor visits time counted lowest highest held_out_visits held_out_time held_out_counted "
-        "predicted predicted_error method probability"
-    ),
-    "record_density": "run attractor state lower upper counted predicted distance independent probability",
-    "landscape_errors": "run source region points covered error error_everywhere",
-    "beside_equations": (
-        "run item quantity noise equations trajectories standard_error relative_difference in_errors note"
-    ),
-    "sweep": (
-        "value second_value well attractor relaxation barrier exit noise mean_time law_error weight note"
-    ),
-    "sweep_ways": "value second_value well exit barrier prefactor relaxation note",
-    "branches": "branch kind well value position unstable growth frequency least largest",
-    "bifurcations": "kind value position branch frequency residual",
-    "bifurcation_curves": "curve kind value second_value position frequency",
-    "escape": "transition intensity predicted simulated simulated_error escapes note",
-    "rrmse": "run method rrmse support_correct certified network_error stated_error",
-    "outcomes": "run step status reason",
-    "timings": "run step seconds",
-    "training": "run step:int64 training_loss held_out_loss dynamics orthogonality learning_rate",
-    "summary": (
-        "method quantity exact mean standard_deviation median inclusion_frequency runs published "
-        "published_standard_deviation source"
-    ),
-}
+_SCHEMA = yaml.safe_load(Path(__file__).with_name("tables.yaml").read_text(encoding="utf-8"))
 
 
 def _types(columns: str) -> dict[str, str]:
-    known = {name: kind for kind, names in _TYPES.items() for name in names.split()}
+    known = {name: kind for kind, names in _SCHEMA["types"].items() for name in names.split()}
     parts = (column.partition(":") for column in columns.split())
     return {name: kind or known.get(name, "float64") for name, _, kind in parts}
 
 
-COLUMNS: Mapping[str, Mapping[str, str]] = {name: _types(columns) for name, columns in _TABLES.items()}
+COLUMNS: Mapping[str, Mapping[str, str]] = {
+    name: _types(columns) for name, columns in _SCHEMA["tables"].items()
+}
 """Columns of every table, in order, with their types: the contract with whoever reads the results."""
 
 
