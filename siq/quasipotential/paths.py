@@ -242,7 +242,7 @@ def transition_path(
     NumericalFailure
         When f leads from the saddle to the target on neither side, or for want of an uphill path.
     """
-    about_cycle = any(isinstance(one, Cycle) for one in (start, over, end))
+    about_cycle = any(isinstance(one, Cycle) for one in (over, end))
     downhill = None
     if end is not None and not about_cycle:
         downhill = descent(dynamics, np.asarray(over, float), np.asarray(end, float), nodes)

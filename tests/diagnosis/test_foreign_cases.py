@@ -165,9 +165,7 @@ def test_a_candidate_that_overflows_ends_itself_and_not_the_case(
 
 def test_a_spent_budget_leaves_what_a_shift_is_judged_by(tmp_path: Path) -> None:
     """The census of the United States and the logistic equation: a prediction that a refit ruins."""
-    people = (
-        "3.93 5.31 7.24 9.64 12.9 17.1 23.2 31.4 39.8 50.2 62.9 76 92 105.7 122.8 131.7 151.3 179.3"
-    )
+    people = "3.93 5.31 7.24 9.64 12.9 17.1 23.2 31.4 39.8 50.2 62.9 76 92 105.7 122.8 131.7 151.3 179.3"
     rows = [f"a,{1790 + 10 * place},{value}" for place, value in enumerate(people.split())]
     (tmp_path / "census.csv").write_text("\n".join(["recording,t,n", *rows]), encoding="utf-8")
     (tmp_path / "card.yaml").write_text(

@@ -9,9 +9,10 @@ from scipy.integrate import quad, solve_ivp
 from scipy.interpolate import CubicSpline
 
 from siq.errors import NumericalFailure
+from siq.quasipotential import paths
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.path_chains import MinimumActionPath
-from siq.quasipotential.paths import minimum_action_path
+from siq.quasipotential.paths import minimum_action_path, transition_path
 from siq.quasipotential.transitions import _escape_rate_over_cycle
 from siq.systems.cycles import Cycle, closed_orbit, hessians_along
 from siq.systems.dynamics import Dynamics
@@ -249,3 +250,15 @@ def test_noise_on_some_states_only_is_refused_in_words() -> None:
     system = Dynamics.of((x, y), rings(2.0).formulas, diffusion=np.diag([0.0, 1.0]))
     with pytest.raises(NumericalFailure, match="noise on every state"):
         minimum_action_path(system, np.zeros(2), ring(system, INNER, 2.0))
+
+
+def test_the_way_down_from_a_saddle_to_a_point_is_a_descent_wherever_the_path_began(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """From a cycle over a saddle to a point: the period of the cycle was asked for, of which there is none."""
+    x, y = sympy.symbols("x y", real=True)
+    system, saddle, point = Dynamics.of((x, y), (x - x**3, -y)), np.zeros(2), np.array([1.0, 0.0])
+    uphill = transition_path(system, -point, saddle, point)
+    monkeypatch.setattr(paths, "minimum_action_path", lambda *_, **__: uphill)
+    found = transition_path(system, Cycle(np.zeros((4, 2)), 1.0, np.zeros(1)), saddle, point)
+    assert found.downhill is not None and found.downhill[-1] == pytest.approx(point)
