@@ -255,7 +255,7 @@ def test_noise_on_some_states_only_is_refused_in_words() -> None:
 def test_the_way_down_from_a_saddle_to_a_point_is_a_descent_wherever_the_path_began(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """From a cycle over a saddle to a point: the period of the cycle was asked for, of which there is none."""
+    """From a cycle over a saddle to a point the period of a cycle was asked for."""
     x, y = sympy.symbols("x y", real=True)
     system, saddle, point = Dynamics.of((x, y), (x - x**3, -y)), np.zeros(2), np.array([1.0, 0.0])
     uphill = transition_path(system, -point, saddle, point)
