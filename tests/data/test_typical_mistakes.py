@@ -18,6 +18,7 @@ from siq.data.layout import RESERVED, _is_error, is_unit, read_heading, usable_n
 from siq.data.preparation import FEWEST_STRETCHES, _checked_for_learning, in_stretches, read_pairs
 from siq.data.recordings import Recordings, read_recordings, write_recordings
 from siq.errors import InputError
+from siq.remarks import sentence
 from siq.systems.cards import check_name
 from siq.systems.formulas import CONSTANTS, FUNCTIONS
 from siq.workflow.pipeline import draw_run, identify_run, source_of
@@ -310,6 +311,25 @@ def test_columns_called_like_recordings_are_some_and_numbered_states_are_not(tmp
     assert named.values.tolist() == [[row[1], row[3]] for row in rows]
     states = read_recordings(put(tmp_path, "states.csv", "t,x1,x2,x3\n" + text))
     assert states.names == ("x1", "x2", "x3")
+
+
+@pytest.mark.parametrize(
+    "names",
+    ["Jan Feb Mar Apr May Jun Jul Aug Sep Oct Nov Dec", "JAN FEB MÄR APR MAI JUN JUL AUG SEP OKT NOV DEZ"],
+)
+def test_months_beside_each_other_are_one_quantity_in_time(names: str, tmp_path: Path) -> None:
+    x = np.sin(np.arange(36.0))
+    cells = [f"{value}" for value in x]
+    cells[4], cells[34:] = "", ["-99.9"] * 2
+    rows = [f"{1950 + k},{','.join(cells[12 * k : 12 * k + 12])},{k}.5" for k in range(3)]
+    file = put(tmp_path, "index.csv", "\n".join([f"Year,{names.replace(' ', ',')},Mean", *rows]))
+    read = read_recordings(file)
+    assert (read.names, read.time_unit) == (("x",), "year")
+    kept = np.delete(np.arange(36), [4, 34, 35])
+    np.testing.assert_allclose(read.t, 1950 + (kept + 0.5) / 12)
+    np.testing.assert_allclose(read.values[:, 0], x[kept])
+    assert any("left out: Mean" in sentence(one) for one in read.remarks)
+    assert read_recordings(file, columns=names.split()[:3]).names == tuple(names.split()[:3])
 
 
 @pytest.mark.parametrize("mark", ["-9999", "999.9", "1e36"])
