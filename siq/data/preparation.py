@@ -87,10 +87,7 @@ def read_pairs(
 
 
 def _checked_for_learning(recordings: Recordings, *, file: str, chosen: bool) -> Recordings:
-    """Refuse what nothing can be learned from.
-
-    Unless `chosen`, angles that cannot be unwrapped and columns that never change are left out.
-    """
+    """Refuse what nothing can be learned from; leave out angles that cannot be unwrapped, unless `chosen`."""
     coarse = {one.values["name"]: one for one in unusual(recordings) if one.values.get("wide")}
     others = [place for place, name in enumerate(recordings.names) if name not in coarse]
     if coarse and others and not chosen:
@@ -99,17 +96,9 @@ def _checked_for_learning(recordings: Recordings, *, file: str, chosen: bool) ->
     still = np.ptp(recordings.values, axis=0) == 0
     if still.any():
         first = int(np.argmax(still))
-        if still.all() or chosen:
-            fault = f"it is {recordings.values[0, first]:g} in every row, and what never changes is no state"
-            remedy = "leave it out of the states" if chosen else "record how the system moves"
-            raise InputError(file, f"column {recordings.titles[first]}", fault, remedy)
-        kept = np.flatnonzero(~still)
-        remarks = [
-            Remark("data.column_at_rest", {"column": recordings.titles[place], "value": float(values[0])})
-            for place, values in enumerate(recordings.values.T)
-            if still[place]
-        ]
-        recordings = recordings.of_states(kept, remarks)
+        fault = f"it is {recordings.values[0, first]:g} in every row, and what never changes is no state"
+        remedy = "leave it out of the states" if chosen else "record how the system moves"
+        raise InputError(file, f"column {recordings.titles[first]}", fault, remedy)
     return replace(recordings, remarks=(*recordings.remarks, *unusual(recordings)))
 
 

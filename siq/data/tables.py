@@ -249,9 +249,9 @@ def _without_clocks_and_labels(recordings: Recordings) -> Recordings:
         onwards = turns > NOISY and len(different) >= FEWEST_VALUES and np.ptp(ways[:, place]) <= 1
         if len(steps) > FEWEST_ON_A_LINE and slope and (off <= exact or onwards):
             remarks.append(Remark("data.clock_left_out", {"column": title}))
-        elif len(different) > 1 and (
-            not steps.any() or len(different) < FEWEST_VALUES <= len(x) / MIN_REPETITIONS
-        ):
+        elif len(different) == 1:
+            remarks.append(Remark("data.column_at_rest", {"column": title, "value": float(x[0])}))
+        elif not steps.any() or len(different) < FEWEST_VALUES <= len(x) / MIN_REPETITIONS:
             values = {"column": title, "values": len(different), "within": bool(steps.any())}
             remarks.append(Remark("data.label_left_out", values))
         else:

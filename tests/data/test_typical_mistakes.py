@@ -570,6 +570,7 @@ def test_a_column_that_never_changes_is_left_out_or_refused(tmp_path: Path) -> N
     path = put(tmp_path, "a.csv", "recording,t,x,T (°C)\na,0,1,20\na,1,2,20\nb,0,3,20\nb,1,4,20\n")
     read, _ = read_pairs(path, states=None, units=None, pair_step=None)
     assert read.names == ("x",) and "'T' is 20 in every row and was left out" in read.notes[0]
+    assert inspect_recordings(path).recordings.names == ("x",)  # as the landscape in memory begins, too
     with pytest.raises(InputError, match="column T: it is 20 in every row"):
         read_pairs(path, states=["x", "T"], units=None, pair_step=None)
 
