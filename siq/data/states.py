@@ -531,6 +531,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     # A valley that is deeper than a linear system's may be the floor of one flat well.
     wanted = kinds * count * pushed[order[0]] >= SIGNIFICANCE
     supported = probability < SIGNIFICANCE and any(one.visits for one in counts)
+    supported = supported and _persist(values - background, places, runs)
     own = values[:, column] - background[:, column]
     profile = Profile.of(own, runs, path, places[:, column]) if supported else None
     if profile is not None and wanted and wells == 1:
@@ -581,6 +582,21 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         return replace(found, limit=Remark("data.not_markov"))
     model = model._replace(lag=step * model.lag, stays=step * model.stays, rates=model.rates / step)
     return replace(found, rung=3, markov=model, limit=Remark("data.levels_alone") if levels else None)
+
+
+def _persist(values: np.ndarray, places: np.ndarray, runs: list[slice]) -> bool:
+    """Whether samples ``(n, d)`` tell next to which of the places the following ones are, beyond chance.
+
+    Otherwise states are left sooner than a sample follows: no stay is seen, however many peaks there are.
+    Of independent samples as many neighbours are alike as have the mean ``n Σp²`` and the variance
+    ``n (Σp² - 2 Σp³ + (Σp²)²)``, with the shares p of the states.
+    """
+    nearest = (((values[:, None] - places) / positive(values.std(axis=0))) ** 2).sum(axis=2).argmin(axis=1)
+    alike = np.concatenate([nearest[run][1:] == nearest[run][:-1] for run in runs])
+    shares = np.bincount(nearest) / len(nearest)
+    square, cube = float((shares**2).sum()), float((shares**3).sum())
+    spread = np.sqrt(len(alike) * max(square - 2 * cube + square**2, 0.0))
+    return bool(alike.sum() - len(alike) * square > -special.ndtri(SIGNIFICANCE) * spread)
 
 
 def _baselines(recordings: Recordings, rest: np.ndarray) -> np.ndarray:

@@ -306,3 +306,14 @@ def test_short_recordings_beside_a_long_one_make_no_period() -> None:
         parts = [one[:, None] for one in np.split(x, np.arange(60, 481, 60))]
         given = Recordings.from_arrays([0.1 * np.arange(len(one)) for one in parts], parts, names=["x"])
         assert change_of(given, x, np.zeros(len(x), dtype=int)) is None
+
+
+def test_levels_that_every_sample_draws_anew_are_no_states_that_last() -> None:
+    generator = np.random.default_rng(0)
+    blur, size = 0.25 * generator.standard_normal(4000), np.arange(4000)
+    drawn = np.where(generator.random(4000) < 0.4, -1.0, 1.0)
+    turned = np.where(size % 2, -1.0, 1.0) * np.where(generator.random(4000) < 0.1, -1, 1)
+    assert not found_in(drawn + blur).supported
+    assert not found_in(turned + blur).supported
+    kept = np.where(chain(0, np.array([[-0.5, 0.5], [0.5, -0.5]]), 4000), -1.0, 1.0)
+    assert found_in(kept + blur).supported  # which stays for two samples
