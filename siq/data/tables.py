@@ -230,10 +230,11 @@ def _past_midnight(times: pd.Series) -> pd.Series:
 
 
 def _without_clocks_and_labels(recordings: Recordings) -> Recordings:
-    """Recordings without columns that are no states: another clock, a label, or what never changes.
+    """Recordings without columns that are no states: a count of rows, a clock, a label, what never changes.
 
     A clock is a straight line in time in every recording, or never turns back where noise turns another one,
-    as the depth of a core; a label has a few values, or one in each recording. The last column stays.
+    as the depth of a core; rows may have been sorted since they were counted; a label has a few values, or
+    one in each recording. The last column stays.
     """
     elapsed, begins = np.diff(recordings.t), np.diff(recordings.recording) == 0
     ways = np.sign(np.diff(recordings.values, axis=0)[begins])
@@ -247,7 +248,10 @@ def _without_clocks_and_labels(recordings: Recordings) -> Recordings:
             float(np.abs(different).max()), abs(slope) * float(elapsed[begins].max(initial=0.0))
         )
         onwards = turns > NOISY and len(different) >= FEWEST_VALUES and np.ptp(ways[:, place]) <= 1
-        if len(steps) > FEWEST_ON_A_LINE and slope and (off <= exact or onwards):
+        counts = len(different) == len(x) and np.array_equal(different, different[0] + np.arange(len(x)))
+        if len(steps) > FEWEST_ON_A_LINE and counts:
+            remarks.append(Remark("data.column_counts_rows", {"column": title, "place": place}))
+        elif len(steps) > FEWEST_ON_A_LINE and slope and (off <= exact or onwards):
             remarks.append(Remark("data.clock_left_out", {"column": title}))
         elif len(different) == 1:
             remarks.append(Remark("data.column_at_rest", {"column": title, "value": float(x[0])}))

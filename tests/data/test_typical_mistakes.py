@@ -566,6 +566,12 @@ def test_one_relaxation_has_a_page_without_f_and_one_hopping_record_is_cut(tmp_p
     assert in_stretches(settling) is settling
 
 
+def test_a_count_of_rows_that_were_sorted_by_something_else_is_no_state(tmp_path: Path) -> None:
+    rows = sorted((k * 7 % 30, k + 1) for k in range(30))  # in the order of time, counted in another one
+    text = "time,rownames,x\n" + "".join(f"{t},{count},{np.sin(t)}\n" for t, count in rows)
+    assert read_recordings(put(tmp_path, "counted.csv", text)).names == ("x",)
+
+
 def test_a_column_that_never_changes_is_left_out_or_refused(tmp_path: Path) -> None:
     path = put(tmp_path, "a.csv", "recording,t,x,T (°C)\na,0,1,20\na,1,2,20\nb,0,3,20\nb,1,4,20\n")
     read, _ = read_pairs(path, states=None, units=None, pair_step=None)
