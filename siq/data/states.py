@@ -299,6 +299,7 @@ DECISIVE_P = 1e-5  # probability for the first test from which on the second one
 MOST_PASSES = 5  # over states and background, each in turn
 SETTLED_BACKGROUND = 0.01  # of the spread of a state
 FALSE_OFFSET_RATE = 1e-3  # probability with which recordings with one baseline are given one each
+LAGS_COMPARED = 8  # up to the relaxation time
 MOST_COLUMNS = 3  # in which states are sought together: neighbours are far away in more
 
 
@@ -531,8 +532,10 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     # A valley that is deeper than a linear system's may be the floor of one flat well.
     wanted = kinds * count * pushed[order[0]] >= SIGNIFICANCE
     supported = probability < SIGNIFICANCE and any(one.visits for one in counts)
-    supported = supported and _persist(values - background, places, runs)
     own = values[:, column] - background[:, column]
+    if supported and _crossed_as_often(own, places[:, column], runs, relaxation) >= SIGNIFICANCE:
+        # What swings from one to the other is driven, and no linear noise.
+        supported = bool(np.isfinite(change_of(recordings, own, path) or np.inf))
     profile = Profile.of(own, runs, path, places[:, column]) if supported else None
     if profile is not None and wanted and wells == 1:
         supported = bool((profile.tops[:, ::2] > FALSE_WELL * profile.tops[:, 1::2]).all())
@@ -584,19 +587,46 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     return replace(found, rung=3, markov=model, limit=Remark("data.levels_alone") if levels else None)
 
 
-def _persist(values: np.ndarray, places: np.ndarray, runs: list[slice]) -> bool:
-    """Whether samples ``(n, d)`` tell next to which of the places the following ones are, beyond chance.
+def _crossed_as_often(values: np.ndarray, levels: np.ndarray, runs: list[slice], relaxation: float) -> float:
+    """The probability that a linear process crosses boundaries between levels as seldom as values ``(n,)``.
 
-    Otherwise states are left sooner than a sample follows: no stay is seen, however many peaks there are.
-    Of independent samples as many neighbours are alike as have the mean ``n Σp²`` and the variance
-    ``n (Σp² - 2 Σp³ + (Σp²)²)``, with the shares p of the states.
+    A histogram with two peaks may be the sensor's, or of samples that are drawn anew each time. So surrogates
+    keep it, and the spectrum of the normal scores: they are linear, seen through any monotone function.
     """
-    nearest = (((values[:, None] - places) / positive(values.std(axis=0))) ** 2).sum(axis=2).argmin(axis=1)
-    alike = np.concatenate([nearest[run][1:] == nearest[run][:-1] for run in runs])
-    shares = np.bincount(nearest) / len(nearest)
-    square, cube = float((shares**2).sum()), float((shares**3).sum())
-    spread = np.sqrt(len(alike) * max(square - 2 * cube + square**2, 0.0))
-    return bool(alike.sum() - len(alike) * square > -special.ndtri(SIGNIFICANCE) * spread)
+    draw = np.random.default_rng(0)  # of equal values each may be the larger one
+    rows = np.concatenate([np.arange(run.start, run.stop) for run in runs])[: MOST_STRETCHES * MOST_POINTS]
+    scores, order = np.full(len(values), np.nan), np.lexsort((draw.random(len(rows)), values[rows]))
+    scores[rows[order]] = special.ndtri((np.arange(len(rows)) + 0.5) / len(rows))
+    parts: dict[int, list[np.ndarray]] = {}
+    for one in (scores[run][np.isfinite(scores[run])] for run in runs):
+        parts.setdefault(len(one), []).append(one)
+    levels = np.sort(levels)
+    boundaries = [np.mean(values[rows] <= one) for one in (levels[1:] + levels[:-1]) / 2]
+    places = special.ndtri(np.clip(boundaries, 1 / len(rows), 1 - 1 / len(rows)))
+    lags = np.unique(np.geomspace(1, max(relaxation, 1), LAGS_COMPARED).astype(int))
+
+    def crossings(series: Sequence[np.ndarray]) -> list[int]:
+        sides = [[one > place for one in series] for place in places]
+        return [
+            sum(int((one[:, lag:] != one[:, :-lag]).sum()) for one in side) for side in sides for lag in lags
+        ]
+
+    seen = [np.array(one) for size, one in parts.items() if size > 1]
+    spectra = [np.fft.rfft(one) for one in seen]
+    counts = [crossings(seen)]
+    for _ in range(FEWEST_SURROGATES):
+        turns = [np.exp(2j * np.pi * draw.random(one.shape)) for one in spectra]
+        counts.append(
+            crossings(
+                [
+                    np.fft.irfft(one * turn, n=each.shape[1])
+                    for one, turn, each in zip(spectra, turns, seen, strict=True)
+                ]
+            )
+        )
+    fewer = np.mean(counts[1:], axis=0) - counts
+    largest = (fewer / positive(np.std(counts[1:], axis=0))).max(axis=1)
+    return float(np.mean(largest[1:] >= largest[0]))
 
 
 def _baselines(recordings: Recordings, rest: np.ndarray) -> np.ndarray:
