@@ -44,7 +44,7 @@ TIME_NAMES, AGE_NAMES, LABEL_NAMES, INDEX_NAMES, TIME_UNITS, ERROR_NAMES, ERROR_
     for each in ("time", "age", "label", "index", "units_of_time", "error", "error_beside")
 )
 ERROR_WORDS |= ERROR_NAMES
-MONTHS = _CALLED["months"].split()
+MONTHS = re.compile(",".join(_CALLED["months"].split()))
 
 _UNITS_AS_TITLES = TIME_UNITS - _words(
     "ns us µs μs ms s min h hr d yr ka"
@@ -297,21 +297,6 @@ def _runs_evenly(values: np.ndarray | None) -> bool:
     steps = np.diff(values)
     usual = np.median(steps)
     return bool(usual > 0 and (np.abs(steps - usual) > EVEN * usual).mean() <= EVEN)
-
-
-def years_and_months(source: ColumnFile) -> tuple[list[int], list[int]]:
-    """The column of years, and those of its months, where a table has one for each; else none of both."""
-    titles = [read_heading(heading).title for heading in source.headings]
-    for first in range(len(titles) - len(MONTHS) + 1):
-        months = list(range(first, first + len(MONTHS)))
-        if not all(titles[place][:3].casefold() in MONTHS[place - first].split("/") for place in months):
-            continue
-        for place in [place for place in range(len(titles)) if place not in months]:
-            named = read_heading(titles[place]).may_be_time or not titles[place]
-            values = _numbers(source, place) if named else None
-            if values is not None and np.array_equal(values, np.round(values)):
-                return [place], months
-    return [], []
 
 
 def _with_stated_times(source: ColumnFile) -> ColumnFile:

@@ -25,7 +25,7 @@ import pyarrow.compute as pc
 
 from siq.data.correlation import FEWEST_VALUES, MIN_REPETITIONS
 from siq.data.formats import Column, ColumnFile, open_columns
-from siq.data.layout import layout_of, read_heading, years_and_months
+from siq.data.layout import MONTHS, layout_of, read_heading
 from siq.data.recordings import LONGEST_STEP, TABLE, Recordings
 from siq.errors import InputError
 from siq.numerics.files import files_of
@@ -164,40 +164,41 @@ def _stacked(source: ColumnFile) -> ColumnFile:
     words = [re.fullmatch(r"(.*?[^\W\d])[\W_]*\d+", part.title) for part in parts]
     own = [place for place, word in enumerate(words) if word is not None and read_heading(word[1]).is_label]
     kinds = {(words[place][1].casefold(), parts[place].unit) for place in own}  # type: ignore[index]
-    years, months = years_and_months(source)
-    if not months and (len(own) < 2 or len(kinds) > 1 or any(part.is_label for part in parts)):
+    months = MONTHS.search(",".join(part.title.replace(",", "")[:3].casefold() for part in parts))
+    years = [at for at, part in enumerate(parts) if months and (part.may_be_time or not part.title)]
+    cells = [one.to_pandas() for one in source.load(years)]
+    years = [
+        at for at, one in zip(years, cells, strict=True) if one.dtype.kind in "if" and not (one % 1).any()
+    ]
+    if months and years:
+        own = [months.string[: months.start()].count(",") + number for number in range(12)]
+    elif len(own) < 2 or len(kinds) > 1 or any(part.is_label for part in parts):
         return source
-    own = months or own
     rest = [place for place in range(len(parts)) if place not in (*own, *years)]
-    gone = [parts[place].title for place in rest if months and not parts[place].is_label]  # means of a year
+    gone = [parts[place].title for place in rest if years and not parts[place].is_label]  # means of a year
     rest = [place for place in rest if parts[place].title not in gone]
     titles, unit = {place: parts[place].title for place in own}, parts[own[0]].unit
 
     def load(positions: Sequence[int]) -> list[pa.Array]:
-        kept = [*rest, *years, *own]
-        table = pd.DataFrame(
-            {place: one.to_pandas() for place, one in zip(kept, source.load(kept), strict=True)}
-        )
-        table = table.melt(kept[: -len(own)], own, "own", "x", ignore_index=False).sort_index(kind="stable")
+        kept = [*rest, *years[:1], *own]
+        table = pd.DataFrame({at: one.to_pandas() for at, one in zip(kept, source.load(kept), strict=True)})
+        table = table.melt([*rest, *years[:1]], own, "own", "x", ignore_index=False).sort_index(kind="stable")
         number = table["own"].map(own.index)
-        table["own"] = table[years[0]] + (number + 0.5) / len(own) if months else table["own"].map(titles)
+        table["own"] = table[years[0]] + (number + 0.5) / 12 if years else table["own"].map(titles)
         if table["x"].dtype == object:  # a column has marks beside numbers, and another none
             table["x"] = table["x"].map(str, na_action="ignore")
         columns = [*rest, "own", "x"]
         return [pa.array(table[columns[position]], from_pandas=True) for position in positions]
 
     values = {"first": titles[own[0]], "last": titles[own[-1]], "left_out": gone}
+    new = ["t [year]" if years else "recording", f"x [{unit}]" if unit else "x"]
     return replace(
         source,
-        headings=(
-            *(source.headings[place] for place in rest),
-            "t [year]" if months else "recording",
-            f"x [{unit}]" if unit else "x",
-        ),
+        headings=(*(source.headings[place] for place in rest), *new),
         units=(*(source.units[place] for place in rest), None, source.units[own[0]]),
         load=load,
         titles=(),
-        remarks=(*source.remarks, Remark(f"data.columns_of_{'months' if months else 'recordings'}", values)),
+        remarks=(*source.remarks, Remark(f"data.columns_of_{'months' if years else 'recordings'}", values)),
     )
 
 
