@@ -166,7 +166,7 @@ def _stacked(source: ColumnFile) -> ColumnFile:
     kinds = {(words[place][1].casefold(), parts[place].unit) for place in own}  # type: ignore[index]
     months = MONTHS.search(",".join(part.title.replace(",", "")[:3].casefold() for part in parts))
     years = [at for at, part in enumerate(parts) if months and (part.may_be_time or not part.title)]
-    cells = [one.to_pandas() for one in source.load(years)]
+    cells = [source.load([place])[0].to_pandas() for place in years]
     years = [
         at for at, one in zip(years, cells, strict=True) if one.dtype.kind in "if" and not (one % 1).any()
     ]
@@ -190,7 +190,8 @@ def _stacked(source: ColumnFile) -> ColumnFile:
         columns = [*rest, "own", "x"]
         return [pa.array(table[columns[position]], from_pandas=True) for position in positions]
 
-    values = {"first": titles[own[0]], "last": titles[own[-1]], "left_out": gone}
+    values = {"first": titles[own[0]], "last": titles[own[-1]], "months": bool(years), "left_out": gone}
+    remark = Remark("data.side_by_side", values)
     new = ["t [year]" if years else "recording", f"x [{unit}]" if unit else "x"]
     return replace(
         source,
@@ -198,7 +199,7 @@ def _stacked(source: ColumnFile) -> ColumnFile:
         units=(*(source.units[place] for place in rest), None, source.units[own[0]]),
         load=load,
         titles=(),
-        remarks=(*source.remarks, Remark(f"data.columns_of_{'months' if years else 'recordings'}", values)),
+        remarks=(*source.remarks, remark),
     )
 
 
