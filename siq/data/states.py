@@ -148,7 +148,8 @@ def _pushed_apart(
     design = (terms - terms.mean(axis=1, keepdims=True)).reshape(-1, degree)
     goal = (increments - increments.mean(axis=1, keepdims=True)).ravel()
     normal = design.T @ design
-    if np.linalg.cond(normal) > 1e12:  # numerical: a record of hardly any different values
+    # Numerical: of a record of hardly any different values the inverse would have no digits.
+    if np.linalg.cond(normal) > 1 / np.sqrt(np.finfo(float).eps):
         return 0.0, 1.0
     inverse = np.linalg.inv(normal)
     coefficients = inverse @ design.T @ goal

@@ -332,3 +332,12 @@ def test_levels_that_every_sample_draws_anew_are_no_states_that_last() -> None:
     assert not found_in(turned + blur).supported
     kept = np.where(chain(0, np.array([[-0.5, 0.5], [0.5, -0.5]]), 4000), -1.0, 1.0)
     assert found_in(kept + blur).supported  # which stays for two samples
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_levels_without_any_noise_are_states(seed: int) -> None:
+    """As of a channel that was told open or closed, 0 or 1, before it was written."""
+    generator = np.random.default_rng(seed)
+    found = found_in((np.cumsum(generator.random(10_000) < 0.02) % 2).astype(float))
+    assert found.levels == pytest.approx((0, 1)) and found.rung == 3
+    assert all(low < 50 < high for low, high in (one.limits for one in found.counts))
