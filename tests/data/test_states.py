@@ -341,3 +341,4 @@ def test_levels_without_any_noise_are_states(seed: int) -> None:
     found = found_in((np.cumsum(generator.random(10_000) < 0.02) % 2).astype(float))
     assert found.levels == pytest.approx((0, 1)) and found.rung == 3
     assert all(low < 50 < high for low, high in (one.limits for one in found.counts))
+    assert found.profile is not None and found.profile.tops[0, 0] > 3  # nothing lay between
