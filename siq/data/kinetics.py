@@ -561,11 +561,8 @@ class Profile(NamedTuple):
         error = 1 / np.sqrt(np.maximum(independent, 1.0))
         height = -np.log(counts[kept] / counts.max())
         place = place[kept]
-        half = (edges[1] - edges[0]) * (0.5 + 1e-6)  # a level without noise reaches no other bin
         bottoms = [
-            int(
-                np.argmin(np.where(np.abs(place - one) <= max(_reach(series, path, k), half), height, np.inf))
-            )
+            int(np.argmin(np.where(np.abs(place - one) <= _reach(series, path, k), height, np.inf)))
             for k, one in enumerate(places)
         ]
         curvatures = np.full(len(places), np.nan)
@@ -576,17 +573,14 @@ class Profile(NamedTuple):
                     2 * np.polyfit(place[near] - place[bottom], height[near], 2, w=1 / error[near])[0]
                 )
         tops = []
-        for first, second in pairwise(bottoms if len(set(bottoms)) == len(bottoms) else []):
+        for first, second in pairwise(bottoms):
             between = slice(min(first, second), max(first, second) + 1)
             top = between.start + int(np.argmax(height[between]))
-            highest, unsure = height[top], error[top]
-            if (np.diff(kept[between]) > 1).any():  # what nobody saw is rarer than one sample
-                highest, unsure = np.log(counts.max()), 1.0
             tops.append(
                 [
                     one
                     for end in (first, second)
-                    for one in (highest - height[end], np.hypot(unsure, error[end]))
+                    for one in (height[top] - height[end], np.hypot(error[top], error[end]))
                 ]
             )
         return cls(place, height, error, curvatures, np.array(tops).reshape(-1, 4))

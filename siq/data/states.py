@@ -386,6 +386,8 @@ class RecordStates:
     def remark(self) -> Remark:
         """What was found as a remark."""
         model = [] if self.markov is None else self.markov.stays.tolist()
+        # Neighbours in one bin, as where values are spread over decades, have no top between them.
+        tops = np.zeros((0, 4)) if self.profile is None or len(self.columns) > 1 else self.profile.tops
         apart = any(high < one.limits[0] for (_, _, high), one in zip(model, self.counts, strict=False))
         places = self.places if self.places.size else np.array(self.levels)[:, None]
         # Three digits, and as many more as all places have in common.
@@ -397,7 +399,7 @@ class RecordStates:
             "transitions": self.transitions, "means": [one.mean for one in self.counts],
             "limits": [one.limits for one in self.counts], "visits": [one.visits for one in self.counts],
             "rung": self.rung, "lag": None if self.markov is None else self.markov.lag,
-            "tops": [] if self.profile is None or len(self.columns) > 1 else self.profile.tops.tolist(),
+            "tops": tops.tolist() if tops[:, ::2].all() else [],
             "offset": self.offset, "missed": model if apart else [],
         }  # fmt: skip
         return Remark("data.record_hops", values)

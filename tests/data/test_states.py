@@ -341,4 +341,9 @@ def test_levels_without_any_noise_are_states(seed: int) -> None:
     found = found_in((np.cumsum(generator.random(10_000) < 0.02) % 2).astype(float))
     assert found.levels == pytest.approx((0, 1)) and found.rung == 3
     assert all(low < 50 < high for low, high in (one.limits for one in found.counts))
-    assert found.profile is not None and found.profile.tops[0, 0] > 3  # nothing lay between
+    assert "−log p" not in found.sentence()  # nothing lay between them that was ever seen
+
+
+def test_levels_of_a_coarse_digitiser_are_no_states() -> None:
+    for step in (2.0, 1.5):
+        assert not found_in(np.round(noise(0, 10_000, memory=np.exp(-1 / 20)) / step) * step).supported
