@@ -253,13 +253,14 @@ def _increments(recordings: Recordings, stretches: Stretches) -> _Increments | N
     degree = max(
         (k for k in range(1, LARGEST_DEGREE + 1) if scipy.special.comb(d + k, k) <= MOST_FUNCTIONS), default=1
     )
-    exponents = [row for row in itertools.product(range(degree + 1), repeat=d) if sum(row) <= degree]
-    if known.sum() < STEPS_PER_FUNCTION * len(exponents):
+    chosen = [
+        list(places)
+        for total in range(degree + 1)
+        for places in itertools.combinations_with_replacement(range(d), total)
+    ]
+    if known.sum() < STEPS_PER_FUNCTION * len(chosen):
         return None
-    powers = np.polynomial.polynomial.polyvander(scaled, degree)
-    functions = np.ones((len(scaled), len(exponents)))
-    for state, row in enumerate(np.transpose(exponents)):
-        functions *= powers[:, state, row]
+    functions = np.stack([scaled[:, places].prod(axis=1) for places in chosen], axis=1)
     # Of a time h, √h f and √h φ(x): so the strength of what is left is that of white noise, whatever h.
     root = np.sqrt(np.where(known, np.diff(recordings.t[: most + 1]) / stretches.step, 1.0))[:, None]
     root[np.abs(root - 1) <= STEP_TOLERANCE] = 1.0

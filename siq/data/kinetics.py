@@ -174,7 +174,9 @@ class _Levels(NamedTuple):
             sum(float(rest[run][: -k or None] @ rest[run][k:]) for run in runs if run.stop - run.start > k)
             for k in range(MOST_FILTERED + 1)
         ]
-        memory = np.array(sums) / max(sums[0], 1e-300)
+        if not sums[0] > 0:  # nothing but the levels
+            return 1
+        memory = np.array(sums) / sums[0]
         from_here = 1 + int(np.flatnonzero(np.abs(memory) >= WHITE_CORRELATION)[-1])
         quick = memory[2] < memory[1] ** 2 - FALSE_WELL * 2 / np.sqrt(len(series))
         return from_here if quick and 2 * from_here <= MOST_FILTERED else 1

@@ -44,6 +44,7 @@ TIME_NAMES, AGE_NAMES, LABEL_NAMES, INDEX_NAMES, TIME_UNITS, ERROR_NAMES, ERROR_
     for each in ("time", "age", "label", "index", "units_of_time", "error", "error_beside")
 )
 ERROR_WORDS |= ERROR_NAMES
+MONTHS = re.compile(",".join(_CALLED["months"].split()))
 
 _UNITS_AS_TITLES = TIME_UNITS - _words(
     "ns us µs μs ms s min h hr d yr ka"

@@ -87,21 +87,18 @@ def read_pairs(
 
 
 def _checked_for_learning(recordings: Recordings, *, file: str, chosen: bool) -> Recordings:
-    """Refuse what nothing can be learned from; leave out columns that never change, unless `chosen`."""
+    """Refuse what nothing can be learned from; leave out angles that cannot be unwrapped, unless `chosen`."""
+    coarse = {one.values["name"]: one for one in unusual(recordings) if one.values.get("wide")}
+    others = [place for place, name in enumerate(recordings.names) if name not in coarse]
+    if coarse and others and not chosen:
+        told = [replace(one, values={**one.values, "left_out": True}) for one in coarse.values()]
+        recordings = recordings.of_states(others, told)
     still = np.ptp(recordings.values, axis=0) == 0
     if still.any():
         first = int(np.argmax(still))
-        if still.all() or chosen:
-            fault = f"it is {recordings.values[0, first]:g} in every row, and what never changes is no state"
-            remedy = "leave it out of the states" if chosen else "record how the system moves"
-            raise InputError(file, f"column {recordings.titles[first]}", fault, remedy)
-        kept = np.flatnonzero(~still)
-        remarks = [
-            Remark("data.column_at_rest", {"column": recordings.titles[place], "value": float(values[0])})
-            for place, values in enumerate(recordings.values.T)
-            if still[place]
-        ]
-        recordings = recordings.of_states(kept, remarks)
+        fault = f"it is {recordings.values[0, first]:g} in every row, and what never changes is no state"
+        remedy = "leave it out of the states" if chosen else "record how the system moves"
+        raise InputError(file, f"column {recordings.titles[first]}", fault, remedy)
     return replace(recordings, remarks=(*recordings.remarks, *unusual(recordings)))
 
 
@@ -140,8 +137,9 @@ def unusual(recordings: Recordings) -> list[Remark]:
             ends = np.array([values.min(), values.max()])
             within = [np.abs(ends - np.array(each) * turn).max() for each in ((0, 1), (-0.5, 0.5))]
             close = min(within) < ENDS_OF_TURN * turn and np.ptp(values) <= turn * (1 + ROUNDED_TURN)
-            if count and wide <= MOST_WIDE_STEPS and close:
+            if count > ((jumps > 0.5 * turn) & (jumps < 0.75 * turn)).sum() and close:
                 told = {"column": title, "name": name, "turn": text, "count": count}
+                told |= {"wide": 0.0 if wide <= MOST_WIDE_STEPS else float(wide), "left_out": False}
                 found.append(Remark("data.wrapped_angle", told))
             far = wide <= MOST_WIDE_STEPS and np.ptp(values) > FEWEST_TURNS * turn
             if far and _repeats_itself(values[:-1][inside], np.diff(values)[inside], turn):

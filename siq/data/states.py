@@ -25,7 +25,7 @@ floor of a flat well: it is told from none by the errors of the profile.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING, Any
@@ -148,7 +148,8 @@ def _pushed_apart(
     design = (terms - terms.mean(axis=1, keepdims=True)).reshape(-1, degree)
     goal = (increments - increments.mean(axis=1, keepdims=True)).ravel()
     normal = design.T @ design
-    if np.linalg.cond(normal) > 1e12:  # numerical: a record of hardly any different values
+    # Numerical: of a record of hardly any different values the inverse would have no digits.
+    if np.linalg.cond(normal) > 1 / np.sqrt(np.finfo(float).eps):
         return 0.0, 1.0
     inverse = np.linalg.inv(normal)
     coefficients = inverse @ design.T @ goal
@@ -198,7 +199,7 @@ def _valleys(
         peak, ``(d,)``.
     """
     every = -(-len(values) // MOST_POINTS)
-    spectra: list[list[np.ndarray]] = [[] for _ in runs]
+    parts: list[list[np.ndarray]] = [[] for _ in runs]
     for one, relaxation in zip(values.T, relaxations, strict=True):
         # Levels of a digitiser are no peaks, which bins that are as narrow would make of them.
         step = resolution_step(one) if len(np.unique(one)) >= FEWEST_VALUES else None
@@ -215,39 +216,25 @@ def _valleys(
         for series, share in product((one - one.mean(), levelled), AVERAGED_SHARES):
             # What the sensor adds to each sample would fill the valley.
             width = max(int(share * relaxation), 1)
-            for run, found in zip(runs, spectra, strict=True):
-                smooth = ndimage.uniform_filter1d(series[run], width, mode="nearest")[::every]
-                found.append(np.fft.rfft(smooth))
-    sizes = [len(range(run.start, run.stop, every)) for run in runs]
-    parts = {  # runs of one size are turned together, (m, c, f): there may be thousands
-        size: np.array([one for one, each in zip(spectra, sizes, strict=True) if each == size])
-        for size in dict.fromkeys(sizes)
-        if size >= FEWEST_POINTS
-    }
+            for run, found in zip(runs, parts, strict=True):
+                found.append(ndimage.uniform_filter1d(series[run], width, mode="nearest")[::every])
     columns = values.shape[1]
-    if not parts:
-        return 1.0, np.ones(columns), np.zeros(columns)
     # Rice's rule for so many bins as independent samples fill; each width has those of its column.
     bins = [
         int(np.clip(2 * (len(values) / (2 * time)) ** (1 / 3), FEWEST_BINS, BINS))
         for time in relaxations
         for _ in range(2 * len(AVERAGED_SHARES))
     ]
-    depths = []
-    for number in range(SURROGATES + 1):
-        drawn = []
-        for size, spectrum in parts.items():
-            turns = np.exp(2j * np.pi * generator.random((len(spectrum), 1, spectrum.shape[2])))
-            turns[..., 0] = 1.0
-            whole = np.fft.irfft(spectrum * turns if number else spectrum, n=size)
-            drawn.append(whole.transpose(1, 0, 2).reshape(len(bins), -1))
-        series = np.concatenate(drawn, axis=1)
+    depths: list[list[float]] = []
+    for series in _surrogates([np.array(one) for one in parts], SURROGATES, generator=generator):
         depths.append(_valley_depths(series, bins))
         if (
-            number == FEWEST_SURROGATES
+            len(depths) > FEWEST_SURROGATES
             and (np.sum(depths[1:] >= np.array(depths[0]), axis=0) >= ENOUGH_DEEPER).all()
         ):
             break
+    if not depths:
+        return 1.0, np.ones(columns), np.zeros(columns)
     depth = np.array(depths)
 
     def rarity(extremes: np.ndarray) -> np.ndarray:
@@ -260,6 +247,25 @@ def _valleys(
     either = np.column_stack([-np.log(alone.min(axis=1)), -np.log(alone).sum(axis=1)])
     least = rarity(either).min(axis=1)
     return float(np.mean(least <= least[0])), alone[0], depth[0].reshape(columns, -1).max(axis=1)
+
+
+def _surrogates(
+    parts: Sequence[np.ndarray], count: int, *, generator: np.random.Generator
+) -> Iterator[np.ndarray]:
+    """Columns ``(c, n)`` of a record, by those of its runs ``(c, m)``; then surrogates with random phases.
+
+    Those of all columns are turned alike, and runs of one size together: there may be thousands.
+    """
+    sizes = dict.fromkeys(one.shape[1] for one in parts if one.shape[1] >= FEWEST_POINTS)
+    spectra = {size: np.fft.rfft([one for one in parts if one.shape[1] == size]) for size in sizes}
+    for number in range(count + 1 if spectra else 0):
+        drawn = []
+        for size, spectrum in spectra.items():
+            turns = np.exp(2j * np.pi * generator.random((len(spectrum), 1, spectrum.shape[2])))
+            turns[..., 0] = 1.0
+            whole = np.fft.irfft(spectrum * turns if number else spectrum, n=size)
+            drawn.append(whole.transpose(1, 0, 2).reshape(whole.shape[1], -1))
+        yield np.concatenate(drawn, axis=1)
 
 
 def _valley_depths(series: np.ndarray, bins: Sequence[int]) -> list[float]:
@@ -299,6 +305,7 @@ DECISIVE_P = 1e-5  # probability for the first test from which on the second one
 MOST_PASSES = 5  # over states and background, each in turn
 SETTLED_BACKGROUND = 0.01  # of the spread of a state
 FALSE_OFFSET_RATE = 1e-3  # probability with which recordings with one baseline are given one each
+LAGS_COMPARED, MOST_COMPARED = 8, 100_000  # up to the relaxation time; samples
 MOST_COLUMNS = 3  # in which states are sought together: neighbours are far away in more
 
 
@@ -379,6 +386,8 @@ class RecordStates:
     def remark(self) -> Remark:
         """What was found as a remark."""
         model = [] if self.markov is None else self.markov.stays.tolist()
+        # Neighbours in one bin, as where values are spread over decades, have no top between them.
+        tops = np.zeros((0, 4)) if self.profile is None or len(self.columns) > 1 else self.profile.tops
         apart = any(high < one.limits[0] for (_, _, high), one in zip(model, self.counts, strict=False))
         places = self.places if self.places.size else np.array(self.levels)[:, None]
         # Three digits, and as many more as all places have in common.
@@ -390,7 +399,7 @@ class RecordStates:
             "transitions": self.transitions, "means": [one.mean for one in self.counts],
             "limits": [one.limits for one in self.counts], "visits": [one.visits for one in self.counts],
             "rung": self.rung, "lag": None if self.markov is None else self.markov.lag,
-            "tops": [] if self.profile is None or len(self.columns) > 1 else self.profile.tops.tolist(),
+            "tops": tops.tolist() if tops[:, ::2].all() else [],
             "offset": self.offset, "missed": model if apart else [],
         }  # fmt: skip
         return Remark("data.record_hops", values)
@@ -532,6 +541,9 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     wanted = kinds * count * pushed[order[0]] >= SIGNIFICANCE
     supported = probability < SIGNIFICANCE and any(one.visits for one in counts)
     own = values[:, column] - background[:, column]
+    if supported and _crossed_as_often(own, places[:, column], runs, relaxation) >= SIGNIFICANCE:
+        # What swings from one to the other is driven, and no linear noise.
+        supported = bool(np.isfinite(change_of(recordings, own, path) or np.inf))
     profile = Profile.of(own, runs, path, places[:, column]) if supported else None
     if profile is not None and wanted and wells == 1:
         supported = bool((profile.tops[:, ::2] > FALSE_WELL * profile.tops[:, 1::2]).all())
@@ -581,6 +593,28 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         return replace(found, limit=Remark("data.not_markov"))
     model = model._replace(lag=step * model.lag, stays=step * model.stays, rates=model.rates / step)
     return replace(found, rung=3, markov=model, limit=Remark("data.levels_alone") if levels else None)
+
+
+def _crossed_as_often(values: np.ndarray, levels: np.ndarray, runs: list[slice], relaxation: float) -> float:
+    """The probability that a linear process crosses boundaries between levels as seldom as values ``(n,)``.
+
+    A histogram with two peaks may be the sensor's, or of samples that are drawn anew each time. So surrogates
+    keep it, and the spectrum of the normal scores: they are linear, seen through any monotone function.
+    """
+    draw, values = np.random.default_rng(0), values[:MOST_COMPARED]
+    scores, order = np.empty(len(values)), np.lexsort((draw.random(len(values)), values))
+    scores[order] = special.ndtri((np.arange(len(values)) + 0.5) / len(values))
+    levels, lags = np.sort(levels), np.unique(np.geomspace(1, max(relaxation, 1), LAGS_COMPARED).astype(int))
+    below = [np.mean(values <= one) for one in (levels[1:] + levels[:-1]) / 2]
+    places = special.ndtri(np.clip(below, 1 / len(values), 1 - 1 / len(values)))[:, None]
+    parts = [scores[None, run] for run in runs if run.start < len(values)]
+    counts = []
+    for series in _surrogates(parts, FEWEST_SURROGATES, generator=draw):
+        above = series > places
+        counts.append(np.concatenate([(above[:, lag:] != above[:, :-lag]).sum(axis=1) for lag in lags]))
+    fewer = np.mean(counts[1:], axis=0) - counts
+    largest = (fewer / positive(np.std(counts[1:], axis=0))).max(axis=1)
+    return float(np.mean(largest[1:] >= largest[0]))
 
 
 def _baselines(recordings: Recordings, rest: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ import pyarrow.compute as pc
 
 from siq.data.correlation import FEWEST_VALUES, MIN_REPETITIONS
 from siq.data.formats import Column, ColumnFile, open_columns
-from siq.data.layout import layout_of, read_heading
+from siq.data.layout import MONTHS, layout_of, read_heading
 from siq.data.recordings import LONGEST_STEP, TABLE, Recordings
 from siq.errors import InputError
 from siq.numerics.files import files_of
@@ -159,31 +159,47 @@ def _checked(
 
 
 def _stacked(source: ColumnFile) -> ColumnFile:
-    """Columns that are called ``cell 1``, ``cell 2``, … one below the other: recordings of one quantity x."""
+    """Columns of one quantity x below each other: recordings, ``cell 1``, ``cell 2``, …, or months."""
     parts = [read_heading(heading) for heading in source.headings]
     words = [re.fullmatch(r"(.*?[^\W\d])[\W_]*\d+", part.title) for part in parts]
     own = [place for place, word in enumerate(words) if word is not None and read_heading(word[1]).is_label]
     kinds = {(words[place][1].casefold(), parts[place].unit) for place in own}  # type: ignore[index]
-    if len(own) < 2 or len(kinds) > 1 or any(part.is_label for part in parts):
+    months = MONTHS.search(",".join(part.title.replace(",", "")[:3].casefold() for part in parts))
+    years = [at for at, part in enumerate(parts) if months and (part.may_be_time or not part.title)]
+    cells = [source.load([place])[0].to_pandas() for place in years]
+    years = [
+        at for at, one in zip(years, cells, strict=True) if one.dtype.kind in "if" and not (one % 1).any()
+    ]
+    if months and years:
+        own = [months.string[: months.start()].count(",") + number for number in range(12)]
+    elif len(own) < 2 or len(kinds) > 1 or any(part.is_label for part in parts):
         return source
-    titles, unit = [parts[place].title for place in own], parts[own[0]].unit
-    rest = [place for place in range(len(parts)) if place not in own]
+    rest = [place for place in range(len(parts)) if place not in (*own, *years)]
+    gone = [parts[place].title for place in rest if years and not parts[place].is_label]  # means of a year
+    rest = [place for place in rest if parts[place].title not in gone]
+    titles, unit = {place: parts[place].title for place in own}, parts[own[0]].unit
 
     def load(positions: Sequence[int]) -> list[pa.Array]:
-        *others, first = (one.to_pandas() for one in source.load([*rest, own[0]]))
-        quantity = pd.concat([first, *(one.to_pandas() for one in source.load(own[1:]))])
-        below = [pd.concat([one] * len(own)) for one in others]
-        below += [pd.Series(np.repeat(titles, len(first))), quantity]
-        return [pa.array(below[position], from_pandas=True) for position in positions]
+        kept = [*rest, *years[:1], *own]
+        table = pd.DataFrame({at: one.to_pandas() for at, one in zip(kept, source.load(kept), strict=True)})
+        table = table.melt([*rest, *years[:1]], own, "own", "x", ignore_index=False).sort_index(kind="stable")
+        number = table["own"].map(own.index)
+        table["own"] = table[years[0]] + (number + 0.5) / 12 if years else table["own"].map(titles)
+        if table["x"].dtype == object:  # a column has marks beside numbers, and another none
+            table["x"] = table["x"].map(str, na_action="ignore")
+        columns = [*rest, "own", "x"]
+        return [pa.array(table[columns[position]], from_pandas=True) for position in positions]
 
-    values = {"first": titles[0], "last": titles[-1]}
+    values = {"first": titles[own[0]], "last": titles[own[-1]], "months": bool(years), "left_out": gone}
+    remark = Remark("data.side_by_side", values)
+    new = ["t [year]" if years else "recording", f"x [{unit}]" if unit else "x"]
     return replace(
         source,
-        headings=(*(source.headings[place] for place in rest), "recording", f"x [{unit}]" if unit else "x"),
+        headings=(*(source.headings[place] for place in rest), *new),
         units=(*(source.units[place] for place in rest), None, source.units[own[0]]),
         load=load,
         titles=(),
-        remarks=(*source.remarks, Remark("data.columns_of_recordings", values)),
+        remarks=(*source.remarks, remark),
     )
 
 
@@ -216,10 +232,11 @@ def _past_midnight(times: pd.Series) -> pd.Series:
 
 
 def _without_clocks_and_labels(recordings: Recordings) -> Recordings:
-    """Recordings without columns that are no states: another clock, a label, or what never changes.
+    """Recordings without columns that are no states: a count of rows, a clock, a label, what never changes.
 
     A clock is a straight line in time in every recording, or never turns back where noise turns another one,
-    as the depth of a core; a label has a few values, or one in each recording. The last column stays.
+    as the depth of a core; rows may have been sorted since they were counted; a label has a few values, or
+    one in each recording. The last column stays.
     """
     elapsed, begins = np.diff(recordings.t), np.diff(recordings.recording) == 0
     ways = np.sign(np.diff(recordings.values, axis=0)[begins])
@@ -233,11 +250,14 @@ def _without_clocks_and_labels(recordings: Recordings) -> Recordings:
             float(np.abs(different).max()), abs(slope) * float(elapsed[begins].max(initial=0.0))
         )
         onwards = turns > NOISY and len(different) >= FEWEST_VALUES and np.ptp(ways[:, place]) <= 1
-        if len(steps) > FEWEST_ON_A_LINE and slope and (off <= exact or onwards):
+        counts = len(different) == len(x) and np.array_equal(different, different[0] + np.arange(len(x)))
+        if len(steps) > FEWEST_ON_A_LINE and counts:
+            remarks.append(Remark("data.column_counts_rows", {"column": title, "place": place}))
+        elif len(steps) > FEWEST_ON_A_LINE and slope and (off <= exact or onwards):
             remarks.append(Remark("data.clock_left_out", {"column": title}))
-        elif len(different) > 1 and (
-            not steps.any() or len(different) < FEWEST_VALUES <= len(x) / MIN_REPETITIONS
-        ):
+        elif len(different) == 1:
+            remarks.append(Remark("data.column_at_rest", {"column": title, "value": float(x[0])}))
+        elif not steps.any() or len(different) < FEWEST_VALUES <= len(x) / MIN_REPETITIONS:
             values = {"column": title, "values": len(different), "within": bool(steps.any())}
             remarks.append(Remark("data.label_left_out", values))
         else:

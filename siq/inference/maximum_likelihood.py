@@ -343,6 +343,7 @@ class Fit:
         return bool((self.noise.process > 0).any())
 
 
+@np.errstate(all="ignore")  # what runs away is told as a fault
 def fit_of_states(
     model: Dynamics, data: Measurements, *, x: np.ndarray, noise: Noise, substeps: int, converged: bool
 ) -> Fit:
@@ -390,11 +391,12 @@ def _fit_from(
     model: Dynamics, x: np.ndarray, along: Linearisation, noise: Noise, substeps: int,
     fit: Callable[[Fit], Fit],
 ) -> Fit:  # fmt: skip
-    """A fit from a start; where it leads to no number, the start itself, with the fault."""
+    """A fit from a start; where it leads to no finite number, the start itself, with the fault."""
     unknown, fault = np.full((len(model.free),) * 2, np.nan), "" if along.finite else RUNS_AWAY
     begin = Fit(model, unknown, x, x, None, noise, along, -np.inf, np.inf, 1, substeps, False, fault)
     try:
-        return begin if fault else fit(begin)
+        found = begin if fault else fit(begin)
+        return found if np.isfinite(found.log_likelihood) else replace(begin, fault=RUNS_AWAY)
     except (ArithmeticError, np.linalg.LinAlgError) as error:
         return replace(begin, fault=str(error))
 
@@ -562,6 +564,7 @@ class _Shooting:
         return _ended(now, data, converged=converged, resolution=self.resolution)
 
 
+@np.errstate(all="ignore")  # what runs away is told as a fault
 def fit_by_multiple_shooting(
     model: Dynamics,
     data: Measurements,
@@ -590,10 +593,9 @@ def fit_by_multiple_shooting(
         Runge–Kutta steps between samples, by default as many as the accuracy needs; most steps of the fit;
         charged for every evaluation.
     """
-    with np.errstate(all="ignore"):  # what runs away is told as a fault
-        shooting = _Shooting(model, data, x, substeps, budget=budget)
-        along = linearise(model, shooting.grid, model.values, x)
-        fit = shooting.fit(x, along, noise, estimate_process=estimate_process, most=iterations)
+    shooting = _Shooting(model, data, x, substeps, budget=budget)
+    along = linearise(model, shooting.grid, model.values, x)
+    fit = shooting.fit(x, along, noise, estimate_process=estimate_process, most=iterations)
     if not (fit.converged and fit.has_process_noise):
         return fit
     return fit_by_filter(
@@ -602,6 +604,7 @@ def fit_by_multiple_shooting(
     )  # fmt: skip
 
 
+@np.errstate(all="ignore")  # what runs away is told as a fault
 def fit_by_filter(
     model: Dynamics,
     data: Measurements,
@@ -621,13 +624,12 @@ def fit_by_filter(
     given, too. With the closure the spread of what the filter knows acts on the mean of f
     (`siq.inference.kalman_filter`).
     """
-    with np.errstate(all="ignore"):  # what runs away is told as a fault
-        if not estimate_sensor:
-            data = replace(data, sensor_noise=noise.measurement)
-        closed = ClosedFunctions(model) if closure else None
-        shooting = _Shooting(model, data, x, substeps, filtered=True, closed=closed, budget=budget)
-        along = shooting.linearised(model.values, x, None, noise)
-        return shooting.fit(x, along, noise, estimate_process=estimate_process, most=iterations)
+    if not estimate_sensor:
+        data = replace(data, sensor_noise=noise.measurement)
+    closed = ClosedFunctions(model) if closure else None
+    shooting = _Shooting(model, data, x, substeps, filtered=True, closed=closed, budget=budget)
+    along = shooting.linearised(model.values, x, None, noise)
+    return shooting.fit(x, along, noise, estimate_process=estimate_process, most=iterations)
 
 
 def _sides(model: Dynamics, data: Measurements, x: np.ndarray) -> np.ndarray:

@@ -159,9 +159,18 @@ def refine_globally(
         Probability that the uncertainty of f alone brings any false term into V.
     precision
         Terms that contribute less than this share of V are dropped in any case; none at all if not `sparse`.
+
+    Raises
+    ------
+    NumericalFailure
+        Where there are fewer points than terms, as of levels without noise.
     """
     library = found.library
     basis = LibraryBasis.of_potential(library)
+    if len(points) < basis.size:
+        raise NumericalFailure(
+            f"states were recorded at {len(points)} places, too few for {basis.size} terms of V"
+        )
     equation = HamiltonJacobi.at(basis, points, found.dynamics)
     solution, left = equation.gauss_newton(start[basis.chosen])
     critical = float(-scipy.special.ndtri(false_terms / (2 * basis.size)))

@@ -266,13 +266,13 @@ class LandscapeSummary:
 
     @property
     def lowest_saddle(self) -> np.ndarray:
-        """Where the lowest saddle lies; the deepest well where there is none."""
+        """Where the lowest saddle lies; the deepest well where there is none, or the middle."""
         known = [way for way in self.ways if np.isfinite(self.wells[way.start].height + way.barrier)]
         if known:
             return min(known, key=lambda way: self.wells[way.start].height + way.barrier).place
         places = self.saddles or self.marks or self.others
         heights = [np.inf if np.isnan(one.height) else one.height for one in places]
-        return places[int(np.argmin(heights))].position
+        return places[int(np.argmin(heights))].position if places else self.box.mean(axis=1)
 
     def standard_error(self, x: np.ndarray) -> np.ndarray | None:
         """Standard error of U of one state at ``(n,)``, against the deepest well; None where not known.

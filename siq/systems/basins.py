@@ -32,7 +32,7 @@ LONGEST_STEP = 0.04  # of the recorded box: longest step
 STEP_ACCURACY = 1e-7  # of the recorded box: local error of a step
 SETTLED_DISTANCE = 0.02  # of the domain: so close to its cycle is what has been followed for long
 CYCLE_DISTANCE = 1e-3  # of the domain: and one so close to a cycle stays with it
-STEPS_PER_CYCLE_CHECK = 10  # steps after which trajectories are asked whether they are on a cycle
+STEPS_PER_CHECK = 10  # steps after which trajectories are asked whether they are on a cycle, or at rest
 INWARDS = 1e-6  # of the distance to the middle of the domain: beside an invariant boundary
 ATTRACTOR_DISTANCE = 1e-4  # of the recorded box: trajectories so close to an attractor end there
 
@@ -83,7 +83,7 @@ def follow(
     horizon = patience * (SLOWEST_TIMES if rates else UNSETTLED_TIMES) / slowest
     count = len(starts)
     x, times, steps = starts.copy(), np.zeros(count), np.full(count, 0.01 / slowest)
-    ends, escaped = np.full(count, -1), np.zeros(count, dtype=bool)
+    ends, escaped, resting = np.full(count, -1), np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
     passed, whose = [starts], [np.arange(count)]
     running = np.arange(count)
     for number in range(patience * MAX_STEPS):
@@ -103,10 +103,13 @@ def follow(
         whose.append(on)
         for index, one in enumerate(attractors):
             ends[on[np.abs((moved - one.position) / width).max(axis=1) < ATTRACTOR_DISTANCE]] = index
-        if cycles and number % STEPS_PER_CYCLE_CHECK == 0:
+        if cycles and number % STEPS_PER_CHECK == 0:
             near = settled_on(moved, cycles, box=box, distance=CYCLE_DISTANCE)
             ends[on[near >= 0]] = len(attractors) + near[near >= 0]
-        running = running[~escaped[running] & (ends[running] < 0) & (times[running] < horizon)]
+        if number % STEPS_PER_CHECK == 0:
+            slow = running[speed < ATTRACTOR_DISTANCE * slowest]
+            resting[slow] = _at_rest(dynamics, x[slow], width)
+        running = running[~(escaped | resting)[running] & (ends[running] < 0) & (times[running] < horizon)]
         if not len(running):
             break
     order = np.argsort(np.concatenate(whose), kind="stable")
@@ -114,6 +117,16 @@ def follow(
     first = np.append(0, last[:-1] + 1)
     kept = np.round(np.linspace(first, last, states, axis=1)).astype(int)
     return Descents(np.concatenate(passed)[order][kept], ends, escaped)
+
+
+def _at_rest(dynamics: Dynamics, x: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """Whether states ``(n, d)`` are next to a stable equilibrium, as one step of Newton's method tells."""
+    slopes, found = dynamics.jacobian(x), np.zeros(len(x), dtype=bool)
+    for place in np.flatnonzero(np.isfinite(slopes).all(axis=(1, 2))):
+        if (np.linalg.eigvals(slopes[place]).real < 0).all():
+            step = np.linalg.solve(slopes[place], dynamics.drift(x[place]))
+            found[place] = np.abs(step / width).max() < ATTRACTOR_DISTANCE / 2
+    return found
 
 
 def settled_on(

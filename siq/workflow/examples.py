@@ -51,7 +51,7 @@ def write_generated(path: Path, name: str) -> tuple[Path, str]:
     found = unusual(read_recordings(path))  # before anything starts or is written
     study = GENERATED / f"{name}.yaml"
     text = f"name: {_scalar(name)}\nrecordings: {{file: {_scalar(_own_path(path, start=study.parent))}}}\n"
-    turns = [one.values for one in found if one.code in ANGLES]
+    turns = [one.values for one in found if one.code in ANGLES and not one.values.get("wide")]
     if turns:
         angles = ", ".join(f"{one['name']}: [0, {str(one['turn']).replace('2π', '2*pi')}]" for one in turns)
         text += f"identification: {{angles: {{{angles}}}}}\n"

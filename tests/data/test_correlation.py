@@ -162,3 +162,10 @@ def test_displacements_are_those_of_simulated_forces(kind: Kind) -> None:
 def test_an_exposure_of_one_step_correlates_neighbours_by_a_quarter() -> None:
     own = _increment_covariances(_displacement("blur", np.arange(5), 1.0))
     assert own == pytest.approx([2 / 3, 1 / 6, 0, 0])
+
+
+def test_what_fifty_columns_remember_is_asked_in_as_many_functions() -> None:
+    """Of all products of fifty powers the few of low degree would never be picked out."""
+    walks = np.cumsum(np.random.default_rng(0).standard_normal((1, 4000, 50)), axis=1)
+    found = markov_lag(Recordings.from_arrays(np.arange(4000.0), walks, names=[f"x{k}" for k in range(50)]))
+    assert found.kind == "white"

@@ -9,7 +9,14 @@ import pytest
 import scipy.signal
 from remembering import double_wells
 
-from siq.data.preparation import in_stretches, joined, unusual, without_faults, without_velocity
+from siq.data.preparation import (
+    _checked_for_learning,
+    in_stretches,
+    joined,
+    unusual,
+    without_faults,
+    without_velocity,
+)
 from siq.data.recordings import Recordings
 from siq.data.stationarity import runs_of
 
@@ -97,6 +104,23 @@ def test_an_angle_that_counts_its_turns_is_told_from_what_only_wanders() -> None
     wandering = scipy.signal.lfilter([1], [1, -0.999], steps)
     found = unusual(seen(np.column_stack([turning, wandering])))
     assert [(one.code, one.values["column"]) for one in found] == [("data.unwrapped_angle", "x")]
+
+
+def test_an_angle_that_goes_too_far_in_a_step_is_left_out_beside_a_state() -> None:
+    generator = np.random.default_rng(1)
+    veers = (
+        generator.random(8000) < 0.1
+    )  # as the wind does from one hour to the next, written in tens of degrees
+    turned = np.where(veers, generator.uniform(-180, 180, 8000), 12 * generator.standard_normal(8000))
+    direction = np.round(np.cumsum(turned) % 360 / 10) * 10
+    speed, white = generator.standard_normal(8000), generator.uniform(0, 360, 8000)
+    wind = Recordings.from_arrays(
+        0.1 * np.arange(8000), np.stack([direction, speed, white], axis=1)[None], names=["dir", "v", "w"]
+    )
+    found = _checked_for_learning(wind, file="", chosen=False)
+    assert (found.names, [one.code for one in found.remarks]) == (wind.names[1:], ["data.wrapped_angle"])
+    wanted = _checked_for_learning(wind, file="", chosen=True)
+    assert (wanted.names, [one.code for one in wanted.remarks]) == (wind.names, ["data.wrapped_angle"])
 
 
 def test_a_state_without_noise_is_no_fault() -> None:

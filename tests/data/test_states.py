@@ -18,7 +18,7 @@ from siq.data.preparation import without_background
 from siq.data.recordings import Recordings
 from siq.data.states import DwellCount, RecordStates, _valley_depths, switching
 from siq.data.stationarity import change_of, relaxation_samples, runs_of
-from siq.remarks import Remark
+from siq.remarks import Remark, sentence
 
 RATES = np.array([[-0.10, 0.06, 0.04], [0.10, -0.15, 0.05], [0.05, 0.10, -0.15]])
 """Per sample: stays of 10, 6.7 and 6.7 of them."""
@@ -306,3 +306,44 @@ def test_short_recordings_beside_a_long_one_make_no_period() -> None:
         parts = [one[:, None] for one in np.split(x, np.arange(60, 481, 60))]
         given = Recordings.from_arrays([0.1 * np.arange(len(one)) for one in parts], parts, names=["x"])
         assert change_of(given, x, np.zeros(len(x), dtype=int)) is None
+
+
+def test_one_well_in_per_cent_is_no_two_states() -> None:
+    """What is bent by a sensor, or lies between two ends, has two peaks as soon as it is spread enough."""
+    share = 1 / (1 + np.exp(-2.5 * noise(1, 12_000, memory=np.exp(-1 / 30))))
+    assert not found_in(np.round(100 * share, 1)).supported
+
+
+def test_seven_states_have_a_number() -> None:
+    remark = found_in(np.where(chain(0, RATES, 2000), -1.0, 1.0) + 0.2 * noise(0, 2000)).remark()
+    seven = {
+        name: [*value] * 4 for name, value in remark.values.items() if name in ("levels", "places", "means")
+    }
+    more = {name: [*remark.values[name]] * 4 for name in ("limits", "visits")}
+    assert "The record has 8 states of x" in sentence(Remark(remark.code, remark.values | seven | more))
+
+
+def test_levels_that_every_sample_draws_anew_are_no_states_that_last() -> None:
+    generator = np.random.default_rng(0)
+    blur, size = 0.25 * generator.standard_normal(4000), np.arange(4000)
+    drawn = np.where(generator.random(4000) < 0.4, -1.0, 1.0)
+    turned = np.where(size % 2, -1.0, 1.0) * np.where(generator.random(4000) < 0.1, -1, 1)
+    assert not found_in(drawn + blur).supported
+    assert not found_in(turned + blur).supported
+    kept = np.where(chain(0, np.array([[-0.5, 0.5], [0.5, -0.5]]), 4000), -1.0, 1.0)
+    assert found_in(kept + blur).supported  # which stays for two samples
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_levels_without_any_noise_are_states(seed: int) -> None:
+    """As of a channel that was told open or closed, 0 or 1, before it was written."""
+    generator = np.random.default_rng(seed)
+    found = found_in((np.cumsum(generator.random(10_000) < 0.02) % 2).astype(float))
+    assert found.levels == pytest.approx((0, 1)) and found.rung == 3
+    assert all(low < 50 < high for low, high in (one.limits for one in found.counts))
+    assert "−log p" not in found.sentence()  # nothing lay between them that was ever seen
+
+
+def test_levels_of_a_coarse_digitiser_are_no_states() -> None:
+    for step in (2.0, 1.5):
+        assert not found_in(np.round(noise(0, 10_000, memory=np.exp(-1 / 20)) / step) * step).supported

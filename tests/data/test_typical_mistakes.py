@@ -18,6 +18,7 @@ from siq.data.layout import RESERVED, _is_error, is_unit, read_heading, usable_n
 from siq.data.preparation import FEWEST_STRETCHES, _checked_for_learning, in_stretches, read_pairs
 from siq.data.recordings import Recordings, read_recordings, write_recordings
 from siq.errors import InputError
+from siq.remarks import sentence
 from siq.systems.cards import check_name
 from siq.systems.formulas import CONSTANTS, FUNCTIONS
 from siq.workflow.pipeline import draw_run, identify_run, source_of
@@ -312,6 +313,25 @@ def test_columns_called_like_recordings_are_some_and_numbered_states_are_not(tmp
     assert states.names == ("x1", "x2", "x3")
 
 
+@pytest.mark.parametrize(
+    "names",
+    ["Jan Feb Mar Apr May Jun Jul Aug Sep Oct Nov Dec", "JAN FEB MÄR APR MAI JUN JUL AUG SEP OKT NOV DEZ"],
+)
+def test_months_beside_each_other_are_one_quantity_in_time(names: str, tmp_path: Path) -> None:
+    x = np.sin(np.arange(36.0))
+    cells = [f"{value}" for value in x]
+    cells[4], cells[34:] = "", ["-99.9"] * 2
+    rows = [f"{1950 + k},{','.join(cells[12 * k : 12 * k + 12])},{k}.5" for k in range(3)]
+    file = put(tmp_path, "index.csv", "\n".join([f"Year,{names.replace(' ', ',')},Mean", *rows]))
+    read = read_recordings(file)
+    assert (read.names, read.time_unit) == (("x",), "year")
+    kept = np.delete(np.arange(36), [4, 34, 35])
+    np.testing.assert_allclose(read.t, 1950 + (kept + 0.5) / 12)
+    np.testing.assert_allclose(read.values[:, 0], x[kept])
+    assert any("left out: Mean" in sentence(one) for one in read.remarks)
+    assert read_recordings(file, columns=names.split()[:3]).names == tuple(names.split()[:3])
+
+
 @pytest.mark.parametrize("mark", ["-9999", "999.9", "1e36"])
 def test_a_number_that_stands_for_a_missing_value_is_none(tmp_path: Path, mark: str) -> None:
     x = ["1.5", "2.5", mark, "0.5", "1.0", mark, "2.0", "1.0"]
@@ -546,10 +566,17 @@ def test_one_relaxation_has_a_page_without_f_and_one_hopping_record_is_cut(tmp_p
     assert in_stretches(settling) is settling
 
 
+def test_a_count_of_rows_that_were_sorted_by_something_else_is_no_state(tmp_path: Path) -> None:
+    rows = sorted((k * 7 % 30, k + 1) for k in range(30))  # in the order of time, counted in another one
+    text = "time,rownames,x\n" + "".join(f"{t},{count},{np.sin(t)}\n" for t, count in rows)
+    assert read_recordings(put(tmp_path, "counted.csv", text)).names == ("x",)
+
+
 def test_a_column_that_never_changes_is_left_out_or_refused(tmp_path: Path) -> None:
     path = put(tmp_path, "a.csv", "recording,t,x,T (°C)\na,0,1,20\na,1,2,20\nb,0,3,20\nb,1,4,20\n")
     read, _ = read_pairs(path, states=None, units=None, pair_step=None)
     assert read.names == ("x",) and "'T' is 20 in every row and was left out" in read.notes[0]
+    assert inspect_recordings(path).recordings.names == ("x",)  # as the landscape in memory begins, too
     with pytest.raises(InputError, match="column T: it is 20 in every row"):
         read_pairs(path, states=["x", "T"], units=None, pair_step=None)
 

@@ -17,7 +17,7 @@ from siq.inference.kalman_filter import (
     linearise,
     substeps_needed,
 )
-from siq.inference.maximum_likelihood import fit_by_multiple_shooting
+from siq.inference.maximum_likelihood import fit_by_multiple_shooting, fit_of_states
 from siq.inference.measurements import Measurements, course_of_input, expectations, first_states
 from siq.inference.recalibration import fit_with_and_without_process_noise
 from siq.inference.trajectories import (
@@ -192,6 +192,14 @@ def test_a_simulation_that_runs_away_gives_no_fit() -> None:
     noise = Noise(np.array([1e-4]), np.zeros(2))
     found = fit_trajectories(model, data, begin=np.full((2, 2), 3.0), noise=noise, substeps=2)
     assert not found.converged and found.log_likelihood == -np.inf
+
+
+def test_states_beyond_all_squares_are_no_fit() -> None:
+    model = model_of({**PENDULUM, "equations": {"x": "v", "v": "-k*x - d*v - c*v + u"}})
+    data, states = driven(model)
+    noise = Noise(np.array([1e-4]), np.zeros(2))
+    found = fit_of_states(model, data, x=1e200 * (1 + states**2), noise=noise, substeps=2, converged=True)
+    assert not found.converged and found.fault and found.log_likelihood == -np.inf
 
 
 def delayed(tau: float) -> Dynamics:

@@ -20,6 +20,7 @@ from known_systems import (
     uniform_points,
 )
 
+from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
 from siq.inference.library import CandidateLibrary
 from siq.quasipotential.global_formula import (
@@ -105,6 +106,14 @@ def test_without_sparsity_all_terms_stay() -> None:
     assert np.count_nonzero(result.potential) > len(
         names(found.library, refined(known, result.potential, found, x))
     )
+
+
+def test_two_places_tell_no_formula() -> None:
+    """As of a channel that is 0 or 1: V had fewer equations than terms."""
+    known = SYSTEMS["Maier-Stein"]
+    found, x = exact_field(known, 5), uniform_points(known, 2, share=0.6)
+    with pytest.raises(NumericalFailure, match="2 places"):
+        refined(known, np.ones(found.library.size), found, x)
 
 
 @pytest.mark.parametrize("units", [np.array([1e-3, 40.0]), np.array([1e-6, 1e3])])

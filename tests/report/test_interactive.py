@@ -75,6 +75,12 @@ def test_there_is_nothing_to_turn_of_one_state_and_of_nothing() -> None:
         assert 'id="view"' not in (interactive_view(one) or "")
 
 
+def test_a_landscape_without_any_equilibrium_is_drawn_as_far_as_it_goes() -> None:
+    empty = replace(landscape(3), wells=(), ways=(), equilibria=())
+    assert interactive_view(empty) is None or data_of(interactive_view(empty) or "")["wells"] == []
+    np.testing.assert_array_equal(empty.lowest_saddle, empty.box.mean(axis=1))
+
+
 def kramers(well: float, strength: float) -> float:
     """The mean time in a well of ``V = (x² - 1)²/4 + x/10`` over its only saddle."""
     saddle = np.sort(np.roots([1, 0, -1, 0.1]).real)[1]

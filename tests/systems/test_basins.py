@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
 import sympy
 
+from siq.numerics.integration import dormand_prince_step
 from siq.quasipotential.landscape import Landscape
-from siq.systems.basins import _saddle_near, edge_saddle, follow
+from siq.systems import basins
+from siq.systems.basins import STEPS_PER_CHECK, _saddle_near, edge_saddle, follow
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import classify
 
@@ -85,3 +88,24 @@ def test_a_root_between_two_sites_leads_to_the_saddle_beside_it(centre: float) -
     found = _saddle_near(system, droplet, system.box)
     assert found is not None and found.kind == "saddle" and found.unstable == 1
     assert np.abs(system.drift(found.position[None])).max() < 1e-9
+
+
+def test_what_rests_elsewhere_is_not_followed_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stiff well beyond the attractors that are asked for: steps there stay short for ever."""
+    x, y = sympy.symbols("x y", real=True)
+    system = Dynamics.of([x, y], [x - x**3, -100 * y], domain=[(-1.6, 1.6)] * 2)
+    wells = [classify(system, np.array([place, 0.0])) for place in (-1.0, 1.0)]
+    starts = np.array([[-1e-3, 0.5], [1e-3, 0.5]])
+    steps = []
+
+    def counted(*given: Any) -> Any:
+        steps.append(given)
+        return dormand_prince_step(*given)
+
+    monkeypatch.setattr(basins, "dormand_prince_step", counted)
+    both = follow(system, starts, wells, box=system.box)
+    needed = len(steps)
+    one = follow(system, starts, wells[1:], box=system.box)
+    assert (both.ends.tolist(), one.ends.tolist()) == ([0, 1], [-1, 0])
+    assert len(steps) <= 2 * needed + 2 * STEPS_PER_CHECK
+    assert one.paths[0, -1] == pytest.approx([-1, 0], abs=1e-4)
