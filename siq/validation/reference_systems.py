@@ -13,7 +13,7 @@ U/2.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,8 @@ import scipy.stats.qmc
 import sympy
 import yaml
 
-from siq.systems.dynamics import Dynamics
-from siq.systems.formulas import compile_formulas
+from siq.systems.dynamics import Dynamics, symbol
+from siq.systems.formulas import compile_formulas, parse_formula
 
 TWO_METHODS = "least action of a chain of points, and Hamilton's equations"
 
@@ -83,28 +83,13 @@ def reference_systems() -> dict[str, _ReferenceSystem]:
     plane = sympy.Matrix([X, Y])
     archetype = (X**2 - 1) ** 2 + Y**2 + Z**2
     slope = [archetype.diff(each) / 2 for each in (X, Y, Z)]
-    alpha, beta, gamma, mu = (
-        sympy.Rational(*each) for each in ((154, 100), (1014, 100), (476, 1000), (112509, 1000000))
-    )
-    eaten = X**2 * Y / (1 + X**2)
     east, north = X - 4, Y - 5
     inside = 1 - east**2 - north**2
     place, friction = (X**2 - 1) ** 2 / 4 - X / 10, half
     units = sympy.symbols("x:10", real=True)
     wells = sum(((s**2 - 1) ** 2 / 4 for s in units), nothing)
     wells += sum((half * (a - b) ** 2 for a, b in itertools.pairwise(units)), nothing)
-    bound = Y**2 / 5000 - 2 * Z
-
-    def expressed(own: sympy.Expr, other: sympy.Expr) -> sympy.Expr:
-        return 16 * own**4 / (1 + 16 * own**4) + 1 / (1 + 16 * other**4) - own
-
     falls = [0, *(wells.diff(s) for s in units), 0]
-    maier_and_stein = "Maier and Stein, Phys. Rev. Lett. 71, 1783 (1993)"
-
-    def of_maier_and_stein(strength: int) -> Dynamics:
-        field = (X - X**3 - strength * X * Y**2, -(1 + X**2) * Y)
-        return Dynamics.of((X, Y), field, domain=[(-2, 2), (-1, 1)])
-
     systems = [
         _exact(
             "linear",
@@ -149,37 +134,10 @@ def reference_systems() -> dict[str, _ReferenceSystem]:
         _exact(
             "maier-stein",
             "Maier and Stein's system with β = 1, where its drift has a potential.",
-            maier_and_stein,
-            of_maier_and_stein(1),
+            "Maier and Stein, Phys. Rev. Lett. 71, 1783 (1993)",
+            Dynamics.of((X, Y), (X - X**3 - X * Y**2, -(1 + X**2) * Y), domain=[(-2, 2), (-1, 1)]),
             X**4 / 2 - X**2 + (1 + X**2) * Y**2 + half,
             (((-1, 0), (0, 0), (1, 0)),),
-        ),
-        *(
-            _computed_twice(
-                f"maier-stein-{strength}",
-                f"Maier and Stein's system with β = {strength}: paths leave the axis, where U has a kink.",
-                maier_and_stein,
-                of_maier_and_stein(strength),
-            )
-            for strength in (5, 10)
-        ),
-        _computed_twice(
-            "consumer-resource",
-            "A consumer with a resource; predation levels off (Holling's type III).",
-            "Collie and Spencer (1994), as Moore et al., The R Journal 8, 19 (2016) take it, with D = 1",
-            Dynamics.of(
-                (X, Y), (alpha * X * (1 - X / beta) - eaten, gamma * eaten - mu * Y**2), domain=[(0, 8)] * 2
-            ),
-        ),
-        _computed_twice(
-            "two-competitors",
-            "Two signed amplitudes that suppress each other: each way leads over a saddle of its own.",
-            "the third example of Moore et al., The R Journal 8, 19 (2016)",
-            Dynamics.of(
-                (X, Y),
-                tuple(each * (rate - X**2 - X * Y - Y**2) for each, rate in ((X, 9 * half**2), (Y, 3))),
-                domain=[(-3, 3)] * 2,
-            ),
         ),
         _exact(
             "cycle",
@@ -191,34 +149,6 @@ def reference_systems() -> dict[str, _ReferenceSystem]:
                 domain=[(2, 6), (3, 7)],
             ),
             tenth * inside**2,
-        ),
-        _computed_twice(
-            "toggle",
-            "Two genes that switch each other off, with D = 1.",
-            "Gardner, Cantor and Collins, Nature 403, 339 (2000)",
-            Dynamics.of((X, Y), (3 / (1 + Y**2) - X, 3 / (1 + X**2) - Y), domain=[(0, 4)] * 2),
-        ),
-        _computed_twice(
-            "fitzhugh-nagumo",
-            "FitzHugh and Nagumo's system where it is bistable, with D = 1.",
-            "FitzHugh, Biophysical Journal 1, 445 (1961)",
-            Dynamics.of((X, Y), (X - X**3 - Y, X - 3 * Y), domain=[(-1.5, 1.5), (-0.8, 0.8)]),
-        ),
-        _computed_twice(
-            "two-genes",
-            "Two genes that activate themselves and suppress each other, with D = 1: three attractors.",
-            "Wang, Zhang, Xu and Wang, PNAS 108, 8257 (2011); an example of EPR-Net",
-            Dynamics.of((X, Y), tuple(map(expressed, (X, Y), (Y, X))), domain=[(0, 3)] * 2),
-        ),
-        _computed_twice(
-            "self-activation",
-            "A gene that its own dimers activate: messengers, proteins and dimers, with D = 1.",
-            "Roma et al., Physical Review E 71, 011902 (2005); an example of ordered line integrals in 3-D",
-            Dynamics.of(
-                (X, Y, Z),
-                ((20 + 400 * Z) / (50 + Z) - 10 * X, 40 * X - Y - 2 * bound, bound),
-                domain=[(0, 40), (0, 1500), (0, 200)],
-            ),
         ),
         _exact(
             "chain",
@@ -244,18 +174,8 @@ def reference_systems() -> dict[str, _ReferenceSystem]:
             2 * friction * (V**2 / 2 + place),
             tuple(tuple((*each, 0) for each in way) for way in over_and_back),
         ),
-        _computed_twice(
-            "van-der-pol",
-            "A particle in a double well with friction as of van der Pol, and noise on its velocity alone.",
-            "a test of CriticalTransitions.jl, which knows the barrier as 0.15 to 0.24",
-            Dynamics.of(
-                (X, V),
-                (V, X - X**3 - V * (1 - 3 * tenth * (1 - X**2))),
-                diffusion=[[0, 0], [0, 2]],
-                domain=[(-2, 2)] * 2,
-            ),
-        ),
         _point_and_cycle(),
+        *_computed_twice(),
     ]
     return {each.name: each for each in systems}
 
@@ -303,15 +223,20 @@ def _exact(
     return _ReferenceSystem(name, about, source, dynamics, quasipotential, tuple(barriers))
 
 
-def _computed_twice(name: str, about: str, source: str, dynamics: Dynamics) -> _ReferenceSystem:
-    """A system without a known formula of U, of which two methods give the barriers."""
-    known = yaml.safe_load(Path(__file__).with_name("reference_barriers.yaml").read_text(encoding="utf-8"))
-    barriers = []
-    for each in known[name]:
-        start, saddle, end = (np.array(each[place], dtype=float) for place in ("start", "saddle", "end"))
-        value, error = each["value"], 1e-9 * max(each["value"], 1.0)
-        barriers.append(_KnownBarrier(start, saddle, end, value, error, np.nan, TWO_METHODS))
-    return _ReferenceSystem(name, about, source, dynamics, None, tuple(barriers))
+def _computed_twice() -> Iterator[_ReferenceSystem]:
+    """Systems without a known formula of U, of which two methods give the barriers."""
+    path = Path(__file__).with_name("reference_systems.yaml")
+    for name, known in yaml.safe_load(path.read_text(encoding="utf-8")).items():
+        symbols, barriers = {state: symbol(state) for state in known["states"]}, []
+        for each in known["barriers"]:
+            start, saddle, end = (np.array(each[place], dtype=float) for place in ("start", "saddle", "end"))
+            value, error = each["value"], 1e-9 * max(each["value"], 1.0)
+            barriers.append(_KnownBarrier(start, saddle, end, value, error, np.nan, TWO_METHODS))
+        dynamics = Dynamics.of(
+            tuple(symbols.values()), [parse_formula(each, symbols) for each in known["equations"]],
+            diffusion=known.get("diffusion"), domain=list(known["states"].values()),
+        )  # fmt: skip
+        yield _ReferenceSystem(name, known["about"], known["source"], dynamics, None, tuple(barriers))
 
 
 def _point_and_cycle() -> _ReferenceSystem:
