@@ -53,7 +53,7 @@ def corpus(folder: Path) -> dict[str, list[tuple[str, bytes]]]:
     import pandas as pd
 
     from siq.data.recordings import read_recordings
-    from siq.workflow.examples import SPRING, double_well_recordings
+    from siq.workflow import examples
     from siq.workflow.pipeline import analyse
     from siq.workflow.study import PipelineSettings
     from workflow.files import write
@@ -65,8 +65,10 @@ def corpus(folder: Path) -> dict[str, list[tuple[str, bytes]]]:
         made[kind] = [
             (".yaml", path.read_bytes()) for path in sorted((ROOT / "config" / place).glob("*.yaml"))
         ]
-    made["card"].append((".yaml", SPRING.encode()))
-    text = double_well_recordings(2, 1500)
+    made["card"].append(
+        (".yaml", Path(examples.__file__).with_name("studies").joinpath("spring.yaml").read_bytes())
+    )
+    text = examples.double_well_recordings(2, 1500)
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "recordings.csv"
     file.write_text(text, encoding="utf-8")
