@@ -217,10 +217,10 @@ class _PairRegression:
         step = step * h[:, None, None] / 4  # a half, of differences over twice the way
         kept = np.eye(d) + step + step @ step / 2
         first_order = kept @ rate @ kept.transpose(0, 2, 1) * h[:, None, None]
-        with np.errstate(invalid="ignore"):
-            off = np.linalg.solve(np.where(np.isfinite(spread), spread, np.eye(d)), first_order) - np.eye(d)
-        squares += np.einsum("nij,nji->n", off, off) / 2
-        usual = squares[np.isfinite(squares)]
+        known = np.isfinite(squares) & np.isfinite(spread + first_order).all(axis=(1, 2))
+        known[known] = np.linalg.eigvalsh(spread[known])[:, 0] > 0  # elsewhere a trial f runs away
+        off = np.linalg.solve(spread[known], first_order[known]) - np.eye(d)
+        usual = squares[known] + np.einsum("nij,nji->n", off, off) / 2
         far = len(self.pairs) / max(len(usual), 1) * float(usual.sum()) > HARMLESS_BIAS**2
         return coarse if far else found
 

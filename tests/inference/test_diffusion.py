@@ -13,7 +13,7 @@ from siq.errors import NumericalFailure
 from siq.inference.diffusion_model import check_units, estimated_diffusion
 from siq.inference.field_estimate import DiffusionSource, FieldEstimate, read_field, write_field
 from siq.inference.library import IdentificationOptions, field_library
-from siq.inference.regression import identify_vector_field
+from siq.inference.regression import ResidualLikelihood, identify_vector_field, residuals
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_comparison import _check_same_noise
 from siq.systems.diffusion import Diffusion
@@ -147,3 +147,24 @@ def test_where_d_is_from_is_kept_with_the_field_and_said_of_the_landscape(tmp_pa
     seen = pipeline.landscape_of_run(settings, recordings, kept, number=0)
     assert seen.result is not None and seen.outcome.status == Status.OK
     assert DiffusionSource.UNIT.note in seen.result.notes
+
+
+def test_steps_whose_covariance_is_off_feign_no_dependence_of_d() -> None:
+    """A tenth of a step at relaxation rates up to two: to first order in h two of twelve had p ≤ 0.01."""
+    generator, step, samples, within, rate = np.random.default_rng(0), 0.1, 2000, 20, 0.22
+    x, seen = np.sign(generator.standard_normal(12)), np.empty((samples, 12))
+    for row in range(samples):
+        seen[row] = x
+        for _ in range(within):
+            push = np.sqrt(rate * step / within) * generator.standard_normal(12)
+            x = x + step / within * (x - x**3) + push
+    options = IdentificationOptions()
+    for record in (8, 11):
+        recordings = Recordings.from_arrays(
+            step * np.arange(samples), seen.T[record, None, :, None], names=["x"]
+        )
+        pairs = snapshot_pairs(recordings)
+        found = identify_vector_field(field_library(("x",), options), pairs, options=options)
+        assert found.flow.coarse
+        assert ResidualLikelihood(found, pairs, residuals(found, pairs)).constant_probability() > 0.1
+        assert found.noise_rate[0, 0] == pytest.approx(rate, rel=0.1)

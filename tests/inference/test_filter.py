@@ -8,7 +8,9 @@ import sympy
 
 from siq.data.recordings import Recordings
 from siq.inference import kalman_filter
+from siq.inference.identify import identify
 from siq.inference.kalman_filter import ClosedFunctions, Noise
+from siq.inference.library import IdentificationOptions
 from siq.inference.maximum_likelihood import Fit, fit_by_filter, noise_uncertainty
 from siq.inference.measurements import Measurements, measurements
 from siq.systems.dynamics import Dynamics, Parameter, Signals
@@ -164,3 +166,16 @@ def test_intervals_taken_some_at_a_time_give_the_same_fit(monkeypatch: pytest.Mo
     assert whole.converged
     np.testing.assert_allclose(parts.model.values, whole.model.values, rtol=1e-9)
     np.testing.assert_allclose(parts.covariance, whole.covariance, rtol=1e-9)
+
+
+def test_a_sensor_that_is_doubtful_is_no_answer_and_counts_in_the_error() -> None:
+    """Of records without a noisy sensor the eleventh shows one by a little more than a standard error."""
+    errors = []
+    for seed in (0, 10):
+        recordings = double_well(seed, sensor=0.0, samples=400)
+        noise = identify(
+            recordings, options=IdentificationOptions(), draw=lambda _: np.random.default_rng(0)
+        ).diagnosis
+        assert noise is not None and noise.intensity_error is not None and not noise.measurement.any()
+        errors.append(noise.intensity_error / noise.intensity)
+    assert errors[0] == pytest.approx(np.sqrt(2 / (4 * 399)), rel=0.05) and errors[1] > 1.3 * errors[0]
