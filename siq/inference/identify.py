@@ -252,9 +252,10 @@ class _Case:
                 noisy = float(scipy.special.expit(odds / 2))
                 if noisy > 0.5:
                     return self.finished(again).with_rival(found, 1 - noisy)
-                return self._finished_by_pairs(found).with_rival(again, noisy)
             except (NumericalFailure, np.linalg.LinAlgError) as error:
                 fault = fault or str(error)
+            else:  # a fault of the pairs is none of the sensor
+                return self._finished_by_pairs(found).with_rival(again, noisy)
         chance = scipy.special.ndtr(score) * len(score)
         if not ((chance < self.limits.each) & (correlation < -HARMLESS_CORRELATION)).any():
             return None

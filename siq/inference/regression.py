@@ -207,9 +207,9 @@ class _PairRegression:
         if rate is None or found.euler or not np.linalg.eigvalsh(rate)[0] > NOISE_FREE * np.trace(rate):
             return found
         coarse = replace(found, coarse=True)
-        first, second = (self._shift(matrix, one, x0, h, rate) for one in (found, coarse))
-        squares = np.einsum("in,ij,jn->n", first - second, np.linalg.inv(rate), first - second) * h
-        spread, d = coarse.moments(lambda x: matrix @ self._terms(x), x0, h, rate)[1], len(rate)
+        mean, spread = coarse.moments(lambda x: matrix @ self._terms(x), x0, h, rate)
+        shifted = self._shift(matrix, found, x0, h, rate) - ((mean - x0) / h - matrix @ self._terms(x0))
+        squares, d = np.einsum("in,ij,jn->n", shifted, np.linalg.inv(rate), shifted) * h, len(rate)
         away = LOCAL * np.sqrt(np.diag(rate)[:, None] * h)  # of states, to differentiate f
         ways = [np.eye(d)[:, [k]] * away for k in range(d)]
         ends = [[matrix @ self._terms(x0 + sign * way) for sign in (1, -1)] for way in ways]

@@ -493,9 +493,8 @@ class _Across:
         slope[1:] += by_middle / 2 + twice
         slope[:-1] += by_middle / 2 - twice
         longer, product = -2 * forward / times[:, 0], parts.speed * parts.length
-        share = np.divide(0.25, product, where=product > 1 / np.finfo(float).max, out=0 * product)[
-            :, None, None
-        ]
+        moving = product > 1 / np.finfo(float).max  # a segment at rest has no times that change
+        share = np.divide(0.25, product, where=moving, out=0 * product)[:, None, None]
         pushed = metric @ turned
         # Second derivatives of the segments by middles, by differences and middles, and by differences.
         frozen = (times * turned.transpose(0, 2, 1) @ pushed, -pushed, metric / times)
