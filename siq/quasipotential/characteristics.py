@@ -43,7 +43,7 @@ from siq.systems.equilibria import hessian_at
 
 NO_ACTION = 1e-7  # of ∫|f||φ'|ds: less is a path without noise
 Function = Callable[[np.ndarray], np.ndarray]
-norm = partial(np.linalg.norm, axis=1)
+norm: Function = partial(np.linalg.norm, axis=1)
 
 
 class ScaledSystem:

@@ -68,6 +68,7 @@ from scipy.interpolate import CubicSpline
 
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import AnyField
+from siq.quasipotential.characteristics import norm
 from siq.quasipotential.path_chains import MinimumActionPath, PathProblem, Tube
 from siq.quasipotential.paths import minimum_action_path
 from siq.quasipotential.power_series import MOST_STATES_OF_DEGREE_4, local_series
@@ -84,6 +85,8 @@ ORBIT_STEPS = 2000  # in each distance from saddle to attractor, in search of th
 ORBIT_REACH = 20.0  # of these distances, up to which it is sought
 
 SERIES_RADIUS = {4: 0.01, 3: 0.003}  # of the distance from A to S, in the metric of M: V is its power series
+SERIES_ERROR = 0.01  # of ∇V to the momenta of the path, up to which the series is used
+SERIES_FAILURE = 0.1  # of the best: from there on the prefactor would be off by as much
 TUBE_LEVEL = 1e-5  # of the action, U where the density about a cycle is no longer that of its tube
 SADDLE_RADIUS = 0.003  # of the distance: from there at the latest the integrand is continued to S
 RICCATI_STEP = 0.2  # in units of the largest rate
@@ -412,14 +415,21 @@ class _Frame:
         level = problem.level(points)
         degree = 3 if dynamics.dimension > MOST_STATES_OF_DEGREE_4 else 4
         least = TUBE_LEVEL * self.height if cycle is not None else SERIES_RADIUS[degree] ** 2 * level[-1]
-        used = np.linalg.norm(points - problem.end, axis=1) > SADDLE_RADIUS
-        used[: int(np.argmax(level >= least))] = False
+        used, first = norm(points - problem.end) > SADDLE_RADIUS, int(np.argmax(level >= least))
         if isinstance(problem.begin, Tube):
-            self.place = problem.begin.place(points[used][:1])
+            self.place = problem.begin.place(points[first : first + 1])
             self.at_attractor = problem.begin.costs(self.place)[0]
         else:
             self.gradients, self.hessians = local_series(dynamics, start)
             self.at_attractor = problem.begin.hessian
+            # Where D grows fast the series ends far closer to A: the momenta of the path tell where.
+            near = slice(1, max(first, 1) + 1)
+            slopes = problem.slopes(self.gradients(path.points[near]))
+            off = norm(slopes - momenta[near]) / norm(momenta[near])
+            if not off.min() < SERIES_FAILURE:
+                raise NumericalFailure(f"f and D change too fast near {start.tolist()} for a series of V")
+            first = 1 + int(np.flatnonzero(off <= max(SERIES_ERROR, off.min()))[-1])
+        used[:first] = False
         # A grid along the path, with the time per unit of it; a step in time is two of its intervals.
         count = int(used.sum())
         curve = CubicSpline(np.arange(count), np.column_stack([points[used], momenta[used]]))
@@ -427,15 +437,12 @@ class _Frame:
         def along(share: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
             y, p = np.split(curve(share), 2, axis=1)
             v = problem.force(y) + 2 * problem.noise.push(y, p)
-            moved = curve(share, 1)[:, : dynamics.dimension]
-            return y, p, v, np.linalg.norm(moved, axis=1) / np.linalg.norm(v, axis=1)
+            return y, p, v, norm(curve(share, 1)[:, : dynamics.dimension]) / norm(v)
 
         y, _, _, pace = along(np.arange(count))
-        largest = np.linalg.norm(problem.jacobian(y), axis=(1, 2)) + 2 * np.linalg.norm(
-            problem.noise.at(y) @ self.at_attractor, axis=(1, 2)
-        )
         # As many steps from one point of the path to the next as its two ends call for.
-        parts = np.ceil(np.maximum(pace[1:], pace[:-1]) * largest.max() / RICCATI_STEP)
+        fastest = pace * np.linalg.norm(problem.jacobian(y), axis=(1, 2))
+        parts = np.ceil(np.maximum(fastest[1:], fastest[:-1]) / RICCATI_STEP)
         if not parts.sum() < MOST_RICCATI_STEPS:
             raise NumericalFailure("the path comes to rest on its way to the saddle: another one lies on it")
         within = [index + np.arange(2 * n) / (2 * n) for index, n in enumerate(parts.astype(int))]
@@ -477,19 +484,22 @@ class _Frame:
 
     def exponent(self, curvatures: np.ndarray) -> float:
         """∫ c dt over the whole path; near S the integrand per length is continued as a straight line."""
-        problem, odd = self.problem, np.zeros(2)
+        problem, first = self.problem, 0.0
         if problem.hessian is not None:  # from A to the first point y: with ẏ = By and c = b·y it is b·B⁻¹y
             here = np.zeros((1, problem.dimension))
             flow = problem.jacobian(here)[0] + 2 * problem.noise.at(here)[0] @ self.at_attractor
-            y = np.linalg.solve(flow, self.points[0]) * np.array([[1.0], [-1.0]])
+            away = np.linalg.solve(flow, self.points[0])
+            short = DERIVATIVE_STEP * float(np.linalg.norm(self.points[0]) / np.linalg.norm(away))
+            y = short * away * np.array([[1.0], [-1.0]])
             p = problem.slopes(self.gradients(problem.points(y)))
-            odd = self.rise(y, p, self.curvature(self.hessians, y))
+            up, down = self.rise(y, p, self.curvature(self.hessians, y))
+            first = float(up - down) / (2 * short)
         rise = self.rise(self.points[::2], self.momenta[::2], curvatures)
         density = rise / np.linalg.norm(self.velocities[::2], axis=1)
         rest = float(np.linalg.norm(self.points[-1] - problem.end))
         outer = rest * (density[-1] + self.continued(density)) / 2
         along = simpson(rise * self.pace[::2], x=self.grid[::2])
-        return float(float(odd[0] - odd[1]) / 2 + along + outer)
+        return float(first + along + outer)
 
     def volume(self) -> tuple[float, float]:
         """The inverse of the density at the start of the path, up to ``(πε)^(d/2)``; and a power of ε.
@@ -527,42 +537,45 @@ class _Frame:
         return (float(found / problem.unit), unknown) if turning < 1 and unknown < 1 else (0.0, 1.0)
 
     def integrated(self) -> np.ndarray:
-        """∇²V at every other point by Riccati's equation, from the power series at A; Runge–Kutta of order 4.
+        """∇²V at every other point by Riccati's equation, from the power series at A.
+
+        Tangents X of places and P of momenta, of which it is P X⁻¹, follow linear equations. A step is the
+        Padé approximant of Magnus' exponential, of order 4 and stable where D is far larger than at A.
 
         Raises
         ------
         NumericalFailure
             Where it diverges.
         """
-        problem = self.problem
+        problem, d = self.problem, self.problem.dimension
         turned, bends = (part(self.points, self.momenta) for part in (problem.turned, problem.bend))
         forces = problem.pull(self.points, self.momenta, turned)
-        noise = problem.noise.at(self.points)
+        upper = np.concatenate([turned, 2 * problem.noise.at(self.points)], axis=2)
+        lower = np.concatenate([-bends, -turned.transpose(0, 2, 1)], axis=2)
+        rates = self.pace[:, None, None] * np.concatenate([upper, lower], axis=1)
+        begin, middle, end = rates[:-2:2], rates[1:-1:2], rates[2::2]
+        step = (self.grid[2::2] - self.grid[:-2:2])[:, None, None]
+        mean, rise, unit = (begin + 4 * middle + end) / 6, end - begin, np.eye(2 * d)
+        change = step * mean - step**2 / 12 * (mean @ rise - rise @ mean)
+        even = unit + change @ change / 12
+        carried = np.linalg.solve(even - change / 2, even + change / 2)
         largest = CAUSTIC_GROWTH * np.abs(self.at_attractor).max()
-
-        def rate(m: np.ndarray, index: int) -> np.ndarray:
-            product = m @ turned[index]
-            return -self.pace[index] * (product + product.T + 2 * m @ noise[index] @ m + bends[index])
-
         m = self.at_attractor
         if problem.hessian is not None:
             m = self.curvature(self.hessians, self.points[:1])[0]
         m = _imposed(m, self.velocities[0], forces[0])
         kept = [m]
-        for index in range(0, len(self.points) - 2, 2):
-            h = self.grid[index + 2] - self.grid[index]
-            with np.errstate(all="ignore"):
-                k1 = rate(m, index)
-                k2 = rate(m + h / 2 * k1, index + 1)
-                k3 = rate(m + h / 2 * k2, index + 1)
-                m = m + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(m + h * k3, index + 2))
-            if not np.abs(m).max() < largest:
-                place = problem.points(self.points[[index]])[0]
+        for index, over in enumerate(carried):
+            place = 2 * index + 2
+            x, p = np.split(over[:, :d] + over[:, d:] @ m, 2)
+            if np.linalg.det(x) > 0:
+                m = _imposed(np.linalg.solve(x.T, p.T), self.velocities[place], forces[place])
+                kept.append(m)
+            if len(kept) < index + 2 or not np.abs(m).max() < largest:
+                where = problem.points(self.points[[2 * index]])[0]
                 raise NumericalFailure(
-                    f"the path meets a caustic near {place.tolist()}: V is not smooth there"
+                    f"the path meets a caustic near {where.tolist()}: V is not smooth there"
                 )
-            m = _imposed(m, self.velocities[index + 2], forces[index + 2])
-            kept.append(m)
         return np.array(kept)
 
 

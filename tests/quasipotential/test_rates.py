@@ -133,6 +133,26 @@ def test_the_hessian_at_a_saddle_follows_from_its_linearisation(dimension: int) 
         assert (np.linalg.eigvalsh(found) < 0).sum() == 1
 
 
+@pytest.mark.parametrize("fast", [1, 20])
+def test_noise_that_grows_fast_about_an_attractor_keeps_the_law_of_one_state(fast: int) -> None:
+    """A gene with 0.02 molecules, and a state without influence: ``2π (D_S/D_A)^½ / (-f'_A f'_S)^½``.
+
+    Series about the attractor end far closer to it than the saddle is; taken too far they gave a time that
+    was too long by 10⁸.
+    """
+    x, y = symbol("x"), symbol("y")
+    birth, death = sympy.Rational(1, 100) + 4 * x**2 / (4 + x**2), x / 2
+    roots = [float(root) for root in sympy.Poly(sympy.numer(sympy.together(birth - death)), x).nroots()[:2]]
+    noise, slope = sympy.lambdify(x, birth + death), sympy.lambdify(x, sympy.diff(birth - death, x))
+    few, saddle = roots
+    law = 2 * np.pi * np.sqrt(noise(saddle) / noise(few) / (-slope(few) * slope(saddle)))
+    dynamics = Dynamics.of(
+        (x, y), (birth - death, -fast * y), diffusion=[[birth + death, 0], [0, 1]], domain=[(0, 10), (-3, 3)]
+    )
+    path = minimum_action_path(dynamics, np.array([few, 0.0]), np.array([saddle, 0.0]))
+    assert escape_rate(dynamics, path).prefactor == pytest.approx(law, rel=0.01)
+
+
 @pytest.mark.parametrize("beta", [2, 3])
 def test_maier_and_steins_integral_below_the_critical_strength(beta: float) -> None:
     def rates(x: float, state: np.ndarray) -> list[float]:

@@ -130,3 +130,21 @@ def test_what_comes_to_rest_slowly_is_none() -> None:
 def test_what_is_not_known_of_the_unsettled_is_said(kind: str | None, words: str) -> None:
     said = sentence(Remark("systems.unsettled", {"share": 0.25, "kind": kind}))
     assert said.startswith("25% of the recorded states lead to no equilibrium: ") and said.endswith(words)
+
+
+def test_what_ends_at_a_pole_outside_the_domain_is_not_asked_for_its_cycle(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Repressor and Cro of phage λ; backwards in time many states come to r = -20, where f has a pole."""
+    asked: list[np.ndarray] = []
+
+    def noted(_: Dynamics, starts: np.ndarray, **__: object) -> Recurrence:
+        asked.append(starts)
+        return Recurrence("none")
+
+    monkeypatch.setattr("siq.systems.phase_portrait.recurrence_of", noted)
+    r, c = sympy.symbols("r c", real=True)
+    free = 1 + r**2 / 4 + r**3 / 80 + 5 * c / 2 + 5 * c**2 / 8
+    flow = (5 * (1 + 5 * r**2 / 2) / free - r / 50, 50 * (1 + 5 * c / 2) / free - c / 50)
+    portrait = phase_portrait(Dynamics.of((r, c), flow, domain=[(0, 250)] * 2))
+    assert len(portrait.attractors) == 2 and not portrait.cycles and not asked
