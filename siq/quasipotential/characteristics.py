@@ -30,7 +30,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
@@ -43,7 +43,7 @@ from siq.systems.equilibria import hessian_at
 
 NO_ACTION = 1e-7  # of ∫|f||φ'|ds: less is a path without noise
 Function = Callable[[np.ndarray], np.ndarray]
-norm: Function = partial(np.linalg.norm, axis=1)
+norm = cast(Function, partial(np.linalg.norm, axis=1))
 
 
 class ScaledSystem:
