@@ -71,6 +71,8 @@ LEAST_NOISE = 1e-9  # numerical: of the strongest noise; where it is weaker it i
 STEEP = 700.0  # of z: beyond, exp overflows, and B has its limits
 CORE_SHARE = 0.5  # of U at the next saddle: a core lies well within its well
 COARSER = 0.5  # as many cells along each state: enough for how much a number changes
+MOST_ROUNDING = 0.1  # numerical: as good as lost in rounding is a time beyond
+MOST_AT_WALLS = 1e-3  # share of the time that is spent in cells at walls, some thousandths of the box wide
 WIDER = 0.75  # as many cells: by which the error of those is told, where three states leave no coarser ones
 FEWEST_PARTS, MOST_PARTS = 256, 4096  # of a period: in each Ψ changes by less than one half
 NODES = 8  # of Gauss and Legendre in each part: to rounding
@@ -460,14 +462,28 @@ class CellProcess:
 
         ln τ is extrapolated to cells of no width, from these and wider ones: it is off by the square of that.
         The error, a relative one, is the square of what this adds, as the next power of the width is.
+
+        Raises
+        ------
+        NumericalFailure
+            When rounding would be a part of so long a time, or when noise carries states over the walls of
+            the box, which a process without walls would leave.
         """
         wide = CellProcess(self.dynamics, self.intensity, self._box, cells=round(WIDER * self._shape[0]))
         own, other = (
-            float(np.log(one.interpolated(one.mean_times(ends))(start.center[:, None])[0]))
-            for one in (self, wide)
+            float(one.interpolated(one.mean_times(ends))(start.center[:, None])[0]) for one in (self, wide)
         )
-        added = (own - other) / (WIDER**-2 - 1)
-        return float(np.exp(own + added)), added**2
+        rounding = own * float(-self.rates.diagonal().min()) * np.finfo(float).eps
+        if not (own > 0 and other > 0 and rounding < MOST_ROUNDING):
+            raise NumericalFailure("the time is so long that rounding is a part of it")
+        edges = np.stack(np.unravel_index(wide._places, wide._shape)) % (wide._shape[0] - 1) == 0
+        spent = wide.mean_times(ends, during=(edges & ~self._turning[:, None]).any(axis=0))
+        if wide.interpolated(spent)(start.center[:, None])[0] > MOST_AT_WALLS * other:
+            raise NumericalFailure(
+                "the noise carries states over the edge of the domain, where cells have walls"
+            )
+        added = np.log(own / other) / (WIDER**-2 - 1)
+        return float(own * np.exp(added)), float(added**2)
 
     def inside(self, part: Neighbourhood) -> np.ndarray:
         """Mask of the cells in a neighbourhood, shape ``(n,)``; NumericalFailure where there is none."""
@@ -510,10 +526,13 @@ class CellProcess:
         density = self.density * forward * back / self.volume
         return ReactiveFlow(self, forward, density, self._current(flows), leaving / spent, (start, *ends))
 
-    def mean_times(self, ends: Sequence[Neighbourhood]) -> np.ndarray:
-        """Mean time until one of some neighbourhoods is reached, from each cell: shape ``(n,)``."""
+    def mean_times(self, ends: Sequence[Neighbourhood], *, during: np.ndarray | float = 1.0) -> np.ndarray:
+        """Mean time until one of some neighbourhoods is reached, from each cell: shape ``(n,)``.
+
+        `during` is 1 for cells in which it counts, ``(n,)``; by default it does in all.
+        """
         reached = np.any([self.inside(one) for one in ends], axis=0)
-        return self.solved(np.where(reached, 0.0, np.nan), source=1.0)
+        return self.solved(np.where(reached, 0.0, np.nan), source=during)
 
     def dissipation(self) -> np.ndarray:
         """Where entropy is produced, per unit of time and of the states: shape ``(n,)``."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -547,10 +548,12 @@ class Landscape:
             try:
                 process = CellProcess(system, intensity, box)
                 progress = process.between(core, others).progress
-                operator = process.mean_time(core, others)
             except (NumericalFailure, np.linalg.LinAlgError, RuntimeError):
                 mine = [way for way in self.transitions if way.start == index]
                 progress = progress_along(mine, self.attractors[index], self.dynamics, intensity)
+            else:
+                with suppress(NumericalFailure, np.linalg.LinAlgError, RuntimeError):
+                    operator = process.mean_time(core, others)
             check = split_escapes(
                 self.dynamics, core, others, intensity=intensity, progress=progress,
                 generator=np.random.default_rng([seed, index]),

@@ -12,6 +12,7 @@ from siq.data.recordings import Recordings
 from siq.data.states import DwellCount
 from siq.data.stationarity import runs_of
 from siq.errors import NumericalFailure
+from siq.quasipotential.fokker_planck import CellProcess
 from siq.quasipotential.occupancy import _core_of, _VisitProcess
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -102,3 +103,30 @@ def test_noise_that_does_not_reach_a_state_is_refused() -> None:
     system = Dynamics(("x", "y"), (y, x - x**3 - y), Diffusion(np.diag([0.0, 1.0])))
     with pytest.raises(NumericalFailure, match="does not reach"):
         _VisitProcess(system, 0.1, np.array([[-2.0, 2.0], [-2.0, 2.0]]), [])
+
+
+@pytest.mark.parametrize(
+    ("intensity", "which", "box", "reason"),
+    [
+        (0.03, 1, BOX, "rounding"),
+        (0.015, 1, BOX, "rounding"),
+        (0.1, 0, np.array([[-1.1, 2.0]]), "edge of the domain"),
+    ],
+)
+def test_times_lost_in_rounding_and_wells_at_a_wall_are_no_numbers(
+    intensity: float, which: int, box: np.ndarray, reason: str
+) -> None:
+    """ΔU/ε is 24 and 47 for the second well; cells gave 10¹⁶ for 10²², and took a wall for nature's."""
+    with pytest.raises(NumericalFailure, match=reason):
+        CellProcess(TILTED, intensity, box).mean_time(CORES[which], [CORES[1 - which]])
+
+
+def test_long_times_of_one_state_are_those_of_quadrature() -> None:
+    intensity = 0.06
+    time, error = CellProcess(TILTED, intensity, BOX).mean_time(CORES[1], CORES[:1])
+    grid = np.linspace(*BOX[0], 400_001)
+    u = 2 * (grid**4 / 4 - grid**2 / 2 - 0.1 * grid) / intensity
+    beyond = cumulative_trapezoid(np.exp(u[-1] - u[::-1]), -grid[::-1], initial=0)[::-1]
+    within = (grid > WELLS[0] + HALF) & (grid < WELLS[1])
+    exact = np.trapezoid((np.exp(u - u[-1]) * beyond)[within], grid[within]) * 2 / intensity
+    assert time == pytest.approx(exact, rel=5e-3) and error < 1e-3
