@@ -107,12 +107,12 @@ TRANSITION = (
 LAW = (
     _fields(NUMBER, "prefactor")
     | _fields(KNOWN, "prefactor_error", "exponent", prefactor_covariance="covariance")
-    | _fields(PLAIN, "correction", "unknown", "power")
+    | _fields(PLAIN, "correction", "unknown", "skew", "power")
     | _fields(ARRAY, "phases")
     | _fields(REMARKS, law_remarks="remarks")
 )
 # Of files from before there was one.
-OLDER_LAW = {"correction": 0.0, "unknown": 1.0, "power": 0.0, "phases": None}
+OLDER_LAW = {"correction": 0.0, "unknown": 1.0, "skew": 0.0, "power": 0.0, "phases": None}
 TURN = _fields(PLAIN, own="loss", beyond="loss_beyond", exact="particle")
 WAY = _fields(PLAIN, minimum_action="action") | _fields(ARRAY, "downhill", uphill="points")
 PATH = (

@@ -206,6 +206,9 @@ class EscapeRate:
         Relative standard error of ΔU/ε from an estimated D over that of ε.
     correction, unknown
         By how much ln E[τ] grows with ε, in the unit of 1/U; and what is not known of that, in ε/ΔU.
+    skew
+        By which share of itself ∇V is off M_S (x - S) where the path ends (`_Frame.skew`): so late as the law
+        sets in then, it errs by about twice that.
     power, phases
         Of ways from or over a cycle K depends on ε, ``K = ε^power / Σ r exp(-δ/ε)``: δ, by how much more the
         path through another phase costs, and r, its part of the rate, shape ``(2, n)``. The prefactor is
@@ -225,6 +228,7 @@ class EscapeRate:
     leverage: float = 1.0
     correction: float = 0.0
     unknown: float = 1.0
+    skew: float = 0.0
     power: float = 0.0
     phases: np.ndarray | None = None
 
@@ -313,7 +317,8 @@ class EscapeRate:
         together = 2 * self.covariance / noise.intensity
         # By rounding, or by what is in one error alone, the two could cancel by more than there is.
         error = float(np.sqrt(max(squares + together, np.nan_to_num(of_noise) ** 2)))
-        law_error = np.hypot(self.correction * noise.intensity, self.unknown) / height
+        of_order = np.hypot(self.correction * noise.intensity, self.unknown) / height
+        law_error = np.hypot(of_order, 2 * self.skew)
         return MeanTime(value, error, float(law_error))
 
 
@@ -358,9 +363,10 @@ def escape_rate(
     remarks, skew = list[Remark](), frame.skew()
     if not path.converged:
         remarks.append(Remark("quasipotential.path_not_converged"))
+    askew = skew > SLIGHT_SKEW and frame.stable < 2 * frame.unstable
     if frame.resonant:
         remarks.append(Remark("quasipotential.law_sets_in_late_by_resonance"))
-    elif skew > SLIGHT_SKEW and frame.stable < 2 * frame.unstable:
+    elif askew:
         remarks.append(Remark("quasipotential.law_sets_in_late_by_turning"))
     if twins:
         remarks.append(Remark("quasipotential.second_path_of_same_action"))
@@ -384,7 +390,7 @@ def escape_rate(
     correction, unknown = frame.correction()
     return EscapeRate(
         path.action, np.nan if power else prefactor, exponent, tuple(remarks), loss, loss_beyond, particle,
-        correction=correction, unknown=unknown, power=power, phases=phases,
+        correction=correction, unknown=unknown, skew=skew if askew else 0.0, power=power, phases=phases,
     )  # fmt: skip
 
 
