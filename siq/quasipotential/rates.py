@@ -326,7 +326,6 @@ def escape_rate(
     dynamics: Dynamics,
     path: MinimumActionPath,
     *,
-    hessian: Callable[[np.ndarray], np.ndarray] | None = None,
     beyond: bool = True,
     cycle: Cycle | None = None,
 ) -> EscapeRate:
@@ -345,8 +344,6 @@ def escape_rate(
     path
         From the attractor to the saddle (`siq.quasipotential.paths.minimum_action_path`). With its tolerance
         of 1e-4 the prefactor is good to a percent, with 1e-5 to a few thousandths.
-    hessian
-        ∇²V of a formula, points ``(n, d)`` to ``(n, d, d)``; by default it is integrated along the path.
     beyond
         Whether beyond the saddle lies another well; it matters where damping is weak.
     cycle
@@ -375,7 +372,7 @@ def escape_rate(
             "V is not smooth at the saddle, where the path does not arrive along the direction in which V"
             " would fall; the escape time then has another power of ε in its prefactor"
         )
-    curvatures = frame.integrated() if hessian is None else frame.curvature(hessian, frame.points[::2])
+    curvatures = frame.integrated()
     exponent = frame.exponent(curvatures)
     at_saddle = frame.continued(curvatures) if frame.at_saddle is None else frame.at_saddle
     volume, power = frame.volume()

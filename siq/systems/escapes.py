@@ -151,9 +151,8 @@ def simulate_escapes(
     generator: np.random.Generator,
     walkers: int = 1000,
     step: float | None = None,
-    confirm: bool = True,
 ) -> _EscapeTimes:
-    """Follow walkers until they reach one of some neighbourhoods.
+    """Follow walkers until they reach one of some neighbourhoods, from which f leads on to its attractor.
 
     Parameters
     ----------
@@ -167,9 +166,6 @@ def simulate_escapes(
         Source of the noise, and how many there are.
     step
         Step h; by default a tenth of the shortest time of f at the start and the targets.
-    confirm
-        Whether one who reaches an ellipsoid must be led on to its attractor by f, and goes on otherwise: an
-        ellipsoid may reach out of the basin of its attractor.
 
     Raises
     ------
@@ -187,7 +183,7 @@ def simulate_escapes(
     function = dynamics.drift_of_components
     draw = noise_source(dynamics.diffusion, intensity=intensity, step=step, generator=generator)
     slowest = [np.abs(np.linalg.eigvals(one).real).min() for one in dynamics.jacobian(centers[1:])]
-    settling = [int(np.ceil(LONGEST_SETTLING / one / step)) if confirm else 0 for one in slowest]
+    settling = [int(np.ceil(LONGEST_SETTLING / one / step)) for one in slowest]
     x = starts.T.copy()
     steps = int(np.ceil(longest / step))
     times, reached = [np.zeros(0)], [np.zeros(0, dtype=int)]
