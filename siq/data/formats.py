@@ -415,11 +415,7 @@ def _open_parquet(file: str) -> ColumnFile:
 
     kept = [field.metadata or {} for field in schema]
     units, titles = (tuple(_text(each.get(key)) for each in kept) for key in (b"unit", b"heading"))
-    noted = json.loads((schema.metadata or {}).get(b"notes", b"[]"))  # sentences, before remarks were kept
-    remarks = (
-        Remark("data.text", {"text": each}) if isinstance(each, str) else Remark.from_data(each)
-        for each in noted
-    )
+    remarks = map(Remark.from_data, json.loads((schema.metadata or {}).get(b"notes", b"[]")))
     return ColumnFile(tuple(schema.names), units, load, titles, tuple(remarks))
 
 

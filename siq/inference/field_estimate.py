@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
@@ -295,16 +295,14 @@ class NoiseDiagnosis:
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any]) -> NoiseDiagnosis:
-        """A diagnosis as `as_data` stored it; older files have fewer entries."""
-        known: dict[str, Any] = {"covariance": [], "measurement": []}
-        known |= {"correlation": 0.0, "correlation_score": 0.0}
-        known |= {each.name: data[each.name] for each in fields(cls) if data.get(each.name) is not None}
+        """A diagnosis as `as_data` stored it."""
+        known: dict[str, Any] = {name: value for name, value in data.items() if value is not None}
         for name in {"covariance", "measurement", "measurement_error"} & known.keys():
             known[name] = np.array(known[name], dtype=float)
         if "measurement_error" in known:
             known["measurement_error"][np.isnan(known["measurement_error"])] = np.inf
-        known["diffusion"] = DiffusionSource(known.get("diffusion", DiffusionSource.GIVEN))
-        known["remarks"] = tuple(map(Remark.from_data, known.get("remarks", ())))
+        known["diffusion"] = DiffusionSource(known["diffusion"])
+        known["remarks"] = tuple(map(Remark.from_data, known["remarks"]))
         return cls(**known)
 
 
@@ -649,8 +647,6 @@ def read_field(path: str | Path) -> FieldEstimate | None:
         )
         shares = [row.get("stability") for row in rows]
         average, shape = data.get("alternatives"), (library.size, library.dimension)
-        if (older := data.get("rivals")) is not None:
-            average = {"bias": older["mean_change"], "spread": older["spread"]}
         formulas = [
             NoiseFormula.from_data(data[key], library.symbols) if data.get(key) else None
             for key in ("noise_formula", "constant_noise")

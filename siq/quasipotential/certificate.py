@@ -387,28 +387,17 @@ def _position_text(position: np.ndarray) -> str:
     return np.array2string(position, precision=4, suppress_small=True, separator=", ")
 
 
-# Curves in search of a caustic; what is said of one has four digits.
-CAUSTIC_FAN: dict[str, Any] = {"most": 512, "tolerance": 1e-7, "spacing": 0.1}
-
-
-def caustics_below(
-    dynamics: Dynamics, wells: Sequence[Well], portrait: PhasePortrait, error: float, *, seed: int = 0
-) -> tuple[Remark, ...]:
+def caustics_below(references: Sequence[Reference], error: float) -> tuple[Remark, ...]:
     """Where characteristics cross below the saddle of a well: no smooth V exists there.
 
-    Only sought where the stated error leaves room for one. A kink of V is no fault of the method, but no
+    Only told where the stated error leaves room for one. A kink of V is no fault of the method, but no
     polynomial follows it, and the error that is stated comes from there.
     """
     remarks = []
-    box = portrait.box + np.ptp(portrait.box, axis=1)[:, None] * np.array([-0.25, 0.25])
-    for well in wells if error > MIN_EXPLAINED_ERROR else ():
-        fan = adapted_fan(
-            dynamics, well.attractor, level=0.98 * well.level, box=box,
-            generator=np.random.default_rng(seed), **CAUSTIC_FAN,
-        )  # fmt: skip
-        if (caustic := fan.first_caustic()) is not None:
-            where, value = caustic
-            places = {"attractor": _position_text(well.attractor), "place": _position_text(where)}
+    for one in references if error > MIN_EXPLAINED_ERROR else ():
+        if one.caustic is not None:
+            where, value = one.caustic
+            places = {"attractor": _position_text(one.attractor), "place": _position_text(where)}
             remarks.append(Remark("quasipotential.caustic", places | {"level": 2 * value}))
     return tuple(remarks)
 
@@ -466,7 +455,7 @@ def _follow_well(
     error = TOLERANCE * int(np.bincount(fan.curve).max()) + (0.0 if lowest.all() else SHEET_MARGIN)
     stopped = np.isin(ends, (End.STALLED, End.TIME, End.CAUSTIC)).mean() > 0.5
     if len(values) >= MIN_POINTS and (values.max() >= REACHED_SHARE * fan.level or not stopped):
-        return Reference(attractor, x, values, level, error)
+        return Reference(attractor, x, values, level, error, caustic=fan.first_caustic())
     if np.isin(ends, (End.STALLED, End.TIME)).mean() > 0.5:
         why = "they are too stiff: leave out the fastest states, or record their slow motion alone"
     elif (ends == End.CAUSTIC).any():
@@ -477,7 +466,7 @@ def _follow_well(
     else:
         why = "they leave the recorded states: record more of them about the attractor"
     fault = f"characteristics from the attractor {name} give {len(values)} points to compare with, as {why}"
-    return Reference(attractor, x, values, level, error, fault)
+    return Reference(attractor, x, values, level, error, fault, fan.first_caustic())
 
 
 def _level(

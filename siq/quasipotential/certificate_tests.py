@@ -110,6 +110,7 @@ class Reference:
     level: float  #: V up to which they were followed, NaN where they could not be
     error: float
     fault: str = ""  #: why there is nothing to compare with, and what would help; empty where there is
+    caustic: tuple[np.ndarray, float] | None = None  #: the lowest, and V there; None where they do not cross
 
     def below(self, level: float) -> tuple[np.ndarray, np.ndarray]:
         """Points and values up to `LEVEL_SHARE` of a level that a formula claims, if it is the lower one."""

@@ -102,6 +102,12 @@ class ScaledSystem:
         jacobian = self.jacobian(y)
         return jacobian if self.noise.constant else jacobian + 2 * self.noise.turn(y, q)
 
+    def tangents(self, y: np.ndarray, q: np.ndarray, turned: np.ndarray) -> np.ndarray:
+        """The matrix of the linear equations of ``(X, P)``, tangents of y and q: ``(n, 2d, 2d)``."""
+        upper = np.concatenate([turned, 2 * self.noise.at(y)], axis=2)
+        lower = np.concatenate([-self.bend(y, q), -turned.transpose(0, 2, 1)], axis=2)
+        return np.concatenate([upper, lower], axis=1)
+
     def pull(self, y: np.ndarray, q: np.ndarray, turned: np.ndarray | None = None) -> np.ndarray:
         """q̇ at positions and momenta ``(n, d)``; `turned` where it is known."""
         turned = self.turned(y, q) if turned is None else turned
@@ -150,9 +156,7 @@ class HamiltonianFlow(ScaledSystem):
         turned, new = self.turned(y, q), np.empty_like(state)
         y_rate, q_rate, v_rate, frames_rate = self.parts(new)
         y_rate[...], q_rate[...], v_rate[...] = self.velocities(y, q, turned)
-        upper = np.concatenate([turned, 2 * self.noise.at(y)], axis=2)
-        lower = np.concatenate([-self.bend(y, q), -turned.transpose(0, 2, 1)], axis=2)
-        frames_rate[...] = np.concatenate([upper, lower], axis=1) @ frames
+        frames_rate[...] = self.tangents(y, q, turned) @ frames
         return new
 
     def orthonormal(self, state: np.ndarray) -> np.ndarray:
@@ -302,11 +306,10 @@ def characteristics(
     start: float = 1e-6,
     start_degree: int = 4,
     spacing: float = 0.05,
-    time_limit: float | None = None,
     tolerance: float = 1e-10,
     most_steps: int = MAX_STEPS,
 ) -> Fan:
-    """Follow characteristics until V reaches a level, a caustic is met, or a box or a time limit is left.
+    """Follow characteristics to a level of V, a caustic, the rim of a box, or for 60 of the slowest times.
 
     Parameters
     ----------
@@ -322,8 +325,6 @@ def characteristics(
         which can grow to a false caustic where curves draw together. Where f has kinks close to A, 2 remains.
     spacing
         Largest distance between points along a curve; the level is at about 1.
-    time_limit
-        In time units; by default 60 of the slowest relaxation times.
     tolerance
         Local error, relative to the distance from A, to V and to the tangents.
     most_steps
@@ -337,8 +338,7 @@ def characteristics(
     rows += [np.broadcast_to(np.eye(flow.dimension).ravel(), (len(x), flow.dimension**2))]
     rows += [flow.curvatures(series.hessians(x)).reshape(len(x), -1)]
     initial = flow.orthonormal(np.concatenate(rows, axis=1))
-    if time_limit is None:
-        time_limit = MAX_RELAXATION_TIMES / np.abs(np.linalg.eigvals(flow.relaxation).real).min()
+    time_limit = MAX_RELAXATION_TIMES / np.abs(np.linalg.eigvals(flow.relaxation).real).min()
     box = np.asarray(box, dtype=float)
 
     def relative(error: np.ndarray, state: np.ndarray) -> np.ndarray:

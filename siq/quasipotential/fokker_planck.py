@@ -461,13 +461,8 @@ class CellProcess:
         """Mean time from the middle of one neighbourhood until one of some others is reached, and its error.
 
         ln τ is extrapolated to cells of no width, from these and wider ones: it is off by the square of that.
-        The error, a relative one, is the square of what this adds, as the next power of the width is.
-
-        Raises
-        ------
-        NumericalFailure
-            When rounding would be a part of so long a time, or when noise carries states over the walls of
-            the box, which a process without walls would leave.
+        The error, a relative one, is the square of what this adds, as the next power of the width is. Neither
+        is told where rounding is a part of so long a time, or noise carries states to walls of the box.
         """
         wide = CellProcess(self.dynamics, self.intensity, self._box, cells=round(WIDER * self._shape[0]))
         own, other = (
@@ -479,9 +474,7 @@ class CellProcess:
         edges = np.stack(np.unravel_index(wide._places, wide._shape)) % (wide._shape[0] - 1) == 0
         spent = wide.mean_times(ends, during=(edges & ~self._turning[:, None]).any(axis=0))
         if wide.interpolated(spent)(start.center[:, None])[0] > MOST_AT_WALLS * other:
-            raise NumericalFailure(
-                "the noise carries states over the edge of the domain, where cells have walls"
-            )
+            raise NumericalFailure("the noise carries states over the edge of the domain, where walls are")
         added = np.log(own / other) / (WIDER**-2 - 1)
         return float(own * np.exp(added)), float(added**2)
 

@@ -177,8 +177,7 @@ def landscape_from_equations(
             references=references_about(system, portrait, depths=depths, seed=seed),
         )  # fmt: skip
         wells, certificate = certify_wells(wells, evidence)
-        sought = [well for well in wells if well is not None]
-        remarks += caustics_below(system, sought, portrait, certificate.error, seed=seed)
+        remarks += caustics_below(evidence.references, certificate.error)
     wells += [None] * len(portrait.cycles)
     noises = settings.landscape.noise_intensities
     found = _assembled(

@@ -111,8 +111,6 @@ LAW = (
     | _fields(ARRAY, "phases")
     | _fields(REMARKS, law_remarks="remarks")
 )
-# Of files from before there was one.
-OLDER_LAW = {"correction": 0.0, "unknown": 1.0, "skew": 0.0, "power": 0.0, "phases": None}
 TURN = _fields(PLAIN, own="loss", beyond="loss_beyond", exact="particle")
 WAY = _fields(PLAIN, minimum_action="action") | _fields(ARRAY, "downhill", uphill="points")
 PATH = (
@@ -215,9 +213,9 @@ def landscape_from_data(data: Mapping[str, Any], dynamics: Dynamics) -> Landscap
             path = MinimumActionPath(**_read(one, WAY), **_read(one["path"], PATH))
         if one["prefactor"] is not None or one.get("phases") is not None:
             turn = {} if one["turn"] is None else _read(one["turn"], TURN)
-            rate = EscapeRate(one["minimum_action"], **_read(OLDER_LAW | one, LAW), **turn)
+            rate = EscapeRate(one["minimum_action"], **_read(one, LAW), **turn)
         start = attractors[one["start"]]
-        own = _read({"of_residual": 0.0} | one, TRANSITION) | {"turns": tuple(one.get("turns", ()))}
+        own = _read(one, TRANSITION) | {"turns": tuple(one.get("turns", ()))}
         cycle = start if isinstance(start, Cycle) else None
         way = Transition(saddle=saddle, path=path, rate=rate, cycle=cycle, **own)
         transitions.append(way)

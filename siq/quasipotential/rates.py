@@ -551,11 +551,9 @@ class _Frame:
             Where it diverges.
         """
         problem, d = self.problem, self.problem.dimension
-        turned, bends = (part(self.points, self.momenta) for part in (problem.turned, problem.bend))
+        turned = problem.turned(self.points, self.momenta)
         forces = problem.pull(self.points, self.momenta, turned)
-        upper = np.concatenate([turned, 2 * problem.noise.at(self.points)], axis=2)
-        lower = np.concatenate([-bends, -turned.transpose(0, 2, 1)], axis=2)
-        rates = self.pace[:, None, None] * np.concatenate([upper, lower], axis=1)
+        rates = self.pace[:, None, None] * problem.tangents(self.points, self.momenta, turned)
         begin, middle, end = rates[:-2:2], rates[1:-1:2], rates[2::2]
         step = (self.grid[2::2] - self.grid[:-2:2])[:, None, None]
         mean, rise, unit = (begin + 4 * middle + end) / 6, end - begin, np.eye(2 * d)
@@ -571,14 +569,13 @@ class _Frame:
         for index, over in enumerate(carried):
             place = 2 * index + 2
             x, p = np.split(over[:, :d] + over[:, d:] @ m, 2)
-            if np.linalg.det(x) > 0:
-                m = _imposed(np.linalg.solve(x.T, p.T), self.velocities[place], forces[place])
-                kept.append(m)
-            if len(kept) < index + 2 or not np.abs(m).max() < largest:
+            m = _imposed(np.linalg.solve(x.T, p.T), self.velocities[place], forces[place])
+            if not (np.linalg.det(x) > 0 and np.abs(m).max() < largest):
                 where = problem.points(self.points[[2 * index]])[0]
                 raise NumericalFailure(
                     f"the path meets a caustic near {where.tolist()}: V is not smooth there"
                 )
+            kept.append(m)
         return np.array(kept)
 
 

@@ -324,8 +324,7 @@ class RefinementContext:
     def refine_and_certify(self) -> Refinement:
         """Refined formulas of the run with their certificate."""
         refined, formulas, certificate = self._certified()
-        wells, found = refined.wells, self.found
-        caustics = caustics_below(found.dynamics, wells, self.portrait, certificate.error, seed=self.number)
+        found, caustics = self.found, caustics_below(self.evidence.references, certificate.error)
         # Hops and histogram of the record, compared with those that f predicts.
         strength = found.noise_strength
         try:

@@ -430,8 +430,10 @@ def transitions(
             remarks += rate.remarks
             error, covariance = prefactor_error(found, path)
             rate = replace(rate, prefactor_error=error, covariance=covariance)
-            if rate.unknown == 1 and (back := _lowest_way_back(way, ways)) is not None:
-                rate = replace(rate, unknown=float(np.hypot(1.0, path.action / back)))
+            there = (way.end, way.start)
+            back = [one.path.action for one in ways if one.path and (one.start, one.end) == there]
+            if rate.unknown == 1 and back:  # from a shallow state behind: the law errs as ε over its depth
+                rate = replace(rate, unknown=float(np.hypot(1.0, path.action / min(back))))
         except (NumericalFailure, np.linalg.LinAlgError) as failure:
             remarks.append(Remark("quasipotential.no_escape_time", {"reason": str(failure)}))
         barrier, share = path.action, 0.0
@@ -453,12 +455,6 @@ def transitions(
             )
         )  # fmt: skip
     return found_ways
-
-
-def _lowest_way_back(way: Transition, ways: Sequence[Transition]) -> float | None:
-    """ΔU from behind the saddle: where it is low, the law errs as ε over it, however deep the well is."""
-    back = (way.end, way.start)
-    return min((one.path.action for one in ways if one.path and (one.start, one.end) == back), default=None)
 
 
 def _barrier_by_formula(path: MinimumActionPath, well: Well) -> tuple[float, float]:

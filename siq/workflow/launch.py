@@ -392,9 +392,8 @@ def _answered(request: Request, pages: Sequence[Path]) -> Exit:
         stdin=subprocess.PIPE,
         stdout=None if request.verbose else subprocess.PIPE,
         stderr=None if request.verbose else subprocess.STDOUT,
-        text=None if request.verbose else True,
-        encoding=None if request.verbose else "utf-8",
-        errors=None if request.verbose else "replace",
+        encoding="utf-8",
+        errors="replace",
     )
     progress, said = _Progress(), []
 

@@ -242,9 +242,11 @@ def test_curves_end_at_the_box() -> None:
     np.testing.assert_allclose(np.abs((reached - [-1, 0]) / 0.1).max(axis=1), 1, atol=1e-6)
 
 
-def test_curves_end_at_a_time_limit_and_at_another_equilibrium() -> None:
+def test_curves_end_at_a_time_limit_and_at_another_equilibrium(monkeypatch: pytest.MonkeyPatch) -> None:
     known = maier_stein(1)
-    assert (fan_of(known, level=0.2, time_limit=0.5).ends == End.TIME).all()
+    with monkeypatch.context() as context:
+        context.setattr("siq.quasipotential.characteristics.MAX_RELAXATION_TIMES", 0.5)
+        assert (fan_of(known, level=0.2).ends == End.TIME).all()
     to_the_saddle = fan_of(known, level=0.3, directions=np.array([[1.0, 0.0]]))
     assert to_the_saddle.ends[0] == End.REST
     assert to_the_saddle.values[-1] == pytest.approx(SADDLE_LEVEL, abs=1e-5)
