@@ -38,7 +38,7 @@ MODULES = {
         " tests/inference/test_model_average.py",
     ),
     "holdout": ("siq.diagnosis.holdout", "tests/diagnosis/test_holdout.py tests/diagnosis/test_verdict.py"),
-    "verify": ("siq.workflow.verification", "tests/rules/test_reruns.py"),
+    "verify": ("siq.workflow.verification", "tests/workflow/test_verification.py"),
 }
 """The modules, and the tests that are theirs."""
 MUTANT = "SIQ_MUTANT"  # of a process: module and number of the mutant
