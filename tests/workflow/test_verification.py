@@ -237,6 +237,7 @@ def test_f_and_d_agree_to_rounding(of_f: float, of_d: float, said: str) -> None:
     positions = states[:, :1]  # of a record without velocities: formulas are compared
     assert kinds(verification._field(one, one, positions)) == {"field": {"agrees"}}
     assert kinds(verification._field(one, other, positions)) == {"field": {"differs" if of_f else "agrees"}}
+    assert kinds(verification._field(one, Dynamics.of((x,), (-x,)), states)) == {"field": {"differs"}}
 
 
 @pytest.mark.parametrize(
@@ -244,6 +245,8 @@ def test_f_and_d_agree_to_rounding(of_f: float, of_d: float, said: str) -> None:
     [
         (1.0, {"residual": {"agrees"}, "branch": {"agrees"}}),
         (1.2, {"residual": {"differs"}, "branch": {"agrees"}}),
+        (0.6, {"residual": {"differs"}, "branch": {"agrees"}}),  # f + 2Dp = -2 + 2·1.2 at the attractor
+        (0.4, {"residual": {"differs"}, "branch": {"differs"}}),
         (0.0, {"branch": {"differs"}}),  # V = const solves the equation
         (-1.0, {"branch": {"differs"}}),
     ],
@@ -255,6 +258,17 @@ def test_a_formula_is_judged_by_residual_and_branch(landscape: Landscape, factor
     assert kinds(verification._formula(0, other, landscape.dynamics, well.points)) == said
     of_others = verification._formula(0, other, landscape.dynamics, np.zeros((3, 2)))
     assert kinds(of_others) == {"residual": {"open"}}
+
+
+def test_a_formula_is_judged_at_states_of_its_own_well(landscape: Landscape) -> None:
+    well = landscape.wells[0]
+    assert well is not None and well.attractor[0] < 0
+    x = np.linspace(-1.8, 1.8, 361)[:, None]
+    own = (x < 0) & ((x**2 - 1) ** 2 / 4 < 0.9 * well.level)
+    own[np.argmin(np.abs(x - well.attractor))] = False  # where V rises on the way
+    findings = verification._formula(0, well, landscape.dynamics, x)
+    counts = [remark.values["count"] for _, remark in findings if remark.code == "workflow.residual"]
+    assert counts == [own.sum()]
 
 
 def lowest(landscape: Landscape, **changed: Any) -> Landscape:
