@@ -9,7 +9,7 @@ it, or it makes no difference. The sources stay as they are; a mutant exists in 
 tests it.
 
 Of samples with the seed 0, in November 2026, were killed: selection 75 of 100, verify 78 of 100, holdout 64
-of 80. Certificate was asked for 15 mutants only, of which its own two files of tests killed 5.
+of 80. Certificate was asked for 17 mutants only, of which its own two files of tests kill 7.
 """
 
 from __future__ import annotations
