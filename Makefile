@@ -15,7 +15,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .DEFAULT_GOAL := help
 
 .PHONY: help statistics examples test suite test-portable full untuned noise slurm wheel test-pages newcomer laboratories coverage supports discrepancies \
-        hostile golden mutants official docs docs-full schemas release-check lint format environment clean
+        hostile golden mutants speed official docs docs-full schemas release-check lint format environment clean
 
 help:  ## this list, which plain `make` prints, too
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
@@ -129,6 +129,10 @@ MODULE ?=
 MUTANTS ?= 20
 mutants: environment  ## whether tests see faults in the modules that decide: hours (MODULE=selection MUTANTS=5)
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m benchmarks.mutation $(MODULE) --sample $(MUTANTS)
+
+# Processor time of four things that people wait for, appended to benchmarks/speed.csv; a fifth more than before is an error.
+speed: environment  ## what people wait for, timed and compared with earlier: three minutes
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m benchmarks.speed
 
 # Schemas of configuration for editors and for the catalogue of workflows, from the classes that check it.
 schemas: environment  ## workflow/schemas/, from the classes that check the configuration

@@ -44,6 +44,12 @@ found = identify_vector_field(library, pairs, options=IdentificationOptions(degr
 terms = {library.names[k]: round(float(found.coefficients[k, i]), 5) for i, k in found.support if i == 0}
 assert terms == {"x": 1.0, "x**3": -1.0}, terms
 
+# Its landscape, certified; and a formula of a mechanism, which numbers and arrays take part in.
+landscape = siq.Landscape.from_equations(well)
+assert landscape.certificate.certified and len(landscape.transitions) == 2, landscape.report()
+limited = siq.Dynamics.of((x,), (sympy.Min(x, 1) - x,))
+assert np.array_equal(limited.drift(np.array([[0.5], [3.0]])), [[0.0], [-2.0]])
+
 
 def command(*arguments: str) -> subprocess.CompletedProcess[str]:
     """The command as it was installed."""

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.stats
 
+from siq.diagnosis import holdout
 from siq.diagnosis.dictionary import roles_of
 from siq.diagnosis.holdout import (
+    CHANGE_BY_CHANCE,
     HeldOutErrors,
     _change_between,
     in_blocks,
+    predicts_better,
+    preferred_model,
+    preferred_recalibration,
     simulated,
+    typically_better,
 )
 from siq.diagnosis.investigation import _spread_of_free_runs
 from siq.diagnosis.study import _measurements_of
@@ -169,3 +180,101 @@ def test_a_name_takes_more_than_it_leaves_beyond_the_noise(
     # What describes the rest is not credited to the name.
     if after is not None:
         assert HeldOutErrors(before, before, augmented=0.0, named=after, noise_floor=floor).takes_most is most
+
+
+@pytest.mark.parametrize(
+    ("share", "change"), [(-1.01, "better"), (-0.99, "same"), (0.99, "same"), (1.01, "worse")]
+)
+def test_what_blocks_change_by_chance_is_the_jackknife_of_their_sums(share: float, change: str) -> None:
+    draw = np.random.default_rng(0)
+    first, second = draw.exponential(size=12), draw.exponential(size=12)
+    left_out = [np.log((second.sum() - b) / (first.sum() - a)) for a, b in zip(first, second, strict=True)]
+    limit = scipy.stats.t.isf(CHANGE_BY_CHANCE, 11) * np.sqrt(11 * np.var(left_out))
+    second *= np.exp(share * limit) * first.sum() / second.sum()
+    assert _change_between(first, second) == change
+
+
+def test_fewer_parameters_win_where_errors_are_nearly_alike() -> None:
+    def with_one_block(height: float) -> np.ndarray:
+        """Squares about one but for a block of twenty, which makes all of it doubtful."""
+        return np.repeat([1.0] * 19 + [height], 10)
+
+    least = with_one_block(1.0)
+    assert preferred_model([least, with_one_block(4.6)], [2, 1]) == 1  # larger by 18 %, a tenth in size
+    assert preferred_model([least, with_one_block(7.0)], [2, 1]) == 0  # by 30 %
+    assert preferred_model([least, 1.05 * least], [2, 1]) == 0  # in every block: not by chance
+    assert preferred_model([with_one_block(4.6), None, least, least.copy()], [3, 0, 2, 2]) == 2
+    assert preferred_model([None, None], [2, 1]) == 0
+
+
+def test_a_model_is_better_than_none_by_more_than_chance_or_below_a_limit() -> None:
+    without = np.random.default_rng(0).exponential(size=400)
+    alike = without[::-1]
+    assert predicts_better(without, 0.5 * without) and not predicts_better(without, None)
+    assert predicts_better(None, without)  # nothing else ends
+    assert not predicts_better(without, alike)
+    assert predicts_better(without, alike, limit=1.01 * alike.mean())
+    assert not predicts_better(without, alike, limit=alike.mean())
+    assert not predicts_better(without, 2 * without, limit=10.0)
+
+
+def test_errors_fall_typically_where_most_blocks_and_their_sum_do() -> None:
+    before = np.ones(200)
+    assert typically_better(before, np.random.default_rng(0).uniform(0.6, 1.1, 200))
+    assert not typically_better(before, np.r_[0.01, np.random.default_rng(0).uniform(0.9, 1.1, 199)])
+    assert not typically_better(
+        before, np.r_[np.full(140, 0.2), np.full(60, 8.0)]
+    )  # less in most, more in all
+
+
+@dataclass
+class FakeFit:
+    model: Any
+    covariance: np.ndarray
+    noise: Any = None
+    refits: Any = None
+
+
+@pytest.mark.parametrize(
+    ("share", "others", "moved"), [(1.01, 0, True), (0.99, 0, False), (1.01, 2, True), (0.99, 2, False)]
+)
+def test_a_refit_counts_where_its_parameters_move_further_than_parts_move_them(
+    share: float, others: int, moved: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    draw = np.random.default_rng(0)
+    covariance = np.array([[1.0, 0.6], [0.6, 1.0]]) * np.outer([1e-3, 1e3], [1e-3, 1e3])
+    inverse, values = np.linalg.inv(covariance), draw.standard_normal((8, 2)) * [1e-3, 1e3]
+    among = 7 / 8 * sum(one @ inverse @ one for one in values - values.mean(axis=0))
+    away = np.array([2e-3, 1e3])
+    # Every refit that is asked has its share of the chance of a false one.
+    needed = scipy.stats.f.isf(CHANGE_BY_CHANCE / (1 + others), 2, 7) * among
+    away *= np.sqrt(share * needed / (away @ inverse @ away))
+
+    def fit(at: np.ndarray, refits: Any, covariance: np.ndarray = covariance) -> Any:
+        model = SimpleNamespace(values=at, free=[0, 1], parameters=[], held=lambda names: None)
+        return FakeFit(model, covariance, refits=refits)
+
+    def refits(squares: np.ndarray) -> list[tuple[Any, np.ndarray]]:
+        return [
+            (SimpleNamespace(model=SimpleNamespace(values=one)), each)
+            for one, each in zip(values, np.array_split(squares, 8), strict=True)
+        ]
+
+    alone, noise = draw.exponential(size=400), SimpleNamespace(without_process=lambda: None)
+    monkeypatch.setattr(holdout, "errors_left_out", lambda *given, **named: alone)
+    monkeypatch.setattr(holdout, "_refits_left_out", lambda fit, *given, **named: fit.refits)
+    half, double = (share * alone * draw.uniform(0.9, 1.1, 400) for share in (0.5, 2.0))
+    card, better = fit(np.zeros(2), None), fit(away, refits(half))
+    failed = [fit(away, None), fit(away, refits(0.1 * alone), np.full((2, 2), np.inf))][:others]
+
+    def preferred(*fits: Any) -> Any:
+        return preferred_recalibration(card, [(one, None) for one in fits], None, noise=noise)  # type: ignore[arg-type]
+
+    assert preferred(*failed, better) is (better if moved else card)
+    worse = fit(away, refits(double))
+    assert preferred(*failed, worse) is card
+    if not others:  # of those that are as good the first is preferred
+        again = fit(2 * away, refits(half))
+        assert preferred(fit(2 * away, refits(half)), again) is not again
+        monkeypatch.setattr(holdout, "errors_left_out", lambda *given, **named: None)
+        assert preferred(worse) is (worse if moved else card)  # the simulation as it is runs away

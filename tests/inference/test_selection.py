@@ -2,11 +2,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.special import ndtr
+from scipy.special import chdtri, ndtr
 
 from siq.errors import NumericalFailure
 from siq.inference.library import CandidateLibrary, candidate_library
 from siq.inference.selection import (
+    JOINT_TERMS_SHARE,
     LinearProblem,
     _improved_support,
     _lacks_terms,
@@ -15,6 +16,7 @@ from siq.inference.selection import (
     critical_values,
     fit_significant,
     strong_terms,
+    triangle_of,
 )
 
 pytestmark = pytest.mark.portable
@@ -110,6 +112,41 @@ def test_noise_alone_brings_few_terms() -> None:
     false = [_improved_support(equation(seed, {}), ()) for seed in range(60)]
     # One equation of two: 2.5 % of the seeds are expected to have one.
     assert sum(map(bool, false)) <= 4
+
+
+@pytest.mark.parametrize("more", [0.99, 1.01])
+def test_terms_are_lacking_where_chance_would_seldom_gain_as_much(more: float) -> None:
+    functions = 8  # as far from zero as each other, and independent
+    critical, support = np.full(functions, 3.0), (1, 4)
+    chance = JOINT_TERMS_SHARE * 2 * functions * ndtr(-3.0)
+    gain = more * chdtri(functions - len(support), chance)
+    for unit in (1.0, 1e-3):
+        goal = np.full(functions, unit * np.sqrt(gain / (functions - len(support))))
+        labels = np.array([(0, place) for place in range(functions)])
+        made = LinearProblem(np.eye(functions), goal, unit**2, critical, labels)
+        assert _lacks_terms(made, support) == (more > 1)
+
+
+def test_the_variance_of_each_component_is_that_of_its_residuals() -> None:
+    draw = np.random.default_rng(0)
+    functions, noise = draw.standard_normal((200, 5)), draw.standard_normal((200, 2)) * [1.0, 3.0]
+    made = LinearProblem.of_components(triangle_of(functions, noise), samples=200, critical=np.full(5, 2.0))
+    squares = np.linalg.lstsq(functions, noise, rcond=None)[1]
+    assert [one.variance for one in made] == pytest.approx(squares / 195)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("more", [0.99, 1.01])
+def test_a_term_stays_as_far_from_zero_as_its_standard_errors_say(unit: float, more: float) -> None:
+    draw = np.random.default_rng(0)
+    columns = draw.standard_normal((6, 3)) @ [[1, 0.9, 0], [0, 1, 0.8], [0, 0, 1]] * [1e-2, 1.0, 1e2]
+    errors, critical = np.sqrt(np.diag(np.linalg.inv(columns.T @ columns))), np.array([2.0, 3.0, 4.0])
+    labels = np.array([(0, place) for place in range(4)])
+    # The second one is as many standard errors from zero as it takes, or not quite; the last has no values.
+    coefficients = unit * errors * critical * [5.0, more, -5.0]
+    whole = np.column_stack([columns, np.zeros(6)])
+    made = LinearProblem(whole, columns @ coefficients, unit**2, np.array([*critical, 2.0]), labels)
+    assert strong_terms(made) == ((0, 1, 2) if more > 1 else (0, 2))
 
 
 def test_scores_of_neighbours_are_those_of_fits() -> None:

@@ -41,6 +41,7 @@ from siq.networks.decomposition import AnyNetworks, shuffled
 from siq.networks.networks import Networks, at_rest, initial_layers
 from siq.numerics.randomness import representative_subset
 from siq.quasipotential.certificate import (
+    OF_TIMES,
     Certificate,
     Evidence,
     _candidate_in_well,
@@ -762,3 +763,22 @@ def test_a_formula_answers_where_it_claims_to_hold(well: Well, reference: Refere
     wrong = np.where(well.basis.exponents[:, 1] == 2, 3.0, 1.0) * well.coefficients
     other = Well(well.basis, wrong, well.dynamics, well.attractor, well.level, well.saddle, 1.0, well.points)
     assert _candidate_in_well(other, evidence_in_well(400, reference)).claimed < 0.5
+
+
+@pytest.mark.parametrize("name", ["characteristics", "descent", *OF_TIMES])
+def test_what_was_not_tested_refuses_all_but_where_it_is_of_times(name: str) -> None:
+    passed = Verdict(0.0, 1.0, True)
+    tests = dict.fromkeys(["characteristics", "descent", *OF_TIMES], passed)
+    whole = Certificate(tests, 0.1, "")
+    assert whole.certified and whole.times_certified
+    untested = Certificate(tests | {name: Verdict(np.nan, 1.0, False, tested=False)}, 0.1, "")
+    assert untested.certified == (name in OF_TIMES) and not untested.times_certified
+    failed = Certificate(tests | {name: Verdict(2.0, 1.0, False)}, 0.1, "")
+    assert not failed.certified and not failed.times_certified
+    assert not Certificate({"descent": passed}, 0.1, "").certified  # none is independent
+
+
+def test_an_error_that_is_not_known_is_read_back_as_such() -> None:
+    for error in (0.1, np.inf):
+        whole = Certificate({"descent": Verdict(0.0, 1.0, True)}, error, "why")
+        assert Certificate.from_data(whole.as_data()).error == error

@@ -1,4 +1,5 @@
 # Helpers of the rules: studies and their parameters, tasks and their versions, one workflow at a time.
+import gc
 import os
 import sys
 from contextlib import contextmanager, suppress
@@ -37,6 +38,12 @@ def bad_input_told(refused=InputError):
 if os.environ.pop(PARENT, None):  # `siq` has started this, and holds its input open
     end_with_parent()
 prepare_environment()
+
+# Of 10,000 runs 50,000 jobs are planned, which all stay: a quarter of the time went into looking for garbage among
+# them, and a seventh into where this one script lies.
+gc.set_threshold(50_000, 20, 1_000)
+SOURCES = workflow.sourcecache
+SOURCES.exists, SOURCES.get_path = cache(SOURCES.exists), cache(SOURCES.get_path)
 
 with bad_input_told():
     STUDIES = Studies(config, configfiles=workflow.configfiles)
@@ -159,20 +166,16 @@ def all_blocks(pattern):
     )
 
 
+@bad_input_told()
 def data_source(wildcards):
-    """Recordings by their content; a card only as what it says of the dynamics, which is a parameter."""
+    """Recordings by their content, a folder with its files; a card only as what it says, which is a parameter."""
     study = study_of(wildcards)
     if study.study.recordings is None:
-        return ancient(study.source())
+        return {"source": ancient(study.source())}
     check_recordings(wildcards.study)  # which refuses a file that is not there
-    return study.source()
-
-
-@bad_input_told()
-def files_in_folder(wildcards):
-    """Input function: the files of a folder of recordings, so that a change of one is seen; of a file none."""
-    folder = Path(study_of(wildcards).source())
-    return [str(file) for file in files_of(folder)] if folder.is_dir() else []
+    folder = Path(study.source())
+    files = files_of(folder) if folder.is_dir() else []
+    return {"source": study.source(), "files": [str(file) for file in files]}
 
 
 @cache
@@ -218,11 +221,12 @@ def networks_of_runs(name):
     return of_networks(files)
 
 
-def of_block(name):
-    """Input function: a file of the block of runs that trained this run, where networks are asked for."""
-    return of_networks(
-        lambda wildcards: f"results/{wildcards.study}/training/{block_of(wildcards)}/{name}"
-    )
+def training_of_run(wildcards):
+    """Input function: the networks of a run and how they came out, where networks are asked for."""
+    if not has_networks(wildcards):
+        return {}
+    block = f"results/{wildcards.study}/training/{block_of(wildcards)}"
+    return {"networks": f"{block}/networks.npz", "train_outcome": f"{block}/train.json"}
 
 
 def regression_of_run(wildcards):

@@ -15,8 +15,7 @@ rule run_task:
 use rule run_task as draw with:
     # One rule for both entrances: whatever follows cannot tell them apart.
     input:
-        source=data_source,
-        files=files_in_folder,
+        unpack(data_source),
     output:
         recordings="results/{study}/runs/{run}/recordings.parquet",
         draw_outcome="results/{study}/runs/{run}/draw.json",
@@ -66,9 +65,8 @@ use rule run_task as train with:
 
 use rule run_task as regress with:
     input:
+        unpack(training_of_run),
         recordings="results/{study}/runs/{run}/recordings.parquet",
-        networks=of_block("networks.npz"),
-        train_outcome=of_block("train.json"),
     output:
         regression="results/{study}/runs/{run}/regression.json",
         regress_outcome="results/{study}/runs/{run}/regress.json",
@@ -84,11 +82,10 @@ use rule run_task as regress with:
 
 use rule run_task as refine with:
     input:
+        unpack(training_of_run),
         recordings="results/{study}/runs/{run}/recordings.parquet",
         field="results/{study}/runs/{run}/vector_field.json",
         identify_outcome="results/{study}/runs/{run}/identify.json",
-        networks=of_block("networks.npz"),
-        train_outcome=of_block("train.json"),
         regression=regression_of_run,
     output:
         model="results/{study}/runs/{run}/model.json",
@@ -107,9 +104,8 @@ use rule run_task as refine with:
 
 use rule run_task as score with:
     input:
+        unpack(training_of_run),
         model="results/{study}/runs/{run}/model.json",
-        train_outcome=of_block("train.json"),
-        networks=of_block("networks.npz"),
         card=card_if_any,
     output:
         coefficients="results/{study}/runs/{run}/coefficients.parquet",

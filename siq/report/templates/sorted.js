@@ -13,6 +13,7 @@
     const body = table.tBodies[0];
     if (body.rows.length < 3) return;
     [...table.tHead.rows[0].cells].forEach((head, column) => {
+      if (!head.textContent.trim()) return;  // a button would have no name to read out
       const button = document.createElement("button"), cell = row => row.cells[column].textContent;
       button.type = "button";
       button.className = "by";
