@@ -393,13 +393,7 @@ def caustics_below(references: Sequence[Reference], error: float) -> tuple[Remar
     Only told where the stated error leaves room for one. A kink of V is no fault of the method, but no
     polynomial follows it, and the error that is stated comes from there.
     """
-    remarks = []
-    for one in references if error > MIN_EXPLAINED_ERROR else ():
-        if one.caustic is not None:
-            where, value = one.caustic
-            places = {"attractor": _position_text(one.attractor), "place": _position_text(where)}
-            remarks.append(Remark("quasipotential.caustic", places | {"level": 2 * value}))
-    return tuple(remarks)
+    return tuple(one.caustic for one in references if one.caustic and error > MIN_EXPLAINED_ERROR)
 
 
 REACHED_SHARE = 0.8  # of what was asked for, up to which a curve has to come where most end before
@@ -444,6 +438,10 @@ def _follow_well(
         fan = _fan(dynamics, portrait, attractor, LEVEL_SHARE * level, seed, **REFERENCE_FAN)
     except (NumericalFailure, ValueError, np.linalg.LinAlgError) as failure:
         return without(f"characteristics cannot be followed from the attractor {name}: {failure}")
+    caustic = None
+    if (met := fan.first_caustic()) is not None:
+        places = {"attractor": name, "place": _position_text(met[0])}
+        caustic = Remark("quasipotential.caustic", places | {"level": 2 * met[1]})
     lowest = fan.lowest_sheet()
     kept = np.flatnonzero(lowest & region.recorded(fan.points))
     if not len(kept):
@@ -455,7 +453,7 @@ def _follow_well(
     error = TOLERANCE * int(np.bincount(fan.curve).max()) + (0.0 if lowest.all() else SHEET_MARGIN)
     stopped = np.isin(ends, (End.STALLED, End.TIME, End.CAUSTIC)).mean() > 0.5
     if len(values) >= MIN_POINTS and (values.max() >= REACHED_SHARE * fan.level or not stopped):
-        return Reference(attractor, x, values, level, error, caustic=fan.first_caustic())
+        return Reference(attractor, x, values, level, error, caustic=caustic)
     if np.isin(ends, (End.STALLED, End.TIME)).mean() > 0.5:
         why = "they are too stiff: leave out the fastest states, or record their slow motion alone"
     elif (ends == End.CAUSTIC).any():
@@ -466,7 +464,7 @@ def _follow_well(
     else:
         why = "they leave the recorded states: record more of them about the attractor"
     fault = f"characteristics from the attractor {name} give {len(values)} points to compare with, as {why}"
-    return Reference(attractor, x, values, level, error, fault, fan.first_caustic())
+    return Reference(attractor, x, values, level, error, fault, caustic)
 
 
 def _level(

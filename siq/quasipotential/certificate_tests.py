@@ -49,6 +49,7 @@ from siq.inference.field_estimate import AnyField, FieldEstimate, Verdict, dynam
 from siq.numerics.randomness import normal_draws
 from siq.numerics.text import percent, place_text
 from siq.quasipotential.characteristics import ascending_integrals, fastest_rate
+from siq.remarks import Remark
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, hessian_at, measure_at
@@ -110,7 +111,7 @@ class Reference:
     level: float  #: V up to which they were followed, NaN where they could not be
     error: float
     fault: str = ""  #: why there is nothing to compare with, and what would help; empty where there is
-    caustic: tuple[np.ndarray, float] | None = None  #: the lowest, and V there; None where they do not cross
+    caustic: Remark | None = None  #: the lowest place at which they cross, None where they do not
 
     def below(self, level: float) -> tuple[np.ndarray, np.ndarray]:
         """Points and values up to `LEVEL_SHARE` of a level that a formula claims, if it is the lower one."""

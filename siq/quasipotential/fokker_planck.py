@@ -468,8 +468,7 @@ class CellProcess:
         own, other = (
             float(one.interpolated(one.mean_times(ends))(start.center[:, None])[0]) for one in (self, wide)
         )
-        rounding = own * float(-self.rates.diagonal().min()) * np.finfo(float).eps
-        if not (own > 0 and other > 0 and rounding < MOST_ROUNDING):
+        if not (other > 0 and 0 < own < MOST_ROUNDING / np.finfo(float).eps / -self.rates.diagonal().min()):
             raise NumericalFailure("the time is so long that rounding is a part of it")
         edges = np.stack(np.unravel_index(wide._places, wide._shape)) % (wide._shape[0] - 1) == 0
         spent = wide.mean_times(ends, during=(edges & ~self._turning[:, None]).any(axis=0))

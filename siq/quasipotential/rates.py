@@ -207,8 +207,7 @@ class EscapeRate:
     correction, unknown
         By how much ln E[τ] grows with ε, in the unit of 1/U; and what is not known of that, in ε/ΔU.
     skew
-        By which share of itself ∇V is off M_S (x - S) where the path ends (`_Frame.skew`): so late as the law
-        sets in then, it errs by about twice that.
+        By which share ∇V is off M_S (x - S) where the path ends: the law errs by about twice that.
     power, phases
         Of ways from or over a cycle K depends on ε, ``K = ε^power / Σ r exp(-δ/ε)``: δ, by how much more the
         path through another phase costs, and r, its part of the rate, shape ``(2, n)``. The prefactor is

@@ -197,10 +197,6 @@ class Well(Expansion):
         scaled = [one / sympy.Float(s, DIGITS) for one, s in zip(basis.symbols, basis.scale, strict=True)]
         return replace(formula, expression=formula.expression + basis.sum_of_units(of_units, scaled))
 
-    def to_text(self) -> str:
-        """The formula as text, a line for each definition."""
-        return self.formula.source("text")
-
     def to_latex(self, *, digits: int = DIGITS) -> str:
         """The formula as LaTeX, with so many significant digits."""
         return self.formula.to_latex(digits=digits)

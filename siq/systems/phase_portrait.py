@@ -390,9 +390,8 @@ def _cycles_backwards(
     try:
         with np.errstate(all="ignore"):
             rate, ways = crossing_rate(dynamics, starts, width), follow(backwards, starts, sources, box=box)
-            # Those that stay outside, at a pole say, are on no cycle within.
             gone = ((ways.paths[:, -1] < box[:, 0]) | (ways.paths[:, -1] > box[:, 1])).any(axis=1)
-            ways = replace(ways, escaped=ways.escaped | gone)
+            ways = replace(ways, escaped=ways.escaped | gone)  # what stays at a pole, say, is on no cycle
             found, _ = _stable_cycles(backwards, ways, first=len(sources), box=box, rate=rate)
     except NumericalFailure:
         return ()

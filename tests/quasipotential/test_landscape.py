@@ -175,7 +175,7 @@ def test_the_formula_of_a_well_can_be_taken_elsewhere() -> None:
     np.testing.assert_allclose(module["V"](*x.T), well.values(x), atol=1e-12)
     values = sympy.lambdify(well.basis.symbols, well.to_sympy())(*x.T)
     np.testing.assert_allclose(values, well.values(x), atol=1e-12)
-    for source in (well.to_text(), well.to_latex(digits=4), well.to_c(), well.to_julia()):
+    for source in (well.formula.source("text"), well.to_latex(digits=4), well.to_c(), well.to_julia()):
         assert "V" in source and "nan" not in source
 
 

@@ -39,11 +39,8 @@ if os.environ.pop(PARENT, None):  # `siq` has started this, and holds its input 
     end_with_parent()
 prepare_environment()
 
-# Of 10,000 runs 50,000 jobs are planned, which all stay: a quarter of the time went into looking for garbage among
-# them, and a seventh into where this one script lies.
+# Of 10,000 runs 50,000 jobs are planned, which all stay: a quarter of the time went into looking for garbage among them.
 gc.set_threshold(50_000, 20, 1_000)
-SOURCES = workflow.sourcecache
-SOURCES.exists, SOURCES.get_path = cache(SOURCES.exists), cache(SOURCES.get_path)
 
 with bad_input_told():
     STUDIES = Studies(config, configfiles=workflow.configfiles)
