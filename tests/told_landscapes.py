@@ -31,7 +31,8 @@ def landscape(
             "saddle": [0.0] * d, "barrier": barrier, "standard_error": 0.01,
             "minimum_action": barrier, "prefactor": prefactor, "exponent": 0.0, "remarks": [],
             "formula_share": None, "by_rivals": 0.0, "noise_leverage": 1.0, "path": None, "law_remarks": [],
-            "turn": None, "prefactor_error": None, "prefactor_covariance": 0.0,
+            "turn": None, "prefactor_error": None, "prefactor_covariance": 0.0, "phases": None,
+            "of_residual": 0.0, "correction": 0.0, "unknown": 1.0, "skew": 0.0, "power": 0.0,
         }
         for index, barrier in enumerate(barriers)
     ]  # fmt: skip
