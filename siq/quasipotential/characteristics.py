@@ -286,10 +286,7 @@ class Fan:
         return distance, self.values[rows], values, bend
 
     def first_caustic(self) -> tuple[np.ndarray, float] | None:
-        """The lowest caustic that a curve of the fan meets, and V along the curve there; or None.
-
-        The lowest sheet may have ended before, and curves in between may meet it a little lower.
-        """
+        """The lowest caustic of its curves, and V there, or None; curves in between may meet it lower."""
         if not len(self.caustic_values):
             return None
         lowest = int(np.argmin(self.caustic_values))

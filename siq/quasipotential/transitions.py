@@ -430,8 +430,7 @@ def transitions(
             remarks += rate.remarks
             error, covariance = prefactor_error(found, path)
             rate = replace(rate, prefactor_error=error, covariance=covariance)
-            there = (way.end, way.start)
-            back = [one.path.action for one in ways if one.path and (one.start, one.end) == there]
+            back = [w.path.action for w in ways if w.path and (w.start, w.end) == (way.end, way.start)]
             if rate.unknown == 1 and back:  # from a shallow state behind: the law errs as ε over its depth
                 rate = replace(rate, unknown=float(np.hypot(1.0, path.action / min(back))))
         except (NumericalFailure, np.linalg.LinAlgError) as failure:

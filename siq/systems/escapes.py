@@ -181,7 +181,7 @@ def simulate_escapes(
     if step is None:
         step = STEP / float(np.abs(np.linalg.eigvals(dynamics.jacobian(centers))).max())
     function = dynamics.drift_of_components
-    draw = noise_source(dynamics.diffusion, intensity=intensity, step=step, generator=generator)
+    draw = noise_source(dynamics, intensity=intensity, step=step, generator=generator)
     slowest = [np.abs(np.linalg.eigvals(one).real).min() for one in dynamics.jacobian(centers[1:])]
     settling = [int(np.ceil(LONGEST_SETTLING / one / step)) for one in slowest]
     x = starts.T.copy()
@@ -198,8 +198,7 @@ def simulate_escapes(
                     staying[arrived] = False
                     times.append(np.full(len(arrived), index * step))
                     reached.append(np.full(len(arrived), number))
-            if not staying.all():
-                x = x[:, staying]
+            x = x[:, staying]
             if not x.shape[1]:
                 break
     lost = int((~np.isfinite(x).all(axis=0)).sum())  # what once is not finite stays so
@@ -209,8 +208,8 @@ def simulate_escapes(
 
 
 def _settles(function: Field, x: np.ndarray, target: Neighbourhood, step: float, steps: int) -> np.ndarray:
-    """Whether f leads from states in a neighbourhood to its middle; all do where no steps are to be made."""
-    settled = np.full(x.shape[1], not steps)
+    """Whether f leads from states in a neighbourhood to its middle within some steps."""
+    settled = np.zeros(x.shape[1], dtype=bool)
     for _ in range(steps):
         x = runge_kutta_step(function, x, step)
         settled |= target.height(x) <= SETTLED
@@ -296,7 +295,7 @@ def split_escapes(
         share = min(STEP, np.sqrt(STEP_ERROR / (HEUN * max(top - lowest, 1.0))))
         step = share / float(np.abs(rates).max())
     function = dynamics.drift_of_components
-    draw = noise_source(dynamics.diffusion, intensity=intensity, step=step, generator=generator)
+    draw = noise_source(dynamics, intensity=intensity, step=step, generator=generator)
 
     def advance(x: np.ndarray) -> np.ndarray:
         x = heun_step(function, x, step, draw(x))

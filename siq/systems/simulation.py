@@ -27,7 +27,6 @@ from pydantic.dataclasses import dataclass
 from siq.data.recordings import Recordings
 from siq.errors import Fault, InputError, NumericalFailure
 from siq.numerics.integration import euler_maruyama_step, runge_kutta_step
-from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import find_equilibria
 
@@ -108,20 +107,28 @@ def _sampling_stride(options: SimulationOptions) -> int:
 
 
 def noise_source(
-    diffusion: Diffusion, *, intensity: float, step: float, generator: np.random.Generator
+    dynamics: Dynamics, *, intensity: float, step: float, generator: np.random.Generator
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Generator of the noise over one step Δt of states: ``sqrt(ε) σ(x) ΔW``, in the sense of Itô.
 
-    It maps the components of states ``(d, n)`` to increments ``(d, n)``, new ones with every call. Every root
-    of D gives the same process in law. Raises ValueError when ε or Δt is negative.
+    It maps components of states ``(d, n)`` to increments ``(d, n)``, new ones with every call. Where D is no
+    covariance beyond the domain, it is that of the edge. Raises ValueError when ε or Δt is negative.
     """
     if intensity < 0 or step < 0:
         raise ValueError(f"the noise intensity ({intensity}) and the step ({step}) must not be negative")
-    factor = float(np.sqrt(intensity * step))
+    factor, diffusion = float(np.sqrt(intensity * step)), dynamics.diffusion
     if diffusion.constant:
         whole = factor * diffusion.root
         return lambda x: np.asarray(whole @ generator.standard_normal(x.shape))
-    return lambda x: factor * diffusion.kicks(x, generator.standard_normal(x.shape))
+    low, high = dynamics.limits.T[..., None]
+
+    def kicks(x: np.ndarray) -> np.ndarray:
+        numbers = generator.standard_normal(x.shape)
+        with suppress(NumericalFailure):
+            return factor * diffusion.kicks(x, numbers)
+        return factor * diffusion.kicks(np.fmin(np.fmax(x, low), high), numbers)
+
+    return kicks
 
 
 def simulate_snapshots(
@@ -157,9 +164,7 @@ def simulate_snapshots(
     count, (lower, upper) = options.trajectories, dynamics.box.T
     x = generator.uniform(lower[:, None], upper[:, None], size=(dynamics.dimension, count))
     samples = np.empty((count, 2 * options.pairs, dynamics.dimension))
-    noise = noise_source(
-        dynamics.diffusion, intensity=options.noise_intensity, step=step, generator=generator
-    )
+    noise = noise_source(dynamics, intensity=options.noise_intensity, step=step, generator=generator)
     drift = dynamics.drift_of_components
 
     def advance(x: np.ndarray) -> np.ndarray:
@@ -183,11 +188,10 @@ def simulate_snapshots(
         )
     starts = options.interval * np.arange(1, options.pairs + 1)
     times = np.stack([starts, starts + options.pair_step], axis=1).ravel()
-    width = len(str(count - 1))
     return Recordings(
         names=dynamics.states,
         units=dynamics.units,
-        labels=tuple(f"trajectory{index:0{width}d}" for index in range(count)),
+        labels=tuple(f"trajectory{index:0{len(str(count - 1))}d}" for index in range(count)),
         recording=np.repeat(np.arange(count), 2 * options.pairs),
         t=np.tile(times, count),
         values=samples.reshape(-1, dynamics.dimension),
@@ -236,7 +240,7 @@ def simulate_stationary(
     """
     if not 1 <= thin <= steps or burn_in < 0:
         raise ValueError(f"of {steps} steps after {burn_in}, every {thin}th leaves no sample")
-    noise = noise_source(dynamics.diffusion, intensity=intensity, step=step, generator=generator)
+    noise = noise_source(dynamics, intensity=intensity, step=step, generator=generator)
     x = np.array(start, dtype=float)
     samples = np.empty((len(x), steps // thin, x.shape[1]))
     with np.errstate(over="ignore", invalid="ignore"):  # told below

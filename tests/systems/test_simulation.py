@@ -176,7 +176,7 @@ def test_increments_have_the_drift_of_one_step_and_the_covariance_of_the_noise()
     increments = values[:, 1] - values[:, 0] - 0.01 * values[:, 0] @ COUPLED.T
     np.testing.assert_allclose(increments.mean(axis=0), 0, atol=5 * (0.3 * 0.01 / 20_000) ** 0.5)
     np.testing.assert_allclose(np.cov(increments.T) / (0.3 * 0.01), UNEQUAL, atol=0.04)
-    draw = noise_source(Diffusion(UNEQUAL), intensity=0.3, step=0.01, generator=generator(1))
+    draw = noise_source(system, intensity=0.3, step=0.01, generator=generator(1))
     numbers = generator(1).standard_normal((2, 3))
     np.testing.assert_allclose(
         draw(np.zeros((2, 3))), np.linalg.cholesky(0.3 * 0.01 * UNEQUAL) @ numbers, rtol=1e-12
@@ -229,7 +229,7 @@ def test_negative_noise_is_refused() -> None:
     with pytest.raises(ValidationError, match="noise_intensity"):
         SimulationOptions(noise_intensity=-0.01)
     with pytest.raises(ValueError, match="must not be negative"):
-        noise_source(Diffusion.identity(2), intensity=-0.01, step=0.1, generator=generator(0))
+        noise_source(linear_system(COUPLED), intensity=-0.01, step=0.1, generator=generator(0))
 
 
 def test_noisy_trajectories_and_walkers_that_run_away_are_counted_and_told() -> None:

@@ -11,7 +11,7 @@ from siq.errors import InputError, NumericalFailure
 from siq.systems.cards import load_system
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
-from siq.systems.simulation import simulate_stationary
+from siq.systems.simulation import noise_source, simulate_stationary
 
 pytestmark = pytest.mark.portable
 
@@ -81,6 +81,18 @@ def test_a_d_that_is_negative_somewhere_is_refused_there() -> None:
             ask()
     with pytest.raises(NumericalFailure, match="not positive definite at"):
         Diffusion.of_formulas((X, Y), ((1, X), (X, 1))).kicks(np.array([[2.0], [0.0]]), np.ones((2, 1)))
+
+
+def test_beyond_the_domain_where_d_is_none_noise_is_that_of_the_edge() -> None:
+    """Molecules that are made and lost, ``D = 2 + x``: below none of them D(0) goes on."""
+    made = Dynamics.of((X,), (2 - X,), diffusion=[[2 + X]], domain=[(0, 10)])
+    draw = noise_source(made, intensity=1.0, step=0.01, generator=np.random.default_rng(0))
+    numbers = np.random.default_rng(0).standard_normal((1, 3))
+    sizes = np.sqrt(0.01 * np.array([2.0, 5.0, 12.0]))
+    np.testing.assert_allclose(draw(np.array([[-2.5, 3.0, 10.0]])), sizes * numbers)
+    within = Dynamics.of((X,), (2 - X,), diffusion=[[X - 2]], domain=[(0, 10)])
+    with pytest.raises(NumericalFailure, match=r"not positive definite at \(1\)"):
+        noise_source(within, intensity=1.0, step=0.01, generator=np.random.default_rng(0))(np.ones((1, 1)))
 
 
 @pytest.mark.parametrize(
