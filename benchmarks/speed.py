@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[1]
 SERIES = ROOT / "benchmarks" / "speed.csv"
 COLUMNS = ("day", "commit", "python", "task", "seconds", "reference")
 REPEATS, EARLIER = 3, 5
-ALLOWED = 1.2  # what an issue asked for
+ALLOWED = 1.2  # of what it was
 
 # About a second of Python objects, small arrays and linear algebra, which the tasks are made of.
 REFERENCE = """

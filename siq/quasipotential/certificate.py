@@ -388,7 +388,7 @@ def _position_text(position: np.ndarray) -> str:
 
 
 def caustics_below(references: Sequence[Reference], error: float) -> tuple[Remark, ...]:
-    """Where characteristics cross below the saddle of a well: no smooth V exists there.
+    """Where characteristics cross up to `LEVEL_SHARE` of a well's level: no smooth V exists there.
 
     Only told where the stated error leaves room for one. A kink of V is no fault of the method, but no
     polynomial follows it, and the error that is stated comes from there.
@@ -456,9 +456,8 @@ def _follow_well(
         return Reference(attractor, x, values, level, error, caustic=caustic)
     if np.isin(ends, (End.STALLED, End.TIME)).mean() > 0.5:
         why = "they are too stiff: leave out the fastest states, or record their slow motion alone"
-    elif (ends == End.CAUSTIC).any():
-        lowest_caustic = 2 * float(fan.caustic_values.min())
-        why = f"they cross at caustics from U = {lowest_caustic:.4g} on: record less far from the attractor"
+    elif met is not None:
+        why = f"they cross at caustics from U = {2 * met[1]:.4g} on: record less far from the attractor"
     elif (ends == End.LEVEL).mean() > 0.5:
         why = "they draw together, its rates being too different: leave out the fastest states"
     else:

@@ -204,10 +204,9 @@ class EscapeRate:
         Standard error of ln K, None where not known, and its covariance with ΔU.
     leverage
         Relative standard error of ΔU/ε from an estimated D over that of ε.
-    correction, unknown
-        By how much ln E[τ] grows with ε, in the unit of 1/U; and what is not known of that, in ε/ΔU.
-    skew
-        By which share ∇V is off M_S (x - S) where the path ends: the law errs by about twice that.
+    correction, unknown, skew
+        By how much ln E[τ] grows with ε, in the unit of 1/U; what is not known of that, in ε/ΔU; and by which
+        share ∇V is off M_S (x - S) where the path ends askew: the law errs by about twice that.
     power, phases
         Of ways from or over a cycle K depends on ε, ``K = ε^power / Σ r exp(-δ/ε)``: δ, by how much more the
         path through another phase costs, and r, its part of the rate, shape ``(2, n)``. The prefactor is
@@ -317,8 +316,7 @@ class EscapeRate:
         # By rounding, or by what is in one error alone, the two could cancel by more than there is.
         error = float(np.sqrt(max(squares + together, np.nan_to_num(of_noise) ** 2)))
         of_order = np.hypot(self.correction * noise.intensity, self.unknown) / height
-        law_error = np.hypot(of_order, 2 * self.skew)
-        return MeanTime(value, error, float(law_error))
+        return MeanTime(value, error, float(np.hypot(of_order, 2 * self.skew)))
 
 
 def escape_rate(
@@ -429,7 +427,7 @@ class _Frame:
             slopes = problem.slopes(self.gradients(path.points[near]))
             off = norm(slopes - momenta[near]) / norm(momenta[near])
             if not off.min() < SERIES_FAILURE:
-                raise NumericalFailure(f"f and D change too fast near {start.tolist()} for a series of V")
+                raise NumericalFailure(f"near {start.tolist()} D bends too much for the law: simulate")
             first = 1 + int(np.flatnonzero(off <= max(SERIES_ERROR, off.min()))[-1])
         used[:first] = False
         # A grid along the path, with the time per unit of it; a step in time is two of its intervals.

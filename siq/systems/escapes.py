@@ -198,7 +198,8 @@ def simulate_escapes(
                     staying[arrived] = False
                     times.append(np.full(len(arrived), index * step))
                     reached.append(np.full(len(arrived), number))
-            x = x[:, staying]
+            if not staying.all():
+                x = x[:, staying]
             if not x.shape[1]:
                 break
     lost = int((~np.isfinite(x).all(axis=0)).sum())  # what once is not finite stays so

@@ -126,7 +126,8 @@ def noise_source(
         numbers = generator.standard_normal(x.shape)
         with suppress(NumericalFailure):
             return factor * diffusion.kicks(x, numbers)
-        return factor * diffusion.kicks(np.fmin(np.fmax(x, low), high), numbers)
+        within = np.where(diffusion.positive_at(x.T), x, np.fmin(np.fmax(x, low), high))
+        return factor * diffusion.kicks(within, numbers)
 
     return kicks
 

@@ -120,6 +120,8 @@ def test_where_they_escape_to_is_told() -> None:
 def test_an_ellipsoid_that_reaches_too_far_is_no_escape() -> None:
     known = archetype(2)
     options = {"level": 20.0, "walkers": 20, "step": 0.02}  # the start itself lies in it
+    reached = Neighbourhood.about(known.dynamics, known.attractors[1], level=20.0)
+    assert reached.height(known.attractors[0][:, None]) <= 1
     assert escapes_of(known, 0.1, 0.1, **options).escapes == 0
 
 

@@ -90,6 +90,10 @@ def test_beyond_the_domain_where_d_is_none_noise_is_that_of_the_edge() -> None:
     numbers = np.random.default_rng(0).standard_normal((1, 3))
     sizes = np.sqrt(0.01 * np.array([2.0, 5.0, 12.0]))
     np.testing.assert_allclose(draw(np.array([[-2.5, 3.0, 10.0]])), sizes * numbers)
+    # What is beyond another edge keeps its D, whoever has left.
+    assert draw(np.array([[-2.5, 14.0]]))[0, 1] == pytest.approx(
+        0.4 * np.random.default_rng(0).standard_normal(5)[4]
+    )
     within = Dynamics.of((X,), (2 - X,), diffusion=[[X - 2]], domain=[(0, 10)])
     with pytest.raises(NumericalFailure, match=r"not positive definite at \(1\)"):
         noise_source(within, intensity=1.0, step=0.01, generator=np.random.default_rng(0))(np.ones((1, 1)))
