@@ -537,7 +537,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
             break
     number = len(places)
     counts = DwellCount.of_visits(recordings.t, path, runs, states=number)
-    # A valley that is deeper than a linear system's may be the floor of one flat well.
+    # A valley that is deeper than a linear system's may be the floor of one flat well, unless nothing lies in it.
     wanted = kinds * count * pushed[order[0]] >= SIGNIFICANCE
     supported = probability < SIGNIFICANCE and any(one.visits for one in counts)
     own = values[:, column] - background[:, column]
@@ -545,7 +545,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         # What swings from one to the other is driven, and no linear noise.
         supported = bool(np.isfinite(change_of(recordings, own, path) or np.inf))
     profile = Profile.of(own, runs, path, places[:, column]) if supported else None
-    if profile is not None and wanted and wells == 1:
+    if profile is not None and wanted and wells == 1 and not levels:
         supported = bool((profile.tops[:, ::2] > FALSE_WELL * profile.tops[:, 1::2]).all())
     if not supported:  # what was taken for hops may be a drift
         background[:] = 0.0
@@ -602,7 +602,16 @@ def _crossed_as_often(values: np.ndarray, levels: np.ndarray, runs: list[slice],
     keep it, and the spectrum of the normal scores: they are linear, seen through any monotone function.
     """
     draw, values = np.random.default_rng(0), values[:MOST_COMPARED]
-    scores, order = np.empty(len(values)), np.lexsort((draw.random(len(values)), values))
+    # Equal values, of a sensor that clips, are no noise: means over more and more samples around them, as
+    # integers, tell them apart. Of levels alone nothing else is known.
+    ranks = [np.unique(values, return_inverse=True)[1]]
+    told = ranks[0].max() >= FEWEST_VALUES
+    for width in 3 ** np.arange(int(np.log(len(values)) / np.log(3)) if told else 0):
+        wider = ranks[-1].copy()
+        for run in runs:
+            wider[run] += np.roll(ranks[-1][run], width) + np.roll(ranks[-1][run], -width)
+        ranks.append(wider)
+    scores, order = np.empty(len(values)), np.lexsort((draw.random(len(values)), *ranks[::-1]))
     scores[order] = special.ndtri((np.arange(len(values)) + 0.5) / len(values))
     levels, lags = np.sort(levels), np.unique(np.geomspace(1, max(relaxation, 1), LAGS_COMPARED).astype(int))
     below = [np.mean(values <= one) for one in (levels[1:] + levels[:-1]) / 2]

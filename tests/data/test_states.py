@@ -334,6 +334,20 @@ def test_levels_that_every_sample_draws_anew_are_no_states_that_last() -> None:
     assert found_in(kept + blur).supported  # which stays for two samples
 
 
+@pytest.mark.parametrize("low", [-1.0, -9.0], ids=["both ends", "one end"])
+def test_one_well_of_a_sensor_that_clips_is_no_two_states(low: float) -> None:
+    well = noise(2, 6000, memory=np.exp(-1 / 8))
+    found = found_in(np.clip(well, low, 1.0))
+    assert found.probability < 0.01 and len(found.levels) > 1  # peaks there are
+    assert not found.supported
+
+
+def test_three_levels_without_any_noise_are_states() -> None:
+    """Nothing lies between them, so that a profile has no top to be told from none."""
+    found = found_in(chain(1, RATES / 4, 6000).astype(float))
+    assert found.supported and found.levels == pytest.approx((0, 1, 2)) and found.rung == 3
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_levels_without_any_noise_are_states(seed: int) -> None:
     """As of a channel that was told open or closed, 0 or 1, before it was written."""
