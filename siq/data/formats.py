@@ -49,6 +49,9 @@ _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 _MISSING = tuple(arrow_csv.ConvertOptions().null_values)
 _DASHES = ("-", "--", "---")  # where nothing was measured; among labels, one as any other
 _FORTRAN = re.compile(rb"(?<=\d)(\.\d*)[dD](?=[+-]\d\d)")  # 1.5D+03, and not the label 7d-01
+_WIDTHS = re.compile(
+    rb"^(\d+[sdn]\t)+\d+[sdn]\r?\n", re.MULTILINE
+)  # a line that tells kinds of columns, 5s 14n
 _NUMERIC = re.compile(f"{_NUMBER.pattern}|{_DECIMAL_COMMA.pattern}", re.IGNORECASE)
 _GROUPED = re.compile(r"[+-]?\d{1,3}((\.\d{3})+,\d+|(,\d{3})+\.\d+|,\d{3}(,\d{3})+)")
 _LABELS = re.compile(r"(?i)^(labels|columns|channels|fields|names)\s*:=?\s*")
@@ -165,6 +168,12 @@ def _open_text(file: str) -> ColumnFile:
         raise InputError(file, "", "it cannot be unpacked", "write the recordings again") from None
     content, remarks = _in_utf8(file, content)
     content = _FORTRAN.sub(rb"\1E", content.replace("\u2212".encode(), b"-"))  # the minus of typesetters, too
+    if content.startswith((b'"TOA5"', b"TOA5,")):  # of data loggers: station, names, units, how each was made
+        _, names_of, units_of, _, *table = content.decode().splitlines()
+        named = zip(*csv.reader([names_of, units_of]), strict=False)
+        heading = ",".join(f'"{a} [{b}]"' if is_unit(b) and b != "TS" else f'"{a}"' for a, b in named)
+        content = "\n".join([heading, *table]).encode()
+    content = _WIDTHS.sub(b"", content, count=1)
     header = content[:LARGEST_HEADER].rfind(_END_OF_HEADER)
     begin, comments, separator = 0 if header < 0 else _after_line(content, header), [], ""
     while begin < len(content):
@@ -203,9 +212,9 @@ def _open_text(file: str) -> ColumnFile:
         lines = [lines[0], *(line for line in lines[1:] if line.strip() != title)]
     rows = [_split(line, separator) for line in lines[1:]]
     if unnamed:
-        # Of several comments the last one with a word for each column.
+        # Of several comments the last one with a word of its own for each column.
         split = (_split(comment, separator) for comment in reversed(comments))
-        above = next((cells for cells in split if len(cells) == len(headings)), [])
+        above = next((cells for cells in split if len(set(cells)) == len(cells) == len(headings)), [])
         if not above and (len(headings) > 1 or sampling) and len(rows) >= FEWEST_UNNAMED:
             above = [f"column {number}" for number in range(1, len(headings) + 1)]
             remarks.append(Remark("data.no_headings", {}))
@@ -591,7 +600,7 @@ def _open_numpy(file: str) -> ColumnFile:
 
 READERS: dict[str, Callable[[str], ColumnFile]] = {
     ".parquet": _open_parquet,
-    **dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".lvm"), _open_text),
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".lvm", ".asc", ".rdb"), _open_text),
     **dict.fromkeys((".h5", ".hdf5"), _open_hdf5),
     ".nc": _open_netcdf,
     ".mat": _open_matlab,

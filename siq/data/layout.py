@@ -45,6 +45,10 @@ TIME_NAMES, AGE_NAMES, LABEL_NAMES, INDEX_NAMES, TIME_UNITS, ERROR_NAMES, ERROR_
 )
 ERROR_WORDS |= ERROR_NAMES
 MONTHS = re.compile(",".join(_CALLED["months"].split()))
+_CALENDAR = {part: _words(words) for part, words in _CALLED["calendar"].items()}
+_RANGES = {"month": (1, 12), "day": (1, 31), "day of the year": (1, 366), "hour": (0, 23)}
+_DAY_ALONE = re.compile(r"\d+(-\d+-|\.\d+\.|/\d+/)\d+|(1[89]|20)\d\d(0[1-9]|1[0-2])([0-2]\d|3[01])")
+TIME_OF_DAY = re.compile(r"\d{1,3}:\d{2}(:\d{2})?([.,]\d+)?")
 
 _UNITS_AS_TITLES = TIME_UNITS - _words(
     "ns us µs μs ms s min h hr d yr ka"
@@ -211,7 +215,7 @@ def layout_of(file: str, source: ColumnFile, columns: Sequence[str] | None) -> _
     """
     if columns is not None and (len(set(columns)) < len(columns) or {"recording", "t"} & set(columns)):
         raise ValueError(f"the columns {list(columns)} are not distinct measured columns")
-    source = _with_stated_times(source)
+    source = _with_stated_times(_with_one_clock(source))
     parts = [read_heading(heading) for heading in source.headings]
     plain = [part.title for part in parts]
     titles = [title or name for title, name in zip(source.titles or (None,) * len(parts), plain, strict=True)]
@@ -299,6 +303,90 @@ def _runs_evenly(values: np.ndarray | None) -> bool:
     return bool(usual > 0 and (np.abs(steps - usual) > EVEN * usual).mean() <= EVEN)
 
 
+def _calendar_parts(source: ColumnFile) -> dict[str, tuple[int, pd.Series]]:
+    """Columns of whole numbers that are years, months, days, hours and so on: their places and values."""
+    parts: dict[str, tuple[int, pd.Series]] = {}
+    for place, heading in enumerate(source.headings):
+        title = _plain(read_heading(heading).title)
+        part = next((one for one, words in _CALENDAR.items() if title in words and one not in parts), None)
+        if part is None or (numbers := _numbers(source, place)) is None or len(numbers) < 2:
+            continue
+        if (numbers != np.round(numbers)).any():  # or one is missing
+            continue
+        values = pd.Series(numbers.astype(int))
+        low, high = _RANGES.get(part, (0, 59))
+        if part == "year":  # one that each row has for itself is a time alone
+            low, high = 1000, 9999 if (np.diff(values) == 0).mean() >= 0.5 else 0
+        elif part == "hour" and values.min() >= 1 and values.max() == 24:  # the last of a day
+            values -= 1
+        elif part == "hour" and values.max() > 24 and (values % 100).max() < 60:  # 1330 is half past one
+            parts["minute"], values = (place, values % 100), values // 100
+        if values.between(low, high).all():
+            parts[part] = place, values
+    return parts
+
+
+def _with_one_clock(source: ColumnFile) -> ColumnFile:
+    """Days in one column and times of day in another, or parts such as year and hour, as one column."""
+    parts, headings = _calendar_parts(source), [read_heading(one) for one in source.headings]
+    rest = [place for place in range(len(headings)) if place not in {place for place, _ in parts.values()}]
+    texts = {
+        place: source.load([place])[0].to_pandas().astype(str).str.strip().str.removesuffix(".0")
+        for place in rest
+        if headings[place].may_be_time
+    }
+    days = [place for place, text in texts.items() if text.str.fullmatch(_DAY_ALONE).all()]
+    clocks = [place for place, text in texts.items() if text.str.fullmatch(TIME_OF_DAY).all()]
+    others = [place for place in rest if "year" in parts and place not in (*days, *clocks)]
+    month, day = parts.get("month"), parts.get("day" if "month" in parts else "day of the year")
+    monthly, used = False, [*days, *clocks]
+    if any(_tells_time(headings[place].title, source, place) for place in others):
+        return _with_column(source, None, [place for place, _ in parts.values()])
+    if len(days) == 1 and (clocks or parts):
+        times = texts[days[0]].str.replace(r"^(\d{4})(\d\d)(\d\d)$", r"\1-\2-\3", regex=True)
+    elif "year" in parts and day is not None:
+        first = 100 * parts["year"][1] + (1 if month is None else month[1])
+        times = pd.to_datetime(first.astype(str), format="%Y%m") + pd.to_timedelta(day[1] - 1, unit="D")
+        times = times.dt.strftime("%Y-%m-%d")
+    elif monthly := "year" in parts and month is not None:
+        times = parts["year"][1] + (month[1] - 0.5) / 12
+    else:
+        return source
+    used += [parts[one][0] for one in ("year", "month", "day", "day of the year") if one in parts]
+    if clocks:
+        times = times + " " + texts[clocks[0]]
+    elif "hour" in parts and not monthly:
+        seconds, used = 3600 * parts["hour"][1], [*used, parts["hour"][0]]
+        for part, size in (("minute", 60), ("second", 1)):
+            place, numbers = parts.get(part, (None, seconds))
+            # What is called min may be a minimum: of times that differ without it none is a part.
+            alike = pd.DataFrame({"day": times, "seconds": seconds}).duplicated().any()
+            if place is None or not (alike or place in used):
+                break
+            seconds, used = seconds + size * numbers, [*used, place]
+        times = times + pd.to_datetime(seconds, unit="s").dt.strftime(" %H:%M:%S")
+    return _with_column(source, ("t [year]" if monthly else "t", pa.array(times)), used)
+
+
+def _with_column(source: ColumnFile, column: tuple[str, pa.Array] | None, parts: Sequence[int]) -> ColumnFile:
+    """A table with one more column at its end, a heading and its cells, in place of the columns `parts`."""
+    kept, titles = [place for place in range(len(source.headings)) if place not in parts], source.titles
+
+    def load(positions: Sequence[int]) -> list[Column]:
+        loaded = iter(source.load([kept[each] for each in positions if each < len(kept)]))
+        return [next(loaded) if each < len(kept) or column is None else column[1] for each in positions]
+
+    values = {"columns": [source.headings[place].strip() for place in dict.fromkeys(parts)]}
+    added = [] if column is None else [column[0]]
+    remark = Remark("data.time_in_parts", values | {"left_out": column is None})
+    return replace(
+        source, headings=(*(source.headings[place] for place in kept), *added), load=load,
+        units=(*(source.units[place] for place in kept), *(None for _ in added)),
+        titles=(*(titles[place] for place in kept), *added) if titles else (),
+        remarks=(*source.remarks, *([remark] if parts else [])),
+    )  # fmt: skip
+
+
 def _with_stated_times(source: ColumnFile) -> ColumnFile:
     """A table of which no column tells the time, with the times that a stated rate or interval gives."""
     stated, places = SAMPLING.fullmatch(source.sampling), range(len(source.headings))
@@ -312,16 +400,10 @@ def _with_stated_times(source: ColumnFile) -> ColumnFile:
         return source
     step = 1 / float(stated["number"]) if unit in _RECIPROCALS else float(stated["number"])
     times = pa.array(step * np.arange(len(source.load([0])[0])))
-
-    def load(positions: Sequence[int]) -> list[Column]:
-        loaded = iter(source.load([each for each in positions if each < len(places)]))
-        return [times if each == len(places) else next(loaded) for each in positions]
-
-    return replace(
-        source, headings=(*source.headings, f"t [{_RECIPROCALS.get(unit, unit)}]"), load=load,
-        units=(*source.units, None),
-        remarks=(*source.remarks, Remark("data.time_by_rate", {"line": source.sampling})),
-    )  # fmt: skip
+    source = replace(
+        source, remarks=(*source.remarks, Remark("data.time_by_rate", {"line": source.sampling}))
+    )
+    return _with_column(source, (f"t [{_RECIPROCALS.get(unit, unit)}]", times), [])
 
 
 def _tells_time(title: str, source: ColumnFile, place: int) -> bool:

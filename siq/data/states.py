@@ -537,7 +537,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
             break
     number = len(places)
     counts = DwellCount.of_visits(recordings.t, path, runs, states=number)
-    # A valley that is deeper than a linear system's may be the floor of one flat well, unless nothing lies in it.
+    # A valley that is deeper than a linear system's may be the floor of one flat well; levels are apart.
     wanted = kinds * count * pushed[order[0]] >= SIGNIFICANCE
     supported = probability < SIGNIFICANCE and any(one.visits for one in counts)
     own = values[:, column] - background[:, column]

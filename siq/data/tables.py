@@ -25,7 +25,7 @@ import pyarrow.compute as pc
 
 from siq.data.correlation import FEWEST_VALUES, MIN_REPETITIONS
 from siq.data.formats import Column, ColumnFile, open_columns
-from siq.data.layout import MONTHS, layout_of, read_heading
+from siq.data.layout import MONTHS, TIME_OF_DAY, layout_of, read_heading
 from siq.data.recordings import LONGEST_STEP, TABLE, Recordings
 from siq.errors import InputError
 from siq.numerics.files import files_of
@@ -39,10 +39,8 @@ AN_HOUR = 3600.0  # in seconds, in which dates are read
 _NUMBER = r"(?:[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?(?i:nan|infinity|inf))"
 _UNIT = r"(?:\s*[^\W\d_]|\s*[%°‰]|\s+1/)[^,;]*"
 _ISO_DATE = re.compile(r"\d{4}-\d{2}(-\d{2}([T ]\d{2}:\d{2}(:\d{2}([.,]\d+)?)?\s*(Z|[+-]\d{2}:?\d{2})?)?)?")
-_TIME_OF_DAY = re.compile(r"\d{1,3}:\d{2}(:\d{2})?([.,]\d+)?")
 _GERMAN_DATE = re.compile(r"\d{1,2}\.\d{1,2}\.\d{4}( \d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?)?")
 _SLASHED_DATE = re.compile(r"(\d{1,4})/(\d{1,2})/\d{1,4}.*")
-_DAY_ALONE = re.compile(r"\d+(-\d+-|\.\d+\.|/\d+/)\d+")
 _NUMERIC = (
     pa.types.is_floating, pa.types.is_integer, pa.types.is_boolean, pa.types.is_decimal, pa.types.is_null,
 )  # fmt: skip
@@ -94,7 +92,6 @@ def _checked(
     file, source = str(table) if isinstance(table, str | Path) else TABLE, open_columns(table)
     if columns is None:
         source = _stacked(source)
-    source = _with_one_clock(source)
     layout = layout_of(file, source, columns)
     source = layout.source
     used = [layout.time, *layout.states]
@@ -201,27 +198,6 @@ def _stacked(source: ColumnFile) -> ColumnFile:
         titles=(),
         remarks=(*source.remarks, remark),
     )
-
-
-def _with_one_clock(source: ColumnFile) -> ColumnFile:
-    """Days that stand in one column and the times of day in another, as one column of both."""
-    called = [place for place, one in enumerate(source.headings) if read_heading(one).may_be_time]
-    if len(called) != 2:
-        return source
-    texts = [one.to_pandas().astype(str).str.strip() for one in source.load(called)]
-    alike = [tuple(text.str.fullmatch(one).all() for one in (_DAY_ALONE, _TIME_OF_DAY)) for text in texts]
-    if sorted(alike) != [(False, True), (True, False)]:
-        return source
-    day, rest = int(alike[1][0]), [place for place in range(len(source.headings)) if place not in called]
-
-    def load(positions: Sequence[int]) -> list[Column]:
-        loaded = iter(source.load([rest[position] for position in positions if position < len(rest)]))
-        both = pa.array(texts[day] + " " + texts[1 - day])
-        return [both if position == len(rest) else next(loaded) for position in positions]
-
-    headings = (*(source.headings[place] for place in rest), source.headings[called[day]])
-    units = (*(source.units[place] for place in rest), None)
-    return replace(source, headings=headings, units=units, titles=(), load=load)
 
 
 def _past_midnight(times: pd.Series) -> pd.Series:
@@ -419,7 +395,7 @@ def _seconds_of_clock(file: str, name: str, cells: Column) -> tuple[np.ndarray, 
                 values = pd.to_datetime(points, dayfirst=True, format="mixed")
             elif slashed:
                 values = pd.to_datetime(points, dayfirst=bool(no_month[0]), format="mixed")
-            elif _TIME_OF_DAY.fullmatch(first):
+            elif TIME_OF_DAY.fullmatch(first):
                 short = "00:" + points if "." in points[text.notna()].iloc[0] else points + ":00"
                 values = _past_midnight(pd.to_timedelta(points.where(points.str.count(":") != 1, short)))
             else:

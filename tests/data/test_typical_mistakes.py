@@ -358,6 +358,14 @@ def test_dates_are_days_and_times_of_day_seconds(tmp_path: Path) -> None:
         ("date,x\n02/03/2024 11:59:50 PM,1\n02/13/2024 12:00:00 AM,3\n", [0, 777610]),
         ("date,x\n02/03/2024 10:00,1\n13/03/2024 10:30,3\n", [0, 952200]),
         ("time,x\n01:30.000,1\n01:30.500,3\n", [0, 0.5]),
+        # A date in parts; hours from 1 to 24, which end then; half past one as 130; a minimum called min.
+        ("year,month,day,hour,x\n2023,12,31,23,1\n2024,1,1,0,3\n2024,1,1,3,2\n", [0, 3600, 14400]),
+        ("STN,YYYYMMDD,HH,x\n9,20240228,23,1\n9,20240228,24,3\n9,20240229,1,2\n", [0, 3600, 7200]),
+        ("Year,DOY,HHMM,x\n2024,60,2330,1\n2024,61,0,3\n2024,61,130,2\n", [0, 1800, 7200]),
+        ("date,time,x\n20240228,2330,1\n20240229,0,3\n20240229,130,2\n", [0, 1800, 7200]),
+        ("Date,Hour,x\n13/02/2024,22,1\n13/02/2024,23,3\n14/02/2024,0,2\n", [0, 3600, 7200]),
+        ("YYYY MM DD hh mm x\n2024 02 28 23 50 1\n2024 02 28 23 55 3\n2024 02 29 00 00 2\n", [0, 300, 600]),
+        ("datetime,year,hour,x\n2024-02-28 11:00,2024,11,1\n2024-02-28 12:00,2024,12,3\n", [0, 3600]),
         ("time,x\n23:59:40,1\n23:59:50,2\n00:00:00,3\n00:00:10,2\n", [0, 10, 20, 30]),
         # The clock was set back, or begins again: nothing tells that a day has passed.
         ("time,x\n09:00:00,1\n09:00:10,2\n08:00:00,3\n08:00:10,2\n", [0, 10, -3600, -3590]),
@@ -366,6 +374,44 @@ def test_dates_are_days_and_times_of_day_seconds(tmp_path: Path) -> None:
 def test_clocks_as_people_write_them(tmp_path: Path, text: str, seconds: list[float]) -> None:
     read = read_recordings(put(tmp_path, "clock.csv", text))
     assert (read.names, read.t.tolist(), read.time_unit) == (("x",), seconds, "s")
+
+
+@pytest.mark.parametrize(
+    ("text", "names", "times", "unit"),
+    [
+        ("year,month,day,min\n2024,2,28,1\n2024,2,29,2\n2024,3,1,0\n", ("min",), [0, 1, 2], "d"),
+        ("year,month,x\n2023,11,1\n2023,12,3\n2024,1,2\n", ("x",), [0, 1 / 12, 1 / 6], "year"),
+        # The day of the year on which cherries flower is no time: each year has one.
+        ("year,doy\n812,92\n815,105\n831,96\n", ("doy",), [812, 815, 831], "year"),
+        ("year,month,decimal date,x\n1958,3,1958.25,1\n1958,4,1958.5,3\n", ("x",), [1958.25, 1958.5], None),
+    ],
+)  # fmt: skip
+def test_parts_of_a_date_are_one_time(
+    tmp_path: Path, text: str, names: tuple[str, ...], times: list[float], unit: str | None
+) -> None:
+    read = read_recordings(put(tmp_path, "parts.csv", text))
+    assert (read.names, read.time_unit) == (names, unit)
+    assert read.t - read.t[0] == pytest.approx(np.subtract(times, times[0]))
+
+
+LOGGER = '"TOA5","CR1000","123"\n"TIMESTAMP","RECORD","T_Avg","u"\n"TS","RN","V","m/s"\n"","","Avg","Smp"\n'
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "row", "units"),
+    [
+        ("buoy.txt", "#YY MM DD hh mm H W\n#yr mo dy hr mn m m\n", "2024 02 28 {:02d} 50 {} {}", (None,) * 2),
+        ("logger.dat", LOGGER, '"2024-02-28 {:02d}:00:00",7,{},{}', ("V", "m/s")),
+        ("gauge.rdb", "# USGS\ndatetime\tx\ty\n20d\t14n\t14n\n", "2024-02-28 {:02d}:00\t{}\t{}", (None,) * 2),
+    ],
+)  # fmt: skip
+def test_tables_of_buoys_loggers_and_gauges(
+    tmp_path: Path, name: str, head: str, row: str, units: tuple[str | None, ...]
+) -> None:
+    rows = [row.format(k, 0.5 * (k % 3), k % 5) for k in range(20)]
+    read = read_recordings(put(tmp_path, name, head + "\n".join(rows)))
+    assert read.t.tolist() == [3600.0 * k for k in range(20)] and read.units == units
+    assert read.values.tolist() == [[0.5 * (k % 3), k % 5] for k in range(20)]
 
 
 def test_months_are_dates(tmp_path: Path) -> None:
