@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Literal
 
@@ -45,6 +45,9 @@ FEW_JUMPS, MOST_APART = 0.05, 0.01  # that stay, a sample that does not; of all 
 MOST_ALIKE = 0.1  # of all samples, where most that stand apart are one number, which noise never repeats
 QUARTERS, SAME_WAVE = 4, 0.5  # of a recording, in which a hum has one amplitude and phase, to a half of it
 SLIGHT_HUM = 0.1  # of the variance of a state: what moves it more may be the state itself, which circulates
+SEASONS = {"day": 86_400.0, "year": 31_556_952.0}  # seconds: what the sun does to what stands outdoors
+_SECONDS = {"s(ec.*)?": 1, "min.*": 60, "h.*": 3600, "d.*": 86_400, "week.*": 604_800, "y.*": 31_556_952}
+FEWEST_SEASONS, MOST_HARMONICS = 4, 4
 KNOWN_SCALE = 0.01  # a choice: relative error to which a velocity tells how its position moves
 _STRETCH_LABEL = re.compile(r"(?P<label>.*) \((?P<number>\d+) of (?P<of>\d+)\)")
 
@@ -208,13 +211,14 @@ def joined(recordings: Recordings) -> Recordings:
 
 
 def without_faults(recordings: Recordings) -> Recordings:
-    """Recordings less what only the sensor can have added: samples that stand apart, and the hum of mains.
+    """Recordings less what the system did not do: samples that stand apart, day and year, the hum of mains.
 
     A sample stands apart whose steps from the last and to the next are both larger than noise makes one in
     all of the record, and lead back to where it came from; so do several of one value, where most such faults
     last one sample only. Where more than a few such steps do not lead back, the state itself jumps, and
     nothing is left out. A hum is a line in the spectrum of the steps that keeps its amplitude and its phase
-    in every quarter of a recording, and that hardly moves the state.
+    in every quarter of a recording, and that hardly moves the state. What has the period of a day or of a
+    year, and is alike in each, is the weather's.
     """
     if noise_floors(recordings) is None:
         return recordings
@@ -253,6 +257,12 @@ def without_faults(recordings: Recordings) -> Recordings:
                 Remark("data.samples_apart", {"column": recordings.titles[state], "samples": count})
             )
     found = without(apart)
+    for state, name in product(range(len(found.names)), SEASONS):
+        season = _season_of(found, found.values[:, state], name)
+        if season.any():
+            found.values[:, state] -= season
+            values = {"column": found.titles[state], "period": name, "range": float(np.ptp(season))}
+            remarks.append(Remark("data.season_taken_off", {**values, "unit": found.units[state]}))
     for state in [place for place, floor in enumerate(noise_floors(found) or ()) if floor.process]:
         hum, period = _hum_of(found, found.values[:, state])
         amplitude = float(np.sqrt(2) * hum.std())
@@ -262,6 +272,37 @@ def without_faults(recordings: Recordings) -> Recordings:
             units = {"unit": found.units[state], "time_unit": found.time_unit}
             remarks.append(Remark("data.hum_taken_off", told | units))
     return replace(found, remarks=tuple(remarks)) if len(remarks) > len(recordings.remarks) else recordings
+
+
+def _season_of(recordings: Recordings, values: np.ndarray, name: str) -> np.ndarray:
+    """What recurs each day or year in a series, ``(n,)``; zero where it is not alike in all of them.
+
+    The amplitude of a harmonic is the mean of those of single periods, and is held against how these differ.
+    """
+    unit = next((size for one, size in _SECONDS.items() if re.fullmatch(one, recordings.time_unit or "")), 0)
+    season, step = np.zeros(len(values)), usual_step(recordings)
+    samples = SEASONS[name] / (unit * step) if unit * step > 0 else 0.0  # in a period
+    harmonics = np.arange(1, min(MOST_HARMONICS, int(samples / 4)) + 1)
+    same = np.flatnonzero(np.diff(recordings.recording)) + 1
+    phase = 2 * np.pi * recordings.t / (SEASONS[name] / max(unit, 1))
+    each = []  # amplitudes in single periods
+    for part in np.split(np.arange(len(values)), same) if len(harmonics) else ():
+        turn = (phase[part] - phase[part[0]]) // (2 * np.pi)
+        for rows in np.split(part, np.flatnonzero(np.diff(turn)) + 1):
+            if len(rows) > 0.8 * samples:
+                waves = np.exp(1j * np.outer(phase[rows], harmonics))
+                line = np.vander(np.linspace(-1, 1, len(rows)), 2)
+                columns = np.column_stack([line, waves.real, -waves.imag])
+                found = np.linalg.lstsq(columns, values[rows], rcond=None)[0][2:].reshape(2, -1)
+                each.append(found[0] + 1j * found[1])
+    if len(each) < FEWEST_SEASONS:
+        return season
+    mean, differ = np.mean(each, axis=0), np.var(each, axis=0, ddof=1)
+    chance = special.fdtrc(2, 2 * len(each) - 2, len(each) * np.abs(mean) ** 2 / positive(differ))
+    recurring = chance < FALSE_FAULT_RATE / (len(SEASONS) * len(harmonics))
+    for harmonic, amplitude in zip(harmonics, mean * recurring, strict=True):
+        season += (amplitude * np.exp(1j * harmonic * phase)).real
+    return season
 
 
 def _hum_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, float]:

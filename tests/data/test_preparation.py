@@ -146,6 +146,24 @@ def test_a_hum_is_taken_off_to_its_phase() -> None:
     assert told["amplitude"] == pytest.approx(0.2, rel=0.02)
 
 
+@pytest.mark.parametrize(
+    ("unit", "step"), [("h", 1.0), ("d", 1.0), ("year", 1 / 12)], ids=["day", "year", "months"]
+)
+def test_what_recurs_each_day_or_year_is_taken_off(unit: str, step: float) -> None:
+    x = hopping()[:12_000]
+    given = Recordings.from_arrays(step * np.arange(len(x)), x, names=["x"], time_unit=unit)
+    turns = 2 * np.pi * given.t / {"h": 24.0, "d": 365.2425, "year": 1.0}[unit]
+    season = np.cos(turns) + 0.5 * np.sin(2 * turns + 1)
+    found = without_faults(replace(given, values=x + season[:, None]))
+    assert float(np.std(found.values - x)) < 0.1 * np.std(season)
+    assert [one.values["period"] for one in found.remarks] == ["day" if unit == "h" else "year"]
+    assert without_faults(given) is given  # which has none
+    # Neither has what has another period, or whose phase is another one each time.
+    other = np.cos(turns / 1.3)
+    found = without_faults(replace(given, values=x + other[:, None]))
+    assert not any(one.code == "data.season_taken_off" for one in found.remarks)
+
+
 def test_a_column_at_rest_has_no_faults() -> None:
     given = seen(np.column_stack([hopping()[:, 0], np.zeros(20_000)]))
     assert without_faults(given) is given
