@@ -51,6 +51,8 @@ RESTART_SHARE = 0.1  # of the time that a recording took: where it starts over, 
 SHUFFLED_SHARE = 1 / 3
 DAY = 86_400.0  # seconds
 FEWEST_ON_A_LINE = 10  # steps: fewer may lie on one by themselves
+MOST_LAGGED = 10  # rows, by which a column may be behind the one that it copies
+MOST_MISSING = 0.5  # of the values of a column, where other columns are fuller
 NOISY = 0.25  # share of the steps at which a column turns back, half of what white forces do
 
 Fault = tuple[int, InputError]
@@ -123,6 +125,16 @@ def _checked(
         found_units.append(_agreed_unit(file, called[index], stated, (units or {}).get(name)))
     if layout.backwards:
         numbers[0] *= -1
+    filled = np.isnan(numbers[1:]).mean(axis=1) <= MOST_MISSING
+    if columns is None and numbers.shape[1] > FEWEST_ON_A_LINE and filled.any() and not filled.all():
+        told = [called[place + 1] for place in np.flatnonzero(~filled)]
+        remarks.append(Remark("data.columns_of_gaps", {"columns": told}))
+        kept = np.flatnonzero(filled)
+        layout = layout._replace(
+            names=tuple(layout.names[place] for place in kept),
+            titles=tuple(layout.titles[place] for place in kept),
+        )
+        numbers, found_units = numbers[[0, *kept + 1]], [found_units[place] for place in (0, *kept + 1)]
     # Rows without a label and without any number are padding.
     blank = np.asarray(np.isnan(numbers).all(axis=0))
     if labels is None:
@@ -217,7 +229,7 @@ def _without_clocks_and_labels(recordings: Recordings) -> Recordings:
     elapsed, begins = np.diff(recordings.t), np.diff(recordings.recording) == 0
     ways = np.sign(np.diff(recordings.values, axis=0)[begins])
     turns = max(((ways[1:] * ways[:-1]) < 0).sum(axis=0, initial=0), default=0) / max(len(ways), 1)
-    kept, remarks = [], []
+    kept, remarks = list[int](), []
     for place, (title, x) in enumerate(zip(recordings.titles, recordings.values.T, strict=True)):
         steps, different = np.diff(x)[begins], np.unique(x)
         slope = float(steps @ elapsed[begins]) / max(float(elapsed[begins] @ elapsed[begins]), 1e-300)
@@ -236,11 +248,29 @@ def _without_clocks_and_labels(recordings: Recordings) -> Recordings:
         elif not steps.any() or len(different) < FEWEST_VALUES <= len(x) / MIN_REPETITIONS:
             values = {"column": title, "values": len(different), "within": bool(steps.any())}
             remarks.append(Remark("data.label_left_out", values))
+        elif len(steps) > FEWEST_ON_A_LINE and (
+            copied := [one for one in kept if _copies(recordings, place, one)]
+        ):
+            remarks.append(
+                Remark("data.copy_left_out", {"column": title, "of": recordings.titles[copied[0]]})
+            )
         else:
             kept.append(place)
     if not remarks or not kept:
         return recordings
     return recordings.of_states(kept, remarks)
+
+
+def _copies(recordings: Recordings, place: int, other: int) -> bool:
+    """Whether a column is another one, of the same row or of one that is a few before or after it."""
+    x, y, recording = recordings.values[:, place], recordings.values[:, other], recordings.recording
+    for lag in range(min(MOST_LAGGED, len(x) // 2) + 1):
+        same = recording[lag:] == recording[: len(x) - lag]
+        for earlier, later in ((x, y), (y, x)):
+            first, second = earlier[: len(x) - lag][same], later[lag:][same]
+            if len(first) and np.array_equal(first[:100], second[:100]) and np.array_equal(first, second):
+                return True
+    return False
 
 
 def _parse_numbers(file: str, name: str, cells: Column) -> tuple[np.ndarray, str | None, Fault | None]:

@@ -19,6 +19,7 @@ from siq.data.recordings import (
     write_recordings,
 )
 from siq.errors import InputError
+from siq.remarks import sentence
 
 
 def recordings(seed: int = 0, lengths: tuple[int, ...] = (3, 1, 5, 2)) -> Recordings:
@@ -462,6 +463,20 @@ def test_other_clocks_and_labels_are_no_states() -> None:
     core = table[["t", "x"]].assign(depth=50 - t + 0.3 * np.sin(t), day=t // 4)
     assert Recordings.of(core).names == ("x",)
     assert Recordings.of(core.assign(x=np.cos(t / 5))).names == ("x", "depth", "day")
+
+
+def test_copies_of_a_column_and_columns_that_are_mostly_empty_are_no_states() -> None:
+    x = np.cumsum(np.random.default_rng(0).standard_normal(40))
+    seldom = np.where(np.arange(40) % 5 == 2, 2 * x, np.nan)
+    table = pd.DataFrame({"t": np.arange(40.0), "x": x, "before": np.roll(x, 3), "again": x, "grab": seldom})
+    table = table.iloc[3:]
+    read = read_recordings(table)
+    assert read.names == ("x",) and len(read.t) == 37
+    told = " ".join(sentence(one) for one in read.remarks)
+    assert "'before' copies 'x'" in told and "'again' copies 'x'" in told and "given of grab" in told
+    assert read_recordings(table, columns=["x", "before"]).names == ("x", "before")
+    with pytest.raises(InputError, match="as in 23 more rows"):
+        read_recordings(table, columns=["x", "grab"])
 
 
 def test_of_several_clocks_the_one_that_tells_rows_apart_is_the_time() -> None:
