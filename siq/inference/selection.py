@@ -324,12 +324,15 @@ def model_average(
     """Bias and spread that the mean over supports of independent problems adds to the f of the chosen one.
 
     By how much f changes in the mean, shape ``(q, d)``; and changes whose outer products add up to the
-    covariance about that mean, less that of the coefficients of the chosen support: ``(r, q, d)``.
+    covariance about that mean, less that of the coefficients of the chosen support: ``(r, q, d)``. A constant
+    costs nothing, since exact symmetry is the exception.
     """
     bias, spread = np.zeros((library.size, library.dimension)), []
     for problem in problems:
         i, k = problem.labels.T
-        bias[k, i], changes = _mean_over_supports(problem, problem.places(support), further=1 / len(problems))
+        free = np.array([library.terms[place] == 1 for place in k])
+        own, further = problem.places(support), 1 / len(problems)
+        bias[k, i], changes = _mean_over_supports(problem, own, further=further, free=free)
         spread.append(np.zeros((len(changes), *bias.shape)))
         spread[-1][:, k, i] = changes
     return bias, np.concatenate(spread)
@@ -343,13 +346,15 @@ def _prices(critical: np.ndarray, *, further: float) -> np.ndarray:
 
 
 def _mean_over_supports(
-    problem: LinearProblem, support: Sequence[int], *, further: float
+    problem: LinearProblem, support: Sequence[int], *, further: float, free: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean change ``(q,)`` and spread ``(r, q)`` of the coefficients about those of a chosen support.
 
-    Supports count with their odds, as far as exchanges of single terms lead from the chosen one.
+    Supports count with their odds, as far as exchanges of single terms lead from the chosen one; terms that
+    are `free`, shape ``(q,)``, have no price.
     """
-    priced = replace(problem, critical=np.sqrt(_prices(problem.critical, further=further)))
+    prices = np.where(free, 0.0, _prices(problem.critical, further=further))
+    priced = replace(problem, critical=np.sqrt(prices))
     best = _improved_support(priced, support)
     scores = {best: priced.score(best)}
     followed: set[tuple[int, ...]] = set()

@@ -22,6 +22,7 @@ from siq.inference.selection import (
 
 LIBRARY = candidate_library(["x"], degree=5)
 CRITICAL = critical_values(LIBRARY, false_terms=0.05)
+NONE = np.zeros(6, dtype=bool)  # of the terms is free
 
 
 def equation(
@@ -54,7 +55,7 @@ def test_odds_of_terms_that_are_not_there_add_up_to_what_was_expected() -> None:
 def test_the_mean_is_that_over_all_supports() -> None:
     one = equation(np.array([0.2, 2.0, 0.0, -2.0, 0.0, 0.0]), generator=np.random.default_rng(3))
     own = chosen(one)
-    mean, spread = _mean_over_supports(one, own, further=1.0)
+    mean, spread = _mean_over_supports(one, own, further=1.0, free=NONE)
     price = _prices(CRITICAL, further=1.0)
     supports = [s for size in range(7) for s in itertools.combinations(range(6), size)]
     scores = np.array([one.chi_square(s) + price[list(s)].sum() for s in supports])
@@ -75,7 +76,7 @@ def test_the_mean_is_that_over_all_supports() -> None:
 
 def test_without_doubt_there_are_no_rivals_of_any_weight() -> None:
     one = equation(np.array([0.0, 400.0, 0.0, -400.0, 0.0, 0.0]), generator=np.random.default_rng(1))
-    mean, spread = _mean_over_supports(one, (1, 3), further=1e-9)
+    mean, spread = _mean_over_supports(one, (1, 3), further=1e-9, free=NONE)
     assert not mean.any()
     assert not len(spread)
 
@@ -92,7 +93,7 @@ def test_barriers_hold_the_truth_however_strong_a_term_is(strength: float) -> No
     for _ in range(200):
         one = equation(truth, generator=draw)
         own = chosen(one)
-        mean, spread = _mean_over_supports(one, own, further=1.0)
+        mean, spread = _mean_over_supports(one, own, further=1.0, free=NONE)
         inverse = np.linalg.pinv(one.columns[:, list(own)])
         variance = float(((top[list(own)] @ inverse) ** 2).sum())
         off = top @ (one.solve(own) - truth)
@@ -100,6 +101,32 @@ def test_barriers_hold_the_truth_however_strong_a_term_is(strength: float) -> No
         together.append(abs(off + top @ mean) < 1.96 * np.sqrt(variance + ((spread @ top) ** 2).sum()))
     assert np.mean(together) > 0.85
     assert np.mean(together) > 0.94 or np.mean(together) > np.mean(alone) + 0.1
+
+
+@pytest.mark.parametrize("strength", [0.0, 2.0])
+def test_wells_of_two_states_hold_the_truth_though_no_constant_is_seen(strength: float) -> None:
+    """Without a constant two wells of ``x - x³`` lie exactly at one distance, as those of few systems do."""
+    planar, draw = candidate_library(["x", "y"], degree=5), np.random.default_rng(5)
+    states = np.array([[0.9, 0.0]]) * draw.choice([-1, 1], (2000, 1)) + 0.3 * draw.standard_normal((2000, 2))
+    columns = 0.9 * np.linalg.qr(planar.evaluate(states), mode="r")
+    own = [planar.terms.index(planar.symbols[0] ** power) for power in (1, 3)]
+    constant = planar.terms.index(1)
+    error = np.linalg.norm(np.linalg.pinv(columns[:, [constant, *own]])[0])
+    slopes = planar.evaluate(np.array([[1.0, 0.0]]))[0] / 2  # of the place where f = 0
+    truth = np.zeros(planar.size)
+    truth[[constant, *own]] = strength * error, 1.0, -1.0
+    critical = critical_values(planar, false_terms=0.05)
+    labels = all_coefficients([0], planar.size)
+    held = []
+    for _ in range(120):
+        goal = columns @ truth + draw.standard_normal(len(columns))
+        one = LinearProblem(columns, goal, 1.0, critical, labels)
+        support = sorted(own)
+        bias, spread = model_average([one, one], one.labels[support], planar)  # of both states alike
+        known = float(((slopes[support] @ np.linalg.pinv(one.columns[:, support])) ** 2).sum())
+        known += ((spread[: len(spread) // 2, :, 0] @ slopes) ** 2).sum() + (slopes @ bias[:, 0]) ** 2
+        held.append(abs(slopes @ (one.solve(support) - truth)) < 1.96 * np.sqrt(known))
+    assert np.mean(held) > 0.9
 
 
 def drawn(average: tuple[np.ndarray, np.ndarray], count: int) -> np.ndarray:
