@@ -213,7 +213,10 @@ def _collect_lines(file: str, node: yaml.Node, keys: Keys, lines: dict[Keys, int
             _collect_lines(file, value_node, path, lines)
 
 
-SUFFIXES = tuple(".parquet .csv .tsv .txt .dat .asc .rdb .h5 .hdf5 .nc .mat .npz .npy".split())
+SUFFIXES = (
+    *(".parquet", ".csv", ".tsv", ".txt", ".dat", ".asc", ".rdb"),
+    *(".h5", ".hdf5", ".nc", ".mat", ".npz", ".npy"),
+)
 """Of files that can be read; `siq.data.formats.READERS` has a reader for each."""
 
 
