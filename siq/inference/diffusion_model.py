@@ -269,10 +269,14 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
 class ResidualLikelihood(_DiffusionLikelihood):
     """The likelihood of residuals ``(n, d)`` of pairs about f; no sensor is noisy.
 
-    They are evenly thinned where there are more than memory has room for.
+    They are evenly thinned where there are more than memory has room for. That noise bends functions of the
+    state over a step can be left out, before D(x) is known: a mean of D may be many times what it is where
+    noise is least.
     """
 
-    def __init__(self, found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray) -> None:
+    def __init__(
+        self, found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray, *, bent: bool = True
+    ) -> None:
         super().__init__(found.library)
         (n, d), symbols, m = rest.shape, self.symbols, len(self.terms)
         rows = np.unique(np.linspace(0, n - 1, min(n, int(MAX_NUMBERS / (m * d * (d + 1))))).astype(int))
@@ -287,7 +291,8 @@ class ResidualLikelihood(_DiffusionLikelihood):
         slopes = compile_formulas(first, symbols)(components).reshape(m, d, -1)
         bends = compile_formulas(second, symbols)(components).reshape(m, d * d, -1)
         moved = np.einsum("kin,ni->kn", slopes, found.dynamics.drift(x))
-        moved += 0.5 * np.einsum("kan,a->kn", bends, found.noise_rate.ravel())
+        rate = np.broadcast_to(found.noise_rate_at(x), (len(x), d, d)).reshape(len(x), -1)
+        moved += bent * 0.5 * np.einsum("kan,na->kn", bends, rate)
         self.functions, self.at_states = (values + share * pairs.h * moved).T, values.T
         self.start = np.asarray(self.rest.T @ self.rest / len(self.rest))
         self.sensor, self.free, self.most_correlated = np.zeros(0), np.zeros(0, dtype=bool), d
@@ -344,12 +349,13 @@ def process_noise_increments(found: FieldEstimate, pairs: SnapshotPairs, rest: n
     it is the covariance of `siq.numerics.integration.FlowMap.moments`.
     """
     if found.flow.coarse:
-        given = np.ascontiguousarray(pairs.x0.T), pairs.h, found.noise_rate
+        rate = np.broadcast_to(found.noise_rate_at(pairs.x0), (len(rest), *found.noise_rate.shape))
+        given = np.ascontiguousarray(pairs.x0.T), pairs.h, rate
         spread = found.flow.moments(found.dynamics.drift_of_components, *given)[1]
         lost = ~np.isfinite(spread).all(axis=(1, 2))
-        spread[lost] = found.noise_rate * pairs.h[lost, None, None]
+        spread[lost] = rate[lost] * pairs.h[lost, None, None]
         try:
-            root = np.linalg.cholesky(found.noise_rate) @ np.linalg.inv(np.linalg.cholesky(spread))
+            root = np.linalg.cholesky(rate) @ np.linalg.inv(np.linalg.cholesky(spread))
         except np.linalg.LinAlgError:
             raise NumericalFailure(
                 "samples are so far apart that what the noise did between two of them cannot be worked out;"
@@ -402,10 +408,10 @@ class InnovationLikelihood(_DiffusionLikelihood):
     """The likelihood of a filter's innovations, the sensors' variances with the coefficients of D.
 
     Of a fit of f, whose trajectories and coefficients stay as they are; noise may drive the first d states of
-    the model, those of the symbols.
+    the model, those of the symbols. For `bent` see `ResidualLikelihood`.
     """
 
-    def __init__(self, library: CandidateLibrary, fit: Fit, data: Measurements) -> None:
+    def __init__(self, library: CandidateLibrary, fit: Fit, data: Measurements, *, bent: bool = True) -> None:
         super().__init__(library)
         symbols = library.symbols
         change, _ = whiten(fit.linearisation, data, fit.noise).solve()
@@ -415,7 +421,7 @@ class InnovationLikelihood(_DiffusionLikelihood):
         middle[rows] += (x[rows + 1, :d] + still.gap[rows, :d] - x[rows, :d]) / 2
         intensity = np.broadcast_to(fit.noise.intensity, (len(x), *fit.noise.intensity.shape[1:]))[:, :d, :d]
         spread = np.zeros_like(intensity) if fit.spread is None else fit.spread[:, :d, :d]
-        wide = spread + intensity * data.step[:, None, None] / 2
+        wide = spread + bent * intensity * data.step[:, None, None] / 2
         second = [term.diff(one, other) for term in self.terms for one in symbols for other in symbols]
         components, plain = np.ascontiguousarray(middle.T), compile_formulas(self.terms, symbols)
         bends = compile_formulas(second, symbols)(components).reshape(len(self.terms), d, d, -1)

@@ -383,6 +383,13 @@ class FieldEstimate:
         rate = matrices.mean(axis=0)
         return replace(self, diffusion=diffusion, noise_rate=rate, noise=formula, constant_noise=None)
 
+    def noise_rate_at(self, x: np.ndarray) -> np.ndarray:
+        """εD at states ``(n, d)``: shape ``(d, d)`` where it is the same at all, else ``(n, d, d)``."""
+        if self.diffusion.constant or self.noise_free:
+            return self.noise_rate
+        matrices = self.diffusion.at(x)
+        return np.asarray(matrices * (np.trace(self.noise_rate) / np.trace(matrices.mean(axis=0))))
+
     @property
     def diffusion_source(self) -> DiffusionSource:
         """Where D is from."""

@@ -114,6 +114,7 @@ def identify_by_likelihood(
     by_state = chance < false_terms and bool(whole.noise.process.any())
     if likelihood is not None and by_state:
         # Weights that are wrong everywhere would choose wrong terms.
+        likelihood = InnovationLikelihood(library, whole, data, bent=False)
         formula, sensor, _ = likelihood.selected(false_terms=false_terms, probability=chance)
         noise = observation.noise(Noise(sensor, np.ones(d), field=formula.diffusion(1.0)))
         whole = _fit_library(whole.model, data, whole.linearised_at, noise)

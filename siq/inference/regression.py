@@ -238,8 +238,8 @@ class _PairRegression:
         shift = (flow(field, x0, h) - x0) / h - begin
         if rate is not None and np.any(rate):
             # Σ_jk (εD)_jk ∂²θ/∂x_j∂x_k of the active functions, shape (active, n).
-            second = self._second(x0).reshape(*rate.shape, len(self.active), -1)
-            curvature = np.einsum("ij,ijkn->kn", rate, second)
+            second = self._second(x0).reshape(*rate.shape[-2:], len(self.active), -1)
+            curvature = np.einsum("nij,ijkn->kn" if rate.ndim == 3 else "ij,ijkn->kn", rate, second)
             shift += flow.response_share * h / 2 * (matrix @ curvature)
         return np.asarray(shift)
 
@@ -273,7 +273,8 @@ class _PairRegression:
         most = 10 * np.abs(quotient).max(axis=1, keepdims=True)
         for begin in range(0, len(self.h), CHUNK):  # small enough to stay in the processor's cache
             part = slice(begin, begin + CHUNK)
-            correction = self._shift(matrix, flow, self.x0[:, part], self.h[part], noise_rate)
+            rate = noise_rate[part] if noise_rate is not None and noise_rate.ndim == 3 else noise_rate
+            correction = self._shift(matrix, flow, self.x0[:, part], self.h[part], rate)
             # A trial f may run away on a few pairs; one round without their correction does no harm.
             correction[:, ~(np.abs(correction) <= most).all(axis=0)] = 0.0
             quotient[:, part] -= correction
@@ -512,7 +513,7 @@ def refit(found: FieldEstimate, pairs: SnapshotPairs) -> FieldEstimate:
 def residuals(found: FieldEstimate, pairs: SnapshotPairs) -> np.ndarray:
     """``Xh - E[Xh | X0]`` of pairs, shape ``(n, d)``; correlated noise shifts no mean within a step."""
     regression = _PairRegression(found.library, pairs, found.support)
-    rate = None if isinstance(pairs, LaggedPairs) else found.noise_rate
+    rate = None if isinstance(pairs, LaggedPairs) else found.noise_rate_at(pairs.x0)
     velocity = regression.corrected(found.values, found.flow, rate)
     return (velocity - regression.predicted(found.values)) * pairs.h[:, None]
 
@@ -555,6 +556,7 @@ def with_noise_formula(
     probability = likelihood.constant_probability()
     if probability >= false_terms:
         return None
+    likelihood = ResidualLikelihood(found, pairs, likelihood.rest, bent=False)
     for _ in range(WEIGHT_ROUNDS):
         formula = likelihood.selected(false_terms=false_terms, probability=probability)[0]
         found = _identify_weighted(found.with_formula(formula, pairs.x0), pairs, false_terms=false_terms)
@@ -594,7 +596,7 @@ def weighted_triangle(
     less what f adds to a straight step; or what f leaves of them.
     """
     regression, d = _PairRegression(found.library, pairs, found.support), found.library.dimension
-    velocity = regression.corrected(found.values, found.flow, found.noise_rate)
+    velocity = regression.corrected(found.values, found.flow, found.noise_rate_at(pairs.x0))
     left = velocity - regression.predicted(found.values)
     goal = left if of_rest else velocity
     places = all_coefficients(range(d), found.library.size) if places is None else places

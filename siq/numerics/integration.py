@@ -177,11 +177,12 @@ class FlowMap:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Mean ``(d, n)`` and covariance ``(n, d, d)`` after h, with noise of the covariance `rate` per time.
 
+        The rate is one for all states, ``(d, d)``, or that of each, ``(n, d, d)``.
         ``dm/dt = E f,  dP/dt = E[f (x-m)ᵀ] + E[(x-m) fᵀ] + εD`` are closed by the normal law ``N(m, P)``:
         means are by ``2d + 1`` points, exact for cubic f (Julier and Uhlmann, Proc. IEEE 92 (2004) 401).
         """
         d, n = x0.shape
-        step, least, away = h / self.steps, 1e-12 * np.diag(np.diag(rate)) * h[:, None, None], np.sqrt(3.0)
+        step, least, away = h / self.steps, 1e-12 * np.eye(d) * rate * h[:, None, None], np.sqrt(3.0)
 
         def rates(mean: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             known = np.nan_to_num(spread, posinf=0.0, neginf=0.0)

@@ -23,16 +23,19 @@ CONSTANT = Dynamics.of((X, Y), (X - X**3, -Y - X), diffusion=np.diag([1.0, 2.0])
 CORRELATED = Dynamics.of((X, Y), (X - X**3, -Y), diffusion=((1, 0), (0, sympy.Rational(1, 2) + X**2)))
 
 
-def recorded(dynamics: Dynamics, *, seed: int, records: int = 20, samples: int = 1000) -> SnapshotPairs:
+def recorded(
+    dynamics: Dynamics, *, seed: int, records: int = 20, samples: int = 1000,
+    box: tuple[float, float] = (-0.8, 0.8), step: float = STEP, intensity: float = INTENSITY,
+) -> SnapshotPairs:  # fmt: skip
     """Pairs of records by Euler and Maruyama with short steps, which here stand for the process itself."""
     draw = np.random.default_rng(seed)
-    x = draw.uniform(-0.8, 0.8, size=(dynamics.dimension, records))
+    x = draw.uniform(*box, size=(dynamics.dimension, records))
     kept = [x]
     for _ in range(samples):
         for _ in range(WITHIN):
             numbers = draw.standard_normal(x.shape)
-            kick = np.sqrt(INTENSITY * STEP / WITHIN) * dynamics.diffusion.kicks(x, numbers)
-            x = x + STEP / WITHIN * dynamics.drift_of_components(x) + kick
+            kick = np.sqrt(intensity * step / WITHIN) * dynamics.diffusion.kicks(x, numbers)
+            x = x + step / WITHIN * dynamics.drift_of_components(x) + kick
         kept.append(x)
     states = np.array(kept)
     first, last = states[:-1].transpose(2, 0, 1), states[1:].transpose(2, 0, 1)
@@ -41,7 +44,7 @@ def recorded(dynamics: Dynamics, *, seed: int, records: int = 20, samples: int =
     return SnapshotPairs(
         first.reshape(-1, d),
         last.reshape(-1, d),
-        np.full(count, STEP),
+        np.full(count, step),
         np.repeat(np.arange(records), samples),
     )
 
@@ -65,6 +68,20 @@ def found(pairs: SnapshotPairs) -> FieldEstimate:
     one = with_noise_formula(identified(MULTIPLIED, pairs), pairs, false_terms=FALSE)
     assert one is not None
     return one
+
+
+@pytest.mark.parametrize("step", [0.1, 0.5])
+def test_noise_in_proportion_to_what_it_drives_is_that_where_it_is_least_too(step: float) -> None:
+    """A grazed pasture: D is four hundred times larger in the one state than in the other."""
+    grazed = X * (1 - X / 10) - 2 * X**2 / (1 + X**2)
+    pasture = Dynamics.of((X,), (grazed,), diffusion=((X**2,),))
+    pairs = recorded(pasture, seed=3, box=(0.4, 9.0), step=step, intensity=0.04)
+    library = candidate_library(("x",), degree=5)
+    one = identify_vector_field(library, pairs, options=IdentificationOptions(degree=5, false_terms=FALSE))
+    found = with_noise_formula(with_process_noise_rate(one, pairs), pairs, false_terms=FALSE)
+    assert found is not None and found.noise is not None
+    assert [str(term) for term in found.noise.terms] == ["x**2"]
+    assert found.noise.values == pytest.approx([0.04], rel=0.05)
 
 
 def test_a_noise_that_depends_on_the_state_is_found_with_its_formula(found: FieldEstimate) -> None:
