@@ -49,6 +49,10 @@ CHANCE_TESTS = (  # of a certificate: those that chance can refuse
     "record",
 )  # fmt: skip
 SMALL_CHANGE = 0.3  # standard deviations: up to there a distribution is flat
+STATE_PARTS, LEAST_SPREAD = (
+    20,
+    0.01,
+)  # of samples by their state; of the largest spread, as where all are held
 ROUNDED_LINE = 2  # steps by which a straight line that is rounded is bent at most
 COPIED = 12  # samples of a stretch that is sought a second time
 MOST_DIGITS = 12  # of numbers that were rounded: those of floating point have sixteen
@@ -251,20 +255,26 @@ def repetitions(recordings: Recordings, column: int) -> list[tuple[float, str, f
     if len(x) <= COPIED or not size > 0:
         return []
     # Less a straight drift, what was rounded has no step: its second differences do.
-    bends = np.diff(moves)[same[1:] & same[:-1]]
+    both = same[1:] & same[:-1]
+    bends = np.diff(moves)[both]
     step = resolution_step(x) or resolution_step(ALIKE * size * np.round(bends / (ALIKE * size)))
     # Of numbers written with so many digits in all, large ones have a coarser step.
     widths = np.maximum(ALIKE * size if step is None else step, _last_digits(x))
     found, width = [], float(widths.max())
-    for kind, changes in (("held", moves[same]), ("straight", bends)):
+    for kind, changes, at in (("held", moves[same], x[:-1][same]), ("straight", bends, x[1:-1][both])):
         if not len(changes):
             continue
-        sizes, spread = np.abs(changes), max(float(np.sqrt((changes**2).mean())), 1e-300)
+        # Noise may be small in some states: how large it is in each twentieth of the samples, by their state.
+        rank = np.argsort(np.argsort(at, kind="stable"), kind="stable")
+        part = rank * min(STATE_PARTS, len(at)) // len(at)
+        spread = np.sqrt(np.bincount(part, changes**2) / np.bincount(part))
+        spread = np.maximum(spread, max(LEAST_SPREAD * float(spread.max()), 1e-300))
+        sizes = np.abs(changes)
         count = int((sizes < ALIKE * size).sum())
         share = float(widths.mean()) / width
-        usual = len(changes) * min(share * width / (np.sqrt(2 * np.pi) * spread), 1.0)
+        usual = len(changes) * min(share * width / np.sqrt(2 * np.pi) * float((1 / spread).mean()), 1.0)
         # As many are zero as any other small number of steps; a line that is rounded is bent by one or two.
-        most = int(SMALL_CHANGE * spread / width)
+        most = int(SMALL_CHANGE * spread.min() / width)
         if most >= 2 * ROUNDED_LINE:
             small = (sizes > (ROUNDED_LINE + 0.5) * width) & (sizes < (most + 0.5) * width)
             usual = max(usual, share * float(small.sum()) / (2 * (most - ROUNDED_LINE)))

@@ -218,3 +218,10 @@ def test_what_rounding_repeats_is_no_sign_of_values_filled_in() -> None:
     five = np.array([float(f"{one:.5g}") for one in wave])
     five *= np.where(five < 0.01, 1.0, 10.0)  # nearly all have one step, and a few a hundred times finer ones
     assert min(chances(five).values()) > 0.01
+    # A state in which there is little noise repeats itself more often, for it is written no finer.
+    quiet = np.zeros(len(t))
+    for k, kick in enumerate(generator.standard_normal(len(t) - 1)):
+        quiet[k + 1] = 0.99 * quiet[k] + 0.02 * (1.0 if quiet[k] > 0 else 0.05) * kick
+    assert chances(quiet.round(4))["held"] > 0.01
+    held = np.where(np.arange(len(t)) % 50 == 7, np.roll(quiet.round(4), 1), quiet.round(4))
+    assert chances(held)["held"] < 1e-6
