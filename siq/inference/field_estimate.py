@@ -385,6 +385,8 @@ class FieldEstimate:
 
     def noise_rate_at(self, x: np.ndarray) -> np.ndarray:
         """εD at states ``(n, d)``: shape ``(d, d)`` where it is the same at all, else ``(n, d, d)``."""
+        if self.noise is not None:
+            return self.noise.diffusion(1.0).at(x)
         if self.diffusion.constant or self.noise_free:
             return self.noise_rate
         matrices = self.diffusion.at(x)

@@ -33,7 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 from scipy import sparse, special
@@ -77,6 +77,7 @@ COMPARED_PLACES = 200  # at which distribution functions are compared
 MEAN_DISTANCE = 0.8687  # of Kolmogorov's statistic: √(π/2) ln 2
 POWER = 0.8  # probability with which a disagreement would have been noticed
 USUAL_GAPS = 0.9  # quantile of the times between samples
+WAY_PIECES = 10  # of a way from a well to a saddle: on each the mean force is asked for
 LEAST_POWER = 10.0  # the factor of a time: a record that would not have shown it tests no times (a choice)
 
 
@@ -264,8 +265,9 @@ class OccupancyCheck:
 
     `missing` says why neither is compared. `unseen` are two states between which the record hops, where a
     single one was identified. `passages` are how often the record went from one well, a row, into another, a
-    column; empty where there is none to go to. `foreseen` are how many visits ought to have ended in all, by
-    fits to other recordings, and the relative error of that.
+    column; empty where there is none to go to. `errors_along` are the standard errors of ΔU/ε that samples on
+    the way between the two leave where no formula is trusted. `foreseen` are how many visits ought to have
+    ended in all, by fits to other recordings, and the relative error of that.
     """
 
     visits: tuple[VisitTest, ...] = ()
@@ -273,6 +275,7 @@ class OccupancyCheck:
     missing: Remark | None = None
     unseen: RecordStates | None = None
     passages: tuple[tuple[int, ...], ...] = ()
+    errors_along: np.ndarray | None = None
     foreseen: tuple[float, float] = (0.0, 0.0)
 
     def verdicts(self, *, false_alarms: float) -> dict[str, Verdict]:
@@ -298,11 +301,16 @@ class OccupancyCheck:
         return tests
 
     def _connected(self) -> Verdict:
-        """Whether all wells are joined by passages, one way at least; the figure is how many are not."""
-        counts = np.array(self.passages)
+        """Whether all wells are joined, one way at least, by passages that tell what lies between them."""
+        counts, error = np.array(self.passages), None
+        if self.errors_along is not None:
+            blind = (counts > 0) & (self.errors_along > np.log(LEAST_POWER))
+            error = float(self.errors_along[blind].min()) if blind.any() else None
+            counts = np.where(blind, 0, counts)
         _, piece = sparse.csgraph.connected_components(counts > 0, directed=False)
         apart = [int(well) + 1 for well in np.flatnonzero(piece != piece[0])]
-        told = sentence(Remark("quasipotential.passages", {"passages": int(counts.sum()), "apart": apart}))
+        values = {"passages": int(counts.sum()), "apart": apart, "error": error}
+        told = sentence(Remark("quasipotential.passages", values))
         return Verdict.not_tested(told) if apart else Verdict(0.0, 0.0, True, told)
 
     def _times(self, false_alarms: float) -> Verdict:
@@ -357,6 +365,37 @@ def _passages_of(
     return tuple(map(tuple, counts.tolist()))
 
 
+def _errors_along(
+    found: FieldEstimate, portrait: PhasePortrait, intensity: float, recordings: Recordings
+) -> np.ndarray:
+    """Standard errors of ΔU/ε on the ways between wells ``(k, k)``, where no formula of f is trusted.
+
+    Of a piece of the way, w long in units of √(εD), the mean force is known to 1/√T from samples that spent
+    the time T abreast of it, and U/ε changes by 2w with each unit of it: together ``Σ 4w²/T``.
+    """
+    x, step, k = recordings.values, usual_step(recordings), len(portrait.attractors)
+    errors, sides = np.full((k, k), np.inf), np.linspace(0, 1, WAY_PIECES + 1)
+    of_saddles: dict[bytes, dict[int, float]] = {}
+    for well, (attractor, around) in enumerate(zip(portrait.attractors, portrait.saddles, strict=True)):
+        for saddle in around:
+            way = saddle.position - attractor.position
+            middles = attractor.position + np.outer((sides[1:] + sides[:-1]) / 2, way)
+            precision = found.diffusion.precision_at(middles) / intensity
+            along = precision.mean(axis=0) @ way
+            off = x - attractor.position
+            share = off @ along / (way @ along)
+            off = off - np.outer(share, way)
+            near = np.einsum("ni,ij,nj->n", off, precision.mean(axis=0), off) <= way @ along
+            spent = step * np.histogram(share[near], sides)[0]
+            squares = 4 * np.einsum("i,nij,j->n", way, precision, way) / WAY_PIECES**2
+            error = float(np.sqrt((squares / np.maximum(spent, step / 2)).sum()))
+            of_saddles.setdefault(saddle.position.tobytes(), {})[well] = error
+    for one in of_saddles.values():
+        for first, second in product(one, repeat=2):
+            errors[first, second] = min(errors[first, second], max(one[first], one[second]))
+    return errors
+
+
 def check_occupancy(
     found: FieldEstimate,
     portrait: PhasePortrait,
@@ -401,10 +440,14 @@ def check_occupancy(
     runs, whole_runs = runs_of(recordings, bridged=True), runs_of(joined(recordings), bridged=True)
     visits = continued_visits(_core_of(cores, recordings.values), whole_runs)
     passages = _passages_of(portrait, joined(recordings), cores)
+    reached = found.diffusion.regular  # every state, by noise
+    along = _errors_along(found, portrait, noise.intensity, recordings) if reached else None
     states = len(portrait.attractors)
     whole = DwellCount.of_visits(recordings.t, visits, whole_runs, states=states)
     if found.dynamics.dimension not in DRAWS and not any(one.visits for one in whole):
-        return OccupancyCheck(missing=Remark("quasipotential.record_without_hops"), passages=passages)
+        return OccupancyCheck(
+            missing=Remark("quasipotential.record_without_hops"), passages=passages, errors_along=along
+        )
     sampled = _as_sampled(cores, found.dynamics, noise.intensity, usual_step(recordings))
     times, processes, unknown = _predicted_visits(found, portrait, noise, sampled, seed=seed)
     method = "operator" if processes else "law"
@@ -429,11 +472,11 @@ def check_occupancy(
         chance = _probability_of(held, held.time / expected if expected > 0 else mean, error)
         tested.append(VisitTest(well, held, whole[well], mean, error, method, chance))
     if not tested:
-        return OccupancyCheck(missing=unknown, passages=passages)
+        return OccupancyCheck(missing=unknown, passages=passages, errors_along=along)
     chance = min(_probability_of(one.whole, one.predicted, one.error) for one in tested)
     if not any(one.visits for one in whole) and chance > NO_HOP_PROBABILITY:
         missing = Remark("quasipotential.record_too_short_to_hop")
-        return OccupancyCheck(missing=missing, passages=passages)
+        return OccupancyCheck(missing=missing, passages=passages, errors_along=along)
     # Each state's distribution during the visits to each well, on recordings that the parts did not see.
     recorded, variance, exposure = recordings.values, found.sensor_variance, found.exposure or 0.0
     if measured is not None:  # at the samples that the filter used
@@ -476,7 +519,9 @@ def check_occupancy(
                 )
             )
     told = (float(foreseen[0]), float(foreseen[1] / foreseen[0]) if foreseen[0] > 0 else 0.0)
-    return OccupancyCheck(tuple(tested), tuple(densities), passages=passages, foreseen=told)
+    return OccupancyCheck(
+        tuple(tested), tuple(densities), passages=passages, errors_along=along, foreseen=told
+    )
 
 
 def _probability_of(count: DwellCount, mean: float, error: float) -> float:
