@@ -14,6 +14,7 @@ from siq.quasipotential.fokker_planck import cores_about
 from siq.quasipotential.occupancy import (
     OccupancyCheck,
     _core_of,
+    _errors_along,
     _predicted_visits,
     _probability_of,
     check_occupancy,
@@ -145,6 +146,34 @@ def test_wells_that_no_recording_joins_are_not_connected(recorded: RECORDED) -> 
         false_alarms=0.01
     )
     assert tests["connected"].passed and tests["times"].passed and "factor" in tests["times"].reason
+
+
+def test_the_error_of_a_barrier_without_a_formula_is_its_scatter_over_recordings(recorded: RECORDED) -> None:
+    """The mean force on ten pieces of the way from −1 to 0, added up, in each recording."""
+    recordings, record, portrait, _ = recorded
+    sides, x = np.linspace(-1, 0, 11), recordings.values[:, 0].reshape(RECORDS, SAMPLES)
+    barriers, stated = [], []
+    for one in x:
+        piece = np.digitize(one[:-1], sides) - 1
+        forces = [np.diff(one)[piece == k].mean() / STEP for k in range(10) if (piece == k).any()]
+        barriers.append(-2 * 0.1 * np.sum(forces) / INTENSITY)
+        single = Recordings.from_arrays(STEP * np.arange(SAMPLES), one[:, None], names=["x"])
+        errors = _errors_along(record, portrait, INTENSITY, single)
+        stated.append(errors[0, 1])
+        assert errors[0, 1] == errors[1, 0]
+    assert np.std(barriers) == pytest.approx(np.median(stated), rel=0.5)
+
+
+def test_passages_that_nothing_is_seen_of_leave_barriers_to_the_formula(recorded: RECORDED) -> None:
+    recordings, record, portrait, held_out = recorded
+    kept = np.abs(recordings.values[:, 0]) > 0.6
+    values, recording = recordings.values[kept], recordings.recording[kept]
+    some = replace(recordings, t=STEP * np.arange(len(values)), values=values, recording=recording)
+    found = check_occupancy(record, portrait, NoiseStrength(INTENSITY), some, [(record, held_out)])
+    connected = found.verdicts(false_alarms=0.05 / 8)["connected"]
+    assert np.array(found.passages).sum() > 30
+    assert not connected.tested and "without a formula ΔU/ε is known to" in connected.reason
+    assert compared(recorded).verdicts(false_alarms=0.05 / 8)["connected"].passed
 
 
 def test_a_few_hops_do_not_test_a_time(recorded: RECORDED) -> None:
