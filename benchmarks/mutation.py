@@ -40,7 +40,10 @@ MODULES = {
         "tests/inference/test_selection.py tests/inference/test_triangle.py tests/inference/test_stability.py"
         " tests/inference/test_model_average.py",
     ),
-    "holdout": ("siq.diagnosis.holdout", "tests/diagnosis/test_holdout.py tests/diagnosis/test_verdict.py"),
+    "holdout": (
+        "siq.diagnosis.holdout",
+        "tests/diagnosis/test_holdout.py tests/diagnosis/test_verdict.py tests/diagnosis/test_naming.py",
+    ),
     "verify": ("siq.workflow.verification", "tests/workflow/test_verification.py"),
 }
 """The modules, and the tests that are theirs."""
