@@ -865,7 +865,7 @@ def test_further_tests_add_their_reasons_once() -> None:
     whole = Certificate({"characteristics": PASSED}, 0.1, "")
     assert whole.with_tests({"times": UNTESTED, "descent": PASSED}).reason == ""
     refused = whole.with_tests({"record": REFUSED, "descent": REFUSED, "prediction": UNTESTED})
-    assert refused.reason == "no; too short"
+    assert refused.reason == "no; too short" and whole.with_tests({"times": REFUSED}).reason == "no"
     assert set(refused.tests) == {"characteristics", "record", "descent", "prediction"}
     assert whole.certified and not refused.certified
 
@@ -969,6 +969,15 @@ def test_where_a_barrier_is_known_they_are_followed_no_further() -> None:
     (low, high) = references_about(KNOWN.dynamics, PORTRAIT, depths=[0.1, np.inf])
     assert low.level == 0.1 and low.values.max() <= LEVEL_SHARE * 0.1 * (1 + 1e-9)
     assert high.level == pytest.approx(0.25, rel=0.05)
+
+
+def test_curves_that_draw_together_say_which_states_to_leave_out() -> None:
+    stiff = KnownSystem(
+        Dynamics.of((x, y), (-x, -50 * y)), None, np.zeros((1, 2)), np.array([[-2.0, 2.0]] * 2)
+    )
+    (found,) = references_of(stiff)
+    assert 0 < len(found.values) < MIN_POINTS and f"give {len(found.values)} points" in found.fault
+    assert "its rates being too different: leave out the fastest states" in found.fault
 
 
 def test_from_where_nothing_is_stable_none_is_followed() -> None:
