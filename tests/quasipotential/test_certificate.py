@@ -907,7 +907,7 @@ def test_a_formula_that_claims_hardly_anything_is_refused_with_its_place(
     certificate = certify([vain], given)
     assert {"hamilton_jacobi", "error"} <= refusals(certificate) and certificate.error == np.inf
     assert "characteristics" not in certificate.tests
-    name = "[-1.,  0.]" if vain.attractor[0] < 0 else "[1., 0.]"
+    name = "(−1, 0)" if vain.attractor[0] < 0 else "(1, 0)"
     said = certificate.tests["hamilton_jacobi"].reason
     assert f"in the well about {name}: raise refinement.degrees" in said
     recorded = certify([vain], replace(given, found=exact_field(KNOWN, 3)))
@@ -961,7 +961,7 @@ def test_where_they_cross_the_place_is_told_and_a_margin_between_sheets_stated()
     found = _follow_well(known.dynamics, portrait_of(known, 400), 0)
     assert found.error == pytest.approx(SHEET_MARGIN, rel=0.01) and found.caustic is not None
     # They meet on the axis of symmetry, where U = (x² - 1)²/2 whatever β is.
-    across = float(str(found.caustic.values["place"]).strip("[]").split(",")[0])
+    across = float(str(found.caustic.values["place"]).strip("()").replace("−", "-").split(",")[0])
     assert found.caustic.values["level"] == pytest.approx((across**2 - 1) ** 2 / 2, rel=1e-3)
 
 
