@@ -165,14 +165,21 @@ def refusals(certificate: Certificate) -> set[str]:
 
 
 def wells_of(known: KnownSystem, *, degree: int = 4, share: float = 0.6) -> tuple[Well, ...]:
+    """V about each attractor, made once for a system."""
     found = portrait_of(known, 300, share=share)
-    return tuple(
-        _grow_well(
-            known.dynamics, attractor, found.basins[index], found.saddles[index],
-            degree=degree, generator=np.random.default_rng(0),
-        )
-        for index, attractor in enumerate(found.attractors)
-    )  # fmt: skip
+    key = (str(known.dynamics.formulas), degree, share)
+    if key not in _WELLS:
+        _WELLS[key] = tuple(
+            _grow_well(
+                known.dynamics, attractor, found.basins[index], found.saddles[index],
+                degree=degree, generator=np.random.default_rng(0),
+            )
+            for index, attractor in enumerate(found.attractors)
+        )  # fmt: skip
+    return _WELLS[key]
+
+
+_WELLS: dict[tuple[object, ...], tuple[Well, ...]] = {}
 
 
 # ---------------------------------------------------------------------------------------- true solutions
@@ -759,15 +766,12 @@ REGION = RecordedRegion.of_basin(PORTRAIT, 0)
 
 @pytest.fixture(scope="module")
 def well() -> Well:
-    return _grow_well(
-        KNOWN.dynamics, PORTRAIT.attractors[0], PORTRAIT.basins[0], PORTRAIT.saddles[0],
-        degree=4, generator=np.random.default_rng(0),
-    )  # fmt: skip
+    return wells_of(KNOWN)[0]
 
 
 @pytest.fixture(scope="module")
 def reference() -> Reference:
-    return _follow_well(KNOWN.dynamics, PORTRAIT, 0)
+    return references_of(KNOWN)[0]
 
 
 def evidence_in_well(count: int, reference: Reference | None) -> Evidence:
