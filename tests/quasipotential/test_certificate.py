@@ -41,6 +41,7 @@ from siq.inference.library import candidate_library, monomial_exponents
 from siq.networks.decomposition import AnyNetworks, NetworksByWell, shuffled
 from siq.networks.networks import Networks, at_rest, initial_layers
 from siq.numerics.randomness import representative_subset
+from siq.quasipotential import certificate as certificate_module
 from siq.quasipotential.certificate import (
     OF_DYNAMICS,
     OF_TIMES,
@@ -982,6 +983,17 @@ def test_curves_that_draw_together_say_which_states_to_leave_out() -> None:
     (found,) = references_of(stiff)
     assert 0 < len(found.values) < MIN_POINTS and f"give {len(found.values)} points" in found.fault
     assert "its rates being too different: leave out the fastest states" in found.fault
+
+
+@pytest.mark.parametrize(("steps", "believed"), [(10, False), (11, True)])
+def test_where_most_curves_stall_one_has_to_come_near_the_level(
+    steps: int, believed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(certificate_module, "_level", lambda *_: 0.25)
+    monkeypatch.setattr(certificate_module, "MAX_STEPS", steps)
+    found = _follow_well(KNOWN.dynamics, PORTRAIT, 0)
+    assert len(found.values) >= MIN_POINTS and ("too stiff" in found.fault) is not believed
+    assert bool(found.values.max() >= 0.8 * LEVEL_SHARE * 0.25) == (not found.fault) == believed
 
 
 def test_from_where_nothing_is_stable_none_is_followed() -> None:
