@@ -28,8 +28,9 @@ examples: environment  ## the two examples that come with their recordings
 
 test: lint suite  ## lint, and every test that takes seconds: what CI asks first
 
-suite: environment  ## the tests of `make test` without lint
-	$(BIN)/pytest --numprocesses logical --dist loadgroup --no-loadscope-reorder
+# Branches of the modules that decide are counted on the way, with a floor: pyproject.toml.
+suite: environment  ## the tests of `make test` without lint, with the floor of coverage
+	$(BIN)/pytest --numprocesses logical --dist loadgroup --no-loadscope-reorder --cov
 
 # Quick numerical tests as on a processor without AVX-512: sums are rounded otherwise there, and no answer may hang on
 # that. On a processor that has none there is nothing to switch off: `make suite` runs the same there.

@@ -44,7 +44,9 @@ found = identify_vector_field(library, pairs, options=IdentificationOptions(degr
 terms = {library.names[k]: round(float(found.coefficients[k, i]), 5) for i, k in found.support if i == 0}
 assert terms == {"x": 1.0, "x**3": -1.0}, terms
 
-# Its landscape, certified; and a formula of a mechanism, which numbers and arrays take part in.
+# Its landscape, of recordings and of equations; a formula of a mechanism takes numbers and arrays.
+recorded = siq.Landscape.from_recordings(made)
+assert len(recorded.transitions) == 2 and np.allclose(recorded.barriers().barrier, 0.5, rtol=0.02), recorded
 landscape = siq.Landscape.from_equations(well)
 assert landscape.certificate.certified and len(landscape.transitions) == 2, landscape.report()
 limited = siq.Dynamics.of((x,), (sympy.Min(x, 1) - x,))

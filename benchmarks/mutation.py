@@ -8,8 +8,9 @@ own tests fails, or takes five times as long. What survives is printed with its 
 it, or it makes no difference. The sources stay as they are; a mutant exists in the memory of the process that
 tests it.
 
-Of samples with the seed 0, in November 2026, were killed: selection 75 of 100, verify 78 of 100, holdout 64
-of 80. Certificate was asked for 17 mutants only, of which its own two files of tests kill 7.
+Of samples with the seed 0, in November 2026, were killed: selection 75 of 100, verify 78 of 100, holdout 67
+of 80, certificate 58 of 70 (36 before). What survives there are numbers of a choice (how many curves, how far
+apart), and comparisons whose two sides are never equal.
 """
 
 from __future__ import annotations
@@ -40,7 +41,10 @@ MODULES = {
         "tests/inference/test_selection.py tests/inference/test_triangle.py tests/inference/test_stability.py"
         " tests/inference/test_model_average.py",
     ),
-    "holdout": ("siq.diagnosis.holdout", "tests/diagnosis/test_holdout.py tests/diagnosis/test_verdict.py"),
+    "holdout": (
+        "siq.diagnosis.holdout",
+        "tests/diagnosis/test_holdout.py tests/diagnosis/test_verdict.py tests/diagnosis/test_naming.py",
+    ),
     "verify": ("siq.workflow.verification", "tests/workflow/test_verification.py"),
 }
 """The modules, and the tests that are theirs."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from siq.data.preparation import in_stretches
 from siq.data.recordings import Recordings, snapshot_pairs
-from siq.errors import NumericalFailure, needs_extra
+from siq.errors import Fault, NumericalFailure, needs_extra
 from siq.inference.library import IdentificationOptions
 from siq.inference.regression import residuals
 from siq.systems.diffusion import Diffusion
@@ -152,13 +152,20 @@ class LandscapeRegressor(RegressorMixin, BaseEstimator):
         -------
         states, velocities
             Shape ``(n, components)`` each.
+
+        Raises
+        ------
+        Fault
+            Where the cells lack one of these.
         """
-        known = cells.obsm.get("velocity_pca")
-        if known is None:
-            genes = cells.layers["velocity"]
-            genes = genes.toarray() if hasattr(genes, "toarray") else genes
-            known = np.nan_to_num(genes) @ cells.varm["PCs"]
-        states, velocities = (np.asarray(each, dtype=float) for each in (cells.obsm["X_pca"], known))
+        try:
+            known = cells.obsm.get("velocity_pca")
+            if known is None:
+                genes = cells.layers["velocity"]
+                known = np.nan_to_num(getattr(genes, "toarray", lambda: genes)()) @ cells.varm["PCs"]
+            states, velocities = (np.asarray(each, dtype=float) for each in (cells.obsm["X_pca"], known))
+        except KeyError as error:
+            raise Fault(f"the cells have no {error}", "run scanpy.pp.pca and scvelo.tl.velocity") from None
         return states[:, :components], velocities[:, :components]
 
     def predict(self, X: Recordings | np.ndarray) -> np.ndarray:

@@ -1,15 +1,18 @@
 from __future__ import annotations
 
 import gc
+import importlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 # Before torch and numpy start their threads: arrays this small take thrice as long on two as on one.
 os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
+from benchmarks.mutation import MODULES
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
 
@@ -18,6 +21,8 @@ gc.disable()  # What imports make stays; looking through it for garbage takes as
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("inference", "rules", "diagnosis", "quasipotential", "workflow", "")
 """Those whose tests come first, in this order, and all others."""
+OF_MODULES_THAT_DECIDE = {ROOT / file for _, tests in MODULES.values() for file in tests.split()}
+"""Their tests, in which `pytest --cov` counts branches."""
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
@@ -38,6 +43,34 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         alike = item.path.parent if "inference" in item.path.parts else item.path
         shared = "finished" in getattr(item, "fixturenames", ())
         item.add_marker(pytest.mark.xdist_group("finished" if shared else str(alike)))
+
+
+def _coverage(config: pytest.Config) -> Any:
+    """What counts branches here; None where nothing does, or `--cov=siq` wants it in all tests."""
+    plugin = config.pluginmanager.getplugin("_cov")
+    alone = plugin is not None and plugin.options.cov_source is None and config.option.dist == "no"
+    return plugin.cov_controller if alone else None
+
+
+def pytest_collection(session: pytest.Session) -> None:
+    """Branches are counted in the modules that decide alone, by their own tests: others would slow down."""
+    if (coverage := _coverage(session.config)) is not None:
+        for module, _ in MODULES.values():
+            importlib.import_module(module)
+        coverage.pause()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Go on counting in the tests of a module that decides, fixtures included."""
+    coverage = _coverage(item.config) if item.path in OF_MODULES_THAT_DECIDE else None
+    if coverage is not None:
+        coverage.resume()
+    try:
+        return (yield)
+    finally:
+        if coverage is not None:
+            coverage.pause()
 
 
 def pytest_collection_finish() -> None:

@@ -66,6 +66,15 @@ def test_the_mathematics_needs_no_extra() -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_recordings_become_a_landscape_and_an_estimator_without_networks() -> None:
+    modules = [f"siq.workflow.{file.stem}" for file in sorted((ROOT / "siq" / "workflow").glob("*.py"))]
+    assert "siq.workflow.pipeline" in modules
+    modules = [name for name in modules if name != "siq.workflow.training"] + ["siq.sklearn"]
+    program = f"import importlib\nfor name in {modules!r}: importlib.import_module(name)"
+    done = run_without(("torch", "pysindy", "cvxpy", "matplotlib", "snakemake", "pygments"), program)
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.parametrize(
     "statement, package, extra",
     [

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,6 +17,7 @@ import jsonschema
 import pytest
 import yaml
 
+from benchmarks.mutation import MODULES
 from siq.errors import InputError
 from workflow.settings import Studies
 
@@ -133,6 +135,19 @@ def test_workflows_of_ci_call_what_people_call() -> None:
         jobs = yaml.safe_load(file.read_text(encoding="utf-8"))["jobs"]
         runs = [step["run"] for job in jobs.values() for step in job["steps"] if "run" in step]
         assert runs and all((ROOT / run.split()[0]).stat().st_mode & 0o100 for run in runs), file.name
+
+
+def test_ci_counts_branches_of_every_module_that_decides_and_has_a_floor() -> None:
+    tools = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["coverage"]
+    deciding = [module.replace(".", "/") + ".py" for module, _ in MODULES.values()]
+    assert tools["run"]["branch"] and sorted(tools["run"]["include"]) == sorted(deciding)
+    assert tools["report"]["fail_under"] > 90
+    files = [ROOT / file for _, tests in MODULES.values() for file in tests.split()]
+    assert [file for file in files if not file.exists()] == []
+    suite = re.search(
+        r"^suite:.*\n\t(.*)", (ROOT / "Makefile").read_text(encoding="utf-8"), flags=re.MULTILINE
+    )
+    assert suite is not None and "--cov" in suite[1].split()
 
 
 def test_forms_ask_for_what_inspect_prints() -> None:

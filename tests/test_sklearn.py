@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from siq.data.recordings import Recordings
-from siq.errors import NumericalFailure
+from siq.errors import Fault, NumericalFailure
 from siq.sklearn import LandscapeRegressor
 
 ONE_TARGET = "it gives one number a row for several states: no velocities"
@@ -116,3 +116,8 @@ def test_velocities_of_cells() -> None:
     cells.obsm["velocity_pca"] = 2 * velocities
     assert np.array_equal(LandscapeRegressor.of_cells(cells)[1], 2 * velocities)
     assert LandscapeRegressor.of_cells(cells, components=1)[0].shape == (600, 1)
+    del cells.obsm["velocity_pca"]
+    for part, missing in ((cells.obsm, "X_pca"), (cells.varm, "PCs"), (cells.layers, "velocity")):
+        del part[missing]
+        with pytest.raises(Fault, match=f"the cells have no '{missing}'; run scanpy.pp.pca"):
+            LandscapeRegressor.of_cells(cells)

@@ -335,8 +335,7 @@ def example_hopping(given: Given, settings: PipelineSettings) -> Any:
 
 def trained_run(given: Given, run: int | None = None) -> StepResult[AnyNetworks]:
     """The networks of a run; of one of several where `run` says which."""
-    from siq.workflow.tables import StepResult
-    from siq.workflow.training import POSITION, not_trained
+    from siq.workflow.tables import POSITION, StepResult, not_trained
 
     number = given.number if run is None else run
     networks, outcomes = given.networks, given.train_outcome

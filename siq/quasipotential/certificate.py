@@ -124,10 +124,9 @@ class Certificate:
         if certificate is None or apart or "prediction" not in certificate.tests:
             return own
         tests = certificate.tests
-        if not all(tests[name].passed for name in OF_DYNAMICS if name in tests):
-            return own
+        known = all(tests[name].passed for name in OF_DYNAMICS if name in tests)
         asked = [tests[name] for name in ("times", "gaussian_force") if name in tests]
-        if any(one.tested and not one.passed for one in asked):
+        if not known or any(one.tested and not one.passed for one in asked):
             return own
         if hidden:
             return 5
@@ -214,7 +213,7 @@ def certify(
             advice = "" if isinstance(found, Dynamics) else "record more there, or "
             reason = (
                 f"V claims to hold at {candidate.claimed:.0%} of the held-out states in the well about"
-                f" {_position_text(wells[number].attractor)}: {advice}raise refinement.degrees"
+                f" {place_text(wells[number].attractor)}: {advice}raise refinement.degrees"
             )
             verdicts["hamilton_jacobi"] = [Verdict.refused(reason, options.hamilton_jacobi)]
             error = own_error = np.inf
@@ -238,10 +237,9 @@ def certify(
     # A formula is no solution if the error that its own residual leaves open is too large. What the
     # uncertainty of f adds is no fault of the formula, and stated as long as a first order tells it.
     known, small = from_field <= MAX_ERROR_FROM_FIELD, own_error <= options.error
-    reason = "f is not known well enough to tell V: record more"
+    reason = "" if known else "f is not known well enough to tell V: record more"
     reason = reason if small else "the error of V that its residual leaves open is too large"
-    value = own_error if known else from_field
-    tests["error"] = Verdict(value, options.error, small and known, "" if small and known else reason)
+    tests["error"] = Verdict(own_error if known else from_field, options.error, not reason, reason)
     if not isinstance(found, Dynamics):
         if portrait.attractors:
             tests["existence"] = check_existence(found, portrait, seed=seed)
@@ -360,7 +358,7 @@ def check_agreement(
                 x = networks.below(LEVEL_SHARE, attractor, networks.states)
                 x = x[potential.values(x) - potential.values(attractor[None]) < LEVEL_SHARE * level]
         if len(x) < MIN_POINTS:
-            few = f"the networks' V is known at {len(x)} points about {_position_text(attractor)}, too few to"
+            few = f"the networks' V is known at {len(x)} points about {place_text(attractor)}, too few to"
             verdicts.append(Verdict.refused(f"{few} compare two routes: record more there, {GO_WITHOUT}"))
             continue
         about = [each for each in evidence.portrait.attractors if np.array_equal(each.position, attractor)]
@@ -380,11 +378,6 @@ def check_agreement(
         worst = place_text(x[int(np.argmax(np.abs(mine - other)))])
         verdicts.append(Verdict.of(difference, limit, f"the two routes disagree most at {worst}"))
     return Verdict.worst(verdicts) if verdicts else Verdict.refused(ALONE)
-
-
-def _position_text(position: np.ndarray) -> str:
-    """A state as it stands in the reasons of a certificate."""
-    return np.array2string(position, precision=4, suppress_small=True, separator=", ")
 
 
 def caustics_below(references: Sequence[Reference], error: float) -> tuple[Remark, ...]:
@@ -428,7 +421,7 @@ def _follow_well(
 ) -> Reference:
     """V by characteristics about one attractor, as far as they may be believed, or a fault."""
     attractor = portrait.attractors[index].position
-    name, region = _position_text(attractor), RecordedRegion.of_basin(portrait, index)
+    name, region = place_text(attractor), RecordedRegion.of_basin(portrait, index)
 
     def without(fault: str) -> Reference:
         return Reference(attractor, np.zeros((0, len(attractor))), np.zeros(0), np.nan, np.inf, fault)
@@ -440,7 +433,7 @@ def _follow_well(
         return without(f"characteristics cannot be followed from the attractor {name}: {failure}")
     caustic = None
     if (met := fan.first_caustic()) is not None:
-        places = {"attractor": name, "place": _position_text(met[0])}
+        places = {"attractor": name, "place": place_text(met[0], digits=4)}
         caustic = Remark("quasipotential.caustic", places | {"level": 2 * met[1]})
     lowest = fan.lowest_sheet()
     kept = np.flatnonzero(lowest & region.recorded(fan.points))

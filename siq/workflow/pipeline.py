@@ -53,8 +53,7 @@ from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import PhasePortrait, evenly_spread, phase_portrait
 from siq.systems.simulation import simulate_snapshots
 from siq.workflow.study import PipelineSettings
-from siq.workflow.tables import Method, Outcome, Status, Step, StepResult, why_no_landscape
-from siq.workflow.training import not_trained, train_block
+from siq.workflow.tables import Method, Outcome, Status, Step, StepResult, not_trained, why_no_landscape
 
 __all__ = ["Analysis", "PipelineSettings", "analyse", "landscape_from_recordings"]
 
@@ -390,6 +389,8 @@ def analyse(
     identified = identify_run(settings, recordings, number=number)
     trained, regressed, landscape = not_trained(number), None, None
     if networks:
+        from siq.workflow.training import train_block
+
         trained = train_block(settings, {number: (recordings, identified.result)}, device=device)[0][number]
         if settings.published_method:
             regressed = regress_run(settings, recordings, trained)

@@ -96,6 +96,8 @@ class Outcome:
         return cls(int(data["run"]), Step(data["step"]), Status(data["status"]), data["reason"], details)
 
 
+POSITION = "position"
+"""In the details of an outcome: where the run stands among the networks of its block."""
 Result = TypeVar("Result", covariant=True)
 
 
@@ -105,6 +107,11 @@ class StepResult(Generic[Result]):
 
     result: Result | None
     outcome: Outcome
+
+
+def not_trained(number: int) -> StepResult[Any]:
+    """A run for which no networks were asked."""
+    return StepResult(None, Outcome(number, Step.TRAIN, Status.SKIPPED, "no networks were asked for"))
 
 
 def why_no_landscape(outcomes: Iterable[Outcome]) -> str:

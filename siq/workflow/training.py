@@ -24,18 +24,11 @@ from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.output_weights import OutputWeights
 from siq.systems.diffusion import Diffusion
 from siq.workflow.study import PipelineSettings
-from siq.workflow.tables import Outcome, Status, Step, StepResult, as_table
+from siq.workflow.tables import POSITION, Outcome, Status, Step, StepResult, as_table
 
-POSITION = "position"
-"""In the details of an outcome: where the run stands among the networks of its block."""
 MOST_POINTS = 10_000  # over which a D that depends on the state is averaged
 Runs = Mapping[int, tuple[Recordings | None, FieldEstimate | None]]
 """What runs bring to their training, by number: trajectories and f, None where a step before failed."""
-
-
-def not_trained(number: int) -> StepResult[AnyNetworks]:
-    """A run for which no networks were asked."""
-    return StepResult(None, Outcome(number, Step.TRAIN, Status.SKIPPED, "no networks were asked for"))
 
 
 def train_block(

@@ -36,8 +36,7 @@ from siq.validation.mesh import STRAIGHT_REACH, mesh_quasipotential
 from siq.workflow.answers import UNRECORDED, Provenance
 from siq.workflow.pipeline import draw_run, identify_run, refine_run, source_of
 from siq.workflow.study import Study, settings_of
-from siq.workflow.tables import Method, Outcome, Step, StepResult
-from siq.workflow.training import not_trained
+from siq.workflow.tables import Method, Outcome, Step, StepResult, not_trained
 
 Finding = tuple[Literal["agrees", "differs", "open"], Remark]
 """What was found of one claim: it holds, it does not, or it could not be derived again."""

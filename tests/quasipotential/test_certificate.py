@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,20 +38,27 @@ from siq.data.recordings import Recordings, SnapshotPairs
 from siq.inference.checks import PredictionLimits, check_prediction, prediction_errors
 from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.inference.library import candidate_library, monomial_exponents
-from siq.networks.decomposition import AnyNetworks, shuffled
+from siq.networks.decomposition import AnyNetworks, NetworksByWell, shuffled
 from siq.networks.networks import Networks, at_rest, initial_layers
 from siq.numerics.randomness import representative_subset
+from siq.quasipotential import certificate as certificate_module
 from siq.quasipotential.certificate import (
+    OF_DYNAMICS,
     OF_TIMES,
+    TOLERANCE,
     Certificate,
     Evidence,
     _candidate_in_well,
     _follow_well,
+    caustics_below,
     certify,
+    certify_wells,
     check_agreement,
     references_about,
 )
 from siq.quasipotential.certificate_tests import (
+    LEVEL_SHARE,
+    MAX_ERROR_FROM_FIELD,
     MIN_POINTS,
     Candidate,
     CertificateOptions,
@@ -58,12 +66,12 @@ from siq.quasipotential.certificate_tests import (
     _check_branch,
     _check_characteristics,
 )
-from siq.quasipotential.characteristics import Fan, adapted_fan
+from siq.quasipotential.characteristics import SHEET_MARGIN, Fan, adapted_fan
 from siq.quasipotential.formulas import exact_decomposition
 from siq.quasipotential.global_formula import fit_values, refine_globally
 from siq.quasipotential.hamilton_jacobi import LibraryBasis
 from siq.quasipotential.wells import Well, _grow_well
-from siq.remarks import sentence
+from siq.remarks import Remark, sentence
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import PhasePortrait, RecordedRegion
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
@@ -158,14 +166,21 @@ def refusals(certificate: Certificate) -> set[str]:
 
 
 def wells_of(known: KnownSystem, *, degree: int = 4, share: float = 0.6) -> tuple[Well, ...]:
+    """V about each attractor, made once for a system."""
     found = portrait_of(known, 300, share=share)
-    return tuple(
-        _grow_well(
-            known.dynamics, attractor, found.basins[index], found.saddles[index],
-            degree=degree, generator=np.random.default_rng(0),
-        )
-        for index, attractor in enumerate(found.attractors)
-    )  # fmt: skip
+    key = (str(known.dynamics.formulas), degree, share)
+    if key not in _WELLS:
+        _WELLS[key] = tuple(
+            _grow_well(
+                known.dynamics, attractor, found.basins[index], found.saddles[index],
+                degree=degree, generator=np.random.default_rng(0),
+            )
+            for index, attractor in enumerate(found.attractors)
+        )  # fmt: skip
+    return _WELLS[key]
+
+
+_WELLS: dict[tuple[object, ...], tuple[Well, ...]] = {}
 
 
 # ---------------------------------------------------------------------------------------- true solutions
@@ -570,6 +585,12 @@ def test_networks_that_are_missing_are_no_second_route() -> None:
     assert refusals(certificate) == {"agreement"}
 
 
+def test_networks_that_are_not_to_be_compared_refuse_nothing() -> None:
+    known = archetype(2)
+    certificate = certify(wells_of(known), evidence_of(known), networks=networks_of(maier_stein(1)))
+    assert certificate.certified and "agreement" not in certificate.tests
+
+
 def held_out(known: KnownSystem) -> Recordings:
     options = SimulationOptions(trajectories=12, pairs=15, pair_step=0.01, interval=0.1)
     return simulate_snapshots(as_system(known), options=options, generator=np.random.default_rng(0))
@@ -644,6 +665,42 @@ def test_networks_must_agree_with_every_well() -> None:
     assert refusals(different) == {"agreement"}
 
 
+def networks_by_well(known: KnownSystem, states: np.ndarray, level: float) -> NetworksByWell:
+    """Stand-ins that know V in two wells, left and right, up to 0.9 of their level, and err above."""
+
+    def known_from(attractor: np.ndarray, x: np.ndarray) -> np.ndarray:
+        values = potential_values(known, x) - potential_values(known, attractor[None])
+        return values + 3 * np.maximum(values - LEVEL_SHARE * level, 0)
+
+    parts: Any = tuple(
+        SimpleNamespace(
+            mean=one[None],
+            potential_at=partial(known_from, one),
+            gradients_at=partial(potential_gradient, known),
+        )
+        for one in known.attractors
+    )
+    side = (states[:, 0] > 0).astype(int)
+    return NetworksByWell(parts, np.zeros(2), np.full(2, level), states, side)
+
+
+@pytest.mark.parametrize("followed", [True, False], ids=["where curves come to", "at their own states"])
+def test_networks_by_well_are_compared_in_each_well_below_their_level(followed: bool) -> None:
+    known, wells = archetype(2), wells_of(archetype(2))
+    evidence, level = evidence_of(known), wells[0].level
+    rows = slice(None, 60 if followed else 0)  # few, as of a small well
+    thin = [replace(one, points=one.points[rows], values=one.values[rows]) for one in evidence.references]
+    evidence = replace(evidence, references=thin)
+    grid = np.mgrid[-1.6:1.6:40j, -0.8:0.8:20j].reshape(2, -1).T
+    # A formula that claims less than networks do is compared no higher than it claims.
+    for claimed in (level, level / 2):
+        formulas = [replace(one, level=claimed) for one in wells]
+        verdict = check_agreement(networks_by_well(known, grid, level), formulas, evidence)
+        assert verdict.passed and verdict.value < 1e-6
+    few = check_agreement(networks_by_well(known, grid[::37], level), wells, evidence)
+    assert followed or (not few.passed and "too few to compare two routes" in few.reason)
+
+
 # ------------------------------------------------------------------------------- wells with a caustic
 
 
@@ -696,9 +753,11 @@ def test_a_phase_portrait_with_a_fault_refuses_whatever_else_passes() -> None:
     faulty: PhasePortrait = replace(setting, descents=escaped)
     assert faulty.fault() is not None
     formulas = exact_decomposition(known.dynamics, 2 * known.potential)
-    certificate = certify(formulas, replace(evidence_of(known), portrait=faulty))
+    evidence = evidence_of(known)
+    certificate = certify(formulas, replace(evidence, portrait=faulty))
     assert not certificate.certified
     assert "another attractor" in certificate.reason
+    assert certificate.tests["branch"].limit == certify(formulas, evidence).tests["branch"].limit > 0
 
 
 KNOWN = maier_stein(1)
@@ -708,15 +767,12 @@ REGION = RecordedRegion.of_basin(PORTRAIT, 0)
 
 @pytest.fixture(scope="module")
 def well() -> Well:
-    return _grow_well(
-        KNOWN.dynamics, PORTRAIT.attractors[0], PORTRAIT.basins[0], PORTRAIT.saddles[0],
-        degree=4, generator=np.random.default_rng(0),
-    )  # fmt: skip
+    return wells_of(KNOWN)[0]
 
 
 @pytest.fixture(scope="module")
 def reference() -> Reference:
-    return _follow_well(KNOWN.dynamics, PORTRAIT, 0)
+    return references_of(KNOWN)[0]
 
 
 def evidence_in_well(count: int, reference: Reference | None) -> Evidence:
@@ -758,13 +814,6 @@ def test_where_they_are_few_characteristics_give_more_and_it_is_said(
     assert 0 < len(alone.points) < MIN_POINTS and "characteristics" not in alone.tested_on
 
 
-def test_a_formula_answers_where_it_claims_to_hold(well: Well, reference: Reference) -> None:
-    # An other curvature across: the residual is large, and the formula claims hardly anything.
-    wrong = np.where(well.basis.exponents[:, 1] == 2, 3.0, 1.0) * well.coefficients
-    other = Well(well.basis, wrong, well.dynamics, well.attractor, well.level, well.saddle, 1.0, well.points)
-    assert _candidate_in_well(other, evidence_in_well(400, reference)).claimed < 0.5
-
-
 @pytest.mark.parametrize("name", ["characteristics", "descent", *OF_TIMES])
 def test_what_was_not_tested_refuses_all_but_where_it_is_of_times(name: str) -> None:
     passed = Verdict(0.0, 1.0, True)
@@ -782,3 +831,174 @@ def test_an_error_that_is_not_known_is_read_back_as_such() -> None:
     for error in (0.1, np.inf):
         whole = Certificate({"descent": Verdict(0.0, 1.0, True)}, error, "why")
         assert Certificate.from_data(whole.as_data()).error == error
+
+
+# ------------------------------------------------------------------------------- what it comes to
+
+
+LADDER = dict.fromkeys([*OF_DYNAMICS, "characteristics", "descent", "gaussian_force", *OF_TIMES], PASSED)
+REFUSED, UNTESTED = Verdict(2.0, 1.0, False, "no"), Verdict(np.nan, 1.0, False, "too short", tested=False)
+
+
+@pytest.mark.parametrize(
+    ("changed", "rung"),
+    [
+        ({}, 6),
+        *[({name: REFUSED}, 2) for name in (*OF_DYNAMICS, "gaussian_force", *OF_TIMES)],
+        ({"characteristics": REFUSED}, 4),
+        ({"descent": REFUSED}, 4),
+        *[({name: UNTESTED}, 4) for name in OF_TIMES],
+    ],
+)
+def test_an_answer_stands_on_the_rung_that_its_tests_bear(changed: dict[str, Verdict], rung: int) -> None:
+    seen = SimpleNamespace(rung=2, limit=None)
+    certificate = Certificate(LADDER | changed, 0.1, "")
+    assert Certificate.rung(certificate, seen) == rung  # type: ignore[arg-type]
+    assert Certificate.rung(certificate, seen, hidden=True) == (5 if rung > 2 else 2)  # type: ignore[arg-type]
+    assert Certificate.rung(certificate, None) == (rung if rung > 2 else 0)
+    # The states themselves are all that can be had of a record that changes, or that predicted nothing.
+    other = SimpleNamespace(rung=2, limit=Remark("data.few_hops", {}))
+    changing = SimpleNamespace(rung=2, limit=Remark("data.not_stationary", {}))
+    assert Certificate.rung(certificate, other) == rung  # type: ignore[arg-type]
+    assert Certificate.rung(certificate, changing) == 2  # type: ignore[arg-type]
+    without = {name: one for name, one in certificate.tests.items() if name != "prediction"}
+    assert Certificate.rung(replace(certificate, tests=without), seen) == 2  # type: ignore[arg-type]
+    assert Certificate.rung(None, seen) == 2  # type: ignore[arg-type]
+
+
+def test_further_tests_add_their_reasons_once() -> None:
+    whole = Certificate({"characteristics": PASSED}, 0.1, "")
+    assert whole.with_tests({"times": UNTESTED, "descent": PASSED}).reason == ""
+    refused = whole.with_tests({"record": REFUSED, "descent": REFUSED, "prediction": UNTESTED})
+    assert refused.reason == "no; too short" and whole.with_tests({"times": REFUSED}).reason == "no"
+    assert set(refused.tests) == {"characteristics", "record", "descent", "prediction"}
+    assert whole.certified and not refused.certified
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3])
+def test_what_is_open_is_the_fault_of_f_or_of_the_formula(share: float) -> None:
+    known, found = archetype(2), exact_field(archetype(2), 3)
+    for factor, reason in ((1.0, "f is not known well enough"), (0.5, "its residual leaves open")):
+        potential = factor * known.potential
+        verdict = certified(known, potential, found=found, relative_error=share).tests["error"]
+        assert verdict.passed is (share == 0.0 and factor == 1.0)
+        assert (reason in verdict.reason) is not verdict.passed
+        # Twice the standard error of V is stated.
+        assert verdict.value == pytest.approx(2 * share, rel=1e-6, abs=1e-6) or factor < 1
+    limit = MAX_ERROR_FROM_FIELD / 2
+    for near, passes in ((0.99 * limit, True), (1.01 * limit, False)):
+        assert certified(known, known.potential, relative_error=near).tests["error"].passed is passes
+
+
+def test_networks_may_be_off_by_what_f_leaves_open_and_by_three_standard_errors_of_their_own() -> None:
+    known = archetype(2)
+    for share in (0.0, 0.01):
+        made = certified(known, known.potential, networks=networks_of(known), relative_error=share)
+        assert made.tests["agreement"].limit == pytest.approx(5 * share, abs=2e-6)
+
+
+@pytest.fixture(scope="module")
+def vain(well: Well) -> Well:
+    """The well with another curvature across: the residual is large, and it claims hardly anything."""
+    wrong = np.where(well.basis.exponents[:, 1] == 2, 3.0, 1.0) * well.coefficients
+    return Well(well.basis, wrong, well.dynamics, well.attractor, well.level, well.saddle, 1.0, well.points)
+
+
+def test_a_formula_that_claims_hardly_anything_is_refused_with_its_place(
+    vain: Well, reference: Reference
+) -> None:
+    given = evidence_in_well(400, reference)
+    assert _candidate_in_well(vain, given).claimed < 0.5
+    certificate = certify([vain], given)
+    assert {"hamilton_jacobi", "error"} <= refusals(certificate) and certificate.error == np.inf
+    assert "characteristics" not in certificate.tests
+    name = "(−1, 0)" if vain.attractor[0] < 0 else "(1, 0)"
+    said = certificate.tests["hamilton_jacobi"].reason
+    assert f"in the well about {name}: raise refinement.degrees" in said
+    recorded = certify([vain], replace(given, found=exact_field(KNOWN, 3)))
+    assert "record more there, or raise" in recorded.tests["hamilton_jacobi"].reason
+
+
+def test_without_a_state_to_compare_at_nothing_is_claimed(well: Well) -> None:
+    given = replace(evidence_in_well(40, None), points=np.array([[1.9, 1.9], [-1.9, 1.9]]))
+    assert "at 0% of" in certify([well], given).tests["hamilton_jacobi"].reason
+
+
+def test_powers_stand_in_for_units_that_are_refused_and_for_no_others(vain: Well) -> None:
+    both, evidence = wells_of(KNOWN), replace(evidence_of(KNOWN), found=KNOWN.dynamics)
+    turn = slice(None) if np.array_equal(both[0].attractor, vain.attractor) else slice(None, None, -1)
+    good, other = both[turn]
+    for instead, passes in ((good, True), (replace(vain), False)):
+        units = replace(vain, instead=instead)
+        chosen, certificate = certify_wells([units, other], evidence)
+        assert certificate.certified is passes
+        assert chosen[0] is (good if passes else units) and chosen[1] is other
+    kept = replace(good, instead=other)
+    chosen, certificate = certify_wells([kept, other], evidence)
+    assert certificate.certified and chosen[0] is kept
+    chosen, certificate = certify_wells([kept, None], evidence)
+    assert chosen == [kept, None] and "1 of 2 attractors have no formula" in certificate.reason
+    assert "2 of 2 attractors" in certify_wells([None, None], evidence)[1].reason
+
+
+def test_a_caustic_is_told_where_the_error_leaves_room_for_one(reference: Reference) -> None:
+    remark = Remark("quasipotential.caustic", {})
+    given = (reference, replace(reference, caustic=remark))
+    assert caustics_below(given, 0.1) == (remark,) and caustics_below(given, 1e-6) == ()
+
+
+# ------------------------------------------------------------------------------- how far curves are followed
+
+
+def test_without_a_saddle_they_come_to_most_recorded_starts() -> None:
+    known = linear_system(2)
+    portrait = portrait_of(known, 300, share=0.6)
+    (found,) = references_of(known)
+    starts = potential_values(known, portrait.descents.paths[:, 0])
+    assert LEVEL_SHARE * found.level == pytest.approx(np.quantile(starts, 0.9), rel=1e-6)
+    assert (found.values <= LEVEL_SHARE * found.level * (1 + 1e-9)).all() and not found.fault
+    # As many steps as a curve has may err by the tolerance each.
+    assert 10 * TOLERANCE < found.error < 1000 * TOLERANCE
+
+
+def test_where_they_cross_the_place_is_told_and_a_margin_between_sheets_stated() -> None:
+    known = maier_stein(10)
+    found = _follow_well(known.dynamics, portrait_of(known, 400), 0)
+    assert found.error == pytest.approx(SHEET_MARGIN, rel=0.01) and found.caustic is not None
+    # They meet on the axis of symmetry, where U = (x² - 1)²/2 whatever β is.
+    across = float(str(found.caustic.values["place"]).strip("()").replace("−", "-").split(",")[0])
+    assert found.caustic.values["level"] == pytest.approx((across**2 - 1) ** 2 / 2, rel=1e-3)
+
+
+def test_where_a_barrier_is_known_they_are_followed_no_further() -> None:
+    (low, high) = references_about(KNOWN.dynamics, PORTRAIT, depths=[0.1, np.inf])
+    assert low.level == 0.1 and low.values.max() <= LEVEL_SHARE * 0.1 * (1 + 1e-9)
+    assert high.level == pytest.approx(0.25, rel=0.05)
+
+
+def test_curves_that_draw_together_say_which_states_to_leave_out() -> None:
+    stiff = KnownSystem(
+        Dynamics.of((x, y), (-x, -50 * y)), None, np.zeros((1, 2)), np.array([[-2.0, 2.0]] * 2)
+    )
+    (found,) = references_of(stiff)
+    assert 0 < len(found.values) < MIN_POINTS and f"give {len(found.values)} points" in found.fault
+    assert "its rates being too different: leave out the fastest states" in found.fault
+
+
+@pytest.mark.parametrize(("steps", "believed"), [(10, False), (11, True)])
+def test_where_most_curves_stall_one_has_to_come_near_the_level(
+    steps: int, believed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(certificate_module, "_level", lambda *_: 0.25)
+    monkeypatch.setattr(certificate_module, "MAX_STEPS", steps)
+    found = _follow_well(KNOWN.dynamics, PORTRAIT, 0)
+    assert len(found.values) >= MIN_POINTS and ("too stiff" in found.fault) is not believed
+    assert bool(found.values.max() >= 0.8 * LEVEL_SHARE * 0.25) == (not found.fault) == believed
+
+
+def test_from_where_nothing_is_stable_none_is_followed() -> None:
+    unstable = replace(KNOWN.dynamics, equations=tuple(-one for one in KNOWN.dynamics.equations))
+    with np.errstate(invalid="ignore"):
+        found = _follow_well(unstable, PORTRAIT, 0)
+    assert "characteristics cannot be followed from the attractor" in found.fault
+    assert found.points.shape == (0, 2) and found.values.shape == (0,) and found.error == np.inf

@@ -122,7 +122,7 @@ def test_what_is_too_stiff_is_told() -> None:
     known = double_well(2)
     stiff = replace(known.dynamics, equations=(known.dynamics.equations[0], -20_000 * (y - x / 2)))
     found = _follow_well(stiff, portrait_of(known, 300, share=0.6), 0)
-    assert "characteristics" in found.fault and "from the attractor [-" in found.fault
+    assert "characteristics" in found.fault and "from the attractor (−1.05, " in found.fault
     verdict, _ = _check_characteristics(
         candidate_of(known, found), exact_field(known, 3), OPTIONS, error=1e-6
     )

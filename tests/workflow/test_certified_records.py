@@ -12,7 +12,7 @@ STEP, WITHIN = 0.05, 5
 CLAIMS = {"one_system", "unchanged", "state_complete", "gaussian_increments", "connected", "times"}
 
 
-def hopping(intensity: float, *, swing: float = 0.0, samples: int = 4000, recordings: int = 6) -> np.ndarray:
+def hopping(intensity: float, *, swing: float = 0.0, samples: int = 2500, recordings: int = 6) -> np.ndarray:
     """``dx = (x - x³ + swing cos(2πt/8)) dt + √ε dW``: shape ``(recordings, samples, 1)``."""
     generator, h = np.random.default_rng(5), STEP / WITHIN
     x, seen = np.where(np.arange(recordings) % 2, 1.0, -1.0), np.empty((recordings, samples, 1))

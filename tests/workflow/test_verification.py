@@ -27,8 +27,7 @@ from siq.workflow import verification
 from siq.workflow.answers import Provenance
 from siq.workflow.pipeline import draw_run, identify_run, landscape_of_run, refine_run, source_of
 from siq.workflow.study import Study, settings_of
-from siq.workflow.tables import Method
-from siq.workflow.training import not_trained
+from siq.workflow.tables import Method, not_trained
 from siq.workflow.verification import verify
 
 CARD = """\
