@@ -58,6 +58,7 @@ OF_TIMES = ("times",)  # what answers on times rest on, and nothing else does
 # What f and D rest on: the record, and no formula of V.
 OF_DYNAMICS = (
     "prediction", "one_system", "unchanged", "state_complete", "gaussian_increments", "existence", "record",
+    "connected",
 )  # fmt: skip
 INDEPENDENT = ("characteristics",)  # tests of V that share nothing with a fit of V but f and D
 GO_WITHOUT = "or do without them: 'refinement: {routes: [local]}'"
