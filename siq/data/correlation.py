@@ -194,7 +194,7 @@ def markov_lag(recordings: Recordings) -> MarkovLag:
 
     Where samples are uneven throughout, increments over the root of their time are, and lags count steps.
     """
-    d, stretches = len(recordings.names), even_stretches(recordings, uneven=True)
+    d, stretches = len(recordings.names), even_stretches(recordings)
     step, sensor = stretches.step, np.zeros(d)
     problem = _increments(recordings, stretches)
     first = None if problem is None else problem.residuals(0)
@@ -391,7 +391,7 @@ class NoiseFloor:
 
 def noise_floors(recordings: Recordings) -> tuple[NoiseFloor, ...] | None:
     """The noise of each state; None where too few neighbouring samples have no gap between them."""
-    stretches = even_stretches(recordings, uneven=True)
+    stretches = even_stretches(recordings)
     for width in WINDOWS:
         begins = stretches.within(width - 2)
         begins = begins[begins % (width // 2) == 0]

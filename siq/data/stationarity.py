@@ -271,8 +271,8 @@ def same_stretch(number: np.ndarray, lag: int) -> np.ndarray:
     return np.asarray((earlier >= 0) & (earlier == number[lag:]))
 
 
-def even_stretches(recordings: Recordings, *, uneven: bool = False) -> Stretches:
-    """Cut recordings into stretches of even steps; with `uneven`, where most are not, of all without gaps."""
+def even_stretches(recordings: Recordings) -> Stretches:
+    """Cut recordings into stretches of even steps, or where most are uneven, of all without gaps."""
     gap = np.diff(recordings.t)
     inside = np.diff(recordings.recording) == 0
     if not inside.any():
@@ -283,7 +283,7 @@ def even_stretches(recordings: Recordings, *, uneven: bool = False) -> Stretches
     if not even.all():  # rounded to the tick of a clock, one step has two lengths, or three
         near = inside & (np.abs(gap - usual) <= ROUNDED_STEP * usual)
         even = near if len(np.unique(np.round(gap[near] / usual, 3))) <= 3 else even
-    if uneven and 2 * even.sum() < inside.sum():
+    if 2 * even.sum() < inside.sum():
         even = inside & (gap <= LONGEST_STEP * usual * (1 + 1e-6))
     return Stretches(np.where(even, np.cumsum(~even), -1), usual)
 

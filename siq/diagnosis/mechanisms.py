@@ -584,9 +584,7 @@ def _without_amplitudes(
 PROCESS_NOISE = "process noise"
 
 
-def candidates_of(
-    model: Dynamics, roles: Roles, dictionary: Sequence[Mechanism], *, file: str = "the dictionary"
-) -> list[MechanismCandidate]:
+def candidates_of(model: Dynamics, roles: Roles, dictionary: Sequence[Mechanism]) -> list[MechanismCandidate]:
     """Every place at which a mechanism of the dictionary may be at work in a system.
 
     Process noise is not among them: it changes no equation. Nor is what the simulation's own parameters can
@@ -606,7 +604,7 @@ def candidates_of(
                 try:
                     candidate = _build_candidate(model, mechanism, form, assignment)
                 except FormulaError as error:
-                    raise InputError(file, mechanism.name, error.fault, error.remedy) from None
+                    raise InputError("the dictionary", mechanism.name, error.fault, error.remedy) from None
                 if candidate is not None:
                     found.append((candidate, ", ".join(assignment.values())))
     reduced = _beyond_parameters(model, [each for each, _ in found])

@@ -17,7 +17,7 @@ import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import scipy.special
@@ -85,9 +85,7 @@ PREDICTED_RECORDINGS = 200  # held-out ones that are predicted: enough for a med
 
 def identify(
     recordings: Recordings,
-    library: CandidateLibrary | None = None,
     *,
-    observation: ObservationModel | Literal["auto"] = "auto",
     options: IdentificationOptions,
     draw: Callable[[Purpose], np.random.Generator],
     diffusion: Diffusion | None = None,
@@ -100,13 +98,10 @@ def identify(
 
     Parameters
     ----------
-    recordings, library, options
-        Whole trajectories; the candidate functions of f, by default those of the options; and what makes a
-        term significant.
-    observation
-        How samples show the states. By default as measurement noise and correlations in the recordings say;
-        with hidden velocities where the options ask for them, or leave it open and f of the position alone
-        is refuted by its inertia.
+    recordings, options
+        Whole trajectories; and the candidate functions of f, what makes a term significant, and whether
+        velocities are hidden. Where that is left open they are if f of the position alone is refuted by its
+        inertia. How else samples show the states, measurement noise and correlations in them say.
     draw
         Gives the generator for a purpose: for held-out recordings, and for resampling.
     diffusion, units
@@ -123,14 +118,8 @@ def identify(
     NumericalFailure
         When there is no f, with the reason, and what would help.
     """
-    hidden = options.hidden_velocities is True if observation == "auto" else observation.hidden
-    if library is not None or observation != "auto":  # which say whether velocities are states
-        options = replace(options, hidden_velocities=hidden)
-    if library is None:
-        names = recordings.names
-        library = field_library((*names, *velocity_names(names)) if hidden else names, options)
-    if observation == "auto" and hidden:
-        observation = ObservationModel(library, Diffusion.identity(library.dimension), hidden=True)
+    hidden, names = options.hidden_velocities is True, recordings.names
+    library = field_library((*names, *velocity_names(names)) if hidden else names, options)
     case = _Case(
         recordings, library, options, draw, diffusion, units or recordings.units, pair_step, integrator_step,
         limits or PredictionLimits(),
@@ -140,20 +129,16 @@ def identify(
     if turning and (by_velocities := case.with_velocities()) is not None:
         return by_velocities
     try:
-        if observation == "auto":
+        if not hidden:
             found = case.identified()
-        elif hidden:
-            if diffusion is not None:
-                raise NumericalFailure(
-                    "D is given for the positions, and noise drives the hidden velocities; leave the"
-                    " diffusion out, it is found"
-                )
+        elif diffusion is None:
+            observation = ObservationModel(library, Diffusion.identity(library.dimension), hidden=True)
             found = case.finished(case.by_likelihood(observation))
         else:
-            seen = case.by_exposure(observation)
-            if seen is None:
-                raise NumericalFailure("the recordings are no means over that exposure")
-            found = seen
+            raise NumericalFailure(
+                "D is given for the positions, and noise drives the hidden velocities; leave the"
+                " diffusion out, it is found"
+            )
         assert found.prediction is not None
         if not hidden and (found.memory is not None or not found.prediction.passed):
             # A position alone is refused where its recordings are correlated since it has inertia.

@@ -101,7 +101,7 @@ class LaggedPairs(SnapshotPairs):
 
 def lagged_pairs(recordings: Recordings, lag: int) -> LaggedPairs:
     """All pairs of neighbouring samples that a sample `lag` steps earlier is known of: at least one."""
-    stretches = even_stretches(recordings, uneven=True)
+    stretches = even_stretches(recordings)
     at = stretches.within(lag)
     if not len(at):
         raise NumericalFailure(
@@ -122,7 +122,7 @@ def coarse_pairs(recordings: Recordings, lag: int, *, lost: float) -> SnapshotPa
     apart is their `h`: given where a pair begins, its mean and its variance are those of white noise in that
     shorter time, but for what circulates.
     """
-    stretches = even_stretches(recordings, uneven=True)
+    stretches = even_stretches(recordings)
     at = stretches.within(lag - 1)
     # The first of each stretch, and every one that is a whole number of lags later.
     _, begins, which = np.unique(stretches.number[at], return_index=True, return_inverse=True)

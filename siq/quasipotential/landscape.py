@@ -24,7 +24,6 @@ from siq.data.states import RecordStates
 from siq.errors import Fault, NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
 from siq.quasipotential.certificate import Certificate
-from siq.quasipotential.characteristics import potential_errors
 from siq.quasipotential.fokker_planck import CellProcess, Dissipation, ReactiveFlow, Rotation, cores_about
 from siq.quasipotential.global_formula import GlobalQuasipotential
 from siq.quasipotential.occupancy import VisitTest
@@ -46,7 +45,6 @@ if TYPE_CHECKING:
 
 DRAWS = 40  # of an estimated f: the ends of a 95 % interval are then two of them
 MARGIN = 0.15  # of the states that were seen, on each side: there the density ends
-LEVEL_TOLERANCE = 1e-6  # numerical, of the level of a well: two values of U are one
 
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -302,29 +300,6 @@ class Landscape:
             raise Fault(f"the points have the shape {x.shape}", f"give (n, {self.dynamics.dimension})")
         whole = self.global_quasipotential
         return np.full(len(x), np.nan) if whole is None else whole(x)
-
-    def quasipotential_errors(self, points: np.ndarray) -> np.ndarray:
-        """Standard errors of U at points ``(n, d)``, above the attractor of the well that each lies in.
-
-        Returns
-        -------
-        numpy.ndarray
-            Shape ``(n,)``, from the uncertainty of f; zero where recordings carry no noise, NaN where U is
-            not known, or f was not identified.
-        """
-        x = np.asarray(points, dtype=float)
-        errors, whole = np.full(len(x), np.nan), self.global_quasipotential
-        if self.field_estimate is None or whole is None:
-            return errors
-        by_well = whole.by_well(x)
-        least = np.fmin.reduce(by_well)
-        for well, values in zip(whole.wells, by_well, strict=True):
-            mine = values <= least + LEVEL_TOLERANCE * well.level  # false of NaN
-            if mine.any():
-                found = self.field_estimate
-                places = whole.placed(well, x[mine])
-                errors[mine] = 2 * potential_errors(found, well.gradients, well.attractor, places)
-        return errors
 
     def potential(self, well: int = 0) -> Well:
         """V about an attractor, zero there, as a formula with where it holds; U is 2V.

@@ -289,7 +289,7 @@ class CycleFormula(NamedTuple):
 
     @classmethod
     def of(
-        cls, dynamics: Dynamics, cycle: Cycle, *, degree: int = 10, tolerance: float = 0.01, seed: int = 0
+        cls, dynamics: Dynamics, cycle: Cycle, *, degree: int = 10, tolerance: float = 0.01
     ) -> CycleFormula:
         """The formula of the degree, up to one, that holds farthest within a relative residual.
 
@@ -312,7 +312,7 @@ class CycleFormula(NamedTuple):
         found = cls(dynamics, cycle, coefficients)
         whole = [found._replace(coefficients=found.coefficients[:count]) for count in range(1, degree)]
         best = max((one._up_to(tolerance) for one in whole), key=lambda one: one.level)
-        draw = np.random.default_rng(seed)
+        draw = np.random.default_rng(0)
         t = draw.uniform(0, cycle.period, UNSEEN)
         s = draw.uniform(best.reach.min(), best.reach.max(), UNSEEN)
         value, *_, share = best._at(t, s)

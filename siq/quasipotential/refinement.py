@@ -9,7 +9,6 @@ put in random order.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -54,8 +53,6 @@ from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.wells import MIN_OUTLIER_RESIDUAL, RESIDUAL_TOLERANCE, Well, local_well
 from siq.remarks import Remark
 from siq.systems.phase_portrait import PhasePortrait, RecordedRegion, evenly_spread, phase_portrait
-
-logger = logging.getLogger(__name__)
 
 Route = Literal["network", "local"]
 Degree = Annotated[int, Field(ge=2, le=16)]

@@ -128,6 +128,12 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str], or
         (each.name, [name for name in entry.look_alikes if name in less[each.name]]) for each, entry in known
     ]
     named = [(each, entry) for each, entry in known if each in statement.mechanisms]
+    formulas = [row for each in findings.named for row in _rows_of(each, findings)]
+    if formulas and statement.outcome == "named":  # the whole new equations, too
+        equations = zip(findings.after.states, findings.after.equations, strict=True)
+        formulas += [FormulaRow(_rate_of(name), _typeset(formula)) for name, formula in equations]
+    compared = (MismatchVerdict.MISSING_PHYSICS, MismatchVerdict.UNEXPLAINED)
+    told = len(statement.explanations) > 1 and statement.verdict in compared
     content = compose(
         "diagnosis_page.j2",
         title=title,
@@ -142,7 +148,7 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str], or
             (each.name, entry.sentence) for each, entry in named if not statement.random_forces
         ],
         errors=_errors_table(findings, of_outputs),
-        formulas=_formulas(findings),
+        formulas=formulas,
         mechanism_parameters=_parameters_of(findings.named, of=True),
         references=list(
             dict.fromkeys((each.name, entry.reference) for each, entry in known if entry.reference)
@@ -158,7 +164,12 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str], or
         ],
         look_alikes=[(name, names) for name, names in alike if names],
         evidence=_evidence(findings.named),
-        explanations=_explanations(statement),
+        explanations=pd.DataFrame(
+            [
+                {"explanation": what, "log-evidence": round(value, 1)}
+                for what, value in (statement.explanations.items() if told else ())
+            ]
+        ),
         wells=None
         if findings.wells.empty
         else findings.wells.replace({"": None})
@@ -249,17 +260,6 @@ def _errors_table(findings: Findings, units: Mapping[str, str]) -> pd.DataFrame 
         rows.append(row(words[said], getattr(errors, name), **own))
     rows.append(row(words["noise"], floor) | {"times noise": "1"})
     return pd.DataFrame(rows).fillna("")
-
-
-def _formulas(findings: Findings) -> list[FormulaRow]:
-    """Formulas of what was named or comes closest; with what is named, the whole new equations."""
-    rows = [row for each in findings.named for row in _rows_of(each, findings)]
-    if rows and findings.statement.outcome == "named":
-        rows += [
-            FormulaRow(_rate_of(name), _typeset(formula))
-            for name, formula in zip(findings.after.states, findings.after.equations, strict=True)
-        ]
-    return rows
 
 
 def _rows_of(part: StatedTerm, findings: Findings) -> list[FormulaRow]:
@@ -374,17 +374,6 @@ def _odds_text(log_odds: float | None) -> str:
     digits = max(len(str(int(odds))) - 2, 0)
     text = f"{round(odds, -digits):.0f}" if odds >= 10 else f"{odds:.1f}"
     return f"{text} to 1" if log_odds >= 0 else f"1 to {text}"
-
-
-def _explanations(statement: Statement) -> pd.DataFrame:
-    compared = (MismatchVerdict.MISSING_PHYSICS, MismatchVerdict.UNEXPLAINED)
-    told = len(statement.explanations) > 1 and statement.verdict in compared
-    return pd.DataFrame(
-        [
-            {"explanation": what, "log-evidence": round(value, 1)}
-            for what, value in (statement.explanations.items() if told else ())
-        ]
-    )
 
 
 def _escape_times(escape: pd.DataFrame) -> pd.DataFrame | None:

@@ -25,7 +25,7 @@ from siq.data.states import RecordStates
 from siq.inference.field_estimate import DiffusionSource, FieldEstimate
 from siq.numerics.text import range_text, unit_text, value_text
 from siq.quasipotential.certificate import Certificate
-from siq.quasipotential.formulas import SymbolicDecomposition
+from siq.quasipotential.formulas import SymbolicDecomposition, read_model
 from siq.quasipotential.landscape import sentences_without_landscape
 from siq.quasipotential.wells import Well
 from siq.report.formatting import (
@@ -105,7 +105,7 @@ class StudyResults:
             formulas = self.landscape is not None and any(w is not None for w in self.landscape.formulas)
             return {str(Method.REFINED): self.certificate} if formulas else {}
         run = self.shown[0]
-        return {} if run is None else self.models.certificates(run)
+        return {} if run is None else read_model(self.models.paths[run])[1]
 
 
 def study_page(

@@ -257,7 +257,6 @@ def split_escapes(
     intensity: float,
     progress: Callable[[np.ndarray], np.ndarray],
     generator: np.random.Generator,
-    step: float | None = None,
     runs: int = RUNS,
 ) -> _SplitTime:
     """The mean time from the middle of one neighbourhood until one of some others is reached, by splitting.
@@ -274,9 +273,6 @@ def split_escapes(
         logarithm changes by about 1, or the number of walkers is not what it should be.
     generator
         Source of the noise.
-    step
-        Step h; by default what lets E[τ] be off by 0.3 % where noise is additive. Elsewhere Heun's rule
-        is of order one.
     runs
         Independent ones, whose spread tells the error.
 
@@ -292,9 +288,9 @@ def split_escapes(
     slowest = float(np.abs(own.real).min())
     along = progress(centers.T)
     lowest, top = float(along[0]), float(along[1:].max())
-    if step is None:
-        share = min(STEP, np.sqrt(STEP_ERROR / (HEUN * max(top - lowest, 1.0))))
-        step = share / float(np.abs(rates).max())
+    # E[τ] is off by 0.3 % where noise is additive. Elsewhere Heun's rule is of order one.
+    share = min(STEP, np.sqrt(STEP_ERROR / (HEUN * max(top - lowest, 1.0))))
+    step = share / float(np.abs(rates).max())
     function = dynamics.drift_of_components
     draw = noise_source(dynamics, intensity=intensity, step=step, generator=generator)
 

@@ -206,7 +206,3 @@ def _example(options: argparse.Namespace) -> Exit:
     files, command = write_example(options.name, Path(options.folder), replace=options.force)
     print("Wrote " + " and ".join(map(str, files)) + f". Try it: {command}")
     return Exit.ANSWERED
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -79,7 +79,7 @@ class _Progress:
         if kind == "run_info":
             counts = {name: int(count) for name, count in event["stats"].items()}
             self.total = counts.pop("total", sum(counts.values()))
-            self._work = sum(count * _seconds(rule) for rule, count in counts.items())
+            self._work = sum(count * SECONDS.get(rule, 1.0) for rule, count in counts.items())
             self._began = self._latest = self.clock()
         elif kind == "job_info":
             job = int(event["jobid"])
@@ -98,7 +98,7 @@ class _Progress:
             self._doing = {of: text for of, text in self._doing.items() if not words.endswith(f"({of})")}
             self.running.pop(job, None)
             self.done += 1
-            self._worked += _seconds(self._rules.get(job, ""))
+            self._worked += SECONDS.get(self._rules.get(job, ""), 1.0)
             self._latest = self.clock()
         elif kind == "job_error":
             job = int(event["jobid"])
@@ -106,11 +106,6 @@ class _Progress:
             self.failed.append((self._words.get(job, str(event["rule_name"])), tuple(event.get("log") or ())))
         elif kind == "error":
             self.errors.append(str(event.get("text", "")))
-
-    def _within(self, words: str) -> str:
-        """What a running job said last of what it is doing."""
-        said = [text for of, text in self._doing.items() if words.endswith(f"({of})")]
-        return f": {said[-1]}" if said else ""
 
     def left(self) -> float | None:
         """Seconds that are left; None before anything began, and where it takes longer than was thought."""
@@ -127,16 +122,14 @@ class _Progress:
             return "reading and checking your files"
         words = list(self.running.values())
         if words:
-            self._latest_words = words[-1] + self._within(words[-1])
+            # With what a running job said last of what it is doing.
+            said = [f": {text}" for of, text in self._doing.items() if words[-1].endswith(f"({of})")]
+            self._latest_words = words[-1] + "".join(said[-1:])
         what = "finishing" if self.done == self.total else self._latest_words
         more = f" (and {len(words) - 1} more)" if len(words) > 1 else ""
         left = self.left()
         time_left = "" if left is None else f", {_duration(left)}"
         return f"{min(self.done + 1, self.total)} of {self.total}: {what}{more}{time_left}"
-
-
-def _seconds(rule: str) -> float:
-    return SECONDS.get(rule, 1.0)
 
 
 def _duration(seconds: float) -> str:

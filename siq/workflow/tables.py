@@ -125,16 +125,14 @@ def why_no_landscape(outcomes: Iterable[Outcome]) -> str:
 
 
 _SCHEMA = yaml.safe_load(Path(__file__).with_name("tables.yaml").read_text(encoding="utf-8"))
-
-
-def _types(columns: str) -> dict[str, str]:
-    known = {name: kind for kind, names in _SCHEMA["types"].items() for name in names.split()}
-    parts = (column.partition(":") for column in columns.split())
-    return {name: kind or known.get(name, "float64") for name, _, kind in parts}
-
+_KINDS = {name: kind for kind, names in _SCHEMA["types"].items() for name in names.split()}
 
 COLUMNS: Mapping[str, Mapping[str, str]] = {
-    name: _types(columns) for name, columns in _SCHEMA["tables"].items()
+    table: {
+        name: kind or _KINDS.get(name, "float64")
+        for name, _, kind in (column.partition(":") for column in columns.split())
+    }
+    for table, columns in _SCHEMA["tables"].items()
 }
 """Columns of every table, in order, with their types: the contract with whoever reads the results."""
 
@@ -202,9 +200,3 @@ class ModelFiles:
         from siq.quasipotential.formulas import read_model
 
         return read_model(self.paths[run])[0]
-
-    def certificates(self, run: int) -> dict[str, Any]:
-        """Their certificates."""
-        from siq.quasipotential.formulas import read_model
-
-        return read_model(self.paths[run])[1]

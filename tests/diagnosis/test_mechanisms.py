@@ -212,7 +212,6 @@ def test_a_formula_outside_the_whitelist_is_refused(oscillator: Dynamics, tmp_pa
             oscillator,
             roles_of(oscillator),
             validate(read_document(path), _Dictionary).mechanisms,
-            file="mechanisms.yaml",
         )
 
 

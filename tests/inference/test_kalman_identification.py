@@ -278,11 +278,12 @@ def test_exposures_do_not_overlap_and_begin_at_rows_of_their_own(steps: float, k
 def test_means_over_an_exposure_of_another_length_are_treated_as_such(steps: float) -> None:
     recordings = recorded(double_wells(1, exposure=steps, samples=4_000, sensor=0.01))
     library = candidate_library(["x"], degree=3)
-    field = identify(
-        recordings, library, observation=ObservationModel(library, Diffusion.identity(1), steps * TIME),
-        options=IdentificationOptions(degree=3), draw=lambda _: np.random.default_rng(0),
+    case = _Case(
+        recordings, library, IdentificationOptions(degree=3), lambda _: np.random.default_rng(0), None,
+        (None,), None, None, PredictionLimits(),
     )  # fmt: skip
-    assert field.exposure == steps * TIME
+    field = case.by_exposure(ObservationModel(library, Diffusion.identity(1), steps * TIME))
+    assert field is not None and field.exposure == steps * TIME
     assert [field.library.names[k] for _, k in field.support] == ["x", "x**3"]
     assert (np.abs(field.values - [1, -1]) < 3.5 * np.sqrt(np.diag(field.covariance))).all()
     assert field.noise_rate[0, 0] == pytest.approx(0.2, rel=0.06)

@@ -23,6 +23,7 @@ from matplotlib.figure import Figure
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import Verdict
 from siq.quasipotential.certificate import Certificate
+from siq.quasipotential.characteristics import potential_errors
 from siq.quasipotential.formulas import read_model, write_model
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
@@ -100,13 +101,15 @@ def test_errors_of_u_of_barriers_and_of_times_are_one_propagation() -> None:
         options=RefinementOptions(degrees=(4,)), noise=NoiseStrength(0.1, 0.001),
         certificate=Certificate(tests, left, ""),
     )  # fmt: skip
-    assert landscape.noise is not None
+    assert landscape.noise is not None and landscape.field_estimate is not None
     for way, row in zip(landscape.transitions, landscape.barriers().itertuples(), strict=True):
         # What the table says is what times rest on, and no less than the share of the formula's own error.
         assert row.standard_error == way.error == way.exit.standard_error
         assert way.error >= left * way.formula_share * way.barrier > 0
         # U just below the saddle is as uncertain as the barrier is by f.
-        of_f = landscape.quasipotential_errors(way.uphill)
+        well = landscape.potential(way.start)
+        below = way.uphill[np.isfinite(well.known_values(way.uphill))]
+        of_f = 2 * potential_errors(landscape.field_estimate, well.gradients, well.attractor, below)
         assert of_f[np.isfinite(of_f)][-1] == pytest.approx(way.standard_error, rel=0.05)
         law = way.exit
         time = law.mean_exit_time(landscape.noise)

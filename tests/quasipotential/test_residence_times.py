@@ -71,10 +71,6 @@ def test_a_landscape_gives_the_dwell_times_of_the_noise_it_knows() -> None:
     table = found.dwell_times()
     assert list(table["attractor"]) == [0, 1] and (table["mean_time"] > 0).all()
     assert (table["data_error"] > 0).all()
-    known_at, unknown = np.array([[0.5, 0.2], [-1.0, -0.3]]), np.array([[9.0, 9.0]])
-    errors = found.quasipotential_errors(known_at)
-    assert (errors > 0).all() and (errors < 0.01 * found.quasipotential(known_at)).all()
-    assert np.isnan(found.quasipotential_errors(unknown)).all()
     given = found.dwell_times(noise=0.05)
     np.testing.assert_allclose(given["mean_time"], table["mean_time"])
     assert (given["data_error"] < table["data_error"]).all()  # a given noise has no error

@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def siq(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "siq.workflow.command", *arguments],
+        [sys.executable, "-m", "siq", *arguments],
         cwd=folder,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,

@@ -70,7 +70,11 @@ def _lowest_behind(landscape: LandscapeSummary, grid: np.ndarray, rest: list[int
     """
     seen = [np.stack([one.position for one in landscape.marks])] if landscape.marks else []
     seen += [way.uphill for way in landscape.ways if len(way.uphill)]
-    places = np.concatenate([*seen, _points(landscape)])[:, rest]
+    fitted = [well.points for well in landscape.formulas if well is not None and len(well.points)]
+    if not fitted and landscape.points is not None:
+        fitted = [landscape.points]
+    points = np.concatenate([np.zeros((0, len(landscape.names))), *fitted])
+    places = np.concatenate([*seen, points[:: max(len(points) // 2000, 1)]])[:, rest]
     width = np.ptp(landscape.box, axis=1)[rest]
     behind = _far_apart(places / width, BEHIND) * width
     best, lowest = grid.copy(), np.full(len(grid), np.inf)
@@ -118,15 +122,6 @@ def _take(
 ) -> None:
     better = np.nan_to_num(values, nan=np.inf) < lowest[known]
     best[known[better]], lowest[known[better]] = moved[better], values[better]
-
-
-def _points(landscape: LandscapeSummary) -> np.ndarray:
-    points = landscape.points
-    fitted = [well.points for well in landscape.formulas if well is not None]
-    together = np.concatenate([np.zeros((0, len(landscape.names))), *fitted])
-    if not len(together) and points is not None:
-        together = points
-    return together[:: max(len(together) // 2000, 1)]
 
 
 def _far_apart(points: np.ndarray, count: int) -> np.ndarray:
