@@ -288,7 +288,13 @@ class OccupancyCheck:
             rarity, limit = -float(np.log10(self.unseen.probability)), -float(np.log10(SIGNIFICANCE))
             return {"record": Verdict(rarity, limit, False, why)}
         if self.passages:
-            tests["connected"] = self._connected()
+            # Whether all wells are joined, one way at least; the figure is how many are not.
+            counts = np.array(self.passages)
+            _, piece = sparse.csgraph.connected_components(counts > 0, directed=False)
+            apart = [int(well) + 1 for well in np.flatnonzero(piece != piece[0])]
+            values = {"passages": int(counts.sum()), "apart": apart}
+            told = sentence(Remark("quasipotential.passages", values))
+            tests["connected"] = Verdict.not_tested(told) if apart else Verdict(0.0, 0.0, True, told)
             tests["times"] = Verdict.not_tested(why) if self.missing else self._times(false_alarms)
         if self.densities:
             worst = min(self.densities, key=lambda one: one.probability)
@@ -296,14 +302,6 @@ class OccupancyCheck:
             chance = worst.probability * len(self.densities)
             tests["record"] = Verdict.of_probability(chance, false_alarms, reason)
         return tests
-
-    def _connected(self) -> Verdict:
-        """Whether all wells are joined by passages, one way at least; the figure is how many are not."""
-        counts = np.array(self.passages)
-        _, piece = sparse.csgraph.connected_components(counts > 0, directed=False)
-        apart = [int(well) + 1 for well in np.flatnonzero(piece != piece[0])]
-        told = sentence(Remark("quasipotential.passages", {"passages": int(counts.sum()), "apart": apart}))
-        return Verdict.not_tested(told) if apart else Verdict(0.0, 0.0, True, told)
 
     def _times(self, false_alarms: float) -> Verdict:
         """All visits together, and those to each well."""
