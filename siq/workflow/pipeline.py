@@ -341,8 +341,7 @@ def _noise_strength(settings: PipelineSettings, record: FieldEstimate) -> NoiseS
     """The noise that the recordings show, or else the first that the study gives."""
     if (shown := record.noise_strength) is not None:
         return NoiseStrength(*shown, source="estimated")
-    given = () if settings.landscape is None else settings.landscape.noise_intensities
-    return NoiseStrength(given[0]) if given else None
+    return NoiseStrength(settings.noises[0]) if settings.noises else None
 
 
 @dataclass(frozen=True)
