@@ -128,7 +128,8 @@ class LandscapeRegressor(RegressorMixin, BaseEstimator):
             self._step = float(np.sqrt(np.finfo(float).eps) * (size or 1.0) / (speed or 1.0))
             both = np.stack([x, x + self._step * velocities], axis=1)
             times = self._step * np.arange(2)
-            self.recordings_ = Recordings.from_arrays(times, both, names=_names(x.shape[1]))
+            names = [f"x{place}" for place in range(x.shape[1])]
+            self.recordings_ = Recordings.from_arrays(times, both, names=names)
         found = identify_run(self._settings, self.recordings_, number=0)
         if found.result is None:
             raise NumericalFailure(found.outcome.reason)
@@ -209,7 +210,8 @@ class LandscapeRegressor(RegressorMixin, BaseEstimator):
             return Recordings.of(X)
         parts = [np.asarray(each, dtype=float) for each in ([X] if np.ndim(X[0]) < 2 else X)]
         times = [self.time_step * np.arange(len(each)) for each in parts]
-        return Recordings.from_arrays(times, parts, names=_names(parts[0].shape[-1]))
+        names = [f"x{place}" for place in range(parts[0].shape[-1])]
+        return Recordings.from_arrays(times, parts, names=names)
 
     @property
     def _settings(self) -> PipelineSettings:
@@ -238,7 +240,3 @@ class LandscapeRegressor(RegressorMixin, BaseEstimator):
         tags.target_tags.required = False
         tags.target_tags.multi_output = True
         return tags
-
-
-def _names(dimension: int) -> list[str]:
-    return [f"x{place}" for place in range(dimension)]

@@ -83,11 +83,6 @@ class Budget:
         """Seconds since it was made."""
         return self.clock() - self._begun
 
-    @property
-    def share(self) -> float:
-        """Of the work allowed, that is spent."""
-        return self.spent / self.work
-
     def charge(self, work: float) -> None:
         """Count work that is about to be done.
 
@@ -135,7 +130,8 @@ class Budget:
     def says(self, what: str) -> None:
         """Tell what is being done, and how much was spent."""
         if self.tell is not None:
-            self.tell(f"{what}; {self.share:.0%} of the budget spent" if self.work < float("inf") else what)
+            share = f"; {self.spent / self.work:.0%} of the budget spent" if self.work < float("inf") else ""
+            self.tell(f"{what}{share}")
 
 
 def evaluation(model: Dynamics, data: Measurements, *, columns: int = 0) -> float:

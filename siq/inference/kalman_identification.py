@@ -243,10 +243,8 @@ def _estimate(
             slopes[:, -1] = np.append(size, np.where(follows, -values, 0.0)) / 2
             slopes[:, -2] = -slopes[:, -1]
         whole = slopes @ joint @ slopes.T
-        rate, diffusion = (
-            np.diag([on_state, on_state if on_force else 0.0]),
-            Diffusion(np.diag([1.0, float(on_force > 0)])),
-        )
+        rate = np.diag([on_state, on_state if on_force else 0.0])
+        diffusion = Diffusion(np.diag([1.0, float(on_force > 0)]))
         strength, driven = float(on_state), slice(0, 1)
     correlation, score = _strongest_correlation(fit, data)
     error = strength * float(np.sqrt((process_error[driven] ** 2).sum())) / len(process_error[driven])

@@ -54,6 +54,7 @@ INEXACT = 1e-4  # numerical: of effects carried along whole trajectories, where 
 NONLINEAR = 0.5  # share of a step's effect that may be unforeseen before the step is shortened
 HARMLESS = 0.1  # of a filter's own corrections: what is unforeseen below that is corrected as they are
 RUNS_AWAY = "the simulation runs away between two samples"
+ITERATIONS = 25  # of a fit, at most
 SUBSTEP_ERROR = 3e-6  # of the spread of a state: far below what any sensor resolves
 SETTLED = 1e-4  # change of the innovations, squared and per sample, at which a fit has converged
 FINE = 1e-3  # the same of all innovations together, by the parameters: a thirtieth of a standard error
@@ -573,7 +574,6 @@ def fit_by_multiple_shooting(
     noise: Noise,
     estimate_process: bool,
     substeps: int | None = None,
-    iterations: int = 25,
     budget: Budget | None = None,
 ) -> Fit:
     """Fit free parameters, states and noise, by Gauss–Newton steps along linearised trajectories.
@@ -589,18 +589,18 @@ def fit_by_multiple_shooting(
         equations exactly.
     estimate_process
         Whether the process noise is estimated, too; the measurement noise always is.
-    substeps, iterations, budget
-        Runge–Kutta steps between samples, by default as many as the accuracy needs; most steps of the fit;
-        charged for every evaluation.
+    substeps, budget
+        Runge–Kutta steps between samples, by default as many as the accuracy needs; and charged for every
+        evaluation.
     """
     shooting = _Shooting(model, data, x, substeps, budget=budget)
     along = linearise(model, shooting.grid, model.values, x)
-    fit = shooting.fit(x, along, noise, estimate_process=estimate_process, most=iterations)
+    fit = shooting.fit(x, along, noise, estimate_process=estimate_process, most=ITERATIONS)
     if not (fit.converged and fit.has_process_noise):
         return fit
     return fit_by_filter(
         fit.model, data, x=fit.x, noise=fit.noise, estimate_process=estimate_process, substeps=fit.substeps,
-        iterations=iterations, closure=False, budget=budget,
+        closure=False, budget=budget,
     )  # fmt: skip
 
 
@@ -614,7 +614,7 @@ def fit_by_filter(
     estimate_process: bool = True,
     estimate_sensor: bool = True,
     substeps: int | None = None,
-    iterations: int = 25,
+    iterations: int = ITERATIONS,
     closure: bool = True,
     budget: Budget | None = None,
 ) -> Fit:

@@ -399,10 +399,8 @@ class HamiltonJacobi:
             if not improved:
                 break
             gain = 1 - float(np.linalg.norm(attempt)) / max(float(np.linalg.norm(residual)), 1e-300)
-            change, reached = (
-                np.linalg.norm(length * step * scale[free]),
-                np.linalg.norm(coefficients * scale),
-            )
+            change = np.linalg.norm(length * step * scale[free])
+            reached = np.linalg.norm(coefficients * scale)
             coefficients, residual = trial, attempt
             if change <= tolerance * reached or gain < 1e-7:
                 break

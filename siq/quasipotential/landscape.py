@@ -631,8 +631,6 @@ class Landscape:
 
         return compare_with(equations, self, noise=noise)
 
-    beside = compare_with
-
     def report(self) -> str:
         """What was found, as text."""
         from siq.report.landscape import landscape_report

@@ -64,12 +64,8 @@ def _rounded(values: np.ndarray) -> list[Any]:
     return [float(f"{one:.{DIGITS}g}") if np.ndim(one) == 0 else _rounded(one) for one in values]
 
 
-def _pairs(values: np.ndarray) -> list[list[float]]:
-    """Complex numbers as real and imaginary parts."""
-    return [[value.real, value.imag] for value in values.astype(complex).tolist()]
-
-
 def _complex(pairs: Sequence[Sequence[float]]) -> np.ndarray:
+    """Numbers of their real and imaginary parts."""
     values = np.array([complex(*one) for one in pairs])
     return values if values.imag.any() else values.real
 
@@ -79,7 +75,7 @@ NUMBER: Codec = (_number, lambda value: np.nan if value is None else float(value
 KNOWN: Codec = (_number, lambda value: value)
 ARRAY: Codec = (_maybe(np.ndarray.tolist), _maybe(np.array))
 ROUNDED: Codec = (_rounded, np.array)
-COMPLEX: Codec = (_pairs, _complex)
+COMPLEX: Codec = (lambda values: [[one.real, one.imag] for one in values.astype(complex).tolist()], _complex)
 REMARKS: Codec = (
     lambda remarks: [one.as_data() for one in remarks], lambda data: tuple(map(Remark.from_data, data))
 )  # fmt: skip

@@ -387,11 +387,8 @@ class CycleFormula(NamedTuple):
         place, along, across, speed, bend = (one[again] for one in self._frame(t))
         powers = np.arange(2, len(self.coefficients) + 2)[:, None]
         c, moved = (_wave(self.coefficients, self.cycle.period, t, order)[:, again] for order in (0, 1))
-        value, turned, slope = (
-            (c * s**powers).sum(0),
-            (moved * s**powers).sum(0),
-            (powers * c * s ** (powers - 1)).sum(0),
-        )
+        value, turned = (c * s**powers).sum(0), (moved * s**powers).sum(0)
+        slope = (powers * c * s ** (powers - 1)).sum(0)
         x = place + s[:, None] * across
         push = (turned / (speed * (1 + s * bend)))[:, None] * along + slope[:, None] * across
         spent = (push * self.dynamics.diffusion.push(x, push)).sum(axis=1)

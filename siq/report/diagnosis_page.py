@@ -119,6 +119,7 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str], or
     statement, before = findings.statement, findings.before
     units = dict(zip(before.states, before.units, strict=True))
     of_outputs = {name: units.get(str(formula), "1") for name, formula in before.outputs}
+    own_units = {entry.name: entry.unit for entry in before.parameters}
     largest = None
     if not findings.held_out.empty:
         largest = largest_difference(findings.held_out, after=statement.final_simulation)
@@ -163,7 +164,20 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str], or
             for each in statement.described
         ],
         look_alikes=[(name, names) for name, names in alike if names],
-        evidence=_evidence(findings.named),
+        evidence=pd.DataFrame(
+            [
+                {
+                    "mechanism": part.label,
+                    "gain in χ²": round(evidence.delta_chi2),
+                    "ΔBIC": round(evidence.delta_bic or 0),
+                    "odds of the name": _odds_text(evidence.log_odds),
+                    "p, independent errors": p_text(evidence.p_white or 0),
+                    "p, errors of a recording together": p_text(evidence.p_cluster or 0),
+                }
+                for part in findings.named
+                if (evidence := part.evidence).delta_chi2 is not None
+            ]
+        ),
         explanations=pd.DataFrame(
             [
                 {"explanation": what, "log-evidence": round(value, 1)}
@@ -186,7 +200,19 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str], or
                 for label, bound in statement.excluded.items()
             ]
         ),
-        parameters=_own_parameters(statement, before),
+        parameters=pd.DataFrame(
+            [
+                {
+                    "parameter": name,
+                    "on the card": value_text(one.before, unit=own_units.get(name, "1"), digits=4),
+                    "fitted": value_text(one.after, one.standard_error, unit=own_units.get(name, "1")),
+                    "change, in standard errors": (one.after - one.before) / one.standard_error
+                    if one.standard_error
+                    else math.nan,
+                }
+                for name, one in statement.recalibration.items()
+            ]
+        ),
         candidates=_candidates(findings),
     )
     return render_report(content)
@@ -347,23 +373,6 @@ def _curve(part: StatedTerm) -> pd.DataFrame:
     )
 
 
-def _evidence(parts: Sequence[StatedTerm]) -> pd.DataFrame:
-    return pd.DataFrame(
-        [
-            {
-                "mechanism": part.label,
-                "gain in χ²": round(evidence.delta_chi2),
-                "ΔBIC": round(evidence.delta_bic or 0),
-                "odds of the name": _odds_text(evidence.log_odds),
-                "p, independent errors": p_text(evidence.p_white or 0),
-                "p, errors of a recording together": p_text(evidence.p_cluster or 0),
-            }
-            for part in parts
-            if (evidence := part.evidence).delta_chi2 is not None
-        ]
-    )
-
-
 def _odds_text(log_odds: float | None) -> str:
     """Odds such as ``340 to 1``; empty where they are not known."""
     if log_odds is None:
@@ -389,23 +398,6 @@ def _escape_times(escape: pd.DataFrame) -> pd.DataFrame | None:
     pivot.columns.name = None
     words = texts("tables")["simulations"]
     return pivot.rename(columns={**words, "transition": "way out", "intensity": "ε"})
-
-
-def _own_parameters(statement: Statement, before: Dynamics) -> pd.DataFrame:
-    """The simulation's own parameters, on the card and fitted."""
-    units = {entry.name: entry.unit for entry in before.parameters}
-    rows = [
-        {
-            "parameter": name,
-            "on the card": value_text(one.before, unit=units.get(name, "1"), digits=4),
-            "fitted": value_text(one.after, one.standard_error, unit=units.get(name, "1")),
-            "change, in standard errors": (one.after - one.before) / one.standard_error
-            if one.standard_error
-            else math.nan,
-        }
-        for name, one in statement.recalibration.items()
-    ]
-    return pd.DataFrame(rows)
 
 
 def _candidates(findings: Findings) -> pd.DataFrame | None:

@@ -25,6 +25,7 @@ import numpy as np
 import pandas as pd
 from jinja2 import ChoiceLoader, Environment, FileSystemLoader, PackageLoader, StrictUndefined
 from markupsafe import Markup
+from pandas.api.types import is_bool_dtype, is_numeric_dtype
 
 from siq.data.inspection import inspect
 from siq.data.preparation import joined
@@ -220,7 +221,7 @@ def render_template(name: str, content: object, *, folder: Path | None = None) -
     )
     environment.filters |= {
         "cell": _cell_text,
-        "is_number": _is_number_column,
+        "is_number": lambda column: is_numeric_dtype(column) and not is_bool_dtype(column),
         "kept_columns": _kept_columns,
         # An SVG inside <img> keeps its identifiers to itself and cannot run or load anything.
         "data_address": lambda figure: _address(figure.kind, figure.image),
@@ -302,10 +303,6 @@ def _wide_for(frame: pd.DataFrame, rows: int) -> str:
         cells = [least_width(_cell_text(value)) for value in frame[name].head(rows)]
         width += CELL + CHARACTER * max([longest_word(str(name)), *cells])
     return "page phone" if width > PAGE else "phone" if width > PHONE else ""
-
-
-def _is_number_column(column: pd.Series) -> bool:
-    return pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column)
 
 
 def _cell_text(value: object) -> str:

@@ -161,12 +161,13 @@ class LandscapeSummary:
     @property
     def cycles(self) -> tuple[np.ndarray, ...]:
         """Stable limit cycles, each of shape ``(n, d)`` and closed."""
-        return tuple(_closed(well.cycle) for well in self.wells if well.cycle is not None)
+        known = (well.cycle.points for well in self.wells if well.cycle is not None)
+        return tuple(np.vstack([points, points[:1]]) for points in known)
 
     @property
     def parting(self) -> tuple[np.ndarray, ...]:
         """Unstable cycles, each of shape ``(n, d)`` and closed."""
-        return tuple(_closed(cycle) for cycle in self.unstable_cycles)
+        return tuple(np.vstack([cycle.points, cycle.points[:1]]) for cycle in self.unstable_cycles)
 
     def potential(self, x: np.ndarray) -> np.ndarray:
         """U at points ``(n, d)``, NaN where it is not known: shape ``(n,)``."""
@@ -370,13 +371,18 @@ def summarise(
         for one in landscape.equilibria
         for place in [tuple(one.position.tolist())]
     )  # fmt: skip
+    visits = {one.well: one for one in landscape.visits}
+    if record is not None:  # the table of a study
+        rows = {str(row["attractor"]): row for row in record[record["run"] == run].to_dict("records")}
+        texts = (place_text(one.position) for one in attractors)
+        visits = {index: visits_of(rows[place]) for index, place in enumerate(texts) if place in rows}
     return LandscapeSummary(
         names=tuple(symbol.name for symbol in dynamics.symbols),
         units=units,
         time_unit=dynamics.time_unit,
         wells=tuple(
-            _well(landscape, index, float(heights[index]), size, visits)
-            for index, visits in enumerate(_visits(landscape, record, run))
+            _well(landscape, index, float(heights[index]), size, visits.get(index))
+            for index in range(len(attractors))
         ),
         ways=ways,
         noise=landscape.noise,
@@ -393,16 +399,6 @@ def summarise(
         equilibria=equilibria,
         size=size,
     )
-
-
-def _visits(landscape: Landscape, record: pd.DataFrame | None, run: int) -> list[VisitTest | None]:
-    """Visits to each well, from the landscape or from the table of a study."""
-    if record is None:
-        known = {one.well: one for one in landscape.visits}
-        return [known.get(index) for index in range(len(landscape.attractors))]
-    rows = {str(row["attractor"]): row for row in record[record["run"] == run].to_dict("records")}
-    found = [rows.get(place_text(one.position)) for one in landscape.attractors]
-    return [None if row is None else visits_of(row) for row in found]
 
 
 def visits_of(row: Mapping[Any, Any]) -> VisitTest:
@@ -444,7 +440,3 @@ def settled(position: Any, errors: Any, size: np.ndarray) -> tuple[np.ndarray, n
     position, errors = np.array(position, dtype=float), np.broadcast_to(errors, np.shape(position))
     nothing = np.hypot(position, np.nan_to_num(errors)) < ZERO_POSITION * size
     return np.where(nothing, 0.0, position), np.where(nothing, 0.0, errors)
-
-
-def _closed(cycle: Cycle) -> np.ndarray:
-    return np.vstack([cycle.points, cycle.points[:1]])

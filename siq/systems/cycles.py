@@ -33,6 +33,7 @@ exponent.
 from __future__ import annotations
 
 import itertools
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -301,15 +302,11 @@ def recurrence_of(dynamics: Dynamics, starts: np.ndarray, *, box: np.ndarray, ra
     box ``(d, 2)`` at the rate, and what is far slower is coming to rest.
     """
     chosen = np.linspace(0, len(starts) - 1, min(MAX_STARTS, len(starts))).astype(int)
-    found = Recurrence("none")
     for start in starts[chosen]:
-        try:
-            found = _recurrence_from(dynamics, start, box, rate)
-        except _TooLongError:
-            found = Recurrence("none")
-        if found.kind != "none":
-            break
-    return found
+        with suppress(_TooLongError):
+            if (found := _recurrence_from(dynamics, start, box, rate)).kind != "none":
+                return found
+    return Recurrence("none")
 
 
 class _TooLongError(Exception):

@@ -12,8 +12,7 @@ U/2.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,9 +41,6 @@ class _KnownBarrier:
     error: float  #: by how much it may be wrong
     prefactor: float  #: of the law E[τ] = prefactor · exp(ΔU/ε) for small ε; NaN where it is not known
     how: str  #: how it is known
-
-
-X, Y, Z, V = sympy.symbols("x y z v", real=True)
 
 
 @dataclass(frozen=True)
@@ -76,119 +72,50 @@ def reference_systems() -> dict[str, _ReferenceSystem]:
     >>> systems["maier-stein"].barriers[0].value
     0.5
     """
-    half, tenth, nothing = sympy.Rational(1, 2), sympy.Rational(1, 10), sympy.S.Zero
-    over_and_back = ((-1,), (0,), (1,)), ((1,), (0,), (-1,))
-    hessian = sympy.Matrix([[2, 1], [1, 3]]) / 2
-    noise, turning = sympy.Matrix([[2, half], [half, 1]]), sympy.Matrix([[0, -3], [3, 0]])
-    plane = sympy.Matrix([X, Y])
-    archetype = (X**2 - 1) ** 2 + Y**2 + Z**2
-    slope = [archetype.diff(each) / 2 for each in (X, Y, Z)]
-    east, north = X - 4, Y - 5
-    inside = 1 - east**2 - north**2
-    place, friction = (X**2 - 1) ** 2 / 4 - X / 10, half
-    units = sympy.symbols("x:10", real=True)
-    wells = sum(((s**2 - 1) ** 2 / 4 for s in units), nothing)
-    wells += sum((half * (a - b) ** 2 for a, b in itertools.pairwise(units)), nothing)
-    falls = [0, *(wells.diff(s) for s in units), 0]
-    systems = [
-        _exact(
-            "linear",
-            "A linear system that turns, with a full D.",
-            "Lyapunov's equation",
-            Dynamics.of(
-                (X, Y),
-                tuple(map(sympy.expand, (turning - noise) * hessian * plane)),
-                diffusion=np.array(noise.tolist(), dtype=float),
-                domain=[(-2, 2)] * 2,
-            ),
-            sympy.expand((plane.T * hessian * plane)[0]),
-        ),
-        _exact(
-            "double-well",
-            "A tilted double well of one state.",
-            "Kramers, Physica 7, 284 (1940)",
-            Dynamics.of((X,), (X - X**3 + tenth,), domain=[(-2, 2)]),
-            (X**2 - 1) ** 2 / 2 - X / 5,
-            over_and_back,
-        ),
-        _exact(
-            "growing-noise",
-            "A double well whose noise grows with the state.",
-            "U' = -2f/D",
-            Dynamics.of((X,), (X - X**3,), diffusion=[[1 + X**2]], domain=[(-2, 2)]),
-            X**2 - 2 * sympy.log(1 + X**2),
-            over_and_back[:1],
-        ),
-        _exact(
-            "archetype",
-            "Two wells of three states with a circulation.",
-            "the archetype of the paper that siq implements",
-            Dynamics.of(
-                (X, Y, Z),
-                tuple(map(sympy.expand, (-sum(slope, nothing), slope[0] - slope[1], slope[0] - slope[2]))),
-                domain=[(-2, 2), (-1.5, 1.5), (-1.5, 1.5)],
-            ),
-            archetype,
-            (((-1, 0, 0), (0, 0, 0), (1, 0, 0)),),
-        ),
-        _exact(
-            "maier-stein",
-            "Maier and Stein's system with β = 1, where its drift has a potential.",
-            "Maier and Stein, Phys. Rev. Lett. 71, 1783 (1993)",
-            Dynamics.of((X, Y), (X - X**3 - X * Y**2, -(1 + X**2) * Y), domain=[(-2, 2), (-1, 1)]),
-            X**4 / 2 - X**2 + (1 + X**2) * Y**2 + half,
-            (((-1, 0), (0, 0), (1, 0)),),
-        ),
-        _exact(
-            "cycle",
-            "A stable limit cycle about an unstable point.",
-            "the second example of Moore et al., The R Journal 8, 19 (2016)",
-            Dynamics.of(
-                (X, Y),
-                (tenth * 2 * east * inside - north, tenth * 2 * north * inside + east),
-                domain=[(2, 6), (3, 7)],
-            ),
-            tenth * inside**2,
-        ),
-        _exact(
-            "chain",
-            "Ten bistable units in a row that turn about each other: f = (A - 1)∇Φ, U = 2Φ.",
-            "any f = (A - 1)∇Φ with A constant and antisymmetric",
-            Dynamics.of(
-                units,
-                [sympy.expand(falls[k + 1] - falls[k] - falls[k - 1]) for k in range(1, 11)],
-                domain=[(-2, 2)] * 10,
-            ),
-            2 * wells,
-        ),
-        _exact(
-            "particle",
-            "A damped particle in a tilted double well, with noise on its velocity alone.",
-            "Kramers, Physica 7, 284 (1940)",
-            Dynamics.of(
-                (X, V),
-                (V, sympy.expand(-place.diff(X) - friction * V)),
-                diffusion=[[0, 0], [0, 1]],
-                domain=[(-2, 2)] * 2,
-            ),
-            2 * friction * (V**2 / 2 + place),
-            tuple(tuple((*each, 0) for each in way) for way in over_and_back),
-        ),
-        _point_and_cycle(),
-        *_computed_twice(),
-    ]
-    return {each.name: each for each in systems}
+    path = Path(__file__).with_name("reference_systems.yaml")
+    systems = yaml.safe_load(path.read_text(encoding="utf-8"))
+    return {name: _system(name, **known) for name, known in systems.items()}
 
 
-def _exact(
+def _system(
     name: str,
+    *,
     about: str,
     source: str,
-    dynamics: Dynamics,
-    quasipotential: sympy.Expr,
-    ways: Sequence[Sequence[Sequence[float]]] = (),
+    states: Mapping[str, Sequence[float]],
+    equations: Sequence[str],
+    diffusion: Sequence[Sequence[float | str]] | None = None,
+    quasipotential: str | None = None,
+    ways: Sequence[Mapping[str, Sequence[float]]] = (),
+    barriers: Sequence[Mapping[str, Any]] = (),
 ) -> _ReferenceSystem:
-    """A system whose U is a formula; ways are attractor, saddle and the attractor behind it, about where."""
+    """A system as the file has it: states with their domains, formulas, and barriers where they are known."""
+    symbols = {state: symbol(state) for state in states}
+    dynamics = Dynamics.of(
+        tuple(symbols.values()), [parse_formula(each, symbols) for each in equations],
+        diffusion=diffusion and [
+            [parse_formula(entry, symbols) if isinstance(entry, str) else entry for entry in row]
+            for row in diffusion
+        ],
+        domain=list(states.values()),
+    )  # fmt: skip
+    known = []
+    for each in barriers:
+        start, saddle, end = (np.array(each[place], dtype=float) for place in ("start", "saddle", "end"))
+        value = each["value"]
+        error, how = each.get("error", 1e-9 * max(value, 1.0)), each.get("how", TWO_METHODS)
+        known.append(_KnownBarrier(start, saddle, end, value, error, np.nan, how))
+    if quasipotential is None:
+        return _ReferenceSystem(name, about, source, dynamics, None, tuple(known))
+    exact = parse_formula(quasipotential, symbols)
+    known += _exact_barriers(dynamics, exact, ways)
+    return _ReferenceSystem(name, about, source, dynamics, exact, tuple(known))
+
+
+def _exact_barriers(
+    dynamics: Dynamics, quasipotential: sympy.Expr, ways: Sequence[Mapping[str, Sequence[float]]]
+) -> list[_KnownBarrier]:
+    """Barriers where U is a formula; ways say about where attractor, saddle and next attractor are."""
     symbols, noise, barriers = dynamics.symbols, dynamics.diffusion, []
     second = compile_formulas([quasipotential.diff(a, b) for a in symbols for b in symbols], symbols)
     divergence_free = False
@@ -204,7 +131,7 @@ def _exact(
                 lambda x: dynamics.drift(x[None])[0], np.array(place, dtype=float),
                 jac=lambda x: dynamics.jacobian(x[None])[0], tol=1e-14,
             ).x
-            for place in way
+            for place in (way["start"], way["saddle"], way["end"])
         )  # fmt: skip
         # The law of Eyring and Kramers, (2π/λ) √(|det H_S| / det H_A) with the unstable eigenvalue λ at the
         # saddle and the Hessians of U, where g has no divergence; in one state with D(x), times D_S/D_A
@@ -220,44 +147,7 @@ def _exact(
         barriers.append(
             _KnownBarrier(start, saddle, end, float(levels[1] - levels[0]), 0.0, prefactor, "exact")
         )
-    return _ReferenceSystem(name, about, source, dynamics, quasipotential, tuple(barriers))
-
-
-def _computed_twice() -> Iterator[_ReferenceSystem]:
-    """Systems without a known formula of U, of which two methods give the barriers."""
-    path = Path(__file__).with_name("reference_systems.yaml")
-    for name, known in yaml.safe_load(path.read_text(encoding="utf-8")).items():
-        symbols, barriers = {state: symbol(state) for state in known["states"]}, []
-        for each in known["barriers"]:
-            start, saddle, end = (np.array(each[place], dtype=float) for place in ("start", "saddle", "end"))
-            value, error = each["value"], 1e-9 * max(each["value"], 1.0)
-            barriers.append(_KnownBarrier(start, saddle, end, value, error, np.nan, TWO_METHODS))
-        dynamics = Dynamics.of(
-            tuple(symbols.values()), [parse_formula(each, symbols) for each in known["equations"]],
-            diffusion=known.get("diffusion"), domain=list(known["states"].values()),
-        )  # fmt: skip
-        yield _ReferenceSystem(name, known["about"], known["source"], dynamics, None, tuple(barriers))
-
-
-def _point_and_cycle() -> _ReferenceSystem:
-    """Rings about a stable point: V' = r(r² - a²)(r² - b²) with a turn."""
-    inner, outer, turns = sympy.Rational(1, 4), sympy.S.One, 2
-    square = X**2 + Y**2
-    half = square**3 / 6 - (inner + outer) * square**2 / 4 + inner * outer * square / 2
-    field = (-half.diff(X) - turns * Y, -half.diff(Y) + turns * X)
-    dynamics = Dynamics.of((X, Y), tuple(map(sympy.expand, field)), domain=[(-1.5, 1.5)] * 2)
-    value = float(2 * half.subs({X: sympy.Rational(1, 2), Y: 0}))
-    beyond = value - float(2 * half.subs({X: 1, Y: 0}))
-    origin, edge, circle = np.zeros(2), np.array([0.5, 0.0]), np.array([1.0, 0.0])
-    how = "exact; any point of the circles"
-    barriers = (
-        _KnownBarrier(origin, edge, circle, value, 0.0, np.nan, how),
-        _KnownBarrier(circle, edge, origin, beyond, 0.0, np.nan, how),
-    )
-    return _ReferenceSystem(
-        "point-and-cycle", "A stable point within a stable limit cycle, and an unstable cycle between them.",
-        "V' = r(r² - a²)(r² - b²) with a turn", dynamics, 2 * half, barriers,
-    )  # fmt: skip
+    return barriers
 
 
 def reference_table(*, points: int = 100) -> pd.DataFrame:

@@ -55,8 +55,7 @@ def write_generated(path: Path, name: str) -> tuple[Path, str]:
     if turns:
         angles = ", ".join(f"{one['name']}: [0, {str(one['turn']).replace('2π', '2*pi')}]" for one in turns)
         text += f"identification: {{angles: {{{angles}}}}}\n"
-    with whole_file(study) as partial:
-        partial.write_text(text, encoding="utf-8")
+    _write({study: text}, replace=True, remedy="")
     return study, _own_path(path)
 
 

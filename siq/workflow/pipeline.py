@@ -34,7 +34,7 @@ from siq.inference.identify import identify
 from siq.inference.kalman_identification import of_all_states
 from siq.inference.library import candidate_library
 from siq.networks.decomposition import AnyNetworks, NetworksByWell
-from siq.networks.regression import RegressionResult, points_below, sparse_decomposition
+from siq.networks.regression import points_below, sparse_decomposition
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.certificate import Certificate, certify, uncertified
 from siq.quasipotential.formulas import SymbolicDecomposition, decomposition_from_coefficients
@@ -151,11 +151,31 @@ def regress_run(
     settings: PipelineSettings, recordings: Recordings | None, trained: StepResult[AnyNetworks]
 ) -> StepResult[SymbolicDecomposition]:
     """Formulas of the networks of one run."""
-    number = trained.outcome.run
-    if trained.result is None or recordings is None:
+    number, networks, options = trained.outcome.run, trained.result, settings.regression
+    if networks is None or recordings is None:
         return StepResult(None, Outcome(number, Step.REGRESS, Status.SKIPPED, _no_networks(trained.outcome)))
     try:
-        formulas, found = _regressed(settings, recordings, trained.result)
+        points = snapshot_pairs(recordings, pair_step=settings.sampling.pair_step).x0
+        potential, circulatory, vector_field = networks.evaluate(points)
+        below = points_below(potential, level=options.level)
+        library = candidate_library(
+            recordings.names, degree=options.degree, potential_degree=options.potential_degree,
+            circulatory_degree=options.circulatory_degree, further=options.functions,
+        )  # fmt: skip
+        # A D that was not given is that of the networks, in their precision.
+        noise = settings.space.constant_noise(points.shape[1]) or Diffusion(networks.diffusion)
+        parts = (points[below], potential[below], circulatory[below], vector_field[below])
+        found = sparse_decomposition(library, *parts, diffusion=noise, options=options)
+        formulas = decomposition_from_coefficients(
+            library, potential=found.potential, circulatory=found.circulatory,
+            vector_field=found.vector_field, points=points[below],
+        )  # fmt: skip
+        if isinstance(networks, NetworksByWell):
+            dynamics = Dynamics.of(
+                formulas.symbols, formulas.vector_field, diffusion=Diffusion(networks.diffusion)
+            )
+            degree = affordable_degree(len(formulas.symbols), options.well_degree)
+            formulas = replace(formulas, wells=formulas_by_well(networks, dynamics, degree=degree))
     except NumericalFailure as error:
         return StepResult(None, Outcome(number, Step.REGRESS, Status.FAILED, str(error)))
     status = Status.OK if found.converged else Status.WARNING
@@ -173,34 +193,6 @@ def regress_run(
 
 def _no_networks(outcome: Outcome) -> str:
     return f"the training gave no networks ({outcome.reason})"
-
-
-def _regressed(
-    settings: PipelineSettings, recordings: Recordings, networks: AnyNetworks
-) -> tuple[SymbolicDecomposition, RegressionResult]:
-    options = settings.regression
-    points = snapshot_pairs(recordings, pair_step=settings.sampling.pair_step).x0
-    potential, circulatory, vector_field = networks.evaluate(points)
-    below = points_below(potential, level=options.level)
-    library = candidate_library(
-        recordings.names, degree=options.degree, potential_degree=options.potential_degree,
-        circulatory_degree=options.circulatory_degree, further=options.functions,
-    )  # fmt: skip
-    # A D that was not given is that of the networks, in their precision.
-    noise = settings.space.constant_noise(points.shape[1]) or Diffusion(networks.diffusion)
-    parts = (points[below], potential[below], circulatory[below], vector_field[below])
-    result = sparse_decomposition(library, *parts, diffusion=noise, options=options)
-    formulas = decomposition_from_coefficients(
-        library, potential=result.potential, circulatory=result.circulatory,
-        vector_field=result.vector_field, points=points[below],
-    )  # fmt: skip
-    if isinstance(networks, NetworksByWell):
-        dynamics = Dynamics.of(
-            formulas.symbols, formulas.vector_field, diffusion=Diffusion(networks.diffusion)
-        )
-        degree = affordable_degree(len(formulas.symbols), options.well_degree)
-        formulas = replace(formulas, wells=formulas_by_well(networks, dynamics, degree=degree))
-    return formulas, result
 
 
 @dataclass(frozen=True)
@@ -348,8 +340,7 @@ def _noise_strength(settings: PipelineSettings, record: FieldEstimate) -> NoiseS
     """The noise that the recordings show, or else the first that the study gives."""
     if (shown := record.noise_strength) is not None:
         return NoiseStrength(*shown, source="estimated")
-    given = () if settings.landscape is None else settings.landscape.noise_intensities
-    return NoiseStrength(given[0]) if given else None
+    return NoiseStrength(settings.noises[0]) if settings.noises else None
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,6 @@ def _diffusion(settings: PipelineSettings, runs: Runs, data: Mapping[int, Traini
     if not records:
         return Diffusion.identity(dimension)
     if not all(record.diffusion.constant for record in records):
-        # Networks only lead to the right solution, which is then found with D as it is.
         points = np.concatenate([data[number].training.x0 for number in data])
         every = max(len(points) // MOST_POINTS, 1)
         noises = [record.diffusion.at(points[::every]).mean(axis=0) for record in records]

@@ -236,12 +236,13 @@ def _barrier(landscape: Landscape | None, x: np.ndarray) -> Iterator[Finding]:
         yield _open("barrier")
         return
     dynamics, start = landscape.dynamics, landscape.attractors[way.start].position
+    other, method = np.nan, "mesh"
     if dynamics.dimension == 1:
         other, method = _action(dynamics, np.linspace(start, way.place, 10 * STATES)), "quadrature"
     elif dynamics.dimension == 2:
         low, high = np.minimum(x.min(axis=0), way.place), np.maximum(x.max(axis=0), way.place)
         box = np.stack([low - 0.1 * (high - low), high + 0.1 * (high - low)], axis=1)
-        nodes, needed, other = 0, NODES, np.nan
+        nodes, needed = 0, NODES
         while nodes < needed <= MOST_NODES:
             nodes = needed
             try:
@@ -253,13 +254,9 @@ def _barrier(landscape: Landscape | None, x: np.ndarray) -> Iterator[Finding]:
                 break
             needed = int(NODES_OF_TURNING * 2 * (mesh.reach - STRAIGHT_REACH))
             other = float(2 * mesh.evaluate(way.place[None])[0]) if needed <= nodes else np.nan
-        if not np.isfinite(other):
-            yield _open("barrier")
-            return
-        method = "mesh"
     elif way.path is not None:
         other, method = _action(dynamics, way.path.points), "path"
-    else:
+    if not np.isfinite(other):
         yield _open("barrier")
         return
     values = {"start": way.start, "barrier": way.barrier, "other": other, "method": method}

@@ -57,7 +57,7 @@ def test_what_trajectories_do_not_show_is_missed_and_what_they_show_beside_is_to
     both, one = wells(), wells(low=0.5)
     missed = one.compare_with(both).set_index("item")
     assert list(missed[missed["note"] == MISSED].index) == ["A1 to A2", "A2 to A1", "A1"]
-    further = both.beside(one)  # the name that it had
+    further = both.compare_with(one)
     assert set(further.loc[further["note"] == FURTHER, "item"]) == {
         "A1 to a further state",
         "a further state to A1",
