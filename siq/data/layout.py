@@ -311,7 +311,7 @@ def _calendar_parts(source: ColumnFile) -> dict[str, tuple[int, pd.Series]]:
         part = next((one for one, words in _CALENDAR.items() if title in words and one not in parts), None)
         if part is None or (numbers := _numbers(source, place)) is None or len(numbers) < 2:
             continue
-        if (numbers != np.round(numbers)).any():  # or one is missing
+        if not np.isfinite(numbers).all() or (numbers != np.round(numbers)).any():
             continue
         values = pd.Series(numbers.astype(int))
         low, high = _RANGES.get(part, (0, 59))
@@ -329,6 +329,8 @@ def _calendar_parts(source: ColumnFile) -> dict[str, tuple[int, pd.Series]]:
 def _with_one_clock(source: ColumnFile) -> ColumnFile:
     """Days in one column and times of day in another, or parts such as year and hour, as one column."""
     parts, headings = _calendar_parts(source), [read_heading(one) for one in source.headings]
+    if any(one.title == "t" for one in headings):
+        return source
     rest = [place for place in range(len(headings)) if place not in {place for place, _ in parts.values()}]
     texts = {
         place: source.load([place])[0].to_pandas().astype(str).str.strip().str.removesuffix(".0")
