@@ -300,6 +300,7 @@ def test_random_forces_are_no_noise_where_a_function_beside_them_is_likelier(
     assert place["outputs"] == ["x"] and place["coordinate"] == "measurement" and not place["equations"]
 
 
+@pytest.mark.slow
 def test_random_forces_that_follow_the_motion_are_not_those_of_surroundings(tmp_path: Path) -> None:
     diagnosis = solved(tmp_path, recordings_of(nothing, drive=0.03, fading=True), study=among(*FEW))
     assert said(diagnosis)["verdict"] == "unexplained"
@@ -338,6 +339,7 @@ def test_a_function_of_a_sensor_is_located_in_what_is_measured(tmp_path: Path) -
     assert said(diagnosis)["described"][0]["outputs"] == ["x"]
 
 
+@pytest.mark.slow
 def test_what_the_dictionary_lacks_is_modelled_without_a_name(tmp_path: Path) -> None:
     table = recordings_of(lambda x, v, t: 1.5 * np.exp(-(((x - 0.5) / 0.15) ** 2)), count=6)
     diagnosis = solved(tmp_path, table, study=among(*FEW, held_out=["r2", "r5"]))

@@ -32,6 +32,7 @@ SMALL: dict[str, Callable[[], ForeignCase]] = {
     "polynomial on the brink": lambda: polynomial_on_the_brink(samples=60, recordings=3),
     "eight states": lambda: chain_of_masses(samples=150, recordings=3),
 }
+MINUTES = ("eight states", "polynomial on the brink")
 LARGE: dict[str, Callable[[], ForeignCase]] = {
     "motor axis, one recording": lambda: motor_axis(recordings=1),
     "motor axis, asymmetric": lambda: motor_axis(asymmetry=6.0),
@@ -59,7 +60,7 @@ def answered(
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "eight states" else name for name in SMALL]
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in MINUTES else name for name in SMALL]
 )
 def test_there_is_an_answer(name: str, tmp_path: Path) -> None:
     found = answered(SMALL[name](), tmp_path)

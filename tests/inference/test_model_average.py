@@ -103,8 +103,7 @@ def test_barriers_hold_the_truth_however_strong_a_term_is(strength: float) -> No
     assert np.mean(together) > 0.94 or np.mean(together) > np.mean(alone) + 0.1
 
 
-@pytest.mark.parametrize("strength", [0.0, 2.0])
-def test_wells_of_two_states_hold_the_truth_though_no_constant_is_seen(strength: float) -> None:
+def test_wells_of_two_states_hold_the_truth_though_no_constant_is_seen() -> None:
     """Without a constant two wells of ``x - x³`` lie exactly at one distance, as those of few systems do."""
     planar, draw = candidate_library(["x", "y"], degree=5), np.random.default_rng(5)
     states = np.array([[0.9, 0.0]]) * draw.choice([-1, 1], (2000, 1)) + 0.3 * draw.standard_normal((2000, 2))
@@ -114,7 +113,7 @@ def test_wells_of_two_states_hold_the_truth_though_no_constant_is_seen(strength:
     error = np.linalg.norm(np.linalg.pinv(columns[:, [constant, *own]])[0])
     slopes = planar.evaluate(np.array([[1.0, 0.0]]))[0] / 2  # of the place where f = 0
     truth = np.zeros(planar.size)
-    truth[[constant, *own]] = strength * error, 1.0, -1.0
+    truth[[constant, *own]] = 2.0 * error, 1.0, -1.0  # which a search leaves out mostly
     critical = critical_values(planar, false_terms=0.05)
     labels = all_coefficients([0], planar.size)
     held = []

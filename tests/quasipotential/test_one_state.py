@@ -69,6 +69,7 @@ def test_recordings_of_one_state_give_barriers() -> None:
     np.testing.assert_allclose(barriers["barrier"], [top - left, top - right], rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_file_and_a_table_do_as_well(tmp_path: Path) -> None:
     file = tmp_path / "recorded.csv"
     rows = recorded(three_roots())

@@ -55,6 +55,7 @@ def test_both_references_are_the_exact_quasipotential(smooth) -> None:
     np.testing.assert_allclose(smooth.heights, 0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_both_references_are_exact_where_the_noise_depends_on_the_state() -> None:
     known = multiplicative(2)
     found = reference_of(known)

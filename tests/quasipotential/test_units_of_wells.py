@@ -86,6 +86,7 @@ def test_powers_stay_where_they_follow_v(of_units: siq.Landscape) -> None:
     assert all(len(well.basis.units) > 0 for well in of_units.wells)
 
 
+@pytest.mark.slow
 def test_units_are_invariant_to_the_unit_of_states(of_units: siq.Landscape) -> None:
     scaled = landscape("auto", 1024.0)
     assert np.isclose(scaled.certificate.error, of_units.certificate.error, rtol=0.2)
@@ -94,6 +95,7 @@ def test_units_are_invariant_to_the_unit_of_states(of_units: siq.Landscape) -> N
         assert np.allclose(other.values(1024 * x), one.values(x), atol=1e-4 * one.level)
 
 
+@pytest.mark.slow
 def test_a_well_over_units_is_written_and_read(of_units: siq.Landscape, tmp_path: Path) -> None:
     write_landscape(tmp_path / "quasipotential.json", of_units)
     again = read_landscape(tmp_path / "quasipotential.json", dynamics=of_units.dynamics)

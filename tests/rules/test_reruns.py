@@ -69,6 +69,7 @@ def test_only_what_depends_on_a_change_runs_again(finished, tmp_path):
     assert threshold == {"regress", "refine"}
 
 
+@pytest.mark.slow
 def test_a_training_without_a_check_goes_on_when_its_steps_are_raised(finished, tmp_path):
     project = finished.copied(tmp_path / "project")
     study, kept = project.path("study.yaml"), (DATA, "results/mini/runs/000/vector_field.json")

@@ -235,6 +235,7 @@ def test_what_could_not_be_followed_is_remarked(monkeypatch):
     assert sentence(remark).startswith("the curve of folds through a = ")
 
 
+@pytest.mark.slow
 def test_cycles_begin_at_a_hopf_point_as_roots_and_fold() -> None:
     """``r² = (1 ± √(1 + 4a))/2``: fold and amplitudes are exact, and a known cycle is no second branch."""
     grow = a + (x**2 + y**2) - (x**2 + y**2) ** 2
