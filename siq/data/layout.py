@@ -329,8 +329,6 @@ def _calendar_parts(source: ColumnFile) -> dict[str, tuple[int, pd.Series]]:
 def _with_one_clock(source: ColumnFile) -> ColumnFile:
     """Days in one column and times of day in another, or parts such as year and hour, as one column."""
     parts, headings = _calendar_parts(source), [read_heading(one) for one in source.headings]
-    if any(one.title == "t" for one in headings):
-        return source
     rest = [place for place in range(len(headings)) if place not in {place for place, _ in parts.values()}]
     texts = {
         place: source.load([place])[0].to_pandas().astype(str).str.strip().str.removesuffix(".0")
@@ -419,7 +417,7 @@ def _tells_time(title: str, source: ColumnFile, place: int) -> bool:
         return re.match(r"\d{4}-\d\d-\d\d|\d\d?\.\d\d?\.\d{4}", first) is not None
     steps = np.diff(values[np.isfinite(values)])
     rises = len(steps) > 0 and bool((steps <= 0).mean() <= EVEN)
-    return rises and any(_is_time(word) for word in re.split(r"[\W_]+", title) if len(word) > 1)
+    return rises and any(_is_time(word) for word in re.split(r"[\W_]+", title) if word[1:] or title == "t")
 
 
 def _time_column(
