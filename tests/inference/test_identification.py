@@ -136,6 +136,7 @@ def test_terms_that_are_no_monomials_are_found() -> None:
     assert identified(known, pairs, degree=2).residual_ratio > 1e-4
 
 
+@pytest.mark.slow
 def test_the_paths_of_the_flow_need_no_small_steps() -> None:
     known = archetype(2)
     found = identified(known, flow_pairs(known, 150, h=(0.05, 0.15)))

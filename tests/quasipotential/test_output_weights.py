@@ -89,6 +89,7 @@ def test_noise_in_the_pairs_is_seen_and_f_known_as_well_as_stated() -> None:
     assert solved.uncertainty < 0.01 and error_of(networks, known) < 0.05
 
 
+@pytest.mark.slow
 def test_a_kink_between_wells_is_met_by_networks_about_each_attractor() -> None:
     known = maier_stein(3)
     exact = exact_field(known, 3)

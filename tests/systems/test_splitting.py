@@ -80,6 +80,7 @@ def test_a_committor_and_a_dissipation_of_a_landscape(landscape: Landscape) -> N
     assert found.value == pytest.approx(20 * np.average(squares, weights=weight), rel=0.02)
 
 
+@pytest.mark.slow
 def test_noise_on_one_state_is_split_along_paths() -> None:
     system = Dynamics.of((x, v), (v, x - x**3 - v), diffusion=np.diag([0.0, 1.0]), domain=[(-2, 2), (-2, 2)])
     table = landscape_from_equations(system, formulas=False).verify_times(noise=0.2)
