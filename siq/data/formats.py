@@ -49,9 +49,8 @@ _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 _MISSING = tuple(arrow_csv.ConvertOptions().null_values)
 _DASHES = ("-", "--", "---")  # where nothing was measured; among labels, one as any other
 _FORTRAN = re.compile(rb"(?<=\d)(\.\d*)[dD](?=[+-]\d\d)")  # 1.5D+03, and not the label 7d-01
-_WIDTHS = re.compile(
-    rb"^(\d+[sdn]\t)+\d+[sdn]\r?\n", re.MULTILINE
-)  # a line that tells kinds of columns, 5s 14n
+# Below the headings of a gauge's table: widths and kinds of its columns, 5s 14n.
+_WIDTHS = re.compile(rb"^(\d+[sdn]\t)+\d+[sdn]\r?\n", re.MULTILINE)
 _NUMERIC = re.compile(f"{_NUMBER.pattern}|{_DECIMAL_COMMA.pattern}", re.IGNORECASE)
 _GROUPED = re.compile(r"[+-]?\d{1,3}((\.\d{3})+,\d+|(,\d{3})+\.\d+|,\d{3}(,\d{3})+)")
 _LABELS = re.compile(r"(?i)^(labels|columns|channels|fields|names)\s*:=?\s*")

@@ -552,11 +552,12 @@ def with_noise_formula(
         When D depends on the state, and no formula for it is positive at all recorded states; or when an
         equation of f has no significant term.
     """
-    likelihood = ResidualLikelihood(found, pairs, residuals(found, pairs))
+    rest = residuals(found, pairs)
+    likelihood = ResidualLikelihood(found, pairs, rest)
     probability = likelihood.constant_probability()
     if probability >= false_terms:
         return None
-    likelihood = ResidualLikelihood(found, pairs, likelihood.rest, bent=False)
+    likelihood = ResidualLikelihood(found, pairs, rest, bent=False)
     for _ in range(WEIGHT_ROUNDS):
         formula = likelihood.selected(false_terms=false_terms, probability=probability)[0]
         found = _identify_weighted(found.with_formula(formula, pairs.x0), pairs, false_terms=false_terms)

@@ -84,6 +84,16 @@ def test_noise_in_proportion_to_what_it_drives_is_that_where_it_is_least_too(ste
     assert found.noise.values == pytest.approx([0.04], rel=0.05)
 
 
+def test_more_residuals_than_memory_has_room_for_are_thinned(
+    pairs: SnapshotPairs, found: FieldEstimate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("siq.inference.diffusion_model.MAX_NUMBERS", 2e4)  # a sixth of them
+    thinned = with_noise_formula(identified(MULTIPLIED, pairs), pairs, false_terms=FALSE)
+    assert thinned is not None and thinned.noise is not None and found.noise is not None
+    assert thinned.noise.terms == found.noise.terms
+    assert (np.abs(thinned.noise.values - found.noise.values) < 4 * thinned.noise.standard_errors).all()
+
+
 def test_a_noise_that_depends_on_the_state_is_found_with_its_formula(found: FieldEstimate) -> None:
     assert found.noise is not None
     assert [str(term) for term in found.noise.terms] == ["1", "x"]
