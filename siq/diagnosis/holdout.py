@@ -311,12 +311,16 @@ def preferred_model(errors: Sequence[np.ndarray | None], parameters: Sequence[in
     """The place of the model that foresees parts left out best.
 
     Of those whose errors are larger by less than a tenth, and by no more than chance, it is one of the fewest
-    parameters, and of these the first. Errors come as squares, None where a fit has no result or runs away.
+    parameters, and of these the first. Errors are squares over the recordings' variance, None where a fit has
+    no result or runs away. Where the best of them foresees no better than the recordings' mean, as
+    where runs take another way past a saddle point, they tell nothing, and it is the first.
     """
     known = {place: each for place, each in enumerate(errors) if each is not None}
     if not known:
         return 0
     least = min(known.values(), key=np.mean)
+    if least.mean() >= 1.0:
+        return min(known)
     alike = [
         place
         for place, each in known.items()

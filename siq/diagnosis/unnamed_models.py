@@ -262,8 +262,10 @@ def _with_function(
     if not ranked:
         return []
     models = _formulas(before, fit, ranked, cost, context)
-    alone = (each for each in ranked if len(each.term.words) == 1)
-    chosen = {id(each): each for each in (*ranked[:FUNCTIONS_FITTED], *itertools.islice(alone, 1))}
+    single = (each for each in ranked if len(each.term.words) == 1)
+    # Along one recording coordinates go together, and the likeliest to first order may be the wrong one.
+    likeliest = (*ranked[:FUNCTIONS_FITTED], *itertools.islice(single, FUNCTIONS_FITTED))
+    chosen = {id(each): each for each in likeliest}
     for one in chosen.values():
         models += _with_smooth_term(before, fit, one.term, cost, context)
     given = sum(part.candidate.log_cost for part in before)

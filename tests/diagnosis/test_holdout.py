@@ -196,8 +196,8 @@ def test_what_blocks_change_by_chance_is_the_jackknife_of_their_sums(share: floa
 
 def test_fewer_parameters_win_where_errors_are_nearly_alike() -> None:
     def with_one_block(height: float) -> np.ndarray:
-        """Squares about one but for a block of twenty, which makes all of it doubtful."""
-        return np.repeat([1.0] * 19 + [height], 10)
+        """Squares about the same but for a block of twenty, which makes all of it doubtful."""
+        return 0.1 * np.repeat([1.0] * 19 + [height], 10)
 
     least = with_one_block(1.0)
     assert preferred_model([least, with_one_block(4.6)], [2, 1]) == 1  # larger by 18 %, a tenth in size
@@ -205,6 +205,12 @@ def test_fewer_parameters_win_where_errors_are_nearly_alike() -> None:
     assert preferred_model([least, 1.05 * least], [2, 1]) == 0  # in every block: not by chance
     assert preferred_model([with_one_block(4.6), None, least, least.copy()], [3, 0, 2, 2]) == 2
     assert preferred_model([None, None], [2, 1]) == 0
+
+
+def test_the_likeliest_model_stays_where_free_runs_are_no_better_than_the_mean_of_the_recordings() -> None:
+    errors = np.ones(100)
+    assert preferred_model([None, 9.0 * errors, errors], [1, 2, 1]) == 1
+    assert preferred_model([None, 9.0 * errors, 0.9 * errors], [1, 2, 1]) == 2
 
 
 def test_a_model_is_better_than_none_by_more_than_chance_or_below_a_limit() -> None:

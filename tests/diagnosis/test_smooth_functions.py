@@ -177,7 +177,7 @@ def test_what_is_beyond_all_numbers_ends_a_function_and_not_the_case(monkeypatch
 
 def test_the_model_is_taken_that_foresees_parts_left_out_best_and_of_those_alike_the_simplest() -> None:
     draw = np.random.default_rng(3)
-    errors = draw.chisquare(1, 400)
+    errors = 0.1 * draw.chisquare(1, 400)
     other = errors * np.exp(0.1 * draw.normal(size=400))
     assert preferred_model([errors, 0.3 * other, 2 * other], [1, 2, 1]) == 1
     assert preferred_model([errors, other], [2, 1]) == 1  # as good, and of fewer parameters
