@@ -12,11 +12,17 @@ What f leaves of recordings that it was not fitted to has no mean that any funct
     ``F = (‖P r‖²/q) / (‖r - P r‖²/(n - q))``,
 
 P being the projection on the q functions, if f misses no term. Without noise recordings are predicted.
+
+What no function of the library is shows where it matters, between wells and the tops beside them. There
+``ΔU/ε = -2 ∫ f/(εD) dx`` follows from f, and without a formula from mean steps of samples on the way. If f is
+of its library both are right, and the variance of their difference is that of the second less that of the
+first (Hausman, Econometrica 46 (1978) 1251).
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Annotated, Any
 
 import numpy as np
@@ -58,6 +64,10 @@ COPIED = 12  # samples of a stretch that is sought a second time
 MOST_DIGITS = 12  # of numbers that were rounded: those of floating point have sixteen
 ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 UNPREDICTED = "f does not predict held-out recordings"
+WAY_GRID, WAY_PARTS = 2001, 20  # numerical: places at which zeros of f are sought; parts of a way
+OTHER_SHAPE = 0.25  # of records: those whose f is of no shape that the library has (a choice)
+MISSED_WORK = 1.0  # of U/ε, a factor e in times: how far off the work is expected of an f of another shape
+ONE_DIRECTION = 0.01  # of the largest variance: ways of which f of its library moves only both are one
 
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -359,6 +369,62 @@ def mean_residual_probability(found: FieldEstimate, pairs: SnapshotPairs, *, see
     weight = np.sqrt(pairs.h)[:, None]
     columns, rest = library.evaluate(pairs.x0) * weight, residuals(found, pairs) / weight
     return unexplained_probability(columns, rest, inflation=inflation)
+
+
+def with_work_of_samples(found: FieldEstimate, pairs: SnapshotPairs) -> tuple[FieldEstimate, float]:
+    """An f of one state with what samples between wells and tops tell of U/ε without a formula.
+
+    That f has a shape that the library has not, and ΔU/ε is off by about `MISSED_WORK`, has the probability
+    `OTHER_SHAPE` beforehand. What follows from f is moved, and less certain, as likely as samples leave it.
+    Second comes the chance of differences as large, were f of its library: 1 where samples tell of no way.
+    """
+    library = found.library
+    if library.dimension != 1 or found.noise_free or library.angles or isinstance(pairs, LaggedPairs):
+        return found, 1.0
+    (x,), h = pairs.x0.T, pairs.h
+    grid = np.linspace(x.min(), x.max(), WAY_GRID)[:, None]
+    force = found.dynamics.drift(grid)[:, 0]
+
+    def rate(x: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(np.ravel(found.noise_rate_at(x)), len(x))
+
+    scale = np.sqrt(rate(pairs.x0))
+    levers, slopes = [], []
+    for ends in pairwise(grid[1:][force[1:] * force[:-1] < 0, 0]):
+        edges = np.linspace(*ends, WAY_PARTS + 1)
+        part = np.searchsorted(edges, x, side="right") - 1
+        way = (part >= 0) & (part < WAY_PARTS)
+        spent = np.bincount(part[way], h[way], minlength=WAY_PARTS)
+        if spent.all():
+            width, middles = edges[1] - edges[0], (edges[1:, None] + edges[:-1, None]) / 2
+            lever = np.where(way, -2 * width / spent[np.clip(part, 0, WAY_PARTS - 1)], 0.0)
+            levers.append(lever * np.sqrt(h) / scale)
+            slopes.append(-2 * width / rate(middles) @ library.evaluate(middles))
+    if not levers:
+        return found, 1.0
+    terms, lever, slope = found.support[:, 1], np.stack(levers), np.stack(slopes)
+    basis = np.linalg.qr(library.evaluate(pairs.x0)[:, terms] * (np.sqrt(h) / scale)[:, None])[0]
+    own = lever - (lever @ basis) @ basis.T
+    rest = process_noise_increments(found, pairs, residuals(found, pairs))[:, 0] / scale
+    difference = own @ rest
+    covariance = own @ own.T * pairs.copies
+    wide = covariance + MISSED_WORK**2 * np.eye(len(own))
+    inverse, share = np.linalg.pinv(covariance, hermitian=True), covariance @ np.linalg.inv(wide)
+    square = float(difference @ inverse @ difference)
+    logarithms = np.linalg.slogdet(share)[1] + square - difference @ np.linalg.solve(wide, difference)
+    likely = scipy.special.expit(logarithms / 2 + scipy.special.logit(OTHER_SHAPE))
+    # What an f of another shape does is done by those coefficients of this one that are known the least.
+    bias, spread = found.alternatives or (0 * found.coefficients, np.zeros((0, *found.coefficients.shape)))
+    change = difference - share @ difference - slope @ bias[:, 0]
+    uncertain = likely * (covariance - share @ covariance + (1 - likely) * np.outer(change, change))
+    reach = found.covariance @ slope[:, terms].T
+    per_work = reach @ np.linalg.pinv(slope[:, terms] @ reach, rcond=ONE_DIRECTION, hermitian=True)
+    sizes, directions = np.linalg.eigh(uncertain)
+    changes = np.zeros((1 + len(own), *bias.shape))
+    changes[0, terms, 0] = per_work @ (likely * change)
+    changes[1:, terms, 0] = (per_work @ directions * np.sqrt(np.maximum(sizes, 0.0))).T
+    average = (bias + changes[0], np.concatenate([spread, changes[1:]]))
+    return replace(found, alternatives=average), float(scipy.special.chdtrc(len(own), square))
 
 
 def predict(dynamics: Dynamics, recordings: Recordings) -> np.ndarray:

@@ -483,15 +483,18 @@ class FieldEstimate:
         numbers = generator.standard_normal((count, len(spread)))
         return np.asarray(bias + np.tensordot(numbers, spread, axes=1))
 
-    def drawn(self, generator: np.random.Generator) -> Dynamics:
-        """f and D drawn from their distributions, further terms of f and the terms of D(x) included."""
-        coefficients = np.zeros_like(self.coefficients)
-        own = normal_draws(self.values, self.covariance, 1, generator=generator)[0]
-        coefficients[self.support[:, 1], self.support[:, 0]] = own
-        coefficients += self.drawn_alternatives(1, generator=generator)[0]
+    def drawn(self, generator: np.random.Generator | None = None) -> Dynamics:
+        """f and D drawn from their distributions, by default their means, with all terms that f may have."""
+        coefficients = self.coefficients.copy()
+        if generator is not None:
+            own = normal_draws(self.values, self.covariance, 1, generator=generator)[0]
+            coefficients[self.support[:, 1], self.support[:, 0]] = own
+            coefficients += self.drawn_alternatives(1, generator=generator)[0]
+        elif self.alternatives is not None:
+            coefficients += self.alternatives[0]
         support = np.argwhere(coefficients.T != 0)
         diffusion = self.diffusion
-        if self.noise is not None:
+        if generator is not None and self.noise is not None:
             entries = normal_draws(self.noise.values, self.noise.covariance, 1, generator=generator)[0]
             diffusion = replace(self.noise, values=entries).diffusion(self.intensity)
         values = coefficients[support[:, 1], support[:, 0]]

@@ -36,6 +36,7 @@ from siq.inference.checks import (
     repetitions,
     residual_noise,
     rounding_text,
+    with_work_of_samples,
 )
 from siq.inference.claims import check_claims
 from siq.inference.diffusion_model import (
@@ -51,6 +52,7 @@ from siq.inference.field_estimate import (
     DiffusionSource,
     FieldEstimate,
     NoiseDiagnosis,
+    Verdict,
 )
 from siq.inference.kalman_filter import Noise
 from siq.inference.kalman_identification import (
@@ -149,7 +151,7 @@ def identify(
                 reason = "; ".join(one for one in (found.prediction.reason, advice) if one)
                 found = replace(found, prediction=replace(found.prediction, passed=False, reason=reason))
         by_force = None if hidden else case.with_slow_force(found)
-        return by_force or found
+        return by_force or (found if hidden else case.with_work(found))
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         reason, claim = (str(error), error.claim) if isinstance(error, NumericalFailure) else (SINGULAR, "")
         rounding = rounding_text(recordings, coarse=True)
@@ -490,6 +492,18 @@ class _Case:
                 if gain > 0 and found.prediction.passed and self._forgets(found):
                     return found
         return None
+
+    def with_work(self, found: FieldEstimate) -> FieldEstimate:
+        """f with what samples between wells tell of it, which may refute it; see `with_work_of_samples`."""
+        states, limit = self.recordings, self.limits.each
+        if found.sensor_variance is not None:
+            states = filtered_recordings(found, states, pair_step=self.pair_step)
+        found, chance = with_work_of_samples(found, self._pairs(states))
+        chance = min(2 * chance, 1.0)  # the test of held-out recordings is another of the same claim
+        if chance >= limit or found.prediction is None or not found.prediction.passed:
+            return found
+        reason = sentence(Remark("inference.other_work", {"probability": chance}))
+        return replace(found, prediction=Verdict.of_probability(chance, limit, reason))
 
     def _forgets(self, found: FieldEstimate) -> bool:
         """Whether the past tells nothing more of the next sample than the state does."""

@@ -183,7 +183,7 @@ def _predicted_visits(
         cells = CELLS[dynamics.dimension]
         box = portrait.box + margin * np.stack([-width, width], axis=1)
         try:
-            processes = [_VisitProcess(dynamics, noise.intensity, box, cores, cells=cells)]
+            processes = [_VisitProcess(found.drawn(), noise.intensity, box, cores, cells=cells)]
             generator = np.random.default_rng(seed)
             for _ in range(DRAWS[dynamics.dimension]):
                 drawn = found.drawn(generator)
