@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.hostile import memories, mixtures, sensors, signals
+from benchmarks.hostile import memories, mixtures, sensors, shapes, signals
 from benchmarks.hostile.kinds import KINDS
 
 __all__ = ["FAMILIES", "HELD_OUT", "KINDS", "KNOWN"]
 
 FAMILIES = {
     name: module.__name__.rsplit(".", 1)[-1]
-    for module in (mixtures, memories, sensors, signals)
+    for module in (mixtures, memories, sensors, shapes, signals)
     for name in vars(module)
     if name in KINDS
 }
@@ -20,6 +20,7 @@ FAMILIES = {
 # These were known, and tried, before any test was built: they cannot be held out.
 KNOWN = {
     "two_offsets", "joined_levels", "swinging_tilt", "hidden_slow_variable", "gate", "force_with_memory",
+    "force_no_polynomial", "noise_no_polynomial",
 }  # fmt: skip
 DRAWN_WITH = 34  # the seed of the draw
 
