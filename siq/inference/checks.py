@@ -16,7 +16,8 @@ P being the projection on the q functions, if f misses no term. Without noise re
 What no function of the library is shows where it matters, between wells and the tops beside them. There
 ``ΔU/ε = -2 ∫ f/(εD) dx`` follows from f, and without a formula from mean steps of samples on the way. If f is
 of its library both are right, and the variance of their difference is that of the second less that of the
-first (Hausman, Econometrica 46 (1978) 1251).
+first (Hausman, Econometrica 46 (1978) 1251). In more states functions of each that are constant in parts may
+explain no more of the residuals than chance lets them.
 """
 
 from __future__ import annotations
@@ -65,6 +66,7 @@ MOST_DIGITS = 12  # of numbers that were rounded: those of floating point have s
 ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 UNPREDICTED = "f does not predict held-out recordings"
 WAY_GRID, WAY_PARTS = 2001, 20  # numerical: places at which zeros of f are sought; parts of a way
+SHAPE_PARTS = 12  # of the samples by each state: a function of it that f lacks is seen as twelve values
 OTHER_SHAPE = 0.25  # of records: those whose f is of no shape that the library has (a choice)
 MISSED_WORK = 1.0  # of U/ε, a factor e in times: how far off the work is expected of an f of another shape
 ONE_DIRECTION = 0.01  # of the largest variance: ways of which f of its library moves only both are one
@@ -372,14 +374,31 @@ def mean_residual_probability(found: FieldEstimate, pairs: SnapshotPairs, *, see
 
 
 def with_work_of_samples(found: FieldEstimate, pairs: SnapshotPairs) -> tuple[FieldEstimate, float]:
-    """An f of one state with what samples between wells and tops tell of U/ε without a formula.
+    """An f with what samples tell of it without a formula: of one state, of U/ε between wells and tops.
 
     That f has a shape that the library has not, and ΔU/ε is off by about `MISSED_WORK`, has the probability
     `OTHER_SHAPE` beforehand. What follows from f is moved, and less certain, as likely as samples leave it.
     Second comes the chance of differences as large, were f of its library: 1 where samples tell of no way.
+    An f of more states is tested, and stays as it is.
     """
-    library = found.library
-    if library.dimension != 1 or found.noise_free or library.angles or isinstance(pairs, LaggedPairs):
+    library, terms = found.library, found.support[:, 1]
+    if found.noise_free or found.memory is not None or not found.diffusion.regular:
+        return found, 1.0
+    pairs = found.wrapped(pairs)
+    rest = process_noise_increments(found, pairs, residuals(found, pairs))
+    if library.dimension > 1:
+        rest = np.einsum("nij,nj->ni", found.diffusion.whitening_at(pairs.x0), rest)
+        shapes = []
+        for x in pairs.x0.T:
+            cuts = np.unique(np.quantile(x, np.linspace(0, 1, SHAPE_PARTS + 1)[1:-1]))
+            shapes.append(np.searchsorted(cuts, x, side="right")[:, None] == np.arange(1, len(cuts) + 1))
+        known = np.column_stack([np.ones(len(rest)), library.evaluate(pairs.x0)[:, np.unique(terms)]])
+        known, columns = (each * np.sqrt(pairs.h)[:, None] for each in (known, np.column_stack(shapes)))
+        known = np.linalg.qr(known / positive(np.linalg.norm(known, axis=0)))[0]
+        columns = columns - known @ (known.T @ columns)
+        freedom = len(rest) - known.shape[1]
+        return found, unexplained_probability(columns, rest, freedom=freedom, inflation=pairs.copies)
+    if library.angles:
         return found, 1.0
     (x,), h = pairs.x0.T, pairs.h
     grid = np.linspace(x.min(), x.max(), WAY_GRID)[:, None]
@@ -402,11 +421,10 @@ def with_work_of_samples(found: FieldEstimate, pairs: SnapshotPairs) -> tuple[Fi
             slopes.append(-2 * width / rate(middles) @ library.evaluate(middles))
     if not levers:
         return found, 1.0
-    terms, lever, slope = found.support[:, 1], np.stack(levers), np.stack(slopes)
+    lever, slope = np.stack(levers), np.stack(slopes)
     basis = np.linalg.qr(library.evaluate(pairs.x0)[:, terms] * (np.sqrt(h) / scale)[:, None])[0]
     own = lever - (lever @ basis) @ basis.T
-    rest = process_noise_increments(found, pairs, residuals(found, pairs))[:, 0] / scale
-    difference = own @ rest
+    difference = own @ (rest[:, 0] / scale)
     covariance = own @ own.T * pairs.copies
     wide = covariance + MISSED_WORK**2 * np.eye(len(own))
     inverse, share = np.linalg.pinv(covariance, hermitian=True), covariance @ np.linalg.inv(wide)

@@ -502,7 +502,8 @@ class _Case:
         chance = min(2 * chance, 1.0)  # the test of held-out recordings is another of the same claim
         if chance >= limit or found.prediction is None or not found.prediction.passed:
             return found
-        reason = sentence(Remark("inference.other_work", {"probability": chance}))
+        values = {"probability": chance, "alone": found.library.dimension == 1}
+        reason = sentence(Remark("inference.other_shape", values))
         return replace(found, prediction=Verdict.of_probability(chance, limit, reason))
 
     def _forgets(self, found: FieldEstimate) -> bool:
