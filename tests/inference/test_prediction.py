@@ -149,7 +149,7 @@ def test_an_f_too_fast_for_the_samples_is_given_up() -> None:
 def hopping(
     force: Callable[[np.ndarray], np.ndarray], *, seed: int, samples: int = 7500, states: int = 1
 ) -> Recordings:
-    """Eight recordings of states pushed by a force ``(8, d)`` and white noise of intensity 0.4, begun at ±1."""
+    """Eight recordings of states pushed by a force ``(8, d)`` and by noise of intensity 0.4, begun at ±1."""
     draw, step, within = np.random.default_rng(seed), 0.02, 5
     state = np.zeros((8, states))
     state[:, 0] = np.sign(draw.standard_normal(8))
@@ -216,7 +216,7 @@ def test_a_function_of_a_state_that_f_lacks_shows_among_several_states(
         x, y = state.T
         return np.column_stack([force(x) + 0.5 * y, -0.5 * force(x) - y])
 
-    found = identified(hopping(both, seed=3, samples=3000, states=2), degree=3)
+    found = identified(hopping(both, seed=3, samples=2000, states=2), degree=3)
     assert found.prediction is not None
     right = force(np.array(2.0)) == -6.0
     assert found.prediction.passed == right
