@@ -67,7 +67,6 @@ ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 UNPREDICTED = "f does not predict held-out recordings"
 WAY_GRID, WAY_PARTS = 2001, 20  # numerical: places at which zeros of f are sought; parts of a way
 SHAPE_PARTS = 12  # of the samples by each state: a function of it that f lacks is seen as twelve values
-OTHER_SHAPE = 0.25  # of records: those whose f is of no shape that the library has (a choice)
 MISSED_WORK = 1.0  # of U/ε, a factor e in times: how far off the work is expected of an f of another shape
 ONE_DIRECTION = 0.01  # of the largest variance: ways of which f of its library moves only both are one
 
@@ -376,8 +375,8 @@ def mean_residual_probability(found: FieldEstimate, pairs: SnapshotPairs, *, see
 def with_work_of_samples(found: FieldEstimate, pairs: SnapshotPairs) -> tuple[FieldEstimate, float]:
     """An f with what samples tell of it without a formula: of one state, of U/ε between wells and tops.
 
-    That f has a shape that the library has not, and ΔU/ε is off by about `MISSED_WORK`, has the probability
-    `OTHER_SHAPE` beforehand. What follows from f is moved, and less certain, as likely as samples leave it.
+    That f has a shape that the library has not, and ΔU/ε is off by about `MISSED_WORK`, is as likely as not
+    beforehand. What follows from f is moved, and less certain, as likely as samples leave it.
     Second comes the chance of differences as large, were f of its library: 1 where samples tell of no way.
     An f of more states is tested, and stays as it is.
     """
@@ -430,7 +429,7 @@ def with_work_of_samples(found: FieldEstimate, pairs: SnapshotPairs) -> tuple[Fi
     inverse, share = np.linalg.pinv(covariance, hermitian=True), covariance @ np.linalg.inv(wide)
     square = float(difference @ inverse @ difference)
     logarithms = np.linalg.slogdet(share)[1] + square - difference @ np.linalg.solve(wide, difference)
-    likely = scipy.special.expit(logarithms / 2 + scipy.special.logit(OTHER_SHAPE))
+    likely = scipy.special.expit(logarithms / 2)
     # What an f of another shape does is done by those coefficients of this one that are known the least.
     bias, spread = found.alternatives or (0 * found.coefficients, np.zeros((0, *found.coefficients.shape)))
     change = difference - share @ difference - slope @ bias[:, 0]

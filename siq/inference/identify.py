@@ -82,6 +82,9 @@ SENSOR_SHARE = 0.1  # of what means move by: a search finds its way down to no s
 MIN_SHARE, MAX_SHARE = 1e-3, 0.45  # of the residuals' variance: a sensor's share that a fit begins with
 WHOLE_STEP_TOLERANCE = 0.05  # of an exposure, as exactly as residuals show it of some thousand samples
 SINGULAR = "the recordings do not determine f; record more, or more often"
+MOST_DEGREE = (
+    9  # of f of one state, where samples refute lower ones: beyond it coefficients lose their digits
+)
 PREDICTED_RECORDINGS = 200  # held-out ones that are predicted: enough for a median
 
 
@@ -494,7 +497,7 @@ class _Case:
         return None
 
     def with_work(self, found: FieldEstimate) -> FieldEstimate:
-        """f with what samples between wells tell of it, which may refute it; see `with_work_of_samples`."""
+        """f with what samples tell of it without a formula, see `with_work_of_samples`; they may refute it."""
         states, limit = self.recordings, self.limits.each
         if found.sensor_variance is not None:
             states = filtered_recordings(found, states, pair_step=self.pair_step)
