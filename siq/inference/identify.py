@@ -497,7 +497,7 @@ class _Case:
         return None
 
     def with_work(self, found: FieldEstimate) -> FieldEstimate:
-        """f with what samples tell of it without a formula, see `with_work_of_samples`; they may refute it."""
+        """f with what samples tell of it without a formula (`with_work_of_samples`); they may refute it."""
         states, limit = self.recordings, self.limits.each
         if found.sensor_variance is not None:
             states = filtered_recordings(found, states, pair_step=self.pair_step)
