@@ -101,10 +101,7 @@ def source_of(path: str | Path, settings: PipelineSettings) -> Dynamics | Record
     if settings.simulation is not None:
         return load_system(path)
     recordings, _ = read_pairs(
-        path,
-        states=settings.space.names,
-        units=settings.space.units,
-        pair_step=settings.sampling.pair_step,
+        path, states=settings.space.names, units=settings.space.units, pair_step=settings.sampling.pair_step
     )
     space = settings.space
     units = tuple(
