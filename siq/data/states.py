@@ -38,7 +38,6 @@ from siq.data.correlation import FEWEST_VALUES, markov_lag, resolution_step
 from siq.data.kinetics import CONFIDENCE, FALSE_WELL, MarkovModel, Profile, exponential, path_of, stays_of
 from siq.data.recordings import Recordings
 from siq.data.stationarity import (
-    MOST_STRETCHES,
     background_of,
     change_of,
     correlated_samples,
@@ -129,7 +128,7 @@ def _pushed_apart(
     low, high = np.quantile(values, [0.001, 0.999])
     if rows * lag < SHORTEST_TIMES * relaxation or not high > low:
         return 0.0, 1.0
-    begins = stretches_of(runs, (rows + 2) * lag, most=MOST_STRETCHES)
+    begins = stretches_of(runs, (rows + 2) * lag)
     if len(begins) < FEWEST_STRETCHES - 2:  # gaps cost some
         return 0.0, 1.0
     scaled = 2 * (values - low) / (high - low) - 1
