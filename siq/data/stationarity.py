@@ -70,7 +70,7 @@ def runs_of(recordings: Recordings, *, longest: float | None = None, bridged: bo
 
 
 def stretches_of(runs: list[slice], length: int) -> np.ndarray:
-    """First rows of stretches of so many samples in a run, one behind the other; of many only some, evenly."""
+    """First rows of stretches of so many samples in a run, one behind the other; of many only some."""
     found = np.concatenate(
         [np.zeros(0, dtype=int), *(np.arange(run.start, run.stop - length + 1, length) for run in runs)]
     )
