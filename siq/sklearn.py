@@ -90,9 +90,7 @@ class LandscapeRegressor(RegressorMixin, BaseEstimator):
         self.random_state = random_state
 
     def fit(
-        self,
-        X: Recordings | pd.DataFrame | np.ndarray | Sequence[np.ndarray],
-        y: np.ndarray | None = None,
+        self, X: Recordings | pd.DataFrame | np.ndarray | Sequence[np.ndarray], y: np.ndarray | None = None
     ) -> LandscapeRegressor:
         """Find f.
 

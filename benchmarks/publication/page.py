@@ -26,12 +26,12 @@ from benchmarks.publication.publication import (
     shown,
 )
 from siq.inference.field_estimate import read_field
-from siq.networks.regression import points_below
+from siq.networks.regression import highest_used
 from siq.numerics.randomness import Purpose, generator
 from siq.numerics.text import number_text
 from siq.report.formatting import texts
 from siq.report.landscape import in_words
-from siq.report.page import ReportFigure, ReportSection, ReportTable, render_template
+from siq.report.page import ReportFigure, ReportSection, ReportTable, render_report
 from siq.report.study_page import errors_over_runs
 from siq.systems.dynamics import Dynamics
 from siq.workflow.tables import Method, ModelFiles, as_table
@@ -78,7 +78,7 @@ class ReproductionContent:
 
 def render_reproduction(content: ReproductionContent) -> str:
     """Render a reproduction as one HTML page; all text is escaped."""
-    return render_template("page.html.j2", content, folder=Path(__file__).parent)
+    return render_report(content, template="page.html.j2", folder=Path(__file__).parent)
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def _equations_table(study: Results) -> ReportTable | None:
     low, high = study.system.box.T
     x = generator(0, Purpose.EQUATIONS).uniform(low, high, (POINTS, study.system.dimension))
     potential = published.evaluate(np.ascontiguousarray(x.T))[0]
-    x = x[points_below(potential, level=study.settings.regression.level)]
+    x = x[potential < highest_used(potential, level=study.settings.regression.level)]
     exact = study.system.drift(x)
     found = {"published": own_equations(published, x, exact)}
     run = study.models.representative(study.table("rrmse"))[0] or 0

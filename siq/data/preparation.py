@@ -59,14 +59,7 @@ def read_pairs(
     units: Mapping[str, str] | None,
     pair_step: float | None,
 ) -> tuple[Recordings, SnapshotPairs]:
-    """Read recordings that something is to be learned from, and their pairs.
-
-    Parameters
-    ----------
-    path, states, units
-        See `read_recordings`.
-    pair_step
-        See `snapshot_pairs`.
+    """Read recordings that something is to be learned from (`read_recordings`), and their `snapshot_pairs`.
 
     Raises
     ------

@@ -35,18 +35,9 @@ from pydantic_core import to_jsonable_python
 from scipy import ndimage, sparse, special
 
 from siq.data.correlation import FEWEST_VALUES, markov_lag, resolution_step
-from siq.data.kinetics import (
-    CONFIDENCE,
-    FALSE_WELL,
-    MarkovModel,
-    Profile,
-    exponential,
-    path_of,
-    stays_of,
-)
+from siq.data.kinetics import CONFIDENCE, FALSE_WELL, MarkovModel, Profile, exponential, path_of, stays_of
 from siq.data.recordings import Recordings
 from siq.data.stationarity import (
-    MOST_STRETCHES,
     background_of,
     change_of,
     correlated_samples,
@@ -137,7 +128,7 @@ def _pushed_apart(
     low, high = np.quantile(values, [0.001, 0.999])
     if rows * lag < SHORTEST_TIMES * relaxation or not high > low:
         return 0.0, 1.0
-    begins = stretches_of(runs, (rows + 2) * lag, most=MOST_STRETCHES)
+    begins = stretches_of(runs, (rows + 2) * lag)
     if len(begins) < FEWEST_STRETCHES - 2:  # gaps cost some
         return 0.0, 1.0
     scaled = 2 * (values - low) / (high - low) - 1
@@ -177,11 +168,7 @@ def _pushed_apart(
 
 
 def _valleys(
-    values: np.ndarray,
-    runs: list[slice],
-    relaxations: Sequence[float],
-    *,
-    generator: np.random.Generator,
+    values: np.ndarray, runs: list[slice], relaxations: Sequence[float], *, generator: np.random.Generator
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Valleys of the histograms of columns ``(n, d)``, against surrogates with random phases.
 
@@ -506,10 +493,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     rarest, rarities, depths = 1.0, np.ones(len(tried)), np.zeros(len(tried))
     if chance >= DECISIVE_P:
         rarest, rarities, depths = _valleys(
-            recordings.values[:, tried],
-            runs,
-            list(relaxations.values()),
-            generator=generator,
+            recordings.values[:, tried], runs, list(relaxations.values()), generator=generator
         )
     kinds = 2 if apart[..., 0].any() else 1  # too few stretches make no test of the first kind
     probability = min(kinds * min(chance, rarest), 1.0)

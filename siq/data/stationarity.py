@@ -69,12 +69,12 @@ def runs_of(recordings: Recordings, *, longest: float | None = None, bridged: bo
     return [slice(int(a), int(b)) for a, b in pairwise(bounds) if b > a]
 
 
-def stretches_of(runs: list[slice], length: int, *, most: int | None = None) -> np.ndarray:
-    """First rows of stretches of so many samples in a run, one behind the other; about `most` of them."""
+def stretches_of(runs: list[slice], length: int) -> np.ndarray:
+    """First rows of stretches of so many samples in a run, one behind the other; of many only some."""
     found = np.concatenate(
         [np.zeros(0, dtype=int), *(np.arange(run.start, run.stop - length + 1, length) for run in runs)]
     )
-    return found if most is None else found[:: max(len(found) // most, 1)]
+    return found[:: max(len(found) // MOST_STRETCHES, 1)]
 
 
 def relaxation_samples(values: np.ndarray, runs: list[slice], *, noisy: bool = False) -> float | None:
@@ -86,7 +86,7 @@ def relaxation_samples(values: np.ndarray, runs: list[slice], *, noisy: bool = F
     length, longest = SHORTEST_STRETCH, max((run.stop - run.start for run in runs), default=0)
     times = []
     while length <= longest and longest >= SHORTEST_RUN:
-        if (time := _correlated(values, stretches_of(runs, length, most=MOST_STRETCHES), length)) is not None:
+        if (time := _correlated(values, stretches_of(runs, length), length)) is not None:
             times.append(max(time, SHORTEST_TIME))
         length *= 2
     if noisy:

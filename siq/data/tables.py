@@ -545,21 +545,9 @@ def check_times(
 ) -> None:
     """Refuse times that do not increase within every recording.
 
-    Parameters
-    ----------
-    file
-        The file, for messages.
-    t, recording
-        Shape ``(n,)``: the time and the recording of each row; the rows of a recording stand together.
-    labels
-        The label of each recording.
-    rows
-        Shape ``(n,)``: where each row stands in the file, counted from 0.
-
-    Raises
-    ------
-    InputError
-        For the first row of the file whose time is repeated or earlier, or when no recording has two rows.
+    The rows of a recording stand together; `rows` says where each stands in the file, counted from 0. An
+    `InputError` has the first row of the file whose time is repeated or earlier; it is raised, too, when no
+    recording has two rows.
     """
     same = recording[1:] == recording[:-1]
     if not same.any():

@@ -370,9 +370,7 @@ def without_variation(model: Dynamics) -> Dynamics:
     )
 
 
-def cross_validation_folds(
-    learned: Measurements,
-) -> Iterator[tuple[Measurements, Measurements, np.ndarray]]:
+def cross_validation_folds(learned: Measurements) -> Iterator[tuple[Measurements, Measurements, np.ndarray]]:
     """The recordings in parts: one that is left out, the rest, and the rows of the rest in all of them.
 
     Of recordings, so many at equal distances are a part; a single one is cut into stretches, of which the

@@ -414,12 +414,7 @@ def free_run(
 
 
 def _initial_states(
-    model: Dynamics,
-    data: Measurements,
-    *,
-    noise: Noise,
-    substeps: int,
-    usual: np.ndarray | None = None,
+    model: Dynamics, data: Measurements, *, noise: Noise, substeps: int, usual: np.ndarray | None = None
 ) -> np.ndarray:
     """The states in which recordings begin, shape ``(recordings, d)``, with all parameters as they are."""
     still = replace(model, parameters=tuple(replace(each, fixed=True) for each in model.parameters))

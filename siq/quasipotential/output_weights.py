@@ -209,12 +209,7 @@ class OutputWeights:
         self.squared_speed = diffusion.squared_speed(self.points, self._flow)
 
     def _fit_field(
-        self,
-        bases: Sequence[_UnitBasis],
-        pairs: SnapshotPairs,
-        held_out: SnapshotPairs,
-        *,
-        noisy: bool,
+        self, bases: Sequence[_UnitBasis], pairs: SnapshotPairs, held_out: SnapshotPairs, *, noisy: bool
     ) -> None:
         """f over the units, and with the damping, that suit held-out pairs best, and how uncertain it is."""
         velocity, observed = ((each.xh - each.x0) / each.h[:, None] for each in (pairs, held_out))

@@ -320,11 +320,7 @@ class EscapeRate:
 
 
 def escape_rate(
-    dynamics: Dynamics,
-    path: MinimumActionPath,
-    *,
-    beyond: bool = True,
-    cycle: Cycle | None = None,
+    dynamics: Dynamics, path: MinimumActionPath, *, beyond: bool = True, cycle: Cycle | None = None
 ) -> EscapeRate:
     """The law of escape along a minimum action path from an attractor to a saddle.
 

@@ -37,15 +37,8 @@ from siq.quasipotential.certificate import (
     references_about,
     uncertified,
 )
-from siq.quasipotential.certificate_tests import (
-    MAX_PAIRS,
-    MIN_POINTS,
-    CertificateOptions,
-)
-from siq.quasipotential.formulas import (
-    SymbolicDecomposition,
-    decomposition_from_coefficients,
-)
+from siq.quasipotential.certificate_tests import MAX_PAIRS, MIN_POINTS, CertificateOptions
+from siq.quasipotential.formulas import SymbolicDecomposition, decomposition_from_coefficients
 from siq.quasipotential.global_formula import GlobalFormula, fit_values, refine_globally
 from siq.quasipotential.hamilton_jacobi import affordable_degree
 from siq.quasipotential.occupancy import OccupancyCheck, check_occupancy

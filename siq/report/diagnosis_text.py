@@ -11,13 +11,7 @@ from siq.diagnosis.holdout import HeldOutErrors
 from siq.diagnosis.mechanisms import PROCESS_NOISE
 from siq.diagnosis.residual_structure import DOUBTFUL
 from siq.diagnosis.statement import Recalibrated, Statement
-from siq.numerics.text import (
-    LARGEST_PLAIN_NUMBER,
-    SMALLEST_SHARE,
-    number_text,
-    p_equation,
-    value_text,
-)
+from siq.numerics.text import LARGEST_PLAIN_NUMBER, SMALLEST_SHARE, number_text, p_equation, value_text
 from siq.remarks import sentence
 from siq.report.formatting import environment
 

@@ -193,11 +193,6 @@ def compose(template: str, *, title: str, interactive: Markup | None = None, **v
     return ReportContent(title, interactive=interactive, **writer.parts)
 
 
-def render_report(content: ReportContent) -> str:
-    """Render a report as one HTML page; the same content gives the same page."""
-    return render_template("report.html.j2", content)
-
-
 LARGEST_VECTOR = 400_000  # bytes: a larger SVG is offered as the PNG that is shown
 DOTS_PER_INCH = 200  # of the PNG files; pages have 96
 CHARACTER = 7.6  # pixels, about: the width of a figure in a table
@@ -206,10 +201,11 @@ SHORT_TEXT, LINE = 24, 34  # characters: longer texts wrap, to lines no shorter 
 PHONE, PAGE = 360, 950  # pixels that a table may fill
 
 
-def render_template(name: str, content: object, *, folder: Path | None = None) -> str:
-    """Render a page as HTML; all text is escaped, but for what is `markupsafe.Markup`.
+def render_report(content: object, *, template: str = "report.html.j2", folder: Path | None = None) -> str:
+    """Render a report, or what another template shows, as HTML; the same content gives the same page.
 
-    A `folder` may have templates of its own beside those of this package.
+    All text is escaped, but for what is `markupsafe.Markup`. A `folder` may have templates of its own beside
+    those of this package.
     """
     package = PackageLoader("siq.report")
     environment = Environment(
@@ -235,7 +231,7 @@ def render_template(name: str, content: object, *, folder: Path | None = None) -
         "records": lambda frame: list(frame.itertuples(index=False, name=None)),
     }
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-    return environment.get_template(name).render(content=content)
+    return environment.get_template(template).render(content=content)
 
 
 def _kept_columns(frame: pd.DataFrame) -> pd.DataFrame:
@@ -398,7 +394,7 @@ def _times_view(landscape: LandscapeSummary) -> Markup | None:
         "time": with_unit("lasts", landscape.time_unit),
         "wells": [one.label for one in landscape.wells],
     }
-    return Markup(render_template("times.html.j2", view))
+    return Markup(render_report(view, template="times.html.j2"))
 
 
 def _solid_view(landscape: LandscapeSummary) -> Markup | None:
@@ -472,4 +468,4 @@ def _solid_view(landscape: LandscapeSummary) -> Markup | None:
         "wells": [one.label for one in landscape.wells],
         "ways": bool(landscape.ways),
     }
-    return Markup(render_template("interactive.html.j2", view))
+    return Markup(render_report(view, template="interactive.html.j2"))

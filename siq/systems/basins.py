@@ -260,18 +260,9 @@ def edge_saddle(
     box: np.ndarray,
     generator: np.random.Generator,
 ) -> Equilibrium | None:
-    """A saddle on the boundary of a basin, between two attractors; None where tracking comes to none.
+    """A saddle on the boundary of the basin of `one`, towards `two`; None where tracking comes to none.
 
-    Parameters
-    ----------
-    dynamics
-        f.
-    one, two, attractors
-        Which of the attractors; the boundary is that of the basin of `one`.
-    box
-        Shape ``(d, 2)``: the domain.
-    generator
-        Bends the first way.
+    Both are numbers of attractors; the box is the domain. See `tracked_edge`, which the generator is for.
     """
     edge = tracked_edge(dynamics, one, two, attractors, box=box, generator=generator)
     for _, _, state in itertools.islice(edge, MAX_TRACKING_ROUNDS):

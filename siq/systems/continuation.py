@@ -391,9 +391,7 @@ class _Cycles(_Equilibria):
 
 
 def _solved(
-    residual: Callable[[np.ndarray], np.ndarray],
-    slope: Callable[[np.ndarray], np.ndarray],
-    start: np.ndarray,
+    residual: Callable[[np.ndarray], np.ndarray], slope: Callable[[np.ndarray], np.ndarray], start: np.ndarray
 ) -> np.ndarray | None:
     """Newton's method; None where it does not converge. A singular slope is taken by least squares."""
     x, last = start.copy(), np.inf

@@ -365,12 +365,7 @@ def _at_sigma(advance: Field, levels: Field, center: np.ndarray, count: int) -> 
 
 
 def _split(
-    advance: Field,
-    levels: Field,
-    x: np.ndarray,
-    count: int,
-    walkers: int,
-    generator: np.random.Generator,
+    advance: Field, levels: Field, x: np.ndarray, count: int, walkers: int, generator: np.random.Generator
 ) -> np.ndarray:
     """p of each run of splitting, whose walkers stand one run after another: shape ``(runs,)``."""
     total = x.shape[1]

@@ -264,8 +264,7 @@ def phase_portrait(dynamics: Dynamics, points: np.ndarray | None = None, *, seed
         remarks += further
         remarks += [
             Remark(
-                "systems.attractor_left_out",
-                {"states": len(points), "place": one.position.round(4).tolist()},
+                "systems.attractor_left_out", {"states": len(points), "place": one.position.round(4).tolist()}
             )
             for index, one in enumerate(stable)
             if index not in (*reached, *absorbing)

@@ -175,6 +175,6 @@ def _csv(header: str, parts: list[tuple[str, np.ndarray, np.ndarray]]) -> str:
     text = io.StringIO()
     text.write(header + "\n")
     for label, t, values in parts:
-        for time, row in zip(t, values, strict=True):
-            text.write(f"{label},{time:.6g}," + ",".join(f"{value:.6f}" for value in row) + "\n")
+        row = ",".join([label, "%.6g", *["%.6f"] * values.shape[1]])
+        np.savetxt(text, np.column_stack([t, values]), fmt=row)
     return text.getvalue()

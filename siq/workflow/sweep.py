@@ -223,21 +223,6 @@ def _branch_rows(branches: Sequence[Branch], numbers: Sequence[np.ndarray]) -> l
     ]
 
 
-def _bifurcation_rows(found: Sequence[Bifurcation]) -> list[dict[str, object]]:
-    """The table of bifurcations."""
-    return [
-        {
-            "kind": one.kind,
-            "value": one.value,
-            "position": _position_text(one.state),
-            "branch": one.branch,
-            "frequency": one.frequency,
-            "residual": one.residual,
-        }
-        for one in found
-    ]
-
-
 def _position_text(state: np.ndarray | Sequence[float]) -> str:
     """A state as tables have it."""
     return str([float(f"{one:.{DIGITS}g}") for one in state])
@@ -549,9 +534,13 @@ def collected(
         ways += _way_rows(point, number)
     units = dict(zip(system.states, system.units, strict=True)) | {"t": system.time_unit}
     units |= {each.name: each.unit for each in system.parameters if each.name in names}
+    found = [
+        {name: value for name, value in vars(one).items() if name != "state"}
+        | {"position": _position_text(one.state)}
+        for one in bifurcations
+    ]
     return Sweep(
         names, system.states, as_table("sweep", rows), as_table("sweep_ways", ways),
-        as_table("branches", _branch_rows(branches, stretches)),
-        as_table("bifurcations", _bifurcation_rows(bifurcations)),
+        as_table("branches", _branch_rows(branches, stretches)), as_table("bifurcations", found),
         notes, units, as_table("bifurcation_curves", _curve_rows(curves)),
     )  # fmt: skip

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from siq.data.recordings import Recordings, snapshot_pairs
 from siq.inference.checks import predict
 from siq.networks.decomposition import AnyNetworks
-from siq.networks.regression import highest_used, points_below
+from siq.networks.regression import highest_used
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.formulas import SymbolicDecomposition
 from siq.quasipotential.global_formula import GlobalQuasipotential
@@ -410,17 +410,15 @@ def _dataset(
     plain = Dataset(paths, quiet, x[:, :2])
     if networks is None:
         return plain
-    level = settings.regression.level
     potential = networks.potential_at(x)
-    marked = replace(plain, below=points_below(potential, level=level))
+    threshold = highest_used(potential, level=settings.regression.level)
+    marked = replace(plain, below=potential < threshold)
     if x.shape[1] != 2:
         return marked
     across, upwards = np.linspace(x.min(axis=0), x.max(axis=0), GRID).T
     grid = np.stack(np.meshgrid(across, upwards), axis=-1).reshape(-1, 2)
     values = networks.potential_at(grid).reshape(GRID, GRID)
-    return replace(
-        marked, axes=(across, upwards), potential=values, threshold=highest_used(potential, level=level)
-    )
+    return replace(marked, axes=(across, upwards), potential=values, threshold=threshold)
 
 
 def _sweep_figure(system: Dynamics, options: SweepOptions, tables: Mapping[str, pd.DataFrame]) -> Figure:

@@ -69,24 +69,9 @@ def plot_before_after(
 ) -> Figure | None:
     """Draw the held-out recording that differs most, with the simulation before and after.
 
-    Parameters
-    ----------
-    table
-        Columns ``recording t output measured before recalibrated augmented scored``.
-    after
-        The simulation that the verdict ends with: ``"augmented"``, ``"recalibrated"``, or ``"before"`` where
-        nothing is to be changed.
-    noise
-        Variance of the sensor's noise by output, for a band of ± 2 standard deviations.
-    units
-        Units of the outputs.
-    time_unit
-        Of ``t``.
-
-    Returns
-    -------
-    matplotlib.figure.Figure or None
-        The course above, simulation minus recording below; None where no recording was held out.
+    The course stands above, simulation minus recording below. `after` is the simulation that the verdict ends
+    with: ``"augmented"``, ``"recalibrated"``, or ``"before"`` where nothing is to be changed. `noise` is the
+    variance of the sensor's noise by output, for a band of ± 2 standard deviations.
     """
     largest = largest_difference(table, after=after)
     if largest is None:
@@ -572,25 +557,11 @@ def plot_missing(
     time_unit: str = "1",
     source: str = "",
 ) -> Figure | None:
-    """Draw the missing part of equations over a plane of the state space.
+    """Draw the missing part of equations over a plane of the state space, given by the `names` of two states.
 
-    Parameters
-    ----------
-    points
-        States in the plane, shape ``(n, 2)``.
-    missing
-        What must be added to each equation there, shape ``(n,)`` each; means over cells are drawn.
-    names
-        Names of the two states.
-    units, time_unit
-        Units of states and time.
-    source
-        Where the numbers are from, in words.
-
-    Returns
-    -------
-    matplotlib.figure.Figure or None
-        A panel for each of up to two equations, below each other; None where nothing is missing anywhere.
+    At points ``(n, 2)`` of the plane `missing` is what must be added to each equation, shape ``(n,)`` each.
+    Means over cells are drawn, a panel for each of up to two equations; `source` says in words where the
+    numbers are from.
     """
     shown = {name: values for name, values in missing.items() if np.isfinite(values).any()}
     shown = dict(sorted(shown.items(), key=lambda each: -float(np.nanstd(each[1])))[:2])

@@ -109,20 +109,11 @@ def plot_sweep(
 def plot_early_warning(
     course: pd.DataFrame, probability: pd.DataFrame, *, state: str, time_unit: str | None = None
 ) -> Figure:
-    """Draw an early warning.
+    """Draw an early warning: its course and its probability, as `siq.early_warning` gives them.
 
-    Parameters
-    ----------
-    course, probability
-        As `siq.early_warning` gives them.
-    state, time_unit
-        Name of the column, and the unit of its time.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Barrier over noise and mean time along the record, and the probability of having left the state
-        afterwards, each with its 90 % interval; an interval without an upper end goes on beyond the panel.
+    Barrier over noise and mean time along the record, and the probability of having left the state
+    afterwards, each with its 90 % interval; an interval without an upper end goes on beyond the panel.
+    `state` is the name of the column, `time_unit` the unit of its time.
     """
     figure = Figure(figsize=(COLUMN_WIDTH, 3 * PANEL))
     panels = figure.subplots(3, 1, sharex=True)
