@@ -14,10 +14,10 @@ What f leaves of recordings that it was not fitted to has no mean that any funct
 P being the projection on the q functions, if f misses no term. Without noise recordings are predicted.
 
 What no function of the library is shows where it matters, between wells and the tops beside them. There
-``ΔU/ε = -2 ∫ f/(εD) dx`` follows from f, and without a formula from mean steps of samples on the way. If f is
-of its library both are right, and the variance of their difference is that of the second less that of the
-first (Hausman, Econometrica 46 (1978) 1251). In more states functions of each that are constant in parts may
-explain no more of the residuals than chance lets them.
+``ΔU/ε = -2 ∫ f/(εD) dx`` follows from f and D, and without formulas from mean and spread of the steps that
+samples on the way make. If the formulas are of their libraries both are right, and the variance of their
+difference is that of the second less that of the first (Hausman, Econometrica 46 (1978) 1251). In more states
+functions of each that are constant in parts may explain no more of the residuals than chance lets them.
 """
 
 from __future__ import annotations
@@ -66,6 +66,7 @@ MOST_DIGITS = 12  # of numbers that were rounded: those of floating point have s
 ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 UNPREDICTED = "f does not predict held-out recordings"
 WAY_GRID, WAY_PARTS = 2001, 20  # numerical: places at which zeros of f are sought; parts of a way
+FEWEST_IN_PART = 6  # samples, by which 1/χ² has a variance
 SHAPE_PARTS = 12  # of the samples by each state: a function of it that f lacks is seen as twelve values
 MISSED_WORK = 1.0  # of U/ε, a factor e in times: how far off the work is expected of an f of another shape
 ONE_DIRECTION = 0.01  # of the largest variance: ways of which f of its library moves only both are one
@@ -407,24 +408,31 @@ def with_work_of_samples(found: FieldEstimate, pairs: SnapshotPairs) -> tuple[Fi
         return np.broadcast_to(np.ravel(found.noise_rate_at(x)), len(x))
 
     scale = np.sqrt(rate(pairs.x0))
-    levers, slopes = [], []
+    noise = rest[:, 0] / scale
+    strength = noise**2 / (noise**2).mean()
+    levers, slopes, by_noise = [], [], []
     for ends in pairwise(grid[1:][force[1:] * force[:-1] < 0, 0]):
         edges = np.linspace(*ends, WAY_PARTS + 1)
         part = np.searchsorted(edges, x, side="right") - 1
         way = (part >= 0) & (part < WAY_PARTS)
-        spent = np.bincount(part[way], h[way], minlength=WAY_PARTS)
-        if spent.all():
+        spent, count, sums = (
+            np.bincount(part[way], each[way], minlength=WAY_PARTS) for each in (h, np.ones(len(h)), strength)
+        )
+        if (count >= FEWEST_IN_PART).all():
             width, middles = edges[1] - edges[0], (edges[1:, None] + edges[:-1, None]) / 2
             lever = np.where(way, -2 * width / spent[np.clip(part, 0, WAY_PARTS - 1)], 0.0)
             levers.append(lever * np.sqrt(h) / scale)
             slopes.append(-2 * width / rate(middles) @ library.evaluate(middles))
+            # 1/χ² of n values has the mean 1/(n - 2), and of that the variance 2/(n - 4).
+            work = -2 * width * found.dynamics.drift(middles)[:, 0] / rate(middles)
+            by_noise.append((work @ ((count - 2) / sums - 1), 2 * work**2 @ (1 / (count - 4))))
     if not levers:
         return found, 1.0
     lever, slope = np.stack(levers), np.stack(slopes)
     basis = np.linalg.qr(library.evaluate(pairs.x0)[:, terms] * (np.sqrt(h) / scale)[:, None])[0]
     own = lever - (lever @ basis) @ basis.T
-    difference = own @ (rest[:, 0] / scale)
-    covariance = own @ own.T * pairs.copies
+    moved, variances = np.transpose(by_noise)
+    difference, covariance = own @ noise + moved, (own @ own.T + np.diag(variances)) * pairs.copies
     wide = covariance + MISSED_WORK**2 * np.eye(len(own))
     inverse, share = np.linalg.pinv(covariance, hermitian=True), covariance @ np.linalg.inv(wide)
     square = float(difference @ inverse @ difference)
