@@ -65,7 +65,8 @@ COPIED = 12  # samples of a stretch that is sought a second time
 MOST_DIGITS = 12  # of numbers that were rounded: those of floating point have sixteen
 ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 UNPREDICTED = "f does not predict held-out recordings"
-WAY_GRID, WAY_PARTS = 2001, 20  # numerical: places at which zeros of f are sought; parts of a way
+WAY_GRID = 2001  # numerical: places at which zeros of f are sought
+WAY_PARTS = 20, 10, 5  # numerical: of a way, as many as have samples enough
 FEWEST_IN_PART = 6  # samples, by which 1/χ² has a variance
 SHAPE_PARTS = 12  # of the samples by each state: a function of it that f lacks is seen as twelve values
 MISSED_WORK = 1.0  # of U/ε, a factor e in times: how far off the work is expected of an f of another shape
@@ -412,20 +413,23 @@ def with_work_of_samples(found: FieldEstimate, pairs: SnapshotPairs) -> tuple[Fi
     strength = noise**2 / (noise**2).mean()
     levers, slopes, by_noise = [], [], []
     for ends in pairwise(grid[1:][force[1:] * force[:-1] < 0, 0]):
-        edges = np.linspace(*ends, WAY_PARTS + 1)
-        part = np.searchsorted(edges, x, side="right") - 1
-        way = (part >= 0) & (part < WAY_PARTS)
-        spent, count, sums = (
-            np.bincount(part[way], each[way], minlength=WAY_PARTS) for each in (h, np.ones(len(h)), strength)
-        )
-        if (count >= FEWEST_IN_PART).all():
+        for parts in WAY_PARTS:
+            edges = np.linspace(*ends, parts + 1)
+            part = np.searchsorted(edges, x, side="right") - 1
+            way = (part >= 0) & (part < parts)
+            spent, count, sums = (
+                np.bincount(part[way], each[way], minlength=parts) for each in (h, np.ones(len(h)), strength)
+            )
+            if (count < FEWEST_IN_PART).any():
+                continue
             width, middles = edges[1] - edges[0], (edges[1:, None] + edges[:-1, None]) / 2
-            lever = np.where(way, -2 * width / spent[np.clip(part, 0, WAY_PARTS - 1)], 0.0)
+            lever = np.where(way, -2 * width / spent[np.clip(part, 0, parts - 1)], 0.0)
             levers.append(lever * np.sqrt(h) / scale)
             slopes.append(-2 * width / rate(middles) @ library.evaluate(middles))
             # 1/χ² of n values has the mean 1/(n - 2), and of that the variance 2/(n - 4).
             work = -2 * width * found.dynamics.drift(middles)[:, 0] / rate(middles)
             by_noise.append((work @ ((count - 2) / sums - 1), 2 * work**2 @ (1 / (count - 4))))
+            break
     if not levers:
         return found, 1.0
     lever, slope = np.stack(levers), np.stack(slopes)

@@ -118,6 +118,7 @@ def test_a_cube_is_named_where_there_are_terms(
     )
 
 
+@pytest.mark.slow
 def test_siq_names_it_and_sees_nothing_where_nothing_is(
     stiffening: tuple[Comparison, TrueCase], nothing: Comparison
 ) -> None:

@@ -367,6 +367,7 @@ def test_what_the_dictionary_lacks_is_modelled_without_a_name(tmp_path: Path) ->
     assert abs(at[np.argmax(missing)] - 0.5) <= 0.1
 
 
+@pytest.mark.slow
 def test_what_a_name_leaves_is_described_and_no_sample_of_a_test_chooses_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

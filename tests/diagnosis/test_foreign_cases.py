@@ -76,6 +76,7 @@ def test_there_is_an_answer_to_what_is_large(name: str, tmp_path: Path) -> None:
     assert found.verdict.mismatch
 
 
+@pytest.mark.slow
 def test_dry_friction_of_a_motor_is_named(tmp_path: Path) -> None:
     found = answered(motor_axis(samples=800), tmp_path)
     names = [each.name for each in found.mechanisms]

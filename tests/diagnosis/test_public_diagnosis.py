@@ -165,6 +165,7 @@ def test_parameters_that_differ_from_recording_to_recording_are_no_missing_physi
     assert "differs from recording to recording" in diagnosis.report()
 
 
+@pytest.mark.slow
 def test_a_parameter_that_differs_from_recording_to_recording_is_found(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -93,6 +93,7 @@ def test_a_refusal_carries_the_states_of_the_record() -> None:
     assert refused.value.reason not in said  # the levels alone say why
 
 
+@pytest.mark.slow
 def test_a_landscape_that_misses_the_states_says_so_as_the_page_does() -> None:
     line = PipelineSettings(identification=IdentificationOptions(degree=1))
     landscape = Landscape.from_recordings(double_well(), line)

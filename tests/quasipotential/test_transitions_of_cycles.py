@@ -232,6 +232,7 @@ def lowest_crossing(system: Dynamics, cycle: Cycle) -> float:
     return min(levels)
 
 
+@pytest.mark.slow
 def test_an_unstable_cycle_alone_bounds_a_well() -> None:
     """V = a²r²/2 - r⁴/4 and a rotation: beyond r = a all states run away."""
     radius, slope = x**2 + y**2, sympy.Rational(1, 2)

@@ -158,6 +158,7 @@ def test_an_interrupted_workflow_resumes_and_gives_the_same_tables(finished, tmp
         assert project.path(path).read_bytes() == finished.path(path).read_bytes()
 
 
+@pytest.mark.slow
 def test_a_second_snakemake_waits_for_nobody_and_says_so(fresh_project):
     project = fresh_project
     project.write_study()
