@@ -26,7 +26,7 @@ from benchmarks.publication.publication import (
     shown,
 )
 from siq.inference.field_estimate import read_field
-from siq.networks.regression import highest_used
+from siq.networks.regression import points_below
 from siq.numerics.randomness import Purpose, generator
 from siq.numerics.text import number_text
 from siq.report.formatting import texts
@@ -137,7 +137,7 @@ def _equations_table(study: Results) -> ReportTable | None:
     low, high = study.system.box.T
     x = generator(0, Purpose.EQUATIONS).uniform(low, high, (POINTS, study.system.dimension))
     potential = published.evaluate(np.ascontiguousarray(x.T))[0]
-    x = x[potential < highest_used(potential, level=study.settings.regression.level)]
+    x = x[points_below(potential, level=study.settings.regression.level)]
     exact = study.system.drift(x)
     found = {"published": own_equations(published, x, exact)}
     run = study.models.representative(study.table("rrmse"))[0] or 0

@@ -412,6 +412,15 @@ class SnapshotPairs:
         """The mean of ``|Xh - X0|²/h`` of each state, shape ``(d,)``."""
         return np.asarray(((self.xh - self.x0) ** 2 / self.h[:, None]).mean(axis=0))
 
+    def state_parts(self, parts: int) -> np.ndarray:
+        """Whether pairs begin in each of so many equal parts by a state but its first: ``(n, columns)``."""
+        columns = []
+        for state in self.x0.T:
+            edges = np.unique(np.quantile(state, np.linspace(0, 1, parts + 1)[1:-1]))
+            part = np.searchsorted(edges, state, side="right")
+            columns.append(part[:, None] == np.arange(1, len(edges) + 1))
+        return np.concatenate(columns, axis=1)
+
     def take(self, rows: np.ndarray | slice) -> SnapshotPairs:
         """Some of the pairs, by their indices or by a mask."""
         parts = self.x0[rows], self.xh[rows], self.h[rows], self.recording[rows]

@@ -68,7 +68,7 @@ UNPREDICTED = "f does not predict held-out recordings"
 WAY_GRID = 2001  # numerical: places at which zeros of f are sought
 WAY_PARTS = 20, 10, 5  # numerical: of a way, as many as have samples enough
 FEWEST_IN_PART = 6  # samples, by which 1/χ² has a variance
-SHAPE_PARTS = 12  # of the samples by each state: a function of it that f lacks is seen as twelve values
+STATE_BINS = 12  # of each state: any function of it is seen as a value in each
 MISSED_WORK = 1.0  # of U/ε, a factor e in times: how far off the work is expected of an f of another shape
 ONE_DIRECTION = 0.01  # of the largest variance: ways of which f of its library moves only both are one
 
@@ -389,12 +389,8 @@ def with_work_of_samples(found: FieldEstimate, pairs: SnapshotPairs) -> tuple[Fi
     rest = process_noise_increments(found, pairs, residuals(found, pairs))
     if library.dimension > 1:
         rest = np.einsum("nij,nj->ni", found.diffusion.whitening_at(pairs.x0), rest)
-        shapes = []
-        for x in pairs.x0.T:
-            cuts = np.unique(np.quantile(x, np.linspace(0, 1, SHAPE_PARTS + 1)[1:-1]))
-            shapes.append(np.searchsorted(cuts, x, side="right")[:, None] == np.arange(1, len(cuts) + 1))
         known = np.column_stack([np.ones(len(rest)), library.evaluate(pairs.x0)[:, np.unique(terms)]])
-        known, columns = (each * np.sqrt(pairs.h)[:, None] for each in (known, np.column_stack(shapes)))
+        known, columns = (each * np.sqrt(pairs.h)[:, None] for each in (known, pairs.state_parts(STATE_BINS)))
         known = np.linalg.qr(known / positive(np.linalg.norm(known, axis=0)))[0]
         columns = columns - known @ (known.T @ columns)
         freedom = len(rest) - known.shape[1]
@@ -425,9 +421,10 @@ def with_work_of_samples(found: FieldEstimate, pairs: SnapshotPairs) -> tuple[Fi
             width, middles = edges[1] - edges[0], (edges[1:, None] + edges[:-1, None]) / 2
             lever = np.where(way, -2 * width / spent[np.clip(part, 0, parts - 1)], 0.0)
             levers.append(lever * np.sqrt(h) / scale)
-            slopes.append(-2 * width / rate(middles) @ library.evaluate(middles))
+            per_force = -2 * width / rate(middles)
+            slopes.append(per_force @ library.evaluate(middles))
             # 1/χ² of n values has the mean 1/(n - 2), and of that the variance 2/(n - 4).
-            work = -2 * width * found.dynamics.drift(middles)[:, 0] / rate(middles)
+            work = per_force * found.dynamics.drift(middles)[:, 0]
             by_noise.append((work @ ((count - 2) / sums - 1), 2 * work**2 @ (1 / (count - 4))))
             break
     if not levers:

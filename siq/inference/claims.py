@@ -47,7 +47,7 @@ import scipy.special
 
 from siq.data.preparation import joined
 from siq.data.recordings import Recordings, SnapshotPairs, parent_recordings, snapshot_pairs
-from siq.inference.checks import repetitions, unexplained_probability
+from siq.inference.checks import STATE_BINS, repetitions, unexplained_probability
 from siq.inference.diffusion_model import process_noise_increments
 from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.inference.regression import coarse_pairs, residuals
@@ -55,7 +55,6 @@ from siq.numerics.integration import machine_code
 from siq.numerics.randomness import positive
 from siq.remarks import Remark, sentence
 
-STATE_BINS = 12  # of each state: what any function of it explains is no memory, and no change
 NOISELESS = 1e-3  # of the rms step: a state with less has no noise of its own, and its residuals say nothing
 FEWEST_PAIRS = 30  # of a recording that is compared by itself
 FEWEST_PER_COLUMN = 10  # pairs for each column of a regression
@@ -99,10 +98,11 @@ class _Residuals:
         self.drift = float(shares.max(initial=0.0))  # of the squares of steps, over that of the noise
         self.pairs, n = pairs, len(pairs.h)
         functions = np.unique(found.support[:, 1])
-        columns = [found.library.evaluate(pairs.x0)[:, functions], np.ones((n, 1))]
-        for state in pairs.x0.T:
-            edges = np.unique(np.quantile(state, np.linspace(0, 1, STATE_BINS + 1)[1:-1]))
-            columns.append(np.eye(len(edges) + 1)[np.searchsorted(edges, state, side="right")])
+        columns = [
+            found.library.evaluate(pairs.x0)[:, functions],
+            np.ones((n, 1)),
+            pairs.state_parts(STATE_BINS),
+        ]
         together = np.concatenate(columns, axis=1) * np.sqrt(pairs.h / pairs.h.mean())[:, None]
         self.basis = _orthonormal(together)
         scaled = (pairs.x0 - pairs.x0.mean(axis=0)) / positive(pairs.x0.std(axis=0))

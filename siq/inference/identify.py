@@ -82,9 +82,6 @@ SENSOR_SHARE = 0.1  # of what means move by: a search finds its way down to no s
 MIN_SHARE, MAX_SHARE = 1e-3, 0.45  # of the residuals' variance: a sensor's share that a fit begins with
 WHOLE_STEP_TOLERANCE = 0.05  # of an exposure, as exactly as residuals show it of some thousand samples
 SINGULAR = "the recordings do not determine f; record more, or more often"
-MOST_DEGREE = (
-    9  # of f of one state, where samples refute lower ones: beyond it coefficients lose their digits
-)
 PREDICTED_RECORDINGS = 200  # held-out ones that are predicted: enough for a median
 
 
@@ -498,10 +495,8 @@ class _Case:
 
     def with_work(self, found: FieldEstimate) -> FieldEstimate:
         """f with what samples tell of it without a formula (`with_work_of_samples`); they may refute it."""
-        states, limit = self.recordings, self.limits.each
-        if found.sensor_variance is not None:
-            states = filtered_recordings(found, states, pair_step=self.pair_step)
-        found, chance = with_work_of_samples(found, self._pairs(states))
+        limit = self.limits.each
+        found, chance = with_work_of_samples(found, self._pairs(self._states(found)))
         chance = min(2 * chance, 1.0)  # the test of held-out recordings is another of the same claim
         if chance >= limit or found.prediction is None or not found.prediction.passed:
             return found
@@ -509,12 +504,15 @@ class _Case:
         reason = sentence(Remark("inference.other_shape", values))
         return replace(found, prediction=Verdict.of_probability(chance, limit, reason))
 
+    def _states(self, found: FieldEstimate) -> Recordings:
+        """The states as recorded, or as a filter knows them behind a sensor."""
+        if found.sensor_variance is None and not found.hidden_states:
+            return self.recordings
+        return filtered_recordings(found, self.recordings, pair_step=self.pair_step)
+
     def _forgets(self, found: FieldEstimate) -> bool:
         """Whether the past tells nothing more of the next sample than the state does."""
-        states = self.recordings
-        if found.sensor_variance is not None or found.hidden_states:
-            states = filtered_recordings(found, states, pair_step=self.pair_step)
-        limit = self.limits.each
+        states, limit = self._states(found), self.limits.each
         claims = check_claims(found, states, self.recordings, pair_step=self.pair_step, false_alarms=limit)
         return "state_complete" not in claims or claims["state_complete"].passed
 

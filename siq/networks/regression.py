@@ -124,9 +124,14 @@ class RegressionResult:
 
 
 def highest_used(potential: np.ndarray, *, level: float | None) -> float:
-    """τ, below which points are used: `level` above the lowest known V, or else above `LOWER_SHARE` of V."""
+    """τ: `level` above the smallest of the known values of V; without one, above `LOWER_SHARE` of them."""
     top = np.nanquantile(potential, LOWER_SHARE) if level is None else np.nanmin(potential) + level
     return float(top)
+
+
+def points_below(potential: np.ndarray, *, level: float | None) -> np.ndarray:
+    """Mask of the points where V lies below τ, see `highest_used`."""
+    return np.asarray(potential < highest_used(potential, level=level))
 
 
 def sparse_decomposition(
@@ -146,7 +151,7 @@ def sparse_decomposition(
     library
         The candidate functions.
     x
-        Points, shape ``(n, d)``, all of which are used; see `highest_used`.
+        Points, shape ``(n, d)``, all of which are used; see `points_below`.
     potential, circulatory, vector_field
         V_θ at the points, shape ``(n,)``, and g_θ and f_θ, shape ``(n, d)``.
     diffusion

@@ -34,7 +34,7 @@ from siq.inference.identify import identify
 from siq.inference.kalman_identification import of_all_states
 from siq.inference.library import candidate_library
 from siq.networks.decomposition import AnyNetworks, NetworksByWell
-from siq.networks.regression import highest_used, sparse_decomposition
+from siq.networks.regression import points_below, sparse_decomposition
 from siq.numerics.randomness import Purpose, generator
 from siq.quasipotential.certificate import Certificate, certify, uncertified
 from siq.quasipotential.formulas import SymbolicDecomposition, decomposition_from_coefficients
@@ -154,7 +154,7 @@ def regress_run(
     try:
         points = snapshot_pairs(recordings, pair_step=settings.sampling.pair_step).x0
         potential, circulatory, vector_field = networks.evaluate(points)
-        below = potential < highest_used(potential, level=options.level)
+        below = points_below(potential, level=options.level)
         library = candidate_library(
             recordings.names, degree=options.degree, potential_degree=options.potential_degree,
             circulatory_degree=options.circulatory_degree, further=options.functions,

@@ -8,7 +8,7 @@ from known_systems import exact_archetype
 
 from siq.errors import NumericalFailure
 from siq.inference.library import CandidateLibrary, candidate_library
-from siq.networks.regression import RegressionOptions, RegressionResult, highest_used, sparse_decomposition
+from siq.networks.regression import RegressionOptions, RegressionResult, points_below, sparse_decomposition
 from siq.quasipotential.formulas import term_coefficients
 from siq.systems.diffusion import Diffusion
 from workflow.scoring import _exact_values
@@ -55,8 +55,7 @@ def archetype_values(x: np.ndarray) -> Values:
 
 def below_two(count: int = 600) -> np.ndarray:
     x = np.random.default_rng(0).uniform(-1.6, 1.6, size=(count, 3))
-    potential = _exact_values(exact_archetype(), x.T) / 2
-    return x[potential < highest_used(potential, level=2.0)]
+    return x[points_below(_exact_values(exact_archetype(), x.T) / 2, level=2.0)]
 
 
 def planar(
@@ -320,13 +319,14 @@ def test_a_library_function_that_is_not_finite_is_a_numerical_failure() -> None:
         regress(x, planar(x, np.eye(2), well_gradient, well), functions=("log(x)",))
 
 
-def test_the_level_is_counted_from_the_minimum() -> None:
-    assert highest_used(np.array([-3.0, -1.5, np.nan, -0.9, 5.0]), level=2.0) == -1.0
+def test_points_below_the_level_are_counted_from_the_minimum() -> None:
+    np.testing.assert_array_equal(
+        points_below(np.array([-3.0, -1.5, -1.0, -0.9, 5.0]), level=2.0), [True, True, False, False, False]
+    )
 
 
 def test_without_a_level_the_lowest_three_quarters_of_the_points_are_used_in_any_units() -> None:
     values = np.random.default_rng(0).normal(size=400)
-    below = values < highest_used(values, level=None)
+    below = points_below(values, level=None)
     assert below.sum() == 300 and values[below].max() < values[~below].min()
-    scaled = 1e-9 * values - 7
-    np.testing.assert_array_equal(below, scaled < highest_used(scaled, level=None))
+    np.testing.assert_array_equal(below, points_below(1e-9 * values - 7, level=None))
