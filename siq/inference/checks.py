@@ -12,18 +12,11 @@ What f leaves of recordings that it was not fitted to has no mean that any funct
     ``F = (‖P r‖²/q) / (‖r - P r‖²/(n - q))``,
 
 P being the projection on the q functions, if f misses no term. Without noise recordings are predicted.
-
-What no function of the library is shows where it matters, between wells and the tops beside them. There
-``ΔU/ε = -2 ∫ f/(εD) dx`` follows from f and D, and without formulas from mean and spread of the steps that
-samples on the way make. If the formulas are of their libraries both are right, and the variance of their
-difference is that of the second less that of the first (Hausman, Econometrica 46 (1978) 1251). In more states
-functions of each that are constant in parts may explain no more of the residuals than chance lets them.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 from typing import Annotated, Any
 
 import numpy as np
@@ -65,12 +58,7 @@ COPIED = 12  # samples of a stretch that is sought a second time
 MOST_DIGITS = 12  # of numbers that were rounded: those of floating point have sixteen
 ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 UNPREDICTED = "f does not predict held-out recordings"
-WAY_GRID = 2001  # numerical: places at which zeros of f are sought
-WAY_PARTS = 20, 10, 5  # numerical: of a way, as many as have samples enough
-FEWEST_IN_PART = 6  # samples, by which 1/χ² has a variance
 STATE_BINS = 12  # of each state: any function of it is seen as a value in each
-MISSED_WORK = 1.0  # of U/ε, a factor e in times: how far off the work is expected of an f of another shape
-ONE_DIRECTION = 0.01  # of the largest variance: ways of which f of its library moves only both are one
 
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -372,85 +360,6 @@ def mean_residual_probability(found: FieldEstimate, pairs: SnapshotPairs, *, see
     weight = np.sqrt(pairs.h)[:, None]
     columns, rest = library.evaluate(pairs.x0) * weight, residuals(found, pairs) / weight
     return unexplained_probability(columns, rest, inflation=inflation)
-
-
-def with_work_of_samples(found: FieldEstimate, pairs: SnapshotPairs) -> tuple[FieldEstimate, float]:
-    """An f with what samples tell of it without a formula: of one state, of U/ε between wells and tops.
-
-    That f has a shape that the library has not, and ΔU/ε is off by about `MISSED_WORK`, is as likely as not
-    beforehand. What follows from f is moved, and less certain, as likely as samples leave it.
-    Second comes the chance of differences as large, were f of its library: 1 where samples tell of no way.
-    An f of more states is tested, and stays as it is.
-    """
-    library, terms = found.library, found.support[:, 1]
-    if found.noise_free or found.memory is not None or not found.diffusion.regular:
-        return found, 1.0
-    pairs = found.wrapped(pairs)
-    rest = process_noise_increments(found, pairs, residuals(found, pairs))
-    if library.dimension > 1:
-        rest = np.einsum("nij,nj->ni", found.diffusion.whitening_at(pairs.x0), rest)
-        known = np.column_stack([np.ones(len(rest)), library.evaluate(pairs.x0)[:, np.unique(terms)]])
-        known, columns = (each * np.sqrt(pairs.h)[:, None] for each in (known, pairs.state_parts(STATE_BINS)))
-        known = np.linalg.qr(known / positive(np.linalg.norm(known, axis=0)))[0]
-        columns = columns - known @ (known.T @ columns)
-        freedom = len(rest) - known.shape[1]
-        return found, unexplained_probability(columns, rest, freedom=freedom, inflation=pairs.copies)
-    if library.angles:
-        return found, 1.0
-    (x,), h = pairs.x0.T, pairs.h
-    grid = np.linspace(x.min(), x.max(), WAY_GRID)[:, None]
-    force = found.dynamics.drift(grid)[:, 0]
-
-    def rate(x: np.ndarray) -> np.ndarray:
-        return np.broadcast_to(np.ravel(found.noise_rate_at(x)), len(x))
-
-    scale = np.sqrt(rate(pairs.x0))
-    noise = rest[:, 0] / scale
-    strength = noise**2 / (noise**2).mean()
-    levers, slopes, by_noise = [], [], []
-    for ends in pairwise(grid[1:][force[1:] * force[:-1] < 0, 0]):
-        for parts in WAY_PARTS:
-            edges = np.linspace(*ends, parts + 1)
-            part = np.searchsorted(edges, x, side="right") - 1
-            way = (part >= 0) & (part < parts)
-            spent, count, sums = (
-                np.bincount(part[way], each[way], minlength=parts) for each in (h, np.ones(len(h)), strength)
-            )
-            if (count < FEWEST_IN_PART).any():
-                continue
-            width, middles = edges[1] - edges[0], (edges[1:, None] + edges[:-1, None]) / 2
-            lever = np.where(way, -2 * width / spent[np.clip(part, 0, parts - 1)], 0.0)
-            levers.append(lever * np.sqrt(h) / scale)
-            per_force = -2 * width / rate(middles)
-            slopes.append(per_force @ library.evaluate(middles))
-            # 1/χ² of n values has the mean 1/(n - 2), and of that the variance 2/(n - 4).
-            work = per_force * found.dynamics.drift(middles)[:, 0]
-            by_noise.append((work @ ((count - 2) / sums - 1), 2 * work**2 @ (1 / (count - 4))))
-            break
-    if not levers:
-        return found, 1.0
-    lever, slope = np.stack(levers), np.stack(slopes)
-    basis = np.linalg.qr(library.evaluate(pairs.x0)[:, terms] * (np.sqrt(h) / scale)[:, None])[0]
-    own = lever - (lever @ basis) @ basis.T
-    moved, variances = np.transpose(by_noise)
-    difference, covariance = own @ noise + moved, (own @ own.T + np.diag(variances)) * pairs.copies
-    wide = covariance + MISSED_WORK**2 * np.eye(len(own))
-    inverse, share = np.linalg.pinv(covariance, hermitian=True), covariance @ np.linalg.inv(wide)
-    square = float(difference @ inverse @ difference)
-    logarithms = np.linalg.slogdet(share)[1] + square - difference @ np.linalg.solve(wide, difference)
-    likely = scipy.special.expit(logarithms / 2)
-    # What an f of another shape does is done by those coefficients of this one that are known the least.
-    bias, spread = found.alternatives or (0 * found.coefficients, np.zeros((0, *found.coefficients.shape)))
-    change = difference - share @ difference - slope @ bias[:, 0]
-    uncertain = likely * (covariance - share @ covariance + (1 - likely) * np.outer(change, change))
-    reach = found.covariance @ slope[:, terms].T
-    per_work = reach @ np.linalg.pinv(slope[:, terms] @ reach, rcond=ONE_DIRECTION, hermitian=True)
-    sizes, directions = np.linalg.eigh(uncertain)
-    changes = np.zeros((1 + len(own), *bias.shape))
-    changes[0, terms, 0] = per_work @ (likely * change)
-    changes[1:, terms, 0] = (per_work @ directions * np.sqrt(np.maximum(sizes, 0.0))).T
-    average = (bias + changes[0], np.concatenate([spread, changes[1:]]))
-    return replace(found, alternatives=average), float(scipy.special.chdtrc(len(own), square))
 
 
 def predict(dynamics: Dynamics, recordings: Recordings) -> np.ndarray:

@@ -469,6 +469,17 @@ class FieldEstimate:
         error = float(np.hypot(noise.intensity_error, noise.intensity * np.sqrt(share)))
         return replace(found, diagnosis=replace(noise, intensity_error=error))
 
+    def with_shape_tested(self, chance: float, *, limit: float, along: str) -> FieldEstimate:
+        """With what another test says of the prediction: samples and f disagree `along` a way or a state.
+
+        The test of held-out recordings is one of the same claim, so that the chance counts twice.
+        """
+        chance = min(2 * chance, 1.0)
+        if chance >= limit or self.prediction is None or not self.prediction.passed:
+            return self
+        reason = sentence(Remark("inference.other_shape", {"probability": chance, "along": along}))
+        return replace(self, prediction=Verdict.of_probability(chance, limit, reason))
+
     def bias(self, slopes: np.ndarray) -> np.ndarray:
         """By how much alternative terms move what follows from f, by its derivatives ``(..., q, d)``."""
         if self.alternatives is None:

@@ -27,6 +27,7 @@ from siq.data.preparation import joined, turns_back
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.checks import (
+    STATE_BINS,
     PredictionLimits,
     bias_of_rounding,
     check_prediction,
@@ -36,7 +37,7 @@ from siq.inference.checks import (
     repetitions,
     residual_noise,
     rounding_text,
-    with_work_of_samples,
+    unexplained_probability,
 )
 from siq.inference.claims import check_claims
 from siq.inference.diffusion_model import (
@@ -44,6 +45,7 @@ from siq.inference.diffusion_model import (
     check_units,
     constant_noise,
     estimated_diffusion,
+    process_noise_increments,
     with_process_noise_rate,
 )
 from siq.inference.field_estimate import (
@@ -52,7 +54,6 @@ from siq.inference.field_estimate import (
     DiffusionSource,
     FieldEstimate,
     NoiseDiagnosis,
-    Verdict,
 )
 from siq.inference.kalman_filter import Noise
 from siq.inference.kalman_identification import (
@@ -73,7 +74,7 @@ from siq.inference.regression import (
     with_noise_formula,
     with_stability,
 )
-from siq.numerics.randomness import Purpose
+from siq.numerics.randomness import Purpose, positive
 from siq.remarks import Remark, sentence
 from siq.systems.diffusion import Diffusion
 
@@ -151,7 +152,7 @@ def identify(
                 reason = "; ".join(one for one in (found.prediction.reason, advice) if one)
                 found = replace(found, prediction=replace(found.prediction, passed=False, reason=reason))
         by_force = None if hidden else case.with_slow_force(found)
-        return by_force or (found if hidden else case.with_work(found))
+        return by_force or (found if hidden else case.with_parts(found))
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         reason, claim = (str(error), error.claim) if isinstance(error, NumericalFailure) else (SINGULAR, "")
         rounding = rounding_text(recordings, coarse=True)
@@ -493,16 +494,22 @@ class _Case:
                     return found
         return None
 
-    def with_work(self, found: FieldEstimate) -> FieldEstimate:
-        """f with what samples tell of it without a formula (`with_work_of_samples`); they may refute it."""
-        limit = self.limits.each
-        found, chance = with_work_of_samples(found, self._pairs(self._states(found)))
-        chance = min(2 * chance, 1.0)  # the test of held-out recordings is another of the same claim
-        if chance >= limit or found.prediction is None or not found.prediction.passed:
+    def with_parts(self, found: FieldEstimate) -> FieldEstimate:
+        """f of several states, tested: parts of each may explain no more of its residuals than chance."""
+        regular = found.diffusion.regular and found.library.dimension > 1
+        if found.noise_free or found.memory is not None or not regular or found.prediction is None:
             return found
-        values = {"probability": chance, "alone": found.library.dimension == 1}
-        reason = sentence(Remark("inference.other_shape", values))
-        return replace(found, prediction=Verdict.of_probability(chance, limit, reason))
+        pairs = found.wrapped(self._pairs(self._states(found)))
+        rest = process_noise_increments(found, pairs, residuals(found, pairs))
+        rest = np.einsum("nij,nj->ni", found.diffusion.whitening_at(pairs.x0), rest)
+        known = found.library.evaluate(pairs.x0)[:, np.unique(found.support[:, 1])]
+        known = np.column_stack([np.ones(len(rest)), known]) * np.sqrt(pairs.h)[:, None]
+        known = np.linalg.qr(known / positive(np.linalg.norm(known, axis=0)))[0]
+        columns = pairs.state_parts(STATE_BINS) * np.sqrt(pairs.h)[:, None]
+        columns = columns - known @ (known.T @ columns)
+        freedom = len(rest) - known.shape[1]
+        chance = unexplained_probability(columns, rest, freedom=freedom, inflation=pairs.copies)
+        return found.with_shape_tested(chance, limit=self.limits.each, along="state")
 
     def _states(self, found: FieldEstimate) -> Recordings:
         """The states as recorded, or as a filter knows them behind a sensor."""

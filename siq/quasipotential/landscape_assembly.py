@@ -117,7 +117,10 @@ def find_landscape(
         kept.append(same[0].surveyed(found.dynamics, portrait, index) if same else None)
         if not same:
             remarks.append(Remark("quasipotential.no_refined_formula", {"place": _place(one.position)}))
-    ways = transitions(found, ways_out(found.dynamics, portrait), kept)
+    # What no certificate vouches for says nothing of barriers: paths of least action alone do.
+    test = None if certificate is None else certificate.tests.get("error")
+    told = kept if test is None or test.passed else [None] * len(kept)
+    ways = transitions(found, ways_out(found.dynamics, portrait), told)
     return _assembled(found, portrait, kept, ways, remarks, certificate=certificate, noise=noise)
 
 

@@ -10,6 +10,11 @@ A change of f by coefficients c, and one of D, change the action by
 
 along the path, on which it is least. Where the terms of f are in doubt, the mean over alternative terms moves
 the barrier (`siq.inference.selection`).
+
+What no function of the library is shows where it matters, along the path. There ``ΔU/ε`` follows from f and
+D, and without formulas from mean and spread of the steps that samples about the path make. If the formulas
+are of their libraries both are right, and the variance of their difference is that of the second less that of
+the first (Hausman, Econometrica 46 (1978) 1251).
 """
 
 from __future__ import annotations
@@ -20,13 +25,17 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+from scipy import special
+from scipy.interpolate import CubicSpline, interp1d
 from scipy.spatial import cKDTree
 
+from siq.data.recordings import SnapshotPairs
 from siq.errors import NumericalFailure
-from siq.inference.diffusion_model import defined_states
-from siq.inference.field_estimate import AnyField, dynamics_of
+from siq.inference.diffusion_model import defined_states, process_noise_increments
+from siq.inference.field_estimate import AnyField, FieldEstimate, dynamics_of
+from siq.inference.regression import residuals
 from siq.numerics.integration import Rates, dormand_prince_step, next_step
+from siq.numerics.randomness import positive
 from siq.quasipotential.characteristics import norm
 from siq.quasipotential.path_chains import LevelSet, LimitSet, MinimumActionPath, PathProblem, Tube
 from siq.quasipotential.paths import descent, transition_path
@@ -55,6 +64,13 @@ FAN_SPENT = 0.01  # of its largest momentum: below, a trajectory goes where f le
 FAN_REACH = 6.0  # in units of the distance of both ends: what is so far away does not come back
 FIRST_STEP, ARRIVAL_STEPS, SHIFT = 1e-3, 8, 1e-6  # numerical, in units of the shortest time
 PATH_TOLERANCE = 1e-5  # of the action; prefactors follow the end of the path and need more than barriers
+WAY_PARTS = 20, 10, 5  # numerical: of a path, as many as have samples enough
+FEWEST_IN_PART = 6  # samples, by which 1/χ² has a variance
+TUBE_RADIUS = 0.2  # of the length of a path, in units of the noise: samples so near are about it (a choice)
+WAY_PLACES, WAY_CHUNK = 1401, 100_000  # numerical: of a path and its extensions; samples at a time
+# How far off ΔU/ε is expected of an f of another shape: a factor e in times, or half of itself (a choice).
+MISSED_WORK, MISSED_SHARE = 1.0, 0.5
+ONE_DIRECTION = 0.01  # of the largest variance: ways of which f of its library moves only both are one
 
 
 @dataclass(frozen=True)
@@ -478,6 +494,116 @@ def _barrier_uncertainty(path: MinimumActionPath, found: AnyField) -> tuple[floa
         slope = -2 * (spent[:, None] * found.noise.push_slopes(middle, force)).sum(axis=0) / found.intensity
         variance += float(slope @ found.noise.covariance @ slope)
     return float(np.sqrt(max(variance, 0.0))), by_rivals
+
+
+def with_work_of_samples(
+    found: FieldEstimate, pairs: SnapshotPairs, paths: Sequence[MinimumActionPath]
+) -> tuple[FieldEstimate, float]:
+    """An f with what samples tell of ΔU/ε along paths of least action, without a formula of f.
+
+    That f has a shape that its library has not, and ΔU/ε is off by `MISSED_WORK` or so, is as likely as not
+    beforehand. What follows from f is moved, and less certain, as likely as samples leave it.
+
+    Parameters
+    ----------
+    found
+        Identified from `pairs`, with noise that drives every state.
+    pairs
+        Of samples of all states; of noisy ones as a filter knows them.
+    paths
+        From attractors up to saddles; those with few samples about them are passed over.
+
+    Returns
+    -------
+    found, chance
+        f, and the probability of differences as large, were it of its library: 1 without a path that is seen.
+    """
+    pairs, diffusion = found.wrapped(pairs), found.diffusion
+    library, (components, terms) = found.library, found.support.T
+    rest = process_noise_increments(found, pairs, residuals(found, pairs))
+    whitening = diffusion.whitening_at(pairs.x0)
+    noise = np.einsum("nij,nj->ni", whitening, rest)
+    intensity = float((noise**2).mean())
+    seen = [one for path in paths if (one := _work_of_samples(found, pairs, noise, intensity, path))]
+    if not seen:
+        return found, 1.0
+    levers, slopes, by_noise, heights = zip(*seen, strict=True)
+    # R of the design, the levers and the noise: its last rows are of what the design leaves of the latter.
+    design, m = len(terms), len(seen)
+    triangle = np.zeros((0, design + m + 1))
+    for begin in range(0, len(noise), WAY_CHUNK):
+        rows = slice(begin, begin + WAY_CHUNK)
+        columns = library.evaluate(pairs.x0[rows])[:, terms] * np.sqrt(pairs.h[rows])[:, None]
+        block = np.concatenate(
+            [
+                whitening[rows][:, :, components] * columns[:, None, :],
+                np.stack([lever[rows] for lever in levers], axis=2) * np.sqrt(intensity),
+                noise[rows][:, :, None] / np.sqrt(intensity),
+            ],
+            axis=2,
+        )
+        stacked = np.concatenate([triangle, block.reshape(-1, triangle.shape[1])])
+        triangle = np.asarray(np.linalg.qr(stacked, mode="r"))
+    own = triangle[design:, design:-1]
+    slope, (moved, variances) = np.stack(slopes), np.transpose(by_noise)
+    difference = own.T @ triangle[design:, -1] + moved
+    covariance = (own.T @ own + np.diag(variances)) * pairs.copies
+    wide = covariance + np.diag(np.minimum(MISSED_WORK, MISSED_SHARE * np.array(heights)) ** 2)
+    inverse, share = np.linalg.pinv(covariance, hermitian=True), covariance @ np.linalg.inv(wide)
+    square = float(difference @ inverse @ difference)
+    logarithms = np.linalg.slogdet(share)[1] + square - difference @ np.linalg.solve(wide, difference)
+    likely = special.expit(logarithms / 2)
+    # What an f of another shape does is done by those coefficients of this one that are known the least.
+    bias, spread = found.alternatives or (0 * found.coefficients, np.zeros((0, *found.coefficients.shape)))
+    change = difference - share @ difference - found.bias(slope)
+    uncertain = likely * (covariance - share @ covariance + (1 - likely) * np.outer(change, change))
+    own_slope = slope[:, terms, components]
+    reach = found.covariance @ own_slope.T
+    per_work = reach @ np.linalg.pinv(own_slope @ reach, rcond=ONE_DIRECTION, hermitian=True)
+    sizes, directions = np.linalg.eigh(uncertain)
+    changes = np.zeros((1 + m, *bias.shape))
+    changes[0, terms, components] = per_work @ (likely * change)
+    changes[1:, terms, components] = (per_work @ directions * np.sqrt(np.maximum(sizes, 0.0))).T
+    average = (bias + changes[0], np.concatenate([spread, changes[1:]]))
+    return replace(found, alternatives=average), float(special.chdtrc(m, square))
+
+
+def _work_of_samples(
+    found: FieldEstimate, pairs: SnapshotPairs, noise: np.ndarray, intensity: float, path: MinimumActionPath
+) -> tuple[np.ndarray, np.ndarray, tuple[float, float], float] | None:
+    """How ΔU/ε along a path hangs on the noise ``(n, d)`` of steps, in units of √D; None where few are seen.
+
+    The derivatives by that noise ``(n, d)`` and by the coefficients of f ``(q, d)``; what the spread of the
+    steps makes of it by itself, with its variance; and ΔU/ε, as f has it.
+    """
+    diffusion, root_h = found.diffusion, np.sqrt(pairs.h)
+    middle, force, spent = _pieces(path, found.dynamics)
+    work = 2 * spent * (force * diffusion.push(middle, force)).sum(axis=1) / intensity
+    force = -2 * force * spent[:, None] / intensity
+    metric = np.linalg.cholesky(diffusion.precision_at(middle).mean(axis=0))
+    line = path.points @ metric
+    arc = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1)))
+    places = np.linspace(-TUBE_RADIUS, 1 + TUBE_RADIUS, WAY_PLACES)
+    tube = interp1d(arc / arc[-1], line, axis=0, fill_value="extrapolate")(places)
+    _, nearest = cKDTree(tube).query(pairs.x0 @ metric, distance_upper_bound=TUBE_RADIUS * arc[-1])
+    along = np.append(places, np.inf)[nearest]
+    for parts in WAY_PARTS:
+        part = np.floor(np.clip(along * parts, -1, parts)).astype(int)
+        (seen,) = np.nonzero((part >= 0) & (part < parts))
+        part, count = part[seen], np.bincount(part[seen], minlength=parts)
+        if (count < FEWEST_IN_PART).any():
+            continue
+        of_part, lever = np.zeros((parts, 1 + noise.shape[1])), np.zeros_like(noise)
+        pieces = np.floor((arc[1:] + arc[:-1]) / (2 * arc[-1]) * parts).astype(int)
+        np.add.at(of_part, pieces, np.column_stack([work, force]))
+        pull = np.einsum("nij,ni->nj", diffusion.root_at(pairs.x0[seen]), of_part[part, 1:])
+        lever[seen] = pull * (root_h[seen] / np.bincount(part, pairs.h[seen])[part])[:, None]
+        sizes = (pull * noise[seen]).sum(axis=1) ** 2 / (intensity * positive((pull**2).sum(axis=1)))
+        # 1/χ² of n values has the mean 1/(n - 2), and of that the variance 2/(n - 4).
+        moved = float(of_part[:, 0] @ ((count - 2) / positive(np.bincount(part, sizes)) - 1))
+        variance = float(2 * of_part[:, 0] ** 2 @ (1 / (count - 4)))
+        return lever, found.library.evaluate(middle).T @ force, (moved, variance), float(work.sum())
+    return None
 
 
 def _noise_leverage(path: MinimumActionPath, dynamics: Dynamics) -> float:

@@ -31,7 +31,7 @@ from siq.data.states import RecordStates
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate
 from siq.inference.identify import identify
-from siq.inference.kalman_identification import of_all_states
+from siq.inference.kalman_identification import filtered_recordings, of_all_states
 from siq.inference.library import candidate_library
 from siq.networks.decomposition import AnyNetworks, NetworksByWell
 from siq.networks.regression import points_below, sparse_decomposition
@@ -45,6 +45,7 @@ from siq.quasipotential.occupancy import OccupancyCheck, VisitTest
 from siq.quasipotential.output_weights import formulas_by_well
 from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.refinement import Refinement, RefinementContext
+from siq.quasipotential.transitions import ways_out, with_work_of_samples
 from siq.quasipotential.wells import Well
 from siq.remarks import Remark, sentence
 from siq.systems.cards import load_system
@@ -131,6 +132,7 @@ def identify_run(
             units=[unit or settings.space.unit(name) or None for name, unit in named],
             pair_step=settings.sampling.pair_step, integrator_step=settings.sampling.integrator_step,
         )  # fmt: skip
+        found = _with_work(settings, found, recordings, number=number)
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         details = {"claim": error.claim} if isinstance(error, NumericalFailure) and error.claim else {}
         return StepResult(None, Outcome(number, Step.IDENTIFY, Status.FAILED, str(error), details))
@@ -142,6 +144,28 @@ def identify_run(
         status, first = Status.WARNING, found.prediction.reason
     reasons = "; ".join(one for one in (first, *remarks) if one)
     return StepResult(found, Outcome(number, Step.IDENTIFY, status, reasons))
+
+
+def _with_work(
+    settings: PipelineSettings, found: FieldEstimate, recordings: Recordings, *, number: int
+) -> FieldEstimate:
+    """f with what samples about its paths of least action tell without a formula; they may refute it."""
+    if found.noise_free or found.memory is not None or found.hidden_states or found.library.angles:
+        return found
+    if not found.diffusion.regular:
+        return found
+    pair_step = settings.sampling.pair_step
+    if found.sensor_variance is not None:
+        recordings = filtered_recordings(found, recordings, pair_step=pair_step)
+    pairs = found.wrapped(snapshot_pairs(recordings, pair_step=pair_step))
+    points = pairs.x0[evenly_spread(pairs.x0, generator=generator(settings.seed, number, Purpose.LANDSCAPE))]
+    try:
+        portrait = phase_portrait(found.dynamics, points, seed=number)
+        paths = [way.path for way in ways_out(found.dynamics, portrait) if way.path is not None]
+        found, chance = with_work_of_samples(found, pairs, paths)
+    except (NumericalFailure, np.linalg.LinAlgError):
+        return found  # the landscape will say what is amiss
+    return found.with_shape_tested(chance, limit=settings.certificate.each, along="way")
 
 
 def regress_run(

@@ -1,8 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import sympy
@@ -17,11 +14,8 @@ from known_systems import (
 )
 from scipy.linalg import expm
 
-from siq.data.recordings import Recordings, snapshot_pairs
-from siq.inference.checks import predict, prediction_errors, with_work_of_samples
-from siq.inference.field_estimate import FieldEstimate
-from siq.inference.identify import identify
-from siq.inference.library import IdentificationOptions
+from siq.data.recordings import Recordings
+from siq.inference.checks import predict, prediction_errors
 from siq.systems.dynamics import Dynamics
 from siq.systems.simulation import SimulationOptions, simulate_snapshots
 
@@ -144,80 +138,3 @@ def test_an_f_too_fast_for_the_samples_is_given_up() -> None:
     recordings = simulated(linear_system(2), trajectories=3)
     fast = Dynamics.of((x, y), (-1e9 * x, -1e9 * y))
     assert np.isinf(prediction_errors(fast, recordings)).all()
-
-
-def hopping(
-    force: Callable[[np.ndarray], np.ndarray], *, seed: int, samples: int = 7500, states: int = 1
-) -> Recordings:
-    """Eight recordings of states pushed by a force ``(8, d)`` and by noise of intensity 0.4, begun at ±1."""
-    draw, step, within = np.random.default_rng(seed), 0.02, 5
-    state = np.zeros((8, states))
-    state[:, 0] = np.sign(draw.standard_normal(8))
-    path = np.empty((samples, 8, states))
-    for sample in range(samples):
-        for _ in range(within):
-            kick = np.sqrt(0.4 * step / within) * draw.standard_normal(state.shape)
-            state = state + step / within * force(state) + kick
-        path[sample] = state
-    times = [step * np.arange(samples)] * 8
-    return Recordings.from_arrays(times, list(path.transpose(1, 0, 2)), names=["x", "y"][:states])
-
-
-def identified(recordings: Recordings, degree: int = 5) -> FieldEstimate:
-    options = IdentificationOptions(degree=degree)
-    return identify(recordings, options=options, draw=lambda purpose: np.random.default_rng(0))
-
-
-def heights(found: FieldEstimate) -> list[tuple[float, float]]:
-    """ΔU/ε from either well to the top between them, moved by what else f may be, and its standard error."""
-    grid = np.linspace(-1.5, 1.5, 3002)[:, None]
-    force, found_heights = found.dynamics.drift(grid)[:, 0], []
-    left, top, right = grid[1:][force[1:] * force[:-1] < 0, 0]
-    for well in (left, right):
-        x, rate = np.linspace(well, top, 1001)[:, None], found.noise_rate[0, 0]
-        slope = -2 * np.trapezoid(found.library.evaluate(x), x[:, 0], axis=0)[:, None] / rate
-        own = -2 * np.trapezoid(found.dynamics.drift(x)[:, 0], x[:, 0]) / rate
-        error = np.sqrt(found.variance(slope, of_mean=True))
-        found_heights.append((float(own + found.bias(slope)), float(error)))
-    return found_heights
-
-
-def test_samples_between_wells_mend_the_work_of_an_f_that_is_no_polynomial() -> None:
-    """Two springs that meet about x = 0, where U has an edge."""
-    recordings = hopping(lambda x: np.tanh(6 * x) - x, seed=1)
-    true = 2 / 0.4 * (np.log(np.cosh(6.0)) / 6 - 0.5)
-    found = identified(recordings)
-    assert found.prediction is not None and not found.prediction.passed
-    assert "has a shape that no function" in found.prediction.reason
-    for (height, error), (plain, _) in zip(
-        heights(found), heights(replace(found, alternatives=None)), strict=True
-    ):
-        assert abs(height - true) < 2.5 * error < 0.7
-        assert plain < true - 0.7
-
-
-def test_samples_between_wells_agree_with_an_f_of_the_library() -> None:
-    chances, scores = [], []
-    for seed in range(6):
-        recordings = hopping(lambda x: x - x**3, seed=seed, samples=2500)
-        found = identified(recordings, degree=3)
-        chances.append(with_work_of_samples(found, snapshot_pairs(recordings))[1])
-        scores += [(height - 0.5 / 0.4) / error for height, error in heights(found)]
-    assert min(chances) > 1e-3
-    assert 0.2 < np.median(chances) < 0.9
-    assert np.sqrt(np.mean(np.square(scores))) < 1.5
-
-
-@pytest.mark.parametrize("force", [lambda x: np.tanh(6 * x) - x, lambda x: x - x**3], ids=["edge", "cubic"])
-def test_a_function_of_a_state_that_f_lacks_shows_among_several_states(
-    force: Callable[[np.ndarray], np.ndarray],
-) -> None:
-    def both(state: np.ndarray) -> np.ndarray:
-        x, y = state.T
-        return np.column_stack([force(x) + 0.5 * y, -0.5 * force(x) - y])
-
-    found = identified(hopping(both, seed=3, samples=2000, states=2), degree=3)
-    assert found.prediction is not None
-    right = force(np.array(2.0)) == -6.0
-    assert found.prediction.passed == right
-    assert ("as a function of a state" in found.prediction.reason) == (not right)
