@@ -68,8 +68,9 @@ WAY_PARTS = 20, 10, 5  # numerical: of a path, as many as have samples enough
 FEWEST_IN_PART = 6  # samples, by which 1/χ² has a variance
 TUBE_RADIUS = 0.2  # of the length of a path, in units of the noise: samples so near are about it (a choice)
 WAY_PLACES, WAY_CHUNK = 1401, 100_000  # numerical: of a path and its extensions; samples at a time
-# How far off ΔU/ε is expected of an f of another shape: a factor e in times, or half of itself (a choice).
-MISSED_WORK, MISSED_SHARE = 1.0, 0.5
+# How far off ΔU/ε is expected of an f of another shape: half, one or two factors e in times, or half of itself
+# where that is less (a choice).
+MISSED_SCALES, MISSED_WORK, MISSED_SHARE = (0.5, 1.0, 2.0), 1.0, 0.5
 ONE_DIRECTION = 0.01  # of the largest variance: ways of which f of its library moves only both are one
 
 
@@ -501,8 +502,8 @@ def with_work_of_samples(
 ) -> tuple[FieldEstimate, float]:
     """An f with what samples tell of ΔU/ε along paths of least action, without a formula of f.
 
-    That f has a shape that its library has not, and ΔU/ε is off by `MISSED_WORK` or so, is as likely as not
-    beforehand. What follows from f is moved, and less certain, as likely as samples leave it.
+    That f has a shape that its library has not, and ΔU/ε is off by one of `MISSED_SCALES`, is as likely as
+    not beforehand. What follows from f is moved, and less certain, as likely as samples leave it.
 
     Parameters
     ----------
@@ -548,24 +549,27 @@ def with_work_of_samples(
     slope, (moved, variances) = np.stack(slopes), np.transpose(by_noise)
     difference = own.T @ triangle[design:, -1] + moved
     covariance = (own.T @ own + np.diag(variances)) * pairs.copies
-    wide = covariance + np.diag(np.minimum(MISSED_WORK, MISSED_SHARE * np.array(heights)) ** 2)
-    inverse, share = np.linalg.pinv(covariance, hermitian=True), covariance @ np.linalg.inv(wide)
-    square = float(difference @ inverse @ difference)
-    logarithms = np.linalg.slogdet(share)[1] + square - difference @ np.linalg.solve(wide, difference)
-    likely = special.expit(logarithms / 2)
+    scales = np.outer((0.0, *MISSED_SCALES), np.minimum(MISSED_WORK, MISSED_SHARE * np.array(heights)))
+    wide = covariance + np.einsum("ki,ij->kij", scales**2, np.eye(m))
+    shares = covariance @ np.linalg.inv(wide)
+    squares = np.einsum("i,kij,j->k", difference, np.linalg.inv(wide), difference)
+    prior = np.append(1.0, np.full(len(MISSED_SCALES), 1 / len(MISSED_SCALES)))
+    odds = special.softmax(np.log(prior) - (squares + np.linalg.slogdet(wide)[1]) / 2)
     # What an f of another shape does is done by those coefficients of this one that are known the least.
     bias, spread = found.alternatives or (0 * found.coefficients, np.zeros((0, *found.coefficients.shape)))
-    change = difference - share @ difference - found.bias(slope)
-    uncertain = likely * (covariance - share @ covariance + (1 - likely) * np.outer(change, change))
+    moves = difference - shares @ difference - (scales > 0) * found.bias(slope)
+    change = odds @ moves
+    uncertain = np.einsum("k,kij->ij", odds, covariance - shares @ covariance)
+    uncertain += (moves.T * odds) @ moves - np.outer(change, change)
     own_slope = slope[:, terms, components]
     reach = found.covariance @ own_slope.T
     per_work = reach @ np.linalg.pinv(own_slope @ reach, rcond=ONE_DIRECTION, hermitian=True)
     sizes, directions = np.linalg.eigh(uncertain)
     changes = np.zeros((1 + m, *bias.shape))
-    changes[0, terms, components] = per_work @ (likely * change)
+    changes[0, terms, components] = per_work @ change
     changes[1:, terms, components] = (per_work @ directions * np.sqrt(np.maximum(sizes, 0.0))).T
     average = (bias + changes[0], np.concatenate([spread, changes[1:]]))
-    return replace(found, alternatives=average), float(special.chdtrc(m, square))
+    return replace(found, alternatives=average), float(special.chdtrc(m, squares[0]))
 
 
 def _work_of_samples(
