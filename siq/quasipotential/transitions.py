@@ -68,7 +68,7 @@ WAY_PARTS = 20, 10, 5  # numerical: of a path, as many as have samples enough
 FEWEST_IN_PART = 6  # samples, by which 1/χ² has a variance
 TUBE_RADIUS = 0.2  # of the length of a path, in units of the noise: samples so near are about it (a choice)
 WAY_PLACES, WAY_CHUNK = 1401, 100_000  # numerical: of a path and its extensions; samples at a time
-# How far off ΔU/ε is expected of an f of another shape: half, one or two factors e in times, or half of itself
+# How far off ΔU/ε is expected of an f of another shape: half, one or two factors e in times, or half of it
 # where that is less (a choice).
 MISSED_SCALES, MISSED_WORK, MISSED_SHARE = (0.5, 1.0, 2.0), 1.0, 0.5
 ONE_DIRECTION = 0.01  # of the largest variance: ways of which f of its library moves only both are one
