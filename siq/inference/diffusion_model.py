@@ -51,6 +51,7 @@ MAX_STEPS, MAX_HALVINGS = 60, 30  # numerical: of Fisher's scoring, each step ha
 SCORING_TOLERANCE = 1e-9  # numerical: gain of the log-likelihood, per residual, with which scoring ends
 MAX_RELAXATION = 0.5  # of Jh/2: beyond that a residual hardly knows where its step began
 MAX_STEP_RELAXATION = 2.0  # of the rates of J times h: the same of the mean over pairs
+MOST_UNKNOWN = 0.02  # of the pairs: so few without a covariance of the noise change no mean over all
 AVERAGED_PAIRS = 500  # the mean of a smooth function of the state, to a few per cent of a small term
 SERIES_TERMS = 24  # of the exponential series, which then is exact to ten digits
 
@@ -352,15 +353,17 @@ def process_noise_increments(found: FieldEstimate, pairs: SnapshotPairs, rest: n
         rate = np.broadcast_to(found.noise_rate_at(pairs.x0), (len(rest), *found.noise_rate.shape))
         given = np.ascontiguousarray(pairs.x0.T), pairs.h, rate
         spread = found.flow.moments(found.dynamics.drift_of_components, *given)[1]
-        lost = ~np.isfinite(spread).all(axis=(1, 2))
-        spread[lost] = rate[lost] * pairs.h[lost, None, None]
-        try:
-            root = np.linalg.cholesky(rate) @ np.linalg.inv(np.linalg.cholesky(spread))
-        except np.linalg.LinAlgError:
+        # Of a few states f leads far away within a step, or D is none, as where formulas of both end.
+        known = np.isfinite(spread).all(axis=(1, 2))
+        for matrices in (rate, spread):
+            known[known] = np.linalg.eigvalsh(matrices[known])[:, 0] > 0
+        if known.mean() < 1 - MOST_UNKNOWN:
             raise NumericalFailure(
                 "samples are so far apart that what the noise did between two of them cannot be worked out;"
                 " sample more often"
-            ) from None
+            )
+        root = np.eye(rest.shape[1]) / np.sqrt(pairs.h)[:, None, None]
+        root[known] = np.linalg.cholesky(rate[known]) @ np.linalg.inv(np.linalg.cholesky(spread[known]))
         return np.asarray(np.einsum("nij,nj->ni", root, rest))
     step = found.dynamics.jacobian(pairs.x0) * (found.flow.response_share * pairs.h)[:, None, None]
     if not (np.abs(step) <= MAX_RELAXATION).all():
