@@ -67,7 +67,7 @@ SMALLEST_CORE = 0.2  # of a core's radius: of steps as long as the core no such 
 # Of the recorded box on each side, beyond which the operator lets nothing go. None where a formula of D(x),
 # continued beyond what was recorded, is no longer positive.
 MARGINS = (0.15, 0.0)
-DRAWS = {1: 24, 2: 8}  # of f, by the number of states: an error is then known to a sixth, or a quarter
+DRAWS = {1: 24, 2: 24}  # of f, by the number of states: an error is then known to a seventh
 MOST_PLACES = 400  # cells of a sheared grid all have places of their own, and are put together
 
 NO_HOP_PROBABILITY = 0.01  # below it, no hop at all contradicts the prediction
