@@ -202,12 +202,7 @@ def has_structure(current: Fit, data: Measurements) -> bool:
 
 
 def explained_by_quantisation(
-    data: Measurements,
-    strict: Fit,
-    roles: Roles,
-    *,
-    least: float = STRUCTURED,
-    budget: Budget | None = None,
+    data: Measurements, strict: Fit, roles: Roles, *, least: float = STRUCTURED, budget: Budget | None = None
 ) -> tuple[Fit, Remainder, tuple[str, ...]] | None:
     """The fit to the values that were rounded, if it leaves noise; None where it does not, or nothing rounds.
 
