@@ -138,10 +138,7 @@ class CheckedStudy:
             raise InputError(self.source(), "", "it is of the future, as where a clock was set back", remedy)
         space = self.settings.space
         found, _ = read_pairs(
-            self.source(),
-            states=space.names,
-            units=space.units,
-            pair_step=recordings.pair_step,
+            self.source(), states=space.names, units=space.units, pair_step=recordings.pair_step
         )
         for name in found.names:
             try:

@@ -21,7 +21,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage, signal, sparse, special
+from scipy import ndimage, sparse, special
 from scipy.spatial import cKDTree
 
 from siq.data.correlation import resolution_step
@@ -107,9 +107,11 @@ def _wells_apart(values: np.ndarray, runs: list[slice]) -> np.ndarray:
 
     A state that is rare, and visited often, has neighbours enough in a bin, and not in all of the record.
     """
+    from scipy.signal import find_peaks  # which brings all of scipy.stats, half a second to import
+
     counts, edges = np.histogram(values, PROFILE_BINS, np.quantile(values, [OUTSIDE, 1 - OUTSIDE]).tolist())
     padded = np.concatenate([[0], counts, [0]]) + 0.5
-    peaks, shape = signal.find_peaks(np.log(padded), prominence=0.0)
+    peaks, shape = find_peaks(np.log(padded), prominence=0.0)
     valleys = np.maximum(padded[shape["left_bases"]], padded[shape["right_bases"]])
     # With errors as if all samples were independent: what these do not tell, nothing does.
     peaks = peaks[shape["prominences"] > FALSE_WELL * np.sqrt(1 / padded[peaks] + 1 / valleys)]

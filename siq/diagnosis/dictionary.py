@@ -239,10 +239,8 @@ class Mechanism(_Part):
     reference: str = ""
 
 
-class _Dictionary(BaseModel):
+class _Dictionary(_Part):
     """The schema of a file of mechanisms."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     mechanisms: tuple[Mechanism, ...]
 

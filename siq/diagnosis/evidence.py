@@ -42,26 +42,15 @@ NUMERICAL_ERRORS = (ArithmeticError, ValueError, np.linalg.LinAlgError)
 
 @dataclass(frozen=True)
 class FittedCandidate:
-    """A candidate with its fit, and how that compares with the simulation without it.
+    """A candidate with its fit, and how that compares with the simulation without it."""
 
-    Attributes
-    ----------
-    candidate, fit
-        What was added, and the fit of the simulation with it.
-    delta_chi2
-        Twice the increase of the log-likelihood.
-    delta_bic
-        Change of the Bayesian information criterion; negative where it is worth its parameters.
-    p_white, p_cluster
-        Probabilities of as much by chance.
-    """
-
-    candidate: MechanismCandidate
-    fit: Fit
-    delta_chi2: float
+    candidate: MechanismCandidate  #: what was added
+    fit: Fit  #: of the simulation with it
+    delta_chi2: float  #: twice the increase of the log-likelihood
+    #: Change of the Bayesian information criterion; negative where it is worth its parameters.
     delta_bic: float
-    p_white: float
-    p_cluster: float
+    p_white: float  #: probability of as much by chance, errors being independent
+    p_cluster: float  #: the same where those of a recording belong together
 
     @classmethod
     def of(

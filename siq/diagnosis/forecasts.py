@@ -140,18 +140,14 @@ class _Foreseen:
         damped = whole / np.outer(scale, scale) + RIDGE * np.eye(len(scale))
         return np.asarray(np.sign(np.linalg.solve(damped, right / scale))[self.own.shape[1] :])
 
-    def log_density(self, columns: np.ndarray, precision: np.ndarray | None = None) -> np.ndarray:
-        """Log-densities of the parts, up to a constant, each foreseen from the others, shape ``(folds,)``.
-
-        With columns ``(n, k)``, whose coefficients have the prior precision ``(k, k)`` in units of the
-        noise.
-        """
-        return self.log_density_of(self.sums(columns), precision)
-
-    def log_density_of(
+    def log_density(
         self, sums: tuple[np.ndarray, np.ndarray], precision: np.ndarray | None = None
     ) -> np.ndarray:
-        """The same by the normal equations of columns, see `sums`."""
+        """Log-densities of the parts, up to a constant, each foreseen from the others, shape ``(folds,)``.
+
+        With columns by their normal equations (`sums`), whose coefficients have the prior precision
+        ``(k, k)`` in units of the noise.
+        """
         (squares, _, _, count), (whole, right), p = self._base, sums, self.own.shape[1]
         k = whole.shape[1] - p
         scale = positive(np.sqrt(np.einsum("fii->i", whole)))
@@ -171,22 +167,12 @@ class _Foreseen:
 
 @dataclass(frozen=True)
 class Horizon:
-    """A fit to recordings of which every so-manieth sample is known, and how well it foresees parts of them.
+    """A fit to recordings of which every so-manieth sample is known, and how well it foresees their parts."""
 
-    Attributes
-    ----------
-    data, fit
-        The recordings, and the fit to all of them.
-    log_density
-        Of what was left out in turn, as a logarithm.
-    correlated
-        Correlation time of the errors, in samples: of so many one counts.
-    """
-
-    data: Measurements
-    fit: Fit
-    log_density: float
-    correlated: float
+    data: Measurements  #: the recordings
+    fit: Fit  #: to all of them
+    log_density: float  #: of what was left out in turn, as a logarithm
+    correlated: float  #: correlation time of the errors, in samples: of so many one counts
 
     @classmethod
     def of(cls, fit: Fit, data: Measurements) -> Horizon:
@@ -201,8 +187,8 @@ class Horizon:
             white.recording.reshape(-1, outputs)[shown].ravel(),
             outputs=outputs,
         )
-        density = foreseen.log_density(np.zeros((len(left), 0))).sum() - 0.5 * white.log_determinant
-        return cls(data, fit, float(density), correlated)
+        density = float(foreseen.log_density(foreseen.sums(np.zeros((len(left), 0)))).sum())
+        return cls(data, fit, density - 0.5 * white.log_determinant, correlated)
 
 
 def _horizons_of(fit: Fit, context: FitContext) -> list[Horizon]:
@@ -372,7 +358,8 @@ def _gained(
                 continue
             further = white.columns[:, len(fit.model.free) :]
             constant = -0.5 * white.log_determinant
-            nothing = max(nothing, float(problem.log_density(white.columns[:, known]).sum()) + constant)
+            without = problem.log_density(problem.sums(white.columns[:, known])).sum()
+            nothing = max(nothing, float(without) + constant)
             for place, (term, group) in enumerate(zip(some, groups, strict=True), start=at):
                 columns = further[:, group]
                 if not np.isfinite(columns).all():
@@ -473,7 +460,7 @@ def _density(problem: _Foreseen, term: Probe | Place, columns: np.ndarray) -> fl
             if not columns.shape[1]:
                 return -np.inf
             sums = problem.sums(columns)
-        return float(problem.log_density_of(sums).sum())
+        return float(problem.log_density(sums).sum())
     values = []
     sizes = sizes_of_effects(float(problem.target @ problem.target))
     gram = sums[0].sum(axis=0)[problem.own.shape[1] :, problem.own.shape[1] :]
@@ -481,7 +468,7 @@ def _density(problem: _Foreseen, term: Probe | Place, columns: np.ndarray) -> fl
         prior = smooth_prior(term.knots, length)
         told, inverse = float((prior * gram).sum()), np.linalg.inv(prior)
         values += [
-            problem.log_density_of(sums, inverse * (told / size)).sum()
+            problem.log_density(sums, inverse * (told / size)).sum()
             for size in sizes[:: max(len(sizes) // 4, 1)]
         ]
     return float(logsumexp(values) - np.log(len(values)))
@@ -489,24 +476,13 @@ def _density(problem: _Foreseen, term: Probe | Place, columns: np.ndarray) -> fl
 
 @dataclass(frozen=True)
 class _Rung:
-    """A mechanism with the family that it belongs to, on top of those before it.
+    """A mechanism with the family that it belongs to, on top of those before it."""
 
-    Attributes
-    ----------
-    accepted
-        The likeliest member, with those that are not ruled out, as a search has them.
-    horizons
-        The fits with it.
-    log_odds
-        Of its family, against all other explanations together.
-    flat_log_odds
-        The same, if all mechanisms are as likely beforehand, with a name or without.
-    """
-
+    #: The likeliest member, with those that are not ruled out, as a search has them.
     accepted: AcceptedMechanism
-    horizons: tuple[Horizon, ...]
-    log_odds: float
-    flat_log_odds: float
+    horizons: tuple[Horizon, ...]  #: the fits with it
+    log_odds: float  #: of its family, against all other explanations together
+    flat_log_odds: float  #: the same, if all mechanisms are as likely beforehand, with a name or without
 
 
 @dataclass(frozen=True, eq=False)

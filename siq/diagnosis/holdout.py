@@ -58,39 +58,24 @@ def simulated(fit: Fit, data: Measurements, *, noise: Noise, substeps: int) -> n
 
 @dataclass(frozen=True)
 class HeldOutErrors:
-    """Normalised errors on held-out recordings; None where a simulation ran away.
+    """Normalised errors on held-out recordings; None where a simulation ran away."""
 
-    Attributes
-    ----------
-    before, recalibrated, augmented
-        Of the simulation as it is, with its parameters refitted, and with what was found.
-    noise_floor
-        What measurement noise alone amounts to.
-    values
-        Number of measured values that the errors are means over; 0 where it is not known.
-    named
-        With what has a name only, where something without a name describes the rest.
-    squares
-        Mean squared errors of blocks of samples, by simulation: what changes are told by.
-    rungs
-        With the first mechanism that is named, with the first two, and so on.
-    floor
-        The same with the error of the model that described the rest (`siq.diagnosis.investigation`).
-    spread, unit
-        Of a single output: what errors of 1 amount to; None where there are several, or it has no unit.
-    """
-
-    before: float | None = None
-    recalibrated: float | None = None
-    augmented: float | None = None
-    noise_floor: float | None = None
-    values: int = 0
+    before: float | None = None  #: of the simulation as it is, ...
+    recalibrated: float | None = None  #: ... with its parameters refitted, ...
+    augmented: float | None = None  #: ... and with what was found
+    noise_floor: float | None = None  #: what measurement noise alone amounts to
+    values: int = 0  #: number of measured values that the errors are means over; 0 where it is not known
+    #: With what has a name only, where something without a name describes the rest.
     named: float | None = None
+    #: Mean squared errors of blocks of samples, by simulation: what changes are told by.
     squares: Mapping[str, tuple[float, ...]] = field(default_factory=dict, repr=False)
+    #: With the first mechanism that is named, with the first two, and so on.
     rungs: tuple[float | None, ...] = ()
+    #: As `noise_floor`, with the error of the model that described the rest (`siq.diagnosis.investigation`).
     floor: float | None = None
+    #: Of a single output: what errors of 1 amount to; None of several, or without a unit.
     spread: float | None = None
-    unit: str = "1"
+    unit: str = "1"  #: of a single output
 
     @classmethod
     def of(

@@ -174,34 +174,20 @@ def _shift_probability(model: Dynamics, recalibrated: Fit) -> float:
 
 @dataclass(frozen=True)
 class HeldOutRuns:
-    """Free runs of held-out recordings by the three simulations, and how far each is off.
+    """Free runs of held-out recordings by the three simulations, and how far each is off."""
 
-    Attributes
-    ----------
-    before, recalibrated, augmented
-        Outputs ``(n, m)`` of the simulation as it is, with its parameters refitted, and with what was found.
-    recalibration
-        Of the recalibrated simulation: where no refit foresees parts left out better, that of the card.
-    fit
-        Of the augmented simulation that was run.
-    errors
-        Of the three.
-    independent
-        Whether the recordings are others than those that were learned from, rather than a later part.
-    described
-        The model of what has no name that is part of the new card, since it makes predictions better.
-    together
-        Whether shifted parameters that predict no better leave only noise when all recordings are fitted.
-    """
-
-    before: np.ndarray
-    recalibrated: np.ndarray
-    augmented: np.ndarray
+    before: np.ndarray  #: outputs ``(n, m)`` of the simulation as it is, ...
+    recalibrated: np.ndarray  #: ... with its parameters refitted, ...
+    augmented: np.ndarray  #: ... and with what was found
+    #: Of the recalibrated simulation: where no refit foresees parts left out better, that of the card.
     recalibration: Fit
-    fit: Fit
-    errors: HeldOutErrors
+    fit: Fit  #: of the augmented simulation that was run
+    errors: HeldOutErrors  #: of the three
+    #: Whether the recordings are others than those that were learned from, rather than a later part.
     independent: bool = True
+    #: The model of what has no name that is part of the new card, since it makes predictions better.
     described: AugmentedModel | None = None
+    #: Whether shifted parameters that predict no better leave only noise when all recordings are fitted.
     together: bool = False
 
 

@@ -137,60 +137,31 @@ def fresh_names(stem: str, count: int, used: Collection[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class MechanismCandidate:
-    """One way in which a mechanism may be at work in a system, or a function without a name.
+    """One way in which a mechanism may be at work in a system, or a function without a name."""
 
-    Attributes
-    ----------
-    name, label, variant, family, weight
-        Of the mechanism; the same, told apart from its other forms and places; of its form; of its kind; and
-        how likely it is beforehand.
-    model
-        The simulation with it built in; amplitudes are zero, shapes not yet set.
-    amplitudes, shapes, searches
-        Names of the new parameters, those that it depends on linearly and the others, with how
-        these are looked for.
-    positive
-        Those that must not be negative.
-    scales, begins
-        For each further state a formula of its size, and one of where it begins.
-    equations, coordinate
-        States in whose equations something changes; and along which coordinate, in words of the system.
-    changes
-        What is added to equations, by state; where something is replaced, the new equation or output; and
-        the equations of further states.
-    generalises
-        Mechanisms that are special cases of it.
-    turning
-        Whether it shows only where the velocity that is its coordinate takes both signs.
-    kind
-        ``mechanism``, one of the dictionary; ``formula``, ``curve`` or ``surface``.
-    log_cost
-        Logarithm of the number of places, or mechanisms, that it was chosen among.
-    place, smooth
-        Where a function stands, and what a curve or a surface is made of: the amplitudes are the heights of
-        its bumps.
-    """
-
-    name: str
-    label: str
-    model: Dynamics
-    amplitudes: tuple[str, ...]
-    equations: tuple[str, ...]
-    coordinate: str
+    name: str  #: of the mechanism
+    label: str  #: the same, told apart from its other forms and places
+    model: Dynamics  #: the simulation with it built in; amplitudes are zero, shapes not yet set
+    amplitudes: tuple[str, ...]  #: names of the new parameters that it depends on linearly
+    equations: tuple[str, ...]  #: states in whose equations something changes
+    coordinate: str  #: along which it acts, in words of the system
+    #: What is added to equations, by state; where something is replaced, the new equation or output; and
+    #: the equations of further states.
     changes: tuple[tuple[str, sympy.Expr], ...] = ()
-    shapes: tuple[str, ...] = ()
-    positive: frozenset[str] = frozenset()
-    searches: tuple[Shape, ...] = ()
-    scales: tuple[sympy.Expr, ...] = ()
-    begins: tuple[sympy.Expr, ...] = ()
-    generalises: tuple[str, ...] = ()
-    variant: str = ""
-    family: str = ""
-    weight: float = 1.0
-    turning: bool = False
-    kind: Kind = MECHANISM
-    log_cost: float = 0.0
-    place: Place | None = None
+    shapes: tuple[str, ...] = ()  #: names of the other new parameters
+    positive: frozenset[str] = frozenset()  #: parameters that must not be negative
+    searches: tuple[Shape, ...] = ()  #: how its shapes are looked for
+    scales: tuple[sympy.Expr, ...] = ()  #: for each further state a formula of its size, ...
+    begins: tuple[sympy.Expr, ...] = ()  #: ... and one of where it begins
+    generalises: tuple[str, ...] = ()  #: mechanisms that are special cases of it
+    variant: str = ""  #: of its form
+    family: str = ""  #: of its kind
+    weight: float = 1.0  #: how likely it is beforehand
+    turning: bool = False  #: whether it shows only where the velocity that is its coordinate takes both signs
+    kind: Kind = MECHANISM  #: ``mechanism``, one of the dictionary; ``formula``, ``curve`` or ``surface``
+    log_cost: float = 0.0  #: logarithm of the number of places, or mechanisms, that it was chosen among
+    place: Place | None = None  #: where a function stands
+    #: What a curve or a surface is made of: the amplitudes are the heights of its bumps.
     smooth: SmoothFunction | None = None
 
     @property

@@ -127,56 +127,31 @@ def _log_odds_of_a_name(fit: Fit, candidates: Sequence[MechanismCandidate], cont
 
 @dataclass(frozen=True)
 class Investigation:
-    """What was found out about a simulation and recordings of the system, with all fits that it rests on.
+    """What was found out about a simulation and recordings of the system, with all fits that it rests on."""
 
-    Attributes
-    ----------
-    context
-        The simulation, the recordings, and the mechanisms that were considered.
-    search
-        Recalibration, mechanisms that are named, or that describe what has no name, and the final fit.
-    remainder
-        What the recalibrated simulation and the final fit leave, and the share of the excess that is
-        explained.
-    verdict
-        One of four.
-    least_squares
-        The recalibration whose trajectories follow the equations exactly.
-    p_shift
-        p-value of the test that the parameters of the card are the true ones.
-    log_odds
-        For each mechanism, that it is this rather than a function without a name, as a logarithm.
-    too_faint
-        Whether what was found explains enough, and is not named since a function is nearly as likely.
-    remarks
-        Reservations.
-    models
-        Of what has no name, be it all that is missing or what names leave, the likeliest first.
-    exact
-        The final fit whose trajectories follow the equations, where process noise stands in for a remainder.
-    account
-        The work that it took, and whether something was left undone.
-    withdrawn
-        Whether a name was given, and mislead on recordings held out (`siq.diagnosis.diagnosis`).
-    recalibrations, finals
-        The simulation alone, and with what is named, fitted at each horizon (`siq.diagnosis.forecasts`).
-    """
-
-    context: FitContext
+    context: FitContext  #: the simulation, the recordings, and the mechanisms that were considered
+    #: Recalibration, mechanisms that are named, or that describe what has no name, and the final fit.
     search: Search
+    #: What the recalibrated simulation and the final fit leave, and the share of the excess explained.
     remainder: Remainder
-    verdict: MismatchVerdict
-    least_squares: Fit
-    p_shift: float = float("nan")
+    verdict: MismatchVerdict  #: one of four
+    least_squares: Fit  #: the recalibration whose trajectories follow the equations exactly
+    p_shift: float = float("nan")  #: p-value of the test that the parameters of the card are the true ones
+    #: For each mechanism, that it is this rather than a function without a name, as a logarithm.
     log_odds: tuple[float, ...] = ()
+    #: Whether what was found explains enough, and is not named since a function is nearly as likely.
     too_faint: bool = False
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[Remark, ...] = ()  #: reservations
+    #: Of what has no name, be it all that is missing or what names leave, the likeliest first.
     models: tuple[AugmentedModel, ...] = ()
+    #: The final fit whose trajectories follow the equations, where process noise stands in for a remainder.
     exact: Fit | None = None
-    account: Account = UNLIMITED
+    account: Account = UNLIMITED  #: the work that it took, and whether something was left undone
+    #: Whether a name was given, and misled on recordings held out (`siq.diagnosis.diagnosis`).
     withdrawn: bool = False
+    #: The simulation alone, fitted at each horizon (`siq.diagnosis.forecasts`).
     recalibrations: tuple[Horizon, ...] = ()
-    finals: tuple[Horizon, ...] = ()
+    finals: tuple[Horizon, ...] = ()  #: the same with what is named
 
     @property
     def process_noise(self) -> bool:

@@ -29,26 +29,16 @@ LAGS = 12  # of autocorrelations
 
 @dataclass(frozen=True)
 class Structure:
-    """What residuals show.
+    """What residuals show."""
 
-    Attributes
-    ----------
-    curves
-        What is missing in an equation along a coordinate, for all of them, what explains most first: values
-        at the knots, less what the parameters can do, in the unit of the equation, and the decrease of the
-        sum of squared innovations.
-    p_curves, p_autocorrelation
-        Probabilities that the best of them is chance, for as many as were tried, and that innovations are as
-        correlated in time by chance.
-    total, freedom
-        Sum of squared innovations and its degrees of freedom, at the measurement noise of the fit.
-    """
-
+    #: What is missing in an equation along a coordinate, for all of them, what explains most first: values at
+    #: the knots, less what the parameters can do, in the unit of the equation, and the decrease of the sum of
+    #: squared innovations.
     curves: tuple[Ranked[Place], ...]
-    p_curves: float
-    p_autocorrelation: float
-    total: float
-    freedom: int
+    p_curves: float  #: probability that the best of them is chance, for as many as were tried
+    p_autocorrelation: float  #: the same of innovations that are as correlated in time
+    total: float  #: sum of squared innovations, at the measurement noise of the fit
+    freedom: int  #: its degrees of freedom
 
     @property
     def p_value(self) -> float:
@@ -212,12 +202,7 @@ def has_structure(current: Fit, data: Measurements) -> bool:
 
 
 def explained_by_quantisation(
-    data: Measurements,
-    strict: Fit,
-    roles: Roles,
-    *,
-    least: float = STRUCTURED,
-    budget: Budget | None = None,
+    data: Measurements, strict: Fit, roles: Roles, *, least: float = STRUCTURED, budget: Budget | None = None
 ) -> tuple[Fit, Remainder, tuple[str, ...]] | None:
     """The fit to the values that were rounded, if it leaves noise; None where it does not, or nothing rounds.
 

@@ -390,31 +390,17 @@ def at_noise_levels(
 
 @dataclass(frozen=True)
 class Ranked(Generic[AnyTerm]):
-    """What a term would do.
-
-    Attributes
-    ----------
-    term
-        The term.
-    gain
-        Increase of what the judge tells, over that of no term, each at its best level of process noise.
-    level
-        The level at which it is best.
-    amplitudes, standard_errors
-        There; shape ``(k,)``, none where they are averaged over.
-    finite
-        Whether what it does to what is measured is a number at any level.
-    p_value
-        Probability of as much by chance, where that is asked.
-    """
+    """What a term would do."""
 
     term: AnyTerm
+    #: Increase of what the judge tells, over that of no term, each at its best level of process noise.
     gain: float = -np.inf
-    level: float = 1.0
+    level: float = 1.0  #: at which it is best
+    #: There; shape ``(k,)``, none where they are averaged over.
     amplitudes: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    standard_errors: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    finite: bool = False
-    p_value: float = np.nan
+    standard_errors: np.ndarray = field(default_factory=lambda: np.zeros(0))  #: of these
+    finite: bool = False  #: whether what it does to what is measured is a number at any level
+    p_value: float = np.nan  #: probability of as much by chance, where that is asked
 
 
 Judge = Callable[[AnyTerm, Projection, slice], tuple[float, np.ndarray, np.ndarray] | None]

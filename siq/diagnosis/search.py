@@ -45,25 +45,14 @@ Standing = Literal["same", "needless", "less"]
 
 @dataclass(frozen=True)
 class FitContext:
-    """A case, and by which means it is explained.
+    """A case, and by which means it is explained."""
 
-    Attributes
-    ----------
-    model, data, roles
-        The simulation as its author believes it, the recordings, and the roles of its states.
-    candidates
-        The mechanisms that may be named.
-    study
-        What counts as found.
-    budget
-        Charged for the work; what it does not reach is left undone.
-    """
-
-    model: Dynamics
-    data: Measurements
-    roles: Roles
-    candidates: tuple[MechanismCandidate, ...] = ()
-    study: MismatchStudy = field(default_factory=MismatchStudy)
+    model: Dynamics  #: the simulation as its author believes it
+    data: Measurements  #: the recordings
+    roles: Roles  #: of the states
+    candidates: tuple[MechanismCandidate, ...] = ()  #: the mechanisms that may be named
+    study: MismatchStudy = field(default_factory=MismatchStudy)  #: what counts as found
+    #: Charged for the work; what it does not reach is left undone.
     budget: Budget = field(default_factory=Budget)
 
 
@@ -81,30 +70,18 @@ class AcceptedMechanism:
 
 @dataclass(frozen=True)
 class Search:
-    """What a search ended with.
+    """What a search ended with."""
 
-    Attributes
-    ----------
-    recalibrated
-        The simulation with its own parameters fitted, and nothing else.
-    found, fit
-        Mechanisms, each judged with those before it in place; and the fit of the simulation with all of them.
-    screened, screened_with
-        The last screening: every probe with what it would gain; and labels of the mechanisms that were in
-        place for it, not the last one where nothing was left to be explained.
-    untried
-        Candidates whose fit gave nothing that could be judged, with the reason.
-    fruitless
-        Labels of those that were fitted and gained nothing.
-    """
-
-    recalibrated: Fit
-    found: tuple[AcceptedMechanism, ...]
-    fit: Fit
-    screened: tuple[Ranked[Probe], ...]
+    recalibrated: Fit  #: the simulation with its own parameters fitted, and nothing else
+    found: tuple[AcceptedMechanism, ...]  #: each judged with those before it in place
+    fit: Fit  #: of the simulation with all of them
+    screened: tuple[Ranked[Probe], ...]  #: the last screening: every probe with what it would gain
+    #: Candidates whose fit gave nothing that could be judged, with the reason.
     untried: tuple[NotFitted, ...] = ()
+    #: Labels of the mechanisms that were in place for the screening, not the last one where nothing was left
+    #: to be explained.
     screened_with: tuple[str, ...] = ()
-    fruitless: frozenset[str] = frozenset()
+    fruitless: frozenset[str] = frozenset()  #: of those that were fitted and gained nothing, the labels
 
 
 def _accepted(

@@ -60,26 +60,14 @@ PRODUCT_TOLERANCE = 1e-4  # of what is left, by which an iteration has to be bet
 
 @dataclass(frozen=True)
 class _Bumps:
-    """A smooth function as a sum of bumps, and what is expected of it: a `siq.diagnosis.terms.Basis`.
+    """A smooth function as a sum of bumps, and what is expected of it: a `siq.diagnosis.terms.Basis`."""
 
-    Attributes
-    ----------
-    coordinates, limits
-        What it is a function of, and where the recordings have been: lower and upper, shape ``(2, c)``.
-    centres, lengths
-        Of the bumps, shape ``(b, c)``; and over which it changes, how wide they are, shape ``(c,)``.
-    deviation
-        s, the size that is expected of it.
-    weight
-        See `siq.systems.dynamics.JointExpectation`.
-    """
-
-    coordinates: tuple[sympy.Expr, ...]
-    limits: np.ndarray
-    centres: np.ndarray
-    lengths: np.ndarray
-    deviation: float = 1.0
-    weight: float = 1.0
+    coordinates: tuple[sympy.Expr, ...]  #: what it is a function of
+    limits: np.ndarray  #: where the recordings have been: lower and upper, shape ``(2, c)``
+    centres: np.ndarray  #: of the bumps, shape ``(b, c)``
+    lengths: np.ndarray  #: over which it changes, how wide the bumps are, shape ``(c,)``
+    deviation: float = 1.0  #: s, the size that is expected of it
+    weight: float = 1.0  #: see `siq.systems.dynamics.JointExpectation`
 
     @classmethod
     def along(
@@ -280,39 +268,22 @@ def _given(basis: np.ndarray, gram: np.ndarray, overlap: np.ndarray) -> tuple[np
 
 @dataclass(frozen=True)
 class Smoothness:
-    """How smooth a function is, as recordings tell it at the likeliest level of process noise.
+    """How smooth a function is, as recordings tell it at the likeliest level of process noise."""
 
-    Attributes
-    ----------
-    place, courses
-        Where it stands, and its coordinates along the recordings, shape ``(c, n)``.
-    shares, deviation
-        Its lengths, as shares of the ranges of its coordinates, and its size.
-    noise, level
-        Variance of the innovations with it, and process noise, in units of what the fit takes for them.
-    correlated
-        Correlation time τ of the innovations in samples, with such a function: n of them count as n/τ.
-    considered
-        How many lengths and sizes were compared.
-    fine, gram, overlap
-        The function with bumps as narrow as any; and of what a unit of each does to the innovations, with
-        each other and with the innovations, over τ; shapes ``(b, b)`` and ``(b,)``.
-    log_evidence
-        Logarithm of the odds for such a function, over none, each at its best level; averaged over all
-        lengths and sizes.
-    """
-
-    place: Place
-    courses: np.ndarray
-    shares: tuple[float, ...]
-    deviation: float
-    noise: float
-    level: float
+    place: Place  #: where it stands
+    courses: np.ndarray  #: its coordinates along the recordings, shape ``(c, n)``
+    shares: tuple[float, ...]  #: its lengths, as shares of the ranges of its coordinates
+    deviation: float  #: its size
+    noise: float  #: variance of the innovations with it, in units of what the fit takes for it
+    level: float  #: process noise, likewise
+    #: Correlation time τ of the innovations in samples, with such a function: n of them count as n/τ.
     correlated: float
-    considered: int
-    fine: _Bumps
-    gram: np.ndarray
-    overlap: np.ndarray
+    considered: int  #: how many lengths and sizes were compared
+    fine: _Bumps  #: the function with bumps as narrow as any
+    gram: np.ndarray  #: what a unit of each does to the innovations, with each other, over τ: ``(b, b)``
+    overlap: np.ndarray  #: the same with the innovations, ``(b,)``
+    #: Logarithm of the odds for such a function, over none, each at its best level; averaged over all lengths
+    #: and sizes.
     log_evidence: float = float("nan")
 
     @classmethod

@@ -60,29 +60,16 @@ class Basis(Protocol):
 
 @dataclass(frozen=True)
 class Place:
-    """Where a function may stand, and of what: a `siq.diagnosis.screening.Term`.
+    """Where a function may stand, and of what: a `siq.diagnosis.screening.Term`."""
 
-    Attributes
-    ----------
-    equations, outputs
-        What the function is multiplied by, in each equation, or each output, in which it stands.
-    coordinates, words
-        What it is a function of: one formula, or two; and these in words of the system. One word more is that
-        of a factor.
-    knots, linear
-        Of the spline: quantiles of the coordinate, shape ``(k,)``; and whether it is piecewise linear, rather
-        than a natural cubic one.
-    basis
-        Of the function, in the place of the spline.
-    """
-
-    equations: tuple[tuple[str, sympy.Expr], ...]
-    outputs: tuple[tuple[str, sympy.Expr], ...]
-    coordinates: tuple[sympy.Expr, ...]
-    words: tuple[str, ...]
+    equations: tuple[tuple[str, sympy.Expr], ...]  #: what the function is multiplied by in each, ...
+    outputs: tuple[tuple[str, sympy.Expr], ...]  #: ... or in each output
+    coordinates: tuple[sympy.Expr, ...]  #: what it is a function of: one formula, or two
+    words: tuple[str, ...]  #: these in words of the system; one word more is that of a factor
+    #: Of the spline: quantiles of the coordinate, shape ``(k,)``.
     knots: np.ndarray = field(default_factory=lambda: np.empty(0))
-    linear: bool = False
-    basis: Basis | None = None
+    linear: bool = False  #: whether the spline is piecewise linear, rather than a natural cubic one
+    basis: Basis | None = None  #: of the function, in the place of the spline
 
     @property
     def width(self) -> int:

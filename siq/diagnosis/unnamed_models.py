@@ -61,21 +61,13 @@ MEMORIES_FITTED = 6  # the most promising ones: a choice
 
 @dataclass(frozen=True)
 class AugmentedModel:
-    """A simulation that describes what has no name.
+    """A simulation that describes what has no name."""
 
-    Attributes
-    ----------
-    parts, fit
-        What was added, in the order in which it was found; and the fit of the simulation with all of it.
-    log_evidence
-        Of the whole over that of the simulation without its parts, less the costs of these; see `_weighed`.
-    exact
-        The fit whose trajectories follow the equations, if process noise is part of `fit`.
-    """
-
-    parts: tuple[FittedCandidate, ...]
-    fit: Fit
+    parts: tuple[FittedCandidate, ...]  #: what was added, in the order in which it was found
+    fit: Fit  #: of the simulation with all of it
+    #: Over that of the simulation without its parts, less the costs of these; see `_weighed`.
     log_evidence: float = float("nan")
+    #: The fit whose trajectories follow the equations, if process noise is part of `fit`.
     exact: Fit | None = None
 
     @property

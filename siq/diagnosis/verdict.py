@@ -17,13 +17,7 @@ import sympy
 
 from siq.data.correlation import correlation_time_of
 from siq.diagnosis.dictionary import Roles, unit_of, units_of
-from siq.diagnosis.evidence import (
-    BUDGET_SPENT,
-    NUMERICAL_ERRORS,
-    FittedCandidate,
-    log_evidences,
-    residuals,
-)
+from siq.diagnosis.evidence import BUDGET_SPENT, NUMERICAL_ERRORS, FittedCandidate, log_evidences, residuals
 from siq.diagnosis.holdout import NEARLY_ALL, simulated
 from siq.diagnosis.investigation import HeldOutRuns
 from siq.diagnosis.mechanisms import PROCESS_NOISE, SURFACE, fresh_names, places_of

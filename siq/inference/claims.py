@@ -42,7 +42,6 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-import scipy.signal
 import scipy.special
 
 from siq.data.preparation import joined
@@ -124,12 +123,14 @@ class _Residuals:
 
     def past(self, values: np.ndarray, memory: float, *, delay: int = 2) -> np.ndarray:
         """Means of columns so many pairs ago and earlier, which fade with a memory in pairs; run by run."""
+        from scipy.signal import lfilter  # which brings all of scipy.stats, half a second to import
+
         fade, found = np.exp(-1 / memory) if memory > 0 else 0.0, np.zeros_like(values)
         for run in self.runs:
             if run.stop - run.start > delay:
                 earlier = values[run][:-delay]
                 begin = earlier[:1] * fade  # as if it had been so before
-                faded, _ = scipy.signal.lfilter([1 - fade], [1, -fade], earlier, axis=0, zi=begin)
+                faded, _ = lfilter([1 - fade], [1, -fade], earlier, axis=0, zi=begin)
                 found[run][delay:] = faded
         return found
 

@@ -28,7 +28,6 @@ from typing import Any
 
 import numpy as np
 import scipy.special
-import scipy.stats
 
 from siq.data.correlation import resolution_step
 from siq.errors import NumericalFailure
@@ -408,12 +407,14 @@ def _before_rounding(
     data: Measurements, simulation: np.ndarray, steps: np.ndarray, deviation: np.ndarray
 ) -> tuple[Measurements, np.ndarray]:
     """Recordings before they were rounded, as far as a simulation tells, and the deviation of their noise."""
+    from scipy.stats import truncnorm  # takes half a second to import, and only rounded values need it
+
     outputs, wide = data.outputs.copy(), deviation.copy()
     for place in np.flatnonzero(steps > 0):
         off = (data.outputs[:, place] - simulation[:, place]) / deviation[place]
         half = steps[place] / 2 / deviation[place]
         known = np.isfinite(off)
-        mean, variance = scipy.stats.truncnorm.stats(off[known] - half, off[known] + half, moments="mv")
+        mean, variance = truncnorm.stats(off[known] - half, off[known] + half, moments="mv")
         outputs[known, place] = simulation[known, place] + deviation[place] * mean
         wide[place] = deviation[place] * np.sqrt(np.mean(mean**2 + variance))
     return replace(data, outputs=outputs), wide
@@ -451,4 +452,4 @@ def wald_probability(differences: np.ndarray, covariance: np.ndarray) -> float:
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     kept = values > SINGULAR * values[-1]
     along = vectors[:, kept].T @ (differences / scale) / np.sqrt(values[kept])
-    return float(scipy.stats.chi2.sf(float(along @ along), int(kept.sum())))
+    return float(scipy.special.chdtrc(int(kept.sum()), float(along @ along)))

@@ -28,14 +28,8 @@ from siq.systems.dynamics import Dynamics
 from siq.systems.formulas import FormulaError, compile_formulas, parse_formula
 
 MOST_STARTS = 8  # of descents to the minimum of V
-WELL = (
-    "attractor",
-    "level",
-    "saddle",
-    "reach",
-    "tolerance",
-    "residual",
-)  # what the file has of a well as it is
+WELL = ("attractor", "level", "saddle", "reach", "tolerance", "residual")
+"""What the file has of a well as it is."""
 
 
 @dataclass(frozen=True)

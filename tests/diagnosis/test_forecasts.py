@@ -195,7 +195,8 @@ def test_the_density_of_each_part_is_that_of_a_fit_to_the_others(width: int, *, 
     root = draw.normal(size=(width, width))
     precision = root @ root.T + np.eye(width) if expected else None
     white = Whitened(target, own, np.zeros(rows, dtype=int), known, int(known.sum()), 0.0)
-    found = _Foreseen(white, target, own, fold).log_density(columns, precision)
+    problem = _Foreseen(white, target, own, fold)
+    found = problem.log_density(problem.sums(columns), precision)
     everything = np.concatenate([own, columns], axis=1)
     for part in range(4):
         out, rest = fold == part, fold != part
@@ -216,9 +217,12 @@ def test_the_density_does_not_depend_on_units_of_columns() -> None:
     own, columns, target = draw.normal(size=(60, 2)), draw.normal(size=(60, 2)), draw.normal(size=60)
     white = Whitened(target, own, np.zeros(60, dtype=int), np.ones(60, dtype=bool), 60, 0.0)
     fold = np.arange(60) // 15
-    one = _Foreseen(white, target, own, fold).log_density(columns, np.eye(2))
-    other = _Foreseen(white, target, own * [1e6, 1.0], fold).log_density(columns * 1e-5, 1e-10 * np.eye(2))
-    np.testing.assert_allclose(one, other, rtol=1e-8)
+    one, other = _Foreseen(white, target, own, fold), _Foreseen(white, target, own * [1e6, 1.0], fold)
+    densities = (
+        one.log_density(one.sums(columns), np.eye(2)),
+        other.log_density(other.sums(columns * 1e-5), 1e-10 * np.eye(2)),
+    )
+    np.testing.assert_allclose(*densities, rtol=1e-8)
 
 
 # Names

@@ -302,10 +302,7 @@ def study_figures(
             tables[name][tables[name]["run"] == shown.number] for name in ("record", "record_density")
         )
         figures["record"] = plot_record(
-            record,
-            density,
-            units=dict(zip(names, units, strict=True)),
-            time_unit=recordings.time_unit or "1",
+            record, density, units=dict(zip(names, units, strict=True)), time_unit=recordings.time_unit or "1"
         )
     return figures
 
@@ -390,10 +387,7 @@ def _prediction_figure(
 
 
 def _dataset(
-    settings: PipelineSettings,
-    recordings: Recordings,
-    networks: AnyNetworks | None,
-    system: Dynamics | None,
+    settings: PipelineSettings, recordings: Recordings, networks: AnyNetworks | None, system: Dynamics | None
 ) -> Dataset:
     """The recorded states of a run, and those that its regression sees."""
     chosen = _some(recordings)

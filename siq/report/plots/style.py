@@ -115,9 +115,9 @@ def axis_label(name: str, unit: str) -> str:
     return with_unit(f"${name_label(name)}$", unit)
 
 
-def energy_label(unit: str, *, what: str = "$U$") -> str:
+def energy_label(unit: str) -> str:
     """Typeset U with its unit; nothing is that of ε."""
-    return f"{what} ({unit_text(unit)})" if unit not in ("", "1") else f"{what} (unit of ε)"
+    return f"$U$ ({unit_text(unit)})" if unit not in ("", "1") else "$U$ (unit of ε)"
 
 
 def magnitude_label(value: float, *, digits: int = 2) -> str:

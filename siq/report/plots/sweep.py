@@ -21,7 +21,6 @@ from siq.report.plots.style import (
     VERMILLION,
     axis_label,
     drawn_in_style,
-    energy_label,
     look,
     unit_label,
 )
@@ -82,7 +81,7 @@ def plot_sweep(
     _draw_branches(rows[0], branches, bifurcations, place)
     rows[0].set_ylabel(axis_label(states[place], units.get(states[place], "1")))
     labels = {
-        "barrier": energy_label("", what="barrier ΔU"),
+        "barrier": "barrier ΔU (unit of ε)",
         "mean_time": "mean time "
         + ("(time units)" if units.get("t", "1") in ("1", "") else unit_label(units["t"])),
         "weight": "share of time",
@@ -187,7 +186,7 @@ def _map(
     for axes, values, label in zip(
         panels,
         (count, lowest),
-        ("number of stable states", energy_label("", what="lowest barrier ΔU")),
+        ("number of stable states", "lowest barrier ΔU (unit of ε)"),
         strict=True,
     ):
         drawn = axes.pcolormesh(
