@@ -51,7 +51,7 @@ MAX_STEPS, MAX_HALVINGS = 60, 30  # numerical: of Fisher's scoring, each step ha
 SCORING_TOLERANCE = 1e-9  # numerical: gain of the log-likelihood, per residual, with which scoring ends
 MAX_RELAXATION = 0.5  # of Jh/2: beyond that a residual hardly knows where its step began
 MAX_STEP_RELAXATION = 2.0  # of the rates of J times h: the same of the mean over pairs
-MOST_UNKNOWN = 0.02  # of the pairs: so few without a covariance of the noise change no mean over all
+MOST_UNKNOWN = 0.5  # of the pairs: where more have no covariance of the noise, the step is too coarse for f
 AVERAGED_PAIRS = 500  # the mean of a smooth function of the state, to a few per cent of a small term
 SERIES_TERMS = 24  # of the exponential series, which then is exact to ten digits
 
