@@ -1,7 +1,7 @@
 """Do the estimator's standard errors cover, whatever the ratio of the two noises?
 
     python -m benchmarks.laboratories.coverage [--seeds 200] [--estimator NAME ...]
-    python -m benchmarks.laboratories.coverage --landscapes [--first 0] [--seeds 200]
+    python -m benchmarks.laboratories.coverage --landscapes [--bent] [--first 0] [--seeds 200]
 
 The ratio is R/(Qh): the variance of the sensor over that of the process noise within a step. A linear system
 and a double well, of which f has free coefficients, and both noises are unknown. The bar is 90 to 98 % of all
@@ -10,8 +10,9 @@ coefficients within 1.96 of their standard errors. What has not converged counts
 With ``--landscapes`` it is asked of what a user reads: coefficients of f, ε, positions of wells, barriers
 ΔU/ε and mean times, by their intervals of 68 and 95 %. Each seed is a laboratory of its own (`drawn`): tilted
 double wells of one state, or of two with a force that circulates, recorded coarsely or finely, with and
-without a noisy sensor, long enough for one passage from well to well or for forty. Parts that begin at
-another seed may be made side by side: each has a file, and the table is of all that are in the folder.
+without a noisy sensor, long enough for one passage from well to well or for forty. With ``--bent`` all have
+two states and a valley that is bent, so that f has many terms. Parts that begin at another seed may be made
+side by side: each has a file, and the table is of all that are in the folder.
 """
 
 from __future__ import annotations
@@ -229,36 +230,46 @@ Figure = tuple[str, float]
 """What is asked, and by how many standard errors the answer is off."""
 
 
-def drawn(seed: int) -> Laboratory:
-    """A laboratory of its own: ``V = (x² - 1)²/4 - tilt x + y²/2``, ``f = -∇V + turn (V_y, -V_x)``."""
+def drawn(seed: int, *, bent: bool = False) -> Laboratory:
+    """A laboratory of its own, of one state or two: ``f = -∇V + turn (V_y, -V_x)`` with
+
+    ``V = (x² - 1)²/4 - tilt x + k (y - lx - bx²)²/2``. Unless it is `bent`, k = 1 and l = b = 0; if it is, f
+    has up to twelve terms, small ones among them.
+    """
     draw = np.random.default_rng([DRAWN_WITH, seed])
     intensity, tilt = 0.5 / draw.uniform(1.7, 3.0), draw.uniform(-0.05, 0.05)
     step, passages = 10 ** draw.uniform(-1.7, -0.7), 10 ** draw.uniform(0, 1.6)
     records, turn = int(draw.choice([1, 4])), float(draw.choice([0.0, 0.0, 0.5, 1.5]))
     sensor = float(draw.choice([0.0, 0.0, 0.1, 0.2]))
+    stiffness, lean, bend = 1.0, 0.0, 0.0
+    if bent:
+        turn, stiffness, lean, bend = draw.uniform([-1, 0.7, -0.5, -0.4], [1, 2, 0.5, 0.4])
     stay = np.sqrt(2) * np.pi * np.exp(0.5 / intensity)
     samples = int(np.clip(passages * stay / step, 1_000, MOST_SAMPLES)) // records
-    slope: dict[tuple[int, ...], float] = {(1, 0): 1.0, (3, 0): -1.0, (0, 0): tilt}  # -V_x
-    if turn:
-        circling = {powers: turn * value for powers, value in slope.items()}
-        drift: tuple[dict[tuple[int, ...], float], ...] = (slope | {(0, 1): turn}, circling | {(0, 1): -1.0})
-    else:
-        drift = ({powers[:1]: value for powers, value in slope.items()},)
-    zero = (0,) * len(drift)
-    places = sorted(np.roots([-1.0, 0.0, 1.0, tilt]).real)
-    left, top, right = ((float(one), *zero[1:]) for one in places)
+    x, y = symbol("x"), symbol("y")
+    own = (x**2 - 1) ** 2 / 4 - tilt * x
+    height, states = (
+        (own + stiffness * (y - lean * x - bend * x**2) ** 2 / 2, (x, y)) if turn else (own, (x,))
+    )
+    slope = [-height.diff(state) for state in states]
     # f·∇V + |∇V|² vanishes, for what circulates is orthogonal to ∇V: U = 2V.
+    force = [slope[0] - turn * slope[1], slope[1] + turn * slope[0]] if turn else slope
+    drift = tuple(
+        {powers: float(value) for powers, value in sympy.Poly(one, *states).terms()} for one in force
+    )
+    places = sorted(np.roots([-1.0, 0.0, 1.0, tilt]).real)
+    left, top, right = ((float(one), lean * one + bend * one**2)[: len(states)] for one in places)
     return Laboratory(
-        f"drawn-{seed}", "a tilted double well", ("x", "y")[: len(drift)], drift, {zero: intensity},
-        attractors=(left, right), saddles=(top,), records=records, samples=samples, step=step,
-        within=int(np.ceil(step / FINE)),
+        f"drawn-{seed}", "a tilted double well", ("x", "y")[: len(drift)], drift,
+        {(0,) * len(drift): intensity}, attractors=(left, right), saddles=(top,), records=records,
+        samples=samples, step=step, within=int(np.ceil(step / FINE)),
         sensor_noise=(sensor,) * len(drift) if sensor else (),
     )  # fmt: skip
 
 
-def landscape_figures(seed: int) -> dict[str, object]:
+def landscape_figures(seed: int, *, bent: bool = False) -> dict[str, object]:
     """Passages seen in a drawn laboratory, by how many standard errors each answer is off, and faults."""
-    laboratory = drawn(seed)
+    laboratory = drawn(seed, bent=bent)
     seen = recorded(laboratory, generator(laboratory, seed))
     began = time.process_time()
     found: dict[str, object] = {"passages": crossings(laboratory, seen), "figures": [], "fault": ""}
@@ -358,16 +369,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--cores", type=int, default=2)
     parser.add_argument("--folder", type=Path, default=Path("results/laboratories/coverage"))
     parser.add_argument("--landscapes", action="store_true", help="intervals of what a user reads")
+    parser.add_argument("--bent", action="store_true", help="of landscapes: two states with a bent valley")
     chosen = parser.parse_args(arguments)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     if chosen.landscapes:
-        file = chosen.folder / f"landscapes-{chosen.first}.json"
+        kind = "bent" if chosen.bent else "landscapes"
+        file = chosen.folder / f"{kind}-{chosen.first}.json"
         found = read(file)
         for seed in range(chosen.first, chosen.seeds):
             if str(seed) not in found:
-                found[str(seed)] = landscape_figures(seed)
+                found[str(seed)] = landscape_figures(seed, bent=chosen.bent)
                 write(file, found)
-        parts = [read(each) for each in sorted(chosen.folder.glob("landscapes*.json"))]
+        parts = [read(each) for each in sorted(chosen.folder.glob(f"{kind}*.json"))]
         print(landscape_table({seed: one for part in parts for seed, one in part.items()}))
         return
     print(HEAD, flush=True)
