@@ -378,12 +378,18 @@ def without_background(recordings: Recordings) -> Recordings:
     if not single and not markov_lag(recordings).may_hop:
         return recordings
     found = switching(recordings, rungs=False)
-    hops = found is not None and found.supported
+    hops = found if found is not None and found.supported else None
     flat, remarks = recordings.values.copy(), list(recordings.remarks)
     for state, (title, values) in enumerate(zip(recordings.titles, recordings.values.T, strict=True)):
-        background = background_of(recordings, values) if single else np.zeros(len(values))
-        if found is not None and hops and title == found.state:
-            background = found.background if single else found.baseline
+        level, background = np.zeros(len(values)), np.zeros(len(values))
+        if hops is not None and title == hops.state:
+            background = hops.background if single else hops.baseline
+        elif single:
+            # What differs between the states of another quantity hops with it, and is no drift.
+            visits = np.zeros(len(values)) if hops is None else hops.visits
+            for one in np.unique(visits):
+                level[visits == one] = values[visits == one].mean()
+            background = background_of(recordings, values - level)
         if not background.any():
             continue
         flat[:, state] -= background

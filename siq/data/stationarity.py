@@ -35,6 +35,7 @@ MOST_SLOW_FUNCTIONS = 8  # of the background in a record: what returns more ofte
 NEIGHBOURS, FEWEST_NEIGHBOURS = 10, 3  # frequencies on either side to compare one with, of all recordings
 HARMLESS_LINE = 0.01  # of the variance: it changes -log p by a hundredth
 FALSE_CHANGE_RATE = 0.01  # probability with which a stationary record is said to change
+LEVEL_ROUNDS = 10  # numerical: of the levels and the hops between them
 FALSE_DRIFT_RATE = 1e-3  # probability with which a record without a background is said to have one
 
 
@@ -220,7 +221,8 @@ def background_of(recordings: Recordings, values: np.ndarray, *, functions: int 
     """The slow drift of a series, common to all that it does: of a hopping record, less its levels.
 
     Every recording has a straight line of its own, and cosines ``cos(πkt/T)`` with k from 1 on: so many
-    `functions`, or else those that are seen. Gives the drift ``(n,)``, of mean zero; zero where none is seen.
+    `functions`, or else those that are seen. Gives the drift ``(n,)``, of mean zero; zero where none is seen,
+    or hops between two levels explain what is seen better.
     """
     bounds = np.searchsorted(recordings.recording, np.arange(len(recordings.labels) + 1))
 
@@ -238,7 +240,7 @@ def background_of(recordings: Recordings, values: np.ndarray, *, functions: int 
     if functions is not None:
         return fitted(functions)
     runs, counts = runs_of(recordings, bridged=True), np.bincount(recordings.recording)
-    best, drift, spread = 0.0, np.zeros(len(values)), float(np.var(values))
+    best, drift, chosen, spread = 0.0, np.zeros(len(values)), 0, float(np.var(values))
     for count in range(1, MOST_SLOW_FUNCTIONS + 1 if spread > 0 else 0):
         slow = fitted(count)
         rest = values - slow
@@ -250,8 +252,37 @@ def background_of(recordings: Recordings, values: np.ndarray, *, functions: int 
         # Twice the gain in the logarithm of the likelihood, less what chance gives it with this probability.
         surplus = gain - used * np.log(independent) - 2 * np.log(1 / FALSE_DRIFT_RATE)
         if surplus > best:
-            best, drift = surplus, slow
-    return drift
+            best, drift, chosen = surplus, slow, used
+    return np.zeros(len(values)) if chosen and _hops_rather(values, drift, chosen, runs) else drift
+
+
+def _hops_rather(values: np.ndarray, drift: np.ndarray, used: int, runs: list[slice]) -> bool:
+    """Whether hops between two levels explain a series better than its drift with so many coefficients.
+
+    Compared are means over as many samples as are one independent value of what the drift leaves, by Bayes's
+    information criterion. A hop costs two coefficients, as it may be anywhere, and is one to a mean that is
+    nearer to the other level than a third of the way.
+    """
+    size = int(np.ceil(2 * correlated_samples(values - drift, runs)))
+    parts = [range(run.start, run.stop - size + 1, size) for run in runs]
+    seen, slow = (
+        np.array([one[at : at + size].mean() for part in parts for at in part]) for one in (values, drift)
+    )
+    numbers = np.arange(len(seen))
+    begins = np.isin(numbers, np.cumsum([0, *map(len, parts)]))
+    levels = np.quantile(seen, [0.1, 0.9]) if len(seen) else np.zeros(2)
+    path = np.zeros(len(seen), dtype=int)
+    for _ in range(LEVEL_ROUNDS):
+        away = np.abs(seen[:, None] - levels)
+        sure = (away.min(axis=1) < np.ptp(levels) / 3) | begins
+        path = away.argmin(axis=1)[np.maximum.accumulate(np.where(sure, numbers, 0))]
+        if len(np.unique(path)) < 2:
+            return False
+        levels = np.array([seen[path == one].mean() for one in (0, 1)])
+    hops = int(((np.diff(path) != 0) & ~begins[1:]).sum())
+    left = [float(np.var(seen - one)) for one in (levels[path], slow)]
+    gain = len(seen) * np.log(max(left[1], 1e-300) / max(left[0], 1e-300))
+    return bool(gain > (2 * hops + 1 - used) * np.log(len(seen)))
 
 
 class Stretches(NamedTuple):

@@ -145,6 +145,27 @@ def test_hops_are_no_slow_drift() -> None:
     assert without_background(hopping) is hopping
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_hops_of_one_quantity_are_no_slow_drift_of_another(seed: int) -> None:
+    """y follows the wells of x, and is spread so widely that it shows none by itself."""
+    draw, path, state = np.random.default_rng(seed), np.empty((20_000, 2)), np.array([1.0, 0.6])
+    for place in range(len(path) * 4):
+        force = np.array([state[0] - state[0] ** 3, 0.6 * state[0] - state[1]])
+        state = state + 0.015 * force + np.sqrt(0.12 * 0.015) * draw.standard_normal(2)
+        path[place // 4] = state
+    hopping = Recordings.from_arrays([0.06 * np.arange(len(path))], [path], names=["x", "y"])
+    assert without_background(hopping) is hopping
+
+
+def test_a_few_hops_explain_a_record_better_than_a_drift() -> None:
+    """Five visits, and cosines that follow them closely."""
+    path = np.repeat([0.0, 1.0, 0.0, 1.0, 0.0], [900, 1300, 400, 700, 1200])
+    noise = lfilter([0.3], [1, -0.9], np.random.default_rng(0).standard_normal(len(path)))
+    for scale in (1.5, 3.0):
+        hopping = recorded(scale * path + noise)
+        assert not background_of(hopping, hopping.values[:, 0]).any()
+
+
 def test_a_long_trace_is_cut_by_its_own_correlation_time() -> None:
     quick, hopping = in_stretches(recorded(one_state(0))), in_stretches(recorded(two_states(3, 0.25)))
     assert len(quick.labels) == 40 and 10 <= len(hopping.labels) < 20
