@@ -379,17 +379,16 @@ def without_background(recordings: Recordings) -> Recordings:
         return recordings
     found = switching(recordings, rungs=False)
     hops = found if found is not None and found.supported else None
+    visits = np.zeros(len(recordings.t), dtype=int) if hops is None else hops.visits + 1
     flat, remarks = recordings.values.copy(), list(recordings.remarks)
     for state, (title, values) in enumerate(zip(recordings.titles, recordings.values.T, strict=True)):
-        level, background = np.zeros(len(values)), np.zeros(len(values))
+        background = np.zeros(len(values))
         if hops is not None and title == hops.state:
             background = hops.background if single else hops.baseline
         elif single:
             # What differs between the states of another quantity hops with it, and is no drift.
-            visits = np.zeros(len(values)) if hops is None else hops.visits
-            for one in np.unique(visits):
-                level[visits == one] = values[visits == one].mean()
-            background = background_of(recordings, values - level)
+            level = np.bincount(visits, values) / np.maximum(np.bincount(visits), 1)
+            background = background_of(recordings, values - level[visits])
         if not background.any():
             continue
         flat[:, state] -= background

@@ -602,8 +602,10 @@ def weighted_triangle(
     goal = left if of_rest else velocity
     places = all_coefficients(range(d), found.library.size) if places is None else places
     p = len(places)
-    triangle, squares = np.zeros((0, p + 1)), 0.0
-    for begin in range(0, len(pairs.h), WEIGHTED_CHUNK):
+    squares = 0.0
+
+    def rows(begin: int) -> np.ndarray:
+        nonlocal squares
         part = slice(begin, begin + WEIGHTED_CHUNK)
         x, h = pairs.x0[part], pairs.h[part]
         whitening = found.diffusion.whitening_at(x) * np.sqrt(h)[:, None, None]
@@ -612,8 +614,9 @@ def weighted_triangle(
         block[:, :, :-1] = whitening[:, :, places[:, 0]] * terms[:, None, :]
         block[:, :, -1] = (whitening @ goal[part][:, :, None])[:, :, 0]
         squares += float(((whitening @ left[part][:, :, None]) ** 2).sum())
-        stacked = np.concatenate([triangle, block.reshape(-1, p + 1)])
-        triangle = np.asarray(np.linalg.qr(stacked, mode="r"))
+        return block.reshape(-1, p + 1)
+
+    triangle = stacked_triangle(map(rows, range(0, len(pairs.h), WEIGHTED_CHUNK)))
     return triangle, squares / (len(pairs.h) * d)
 
 

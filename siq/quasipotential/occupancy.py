@@ -67,7 +67,7 @@ SMALLEST_CORE = 0.2  # of a core's radius: of steps as long as the core no such 
 # Of the recorded box on each side, beyond which the operator lets nothing go. None where a formula of D(x),
 # continued beyond what was recorded, is no longer positive.
 MARGINS = (0.15, 0.0)
-DRAWS = {1: 24, 2: 24}  # of f, by the number of states: an error is then known to a seventh
+DRAWS, MOST_STATES = 24, 2  # of f, by which an error is known to a seventh; more states have too many cells
 MOST_PLACES = 400  # cells of a sheared grid all have places of their own, and are put together
 
 NO_HOP_PROBABILITY = 0.01  # below it, no hop at all contradicts the prediction
@@ -179,13 +179,13 @@ def _predicted_visits(
     """
     reasons: list[str] = []
     dynamics, width = found.dynamics, portrait.box[:, 1] - portrait.box[:, 0]
-    for margin in MARGINS if dynamics.dimension in DRAWS else ():
+    for margin in MARGINS if dynamics.dimension <= MOST_STATES else ():
         cells = CELLS[dynamics.dimension]
         box = portrait.box + margin * np.stack([-width, width], axis=1)
         try:
             processes = [_VisitProcess(found.drawn(), noise.intensity, box, cores, cells=cells)]
             generator = np.random.default_rng(seed)
-            for _ in range(DRAWS[dynamics.dimension]):
+            for _ in range(DRAWS):
                 drawn = found.drawn(generator)
                 strength = float(np.exp(noise.standard_error / noise.intensity * generator.standard_normal()))
                 coarse = round(COARSER * cells)
@@ -444,7 +444,7 @@ def check_occupancy(
     along = _errors_along(found, portrait, noise.intensity, recordings) if reached else None
     states = len(portrait.attractors)
     whole = DwellCount.of_visits(recordings.t, visits, whole_runs, states=states)
-    if found.dynamics.dimension not in DRAWS and not any(one.visits for one in whole):
+    if found.dynamics.dimension > MOST_STATES and not any(one.visits for one in whole):
         return OccupancyCheck(
             missing=Remark("quasipotential.record_without_hops"), passages=passages, errors_along=along
         )

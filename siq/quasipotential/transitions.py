@@ -34,6 +34,7 @@ from siq.errors import NumericalFailure
 from siq.inference.diffusion_model import defined_states, process_noise_increments
 from siq.inference.field_estimate import AnyField, FieldEstimate, dynamics_of
 from siq.inference.regression import residuals
+from siq.inference.selection import triangle_of
 from siq.numerics.integration import Rates, dormand_prince_step, next_step
 from siq.numerics.randomness import positive
 from siq.quasipotential.characteristics import norm
@@ -66,8 +67,10 @@ FIRST_STEP, ARRIVAL_STEPS, SHIFT = 1e-3, 8, 1e-6  # numerical, in units of the s
 PATH_TOLERANCE = 1e-5  # of the action; prefactors follow the end of the path and need more than barriers
 WAY_PARTS = 20, 10, 5  # numerical: of a path, as many as have samples enough
 FEWEST_IN_PART = 6  # samples, by which 1/χ² has a variance
-TUBE_RADIUS = 0.2  # of the length of a path, in units of the noise: samples so near are about it (a choice)
-WAY_PLACES, WAY_CHUNK = 1401, 100_000  # numerical: of a path and its extensions; samples at a time
+# Of the length of a path, in units of the noise: samples so near are about it. A choice, made on one f that
+# is no polynomial: half of it was less exact, and twice of it smoothed too much.
+TUBE_RADIUS = 0.2
+WAY_PLACES = 1401  # numerical: of a path and its extensions
 # How far off ΔU/ε is expected of an f of another shape: half, one or two factors e in times, or half of it
 # where that is less (a choice).
 MISSED_SCALES, MISSED_WORK, MISSED_SHARE = (0.5, 1.0, 2.0), 1.0, 0.5
@@ -508,7 +511,7 @@ def with_work_of_samples(
     Parameters
     ----------
     found
-        Identified from `pairs`, with noise that drives every state.
+        Identified from `pairs`, with noise that drives every state; of no angles.
     pairs
         Of samples of all states; of noisy ones as a filter knows them.
     paths
@@ -519,8 +522,7 @@ def with_work_of_samples(
     found, chance
         f, and the probability of differences as large, were it of its library: 1 without a path that is seen.
     """
-    pairs, diffusion = found.wrapped(pairs), found.diffusion
-    library, (components, terms) = found.library, found.support.T
+    library, diffusion, (components, terms) = found.library, found.diffusion, found.support.T
     rest = process_noise_increments(found, pairs, residuals(found, pairs))
     whitening = diffusion.whitening_at(pairs.x0)
     noise = np.einsum("nij,nj->ni", whitening, rest)
@@ -530,24 +532,13 @@ def with_work_of_samples(
         return found, 1.0
     levers, slopes, by_noise, heights = zip(*seen, strict=True)
     # R of the design, the levers and the noise: its last rows are of what the design leaves of the latter.
-    design, m = len(terms), len(seen)
-    triangle = np.zeros((0, design + m + 1))
-    for begin in range(0, len(noise), WAY_CHUNK):
-        rows = slice(begin, begin + WAY_CHUNK)
-        columns = library.evaluate(pairs.x0[rows])[:, terms] * np.sqrt(pairs.h[rows])[:, None]
-        block = np.concatenate(
-            [
-                whitening[rows][:, :, components] * columns[:, None, :],
-                np.stack([lever[rows] for lever in levers], axis=2) * np.sqrt(intensity),
-                noise[rows][:, :, None] / np.sqrt(intensity),
-            ],
-            axis=2,
-        )
-        stacked = np.concatenate([triangle, block.reshape(-1, triangle.shape[1])])
-        triangle = np.asarray(np.linalg.qr(stacked, mode="r"))
-    own = triangle[design:, design:-1]
+    functions = library.evaluate(pairs.x0)[:, terms] * np.sqrt(pairs.h)[:, None]
+    design = (whitening[:, :, components] * functions[:, None, :]).reshape(-1, len(terms))
+    goals = np.stack([*levers, noise / intensity], axis=2) * np.sqrt(intensity)
+    left = triangle_of(design, goals.reshape(len(design), -1))[len(terms) :, len(terms) :]
+    own, m = left[:, :-1], len(seen)
     slope, (moved, variances) = np.stack(slopes), np.transpose(by_noise)
-    difference = own.T @ triangle[design:, -1] + moved
+    difference = own.T @ left[:, -1] + moved
     covariance = (own.T @ own + np.diag(variances)) * pairs.copies
     scales = np.outer((0.0, *MISSED_SCALES), np.minimum(MISSED_WORK, MISSED_SHARE * np.array(heights)))
     wide = covariance + np.einsum("ki,ij->kij", scales**2, np.eye(m))

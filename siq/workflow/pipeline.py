@@ -150,14 +150,13 @@ def _with_work(
     settings: PipelineSettings, found: FieldEstimate, recordings: Recordings, *, number: int
 ) -> FieldEstimate:
     """f with what samples about its paths of least action tell without a formula; they may refute it."""
-    if found.noise_free or found.memory is not None or found.hidden_states or found.library.angles:
-        return found
-    if not found.diffusion.regular:
+    untold = found.noise_free or found.memory is not None or found.hidden_states or found.library.angles
+    if untold or not found.diffusion.regular:
         return found
     pair_step = settings.sampling.pair_step
     if found.sensor_variance is not None:
         recordings = filtered_recordings(found, recordings, pair_step=pair_step)
-    pairs = found.wrapped(snapshot_pairs(recordings, pair_step=pair_step))
+    pairs = snapshot_pairs(recordings, pair_step=pair_step)
     points = pairs.x0[evenly_spread(pairs.x0, generator=generator(settings.seed, number, Purpose.LANDSCAPE))]
     try:
         portrait = phase_portrait(found.dynamics, points, seed=number)

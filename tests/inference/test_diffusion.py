@@ -6,14 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import sympy
 from known_systems import as_system, linear_system
 
-from siq.data.recordings import Recordings, snapshot_pairs
+from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.errors import NumericalFailure
-from siq.inference.diffusion_model import check_units, estimated_diffusion
+from siq.inference.diffusion_model import check_units, estimated_diffusion, process_noise_increments
 from siq.inference.field_estimate import DiffusionSource, FieldEstimate, read_field, write_field
 from siq.inference.library import IdentificationOptions, field_library
 from siq.inference.regression import ResidualLikelihood, identify_vector_field, residuals
+from siq.numerics.integration import FlowMap
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_comparison import _check_same_noise
 from siq.systems.diffusion import Diffusion
@@ -168,3 +170,24 @@ def test_steps_whose_covariance_is_off_feign_no_dependence_of_d() -> None:
         assert found.flow.coarse
         assert ResidualLikelihood(found, pairs, residuals(found, pairs)).constant_probability() > 0.1
         assert found.noise_rate[0, 0] == pytest.approx(rate, rel=0.1)
+
+
+def test_of_a_pair_from_which_f_leads_far_away_the_noise_is_told_without_its_step() -> None:
+    x = sympy.Symbol("x", real=True)
+    draw, count = np.random.default_rng(0), 200
+    begins = np.append(draw.uniform(-1, 1, count - 1), 50.0)[:, None]
+    pairs = SnapshotPairs(begins, begins, np.full(count, 0.1), np.zeros(count, dtype=int))
+    library = field_library(("x",), IdentificationOptions(degree=3))
+    coefficients = np.array([[1.0 if term == x else -1.0 if term == x**3 else 0.0] for term in library.terms])
+    support = np.argwhere(coefficients.T)
+    found = FieldEstimate(
+        library, coefficients, support, np.eye(len(support)), np.array([[0.2]]), 1.0,
+        FlowMap(steps=2, coarse=True), Diffusion.identity(1),
+    )  # fmt: skip
+    rest = draw.standard_normal((count, 1))
+    told = process_noise_increments(found, pairs, rest)
+    assert np.isfinite(told).all()
+    assert told[-1, 0] == pytest.approx(rest[-1, 0] / np.sqrt(0.1))
+    strays = pairs.take(np.full(count, count - 1))
+    with pytest.raises(NumericalFailure, match="sample more often"):
+        process_noise_increments(found, strays, rest)

@@ -93,6 +93,23 @@ def test_barriers_are_a_table_in_the_order_of_the_attractors() -> None:
     assert (table["standard_error"] > 0).all()
 
 
+def test_a_formula_that_its_certificate_does_not_trust_says_nothing_of_barriers() -> None:
+    known = double_well(2)
+    options = RefinementOptions(degrees=(4,))
+    for passed in (True, False):
+        certificate = Certificate({"error": Verdict(1.4, 0.15, passed)}, 1.4, "")
+        landscape = find_landscape(
+            exact_field(known, 3, relative_error=1e-3), portrait_of(known, 250, share=0.8),
+            options=options, certificate=certificate,
+        )  # fmt: skip
+        for way in landscape.transitions:
+            assert way.path is not None
+            assert (way.formula_share > 0) == passed
+            if not passed:
+                assert way.barrier == way.path.action + way.by_rivals
+                assert way.error == way.standard_error > 0
+
+
 def test_errors_of_u_of_barriers_and_of_times_are_one_propagation() -> None:
     known, left = double_well(2), 0.02
     tests = {"characteristics": Verdict(0.0, 1.0, True), "error": Verdict(left, 0.15, True)}
