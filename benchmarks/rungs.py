@@ -149,7 +149,7 @@ LABORATORIES = {
         Laboratory("slow filter", 5, "the filter has a state", _hostile("smoothed", 0.4)),
         Laboratory("slow sensor noise", 5, "the sensor has a state", _hostile("correlated_sensor", 0.6)),
         Laboratory("lost order", 4, "samples within the jitter", _hostile("jittered_clock", 0.6)),
-        Laboratory("held values", 4, "values within the hold", _hostile("held_values", 0.4)),
+        Laboratory("held values", 6, "", _hostile("held_values", 0.4)),
         Laboratory("few passages", 4, "hardly a passage", _hostile("few_passages", 0.8)),
         Laboratory("telegraph", 3, "no path between levels", _hostile("popcorn", 1.0)),
         Laboratory("chain of three", 3, "no path between levels", lambda draw: _chain(draw, 1, noise=0.15)),

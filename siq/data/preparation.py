@@ -49,6 +49,13 @@ SEASONS = {"day": 86_400.0, "year": 31_556_952.0}  # seconds: what the sun does 
 _SECONDS = {"s(ec.*)?": 1, "min.*": 60, "h.*": 3600, "d.*": 86_400, "week.*": 604_800, "y.*": 31_556_952}
 FEWEST_SEASONS, MOST_HARMONICS = 4, 4
 KNOWN_SCALE = 0.01  # a choice: relative error to which a velocity tells how its position moves
+SMALL_CHANGE = 0.3  # standard deviations: up to there a distribution is flat
+STATE_PARTS, LEAST_SPREAD = 20, 0.01  # of samples by their state; of the largest spread, where all are held
+ROUNDED_LINE = 2  # steps by which a straight line that is rounded is bent at most
+SMALL_STEP, FEWEST_SMALL = 0.2, 0.05  # of the median step, and how many are: 0.11 of normal ones
+COPIED = 12  # samples of a stretch that is sought a second time
+MOST_DIGITS = 12  # of numbers that were rounded: those of floating point have sixteen
+ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 _STRETCH_LABEL = re.compile(r"(?P<label>.*) \((?P<number>\d+) of (?P<of>\d+)\)")
 
 
@@ -204,17 +211,19 @@ def joined(recordings: Recordings) -> Recordings:
 
 
 def without_faults(recordings: Recordings) -> Recordings:
-    """Recordings less what the system did not do: samples that stand apart, day and year, the hum of mains.
+    """Recordings less what the system did not do.
 
-    A sample stands apart whose steps from the last and to the next are both larger than noise makes one in
-    all of the record, and lead back to where it came from; so do several of one value, where most such faults
-    last one sample only. Where more than a few such steps do not lead back, the state itself jumps, and
-    nothing is left out. A hum is a line in the spectrum of the steps that keeps its amplitude and its phase
-    in every quarter of a recording, and that hardly moves the state. What has the period of a day or of a
-    year, and is alike in each, is the weather's.
+    Values that were filled in and samples that stand apart are left out, day and year and the hum of mains
+    taken off. A sample stands apart whose steps from the last and to the next are both larger than noise
+    makes one in all of the record, and lead back to where it came from; so do several of one value, where
+    most such faults last one sample only. Where more than a few such steps do not lead back, the state
+    itself jumps, and nothing is left out. A hum is a line in the spectrum of the steps that keeps its
+    amplitude and its phase in every quarter of a recording, and that hardly moves the state. What has the
+    period of a day or of a year, and is alike in each, is the weather's.
     """
     if noise_floors(recordings) is None:
         return recordings
+    recordings = _without_filled(recordings)
 
     def without(apart: np.ndarray) -> Recordings:
         kept = {name: getattr(recordings, name)[~apart] for name in ("t", "recording", "values")}
@@ -265,6 +274,41 @@ def without_faults(recordings: Recordings) -> Recordings:
             units = {"unit": found.units[state], "time_unit": found.time_unit}
             remarks.append(Remark("data.hum_taken_off", told | units))
     return replace(found, remarks=tuple(remarks)) if len(remarks) > len(recordings.remarks) else recordings
+
+
+def _without_filled(recordings: Recordings) -> Recordings:
+    """Recordings less samples that repeat the one before, or lie on a straight line between their neighbours.
+
+    A file holds a value until the next one is measured, or fills gaps along lines, if noisy values repeat
+    themselves more often than `repetitions` allows. Values at which a sensor is clipped are few, and one that
+    stays until it is moved far enough makes no small steps: of these nothing is left out, nor where states
+    were hardly ever measured together.
+    """
+    x, same = recordings.values, np.diff(recordings.recording) == 0
+    rates, filled, fewest = FALSE_FAULT_RATE / x.shape[1], np.zeros(len(x), dtype=bool), len(x)
+    told = []
+    for column, title in enumerate(recordings.titles):
+        likely = {kind for chance, kind, _ in repetitions(recordings, column) if chance < rates}
+        moves, step = np.diff(x[:, column]), resolution_step(x[:, column]) or 0.0
+        near = ALIKE * float(np.sqrt((moves[same] ** 2).mean())) if same.any() else 0.0
+        own, again = np.zeros(len(x), dtype=bool), np.r_[False, same & (np.abs(moves) <= near)]
+        if "held" in likely:
+            numbers = np.unique(x[again & ~np.roll(again, 1), column], return_counts=True)[1]
+            sizes = np.abs(np.diff(x[~again, column])[np.diff(recordings.recording[~again]) == 0])
+            small = (sizes < SMALL_STEP * np.median(sizes)).mean() if len(sizes) else 0.0
+            if numbers.max(initial=0) <= MOST_ALIKE * numbers.sum() and small >= FEWEST_SMALL:
+                own |= again
+        bend = max(near, (ROUNDED_LINE + 0.5) * step)
+        if "straight" in likely and bend < SMALL_STEP * np.median(np.abs(moves[same & ~again[1:]])):
+            bent = np.abs(np.diff(moves)) > bend
+            own[1:-1] |= same[1:] & same[:-1] & ~bent & ~again[1:-1] & ~again[2:]
+        if own.any():
+            filled, fewest = filled | own, min(fewest, int((~own).sum()))
+            told.append(Remark("data.filled_left_out", {"column": title, "samples": int(own.sum())}))
+    if not told or 2 * int((~filled).sum()) < fewest:
+        return recordings
+    kept = {name: getattr(recordings, name)[~filled] for name in ("t", "recording", "values")}
+    return replace(recordings, **kept, remarks=(*recordings.remarks, *told))
 
 
 def _season_of(recordings: Recordings, values: np.ndarray, name: str) -> np.ndarray:
@@ -398,3 +442,61 @@ def without_background(recordings: Recordings) -> Recordings:
     if len(remarks) == len(recordings.remarks):
         return recordings
     return replace(recordings, values=flat, remarks=tuple(remarks))
+
+
+def repetitions(recordings: Recordings, column: int) -> list[tuple[float, str, float]]:
+    """Values of a noisy state that repeat themselves: the probability of so many, their kind, their share.
+
+    ``held``: equal to the one before. ``straight``: steps that are. ``copied``: stretches of `COPIED` samples
+    that stand in the recordings twice. What rounding to a resolution step makes of it is allowed for.
+    """
+    x, which = recordings.values[:, column], recordings.recording
+    same, moves = np.diff(which) == 0, np.diff(x)
+    size = float(np.sqrt((moves[same] ** 2).mean())) if same.any() else 0.0
+    if len(x) <= COPIED or not size > 0:
+        return []
+    # Less a straight drift, what was rounded has no step: its second differences do.
+    both = same[1:] & same[:-1]
+    bends = np.diff(moves)[both]
+    step = resolution_step(x) or resolution_step(ALIKE * size * np.round(bends / (ALIKE * size)))
+    # Of numbers written with so many digits in all, large ones have a coarser step.
+    widths = np.maximum(ALIKE * size if step is None else step, _last_digits(x))
+    found, width = [], float(widths.max())
+    for kind, changes, at in (("held", moves[same], x[:-1][same]), ("straight", bends, x[1:-1][both])):
+        if not len(changes):
+            continue
+        # Noise may be small in some states: how large it is in each twentieth of the samples, by their state.
+        rank = np.argsort(np.argsort(at, kind="stable"), kind="stable")
+        part = rank * min(STATE_PARTS, len(at)) // len(at)
+        spread = np.sqrt(np.bincount(part, changes**2) / np.bincount(part))
+        spread = np.maximum(spread, max(LEAST_SPREAD * float(spread.max()), 1e-300))
+        sizes = np.abs(changes)
+        count = int((sizes < ALIKE * size).sum())
+        share = float(widths.mean()) / width
+        usual = len(changes) * min(share * width / np.sqrt(2 * np.pi) * float((1 / spread).mean()), 1.0)
+        # As many are zero as any other small number of steps; a line that is rounded is bent by one or two.
+        most = int(SMALL_CHANGE * spread.min() / width)
+        if most >= 2 * ROUNDED_LINE:
+            small = (sizes > (ROUNDED_LINE + 0.5) * width) & (sizes < (most + 0.5) * width)
+            usual = max(usual, share * float(small.sum()) / (2 * (most - ROUNDED_LINE)))
+        found.append((float(special.gammainc(count, usual)), kind, count / len(moves)))
+    # A stretch is another one by chance where each of its steps is.
+    begins = np.arange(len(x) - COPIED + 1)
+    begins = begins[which[begins] == which[begins + COPIED - 1]]
+    weights = np.random.default_rng(0).standard_normal(COPIED)
+    marks = np.convolve(x - x.mean(), weights, mode="valid")[begins]
+    moved = np.ptp(x[begins[:, None] + np.arange(COPIED)], axis=1) > ALIKE * size
+    count = int(moved.sum()) - len(np.unique(marks[moved]))
+    alike = min(width / (2 * np.sqrt(np.pi) * size), 1.0) ** (COPIED - 1)
+    chance = float(special.gammainc(count, len(begins) ** 2 / 2 * alike))
+    return [*found, (chance, "copied", count / max(len(begins), 1))]
+
+
+def _last_digits(values: np.ndarray) -> np.ndarray:
+    """One in the last digit of each value ``(n,)``, where all have so many digits; zero where they do not."""
+    exponents = np.floor(np.log10(positive(np.abs(values))))
+    for digits in range(1, MOST_DIGITS + 1):
+        last = 10.0 ** (exponents + 1 - digits)
+        if np.allclose(np.round(values / last) * last, values, rtol=1e-14, atol=0.0):
+            return last
+    return np.zeros(len(values))

@@ -48,15 +48,6 @@ CHANCE_TESTS = (  # of a certificate: those that chance can refuse
     "prediction", "descent", "one_system", "unchanged", "state_complete", "gaussian_increments", "times",
     "record",
 )  # fmt: skip
-SMALL_CHANGE = 0.3  # standard deviations: up to there a distribution is flat
-STATE_PARTS, LEAST_SPREAD = (
-    20,
-    0.01,
-)  # of samples by their state; of the largest spread, as where all are held
-ROUNDED_LINE = 2  # steps by which a straight line that is rounded is bent at most
-COPIED = 12  # samples of a stretch that is sought a second time
-MOST_DIGITS = 12  # of numbers that were rounded: those of floating point have sixteen
-ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 UNPREDICTED = "f does not predict held-out recordings"
 STATE_BINS = 12  # of each state: any function of it is seen as a value in each
 
@@ -242,64 +233,6 @@ def rounding_text(recordings: Recordings, *, coarse: bool = False) -> str | None
         new = {"names": [], "step": step, "unit": behind, "decimals": decimals_of(step), "error": error}
         alike.setdefault((step, behind), new)["names"].append(f"'{name}'")
     return sentence(Remark("inference.written", {"steps": list(alike.values())})) if alike else None
-
-
-def repetitions(recordings: Recordings, column: int) -> list[tuple[float, str, float]]:
-    """Values of a noisy state that repeat themselves: the probability of so many, their kind, their share.
-
-    ``held``: equal to the one before. ``straight``: steps that are. ``copied``: stretches of `COPIED` samples
-    that stand in the recordings twice. What rounding to a resolution step makes of it is allowed for.
-    """
-    x, which = recordings.values[:, column], recordings.recording
-    same, moves = np.diff(which) == 0, np.diff(x)
-    size = float(np.sqrt((moves[same] ** 2).mean())) if same.any() else 0.0
-    if len(x) <= COPIED or not size > 0:
-        return []
-    # Less a straight drift, what was rounded has no step: its second differences do.
-    both = same[1:] & same[:-1]
-    bends = np.diff(moves)[both]
-    step = resolution_step(x) or resolution_step(ALIKE * size * np.round(bends / (ALIKE * size)))
-    # Of numbers written with so many digits in all, large ones have a coarser step.
-    widths = np.maximum(ALIKE * size if step is None else step, _last_digits(x))
-    found, width = [], float(widths.max())
-    for kind, changes, at in (("held", moves[same], x[:-1][same]), ("straight", bends, x[1:-1][both])):
-        if not len(changes):
-            continue
-        # Noise may be small in some states: how large it is in each twentieth of the samples, by their state.
-        rank = np.argsort(np.argsort(at, kind="stable"), kind="stable")
-        part = rank * min(STATE_PARTS, len(at)) // len(at)
-        spread = np.sqrt(np.bincount(part, changes**2) / np.bincount(part))
-        spread = np.maximum(spread, max(LEAST_SPREAD * float(spread.max()), 1e-300))
-        sizes = np.abs(changes)
-        count = int((sizes < ALIKE * size).sum())
-        share = float(widths.mean()) / width
-        usual = len(changes) * min(share * width / np.sqrt(2 * np.pi) * float((1 / spread).mean()), 1.0)
-        # As many are zero as any other small number of steps; a line that is rounded is bent by one or two.
-        most = int(SMALL_CHANGE * spread.min() / width)
-        if most >= 2 * ROUNDED_LINE:
-            small = (sizes > (ROUNDED_LINE + 0.5) * width) & (sizes < (most + 0.5) * width)
-            usual = max(usual, share * float(small.sum()) / (2 * (most - ROUNDED_LINE)))
-        found.append((float(scipy.special.gammainc(count, usual)), kind, count / len(moves)))
-    # A stretch is another one by chance where each of its steps is.
-    begins = np.arange(len(x) - COPIED + 1)
-    begins = begins[which[begins] == which[begins + COPIED - 1]]
-    weights = np.random.default_rng(0).standard_normal(COPIED)
-    marks = np.convolve(x - x.mean(), weights, mode="valid")[begins]
-    moved = np.ptp(x[begins[:, None] + np.arange(COPIED)], axis=1) > ALIKE * size
-    count = int(moved.sum()) - len(np.unique(marks[moved]))
-    alike = min(width / (2 * np.sqrt(np.pi) * size), 1.0) ** (COPIED - 1)
-    chance = float(scipy.special.gammainc(count, len(begins) ** 2 / 2 * alike))
-    return [*found, (chance, "copied", count / max(len(begins), 1))]
-
-
-def _last_digits(values: np.ndarray) -> np.ndarray:
-    """One in the last digit of each value ``(n,)``, where all have so many digits; zero where they do not."""
-    exponents = np.floor(np.log10(positive(np.abs(values))))
-    for digits in range(1, MOST_DIGITS + 1):
-        last = 10.0 ** (exponents + 1 - digits)
-        if np.allclose(np.round(values / last) * last, values, rtol=1e-14, atol=0.0):
-            return last
-    return np.zeros(len(values))
 
 
 def unexplained_probability(

@@ -44,9 +44,9 @@ from itertools import pairwise
 import numpy as np
 import scipy.special
 
-from siq.data.preparation import joined
+from siq.data.preparation import joined, repetitions
 from siq.data.recordings import Recordings, SnapshotPairs, parent_recordings, snapshot_pairs
-from siq.inference.checks import STATE_BINS, repetitions, unexplained_probability
+from siq.inference.checks import STATE_BINS, unexplained_probability
 from siq.inference.diffusion_model import process_noise_increments
 from siq.inference.field_estimate import FieldEstimate, Verdict
 from siq.inference.regression import coarse_pairs, residuals

@@ -23,7 +23,7 @@ import numpy as np
 import scipy.special
 
 from siq.data.correlation import MarkovLag, markov_lag
-from siq.data.preparation import joined, turns_back
+from siq.data.preparation import joined, repetitions, turns_back
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.checks import (
@@ -34,7 +34,6 @@ from siq.inference.checks import (
     mean_residual_probability,
     neighbour_correlations,
     prediction_errors,
-    repetitions,
     residual_noise,
     rounding_text,
     unexplained_probability,

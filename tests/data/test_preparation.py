@@ -78,6 +78,45 @@ def test_samples_that_stand_apart_are_left_out_and_nothing_else() -> None:
     assert without_faults(seen(x)).values.shape == x.shape
 
 
+def held(x: np.ndarray, generator: np.random.Generator, *, every: int = 0) -> np.ndarray:
+    """Values that stay until the next one is measured, every so many samples or at half of them."""
+    fresh = np.arange(len(x)) % every == 0 if every else generator.random(len(x)) < 0.5
+    return x[np.maximum.accumulate(np.where(fresh, np.arange(len(x)), 0))]
+
+
+@pytest.mark.parametrize("every", [0, 2, 9])
+@pytest.mark.parametrize("digits", [2, 12])
+def test_values_that_are_held_are_left_out(every: int, digits: int) -> None:
+    x = np.round(hopping(), digits)
+    found = without_faults(seen(held(x, np.random.default_rng(0), every=every)))
+    assert "data.filled_left_out" in {one.code for one in found.remarks}
+    rows = np.round(found.t / 0.04).astype(int)
+    np.testing.assert_array_equal(found.values, x[rows])
+    assert len(rows) > 0.95 * len(x) / (every or 2)  # rounded values repeat themselves here and there
+    together = without_faults(seen(np.column_stack([x, held(x, np.random.default_rng(0), every=every)])))
+    np.testing.assert_array_equal(together.values, x[np.round(together.t / 0.04).astype(int)] * [1, 1])
+
+
+@pytest.mark.parametrize("digits", [3, 12])
+def test_gaps_that_are_filled_along_straight_lines_are_gaps(digits: int) -> None:
+    x, rows = hopping(), np.arange(20_000)
+    gap = rows // 37 % 5 == 0
+    lines = np.interp(rows, rows[~gap], x[~gap, 0])[:, None]
+    found = without_faults(seen(np.round(lines, digits)))
+    left = np.round(found.t / 0.04).astype(int)
+    assert gap[left].sum() <= 0.02 * gap.sum()
+    assert len(left) > 0.98 * (~gap).sum()
+
+
+def test_what_a_sensor_repeats_is_not_taken_for_filled_in() -> None:
+    x, dead = hopping(), hopping()
+    for k in range(1, len(x)):  # it stays until it is moved far enough
+        dead[k] = x[k] if abs(x[k] - dead[k - 1]) >= 0.25 else dead[k - 1]
+    apart = np.column_stack([np.repeat(x[::4], 4, axis=0), np.roll(np.repeat(x[1::4], 4, axis=0), 2)])
+    for values in (np.clip(x, -1, 0.9), np.round(x, 1), np.round(x / 0.3) * 0.3, dead, apart):
+        assert len(without_faults(seen(values)).t) == len(x)
+
+
 def test_one_number_for_a_fault_is_left_out_where_it_stands_twice_in_a_row_too() -> None:
     x = 10 + hopping()
     lost = np.random.default_rng(0).random(len(x)) < 0.005
