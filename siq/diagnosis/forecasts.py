@@ -66,6 +66,7 @@ PROMISING, SHAPES = 32, 3  # explanations, and shapes of each, that are asked at
 LEADERS, ATTEMPTS = 6, 12  # explanations that are fitted in earnest before none is said to lead: a choice
 SUSPECTS = 4  # rivals of the leader that are fitted in earnest before they count: a choice
 UNSETTLED = "its fit does not settle"
+EXACT = 1e-6  # numerical: of an effect, what is not reproduced where nothing tells two mechanisms apart
 RIDGE = 1e-10  # numerical: of normal equations whose columns have unit length
 # Of the budget, for the first name, so that tests have something left where forecasts name nothing: a choice.
 FIRST_NAME_SHARE = 0.5
@@ -427,27 +428,33 @@ def _places_of(leading: MechanismCandidate | None, fit: Fit, *, linear: bool) ->
     return [names.index(name) for name in chosen if name in names]
 
 
-def _containing(horizon: Horizon, sites: Sequence[_Site], leading: MechanismCandidate) -> set[str]:
-    """Labels of sites with more parameters that could do nearly all that a leading mechanism does.
+def _containing(
+    horizon: Horizon, sites: Sequence[_Site], leading: MechanismCandidate
+) -> tuple[set[str], set[str]]:
+    """Labels of sites that could do what a leading mechanism does: nearly, with more parameters, or exactly.
 
     A product of a function and a velocity contains linear damping. It is the mechanism and more, rather than
-    something else. So is a hysteresis that does what a drag does.
+    something else. So is a hysteresis that does what a drag does. And an offset of the sensor is what a
+    constant force does to a linear spring: no recording of this kind tells them apart.
     """
-    fit, data, found, size = horizon.fit, horizon.data, set[str](), len(leading.new)
-    chosen = [each for each in sites if each.candidate is None or len(each.candidate.new) > size]
-    terms, without = [each.terms[0] for each in chosen], _places_of(leading, fit, linear=True)
+    fit, data, size = horizon.fit, horizon.data, len(leading.new)
+    more, equal = set[str](), set[str]()
+    counts = [np.inf if each.candidate is None else len(each.candidate.new) for each in sites]
+    chosen = [(site, count) for site, count in zip(sites, counts, strict=True) if count >= size]
+    terms, without = [each.terms[0] for each, _ in chosen], _places_of(leading, fit, linear=True)
     response, groups = linearised_with(fit, data, terms, without=without)
     white = whiten(response, data, fit.noise)
     problem = _in_place_of(leading, fit, white, _fold_of(data))
     basis, effect = orthonormal(problem.own), problem.target - white.innovations
     effect = effect - basis @ (basis.T @ effect)
-    for each, group in zip(chosen, groups, strict=True):
+    for (each, count), group in zip(chosen, groups, strict=True):
         columns = white.columns[:, len(fit.model.free) :][:, group]
         if np.isfinite(columns).all():
             own = orthonormal(columns - basis @ (basis.T @ columns))
-            if ((own.T @ effect) ** 2).sum() >= NEARLY_ALL * (effect @ effect):
-                found.add(each.label)
-    return found
+            share = ((own.T @ effect) ** 2).sum() / (effect @ effect)
+            if share >= (NEARLY_ALL if count > size else 1 - EXACT):
+                (more if count > size else equal).add(each.label)
+    return more, equal
 
 
 def _density(problem: _Foreseen, term: Probe | Place, columns: np.ndarray) -> float:
@@ -508,8 +515,9 @@ class _Leader:
 def _fitted_at(
     horizons: Sequence[Horizon], site: _Site, budget: Budget, untried: dict[str, NotFitted]
 ) -> tuple[list[Horizon], float] | None:
-    """A mechanism fitted at every horizon, and what it gains; None where that fails, or its sign is wrong.
+    """A mechanism fitted at every horizon, and what it gains; None where that fails.
 
+    It gains less than nothing if its sign is wrong.
     One that does not settle at one of them is among the untried, too.
     """
     candidate, probe, found = site.candidate, site.terms[0], list[Horizon]()
@@ -520,8 +528,10 @@ def _fitted_at(
             x = probe.states_along(each.fit, each.data, each.fit.x)
             model, rough = candidate.begun(each.fit.model, known), horizons[0].data.roughness
             fit = _fitted(model, each.data, each.fit, x, rough, budget=budget)
-            if not candidate.admits(fit, each.data):
-                raise NumericalFailure("its best parameters have a sign or a period that it cannot have")
+            if not candidate.admits(fit, each.data):  # it is refuted, whatever it promised
+                error = NumericalFailure("its best parameters have a sign or a period that it cannot have")
+                untried[candidate.label] = NotFitted.of(candidate, error)
+                return [], -np.inf
             if candidate.generalises and candidate.idle(fit):
                 raise NumericalFailure("it is no more than the special case of it")
             found.append(Horizon.of(fit, each.data))
@@ -580,10 +590,21 @@ def _next_rung(
     heaviest = max(each.weight for each in leading)
     plausible = [each for each in leading if each.weight > heaviest + np.log(PLAUSIBLE)]
     leader = min(plausible, key=lambda each: (len(each.candidate.new), -each.weight))
+    errors = cache(lambda one: _left_out(one.horizons[0].fit, [one.candidate], base.noise, context))
     # All others are compared in the place of one that brings no states of its own.
     steady = [each for each in leading if each.candidate.model.dimension == d]
     if steady:
         ground = leader if leader in steady else max(steady, key=lambda each: each.weight)
+        # What is a simpler mechanism and hardly more has to take most of what that one leaves: a gain beside
+        # an offset may take no more than a part of an error of the model.
+        for each in sorted(steady, key=lambda each: -each.weight):
+            if (
+                len(each.candidate.new) < len(ground.candidate.new)
+                and each.gain >= NEARLY_ALL * ground.gain
+                and _containing(each.horizons[0], [ground.site], each.candidate)[0]
+                and not _takes_most(errors(each), errors(ground), ground.horizons[0].fit, context.data)
+            ):
+                leader, ground = each if leader is ground else leader, each
         there = ground.horizons[0].fit
         rebased = [each.rebased(base.model, there.model) for each in candidates]
         remaining = _sites(rebased, there, context, untried)
@@ -594,7 +615,6 @@ def _next_rung(
             plain = [one for one in remaining if one.candidate is None or one.candidate.model.dimension == d]
             above, more = _gains(ground.horizons, plain, None, budget, untried)
             both = ground.weight + max([0.0, *(more + np.array([site.prior for site in above]))])
-            errors = cache(lambda one: _left_out(one.horizons[0].fit, [one.candidate], base.noise, context))
             outdone = {
                 each.site.label
                 for each in near
@@ -616,7 +636,18 @@ def _next_rung(
     ]
     for site in suspects[:SUSPECTS]:
         attempt(site)
-    contained = _containing(leader.horizons[0], sites, leader.candidate) if leader in steady else set[str]()
+    contained, equal = set[str](), set[str]()
+    if leader in steady:
+        contained, equal = _containing(leader.horizons[0], sites, leader.candidate)
+    # What has more parameters is no rival where it takes no more than it leaves of what the leader leaves.
+    outdone |= {
+        label
+        for label, each in fitted.items()
+        if each.weight > leader.weight - options.least_log_odds
+        and each.site.family != leader.site.family
+        and len(each.candidate.new) > len(leader.candidate.new)
+        and not _takes_most(errors(leader), errors(each), each.horizons[0].fit, context.data)
+    }
     # What was fitted in earnest counts as it was fitted; if it did not settle, at most as it promised.
     limit = dict(zip((site.label for site in sites), gains, strict=True))
     kept = [place for place, site in enumerate(sites) if site.label not in fitted]
@@ -630,7 +661,7 @@ def _next_rung(
     rival = ~more | ((gains > leader.gain + options.least_log_odds) & (leader.gain < NEARLY_ALL * gains))
     weights = np.where(rival, gains + np.array([site.prior for site in sites]), -np.inf)
     flat = np.where(rival, gains + np.array([site.flat for site in sites]), -np.inf)
-    family = np.array([site.family == leader.site.family for site in sites])
+    family = np.array([site.family == leader.site.family or site.label in equal for site in sites])
     log_odds, flat_log_odds = (
         float(logsumexp(each[family]) - logsumexp(np.append(each[~family], 0.0)))  # and nothing at all
         for each in (weights, flat)
@@ -652,6 +683,7 @@ def _next_rung(
             each.horizons[0].fit, base, horizons[0].data, each.candidate, blocks=options.blocks
         )
         for label, each in fitted.items()
+        if each.horizons
     }
     best = known.pop(leader.site.label)
     others: dict[Standing, tuple[FittedCandidate, ...]] = {
@@ -670,15 +702,20 @@ def _left_out(
     return None if squares is None else np.array(in_blocks(squares))
 
 
-def _takes_most(before: np.ndarray | None, after: np.ndarray | None, fit: Fit, data: Measurements) -> bool:
+def _takes_most(
+    before: np.ndarray | None, after: np.ndarray | None, fit: Fit, data: Measurements, *, surely: bool = True
+) -> bool:
     """Whether a fit takes more than it leaves of the errors of free runs of parts left out.
 
-    That is b - a > a - s², with squared errors b before it and a after it, and s² of the sensors.
+    That is b - a > a - s², with squared errors b before it and a after it, and s² of the sensors: surely, if
+    it is more so than by chance; else, if typical errors have it so, and a is below b by more than chance.
     """
     if before is None or after is None:
         return after is not None
-    sensors = fit.noise.measurement / np.nanvar(data.outputs, axis=0)
-    return typically_better(before + sensors.mean(), 2 * after)
+    sensors = (fit.noise.measurement / np.nanvar(data.outputs, axis=0)).mean()
+    if surely:
+        return typically_better(before + sensors, 2 * after)
+    return typically_better(before, after) and bool(np.log((before + sensors) / (2 * after)).mean() > 0)
 
 
 def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], tuple[NotFitted, ...]]:
@@ -720,6 +757,8 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], tu
     fits = [*(each.fit for each in alone[:1]), *(each.fit for each in best)]
     own = [each.candidate for each in best]
     errors = cache(lambda count: _left_out(fits[count], own[:count], alone[0].fit.noise, context))
-    while (last := len(found)) and not _takes_most(errors(last - 1), errors(last), fits[last], context.data):
+    while (last := len(found)) and not _takes_most(
+        errors(last - 1), errors(last), fits[last], context.data, surely=False
+    ):
         LOGGER.info("%s makes no free run better", found.pop().accepted.best.candidate.label)
     return alone, found, tuple(untried.values())

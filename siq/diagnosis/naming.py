@@ -233,7 +233,8 @@ def _with_models(decision: Investigation, whole: Search, context: FitContext) ->
     if len(whole.found) > len(search.found) or decision.remainder.doubtful or search.fit.has_process_noise:
         models = fit_models_of_remainder(search, whole, context)
         decision = replace(decision, models=models)
-        if models and not models[0].fit.has_process_noise:
+        # What forecasts named has been held against functions without a name on parts left out.
+        if models and not (models[0].fit.has_process_noise or decision.finals):
             decision = _one_cause_or_two(decision, context)
             if not decision.verdict.names:
                 return decision

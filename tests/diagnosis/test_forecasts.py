@@ -251,7 +251,7 @@ def test_a_last_mechanism_that_makes_no_free_run_better_is_taken_back(
     assert climb(fit, context)[1] == [damped()]
     # One that makes free runs better stays, with those that it stands on.
     rungs = iter([damped(), damped(), None])
-    monkeypatch.setattr(forecasts, "typically_better", lambda *_, **__: True)
+    monkeypatch.setattr(forecasts, "_takes_most", lambda *_, **__: True)
     assert climb(fit, context)[1] == [damped(), damped()]
 
 
@@ -433,11 +433,11 @@ def test_what_follows_any_motion_is_no_rival_where_something_simple_does_as_much
 
     monkeypatch.setattr(forecasts, "_fitted_at", fitted)
     monkeypatch.setattr(forecasts, "_gains", promised)
-    monkeypatch.setattr(forecasts, "_containing", lambda *_: set())
+    monkeypatch.setattr(forecasts, "_containing", lambda *_: (set(), set()))
     monkeypatch.setattr(forecasts.FittedCandidate, "of", lambda *given, **_: given[3])
     monkeypatch.setattr(forecasts, "_left_out", lambda *_: None)
     for on_top, takes_most in ((50.0, True), (0.0, True), (0.0, False)):
-        monkeypatch.setattr(forecasts, "_takes_most", lambda *_, most=takes_most: most)
+        monkeypatch.setattr(forecasts, "_takes_most", lambda *_, most=takes_most, **__: most)
         rung = _next_rung(horizons, context.candidates, context, {})
         assert (rung is not None) == (on_top > 0 or not takes_most)
 
@@ -463,7 +463,7 @@ def test_a_fit_that_does_not_settle_counts_for_no_more_than_it_promised(
 
     monkeypatch.setattr(forecasts, "_fitted_at", fitted)
     monkeypatch.setattr(forecasts, "_gains", promised)
-    monkeypatch.setattr(forecasts, "_containing", lambda *_: set())
+    monkeypatch.setattr(forecasts, "_containing", lambda *_: (set(), set()))
     monkeypatch.setattr(forecasts.FittedCandidate, "of", lambda *given, **_: given[3])
     rung = _next_rung(_horizons_of(fit, context)[:1], context.candidates, context, {})
     best = "" if rung is None else rung.accepted.best.name
@@ -491,7 +491,7 @@ def test_the_general_form_outdoes_a_member_only_if_it_is_likelier(
 
     monkeypatch.setattr(forecasts, "_fitted_at", fitted)
     monkeypatch.setattr(forecasts, "_gains", promised)
-    monkeypatch.setattr(forecasts, "_containing", lambda *_: set())
+    monkeypatch.setattr(forecasts, "_containing", lambda *_: (set(), set()))
     monkeypatch.setattr(forecasts.FittedCandidate, "of", lambda *given, **_: given[3])
     rung = _next_rung(_horizons_of(fit, context)[:1], context.candidates, context, {})
     assert (rung is not None) == named
