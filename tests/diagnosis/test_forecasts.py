@@ -21,6 +21,7 @@ from siq.diagnosis.forecasts import (
     _fold_of,
     _Foreseen,
     _gained,
+    _gains,
     _horizons_of,
     _log_priors,
     _next_rung,
@@ -46,22 +47,31 @@ SAMPLES, FINE, DURATION, LASTING, NOISE = 120, 10, 8.0, 0.5, 0.001
 CLOSE = ("linear damping", "quadratic drag", "cubic stiffness", "constant bias")  # near the truth, or far off
 
 
-def pendulum(scale: float = 1.0) -> Dynamics:
-    """Without damping; angles are in units of so many per radian."""
+def pendulum(scale: float = 1.0, *, linear: bool = False) -> Dynamics:
+    """Without damping; angles are in units of so many per radian. One that is linear is a spring."""
     card = {
         "time_unit": "s",
         "states": states(a="1", w="1/s"),
         "parameters": numbers(k=8.5),
-        "equations": {"a": "w", "w": f"-k*{scale}*sin(a/{scale})"},
+        "equations": {"a": "w", "w": "-k*a" if linear else f"-k*{scale}*sin(a/{scale})"},
         "outputs": {"q": "a"},
     }
     return model_of(card)
 
 
 def recorded(
-    damping: float, force: float, *, scale: float = 1.0, count: int = 6, seed: int = 3
+    damping: float,
+    force: float,
+    *,
+    scale: float = 1.0,
+    count: int = 6,
+    seed: int = 3,
+    bias: float | None = None,
 ) -> Measurements:
-    """Pendulums of another swing each, by Heun's rule, with forces at random that last for a while."""
+    """Pendulums of another swing each, by Heun's rule, with forces at random that last for a while.
+
+    Or springs, on which a constant force acts.
+    """
     draw = np.random.default_rng(seed)
     h = DURATION / (SAMPLES - 1) / FINE
     state = np.stack([np.linspace(0.6, 2.2, count), draw.normal(size=count)])
@@ -69,7 +79,8 @@ def recorded(
     seen = np.empty((count, SAMPLES))
 
     def rate(y: np.ndarray) -> np.ndarray:
-        return np.stack([y[1], -9.0 * np.sin(y[0]) - damping * y[1] + force * push])
+        back = -9.0 * np.sin(y[0]) if bias is None else bias - 9.0 * y[0]
+        return np.stack([y[1], back - damping * y[1] + force * push])
 
     for sample in range(SAMPLES):
         seen[:, sample] = state[0]
@@ -78,7 +89,7 @@ def recorded(
             state = state + h / 2 * (first + rate(state + h * first))
             push = memory * push + np.sqrt(1 - memory**2) * draw.normal(size=count)
     seen = scale * (seen + NOISE * draw.normal(size=seen.shape))
-    return laid_out(seen, pendulum(scale))
+    return laid_out(seen, pendulum(scale, linear=bias is not None))
 
 
 def laid_out(seen: np.ndarray, model: Dynamics) -> Measurements:
@@ -239,6 +250,38 @@ def test_damping_is_named_beside_forces_that_last() -> None:
     assert len(alone) == len(found.horizons) >= 2
     c = next(each for each in best.fit.model.parameters if each.name in best.candidate.amplitudes)
     assert c.value == pytest.approx(0.15, rel=0.3)
+
+
+def test_what_nothing_tells_from_a_name_is_named_with_it_and_a_gain_that_does_no_more_is_not() -> None:
+    """A constant force on a spring is an offset of its sensor, to which a gain adds what an error may be."""
+    model = pendulum(linear=True)
+    context = context_of(model, recorded(0.0, 0.2, bias=0.8), ("constant bias", "sensor gain or offset"))
+    found = first_rung(context)
+    assert found is not None and found.accepted.best.candidate.name == "constant bias"
+    alike = [each.candidate for each in found.accepted.others["same"]]
+    assert [(each.name, len(each.new)) for each in alike] == [("sensor gain or offset", 1)]
+
+
+def test_what_was_fitted_with_a_sign_that_it_cannot_have_is_no_rival(monkeypatch: pytest.MonkeyPatch) -> None:
+    context = context_of(pendulum(), recorded(0.15, 0.2), ("linear damping", "sensor lag"))
+    horizons, untried = (
+        _horizons_of(recalibrate(context.model, context.data)[0], context)[:1],
+        dict[str, NotFitted](),
+    )
+    (lag,) = [each for each in context.candidates if each.name == "sensor lag"]
+    monkeypatch.setattr(MechanismCandidate, "admits", lambda one, *_: one.name != lag.name)
+    told = _gains
+
+    def promised(*given: object) -> tuple:
+        sites, gains = told(*given)
+        return sites, np.where(
+            [each.candidate is not None and each.candidate.name == lag.name for each in sites], 1e6, gains
+        )
+
+    monkeypatch.setattr(forecasts, "_gains", promised)
+    found = _next_rung(horizons, context.candidates, context, untried)
+    assert found is not None and found.accepted.best.candidate.name == "linear damping"
+    assert lag.label in untried
 
 
 def test_a_last_mechanism_that_makes_no_free_run_better_is_taken_back(
