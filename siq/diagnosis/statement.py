@@ -158,27 +158,17 @@ class StatedTerm:
 
 @dataclass(frozen=True)
 class Description:
-    """What is known of a mismatch that has no name.
+    """What is known of a mismatch that has no name."""
 
-    Attributes
-    ----------
-    share_described, by
-        Share of the excess that these mechanisms describe, which explain a part and are not named.
-    p_residuals_random
-        p-value of the test that what is left is noise: how often noise alone would look as structured.
-    random_forces_admitted
-        Whether the fit needed process noise.
-    too_faint
-        Whether the mechanisms explain enough, and a function without a name is nearly as likely.
-    misleading
-        Whether the mechanisms are not named since recordings held out do not bear them out.
-    """
-
+    #: Share of the excess that these mechanisms describe, which explain a part and are not named.
     share_described: float
     by: tuple[StatedTerm, ...]
+    #: p-value of the test that what is left is noise: how often noise alone would look as structured.
     p_residuals_random: float
-    random_forces_admitted: bool
+    random_forces_admitted: bool  #: whether the fit needed process noise
+    #: Whether the mechanisms explain enough, and a function without a name is nearly as likely.
     too_faint: bool = False
+    #: Whether the mechanisms are not named since recordings held out do not bear them out.
     misleading: bool = False
 
 
@@ -233,42 +223,28 @@ class Location:
 
 @dataclass(frozen=True)
 class Statement:
-    """All that a diagnosis states.
+    """All that a diagnosis states."""
 
-    Attributes
-    ----------
-    verdict, mechanisms
-        One of four, and what is named.
-    description, described
-        Of a mismatch without a name; and the model of it that is part of the new card, empty where nothing
-        that was added helped. A model that leaves nothing to be explained is missing physics, too.
-    location
-        Where the mismatch sits, if there is one.
-    recalibration, errors
-        The simulation's own parameters, and errors on held-out recordings.
-    excluded
-        Bounds of what was not found, where nothing is missing.
-    remarks, not_fitted
-        Reservations, and what could not be judged.
-    explanations
-        Logarithms of the marginal likelihoods of whole explanations, less that of the likeliest, which is the
-        first; see `siq.diagnosis.evidence.log_evidences`.
-    account
-        The work that it took, and whether something was left undone.
-    """
-
+    #: One of four, and what is named.
     verdict: MismatchVerdict
     mechanisms: tuple[StatedTerm, ...] = ()
+    #: Of a mismatch without a name; and the model of it that is part of the new card, empty where nothing
+    #: that was added helped. A model that leaves nothing to be explained is missing physics, too.
     description: Description | None = None
     described: tuple[StatedTerm, ...] = ()
-    location: Location | None = None
+    location: Location | None = None  #: where the mismatch sits, if there is one
+    #: The simulation's own parameters, and errors on held-out recordings.
     recalibration: Mapping[str, Recalibrated] = field(default_factory=dict)
     errors: HeldOutErrors = field(default_factory=HeldOutErrors)
+    #: Bounds of what was not found, where nothing is missing.
     excluded: Mapping[str, UpperBound] = field(default_factory=dict)
+    #: Reservations, and what could not be judged.
     remarks: tuple[Remark, ...] = ()
     not_fitted: tuple[NotFitted, ...] = ()
+    #: Logarithms of the marginal likelihoods of whole explanations, less that of the likeliest, which is the
+    #: first; see `siq.diagnosis.evidence.log_evidences`.
     explanations: Mapping[str, float] = field(default_factory=dict)
-    account: Account = UNLIMITED
+    account: Account = UNLIMITED  #: the work that it took, and whether something was left undone
 
     @property
     def partial(self) -> bool:

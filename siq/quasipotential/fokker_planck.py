@@ -83,31 +83,17 @@ QUANTILES = (0.025, 0.975)  # of an interval
 
 
 class ReactiveFlow(NamedTuple):
-    """What goes from a set A to a set B, in the cells of `process`.
+    """What goes from a set A to a set B, in the cells of `process`."""
 
-    Attributes
-    ----------
-    process
-        The cells: their middles are `process.points`, shape ``(n, d)``.
-    committor
-        Probability to reach B before A, shape ``(n,)``.
-    density
-        Of states on their way from A to B, per unit of the states, shape ``(n,)``: its integral is the share
-        of time spent so.
-    current
-        Net current of what is on its way, ``(n, d)``: per unit of time and of what is across.
-    rate
-        Of transitions per unit of time that A was the last of both.
-    sets
-        A, and the parts of B.
-    """
-
-    process: CellProcess
-    committor: np.ndarray
+    process: CellProcess  #: the cells: their middles are `process.points`, shape ``(n, d)``.
+    committor: np.ndarray  #: probability to reach B before A, shape ``(n,)``
+    #: Of states on their way from A to B, per unit of the states, shape ``(n,)``: its integral is the share
+    #: of time spent so.
     density: np.ndarray
+    #: Net current of what is on its way, ``(n, d)``: per unit of time and of what is across.
     current: np.ndarray
-    rate: float
-    sets: tuple[Neighbourhood, ...] = ()
+    rate: float  #: of transitions per unit of time that A was the last of both
+    sets: tuple[Neighbourhood, ...] = ()  #: A, and the parts of B
 
     def counted(self, recordings: Recordings) -> pd.DataFrame:
         """How often a record went to B before A, beside the committor.
@@ -156,21 +142,15 @@ class ReactiveFlow(NamedTuple):
 
 
 class Dissipation(NamedTuple):
-    """Production of entropy per unit of time, in units of Boltzmann's constant.
+    """Production of entropy per unit of time, in units of Boltzmann's constant."""
 
-    Attributes
-    ----------
-    value, lower, upper
-        Σ̇, and its 95 % interval: by the uncertainty of f and ε where these were estimated, and of given ones
-        the error of the cells. Not a number stands above where the terms of an estimated f leave no current,
-        whatever their coefficients are: then nothing is known of other terms.
-    points, density
-        Middles of the cells, ``(n, d)``, and where in them it is made, per unit of the states, ``(n,)``.
-    """
-
+    #: Σ̇, and its 95 % interval: by the uncertainty of f and ε where these were estimated, and of given ones
+    #: the error of the cells. Not a number stands above where the terms of an estimated f leave no current,
+    #: whatever their coefficients are: then nothing is known of other terms.
     value: float
     lower: float
     upper: float
+    #: Middles of the cells, ``(n, d)``, and where in them it is made, per unit of the states, ``(n,)``.
     points: np.ndarray
     density: np.ndarray
 
@@ -219,22 +199,14 @@ class Dissipation(NamedTuple):
 
 
 class Rotation(NamedTuple):
-    """How a periodic state moves on in the long run, by ``⟨x⟩ = v t`` and ``var x = 2 D_eff t``.
+    """How a periodic state moves on in the long run, by ``⟨x⟩ = v t`` and ``var x = 2 D_eff t``."""
 
-    Attributes
-    ----------
-    state
-        Its name.
-    velocity, diffusion
-        v, in its unit per unit of time, and D_eff, in the square of its unit.
-    velocity_error, diffusion_error
-        Standard errors by the uncertainty of f and ε where these were estimated, or from counting; of given
-        ones the error of the cells, none in one state.
-    """
-
-    state: str
+    state: str  #: its name
+    #: v, in its unit per unit of time, and D_eff, in the square of its unit.
     velocity: float
     diffusion: float
+    #: Standard errors by the uncertainty of f and ε where these were estimated, or from counting; of given
+    #: ones the error of the cells, none in one state.
     velocity_error: float = 0.0
     diffusion_error: float = 0.0
 

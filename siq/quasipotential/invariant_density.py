@@ -56,27 +56,19 @@ QUADRATURE_TOLERANCE = 1e-6  # relative: what a quadrature's own estimate of its
 
 @dataclass(frozen=True)
 class DensityComparison:
-    """The histogram of a long simulation beside a marginal density.
+    """The histogram of a long simulation beside a marginal density."""
 
-    Attributes
-    ----------
-    total_variation
-        ``½ Σ |P_b - Q_b|`` over the bins, Q the samples' shares and P the density's probabilities: from 0
-        to 1, the largest difference in the probability of any union of bins.
-    sampling_floor
-        What total variation to expect of these samples if the density were exact, from the spread among
-        the walkers; NaN with one walker.
-    outside
-        Share of the samples outside the box, which counts as a further bin, of probability 0. Of a
-        landscape: share of the samples where U is not known, which are left out.
-    x1_edges, x2_edges, histogram
-        Edges of the bins, shapes ``(n + 1,)`` and ``(m + 1,)``, the latter empty with one state; and the
-        samples' density, ``(m, n)`` or ``(1, n)``, in the marginal density's unit.
-    """
-
+    #: ``½ Σ |P_b - Q_b|`` over the bins, Q the samples' shares and P the density's probabilities: from 0 to
+    #: 1, the largest difference in the probability of any union of bins.
     total_variation: float
+    #: What total variation to expect of these samples if the density were exact, from the spread among the
+    #: walkers; NaN with one walker.
     sampling_floor: float
+    #: Share of the samples outside the box, which counts as a further bin, of probability 0. Of a landscape:
+    #: share of the samples where U is not known, which are left out.
     outside: float
+    #: Edges of the bins, shapes ``(n + 1,)`` and ``(m + 1,)``, the latter empty with one state; and the
+    #: samples' density, ``(m, n)`` or ``(1, n)``, in the marginal density's unit.
     x1_edges: np.ndarray
     x2_edges: np.ndarray
     histogram: np.ndarray
@@ -122,32 +114,23 @@ class DensityComparison:
 
 @dataclass(frozen=True)
 class StationaryDensity:
-    """The density on a plane of two states, the others integrated out; or of a single state.
+    """The density on a plane of two states, the others integrated out; or of a single state."""
 
-    Attributes
-    ----------
-    plane, intensity
-        Indices of the two states, or of the only one; and ε.
-    x1, x2
-        The grid, shapes ``(n,)`` and ``(m,)``, evenly spaced: from edge to edge of the box, or, of wells, in
-        the middles of its cells. With one state `x2` is empty.
-    values
-        Shape ``(m, n)``, ``(1, n)`` with one state: density per unit of the first state and unit of the
-        second; its integral over the box is 1. NaN where it is not known.
-    normalisation, comparison
-        Z, None where it is not to be written; and a long simulation beside it.
-    unknown
-        The share of all probability that lies where the density is not known, at most; None where it is
-        known everywhere.
-    """
-
+    #: Indices of the two states, or of the only one; and ε.
     plane: tuple[int, ...]
     intensity: float
+    #: The grid, shapes ``(n,)`` and ``(m,)``, evenly spaced: from edge to edge of the box, or, of wells, in
+    #: the middles of its cells. With one state `x2` is empty.
     x1: np.ndarray
     x2: np.ndarray
+    #: Shape ``(m, n)``, ``(1, n)`` with one state: density per unit of the first state and unit of the
+    #: second; its integral over the box is 1. NaN where it is not known.
     values: np.ndarray
+    #: Z, None where it is not to be written; and a long simulation beside it.
     normalisation: float | None = None
     comparison: DensityComparison | None = None
+    #: The share of all probability that lies where the density is not known, at most; None where it is known
+    #: everywhere.
     unknown: float | None = None
 
     def compare(self, samples: np.ndarray, *, bins: int = BINS) -> DensityComparison:
@@ -298,23 +281,15 @@ def marginal_density(
 
 @dataclass(frozen=True)
 class SampledPotential:
-    """U over all wells in the middles of the cells of a box.
+    """U over all wells in the middles of the cells of a box."""
 
-    Attributes
-    ----------
-    box, values, well
-        Shape ``(d, 2)``; U, one axis for each state, NaN where it is not known; and the index of the well
-        whose formula gives it, -1 where none does.
-    wells
-        Their number, k.
-    prefactor
-        Of exp(-U/ε): of one state, D at the first attractor over D, of the shape of `values`; elsewhere 1.
-    """
-
+    #: Shape ``(d, 2)``; U, one axis for each state, NaN where it is not known; and the index of the well
+    #: whose formula gives it, -1 where none does.
     box: np.ndarray
     values: np.ndarray
     well: np.ndarray
-    wells: int
+    wells: int  #: their number, k
+    #: Of exp(-U/ε): of one state, D at the first attractor over D, of the shape of `values`; elsewhere 1.
     prefactor: np.ndarray | float = 1.0
 
     @classmethod
@@ -476,27 +451,18 @@ class SampledPotential:
 
 @dataclass(frozen=True)
 class _KnownDensity:
-    """``exp(-U/ε)/Z`` where U is known, and how much of all probability lies elsewhere at most.
+    """``exp(-U/ε)/Z`` where U is known, and how much of all probability lies elsewhere at most."""
 
-    Attributes
-    ----------
-    potential, intensity
-        U on the cells, and ε.
-    normalisation, change
-        Z over the cells in which U is known, in the product of the states' units; and by how much it changes,
-        relatively, if cells are twice as wide.
-    unknown
-        The share of all probability in the box that the other cells can hold at most.
-    probabilities, shares
-        Of the cells, of the shape of `SampledPotential.values`, 1 in total, zero where U is not known; and
-        the wells' shares of it, shape ``(k,)``.
-    """
-
+    #: U on the cells, and ε.
     potential: SampledPotential
     intensity: float
+    #: Z over the cells in which U is known, in the product of the states' units; and by how much it changes,
+    #: relatively, if cells are twice as wide.
     normalisation: float
     change: float
-    unknown: float
+    unknown: float  #: the share of all probability in the box that the other cells can hold at most
+    #: Of the cells, of the shape of `SampledPotential.values`, 1 in total, zero where U is not known; and
+    #: the wells' shares of it, shape ``(k,)``.
     probabilities: np.ndarray
     shares: np.ndarray
 

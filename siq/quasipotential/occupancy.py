@@ -235,25 +235,16 @@ class VisitTest:
 
 @dataclass(frozen=True, eq=False)
 class _DensityTest:
-    """How a state is spread during the visits to one well.
+    """How a state is spread during the visits to one well."""
 
-    Attributes
-    ----------
-    well, state
-        Indices of the attractor, and of the state.
-    distance, independent
-        The largest difference of the two distribution functions; and how many independent samples there are.
-    probability
-        Of as large a distance, were the prediction true within its error.
-    edges, counted, predicted
-        The histogram: edges ``(b + 1,)``, densities ``(b,)`` per unit of the state.
-    """
-
+    #: Indices of the attractor, and of the state.
     well: int
     state: int
+    #: The largest difference of the two distribution functions; and how many independent samples there are.
     distance: float
     independent: float
-    probability: float
+    probability: float  #: of as large a distance, were the prediction true within its error
+    #: The histogram: edges ``(b + 1,)``, densities ``(b,)`` per unit of the state.
     edges: np.ndarray
     counted: np.ndarray
     predicted: np.ndarray

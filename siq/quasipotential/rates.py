@@ -653,21 +653,13 @@ def _equilibrium_near(dynamics: Dynamics, path: MinimumActionPath, end: int) -> 
 
 @dataclass(frozen=True)
 class MeanTime:
-    """A mean time with its errors.
+    """A mean time with its errors."""
 
-    Attributes
-    ----------
-    value
-        E[τ], in the unit of time.
-    data_error, law_error
-        Relative errors: the standard error from f and from the noise; and that of the law.
-    complete
-        Whether every way out counts; where one has no rate, the mean residence time is at most `value`.
-    """
-
-    value: float
+    value: float  #: E[τ], in the unit of time
+    #: Relative errors: the standard error from f and from the noise; and that of the law.
     data_error: float
     law_error: float
+    #: Whether every way out counts; where one has no rate, the mean residence time is at most `value`.
     complete: bool = True
 
     @property

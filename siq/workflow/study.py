@@ -183,7 +183,8 @@ class RecordingsOptions(BaseModel):
         those of a map, from which the continuous process is then found. Leave it out for measurements.
     background
         Whether slow drift of a single recording, the baselines of several that hop and differ in them, and
-        what only a sensor can have added are taken off: hum, and samples that stand apart. It is noted.
+        what only a sensor or a file can have added are taken off: hum, samples that stand apart, and values
+        that were filled in. It is noted.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
