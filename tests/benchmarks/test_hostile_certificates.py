@@ -10,7 +10,7 @@ from benchmarks.hostile.scores import scored
 # Chosen for what they are, and for a short computing time: a minute and a half together.
 REFUSED = (
     "hysteresis", "swinging_tilt", "projected_wells", "growing_noise", "force_with_memory",
-    "relaxation_oscillator", "lost_buffers", "square_wave", "feedback_with_delay", "growing_oscillation",
+    "popcorn", "lost_buffers", "square_wave", "jittered_clock", "duplicated",
 )  # fmt: skip
 NAMED = ("held_values",)  # values that repeat themselves are no copies of recordings
 HONEST = ("gate", "swinging_tilt", "two_offsets", "growing_noise")
