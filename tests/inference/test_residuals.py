@@ -9,8 +9,9 @@ import sympy
 from known_systems import KnownSystem, archetype, as_system, double_well, maier_stein
 from scipy.signal import lfilter
 
+from siq.data.preparation import repetitions
 from siq.data.recordings import Recordings, snapshot_pairs
-from siq.inference.checks import mean_residual_probability, repetitions, residual_noise
+from siq.inference.checks import mean_residual_probability, residual_noise
 from siq.inference.field_estimate import FieldEstimate, NoiseDiagnosis
 from siq.inference.library import IdentificationOptions, field_library
 from siq.inference.regression import identify_vector_field
