@@ -53,6 +53,7 @@ SMALL_CHANGE = 0.3  # standard deviations: up to there a distribution is flat
 STATE_PARTS, LEAST_SPREAD = 20, 0.01  # of samples by their state; of the largest spread, where all are held
 ROUNDED_LINE = 2  # steps by which a straight line that is rounded is bent at most
 SMALL_STEP, FEWEST_SMALL = 0.2, 0.05  # of the median step, and how many are: 0.11 of normal ones
+FEWEST_TOGETHER = 0.1  # a choice: of samples with a new value of any state, those with one of all
 COPIED = 12  # samples of a stretch that is sought a second time
 MOST_DIGITS = 12  # of numbers that were rounded: those of floating point have sixteen
 ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
@@ -280,18 +281,17 @@ def _without_filled(recordings: Recordings) -> Recordings:
     """Recordings less samples that repeat the one before, or lie on a straight line between their neighbours.
 
     A file holds a value until the next one is measured, or fills gaps along lines, if noisy values repeat
-    themselves more often than `repetitions` allows. Values at which a sensor is clipped are few, and one that
-    stays until it is moved far enough makes no small steps: of these nothing is left out, nor where states
-    were hardly ever measured together.
+    themselves more often than `repetitions` allows. Of values at which a sensor is clipped, which are few, of
+    one that stays until it is moved far enough, which makes no small steps, and of states that were hardly
+    ever measured together nothing is left out.
     """
     x, same = recordings.values, np.diff(recordings.recording) == 0
-    rates, filled, fewest = FALSE_FAULT_RATE / x.shape[1], np.zeros(len(x), dtype=bool), len(x)
-    told = []
+    rate, filled, told = FALSE_FAULT_RATE / x.shape[1], np.zeros(x.shape, dtype=bool), list[Remark]()
     for column, title in enumerate(recordings.titles):
-        likely = {kind for chance, kind, _ in repetitions(recordings, column) if chance < rates}
+        likely = {kind for chance, kind, _ in repetitions(recordings, column) if chance < rate}
         moves, step = np.diff(x[:, column]), resolution_step(x[:, column]) or 0.0
         near = ALIKE * float(np.sqrt((moves[same] ** 2).mean())) if same.any() else 0.0
-        own, again = np.zeros(len(x), dtype=bool), np.r_[False, same & (np.abs(moves) <= near)]
+        own, again = filled[:, column], np.r_[False, same & (np.abs(moves) <= near)]
         if "held" in likely:
             numbers = np.unique(x[again & ~np.roll(again, 1), column], return_counts=True)[1]
             sizes = np.abs(np.diff(x[~again, column])[np.diff(recordings.recording[~again]) == 0])
@@ -303,11 +303,11 @@ def _without_filled(recordings: Recordings) -> Recordings:
             bent = np.abs(np.diff(moves)) > bend
             own[1:-1] |= same[1:] & same[:-1] & ~bent & ~again[1:-1] & ~again[2:]
         if own.any():
-            filled, fewest = filled | own, min(fewest, int((~own).sum()))
             told.append(Remark("data.filled_left_out", {"column": title, "samples": int(own.sum())}))
-    if not told or 2 * int((~filled).sum()) < fewest:
+    fresh, some = ~filled.any(axis=1), ~filled.all(axis=1)
+    if not told or fresh.sum() < FEWEST_TOGETHER * some.sum():
         return recordings
-    kept = {name: getattr(recordings, name)[~filled] for name in ("t", "recording", "values")}
+    kept = {name: getattr(recordings, name)[fresh] for name in ("t", "recording", "values")}
     return replace(recordings, **kept, remarks=(*recordings.remarks, *told))
 
 

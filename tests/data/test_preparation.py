@@ -113,7 +113,8 @@ def test_what_a_sensor_repeats_is_not_taken_for_filled_in() -> None:
     for k in range(1, len(x)):  # it stays until it is moved far enough
         dead[k] = x[k] if abs(x[k] - dead[k - 1]) >= 0.25 else dead[k - 1]
     apart = np.column_stack([np.repeat(x[::4], 4, axis=0), np.roll(np.repeat(x[1::4], 4, axis=0), 2)])
-    for values in (np.clip(x, -1, 0.9), np.round(x, 1), np.round(x / 0.3) * 0.3, dead, apart):
+    anew = np.column_stack([x, np.repeat(np.random.default_rng(0).normal(size=len(x) // 500), 500)])
+    for values in (np.clip(x, -1, 0.9), np.round(x, 1), np.round(x / 0.3) * 0.3, dead, apart, anew):
         assert len(without_faults(seen(values)).t) == len(x)
 
 
