@@ -42,7 +42,7 @@ STRETCH_LENGTH = 10  # correlation times: what is left of its first sample at it
 BLOCK = 200  # steps, whose median says how large steps are thereabouts
 FALSE_FAULT_RATE = 1e-3  # probability with which a record of white noise has a step that stands out
 FEW_JUMPS, MOST_APART = 0.05, 0.01  # that stay, a sample that does not; of all samples
-MOST_ALIKE = 0.1  # of all samples, where most that stand apart are one number, which noise never repeats
+MOST_ALIKE = 0.1  # of all samples, where most that stand apart are one number; of held values, one number
 QUARTERS, SAME_WAVE = 4, 0.5  # of a recording, in which a hum has one amplitude and phase, to a half of it
 SLIGHT_HUM = 0.1  # of the variance of a state: what moves it more may be the state itself, which circulates
 SEASONS = {"day": 86_400.0, "year": 31_556_952.0}  # seconds: what the sun does to what stands outdoors
@@ -52,7 +52,7 @@ KNOWN_SCALE = 0.01  # a choice: relative error to which a velocity tells how its
 SMALL_CHANGE = 0.3  # standard deviations: up to there a distribution is flat
 STATE_PARTS, LEAST_SPREAD = 20, 0.01  # of samples by their state; of the largest spread, where all are held
 ROUNDED_LINE = 2  # steps by which a straight line that is rounded is bent at most
-SMALL_STEP, FEWEST_SMALL = 0.2, 0.05  # of the median step, and how many are: 0.11 of normal ones
+SMALL_STEP, FEWEST_SMALL = 0.2, 0.05  # of the median step; of steps, at least: half of what normal ones have
 FEWEST_TOGETHER = 0.1  # a choice: of samples with a new value of any state, those with one of all
 COPIED = 12  # samples of a stretch that is sought a second time
 MOST_DIGITS = 12  # of numbers that were rounded: those of floating point have sixteen
@@ -225,11 +225,6 @@ def without_faults(recordings: Recordings) -> Recordings:
     if noise_floors(recordings) is None:
         return recordings
     recordings = _without_filled(recordings)
-
-    def without(apart: np.ndarray) -> Recordings:
-        kept = {name: getattr(recordings, name)[~apart] for name in ("t", "recording", "values")}
-        return replace(recordings, **kept)
-
     apart, remarks = np.zeros(len(recordings.t), dtype=bool), list(recordings.remarks)
     for state in range(len(recordings.names)):
         same, moves = np.diff(recordings.recording) == 0, np.diff(recordings.values[:, state])
@@ -254,12 +249,12 @@ def without_faults(recordings: Recordings) -> Recordings:
         most = (MOST_ALIKE if alike else MOST_APART) * len(recordings.t)
         few = jumps <= FEW_JUMPS * alone.sum() and 0 < count <= most
         # What jumps where there is no noise was measured; large faults would hide the noise.
-        if few and any(floor.process for floor in (noise_floors(without(left_out)) or ())[state : state + 1]):
+        floors = noise_floors(_without_rows(recordings, left_out)) if few else None
+        if floors and floors[state].process:
             apart |= left_out
-            remarks.append(
-                Remark("data.samples_apart", {"column": recordings.titles[state], "samples": count})
-            )
-    found = without(apart)
+            values = {"column": recordings.titles[state], "samples": count}
+            remarks.append(Remark("data.samples_apart", values))
+    found = _without_rows(recordings, apart)
     for state, name in product(range(len(found.names)), SEASONS):
         season = _season_of(found, found.values[:, state], name)
         if season.any():
@@ -277,6 +272,11 @@ def without_faults(recordings: Recordings) -> Recordings:
     return replace(found, remarks=tuple(remarks)) if len(remarks) > len(recordings.remarks) else recordings
 
 
+def _without_rows(recordings: Recordings, left_out: np.ndarray) -> Recordings:
+    kept = {name: getattr(recordings, name)[~left_out] for name in ("t", "recording", "values")}
+    return replace(recordings, **kept)
+
+
 def _without_filled(recordings: Recordings) -> Recordings:
     """Recordings less samples that repeat the one before, or lie on a straight line between their neighbours.
 
@@ -288,10 +288,12 @@ def _without_filled(recordings: Recordings) -> Recordings:
     x, same = recordings.values, np.diff(recordings.recording) == 0
     rate, filled, told = FALSE_FAULT_RATE / x.shape[1], np.zeros(x.shape, dtype=bool), list[Remark]()
     for column, title in enumerate(recordings.titles):
-        likely = {kind for chance, kind, _ in repetitions(recordings, column) if chance < rate}
-        moves, step = np.diff(x[:, column]), resolution_step(x[:, column]) or 0.0
+        moves, own = np.diff(x[:, column]), filled[:, column]
         near = ALIKE * float(np.sqrt((moves[same] ** 2).mean())) if same.any() else 0.0
-        own, again = filled[:, column], np.r_[False, same & (np.abs(moves) <= near)]
+        if not any((np.abs(each) <= near).any() for each in (moves, np.diff(moves))):  # as in most files
+            continue
+        again, step = np.r_[False, same & (np.abs(moves) <= near)], resolution_step(x[:, column]) or 0.0
+        likely = {kind for chance, kind, _ in repetitions(recordings, column) if chance < rate}
         if "held" in likely:
             numbers = np.unique(x[again & ~np.roll(again, 1), column], return_counts=True)[1]
             sizes = np.abs(np.diff(x[~again, column])[np.diff(recordings.recording[~again]) == 0])
@@ -304,11 +306,9 @@ def _without_filled(recordings: Recordings) -> Recordings:
             own[1:-1] |= same[1:] & same[:-1] & ~bent & ~again[1:-1] & ~again[2:]
         if own.any():
             told.append(Remark("data.filled_left_out", {"column": title, "samples": int(own.sum())}))
-    fresh, some = ~filled.any(axis=1), ~filled.all(axis=1)
-    if not told or fresh.sum() < FEWEST_TOGETHER * some.sum():
+    if not told or (~filled).all(axis=1).sum() < FEWEST_TOGETHER * (~filled).any(axis=1).sum():
         return recordings
-    kept = {name: getattr(recordings, name)[fresh] for name in ("t", "recording", "values")}
-    return replace(recordings, **kept, remarks=(*recordings.remarks, *told))
+    return replace(_without_rows(recordings, filled.max(axis=1)), remarks=(*recordings.remarks, *told))
 
 
 def _season_of(recordings: Recordings, values: np.ndarray, name: str) -> np.ndarray:

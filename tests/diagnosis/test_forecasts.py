@@ -27,6 +27,7 @@ from siq.diagnosis.forecasts import (
     _next_rung,
     _Rung,
     _Site,
+    _takes_most,
     _thinned,
     climb,
 )
@@ -282,6 +283,20 @@ def test_what_was_fitted_with_a_sign_that_it_cannot_have_is_no_rival(monkeypatch
     found = _next_rung(horizons, context.candidates, context, untried)
     assert found is not None and found.accepted.best.candidate.name == "linear damping"
     assert lag.label in untried
+
+
+def test_to_take_most_surely_is_more_than_to_do_so_typically() -> None:
+    """Of free runs whose blocks have very different errors, as where some come near a saddle point."""
+    data, best = recorded(0.15, 0.2), damped().accepted.best
+    before, spread = np.full(12, 0.05), np.exp(np.linspace(-2.5, 2.5, 12))
+    for share, surely, typically in ((0.3, False, True), (0.02, True, True), (0.7, False, False)):
+        after = share * before * spread
+        assert _takes_most(before, after, best.fit, data) == surely
+        assert _takes_most(before, after, best.fit, data, surely=False) == typically
+    once = before.copy()
+    once[0] *= 1e-9  # of which chance makes one
+    assert not _takes_most(before, once, best.fit, data, surely=False)
+    assert _takes_most(None, before, best.fit, data) and not _takes_most(before, None, best.fit, data)
 
 
 def test_a_last_mechanism_that_makes_no_free_run_better_is_taken_back(

@@ -14,9 +14,10 @@ from siq.data.recordings import Recordings
 from siq.diagnosis import naming
 from siq.diagnosis.holdout import errors_left_out, predicts_better
 from siq.diagnosis.mechanisms import MECHANISM
-from siq.diagnosis.naming import Investigation, _MissingEffect, _one_cause_or_two
+from siq.diagnosis.naming import Investigation, _MissingEffect, _one_cause_or_two, _with_models
 from siq.diagnosis.study import MismatchStudy, MismatchVerdict
 from siq.diagnosis.unnamed_models import _runs_freely
+from siq.inference.budget import Budget
 from siq.inference.kalman_filter import Whitened
 from siq.inference.measurements import Measurements, cross_validation_folds, measurements
 from siq.inference.recalibration import recalibrate
@@ -209,3 +210,24 @@ def test_a_name_that_leaves_something_has_to_be_likelier_than_one_cause_without_
     if not named:
         assert [each.code for each in after.remarks] == ["diagnosis.not_certain"] and after.too_faint
         assert after.models == tuple(alone)
+
+
+@pytest.mark.parametrize("by_forecasts", [True, False])
+def test_a_name_that_forecasts_found_is_not_held_against_functions_again(
+    by_forecasts: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fit = SimpleNamespace(has_process_noise=True)
+    decision = Investigation(
+        None, SimpleNamespace(found=(None,), fit=fit), SimpleNamespace(doubtful=False),
+        MismatchVerdict.MISSING_PHYSICS, None,
+        finals=(SimpleNamespace(),) if by_forecasts else (),
+    )  # fmt: skip
+    withdrawn = replace(decision, verdict=MismatchVerdict.UNEXPLAINED)
+    rest = (SimpleNamespace(fit=SimpleNamespace(has_process_noise=False)),)
+    monkeypatch.setattr(naming, "fit_models_of_remainder", lambda *_: rest)
+    monkeypatch.setattr(naming, "_one_cause_or_two", lambda *_: withdrawn)
+    monkeypatch.setattr(naming, "exact_fit", lambda *_: None)
+    context = SimpleNamespace(budget=Budget(), data=None)
+    after = _with_models(decision, decision.search, context)
+    assert after.verdict.names == by_forecasts
+    assert (after.models == rest) == by_forecasts
