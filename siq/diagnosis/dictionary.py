@@ -284,12 +284,18 @@ def unit_of(formula: str, units: Mapping[str, str]) -> str:
 
     A number has the unit ``"1"``. What cannot be read as a product of powers (``"°C"``) is kept as one word.
     """
+    mentioned = re.findall(r"[A-Za-z_]\w*", formula)
+    return _unit_of(formula, tuple((name, unit) for name, unit in units.items() if name in mentioned))
+
+
+@cache  # the same few for every place at which a mechanism may act
+def _unit_of(formula: str, units: tuple[tuple[str, str], ...]) -> str:
     words, known = dict[str, sympy.Symbol](), dict[str, sympy.Expr]()
 
     def stand_in(word: str) -> sympy.Symbol:
         return words.setdefault(word, sympy.Symbol(f"unit{len(words)}", positive=True))
 
-    for name, unit in units.items():
+    for name, unit in units:
         names = {word: stand_in(word) for word in re.findall(r"[A-Za-z_]\w*", unit)}
         try:
             known[name] = parse_formula(unit, names)

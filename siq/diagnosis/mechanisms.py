@@ -223,9 +223,10 @@ class MechanismCandidate:
         zero = dict.fromkeys(map(symbol, self.amplitudes), 0)
         found = []
         for row, (new, old) in enumerate(zip(after, before, strict=True)):
-            formula = self.model.evaluable(new)
-            columns = [formula.diff(name).subs(zero) for name in zero] or [formula - model.evaluable(old)]
-            found += [(row, column, each) for column, each in enumerate(columns) if each != 0]
+            if new != old:
+                formula = self.model.evaluable(new)
+                columns = [formula.diff(name).subs(zero) for name in zero] or [formula - model.evaluable(old)]
+                found += [(row, column, each) for column, each in enumerate(columns) if each != 0]
         return found
 
     def admits(self, fit: Fit, data: Measurements) -> bool:

@@ -134,8 +134,7 @@ def identify(
         if not hidden:
             found = case.identified()
         elif diffusion is None:
-            observation = ObservationModel(library, Diffusion.identity(library.dimension), hidden=True)
-            found = case.finished(case.by_likelihood(observation))
+            found = case.with_hidden_states()
         else:
             raise NumericalFailure(
                 "D is given for the positions, and noise drives the hidden velocities; leave the"
@@ -448,16 +447,19 @@ class _Case:
         fault = found.diagnosis.fault(self.recordings.names)
         return replace(found, prediction=check_prediction(noise_fault=fault, limits=self.limits, **figures))
 
+    def with_hidden_states(self) -> FieldEstimate:
+        """f, tested, where the second half of the library's states are velocities that were not recorded."""
+        hidden = ObservationModel(self.library, Diffusion.identity(self.library.dimension), hidden=True)
+        return self.finished(self.by_likelihood(hidden))
+
     def with_velocities(self) -> FieldEstimate | None:
         """f with the velocity as a further state; None where it was not to be tried, or fails its test."""
         if self.options.hidden_velocities != "auto" or self.given is not None:
             return None
+        options, names = replace(self.options, hidden_velocities=True), self.recordings.names
         try:
-            found = identify(
-                self.recordings, options=replace(self.options, hidden_velocities=True), draw=self.draw,
-                units=self.units, pair_step=self.pair_step, integrator_step=self.integrator_step,
-                limits=self.limits,
-            )  # fmt: skip
+            library = field_library((*names, *velocity_names(names)), options)
+            found = replace(self, library=library, options=options).with_hidden_states()
         except (NumericalFailure, np.linalg.LinAlgError):
             return None
         return found if found.prediction is not None and found.prediction.passed else None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 import json
 from collections.abc import Callable
 from html.parser import HTMLParser
@@ -14,7 +13,6 @@ import pytest
 import sympy
 
 import siq
-from siq.diagnosis import diagnosis as module
 from siq.diagnosis.diagnosis import tables_of, tables_of_failure
 from siq.diagnosis.dictionary import standard_dictionary
 from siq.diagnosis.study import _measurements_of, comparison_of
@@ -47,10 +45,6 @@ def logistic() -> pd.DataFrame:
 @pytest.fixture(scope="module")
 def diagnosis() -> siq.Diagnosis:
     return siq.diagnose(GROWTH, logistic())
-
-
-def test_the_example_is_right() -> None:
-    assert doctest.testmod(module).failed == 0
 
 
 def test_what_is_found_is_a_dynamics_with_the_true_parameters(diagnosis: siq.Diagnosis) -> None:
@@ -184,7 +178,7 @@ def test_a_parameter_that_differs_from_recording_to_recording_is_found(
     def fails(*_: object, **__: object) -> str:
         raise siq.NumericalFailure("the second look has no result")
 
-    monkeypatch.setattr(module, "most_varying", fails)
+    monkeypatch.setattr("siq.diagnosis.diagnosis.most_varying", fails)
     first = siq.diagnose(GROWTH, table, settings=siq.MismatchStudy(without=tuple(without)))
     assert first.verdict.mismatch  # the answer of the first look stands
     few = _measurements_of(table[table["recording"] < "r4"], GROWTH)

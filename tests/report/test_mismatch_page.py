@@ -19,7 +19,6 @@ from siq.report.diagnosis_page import Findings, largest_difference, mismatch_ans
 from siq.report.formatting import texts
 from siq.report.plots.diagnosis import (
     _limits_of,
-    _rate_unit,
     plot_before_after,
     plot_candidates,
     plot_curves,
@@ -356,16 +355,6 @@ def test_map_has_a_panel_for_each_of_two_equations():
     figure = plot_missing(points, missing, names=("x", "v"), units={"v": "mm/s"}, time_unit="s")
     bars = [axes.get_ylabel() for axes in figure.axes if "missing" in axes.get_ylabel()]
     assert bars == ["missing in $\\dot{v}$ (mm/s²)", "missing in $\\dot{x}$ (1/s)"]
-
-
-@pytest.mark.parametrize(
-    ("unit", "time", "rate"),
-    [("mm/s", "s", "mm/s**2"), ("m", "s", "m/s"), ("1", "s", "1/s"), ("kg", "1", "kg"),
-     ("m/s**2", "s", "m/s**3"),
-     ("N/m", "s", "(N/m)/s")],
-)  # fmt: skip
-def test_the_unit_of_a_rate(unit, time, rate):
-    assert _rate_unit(unit, time) == rate
 
 
 @pytest.mark.parametrize("spread", [None, 2.0])

@@ -7,7 +7,6 @@ states, inputs and outputs by name, `time_unit` that of time.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from siq.diagnosis.dictionary import unit_of
 from siq.inference.trajectories import scored_rows
 from siq.numerics.text import value_text
 from siq.report.diagnosis_page import largest_difference
@@ -494,18 +494,8 @@ def _missing_label(equation: str, units: Mapping[str, str] | None, time_unit: st
     """What is missing in one equation, or in several with commas between them, with its unit."""
     names = equation.split(", ")
     where = " and ".join(f"$\\dot{{{name_label(name)}}}$" for name in names)
-    return with_unit(f"missing in {where}", _rate_unit((units or {}).get(names[0], "1"), time_unit))
-
-
-def _rate_unit(unit: str, time_unit: str) -> str:
-    """The unit of a rate of change, as cards write units."""
-    if time_unit in ("1", ""):
-        return unit
-    if unit in ("1", ""):
-        return f"1/{time_unit}"
-    if power := re.fullmatch(rf"(.+)/{re.escape(time_unit)}(?:\*\*(\d+))?", unit):
-        return f"{power[1]}/{time_unit}**{int(power[2] or 1) + 1}"
-    return f"{unit}/{time_unit}" if "/" not in unit else f"({unit})/{time_unit}"
+    rate = unit_of("_x/_t", {"_x": (units or {}).get(names[0], "1") or "1", "_t": time_unit or "1"})
+    return with_unit(f"missing in {where}", rate)
 
 
 def _draw_curves(axes: Axes, stages: Mapping[str, pd.DataFrame]) -> None:
