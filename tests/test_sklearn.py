@@ -49,6 +49,7 @@ def test_check_estimator() -> None:
     assert excused == set(NO_VELOCITIES)
 
 
+@pytest.mark.slow
 def test_velocities_give_a_landscape() -> None:
     x, velocities = states()
     regressor = LandscapeRegressor(degree=3).fit(x, velocities)

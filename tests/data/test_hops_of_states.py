@@ -145,7 +145,7 @@ def test_hops_are_no_slow_drift() -> None:
     assert without_background(hopping) is hopping
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [*(pytest.param(one, marks=pytest.mark.slow) for one in (0, 2)), 1])
 def test_hops_of_one_quantity_are_no_slow_drift_of_another(seed: int) -> None:
     """y follows the wells of x, and is spread so widely that it shows none by itself."""
     draw, path, state = np.random.default_rng(seed), np.empty((20_000, 2)), np.array([1.0, 0.6])

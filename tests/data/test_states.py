@@ -272,6 +272,7 @@ def test_ten_seasons_are_a_period() -> None:
     assert change_of(recorded(hops), hops + 0.2 * noise(7, len(t)), hops) is None
 
 
+@pytest.mark.slow
 def test_few_visits_in_two_dimensions_are_three_states() -> None:
     """Some forty visits to each: the wells are known by these less well than the valleys between them."""
     places = np.array([[2.0, 0.5], [1.4, 1.4], [0.5, 2.0]])

@@ -194,6 +194,7 @@ def test_a_hardening_spring_is_named_measured_and_located(tmp_path: Path) -> Non
     json.dumps(verdict, allow_nan=False)
 
 
+@pytest.mark.slow
 def test_a_mechanism_that_is_not_certain_enough_is_described_but_not_named(tmp_path: Path) -> None:
     table = recordings_of(lambda x, v, t: -0.03 * x**3)
     study = among(*OF_OSCILLATORS, search={"wrong_names": 1e-200})
@@ -260,6 +261,7 @@ def test_a_path_that_is_never_gone_back_shows_no_hysteresis_and_time_since_a_beg
     ]  # the falls: one drop
 
 
+@pytest.mark.slow
 def test_dry_friction_is_told_from_other_friction(tmp_path: Path) -> None:
     diagnosis = solved(
         tmp_path, recordings_of(lambda x, v, t: -0.25 * np.tanh(v / 1e-3)), study=among(*FRICTIONS)
@@ -310,6 +312,7 @@ def test_random_forces_that_follow_the_motion_are_not_those_of_surroundings(tmp_
     assert "the simulation stays as it was" in said(diagnosis)["sentence"]
 
 
+@pytest.mark.slow
 def test_unequal_friction_is_found_though_its_first_fit_may_lead_nowhere(tmp_path: Path) -> None:
     def force(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
         return -np.where(v > 0, 0.25, 0.1) * np.tanh(v / 1e-3)
@@ -319,6 +322,7 @@ def test_unequal_friction_is_found_though_its_first_fit_may_lead_nowhere(tmp_pat
     assert diagnosis.investigation.search.fit.substeps > 12  # the jump was made sharp enough
 
 
+@pytest.mark.slow
 def test_random_forces_stand_for_no_jump_that_is_spread_too_far(tmp_path: Path) -> None:
     def force(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
         return -(0.1 + 0.25 * np.exp(-((v / 0.6) ** 2))) * np.tanh(v / 1e-3)
@@ -537,6 +541,7 @@ def test_a_missing_column_is_told(tmp_path: Path) -> None:
         solved(tmp_path, recordings_of(nothing).drop(columns="u"))
 
 
+@pytest.mark.slow
 def test_a_name_that_misleads_on_recordings_held_out_is_withdrawn(tmp_path: Path) -> None:
     def tilted(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
         return np.where(np.arange(len(x)) == 2, 0.0, 0.4)  # r2 is level

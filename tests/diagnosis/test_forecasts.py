@@ -420,6 +420,7 @@ def refitted(start: float, *, force: float, seed: int) -> bool:
     return preferred_recalibration(card, refits, data, noise=loose.noise) is not card
 
 
+@pytest.mark.slow
 def test_values_of_the_card_stay_where_a_refit_follows_nothing_but_forces_at_random() -> None:
     kept = [not refitted(9.0, force=0.3, seed=seed) for seed in range(12)]
     assert sum(kept) >= 10  # each is another with a probability of 5 % at the most, so three with 2 %

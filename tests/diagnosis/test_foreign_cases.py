@@ -97,6 +97,7 @@ def test_there_is_an_answer_to_a_ball_that_falls(followed: tuple[Diagnosis, list
     assert found.verdict.mismatch and not found.statement.partial
 
 
+@pytest.mark.slow
 def test_what_the_budget_does_not_reach_is_named(
     tmp_path: Path, followed: tuple[Diagnosis, list[str]]
 ) -> None:

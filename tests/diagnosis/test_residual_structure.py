@@ -86,6 +86,7 @@ def test_without_steps_there_is_nothing_to_explain() -> None:
     assert asked(model, _measurements_of(readings(quadratic=0.0, step=0.0), model)) is None
 
 
+@pytest.mark.slow
 def test_a_diagnosis_raises_no_alarm_where_sensors_round() -> None:
     diagnosis = diagnose(decaying(quadratic=0.0), readings(quadratic=0.0))
     assert not diagnosis.verdict.mismatch or [each.name for each in diagnosis.mechanisms] == ["quantisation"]

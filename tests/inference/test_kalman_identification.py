@@ -90,6 +90,7 @@ def test_terms_and_noises_are_found(found: tuple[FieldEstimate, Recordings, np.n
     assert noise.sensor_evidence > 100 and abs(noise.correlation_score) < 4
 
 
+@pytest.mark.slow
 def test_many_short_recordings_leave_white_innovations() -> None:
     """An initial state fitted to each seven samples would leave correlations of about minus one in seven."""
     whole, _ = double_well(1)
@@ -274,6 +275,7 @@ def test_exposures_do_not_overlap_and_begin_at_rows_of_their_own(steps: float, k
     assert data.restarting == (1,)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [0.5, pytest.param(3.0, marks=pytest.mark.slow)])
 def test_means_over_an_exposure_of_another_length_are_treated_as_such(steps: float) -> None:
     recordings = recorded(double_wells(1, exposure=steps, samples=4_000, sensor=0.01))

@@ -27,6 +27,7 @@ def recorded(seed: int, size: float) -> tuple[Recordings, np.ndarray]:
     return Recordings.from_arrays([times], [path[:, :1]], names=["x"], units=["mm"]), path[:, 1]
 
 
+@pytest.mark.slow
 def test_it_is_a_state_where_the_past_refutes_f_of_the_position(tmp_path) -> None:
     recordings, force = recorded(1, SIZE)
     recordings = in_stretches(recordings)

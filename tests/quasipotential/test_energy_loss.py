@@ -44,6 +44,7 @@ def test_the_loss_of_a_cubic_well_is_exact(speed: float) -> None:
     assert loss == pytest.approx(2 * friction**2 / noise * 1.2 / speed**2, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_two_weakly_damped_particles_have_a_time_only_where_it_is_known() -> None:
     forces = (X - X**3 - 0.1 * V - (X - Y) / 2, -Y - 0.1 * W + (X - Y) / 2)
     system = Dynamics.of((X, Y, V, W), (V, W, *forces), diffusion=np.diag([0.0, 0.0, 0.1, 0.1]))

@@ -61,7 +61,7 @@ def test_damped_particles_have_the_barrier_and_the_momenta_of_their_energy(
     np.testing.assert_allclose(path.values, values, atol=1e-4 * barrier)
 
 
-@pytest.mark.parametrize("balanced", [True, False])
+@pytest.mark.parametrize("balanced", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_damping_that_all_but_vanishes_at_the_saddle_has_a_path(balanced: bool) -> None:
     """``dv = (x - x³ - γ(x) v) dt + √(ε D) dW`` with γ = 0.1 x² + 0.01: the path winds, and comes in slowly.
 
@@ -192,6 +192,7 @@ def test_the_prefactor_is_that_of_kramers(friction: float) -> None:
     assert rate.prefactor == pytest.approx(2 * np.pi / across * there / here, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_curve_along_which_h_would_grow_is_no_path() -> None:
     """As where states come to the saddle about as fast across the path: this one had an action of 0.0885."""
     system = siq.reference_systems()["two-genes"]

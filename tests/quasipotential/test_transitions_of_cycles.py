@@ -127,6 +127,7 @@ def time_by_quadrature(begin: float, end: float, noise: float) -> float:
     return abs(quad(slowness, begin, end, points=[INNER], limit=400)[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("outwards", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_the_law_of_ways_over_a_cycle_errs_as_the_noise_does(outwards: bool) -> None:
     """From the point, and from the outer ring, whose laws go with other powers of ε."""

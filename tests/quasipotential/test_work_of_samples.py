@@ -61,6 +61,7 @@ def heights(found: FieldEstimate, recordings: Recordings) -> list[tuple[float, f
     return both
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("states", [1, 2])
 def test_samples_between_wells_mend_the_work_of_an_f_that_is_no_polynomial(states: int) -> None:
     recordings = hopping(springs if states == 1 else turning, seed=1, states=states)

@@ -265,6 +265,7 @@ def test_a_wrapped_angle_is_refused_with_the_remedy(records: Recordings) -> None
         Landscape.from_recordings(records)
 
 
+@pytest.mark.slow
 def test_records_of_an_angle_tell_torque_barriers_and_velocity(records: Recordings) -> None:
     landscape = Landscape.from_recordings(records, ANGLE)
     found = dict(

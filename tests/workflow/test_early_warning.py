@@ -138,6 +138,7 @@ def test_seconds_or_years_and_an_offset_change_nothing(nearing):
     )
 
 
+@pytest.mark.slow
 def test_a_record_with_a_memory_and_one_that_bends_are_told():
     draw = np.random.default_rng(2)
     coloured = np.zeros(6000)

@@ -132,7 +132,12 @@ def test_the_same_seed_gives_the_same_and_another_run_another_answer(
     ("training", "agrees"),
     [
         pytest.param(CHECKED, True, id="with output weights"),
-        pytest.param(replace(CHECKED, thinning_distance=0.3), True, id="with fewer points than units"),
+        pytest.param(
+            replace(CHECKED, thinning_distance=0.3),
+            True,
+            id="with fewer points than units",
+            marks=pytest.mark.slow,
+        ),
         pytest.param(replace(CHECKED, learning_rate=1e30), True, id="with lost networks"),
         pytest.param(BRIEF, False, id="as trained, far too briefly"),
     ],
