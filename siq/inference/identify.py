@@ -107,11 +107,9 @@ def identify(
     draw
         Gives the generator for a purpose: for held-out recordings, and for resampling.
     diffusion, units
-        D, where it is given; and the states' units, None of an unknown one, by default those of the
-        recordings.
+        D, where it is given; and the states' units, None where unknown, by default those of the recordings.
     pair_step, integrator_step
-        Longest time between samples that still belong together; step of the Euler–Maruyama simulation that
-        made the recordings, None for everything else.
+        Longest time between samples that belong together; step of an Euler–Maruyama simulation, else None.
     limits
         Of the test of f.
 
@@ -467,10 +465,9 @@ class _Case:
     def with_slow_force(self, alone: FieldEstimate | None = None) -> FieldEstimate | None:
         """f with a slow force on the one recorded state; None where none is needed, or it does not do.
 
-        It is tried where f `alone` fails its test or is refuted by the past, which tells more of the next
-        sample than the state does; or where there is none. It has to take that away, and to foresee
-        recordings that were held out better than f alone. First the force has noise alone, then it follows
-        the state.
+        It is tried where f `alone` fails its test or is refuted by the past, or is not there. It has to
+        take that away, and to foresee recordings held out better than f alone. First it has noise alone, then
+        it follows the state.
         """
         if self.options.hidden_velocities != "auto" or self.given is not None or self.integrator_step:
             return None
@@ -535,10 +532,9 @@ class _Case:
         if test.needs_velocity == hidden:
             return None
         said = test.sentence(self.recordings.time_unit or "")
-        if hidden and not (test.seen or test.overdamped):
-            return said
         if hidden:
-            return f"{said}: leave 'identification.hidden_velocities' out, the position alone is the state"
+            out = ": leave 'identification.hidden_velocities' out, the position alone is the state"
+            return said + out * (test.seen or test.overdamped)
         if self.options.hidden_velocities == "auto" and self.given is None:
             return (
                 f"{said}: with the velocity as a state f does not pass its test either; record the velocity"

@@ -137,8 +137,8 @@ class InputEntry(_CardPart):
 
     unit: str = "1"  #: compared with the units of recordings
     #: How it runs between samples: ``zero_order`` for what a converter puts out, ``linear``, or
-    #: ``band_limited`` for what was filtered before it was sampled.
-    interpolation: Literal["zero_order", "linear", "band_limited"] = "linear"
+    #: ``band_limited`` for what was filtered before it was sampled. By default a staircase jumps.
+    interpolation: Literal["zero_order", "linear", "band_limited"] | None = None
 
 
 class ExactEntry(_CardPart):
@@ -355,8 +355,8 @@ def card_of(dynamics: Dynamics) -> str:
     }
     if dynamics.inputs:
         data["inputs"] = {
-            entry.name: {"unit": entry.unit, "interpolation": entry.interpolation}
-            for entry in dynamics.inputs
+            one.name: {key: each for key, each in vars(one).items() if each and key != "name"}
+            for one in dynamics.inputs
         }
     if dynamics.parameters:
         data["parameters"] = {

@@ -259,11 +259,11 @@ def _slope(place: int) -> sympy.Symbol:
 
 @dataclass(frozen=True)
 class Input:
-    """An exogenous signal: its name, unit, and how it holds between samples."""
+    """An exogenous signal: its name, unit, and how it runs between samples; None: as its record shows."""
 
     name: str
     unit: str
-    interpolation: str
+    interpolation: str | None = None
 
 
 @dataclass(frozen=True)

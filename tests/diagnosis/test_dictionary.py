@@ -461,6 +461,10 @@ def test_forms_ask_for_units() -> None:
     assert "diode or exponential loss" in names(HOMES["circuit"].model)
     assert not {"thermal radiation", "outflow through an opening"} & names(HOMES["circuit"].model)
     assert not {"diode or exponential loss", "outflow through an opening"} & names(HOMES["heat"].model)
+    for unit, empty in (("°C", False), ("kg", True)):  # zero degrees are not empty
+        card = {"states": states(s=unit), "parameters": numbers(r=1.0), "equations": {"s": "-r*s"}}
+        labels = {each.label for each in candidates(model_of(card))}
+        assert "hidden capacity in s" in labels and ("hidden capacity empty at first in s" in labels) is empty
 
 
 def test_recruitment_makes_up_for_what_is_lost() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import sympy
 
+from siq.data.recordings import Recordings
 from siq.inference import trajectories
 from siq.inference.kalman_filter import (
     MAX_SUBSTEPS,
@@ -18,7 +19,13 @@ from siq.inference.kalman_filter import (
     substeps_needed,
 )
 from siq.inference.maximum_likelihood import fit_by_multiple_shooting, fit_of_states
-from siq.inference.measurements import Measurements, course_of_input, expectations, first_states
+from siq.inference.measurements import (
+    Measurements,
+    course_of_input,
+    expectations,
+    first_states,
+    measurements,
+)
 from siq.inference.recalibration import fit_with_and_without_process_noise
 from siq.inference.trajectories import (
     _NormalEquations,
@@ -278,3 +285,28 @@ def test_a_fit_to_few_samples_that_never_settles_has_an_end(monkeypatch: pytest.
     noise = Noise(np.ones(1), np.zeros(2))
     found = fit_trajectories(model, data, begin=np.array([[1.0, 0.0]]), noise=noise, substeps=1)
     assert not found.converged and len(runs) <= 501
+
+
+def course_of(u: np.ndarray, **entry: str) -> str:
+    """How an input runs between its samples, in two recordings of half the length each."""
+    half = len(u) // 2
+    values = [np.stack([0 * one, one], axis=1) for one in (u[:half], u[half : 2 * half])]
+    recordings = Recordings.from_arrays([np.arange(half) * STEP] * 2, values, names=["x", "u"])
+    card = PENDULUM | {"inputs": {"u": {"unit": "1/s**2", **entry}}}
+    (one,), (other,) = measurements(recordings, model_of(card)).courses
+    assert one.c.shape[0] == other.c.shape[0]
+    return {1: "held", 2: "joined"}[one.c.shape[0]]
+
+
+def test_an_input_that_was_recorded_as_a_staircase_is_held_between_samples() -> None:
+    generator, t = np.random.default_rng(7), np.arange(400)
+    stairs = np.repeat(generator.normal(size=40), 10)
+    assert course_of(stairs) == course_of(np.sign(np.sin(t / 7))) == "held"
+    assert course_of(stairs + 0.1 * generator.normal(size=400)) == "held"  # as a voltmeter reads it
+    assert (
+        course_of(np.round(20 * np.sin(t / 40)) / 20) == "held"
+    )  # a coarse digitiser, where it matters little
+    for smooth in (np.sin(t / 7), generator.normal(size=400), np.abs(t % 40 - 20.0), np.ones(400) * t):
+        assert course_of(smooth) == "joined"
+    assert course_of(stairs, interpolation="linear") == "joined"
+    assert course_of(np.sin(t / 7), interpolation="zero_order") == "held"
