@@ -309,6 +309,23 @@ def test_drag_in_a_stream_goes_with_the_square_of_the_relative_speed() -> None:
     assert change.subs({c: 2, u: 3, v: 1}) == 8 and change.subs({c: 2, u: 1, v: 3}) == -8
 
 
+def test_what_coasts_has_a_resistance_that_is_constant_and_one_that_grows_with_the_square() -> None:
+    # White and Korst (1972): m dv/dt = -(A + C v²) ahead, and the other way around.
+    change = dict(the("rolling resistance and drag", "mass").changes)["v"]
+    c, d, v = (
+        next(each for each in change.free_symbols if each.name == name) for name in ("c_1", "d_1", "v")
+    )
+    assert change.subs({c: 2, d: 3, v: 4}) == -(2 + 3 * 16) == -change.subs({c: 2, d: 3, v: -4})
+
+
+def test_a_drive_gives_no_more_than_its_limit() -> None:
+    model = the("saturation", "mass", "at a limit").model
+    rate = dict(zip(model.states, model.equations, strict=True))["v"]
+    a, u = (next(each for each in rate.free_symbols if each.name == name) for name in ("a_1", "u"))
+    acts = [sympy.simplify(rate.subs({a: 2, u: drive}) - rate.subs({a: 2, u: 0})) for drive in (1, 2, 3, -5)]
+    assert acts[1] == acts[2] == 2 * acts[0] == -acts[3]
+
+
 def test_an_actuator_that_lags_has_the_transfer_function_of_first_order() -> None:
     # Åström and Murray (2008): 1 / (1 + s tau), of what reaches the mass.
     model = the("actuator lag", "mass").model
