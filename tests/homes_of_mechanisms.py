@@ -493,6 +493,7 @@ RESIDENTS: Sequence[Resident] = (
     Resident("amplitude-dependent damping", "rotating frame", {"c": 0.1}),
     Resident("dry friction", "mass", {"c": 0.4}),
     Resident("dry friction", "rotating frame", {"c": 0.03}),
+    Resident("Coulomb and viscous friction", "mass without damping", {"c": 0.2, "d": 0.3}),
     Resident("rolling resistance and drag", "mass", {"c": 0.2, "d": 0.3}),
     Resident("asymmetric friction", "mass", {"c": 0.5, "d": 0.15}),
     Resident("Stribeck friction", "mass", {"c": 0.3, "s": 0.6, "w": 0.5}),

@@ -284,8 +284,7 @@ def unit_of(formula: str, units: Mapping[str, str]) -> str:
 
     A number has the unit ``"1"``. What cannot be read as a product of powers (``"°C"``) is kept as one word.
     """
-    mentioned = re.findall(r"[A-Za-z_]\w*", formula)
-    return _unit_of(formula, tuple((name, unit) for name, unit in units.items() if name in mentioned))
+    return _unit_of(formula, tuple(each for each in units.items() if re.search(rf"\b{each[0]}\b", formula)))
 
 
 @cache  # the same few for every place at which a mechanism may act

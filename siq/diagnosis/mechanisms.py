@@ -478,8 +478,7 @@ def _new_columns(own: np.ndarray, columns: np.ndarray) -> list[bool]:
 
 
 def _of_unit_length(columns: np.ndarray) -> np.ndarray:
-    largest = np.abs(columns).max(axis=0, initial=0.0)  # first, since squares may be beyond all numbers
-    columns = columns / positive(largest)
+    columns = columns / positive(np.abs(columns).max(axis=0, initial=0.0))  # first: squares may overflow
     return columns / positive(np.sqrt((columns**2).sum(axis=0)))
 
 
@@ -580,12 +579,14 @@ def candidates_of(model: Dynamics, roles: Roles, dictionary: Sequence[Mechanism]
                 if candidate is not None:
                     found.append((candidate, ", ".join(assignment.values())))
     reduced = _beyond_parameters(model, [each for each, _ in found])
-    # Ways of filling the roles of a mechanism that end in one model are one.
-    models: dict[object, tuple[MechanismCandidate, str]] = {}
+    # Ways of filling the roles of a mechanism that end in one model are one, as it is with its special case.
+    models: dict[tuple[object, ...], tuple[MechanismCandidate, str]] = {}
     for each, (_, filled) in zip(reduced, found, strict=True):
         if each is not None:
             key = (each.name, each.model.equations, each.model.outputs, each.begins)
             models.setdefault(key, (each, filled))
+    plain = {key[1:] for key, (each, _) in models.items() if not each.generalises}
+    models = {key: one for key, one in models.items() if not one[0].generalises or key[1:] not in plain}
     # Labels occur once, where needed with what fills the roles, and then with what is added: two parameters
     # of one equation may drift, each of two species be satiated, and a coupling have two forms.
     by_label = Counter(each.label for each, _ in models.values())

@@ -318,6 +318,17 @@ def test_what_coasts_has_a_resistance_that_is_constant_and_one_that_grows_with_t
     assert change.subs({c: 2, d: 3, v: 4}) == -(2 + 3 * 16) == -change.subs({c: 2, d: 3, v: -4})
 
 
+def test_friction_of_two_kinds_is_one_kind_where_the_card_has_the_other() -> None:
+    # Armstrong-Hélouvry et al. (1994): F = -Fc sign(v) - Fv v.
+    change = dict(the("Coulomb and viscous friction", "mass without damping").changes)["v"]
+    c, d, v = (
+        next(each for each in change.free_symbols if each.name == name) for name in ("c_1", "d_1", "v")
+    )
+    assert change.subs({c: 2, d: 3, v: 4}) == -(2 + 3 * 4) == -change.subs({c: 2, d: 3, v: -4})
+    damped = names(oscillator("-k*x - d*v + u", k=4.0, d=0.5))
+    assert "dry friction" in damped and "Coulomb and viscous friction" not in damped
+
+
 def test_a_drive_gives_no_more_than_its_limit() -> None:
     model = the("saturation", "mass", "at a limit").model
     rate = dict(zip(model.states, model.equations, strict=True))["v"]

@@ -17,7 +17,7 @@ NAMES = (
     "linear stiffness", "geometric stiffness", "preload", "backlash", "gravity", "added mass",
     "moment of inertia", "linear damping", "quadratic stiffness", "cubic stiffness", "quintic stiffness",
     "quadratic drag", "cubic damping", "amplitude-dependent damping", "dry friction",
-    "rolling resistance and drag", "asymmetric friction",
+    "Coulomb and viscous friction", "rolling resistance and drag", "asymmetric friction",
     "Stribeck friction", "eddy-current brake", "position-dependent damping", "constant bias",
     "linear coupling", "attached oscillator", "nonlinear coupling", "self-limitation", "Gompertz growth",
     "mortality", "harvest", "Allee effect", "prey refuge", "sigmoid functional response",
