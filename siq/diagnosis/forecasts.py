@@ -470,14 +470,12 @@ def _density(problem: _Foreseen, term: Probe | Place, columns: np.ndarray) -> fl
         return float(problem.log_density(sums).sum())
     values = []
     sizes = sizes_of_effects(float(problem.target @ problem.target))
+    sizes = sizes[:: max(len(sizes) // 4, 1)]
     gram = sums[0].sum(axis=0)[problem.own.shape[1] :, problem.own.shape[1] :]
     for length in SMOOTH_LENGTHS:
         prior = smooth_prior(term.knots, length)
         told, inverse = float((prior * gram).sum()), np.linalg.inv(prior)
-        values += [
-            problem.log_density(sums, inverse * (told / size)).sum()
-            for size in sizes[:: max(len(sizes) // 4, 1)]
-        ]
+        values += [problem.log_density(sums, inverse * (told / size)).sum() for size in sizes]
     return float(logsumexp(values) - np.log(len(values)))
 
 
@@ -485,8 +483,7 @@ def _density(problem: _Foreseen, term: Probe | Place, columns: np.ndarray) -> fl
 class _Rung:
     """A mechanism with the family that it belongs to, on top of those before it."""
 
-    #: The likeliest member, with those that are not ruled out, as a search has them.
-    accepted: AcceptedMechanism
+    accepted: AcceptedMechanism  #: the likeliest member, with those that are not ruled out
     horizons: tuple[Horizon, ...]  #: the fits with it
     log_odds: float  #: of its family, against all other explanations together
     flat_log_odds: float  #: the same, if all mechanisms are as likely beforehand, with a name or without
@@ -517,8 +514,7 @@ def _fitted_at(
 ) -> tuple[list[Horizon], float] | None:
     """A mechanism fitted at every horizon, and what it gains; None where that fails.
 
-    It gains less than nothing if its sign is wrong.
-    One that does not settle at one of them is among the untried, too.
+    It gains less than nothing if its sign is wrong; where it does not settle it is among the untried, too.
     """
     candidate, probe, found = site.candidate, site.terms[0], list[Horizon]()
     assert candidate is not None and isinstance(probe, Probe)
@@ -571,7 +567,11 @@ def _next_rung(
                 break
 
     weights = gains + np.array([site.prior for site in sites])
-    order = [place for place in np.argsort(-weights) if sites[place].candidate is not None]
+    named = {k: one for k in np.argsort(-weights) if (one := sites[k].candidate) is not None}
+    most = {(named[k].name, named[k].coordinate): gains[k] for k in sorted(named, key=lambda k: gains[k])}
+    # Friction of two kinds is not fitted where one of them promises nearly as much.
+    less = {k: [most.get((n, one.coordinate), -np.inf) for n in one.generalises] for k, one in named.items()}
+    order = [k for k in named if max(less[k], default=-np.inf) < NEARLY_ALL * gains[k]]
     for number, place in enumerate(order[:ATTEMPTS], start=1):
         if not gains[place] > 0 or len(leading) == LEADERS:
             break
@@ -587,8 +587,7 @@ def _next_rung(
         for place in [place for place in order if sites[place].label in stateless][:ATTEMPTS]:
             attempt(sites[place], weights[place])
     # Of those that are not told apart, the one with the fewest parameters.
-    heaviest = max(each.weight for each in leading)
-    plausible = [each for each in leading if each.weight > heaviest + np.log(PLAUSIBLE)]
+    plausible = [each for each in leading if each.weight > max(e.weight for e in leading) + np.log(PLAUSIBLE)]
     leader = min(plausible, key=lambda each: (len(each.candidate.new), -each.weight))
     errors = cache(lambda one: _left_out(one.horizons[0].fit, [one.candidate], base.noise, context))
     # All others are compared in the place of one that brings no states of its own.
