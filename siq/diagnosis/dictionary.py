@@ -295,9 +295,8 @@ def _unit_of(formula: str, units: tuple[tuple[str, str], ...]) -> str:
         return words.setdefault(word, sympy.Symbol(f"unit{len(words)}", positive=True))
 
     for name, unit in units:
-        names = {word: stand_in(word) for word in re.findall(r"[A-Za-z_]\w*", unit)}
         try:
-            known[name] = parse_formula(unit, names)
+            known[name] = parse_formula(unit, {w: stand_in(w) for w in re.findall(r"[A-Za-z_]\w*", unit)})
         except FormulaError:
             known[name] = stand_in(unit)
     text = str(sympy.powsimp(parse_formula(formula, known), force=True))

@@ -24,8 +24,8 @@ of the past alone, and then the products ``G z`` are martingale differences, wha
     and of ``φ(x) z``, which follow what a hidden variable does to the force; and what filters know of a gate,
     which is not forgotten as such means are. A hidden variable that changes D shows in means of ``z² - 1``.
 ``gaussian_increments``
-    The largest residual, and how many are beyond three; values, or steps, that repeat themselves more often
-    than rounding lets them; and stretches that stand in the record twice.
+    The largest residual, how many are beyond three, and whether enough are beyond two and a half; values, or
+    steps, that repeat themselves more often than rounding lets them; and stretches that are there twice.
 
 ``gaussian_force``
     Of a slow force that was not recorded: the fourth cumulant of what a filter knows of it. Where a gate with
@@ -67,7 +67,7 @@ SLIGHT_EXCESS = 0.25  # of the standard deviation of what all recordings explain
 RANK = 1e-8  # numerical: of the squares of a column, what is left of it by chance
 FORGOTTEN = 3.0  # of its times, after which a filter has forgotten that it did not know the force at first
 POWER = 0.8  # probability with which a flaw as large as is said would have been noticed
-TAIL = 3.0  # standard deviations: beyond are 2.7 in 1000
+TAIL, EDGE = 3.0, 2.5  # standard deviations: beyond are 2.7 in 1000, and 12, enough to miss some
 HARMLESS_CHANGE = 0.01  # of a barrier
 
 
@@ -448,21 +448,22 @@ def _state_complete(rest: _Residuals, limit: float) -> Verdict:
 
 
 def _gaussian(rest: _Residuals, recordings: Recordings, limit: float) -> Verdict:
-    chances: list[tuple[float, str, float, str]] = []  # probability, kind, figure, and the state that repeats
     # A fourth cumulant k of a step changes the action of a path by its share k (2fh)²/(12 εh); what changes
     # barriers by less is harmless, and makes tails larger by 1 + k (z⁴ - 3z²)/24 (Edgeworth).
-    noise, harmless = rest.noise, min(12 * HARMLESS_CHANGE / max(4 * rest.drift, 1e-300), 1.0)
+    away, harmless = np.abs(rest.noise), min(12 * HARMLESS_CHANGE / max(4 * rest.drift, 1e-300), 1.0)
 
-    def beyond(z: float) -> float:
-        return 2 * float(scipy.special.ndtr(-z)) * (1 + harmless * (z**4 - 3 * z**2) / 24) * noise.size
+    def beyond(z: float, cumulant: float) -> float:
+        return 2 * float(scipy.special.ndtr(-z)) * (1 + cumulant * (z**4 - 3 * z**2) / 24) * away.size
 
-    largest = float(np.abs(noise).max())
-    chances.append((beyond(largest), "jump", largest, ""))
-    count = int((np.abs(noise) > TAIL).sum())
-    chances.append((float(scipy.special.gammainc(count, beyond(TAIL))), "tails", count / beyond(TAIL), ""))
+    largest, many, few = float(away.max()), int((away > TAIL).sum()), int((away > EDGE).sum())
+    most, least = beyond(TAIL, harmless), beyond(EDGE, -harmless)
+    chances: list[tuple[float, str, float, str]] = [  # probability, kind, figure, and the state that repeats
+        (beyond(largest, harmless), "jump", largest, ""),
+        (float(scipy.special.gammainc(many, most)), "tails", many / most, ""),
+        (float(scipy.special.pdtr(few, least)), "cut", few / least, ""),
+    ]
     for column in np.flatnonzero(rest.noisy[: recordings.values.shape[1]]):
-        name = recordings.titles[column]
-        chances += [(*one, name) for one in repetitions(recordings, int(column))]
+        chances += [(*one, recordings.titles[column]) for one in repetitions(recordings, int(column))]
     chance, kind, value, state = min(chances)
     if state:
         told = sentence(Remark("inference.repeated", {"kind": kind, "value": value, "state": state}))

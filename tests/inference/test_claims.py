@@ -40,9 +40,10 @@ def records(
     return seen
 
 
-def claims(*parts: np.ndarray) -> dict[str, Verdict]:
-    """Of recordings ``(n, 1)`` each, with x and x³ fitted to them."""
-    times = [STEP * np.arange(len(one)) for one in parts]
+def claims(*parts: np.ndarray, kept: np.ndarray | None = None) -> dict[str, Verdict]:
+    """Of recordings ``(n, 1)`` each, with x and x³ fitted to them; or of some samples of one."""
+    times = [STEP * (np.arange(len(one)) if kept is None else np.flatnonzero(kept)) for one in parts]
+    parts = parts if kept is None else tuple(one[kept] for one in parts)
     recordings = Recordings.from_arrays(times, list(parts), names=["x"])
     support = np.array([[0, LIBRARY.names.index(name)] for name in ("1", "x", "x**3")])
     found = FieldEstimate.on_support(
@@ -207,3 +208,16 @@ def test_noise_that_is_not_gaussian_is_noticed() -> None:
         assert not claims(record)["gaussian_increments"].passed
     rounded = claims(np.round(seen, 3))["gaussian_increments"]
     assert rounded.passed
+
+
+def test_large_steps_that_were_taken_out_are_missed() -> None:
+    """A sample that is more than so many robust deviations from the one before it, as despiking does."""
+    seen = records(1, samples=16_000, seed=8)[0]
+    step = np.abs(np.diff(seen[:, 0], prepend=seen[0, 0]))
+    spread = 1.4826 * np.median(step)
+    found = claims(seen, kept=step < 1.9 * spread)["gaussian_increments"]
+    assert not found.passed and "large steps are missing" in found.reason
+    assert claims(seen, kept=step < 5 * spread)["gaussian_increments"].passed
+    # Samples that are missing by chance take no steps out.
+    by_chance = np.random.default_rng(1).random(len(seen)) > 0.03
+    assert claims(seen, kept=by_chance)["gaussian_increments"].passed
