@@ -587,7 +587,8 @@ def _next_rung(
         for place in [place for place in order if sites[place].label in stateless][:ATTEMPTS]:
             attempt(sites[place], weights[place])
     # Of those that are not told apart, the one with the fewest parameters.
-    plausible = [each for each in leading if each.weight > max(e.weight for e in leading) + np.log(PLAUSIBLE)]
+    heaviest = max(each.weight for each in leading)
+    plausible = [each for each in leading if each.weight > heaviest + np.log(PLAUSIBLE)]
     leader = min(plausible, key=lambda each: (len(each.candidate.new), -each.weight))
     errors = cache(lambda one: _left_out(one.horizons[0].fit, [one.candidate], base.noise, context))
     # All others are compared in the place of one that brings no states of its own.

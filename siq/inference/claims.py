@@ -67,7 +67,7 @@ SLIGHT_EXCESS = 0.25  # of the standard deviation of what all recordings explain
 RANK = 1e-8  # numerical: of the squares of a column, what is left of it by chance
 FORGOTTEN = 3.0  # of its times, after which a filter has forgotten that it did not know the force at first
 POWER = 0.8  # probability with which a flaw as large as is said would have been noticed
-TAIL, EDGE = 3.0, 2.5  # standard deviations: beyond are 2.7 in 1000, and 12, enough to miss some
+TAIL, EDGE = 3.0, 2.5  # standard deviations: beyond are 2.7 in 1000, and 12: a choice
 HARMLESS_CHANGE = 0.01  # of a barrier
 
 

@@ -534,7 +534,7 @@ class _Case:
         said = test.sentence(self.recordings.time_unit or "")
         if hidden:
             out = ": leave 'identification.hidden_velocities' out, the position alone is the state"
-            return said + out * (test.seen or test.overdamped)
+            return said + out if test.seen or test.overdamped else said
         if self.options.hidden_velocities == "auto" and self.given is None:
             return (
                 f"{said}: with the velocity as a state f does not pass its test either; record the velocity"

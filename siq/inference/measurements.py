@@ -25,7 +25,7 @@ from siq.systems.dynamics import Dynamics, Input, JointExpectation, Parameter, S
 OVERSAMPLING = 16  # of band-limited inputs, between whose dense samples cubics are exact enough
 FOLDS = 4  # of which one is left out at a time: a quarter, as is held out by default
 MIN_STRETCH_SAMPLES = 16  # of a stretch that an initial state and an error can be told from
-STAIRCASE = 0.25  # of squared changes that go on in the next: none in a staircase, 0.36 of independent ones
+STAIRCASE = 0.25  # of squared changes that go on in the next: none in a staircase, 0.36 of normal ones
 PADDING = 64  # samples by which they are continued, mirrored, so that the ends do not ring
 
 

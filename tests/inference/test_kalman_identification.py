@@ -276,7 +276,7 @@ def test_exposures_do_not_overlap_and_begin_at_rows_of_their_own(steps: float, k
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("steps", [0.5, pytest.param(3.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("steps", [0.5, 3.0])
 def test_means_over_an_exposure_of_another_length_are_treated_as_such(steps: float) -> None:
     recordings = recorded(double_wells(1, exposure=steps, samples=4_000, sensor=0.01))
     library = candidate_library(["x"], degree=3)

@@ -303,9 +303,8 @@ def test_an_input_that_was_recorded_as_a_staircase_is_held_between_samples() -> 
     stairs = np.repeat(generator.normal(size=40), 10)
     assert course_of(stairs) == course_of(np.sign(np.sin(t / 7))) == "held"
     assert course_of(stairs + 0.1 * generator.normal(size=400)) == "held"  # as a voltmeter reads it
-    assert (
-        course_of(np.round(20 * np.sin(t / 40)) / 20) == "held"
-    )  # a coarse digitiser, where it matters little
+    coarse = np.round(20 * np.sin(t / 40)) / 20  # where it matters little
+    assert course_of(coarse) == "held"
     for smooth in (np.sin(t / 7), generator.normal(size=400), np.abs(t % 40 - 20.0), np.ones(400) * t):
         assert course_of(smooth) == "joined"
     assert course_of(stairs, interpolation="linear") == "joined"

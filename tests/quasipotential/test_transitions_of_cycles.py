@@ -128,7 +128,7 @@ def time_by_quadrature(begin: float, end: float, noise: float) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("outwards", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.parametrize("outwards", [True, False])
 def test_the_law_of_ways_over_a_cycle_errs_as_the_noise_does(outwards: bool) -> None:
     """From the point, and from the outer ring, whose laws go with other powers of ε."""
     system = rings(2.0)
