@@ -218,6 +218,18 @@ HOMES: Mapping[str, Home] = {
         lambda rng: rng.normal(size=1),
         lambda rng, t: np.concatenate([waves(rng, t, size=0.7), waves(rng, t, size=1.0)]),
     ),
+    "boat": Home(
+        {
+            "time_unit": "s",
+            "states": states(v="m/s"),
+            "inputs": {"u": {"unit": "m/s^2"}},
+            "parameters": numbers(d=0.5),
+            "equations": {"v": "u - d*v*Abs(v)"},
+        },
+        0.2,
+        lambda rng: rng.normal(size=1),
+        waves,
+    ),
     "rotating frame": Home(
         {
             "time_unit": "s",
@@ -277,6 +289,16 @@ HOMES: Mapping[str, Home] = {
         },
         0.15,
         lambda rng: np.array([rng.uniform(6, 14), rng.uniform(0.3, 2), rng.uniform(0, 4)]),
+    ),
+    "culture": Home(
+        {
+            "time_unit": "h",
+            "states": states(n="g/L", s="g/L"),
+            "parameters": numbers(m=0.5, y=0.5),
+            "equations": {"n": "m*n", "s": "-m*n/y"},
+        },
+        0.15,
+        lambda rng: np.array([rng.uniform(0.3, 2), rng.uniform(6, 14)]),
     ),
     "inducible gene": Home(
         {
@@ -431,6 +453,18 @@ HOMES: Mapping[str, Home] = {
         lambda rng: rng.uniform(20.0, 300.0, size=1),
         inflow,
     ),
+    "lamp": Home(
+        {
+            "time_unit": "s",
+            "states": states(s="K"),
+            "inputs": {"u": {"unit": "A"}},
+            "parameters": numbers(k=0.5),
+            "equations": {"s": "-k*s"},
+        },
+        0.2,
+        lambda rng: rng.uniform(0.0, 2.0, size=1),
+        waves,
+    ),
     "basins": Home(
         {
             "time_unit": "s",
@@ -471,8 +505,9 @@ RESIDENTS: Sequence[Resident] = (
     Resident("geometric stiffness", "mass", {"c": 4.0, "a": 0.5}),
     Resident("preload", "mass", {"c": 0.8}),
     Resident("backlash", "mass", {"c": 3.0, "a": 0.3}),
-    Resident("backlash", "mass", {"a": 0.4}),
+    Resident("backlash", "mass", {"a": 0.4}, "(u)"),
     Resident("backlash", "two masses", {"c": 1.5, "d": 1.5, "a": 0.4}),
+    Resident("backlash", "mass", {"a": 0.1}, "of what is measured"),
     Resident("gravity", "arm", {"c": 3.0}),
     Resident("gravity", "arm", {"d": 2.0}),
     Resident("gravity", "arm", {"c": 2.0, "d": 1.5}),
@@ -496,6 +531,9 @@ RESIDENTS: Sequence[Resident] = (
     Resident("Coulomb and viscous friction", "mass without damping", {"c": 0.2, "d": 0.3}),
     Resident("rolling resistance and drag", "mass", {"c": 0.2, "d": 0.3}),
     Resident("asymmetric friction", "mass", {"c": 0.5, "d": 0.15}),
+    Resident("asymmetric damping", "mass", {"c": 0.5}),
+    Resident("asymmetric damping", "mass without damping", {"c": 0.5, "d": 0.15}),
+    Resident("wind or current", "boat", {"w": 0.4}),
     Resident("Stribeck friction", "mass", {"c": 0.3, "s": 0.6, "w": 0.5}),
     Resident("position-dependent damping", "mass", {"c": 0.8}),
     Resident("constant bias", "mass", {"c": 0.8}),
@@ -533,6 +571,8 @@ RESIDENTS: Sequence[Resident] = (
     Resident("overflow", "two tanks", {"c": 1.0, "L": 2.5}),
     Resident("overflow", "two tanks", {"c": 1.0, "d": 0.6, "L": 2.5}, "h, g"),
     Resident("overflow", "two tanks", {"c": 1.0, "d": 0.8, "L": 2.2, "M": 3.0}, "h, g"),
+    Resident("flow over a weir", "basins", {"c": 0.15}, "in h"),
+    Resident("flow over a weir", "basins", {"c": 0.4, "L": 2.0}, "in h"),
     Resident("leak", "two tanks", {"c": 0.3}, "in h"),
     Resident("leak", "two tanks", {"c": 0.3, "d": 0.2}, "h, g"),
     Resident("input delay", "mass", {"tau": 0.3}),
@@ -550,6 +590,8 @@ RESIDENTS: Sequence[Resident] = (
     Resident("clipping", "mass", {"H": 1.2, "L": -1.0}),
     Resident("quadratic drag", "cart", {"c": 0.3}, "relative to u"),
     Resident("input gain", "cart", {"c": 0.3}, "'v', c_1*u"),
+    Resident("Joule heating", "lamp", {"c": 2.0}),
+    Resident("dependence on an input", "cart", {"c": 0.5}, "of d on u"),
     Resident("thrust of a propeller", "cart", {"c": 0.3}, "p*Abs(p)"),
     Resident("actuator lag", "mass", {"tau": 0.5}),
     Resident("hidden capacity", "heat", {"c": 0.5, "tau": 3.0}, "capacity in s"),
@@ -582,6 +624,7 @@ RESIDENTS: Sequence[Resident] = (
     Resident("rate limit", "circuit", {"r": 0.25}),
     Resident("magnetic saturation", "coil", {"c": 0.4}),
     Resident("photoinhibition", "algae", {"h": 0.4}),
+    Resident("limiting resource", "culture", {"w": 1.0}, "of m"),
     Resident("thermal radiation", "furnace", {"c": 2e-10, "d": 5.0}, "to surroundings"),
     Resident("thermal radiation", "kettle", {"c": 1e-9, "d": 6.0}, "to surroundings"),
     Resident("cogging or gear ripple", "arm", {"c": 1.0, "d": 0.5, "n": 3.0}),

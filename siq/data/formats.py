@@ -93,7 +93,11 @@ def open_columns(path: str | Path | pd.DataFrame | xarray.Dataset) -> ColumnFile
         for columns that are no vectors of numbers or text, or that differ in length.
     """
     if not isinstance(path, str | Path):
-        return _open_dataset(path) if hasattr(path, "data_vars") else _open_frame(path)
+        if not hasattr(path, "data_vars"):
+            return _open_frame(path)
+        every = {str(name): each for name, each in path.variables.items()}
+        known = {name: _Variable(tuple(map(str, v.dims)), v.values, v.attrs) for name, v in every.items()}
+        return _over_dimensions(TABLE, known)
     file, path = str(path), Path(path)
     suffix, exists, begin = path.suffix.lower(), path.exists(), b""
     reader = READERS.get(suffix)
@@ -489,14 +493,6 @@ class _Variable(NamedTuple):
             return values
         numbers = np.where(np.isin(values, np.ravel(empty)), np.nan, values.astype(float))
         return np.asarray(numbers * told.get("scale_factor", 1.0) + told.get("add_offset", 0.0))
-
-
-def _open_dataset(dataset: xarray.Dataset) -> ColumnFile:
-    """The columns of a dataset in memory."""
-    every = {str(name): each for name, each in dataset.variables.items()}
-    return _over_dimensions(
-        TABLE, {name: _Variable(tuple(map(str, v.dims)), v.values, v.attrs) for name, v in every.items()}
-    )
 
 
 def _open_netcdf(file: str) -> ColumnFile:

@@ -166,8 +166,9 @@ class Form(_Part):
         Regular expressions of the units that fill a role.
     one_unit
         Whether the states and inputs that fill the roles must have one unit, and not be mere numbers.
-    family
-        Where it is a member of another family than the mechanism's other forms.
+    family, generalises
+        Where it is a member of another family than the mechanism's other forms, or they have no such special
+        cases.
     turning
         Whether it shows only where the motion turns back: the coordinate is a velocity, and has both signs.
     """
@@ -186,6 +187,7 @@ class Form(_Part):
     units: dict[Name, str] = {}
     one_unit: bool = False
     family: str = ""
+    generalises: tuple[str, ...] = ()
     turning: bool = False
 
     @model_validator(mode="after")
@@ -546,8 +548,10 @@ def assignments(form: Form, model: Dynamics, roles: Roles) -> Iterator[dict[str,
     order = {name: place for place, name in enumerate(model.states)}
     for combination in itertools.product(*choices):
         filled = [name for part in combination for name in part.values()]
+        # An output may have the name of the state that it shows.
+        apart = {(form.roles[role] == "output", name) for part in combination for role, name in part.items()}
         ordered = sorted(filled, key=lambda name: order.get(name, -1))
-        if len(set(filled)) < len(filled) or (form.symmetric and filled != ordered):
+        if len(apart) < len(filled) or (form.symmetric and filled != ordered):
             continue
         alike = {units.get(name, "1") for name in filled} if form.one_unit else set()
         if len(alike) > 1 or "1" in alike:

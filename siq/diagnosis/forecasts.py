@@ -51,6 +51,7 @@ from siq.inference.budget import Budget, BudgetSpent, evaluation
 from siq.inference.kalman_filter import Noise, Whitened, whiten
 from siq.inference.maximum_likelihood import Fit, first_noise, fit_by_multiple_shooting
 from siq.inference.measurements import Measurements
+from siq.inference.recalibration import fit_with_process_noise_as_needed
 from siq.inference.trajectories import EDGE_SUBSTEPS, jumps_of, spread_edges
 from siq.numerics.randomness import positive
 from siq.systems.dynamics import Dynamics
@@ -553,7 +554,8 @@ def _next_rung(
     """The mechanism that stands first on top of fits; None where none is likelier than what has no name."""
     options, base, budget = context.study.search, horizons[0].fit, context.budget
     budget.says("comparing forecasts of what was left out")
-    sites, gains = _gains(horizons, _sites(candidates, base, context, untried), None, budget, untried)
+    places = _sites(candidates, base, context, untried)
+    sites, gains = _gains(horizons, places, None, budget, untried)
     # The mechanisms that promise most, fitted at every horizon; those that foresee better than nothing.
     fitted, leading = dict[str, _Leader](), list[_Leader]()
 
@@ -572,6 +574,15 @@ def _next_rung(
     # Friction of two kinds is not fitted where one of them promises nearly as much.
     less = {k: [most.get((n, one.coordinate), -np.inf) for n in one.generalises] for k, one in named.items()}
     order = [k for k in named if max(less[k], default=-np.inf) < NEARLY_ALL * gains[k]]
+    # A state of its own follows the motion. That is bent one sample ahead, where forces at random have to do
+    # what the state would: behind a gear with play the motor seems to wait whenever it turns.
+    far, promise = _gains(horizons[-1:], places, None, budget, untried)
+    first = far[int(np.argmax(promise + np.array([site.prior for site in far])))]
+    own_states = first.candidate is not None and first.candidate.model.dimension > base.model.dimension
+    shapes = first.terms if first.label not in {sites[k].label for k in order if gains[k] > 0} else ()
+    for term in shapes if own_states else ():
+        if not leading:
+            attempt(replace(first, terms=(term,)))
     for number, place in enumerate(order[:ATTEMPTS], start=1):
         if not gains[place] > 0 or len(leading) == LEADERS:
             break
@@ -639,6 +650,9 @@ def _next_rung(
     contained, equal = set[str](), set[str]()
     if leader in steady:
         contained, equal = _containing(leader.horizons[0], sites, leader.candidate)
+    else:  # a lag of what drives and one of what measures are the same to a linear system
+        ours = leader.site.family[0], len(leader.candidate.new)
+        equal = {k for k, each in fitted.items() if (each.site.family[0], len(each.candidate.new)) == ours}
     # What has more parameters is no rival where it takes no more than it leaves of what the leader leaves.
     outdone |= {
         label
@@ -718,13 +732,33 @@ def _takes_most(
     return typically_better(before, after) and bool(np.log((before + sensors) / (2 * after)).mean() > 0)
 
 
+def _needed(
+    candidate: MechanismCandidate, fit: Fit, found: Sequence[MechanismCandidate], context: FitContext
+) -> bool:
+    """Whether a fit with mechanisms needs one of them: its sign is right, and free runs are worse without."""
+    if not (candidate.amplitudes and candidate.admits(fit, context.data)):
+        return not candidate.amplitudes
+    model = fit.model.held(candidate.new, zero=candidate.amplitudes)
+    try:
+        with context.budget.exempt():
+            without = fit_with_process_noise_as_needed(model, context.data, fit, budget=context.budget)
+    except NUMERICAL_ERRORS:
+        return True
+    rest = [each for each in found if each is not candidate]
+    before, after = (
+        _left_out(*each, fit.noise, context) for each in ((without, rest), (fit, [*rest, candidate]))
+    )
+    return _takes_most(before, after, without, context.data, surely=False)
+
+
 def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], tuple[NotFitted, ...]]:
     """Mechanisms one on top of the other, as long as the next is likelier than what has no name.
 
     A mechanism may take over a part of an error of the model, above all on top of others, and most causes
     that have no name look a little like one that has. So the last one has to take more than it leaves of what
     free runs of parts left out are off by, beyond the sensors' noise, or it is taken back, and then the one
-    before it is the last.
+    before it is the last. One that those after it make needless stood for them: the climb is made again
+    without it, and counts unless it foresees worse.
 
     Returned are also the fits of the simulation alone, empty where it cannot be fitted, and what could not be
     judged.
@@ -761,4 +795,15 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], tu
         errors(last - 1), errors(last), fits[last], context.data, surely=False
     ):
         LOGGER.info("%s makes no free run better", found.pop().accepted.best.candidate.label)
+    own, last = own[: len(found)], len(found)
+    needless = {each.label for each in own[:-1] if not _needed(each, fits[last], own, context)}
+    fewer = tuple(each for each in context.candidates if each.label not in needless)
+    if needless and (before := errors(last)) is not None:
+        _, again, more = climb(fit, replace(context, candidates=fewer))
+        best = [each.accepted.best for each in again]
+        added = [each.candidate for each in best]
+        after = _left_out(best[-1].fit, added, alone[0].fit.noise, context) if best else None
+        LOGGER.info("climbed once more, without what became needless: %s", [each.label for each in added])
+        if after is not None and not typically_better(after, before):
+            return alone, again, more
     return alone, found, tuple(untried.values())

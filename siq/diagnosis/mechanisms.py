@@ -358,7 +358,7 @@ def _build_candidate(
         equations=(),
         coordinate=" ".join(assignment.get(word, word) for word in form.coordinate.split()),
         changes=(*changes, *further),
-        generalises=mechanism.generalises,
+        generalises=form.generalises or mechanism.generalises,
         turning=form.turning,
         variant=form.variant.format_map(assignment),
         family=form.family or mechanism.family or mechanism.name,
@@ -428,7 +428,8 @@ def _beyond_parameters(
     Other units and zeros of the states are no parameters, and can do as little: a sensor's gain beside a free
     inertia and a free damping is another unit of the angle.
 
-    Of several amplitudes those are taken out that the parameters, together with those before, stand for.
+    Of several amplitudes those are taken out that the parameters, together with those before, stand for. Of
+    a general form nothing may be left beside a special case of it.
     """
     d = model.dimension
     count = 2 * (len(model.free) + (d + 1) ** 2)
@@ -446,9 +447,18 @@ def _beyond_parameters(
     own = np.concatenate([own, seen_otherwise.reshape(len(own), -1, count)], axis=1)
     own = own.swapaxes(1, 2).reshape(len(own) * count, -1)
     result: list[MechanismCandidate | None] = []
-    for each in candidates:
-        shown = any(search.recorded for search in each.searches)  # and known where it acts by recordings only
-        new = [True] if shown else _new_columns(own, _columns(model, each, x, signals, values))
+    # Where a general form acts by recordings only, nothing is known of it here.
+    shown = [any(search.recorded for search in each.searches) for each in candidates]
+    columns = [
+        np.empty((len(own), 0)) if recorded else _columns(model, each, x, signals, values)
+        for each, recorded in zip(candidates, shown, strict=True)
+    ]
+    for each, recorded, change in zip(candidates, shown, columns, strict=True):
+        new = [True] if recorded else _new_columns(own, change)
+        named = zip(columns, candidates, strict=True)
+        special = [np.hstack([own, by]) for by, other in named if other.name in each.generalises]
+        if not all(any(_new_columns(one, change)) for one in special):
+            new = [False]
         needless = {name for name, is_new in zip(each.amplitudes, new, strict=False) if not is_new}
         if not any(new):
             result.append(None)
@@ -579,14 +589,12 @@ def candidates_of(model: Dynamics, roles: Roles, dictionary: Sequence[Mechanism]
                 if candidate is not None:
                     found.append((candidate, ", ".join(assignment.values())))
     reduced = _beyond_parameters(model, [each for each, _ in found])
-    # Ways of filling the roles of a mechanism that end in one model are one, as it is with its special case.
+    # Ways of filling the roles of a mechanism that end in one model are one.
     models: dict[tuple[object, ...], tuple[MechanismCandidate, str]] = {}
     for each, (_, filled) in zip(reduced, found, strict=True):
         if each is not None:
             key = (each.name, each.model.equations, each.model.outputs, each.begins)
             models.setdefault(key, (each, filled))
-    plain = {key[1:] for key, (each, _) in models.items() if not each.generalises}
-    models = {key: one for key, one in models.items() if not one[0].generalises or key[1:] not in plain}
     # Labels occur once, where needed with what fills the roles, and then with what is added: two parameters
     # of one equation may drift, each of two species be satiated, and a coupling have two forms.
     by_label = Counter(each.label for each, _ in models.values())

@@ -154,11 +154,7 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str], or
         references=list(
             dict.fromkeys((each.name, entry.reference) for each, entry in known if entry.reference)
         ),
-        described_formulas=[
-            row
-            for each in statement.described
-            for row in (*_rows_of(each, findings), *_simplest_of(each, findings))
-        ],
+        described_formulas=[row for each in statement.described for row in _rows_of(each, findings)],
         described_tables=[
             (each, _parameters_of([each]) if each.curve is None else _curve(each))
             for each in statement.described
@@ -289,9 +285,9 @@ def _errors_table(findings: Findings, units: Mapping[str, str]) -> pd.DataFrame 
 
 
 def _rows_of(part: StatedTerm, findings: Findings) -> list[FormulaRow]:
-    """The formulas of a mechanism or of what has no name, and what each is."""
+    """The formulas of a mechanism or of what has no name, and what each is; the simplest that it may be."""
     entry, words, kind = findings.entry(part.name), texts("tables")["smooth"], part.kind
-    return [
+    rows = [
         FormulaRow(
             part.label,
             words[kind] if kind in words else _typeset_text(formula, findings.after, part.parameters),
@@ -300,15 +296,11 @@ def _rows_of(part: StatedTerm, findings: Findings) -> list[FormulaRow]:
         )
         for name, formula in part.terms.items()
     ]
-
-
-def _simplest_of(part: StatedTerm, findings: Findings) -> list[FormulaRow]:
-    """The simplest formula that a function may be."""
-    if not part.formula:
-        return []
-    words = texts("tables")["formula_of"]["coefficient" if part.coordinates[1:] else "simplest"]
-    typeset = _typeset_text(part.formula, findings.after, part.sizes)
-    return [FormulaRow(part.shape, typeset, str(words).format(*part.coordinates))]
+    if part.formula:
+        what = texts("tables")["formula_of"]["coefficient" if part.coordinates[1:] else "simplest"]
+        typeset = _typeset_text(part.formula, findings.after, part.sizes)
+        rows.append(FormulaRow(part.shape, typeset, str(what).format(*part.coordinates)))
+    return rows
 
 
 def _meaning(name: str, entry: Mechanism | None, findings: Findings) -> str:

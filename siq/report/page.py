@@ -222,8 +222,15 @@ def render_report(content: object, *, template: str = "report.html.j2", folder: 
         # An SVG inside <img> keeps its identifiers to itself and cannot run or load anything.
         "data_address": lambda figure: _address(figure.kind, figure.image),
         "figure_download": _figure_download,
-        "table_download": _table_download,
-        "file_name": _file_name,
+        "table_download": lambda table: _address(
+            "csv",
+            (table.frame if table.data is None else table.data)
+            .to_csv(index=False, lineterminator="\n")
+            .encode(),
+        ),
+        "file_name": lambda caption, number, *, what: "-".join(
+            [what, str(number), *re.findall(r"[a-z0-9]+", caption.lower())[:5]]  # "table-3-barriers-of-u"
+        ),
         "page_width": _page_width,
         "wide_for": _wide_for,
         "short": _short_caption,
@@ -254,22 +261,10 @@ def _figure_download(figure: Any) -> tuple[str, str]:
     return figure.kind, _address(figure.kind, figure.image)
 
 
-def _table_download(table: Any) -> str:
-    frame = table.frame if table.data is None else table.data
-    text = frame.to_csv(index=False, lineterminator="\n")
-    return _address("csv", text.encode("utf-8"))
-
-
 def _short_caption(caption: str) -> str:
     """The first sentence, or its first part, for the contents: no more than a line."""
     first = re.split(r"(?<=[a-zà-ÿ)\]])[.:;](?:\s|$)", caption, maxsplit=1)[0].rstrip(".")
     return first if len(first) <= 90 else first[:88].rsplit(" ", 1)[0] + " …"
-
-
-def _file_name(caption: str, number: int, *, what: str) -> str:
-    """A name for a download: ``table-3-barriers-of-u``."""
-    words = re.findall(r"[a-z0-9]+", caption.lower())[:5]
-    return "-".join([what, str(number), *words])
 
 
 def _page_width(figure: Any) -> int:

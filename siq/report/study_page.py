@@ -171,7 +171,12 @@ def study_page(
         without_landscape=_without_landscape(results.tables),
         compared=compared,
         comparison=None if compared is None else comparison_table(compared),
-        compared_notes=[] if compared is None else _comparison_notes(compared),
+        compared_notes=[]
+        if compared is None
+        else [  # what could not be compared with the equations, and the numbers that it is of
+            (str(note), [item for item in dict.fromkeys(some["item"].fillna("")) if item])
+            for note, some in compared[compared["note"].fillna("") != ""].groupby("note", sort=False)
+        ],
         tests=None if run is None else _tests_table(certificates, run, method),
         landscape_errors=None if errors is None else errors_over_runs(errors),
         escape=None if escape is None else escape.rename(columns=lambda name: name.replace("_", " ")),
@@ -510,15 +515,6 @@ def _without_landscape(tables: Mapping[str, pd.DataFrame]) -> tuple[str, int, in
     if without.empty:
         return None
     return str(without["reason"].iloc[0]), len(without), int(outcomes["run"].nunique())
-
-
-def _comparison_notes(table: pd.DataFrame) -> list[tuple[str, list[str]]]:
-    """What could not be compared with the equations: each note, and the numbers that it is of."""
-    noted = table[table["note"].fillna("") != ""]
-    return [
-        (str(note), [item for item in dict.fromkeys(some["item"].fillna("")) if item])
-        for note, some in noted.groupby("note", sort=False)
-    ]
 
 
 def _run_figures(tables: Mapping[str, pd.DataFrame], *, runs: int, method: str) -> dict[str, Any]:

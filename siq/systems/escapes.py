@@ -194,7 +194,13 @@ def simulate_escapes(
             for number, target in enumerate(targets):
                 inside = np.flatnonzero(target.height(x) <= 1)
                 if len(inside):
-                    arrived = inside[_settles(function, x[:, inside], target, step, settling[number])]
+                    there, settled = x[:, inside], np.zeros(len(inside), dtype=bool)
+                    for _ in range(settling[number]):  # f leads on to its middle
+                        there = runge_kutta_step(function, there, step)
+                        settled |= target.height(there) <= SETTLED
+                        if settled.all():
+                            break
+                    arrived = inside[settled]
                     staying[arrived] = False
                     times.append(np.full(len(arrived), index * step))
                     reached.append(np.full(len(arrived), number))
@@ -206,17 +212,6 @@ def simulate_escapes(
     if lost:
         raise NumericalFailure(f"{lost} of {walkers} walkers run to infinity; take a smaller step")
     return _EscapeTimes(np.concatenate(times), np.concatenate(reached), x.shape[1], steps * step)
-
-
-def _settles(function: Field, x: np.ndarray, target: Neighbourhood, step: float, steps: int) -> np.ndarray:
-    """Whether f leads from states in a neighbourhood to its middle within some steps."""
-    settled = np.zeros(x.shape[1], dtype=bool)
-    for _ in range(steps):
-        x = runge_kutta_step(function, x, step)
-        settled |= target.height(x) <= SETTLED
-        if settled.all():
-            break
-    return settled
 
 
 class _SplitTime(NamedTuple):

@@ -55,6 +55,7 @@ FUNCTIONS: Mapping[str, Callable[..., sympy.Expr]] = {
     "Min": sympy.Min,
 }
 """The functions that a formula may use, by the names that it uses for them."""
+OTHER_NAMES = {"abs": "Abs", "max": "Max", "min": "Min", "ln": "log", "arctan": "atan"}
 
 
 class delay(sympy.Function):  # noqa: N801 (the name that formulas use)
@@ -218,6 +219,7 @@ def _power(base: sympy.Expr, exponent: sympy.Expr) -> sympy.Expr:
 
 
 def _call(name: str, arguments: Sequence[sympy.Expr]) -> sympy.Expr:
+    name = OTHER_NAMES.get(name, name)
     if name not in FUNCTIONS:
         remedy = suggestion(name, FUNCTIONS, otherwise=f"use one of {', '.join(FUNCTIONS)}")
         raise FormulaError(f"the function '{name}' is not allowed in a formula", remedy)

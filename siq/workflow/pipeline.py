@@ -330,11 +330,14 @@ def landscape_of_run(
     x = record.wrapped(snapshot_pairs(recordings, pair_step=settings.sampling.pair_step)).x0
     draw = generator(settings.seed, number, Purpose.LANDSCAPE)
     points = x[evenly_spread(x, generator=draw)]
+    noise = NoiseStrength(settings.noises[0]) if settings.noises else None
+    if (shown := record.noise_strength) is not None:  # what the recordings show, before what the study gives
+        noise = NoiseStrength(*shown, source="estimated")
     try:
         portrait = phase_portrait(record.dynamics, points, seed=number)
         found = find_landscape(
             record, portrait, wells=wells if wells or not seek_wells else None, certificate=certificate,
-            options=settings.refinement, noise=_noise_strength(settings, record), seed=number,
+            options=settings.refinement, noise=noise, seed=number,
         ).with_checked_times(settings.landscape, seed=number)  # fmt: skip
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         return StepResult(None, Outcome(number, Step.LANDSCAPE, Status.FAILED, str(error)))
@@ -354,13 +357,6 @@ def landscape_of_run(
     units = tuple(unit or space.unit(name, unknown="1") for name, unit in named)
     found = found.in_units(units, time=recordings.time_unit or space.unit("t", unknown="1"))
     return StepResult(found, outcome)
-
-
-def _noise_strength(settings: PipelineSettings, record: FieldEstimate) -> NoiseStrength | None:
-    """The noise that the recordings show, or else the first that the study gives."""
-    if (shown := record.noise_strength) is not None:
-        return NoiseStrength(*shown, source="estimated")
-    return NoiseStrength(settings.noises[0]) if settings.noises else None
 
 
 @dataclass(frozen=True)

@@ -228,20 +228,6 @@ def _position_text(state: np.ndarray | Sequence[float]) -> str:
     return str([float(f"{one:.{DIGITS}g}") for one in state])
 
 
-def _curves_of_map(
-    system: Dynamics, names: tuple[str, ...], points: Sequence[SweptPoint]
-) -> tuple[list[Branch], list[Remark]]:
-    """Curves of folds and of Hopf points that a row or a column of a map crosses; none where it is a line."""
-    values = np.array([point.values for point in points])
-    limits = list(zip(values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True))
-    if any(low == high for low, high in limits):
-        return [], []
-    seeds = [
-        seed for along in range(len(names)) for seed in _seeds(system, names, points, limits[along], along)
-    ]
-    return follow_curves(system, dict(zip(names, limits, strict=True)), seeds)
-
-
 def _seeds(
     system: Dynamics,
     names: tuple[str, ...],
@@ -526,7 +512,12 @@ def collected(
     else:
         numbers = [list(range(len(point.wells))) for point in points]
     if len(names) == MOST_PARAMETERS:
-        curves, remarks = _curves_of_map(system, names, points)
+        # Curves of folds and of Hopf points that a row or a column of the map crosses, unless it is a line.
+        swept = np.array([point.values for point in points])
+        sides = list(zip(swept.min(axis=0).tolist(), swept.max(axis=0).tolist(), strict=True))
+        if all(low < high for low, high in sides):
+            begun = [one for k in range(len(names)) for one in _seeds(system, names, points, sides[k], k)]
+            curves, remarks = follow_curves(system, dict(zip(names, sides, strict=True)), begun)
     notes = tuple(dict.fromkeys(map(sentence, remarks)))
     rows, ways = [], []
     for point, number in zip(points, numbers, strict=True):

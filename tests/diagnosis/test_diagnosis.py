@@ -288,7 +288,8 @@ def test_random_forces_are_no_noise_where_a_function_beside_them_is_likelier(
     def models(search: Search, _: FitContext) -> tuple[AugmentedModel, ...]:
         # A function of a sensor that leaves process noise, and is likelier than noise alone.
         assert search.recalibrated.has_process_noise
-        candidate = next(each.term.candidate for each in search.screened if not each.term.candidate.equations)
+        screened = [each.term.candidate for each in search.screened]
+        candidate = next(each for each in screened if each.coordinate == "measurement")
         part = FittedCandidate(candidate, search.recalibrated, 50.0, 40.0, 0.0, 0.0)
         return (AugmentedModel((part,), search.recalibrated, 5.0),)
 

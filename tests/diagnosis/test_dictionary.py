@@ -262,7 +262,8 @@ SCREENED = (
     "outflow through an opening", "thermal radiation",
     "reverse reaction or backflow", "adaptation", "waning immunity", "eddy-current brake",
     "product inhibition", "attached oscillator", "rate limit", "magnetic saturation",
-    "photoinhibition", "Gompertz growth", "second-order reaction",
+    "photoinhibition", "Gompertz growth", "second-order reaction", "asymmetric damping", "wind or current",
+    "flow over a weir", "limiting resource", "Joule heating", "dependence on an input",
 )  # fmt: skip
 
 
@@ -316,6 +317,68 @@ def test_what_coasts_has_a_resistance_that_is_constant_and_one_that_grows_with_t
         next(each for each in change.free_symbols if each.name == name) for name in ("c_1", "d_1", "v")
     )
     assert change.subs({c: 2, d: 3, v: 4}) == -(2 + 3 * 16) == -change.subs({c: 2, d: 3, v: -4})
+
+
+def test_a_shock_absorber_resists_one_way_more_than_the_other() -> None:
+    # Dixon (2007): F = -C_rebound v for v > 0, -C_bump v for v < 0.
+    change = dict(the("asymmetric damping", "mass without damping").changes)["v"]
+    c, d, v = (
+        next(each for each in change.free_symbols if each.name == name) for name in ("c_1", "d_1", "v")
+    )
+    assert change.subs({c: 2, d: 3, v: 4}) == -8 and change.subs({c: 2, d: 3, v: -4}) == 12
+
+
+def test_drag_in_wind_goes_with_the_relative_speed_and_a_linear_one_is_a_constant_force() -> None:
+    # Fossen (2011), chapter 8: drag acts on ν - ν_c.
+    change = dict(the("wind or current", "boat").changes)["v"]
+    w, v, u, d = (
+        next(each for each in change.free_symbols if each.name == name) for name in ("w_1", "v", "u", "d")
+    )
+    assert change.subs({w: 1, v: 3, u: 0, d: 2}) == -8 and change.subs({w: 1, v: 0, u: 0, d: 2}) == 2
+    linear = names(oscillator("-k*x - d*v + u", k=4.0, d=0.5))
+    assert "constant bias" in linear and "wind or current" not in linear
+
+
+def test_the_flow_over_a_weir_goes_with_the_power_three_halves_of_the_height() -> None:
+    # Poleni (1717): Q = 2/3 μ b sqrt(2 g) h^(3/2).
+    change = dict(the("flow over a weir", "basins", "weir in h").changes)["h"]
+    c, h = (next(each for each in change.free_symbols if each.name == name) for name in ("c_1", "h"))
+    assert change.subs({c: 2, h: 4}) == -16 and change.subs({c: 2, h: -1}) == 0
+
+
+def test_growth_on_a_limiting_resource_is_that_of_monod() -> None:
+    # Monod (1949): μ = μ_max S / (K_s + S), and what is used up follows.
+    model = the("limiting resource", "culture", "of m").model
+    rates = dict(zip(model.states, model.equations, strict=True))
+    at = {"n": 3, "s": 2, "w_1": 4, "m": 0.5, "y": 0.5}
+    told = {name: rate.subs({s: at[s.name] for s in rate.free_symbols}) for name, rate in rates.items()}
+    assert told == {"n": 0.5 * 2 / 6 * 3, "s": -0.5 * 2 / 6 * 3 / 0.5}
+
+
+def test_a_current_heats_with_its_square() -> None:
+    # Joule (1841): Q = R I² t.
+    change = dict(the("Joule heating", "lamp").changes)["s"]
+    c, u = (next(each for each in change.free_symbols if each.name == name) for name in ("c_1", "u"))
+    assert change.subs({c: 2, u: 3}) == 18 == change.subs({c: 2, u: -3})
+
+
+def test_a_parameter_goes_with_an_input_in_proportion() -> None:
+    # McAdams (1954): a film coefficient goes with the speed of the air, h = h0 (1 + c w).
+    model = the("dependence on an input", "cart", "of d on u").model
+    (rate,) = model.equations
+    at = {"d": 2.0, "c_1": 0.5, "u": 3.0, "v": 1.0, "g": 0.0, "p": 1.0}
+    assert rate.subs({each: at[each.name] for each in rate.free_symbols}) == -2.0 * (1 + 0.5 * 3.0)
+
+
+def test_behind_a_gear_with_play_nothing_moves_until_it_is_taken_up() -> None:
+    # Nordin and Gutman (2002): the load follows a drive only beyond the gap.
+    model = the("backlash", "mass", "of what is measured").model
+    rate, (seen,) = model.equations[-1], dict(model.outputs).values()
+    by_name = {each.name: each for each in rate.free_symbols | seen.free_symbols}
+    a, z, v, x = (by_name[name] for name in ("a_1", "z_1", "v", "x"))
+    assert seen == x - z
+    assert rate.subs({a: 2, z: 2, v: 3}) == 0 == rate.subs({a: 2, z: -2, v: -3})  # taken along
+    assert rate.subs({a: 2, z: 0, v: 3}) == 3 == -rate.subs({a: 2, z: 2, v: -3})  # in the gap
 
 
 def test_friction_of_two_kinds_is_one_kind_where_the_card_has_the_other() -> None:

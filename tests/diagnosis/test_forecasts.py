@@ -24,6 +24,7 @@ from siq.diagnosis.forecasts import (
     _gains,
     _horizons_of,
     _log_priors,
+    _needed,
     _next_rung,
     _Rung,
     _Site,
@@ -310,6 +311,39 @@ def test_a_last_mechanism_that_makes_no_free_run_better_is_taken_back(
     # One that makes free runs better stays, with those that it stands on.
     rungs = iter([damped(), damped(), None])
     monkeypatch.setattr(forecasts, "_takes_most", lambda *_, **__: True)
+    assert climb(fit, context)[1] == [damped(), damped()]
+
+
+def test_a_name_is_needed_where_free_runs_are_worse_without_it() -> None:
+    context = context_of(pendulum(), recorded(0.15, 0.2), CLOSE)
+    best = damped().accepted.best
+    assert _needed(best.candidate, best.fit, [best.candidate], context)
+    undamped = context_of(pendulum(), recorded(0.0, 0.2), CLOSE)
+    names = [each.name for each in best.fit.model.parameters]
+    values = best.fit.model.values.copy()
+    values[names.index(best.candidate.amplitudes[0])] = 1e-6
+    assert not _needed(
+        best.candidate, replace(best.fit, model=best.fit.model.with_values(values)), [], undamped
+    )
+
+
+def test_one_that_those_after_it_make_needless_is_climbed_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As an eddy-current brake that was named for the dry friction that came second."""
+    context = context_of(pendulum(), recorded(0.15, 0.2), CLOSE)
+    rungs, asked = iter([damped(), damped(), None, damped(), None] * 2), list[bool]()
+
+    def rung(_: object, candidates: list[MechanismCandidate], *__: object) -> _Rung | None:
+        asked.append(damped().accepted.best.candidate.label in {each.label for each in candidates})
+        return next(rungs)
+
+    monkeypatch.setattr(forecasts, "_next_rung", rung)
+    monkeypatch.setattr(forecasts, "_takes_most", lambda *_, **__: True)
+    monkeypatch.setattr(forecasts, "_needed", lambda *_: False)
+    fit, _ = recalibrate(context.model, context.data)
+    assert climb(fit, context)[1] == [damped()]
+    assert asked[0] and not asked[3]
+    # Not if it foresees worse without it.
+    monkeypatch.setattr(forecasts, "typically_better", lambda *_: True)
     assert climb(fit, context)[1] == [damped(), damped()]
 
 

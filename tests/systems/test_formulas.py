@@ -135,7 +135,6 @@ def test_a_number_beyond_floating_point_is_refused_as_a_formula_error(text: str)
     [
         ("2*zetta", "perhaps you meant 'zeta'"),
         ("sine(x)", "perhaps you meant 'sin'"),
-        ("abs(x)", "perhaps you meant 'Abs'"),
         ("x^2", "write '**' for powers"),
     ],
 )

@@ -127,14 +127,6 @@ def residuals_figure(
     return figure
 
 
-def _rate_unit(unit: str, time_unit: str) -> str:
-    """The unit of a state per time, empty where both are plain numbers."""
-    plain, timeless = unit in ("", "1"), time_unit in ("", "1")
-    if timeless:
-        return "" if plain else f"{unit} per time"
-    return f"1/{time_unit}" if plain else f"{unit}/{time_unit}"
-
-
 def _binned_residuals(dynamics: Dynamics, recordings: Recordings, place: int) -> tuple[pd.DataFrame, float]:
     """What f leaves of one state's increments, per time, in bins along that state; and its share of them.
 
@@ -194,7 +186,9 @@ def _draw(axes: Axes, binned: pd.DataFrame, share: float, name: str, units: tupl
     axes.set_xlabel(scaled_label(axes.xaxis, f"${name_label(name)}$", units[0], largest))
     largest = max(abs(limit) for limit in axes.get_ylim())
     what = f"left of d${name_label(name)}$/d$t$"
-    axes.set_ylabel(scaled_label(axes.yaxis, what, _rate_unit(*units), largest))
+    unit, per = ("" if each == "1" else each for each in units)
+    rate = f"{unit or 1}/{per}" if per else unit and f"{unit} per time"
+    axes.set_ylabel(scaled_label(axes.yaxis, what, rate, largest))
     within = int((np.abs(mean) <= 2 * error).sum())
     title = f"{within} of {len(binned)} bins within the band"
     if quiet:

@@ -262,7 +262,12 @@ def _draw_quasipotential(
     shown = landscape.plane(states)
     values, sentence = _on_plane(landscape, shown, view)
     handles = _draw_map(axes, landscape, shown, values.T)
-    handles += _draw_points(axes, landscape, shown)
+    if (points := landscape.points) is not None and len(points):
+        # As an image: so many points would make megabytes of vector graphics.
+        some = points[:: max(len(points) // MOST_POINTS, 1), list(shown)]
+        axes.plot(*some.T, rasterized=True, zorder=2, **RECORDED)
+        look = RECORDED | {"markersize": 5, "alpha": 0.8}
+        handles.append(Line2D([], [], label="recorded states", **look))
     handles += _draw_ways(axes, landscape, shown)
     handles += draw_equilibria(axes, landscape, shown)
     name_axes(axes, landscape, shown)
@@ -346,17 +351,6 @@ def _draw_map(
     axes.set_xlim(*landscape.box[first])
     axes.set_ylim(*landscape.box[second])
     return handles
-
-
-def _draw_points(axes: Axes, landscape: LandscapeSummary, shown: tuple[int, int]) -> list[Any]:
-    """Draw some of the recorded states, faintly."""
-    points = landscape.points
-    if points is None or not len(points):
-        return []
-    thinned = points[:: max(len(points) // MOST_POINTS, 1)]
-    # As an image: so many points would make megabytes of vector graphics.
-    axes.plot(*thinned[:, list(shown)].T, rasterized=True, zorder=2, **RECORDED)
-    return [Line2D([], [], label="recorded states", **(RECORDED | {"markersize": 5, "alpha": 0.8}))]
 
 
 def _draw_ways(axes: Axes, landscape: LandscapeSummary, shown: tuple[int, int]) -> list[Any]:

@@ -355,9 +355,12 @@ def plot_barriers(landscape: Landscape | LandscapeSummary, *, ax: Axes | None = 
                 place, height + well.depth, yerr=2 * well.depth_error, color=VERMILLION, marker="_",
                 markersize=9, capsize=4, elinewidth=1.4, zorder=4,
             )  # fmt: skip
-        labels.append(
-            f"{well.label}\n$\\Delta U$ =\n{_with_error(well.depth, well.depth_error, broken=many)}"
-        )
+        barrier = magnitude_label(well.depth, digits=4)  # without digits that mean nothing
+        if np.isfinite(well.depth_error) and well.depth_error > NO_ERROR * abs(well.depth):
+            barrier = mean_and_spread(well.depth, well.depth_error)
+            if many and "(" not in barrier:  # on two lines where there is no room
+                barrier = barrier.replace(r" \pm ", "$\n$\\pm$ $")
+        labels.append(f"{well.label}\n$\\Delta U$ =\n{barrier}")
     axes.set_xticks([places[number] for number in range(len(order))], labels)
     axes.tick_params(axis="x", length=0)
     axes.set_xlim(-0.6, len(order) - 0.4)
@@ -369,14 +372,6 @@ def plot_barriers(landscape: Landscape | LandscapeSummary, *, ax: Axes | None = 
     name_energy(axes, shown, reach, what)
     axes.set_xlabel("bars: ± 2 standard errors of the lowest way out", color=GREY)
     return axes
-
-
-def _with_error(value: float, error: float, *, broken: bool) -> str:
-    """A barrier with its error, without digits that mean nothing; on two lines where there is no room."""
-    if not (np.isfinite(error) and error > NO_ERROR * abs(value)):
-        return magnitude_label(value, digits=4)
-    text = mean_and_spread(value, error)
-    return text.replace(r" \pm ", "$\n$\\pm$ $") if broken and "(" not in text else text
 
 
 def _joined(landscape: LandscapeSummary) -> tuple[list[_Join], tuple[int, ...]]:
