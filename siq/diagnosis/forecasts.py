@@ -577,12 +577,12 @@ def _next_rung(
     # A state of its own follows the motion. That is bent one sample ahead, where forces at random have to do
     # what the state would: behind a gear with play the motor seems to wait whenever it turns.
     far, promise = _gains(horizons[-1:], places, None, budget, untried)
-    first = far[int(np.argmax(promise + np.array([site.prior for site in far])))]
-    own_states = first.candidate is not None and first.candidate.model.dimension > base.model.dimension
-    shapes = first.terms if first.label not in {sites[k].label for k in order if gains[k] > 0} else ()
-    for term in shapes if own_states else ():
-        if not leading:
-            attempt(replace(first, terms=(term,)))
+    ahead = far[int(np.argmax(promise + np.array([site.prior for site in far])))]
+    own_states = ahead.candidate is not None and ahead.candidate.model.dimension > base.model.dimension
+    if own_states and ahead.label not in {sites[k].label for k in order if gains[k] > 0}:
+        for term in ahead.terms:
+            if not leading:
+                attempt(replace(ahead, terms=(term,)))
     for number, place in enumerate(order[:ATTEMPTS], start=1):
         if not gains[place] > 0 or len(leading) == LEADERS:
             break
@@ -597,7 +597,11 @@ def _next_rung(
         stateless = {each.label for each in candidates if each.model.dimension == d} - {*fitted, *untried}
         for place in [place for place in order if sites[place].label in stateless][:ATTEMPTS]:
             attempt(sites[place], weights[place])
-    # Of those that are not told apart, the one with the fewest parameters.
+    # Of those that are not told apart, the one with the fewest parameters; special cases are asked.
+    first = max(leading, key=lambda each: each.weight).candidate
+    for place, one in named.items():
+        if one.name in first.generalises and one.coordinate == first.coordinate and one.label not in fitted:
+            attempt(sites[place])
     heaviest = max(each.weight for each in leading)
     plausible = [each for each in leading if each.weight > heaviest + np.log(PLAUSIBLE)]
     leader = min(plausible, key=lambda each: (len(each.candidate.new), -each.weight))
@@ -758,7 +762,7 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], tu
     that have no name look a little like one that has. So the last one has to take more than it leaves of what
     free runs of parts left out are off by, beyond the sensors' noise, or it is taken back, and then the one
     before it is the last. One that those after it make needless stood for them: the climb is made again
-    without it, and counts unless it foresees worse.
+    without it, and counts unless it has more names or foresees worse.
 
     Returned are also the fits of the simulation alone, empty where it cannot be fitted, and what could not be
     judged.
@@ -796,7 +800,9 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], tu
     ):
         LOGGER.info("%s makes no free run better", found.pop().accepted.best.candidate.label)
     own, last = own[: len(found)], len(found)
-    needless = {each.label for each in own[:-1] if not _needed(each, fits[last], own, context)}
+    # So may a general form whose special case is enough beside what came after it.
+    earlier = own[:-1]
+    needless = {e.label for e in earlier if e.generalises or not _needed(e, fits[last], own, context)}
     fewer = tuple(each for each in context.candidates if each.label not in needless)
     if needless and (before := errors(last)) is not None:
         _, again, more = climb(fit, replace(context, candidates=fewer))
@@ -804,6 +810,6 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], tu
         added = [each.candidate for each in best]
         after = _left_out(best[-1].fit, added, alone[0].fit.noise, context) if best else None
         LOGGER.info("climbed once more, without what became needless: %s", [each.label for each in added])
-        if after is not None and not typically_better(after, before):
+        if after is not None and len(again) <= last and not typically_better(after, before):
             return alone, again, more
     return alone, found, tuple(untried.values())

@@ -104,9 +104,12 @@ def _accepted(
     equal = [each for each, leads in zip(significant, near, strict=True) if leads]
     best = max(equal, key=lambda each: (each.candidate.weight, bool(each.candidate.equations)))
     if best.fit.has_process_noise:
-        # What is left is no noise, and white errors mean little: of equals, what all recordings ask for.
+        # What is left is no noise, and white errors mean little: of equals, what all recordings ask for, but
+        # no general form whose special case is one of them.
         equals = [each for each in significant if each.delta_bic < best.delta_bic + options.same]
-        best = min(equals, key=lambda each: each.p_cluster)
+        known = [each.candidate for each in equals]
+        plain = [e for e in equals if not any(_special_case(one, e.candidate) for one in known)]
+        best = min(plain, key=lambda each: each.p_cluster)
     least = best.delta_chi2 - options.same
 
     def standing(other: FittedCandidate) -> Standing:

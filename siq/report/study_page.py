@@ -135,6 +135,11 @@ def study_page(
     swept: Iterable[int] = () if table("sweep") is None else results.tables["sweep"]["well"]
     named = ", ".join(f"{name} {version}" for name, version in versions.items())
     machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
+    printed = study.model_dump(mode="json", by_alias=True)
+    if given is not None:  # nothing is simulated of recordings, and of equations fewer keys have a use
+        printed = {key: printed[key] for key in PRINTED_OF_EQUATIONS}
+    elif study.recordings is not None:
+        printed |= {"simulation": None}
 
     return compose(
         "study.j2",
@@ -204,7 +209,7 @@ def study_page(
         in (study.refinement.with_routes(networks=study.training is not None).routes or ()),
         steps=results.tables["outcomes"].drop(columns=[] if several else "run"),
         machine=f"{named}; {machine}, {os.cpu_count()} cores",
-        printed=_printed(study, given=given is not None),
+        printed=str(yaml.safe_dump(printed, sort_keys=False, allow_unicode=True)),
         spent={} if timings is None else timings.groupby("step")["seconds"].sum().to_dict(),
     )
 
@@ -659,13 +664,3 @@ def _bifurcations(
             }
         )
     return pd.DataFrame(rows)
-
-
-def _printed(study: Study, *, given: bool) -> str:
-    """The study as it was asked; of recordings nothing is simulated, of equations fewer keys have a use."""
-    data = study.model_dump(mode="json", by_alias=True)
-    if given:
-        data = {key: data[key] for key in PRINTED_OF_EQUATIONS}
-    elif study.recordings is not None:
-        data = data | {"simulation": None}
-    return str(yaml.safe_dump(data, sort_keys=False, allow_unicode=True))

@@ -270,16 +270,6 @@ FOLLOWED = "SIQ_FOLLOWED"
 """Environment variable that tells jobs that what they say of their progress is read."""
 
 
-def _environment() -> dict[str, str]:
-    """What Snakemake is started with: our logger, and in a checkout our sources."""
-    base = _workflow_folder()
-    paths = [str(base / PLUGINS)]
-    if (base / "siq").is_dir():
-        paths.append(str(base))
-    paths += [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
-    return os.environ | {"PYTHONPATH": os.pathsep.join(paths), "PYTHONIOENCODING": "utf-8"}
-
-
 def _lines(stream: IO[str]) -> Iterator[str]:
     """The lines of a stream as they come, and an empty one each tick in between."""
     waiting: queue.Queue[str | None] = queue.Queue()
@@ -379,9 +369,13 @@ def _not_there(given: str) -> InputError:
 def _answered(request: Request, pages: Sequence[Path]) -> Exit:
     """Run the workflow in the folder in which you work, with one line of progress; say how it ended."""
     # Its standard input ends with this process, however that ends, and Snakemake then ends, too.
+    base = _workflow_folder()  # with our logger, and in a checkout our sources
+    paths = [str(base / PLUGINS), *([str(base)] if (base / "siq").is_dir() else [])]
+    paths += [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
+    ours = {"PYTHONPATH": os.pathsep.join(paths), "PYTHONIOENCODING": "utf-8", PARENT: "1"}
     process = subprocess.Popen(
         request.command(),
-        env=_environment() | {PARENT: "1"} | ({} if request.verbose else {FOLLOWED: "1"}),
+        env=os.environ | ours | ({} if request.verbose else {FOLLOWED: "1"}),
         stdin=subprocess.PIPE,
         stdout=None if request.verbose else subprocess.PIPE,
         stderr=None if request.verbose else subprocess.STDOUT,
