@@ -230,6 +230,18 @@ HOMES: Mapping[str, Home] = {
         lambda rng: rng.normal(size=1),
         waves,
     ),
+    "pipe": Home(
+        {
+            "time_unit": "s",
+            "states": states(q="L/s"),
+            "inputs": {"u": {"unit": "L/s**2"}},
+            "parameters": numbers(d=0.2),
+            "equations": {"q": "u - d*q"},
+        },
+        0.2,
+        lambda rng: rng.normal(size=1),
+        waves,
+    ),
     "rotating frame": Home(
         {
             "time_unit": "s",
@@ -289,6 +301,30 @@ HOMES: Mapping[str, Home] = {
         },
         0.15,
         lambda rng: np.array([rng.uniform(6, 14), rng.uniform(0.3, 2), rng.uniform(0, 4)]),
+    ),
+    "fermenter with a feed": Home(
+        {
+            "time_unit": "h",
+            "states": states(n="g/L"),
+            "inputs": {"u": {"unit": "1/h", "interpolation": "zero_order"}},
+            "parameters": numbers(r=1.0, k=0.3),
+            "equations": {"n": "r*n - k*n**2"},
+        },
+        0.3,
+        lambda rng: np.array([rng.uniform(0.3, 4)]),
+        lambda rng, t: inflow(rng, t, size=1.5),
+    ),
+    "mixer": Home(
+        {
+            "time_unit": "min",
+            "states": states(s="K"),
+            "inputs": {"u": {"unit": "L/min", "interpolation": "zero_order"}, "w": {"unit": "K"}},
+            "parameters": numbers(k=0.2),
+            "equations": {"s": "-k*s"},
+        },
+        0.3,
+        lambda rng: rng.uniform(1.0, 4.0, size=1),
+        lambda rng, t: np.concatenate([inflow(rng, t, size=1.5), 2.0 + waves(rng, t)]),
     ),
     "culture": Home(
         {
@@ -523,6 +559,7 @@ RESIDENTS: Sequence[Resident] = (
     Resident("quintic stiffness", "rotating frame", {"c": 0.05}),
     Resident("quadratic drag", "mass", {"c": 0.4}),
     Resident("quadratic drag", "rotating frame", {"c": 0.2}),
+    Resident("quadratic drag", "pipe", {"c": 0.4}),
     Resident("cubic damping", "mass", {"c": 0.2}),
     Resident("eddy-current brake", "mass without damping", {"c": 1.5, "w": 0.5}),
     Resident("amplitude-dependent damping", "rotating frame", {"c": 0.1}),
@@ -599,6 +636,9 @@ RESIDENTS: Sequence[Resident] = (
     Resident("maturation delay", "crop", {"tau": 2.0}, "three stages"),
     Resident("maturation delay", "crop", {"tau": 2.0}, "one length"),
     Resident("delayed self-limitation", "crop", {"tau": 0.8}),
+    Resident("washout", "fermenter with a feed", {"c": 0.3}),
+    Resident("washout", "mixer", {"c": 0.3, "d": 0.8}),
+    Resident("washout", "mixer", {"c": 0.3}, "by what has w"),
     Resident("saturated elimination", "heat", {"c": 1.0, "w": 1.0}, "in s"),
     Resident("diode or exponential loss", "circuit", {"c": 0.05, "w": 0.3}),
     Resident("thermal radiation", "furnace", {"c": 2e-10}),

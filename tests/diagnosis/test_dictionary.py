@@ -264,6 +264,7 @@ SCREENED = (
     "product inhibition", "attached oscillator", "rate limit", "magnetic saturation",
     "photoinhibition", "Gompertz growth", "second-order reaction", "asymmetric damping", "wind or current",
     "flow over a weir", "limiting resource", "Joule heating", "dependence on an input",
+    "washout",
 )  # fmt: skip
 
 
@@ -368,6 +369,16 @@ def test_a_parameter_goes_with_an_input_in_proportion() -> None:
     (rate,) = model.equations
     at = {"d": 2.0, "c_1": 0.5, "u": 3.0, "v": 1.0, "g": 0.0, "p": 1.0}
     assert rate.subs({each: at[each.name] for each in rate.free_symbols}) == -2.0 * (1 + 0.5 * 3.0)
+
+
+def test_what_flows_through_carries_off_what_is_there() -> None:
+    # Fogler (2016): V dC/dt = v (C_in - C) of a stirred tank; Novick and Szilard (1950): nothing flows in.
+    change = dict(the("washout", "mixer", "by what has w").changes)["s"]
+    c, u, w, s = (next(e for e in change.free_symbols if e.name == name) for name in ("c_1", "u", "w", "s"))
+    assert change.subs({c: 2, u: 3, w: 5, s: 1}) == 24 and change.subs({c: 2, u: 3, w: 1, s: 1}) == 0
+    change = dict(the("washout", "fermenter with a feed").changes)["n"]
+    c, u, n = (next(e for e in change.free_symbols if e.name == name) for name in ("c_1", "u", "n"))
+    assert change.subs({c: 2, u: 3, n: 4}) == -24
 
 
 def test_behind_a_gear_with_play_nothing_moves_until_it_is_taken_up() -> None:

@@ -25,7 +25,7 @@ NAMES = (
     "photoinhibition", "decay or leakage", "delayed response", "saturation", "rate limit",
     "magnetic saturation", "parametric drive", "parameter drift", "dependence on an input",
     "periodic forcing", "overflow", "flow over a weir", "leak", "input delay", "hysteresis",
-    "saturated elimination", "second-order reaction", "diode or exponential loss",
+    "saturated elimination", "second-order reaction", "washout", "diode or exponential loss",
     "outflow through an opening", "thermal radiation", "reverse reaction or backflow", "adaptation",
     "waning immunity", "recruitment", "seasonality", "process noise", "sensor gain or offset",
     "thermal drift", "sensor lag", "quantisation", "clipping", "input gain", "Joule heating",
