@@ -90,13 +90,9 @@ def evaluate(networks: Networks, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Ten
     All are in the units of the states: ∇V is the gradient with respect to x, not to the normalised y.
     """
     y = (x - networks.mean) / networks.scale
-    # With h_k = tanh(h_{k-1} W_k + b_k) backwards δ_k = (δ_{k+1} W_{k+1}ᵀ) (1 - h_k²), from the last weights.
-    *hidden, value = _hidden(networks.potential, y)
-    delta = networks.potential[-1][0].mT
-    for (weights, _), activation in zip(reversed(networks.potential[:-1]), reversed(hidden), strict=True):
-        delta = (delta * (1 - activation * activation)) @ weights.mT
+    value, gradient = _value_and_gradient(networks.potential, y)
     potential = networks.potential_scale * (value + (y * y).sum(dim=-1, keepdim=True))
-    gradient = networks.potential_scale / networks.scale * (delta + 2 * y)
+    gradient = networks.potential_scale / networks.scale * (gradient + 2 * y)
     circulatory = networks.circulatory_scale * _hidden(networks.circulatory, y)[-1]
     return potential.squeeze(-1), gradient, circulatory, circulatory - gradient @ networks.diffusion
 
@@ -148,6 +144,16 @@ def _hidden(layers: tuple[Layer, ...], y: Tensor) -> list[Tensor]:
         found.append(y)
     weights, biases = layers[-1]
     return [*found, torch.baddbmm(biases, y, weights)]
+
+
+def _value_and_gradient(layers: tuple[Layer, ...], y: Tensor) -> tuple[Tensor, Tensor]:
+    """Value of a scalar tanh network, and its gradient with respect to its input."""
+    # With h_k = tanh(h_{k-1} W_k + b_k) backwards δ_k = (δ_{k+1} W_{k+1}ᵀ) (1 - h_k²), from the last weights.
+    *hidden, value = _hidden(layers, y)
+    delta = layers[-1][0].mT
+    for (weights, _), activation in zip(reversed(layers[:-1]), reversed(hidden), strict=True):
+        delta = (delta * (1 - activation * activation)) @ weights.mT
+    return value, delta
 
 
 def dynamics_loss(
