@@ -155,7 +155,7 @@ def made(number: int, seed: int) -> tuple[dict[str, Any], pd.DataFrame, dict[str
             strange = [
                 np.sin(7 * x[place] * rate),
                 np.cos(5 * x[0] * rate),
-                abs(np.sin(3 * x[0] * rate)) - 0.5,
+                abs(np.sin(3 * x[0] * rate)) - 2 / np.pi,  # a constant force is a mechanism
             ]
             rates[place] += error * size * (strange[kind] if odd else force(time_))
             if effect != "none":
