@@ -801,8 +801,7 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], tu
         LOGGER.info("%s makes no free run better", found.pop().accepted.best.candidate.label)
     own, last = own[: len(found)], len(found)
     # So may a general form whose special case is enough beside what came after it.
-    earlier = own[:-1]
-    needless = {e.label for e in earlier if e.generalises or not _needed(e, fits[last], own, context)}
+    needless = {e.label for e in own[:-1] if e.generalises or not _needed(e, fits[last], own, context)}
     fewer = tuple(each for each in context.candidates if each.label not in needless)
     if needless and (before := errors(last)) is not None:
         _, again, more = climb(fit, replace(context, candidates=fewer))
