@@ -107,8 +107,7 @@ def _accepted(
         # What is left is no noise, and white errors mean little: of equals, what all recordings ask for, but
         # no general form whose special case is one of them.
         equals = [each for each in significant if each.delta_bic < best.delta_bic + options.same]
-        known = [each.candidate for each in equals]
-        plain = [e for e in equals if not any(_special_case(one, e.candidate) for one in known)]
+        plain = [e for e in equals if not any(_special_case(o.candidate, e.candidate) for o in equals)]
         best = min(plain, key=lambda each: each.p_cluster)
     least = best.delta_chi2 - options.same
 

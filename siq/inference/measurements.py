@@ -207,7 +207,8 @@ def measurements(recordings: Recordings, model: Dynamics) -> Measurements:
     """
     count = len(model.outputs)
     first = np.searchsorted(recordings.recording, np.arange(len(recordings.labels) + 1))
-    changes = np.diff(recordings.values[:, count:], axis=0) ** 2
+    within = np.diff(recordings.recording) == 0  # one recording may end far from where the next begins
+    changes = np.diff(recordings.values[:, count:], axis=0) ** 2 * within[:, None]
     staircase = np.minimum(changes[1:], changes[:-1]).sum(axis=0) < STAIRCASE * changes.sum(axis=0)
     courses = []
     for begin, end in itertools.pairwise(first):
