@@ -447,7 +447,6 @@ def _beyond_parameters(
     own = np.concatenate([own, seen_otherwise.reshape(len(own), -1, count)], axis=1)
     own = own.swapaxes(1, 2).reshape(len(own) * count, -1)
     result: list[MechanismCandidate | None] = []
-    # Where a general form acts by recordings only, nothing is known of it here.
     shown = [any(search.recorded for search in each.searches) for each in candidates]
     columns = [
         np.empty((len(own), 0)) if recorded else _columns(model, each, x, signals, values)

@@ -14,10 +14,10 @@ import pytest
 import yaml
 
 from siq.diagnosis import investigation, naming
-from siq.diagnosis.diagnosis import Diagnosis, _withdrawn, solve_case
+from siq.diagnosis.diagnosis import Diagnosis, _judged, _withdrawn, solve_case
 from siq.diagnosis.dictionary import standard_dictionary
 from siq.diagnosis.evidence import FittedCandidate
-from siq.diagnosis.investigation import held_out_runs, investigate
+from siq.diagnosis.investigation import HeldOutRuns, held_out_runs, investigate
 from siq.diagnosis.mechanisms import MechanismCandidate
 from siq.diagnosis.naming import Investigation
 from siq.diagnosis.residual_structure import Remainder
@@ -26,6 +26,7 @@ from siq.diagnosis.study import Comparison, MismatchVerdict, read_case
 from siq.diagnosis.unnamed_models import AugmentedModel
 from siq.errors import InputError, NumericalFailure
 from siq.inference.budget import Budget
+from siq.inference.measurements import Measurements
 from siq.inference.trajectories import scored_rows
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics, Signals
@@ -561,6 +562,25 @@ def test_a_name_that_misleads_on_recordings_held_out_is_withdrawn(tmp_path: Path
     level = table["recording"] == "r2"
     diagnosis = solved(tmp_path, table[~level], study=among(*FEW, held_out=["r1"]))
     assert said(diagnosis)["verdict"] == "missing physics"
+
+
+def test_a_name_has_to_make_recordings_better_that_were_held_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = among("constant bias", "cubic stiffness")
+    diagnosis = solved(tmp_path, recordings_of(lambda x, v, t: 0.4 + 0 * x), study=study)
+    assert names(diagnosis) == ["constant bias"]
+    monkeypatch.setattr("siq.diagnosis.diagnosis.investigate", lambda *_, **__: diagnosis.investigation)
+    for share, verdict in ((0.999, "missing physics"), (1.001, "unexplained")):
+
+        def runs(found: Investigation, kept: Measurements, share: float = share) -> HeldOutRuns:
+            shown = held_out_runs(found, kept)
+            augmented = share * (shown.errors.error("without") or 1.0)
+            return replace(shown, errors=replace(shown.errors, augmented=augmented))
+
+        monkeypatch.setattr("siq.diagnosis.diagnosis.held_out_runs", runs)
+        found, *_ = _judged(diagnosis.case, diagnosis.investigation.context.budget)
+        assert str(found.verdict) == verdict
 
 
 def test_where_nothing_speaks_of_a_mismatch_but_a_refuted_name_there_is_none(cleared: Diagnosis) -> None:
