@@ -254,7 +254,7 @@ def _judged(case: Comparison, budget: Budget) -> tuple[Investigation, HeldOutRun
     named = found.verdict.names and not found.process_noise
     # Tests of somebody else may be among the recordings held out, and decide nothing.
     incomplete = found.remainder.doubtful or found.search.fit.has_process_noise
-    without, augmented = map(shown.errors.error, ("without", "augmented"))
+    without, augmented = shown.errors.error("without"), shown.errors.augmented
     worse = without is not None and (augmented is None or augmented >= without)
     if named and not case.settings.tests and (worse or (incomplete and not shown.errors.takes_most)):
         found = _withdrawn(found)
