@@ -42,8 +42,10 @@ def entry(mechanism: Mechanism) -> Iterator[str]:
     for name, unit, sign, where in parameters:
         yield f"| `{name}` | `{unit}` | {sign} | {where} |"
     yield from ("", f"Family: {mechanism.family or mechanism.name}, weight {mechanism.weight:g}.", "")
+    of_forms = (name for form in mechanism.forms for name in form.generalises)
+    special = tuple(dict.fromkeys((*mechanism.generalises, *of_forms)))
     for words, names in (
-        ("Special cases of it", mechanism.generalises),
+        ("Special cases of it", special),
         ("Easily taken for it", mechanism.look_alikes),
     ):
         if names:

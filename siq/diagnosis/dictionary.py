@@ -166,9 +166,10 @@ class Form(_Part):
         Regular expressions of the units that fill a role.
     one_unit
         Whether the states and inputs that fill the roles must have one unit, and not be mere numbers.
-    family, generalises
-        Where it is a member of another family than the mechanism's other forms, or they have no such special
-        cases.
+    family
+        Where it is a member of another family than the mechanism's other forms.
+    generalises
+        Mechanisms that are special cases of this form, but not of the others.
     turning
         Whether it shows only where the motion turns back: the coordinate is a velocity, and has both signs.
     """

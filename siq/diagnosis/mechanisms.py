@@ -448,7 +448,7 @@ def _beyond_parameters(
     own = own.swapaxes(1, 2).reshape(len(own) * count, -1)
     result: list[MechanismCandidate | None] = []
     shown = [any(search.recorded for search in each.searches) for each in candidates]
-    columns = [
+    columns = [  # none of those of which only recordings tell where they act
         np.empty((len(own), 0)) if recorded else _columns(model, each, x, signals, values)
         for each, recorded in zip(candidates, shown, strict=True)
     ]
@@ -456,7 +456,7 @@ def _beyond_parameters(
         new = [True] if recorded else _new_columns(own, change)
         named = zip(columns, candidates, strict=True)
         special = [np.hstack([own, by]) for by, other in named if other.name in each.generalises]
-        if not all(any(_new_columns(one, change)) for one in special):
+        if not (recorded or all(any(_new_columns(one, change)) for one in special)):
             new = [False]
         needless = {name for name, is_new in zip(each.amplitudes, new, strict=False) if not is_new}
         if not any(new):

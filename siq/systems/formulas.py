@@ -55,7 +55,7 @@ FUNCTIONS: Mapping[str, Callable[..., sympy.Expr]] = {
     "Min": sympy.Min,
 }
 """The functions that a formula may use, by the names that it uses for them."""
-OTHER_NAMES = {"abs": "Abs", "max": "Max", "min": "Min", "ln": "log", "arctan": "atan"}
+OTHER_NAMES = {"abs": "Abs", "max": "Max", "min": "Min", "ln": "log", "arctan": "atan"}  # of the same
 
 
 class delay(sympy.Function):  # noqa: N801 (the name that formulas use)

@@ -12,6 +12,7 @@ from barriers and prefactors for a noise.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -118,7 +119,12 @@ def point_at(
         found = landscape_from_equations(system, EquationSettings(seed=seed), formulas=False)
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         reason = error.reason if isinstance(error, NoLandscape) else str(error)
-        return SweptPoint(values, _resting(system, seed), reason=reason)
+        resting: tuple[tuple[float, ...], ...] = ()  # a branch may pass through them all the same
+        with suppress(NumericalFailure, np.linalg.LinAlgError):
+            if system.dimension <= MOST_SEARCHED:
+                known, _ = all_equilibria(system, generator=generator(seed, Purpose.LANDSCAPE))
+                resting = tuple(tuple(map(float, one.position)) for one in known)
+        return SweptPoint(values, resting, reason=reason)
     return SweptPoint(
         values,
         tuple(tuple(map(float, one.position)) for one in found.equilibria),
@@ -145,18 +151,6 @@ def point_at(
         settled=float(found.basins.sum()),
         notes=found.notes,
     )
-
-
-def _resting(system: Dynamics, seed: int) -> tuple[tuple[float, ...], ...]:
-    """Equilibria where there is no landscape: a branch may pass through them all the same."""
-    if system.dimension > MOST_SEARCHED:
-        return ()
-    try:
-        draw = generator(seed, Purpose.LANDSCAPE)
-        found, _ = all_equilibria(system, generator=draw)
-    except (NumericalFailure, np.linalg.LinAlgError):
-        return ()
-    return tuple(tuple(map(float, one.position)) for one in found)
 
 
 DIGITS = 10  # of positions in tables

@@ -53,7 +53,8 @@ def oscillator(equation: str, **parameters: float) -> Dynamics:
 def test_entries_refer_to_entries_and_to_sources() -> None:
     known = {each.name for each in dictionary()}
     for each in dictionary():
-        assert {*each.look_alikes, *each.generalises} <= known - {each.name}, each.name
+        special = {*each.generalises, *(name for form in each.forms for name in form.generalises)}
+        assert {*each.look_alikes} | special <= known - {each.name}, each.name
         assert re.search(r"\b(1[67]\d\d|1[89]\d\d|20\d\d)\b", each.reference), each.name
         assert each.sentence.endswith("."), each.name
 

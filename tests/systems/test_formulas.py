@@ -144,6 +144,20 @@ def test_a_slip_is_told_with_what_was_probably_meant(text: str, remedy: str) -> 
     assert caught.value.remedy == remedy
 
 
+@pytest.mark.parametrize(
+    ("written", "meant"),
+    [
+        ("abs(x)", "Abs(x)"),
+        ("max(x, 1)", "Max(x, 1)"),
+        ("min(x, 1)", "Min(x, 1)"),
+        ("ln(x)", "log(x)"),
+        ("arctan(x)", "atan(x)"),
+    ],
+)
+def test_a_function_may_have_the_name_that_other_languages_give_it(written: str, meant: str) -> None:
+    assert parse_formula(written, NAMES) == parse_formula(meant, NAMES)
+
+
 def test_an_undeclared_name_is_named() -> None:
     with pytest.raises(FormulaError, match="the name 'omega' is not declared"):
         parse_formula("omega*x", NAMES)
