@@ -194,7 +194,13 @@ def _open_text(file: str) -> ColumnFile:
     lines = [line for line in sample if line.strip() and not line.lstrip().startswith(_COMMENTS)]
     if not lines:
         raise InputError(file, "", "the table has no headings and no rows", "write the recordings again")
-    if beside := _beside_settings(lines):
+    # An oscilloscope writes numbers to the right of its settings, which end after some lines.
+    rows = [_split(line, ",") for line in lines]
+    beside = [place for place, cell in enumerate(rows[-1]) if cell]
+    if (
+        len(rows) >= FEWEST_UNNAMED and len(beside) > 1 and beside[0] > 0 and rows[0][0]
+        and all(len(row) > beside[-1] and all(_NUMERIC.fullmatch(row[k]) for k in beside) for row in rows)
+    ):  # fmt: skip
         cells = csv.reader(content[begin:].decode("utf-8", errors="ignore").splitlines())
         columns = [",".join(row[place] for place in beside) for row in cells if row]
         content, begin, lines = "\n".join(columns).encode(), 0, columns[: len(lines)]
@@ -325,16 +331,6 @@ def _preamble(lines: list[str], separator: str) -> int:
     if headings <= 0 or len(rows[headings]) != len(rows[-1]) or any(map(_NUMERIC.fullmatch, rows[headings])):
         return 0
     return headings
-
-
-def _beside_settings(lines: list[str]) -> list[int]:
-    """Columns of numbers to the right of an oscilloscope's settings, which end after some lines."""
-    rows = [_split(line, ",") for line in lines]
-    used = [place for place, cell in enumerate(rows[-1]) if cell]
-    if len(rows) < FEWEST_UNNAMED or len(used) < 2 or used[0] == 0 or not rows[0][0]:
-        return []
-    numbers = (len(row) > used[-1] and all(_NUMERIC.fullmatch(row[place]) for place in used) for row in rows)
-    return used if all(numbers) else []
 
 
 def _split(line: str, separator: str) -> list[str]:

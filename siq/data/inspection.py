@@ -66,14 +66,6 @@ class _StateFacts:
     noise: NoiseFloor | None  #: a first look; None where neighbouring samples are too few or uneven
     values: int | None = None  #: how many differ, where so few that it is rather a label than a state
 
-    def sensor_dominates(self, step: float) -> bool:
-        """Whether measurement noise, other than rounding, is more than an identification takes."""
-        if self.noise is None:
-            return False
-        variance = self.noise.sensor**2
-        rounded = self.quantum is not None and self.noise.sensor <= 1.5 * rounding_error(self.quantum)
-        return not rounded and variance > SENSOR_SHARE * (self.noise.process * step + 2 * variance)
-
 
 @dataclass(frozen=True)
 class Inspection:
@@ -183,7 +175,12 @@ class Inspection:
         if not forced and len(units) > 1:
             found.append(Remark("data.different_units", {"units": units}))
         step = 0.0 if self.steps is None else self.steps.usual
-        noisy = [state.title for state in self.states if state.sensor_dominates(step)]
+        noisy = []  # with more measurement noise, other than rounding, than an identification takes
+        for state in self.states:
+            if state.noise is not None:
+                variance, rounding = state.noise.sensor**2, rounding_error(state.quantum or 0.0)
+                large = variance > SENSOR_SHARE * (state.noise.process * step + 2 * variance)
+                noisy += [state.title] if large and state.noise.sensor > 1.5 * rounding else []
         if noisy and not memory.remembers:
             found.append(Remark("data.sensor_noise", {"states": noisy}))
         if memory.remembers:

@@ -415,13 +415,9 @@ def _memoryless(path: np.ndarray, runs: list[slice], states: int, dead: int) -> 
 
     The exits after each age ``a`` beyond the dead time are held against one rate for all ages, in the
     direction of ``log a``: the score test of exponential times against those of Weibull, whose shape it is.
-    Visits that a run cuts count with the ages that were seen of them.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(k, 3)``: score, its variance, and exits, of each state. An error of the shape is one over the root
-        of the variance; shapes above 1, where the score is positive, are of regular stays.
+    Visits that a run cuts count with the ages that were seen of them. Returned are score, its variance, and
+    exits of each state, ``(k, 3)``: an error of the shape is one over the root of the variance, and shapes
+    above 1, where the score is positive, are of regular stays.
     """
     found = np.zeros((states, 3))
     longest = max(run.stop - run.start for run in runs) + 1

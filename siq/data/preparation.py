@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from scipy import optimize, special
+from scipy import ndimage, optimize, special
 
 from siq.data.correlation import markov_lag, noise_floors, resolution_step
 from siq.data.recordings import (
@@ -55,6 +55,11 @@ ROUNDED_LINE = 2  # steps by which a straight line that is rounded is bent at mo
 SMALL_STEP, FEWEST_SMALL = 0.2, 0.05  # of the median step; of steps, at least: half of what normal ones have
 FEWEST_TOGETHER = 0.1  # a choice: of samples with a new value of any state, those with one of all
 COPIED = 12  # samples of a stretch that is sought a second time
+NEIGHBOURS, NEARBY = 3, 20  # samples on either side: of a cubic; of how well one fits there
+SMOOTH_AROUND = 8  # a choice: times as far off is an outlier as any neighbour is
+MOST_TOGETHER, MOST_ROUNDS = 2, 10  # outliers with values of their own; of taking samples for them
+PULSE = 0.1  # a choice: of the range of an input, up and down within two samples
+MOST_OUTLIERS = 0.05  # a choice: of all samples; what stands apart more often belongs to the system
 MOST_DIGITS = 12  # of numbers that were rounded: those of floating point have sixteen
 ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 _STRETCH_LABEL = re.compile(r"(?P<label>.*) \((?P<number>\d+) of (?P<of>\d+)\)")
@@ -270,6 +275,78 @@ def without_faults(recordings: Recordings) -> Recordings:
             units = {"unit": found.units[state], "time_unit": found.time_unit}
             remarks.append(Remark("data.hum_taken_off", told | units))
     return replace(found, remarks=tuple(remarks)) if len(remarks) > len(recordings.remarks) else recordings
+
+
+def outliers(t: np.ndarray, x: np.ndarray, recording: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+    """Which samples of a motion that is smooth in pieces the sensor alone has made, shape ``(n,)``.
+
+    An outlier is off the cubic through its neighbours, outliers left out, by more than noise makes of any
+    sample of the record. These lie on that cubic, and the straight lines of either side miss the outlier in
+    the same direction: next to a kink or a jump one of them does not. What lasts for several samples is one
+    only where all are one number, as when a sensor drops out. They are left in where they are not most of
+    what the sensor adds, by their squares. Not to be confused with what `without_faults` leaves out, which
+    has no smooth motion to be held against.
+
+    Parameters
+    ----------
+    t, x, recording
+        Times, values (NaN where there is none), and the place of the recording of each, shape ``(n,)``.
+    inputs
+        What moves the system, shape ``(k, n)``: beside a pulse of one sample nothing is an outlier.
+    """
+    rows, result = np.flatnonzero(np.isfinite(x)), np.zeros(len(x), dtype=bool)
+    t, values, which = t[rows], x[rows], recording[rows]
+    every, width, suspects = np.arange(len(rows)), 2 * NEIGHBOURS + 1, np.zeros(len(rows), dtype=bool)
+    if len(rows) <= 2 * NEARBY:
+        return result
+
+    def cubic(used: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """How far each sample is off the cubic through those near it, these at most, and over which time."""
+        first, end = (np.searchsorted(which[used], which, side) for side in ("left", "right"))
+        begin = np.maximum(np.minimum(np.searchsorted(used, every) - NEIGHBOURS, end - width), first)
+        near = used[np.minimum(begin[:, None] + np.arange(width), len(used) - 1)]
+        others, times = near != every[:, None], t[near] - t[:, None]
+        span = positive(np.ptp(times, axis=1))
+        powers = (times / span[:, None])[..., None] ** np.arange(4)
+        solved = np.linalg.pinv(powers * others[..., None])
+        found = np.einsum("nij,nj->ni", solved, values[near] * others)
+        around = np.abs(values[near] - np.einsum("nij,nj->ni", powers, found)) * others
+        off = np.abs(values - found[:, 0]) / np.sqrt(1 + (solved[:, 0] ** 2).sum(axis=1))
+        return np.where(end - first >= width, off, 0.0), around.max(axis=1), span
+
+    # A cubic through every second sample shows whether a longer time makes it worse: not if it is noise.
+    worse = np.median(cubic(every[::2])[0][::2]) / positive(np.median(cubic(every)[0]))
+    power = np.clip(np.log2(positive(worse)), 0, 4)
+    step, most = resolution_step(values) or 0.0, -special.ndtri(FALSE_FAULT_RATE / 2 / len(rows))
+    for _ in range(MOST_ROUNDS):
+        used = np.flatnonzero(~suspects)
+        off, around, span = cubic(used)
+        usual = np.maximum(ndimage.median_filter(off[used], 2 * NEARBY + 1), np.median(off[used]))
+        usual = np.maximum(usual / special.ndtri(0.75), step)[np.minimum(np.cumsum(~suspects), len(used) - 1)]
+        apart = off > SMOOTH_AROUND * around
+        large = off > most * usual * np.maximum(span / np.median(span), 1) ** power
+        before, suspects = suspects, large & (apart | suspects | ~suspects.any())
+        if (before == suspects).all() or (~suspects).sum() <= 2 * NEARBY:
+            break
+    apart &= suspects
+    for u in inputs:
+        steps, back = np.abs(np.diff(u)) > PULSE * np.ptp(u), np.diff(u[1:]) * np.diff(u[:-1]) < 0
+        apart &= ~ndimage.binary_dilation(np.r_[False, steps[1:] & steps[:-1] & back, False])[rows]
+    for row in np.flatnonzero(apart):
+        sides = (used[used < row][:-3:-1], used[used > row][:2])
+        if any(len(side) < 2 or (which[side] != which[row]).any() for side in sides):
+            apart[row] = False
+            continue
+        slopes = [np.diff(values[side])[0] / np.diff(t[side])[0] for side in sides]
+        far = [
+            values[row] - values[i] - slope * (t[row] - t[i])
+            for (i, _), slope in zip(sides, slopes, strict=True)
+        ]
+        apart[row] = far[0] * far[1] > 0 and min(np.abs(far)) > off[row] / 2
+    for run in np.split(np.flatnonzero(apart), np.flatnonzero(np.diff(np.flatnonzero(apart)) > 1) + 1):
+        result[rows[run]] = len(run) <= MOST_TOGETHER or np.ptp(values[run]) == 0
+    few, squares = result.sum() <= MOST_OUTLIERS * len(rows), off**2
+    return result & few & (squares[result[rows]].sum() > squares.sum() / 2)
 
 
 def _without_rows(recordings: Recordings, left_out: np.ndarray) -> Recordings:

@@ -174,16 +174,10 @@ def _valleys(
 
     Every column is looked at as it is, and as means over some shares of its relaxation time, in samples,
     which hardly any noise blurs. Surrogates turn the phases of all columns alike, which keeps spectra and
-    cross-spectra.
-
-    Returns
-    -------
-    tuple
-        The probability of the rarest valley of all, or of as rare ones in all columns together (Westfall and
-        Young, 1993: the least of probabilities that depend on each other is held against the same of each
-        surrogate); the least probability of each column alone, ``(d,)``; and the largest share of its samples
-        in a lesser
-        peak, ``(d,)``.
+    cross-spectra. Returned are the probability of the rarest valley of all, or of as rare ones in all columns
+    together (Westfall and Young, 1993: the least of probabilities that depend on each other is held against
+    the same of each surrogate); the least of each column alone, ``(d,)``; and the largest share of its
+    samples in a lesser peak, ``(d,)``.
     """
     every = -(-len(values) // MOST_POINTS)
     parts: list[list[np.ndarray]] = [[] for _ in runs]

@@ -264,7 +264,8 @@ def _judged(case: Comparison, budget: Budget) -> tuple[Investigation, HeldOutRun
         verdict, remarks = MismatchVerdict.MISSING_PHYSICS, (*others, Remark("diagnosis.same_formula"))
         found = replace(found, verdict=verdict, models=(), too_faint=False, remarks=remarks)
         shown = held_out_runs(found, case.kept)
-    return found, shown, statement_of(found, shown)
+    statement = statement_of(found, shown)
+    return found, shown, replace(statement, remarks=(*case.remarks, *statement.remarks))
 
 
 def solve_case(

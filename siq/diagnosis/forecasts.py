@@ -194,13 +194,7 @@ class Horizon:
 
 
 def _horizons_of(fit: Fit, context: FitContext) -> list[Horizon]:
-    """A simulation fitted once for each horizon, with forces at random, from a fit that has them.
-
-    Raises
-    ------
-    NumericalFailure
-        When it cannot be fitted at any.
-    """
+    """A simulation fitted once for each horizon, with forces at random; fails where it cannot be at any."""
     data, found, every = context.data, list[Horizon](), 1
     if not fit.has_process_noise:
         fit = replace(fit, noise=first_noise(fit.model, data, fit.x))

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from siq.data.preparation import outliers
 from siq.data.recordings import Recordings, read_recordings
 from siq.diagnosis.dictionary import Mechanism, dictionary_of
 from siq.errors import Fault, InputError
@@ -23,6 +24,7 @@ from siq.inference.budget import DEFAULT_SECONDS, DEFAULT_WORK
 from siq.inference.measurements import Measurements, columns_of, measurements, with_variation
 from siq.inference.trajectories import PREFIX, SHORTEST_PREFIX
 from siq.numerics.files import read_document, validate
+from siq.remarks import Remark
 from siq.systems.cards import load_system
 from siq.systems.dynamics import Dynamics
 
@@ -132,6 +134,9 @@ class MismatchStudy(BaseModel):
         to learn from, each left out of its fit in turn.
     noise
         Standard deviation of the measurement noise by output, where it is known; by default it is estimated.
+    without_outliers
+        Whether single samples of a smooth motion that stand apart from their neighbours are left out: the
+        sensor made them. Turn it off where the system itself does something that lasts for one sample.
     varies
         Parameters that differ from recording to recording, such as a friction that the temperature changes.
     mechanisms
@@ -154,6 +159,7 @@ class MismatchStudy(BaseModel):
     held_out: tuple[str, ...] | Annotated[float, Field(gt=0, lt=1)] = 0.25
     tests: tuple[str, ...] = ()
     noise: dict[str, Annotated[float, Field(gt=0)]] = {}
+    without_outliers: bool = True
     varies: tuple[str, ...] = ()
     mechanisms: tuple[Mechanism, ...] = ()
     without: tuple[str, ...] = ()
@@ -216,7 +222,8 @@ def _measurements_of(recordings: Recordings | pd.DataFrame | str | Path, system:
 class Comparison:
     """What is compared with what: the simulation, recordings to learn from, and those held out.
 
-    The settings say how, and the dictionary has the mechanisms that may be named.
+    The settings say how, the dictionary has the mechanisms that may be named, and remarks say what was
+    left out.
     """
 
     system: Dynamics
@@ -224,12 +231,13 @@ class Comparison:
     kept: Measurements
     settings: MismatchStudy
     dictionary: tuple[Mechanism, ...]
+    remarks: tuple[Remark, ...] = ()
 
     def with_variation(self, names: tuple[str, ...]) -> Comparison:
         """The same where parameters differ from recording to recording."""
         system, learn, kept = with_variation(self.system, names, self.learn, self.kept)
         settings = self.settings.model_copy(update={"varies": names})
-        return Comparison(system, learn, kept, settings, self.dictionary)
+        return replace(self, system=system, learn=learn, kept=kept, settings=settings)
 
 
 def comparison_of(
@@ -266,6 +274,15 @@ def comparison_of(
     if settings.noise:
         known = [settings.noise.get(name, np.nan) ** 2 for name in system.output_names]
         data = replace(data, sensor_noise=np.array(known))
+    remarks = []
+    if settings.without_outliers:
+        inputs, cleared = data.signals(data.t, data.recording, delays=()).inputs, data.outputs.copy()
+        for name, column in zip(system.output_names, cleared.T, strict=True):
+            apart = outliers(data.t, column, data.recording, inputs)
+            if apart.any():
+                column[apart] = np.nan
+                remarks.append(Remark("data.outliers", {"column": name, "samples": int(apart.sum())}))
+        data = replace(data, outputs=cleared)
     learn, kept = _split(data, settings, file=file)
     for name in settings.varies:
         if not any(each.name == name and each.value and not each.fixed for each in system.parameters):
@@ -275,7 +292,7 @@ def comparison_of(
             fault = "there is one recording to learn from"
             raise InputError(file, "varies", fault, "give several, or leave it out")
     dictionary = dictionary_of(without=settings.without, further=settings.mechanisms, file=file)
-    case = Comparison(system, learn, kept, settings, dictionary)
+    case = Comparison(system, learn, kept, settings, dictionary, tuple(remarks))
     return case.with_variation(settings.varies) if settings.varies else case
 
 

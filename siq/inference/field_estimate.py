@@ -444,11 +444,9 @@ class FieldEstimate:
         return noise.intensity, noise.intensity * (2 / samples) ** 0.5 if samples else 0.0
 
     def error_of_strength(self, x0: np.ndarray, h: np.ndarray) -> float:
-        """Standard error of ``ln ε`` by residuals of pairs from states ``(n, d)``, h apart.
-
-        The variance of n residuals of d states has the relative standard error ``√(2/nd)``. A step multiplies
-        it by about ``exp(h tr J/d)``, which is known as well as the divergence of f is.
-        """
+        """Standard error of ``ln ε`` by residuals of pairs from states ``(n, d)``, h apart."""
+        # The variance of n residuals of d states has the relative standard error √(2/nd). A step multiplies
+        # it by about exp(h tr J/d), which is known as well as the divergence of f is.
         d, (components, terms) = self.library.dimension, self.support.T
         means = (self.library.evaluate(x0) * h[:, None]).mean(axis=0)
         forgotten = means @ self.library.derivatives[:, components, terms] * 2 * self.flow.response_share / d

@@ -246,25 +246,13 @@ def _initial_networks(
 
 @dataclass(frozen=True)
 class _TrainingState:
-    """Everything that a training needs to go on from where it stands.
+    """Everything that a training needs to go on from where it stands."""
 
-    Attributes
-    ----------
-    step
-        Steps done.
-    networks
-        As they are.
-    first_moments, second_moments
-        Adam's running means, one array for each of ``networks.parameters()``.
-    history
-        Rows of the loss so far, see `train`.
-    """
-
-    step: int
+    step: int  #: so many are done
     networks: Networks
-    first_moments: tuple[Tensor, ...]
+    first_moments: tuple[Tensor, ...]  #: Adam's running means, one for each of ``networks.parameters()``
     second_moments: tuple[Tensor, ...]
-    history: pd.DataFrame
+    history: pd.DataFrame  #: of the loss so far, see `train`
 
 
 def start(
@@ -597,15 +585,6 @@ class Block:
                 self.failures[run] = lost[position]
         history = state.history
         self.histories.append(history.assign(run=history["run"].map(dict(enumerate(runs)))))
-
-    def unchecked(self, run: int) -> str:
-        """Why the check of a run has not passed."""
-        if run in self.checks:
-            return self.checks[run].hopeless() or (
-                f"the check passed in none of {self.attempts} trainings of {self.options.steps} steps; raise"
-                " training.steps or training.output_weights"
-            )
-        return self.faults.get(run, "no vector field was identified, so that nothing could be checked")
 
     def history(self) -> pd.DataFrame:
         """The loss of the last training of every run."""

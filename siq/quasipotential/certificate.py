@@ -135,11 +135,8 @@ class Certificate:
 
     def with_tests(self, tests: Mapping[str, Verdict]) -> Certificate:
         """With further tests; the reason says which of them refused it, or could not be made."""
-        further = [
-            one.reason
-            for name, one in tests.items()
-            if not (one.passed or (name in OF_TIMES and not one.tested))
-        ]
+        refusing = (one for name, one in tests.items() if one.tested or name not in OF_TIMES)
+        further = [one.reason for one in refusing if not one.passed]
         reason = "; ".join(dict.fromkeys(one for one in (self.reason, *further) if one))
         return replace(self, tests={**self.tests, **tests}, reason=reason)
 

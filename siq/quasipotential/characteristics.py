@@ -651,7 +651,9 @@ def _potential_slopes(
     return total[:, : q * d].reshape(-1, q, d), total[:, q * d :]
 
 
-def potential_errors(found: AnyField, gradient: Function, attractor: np.ndarray, x: np.ndarray) -> np.ndarray:
+def _potential_errors(
+    found: AnyField, gradient: Function, attractor: np.ndarray, x: np.ndarray
+) -> np.ndarray:
     """Standard errors of ``V(x) - V(attractor)``, shape ``(n,)``, from what is not known of f and of D.
 
     `gradient` is ∇V, points ``(n, d)`` to ``(n, d)``. They are zero where f carries no noise, and NaN where
@@ -666,11 +668,11 @@ def potential_errors(found: AnyField, gradient: Function, attractor: np.ndarray,
 def relative_error(
     found: AnyField, gradient: Function, attractor: np.ndarray, x: np.ndarray, values: np.ndarray
 ) -> float:
-    """Root mean square of the standard errors of V (`potential_errors`) over that of its values at points.
+    """Root mean square of the standard errors of V (`_potential_errors`) over that of its values at points.
 
     Infinite where the errors of more than a tenth of the points cannot be told.
     """
-    errors = potential_errors(found, gradient, attractor, x)
+    errors = _potential_errors(found, gradient, attractor, x)
     if not errors.any():
         return 0.0
     known = np.isfinite(errors)

@@ -85,23 +85,14 @@ STEEPER = 1.2  # a paraboloid, until all paths leave the attractor
 
 @dataclass(frozen=True)
 class _UnitBasis:
-    """Random tanh units ``tanh(y W + b)`` and ``|y|²`` of normalised states ``y = (x - μ)/σ``.
+    """Random tanh units ``tanh(y W + b)`` and ``|y|²`` of normalised states ``y = (x - μ)/σ``."""
 
-    Attributes
-    ----------
-    weights, biases
-        W and b, shapes ``(d, units)`` and ``(units,)``.
-    center, scale
-        μ and σ, shape ``(d,)``.
-    flat
-        Whether each function has no slope at μ either, as V has none at an attractor. Then the first d units
-        take up that of each other one, and are no functions of their own.
-    """
-
-    weights: np.ndarray
-    biases: np.ndarray
-    center: np.ndarray
-    scale: np.ndarray
+    weights: np.ndarray  #: W, shape ``(d, units)``
+    biases: np.ndarray  #: b, shape ``(units,)``
+    center: np.ndarray  #: μ, shape ``(d,)``
+    scale: np.ndarray  #: σ, shape ``(d,)``
+    #: Whether each function has no slope at μ either, as V has none at an attractor. Then the first d units
+    #: take up that of each other one, and are no functions of their own.
     flat: bool = False
 
     def hidden(self, x: np.ndarray) -> np.ndarray:

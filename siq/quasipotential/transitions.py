@@ -235,19 +235,12 @@ def _escape_rate_over_cycle(
     Where all phases are as good, as on circles, U + W is constant, and K goes as ε^½ from a point, and as ε⁰
     from a cycle; where one is best by far, Laplace's method makes ε⁰ and ε^(-½) of that. The integral is
     taken as a whole, and holds in between. At which phase the unstable cycle is crossed depends on ln ε
-    periodically; the rate, a sum over all phases, does not to this order.
+    periodically; the rate, a sum over all phases, does not to this order. It is a `NumericalFailure` where
+    trajectories next to the best one do not meet, as beyond a caustic.
 
-    Raises
-    ------
-    NumericalFailure
-        When there are more than two states, when the start is no attractor, or when trajectories next to the
-        best one do not meet, as beyond a caustic.
-
-    References
-    ----------
-    J. Lehmann, P. Reimann, P. Hänggi, Phys. Rev. Lett. 84 (2000) 1639: one state that is driven.
-    R. S. Maier, D. L. Stein, Phys. Rev. Lett. 77 (1996) 4860: the current on the unstable cycle itself.
-    N. Berglund, B. Gentz, SIAM J. Math. Anal. 46 (2014) 310: at which phase it is crossed.
+    J. Lehmann, P. Reimann, P. Hänggi, Phys. Rev. Lett. 84 (2000) 1639: one state that is driven. R. S. Maier,
+    D. L. Stein, Phys. Rev. Lett. 77 (1996) 4860: the current on the unstable cycle itself. N. Berglund,
+    B. Gentz, SIAM J. Math. Anal. 46 (2014) 310: at which phase it is crossed.
     """
     if dynamics.dimension != 2:
         raise NumericalFailure("the law of ways over an unstable cycle is known for two states only")

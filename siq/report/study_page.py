@@ -188,7 +188,18 @@ def study_page(
         time_unit=results.time_unit,
         troubled=_troubled(study, results),
         remarks=_remarks(results),
-        barriers_over_runs=_barriers_over_runs(landscape),
+        barriers_over_runs=None
+        if landscape is None or landscape["run"].nunique() == 1
+        else _counted_over_runs(
+            landscape[landscape["kind"] == "transition"],
+            "item",
+            runs=("barrier", "size"),
+            mean=("barrier", "mean"),
+            lowest=("barrier", "min"),
+            highest=("barrier", "max"),
+            by_the_path_alone=("minimum_action", "mean"),
+            prefactor=("prefactor", "mean"),
+        ),
         invariant_missing=density,
         invariant=None if invariant is None else in_words(invariant.rename(columns=headings)),
         well_shares=None
@@ -585,10 +596,7 @@ def _tests_table(certificates: pd.DataFrame, run: int, method: Method) -> pd.Dat
 
 
 def _control_counts(certificates: pd.DataFrame) -> dict[str, int] | None:
-    """In how many ``runs`` the control was ``refused``; None where there is none.
-
-    The control is networks with their weights in random order, compared with the refined U.
-    """
+    """Of how many ``runs`` networks with weights in random order were ``refused``; None without control."""
     mine = certificates[certificates["method"] == Method.CONTROL]
     passed = mine.groupby("run")["passed"].all()
     return {"runs": len(passed), "refused": int((~passed).sum())} if len(mine) else None
@@ -632,16 +640,6 @@ def errors_over_runs(errors: pd.DataFrame) -> pd.DataFrame:
         errors, ["source", "region"], runs=("error", "size"), mean_error=("error", "mean"),
         worst_error=("error", "max"), least_covered=("covered", "min"),
         worst_everywhere=("error_everywhere", "max"),
-    )  # fmt: skip
-
-
-def _barriers_over_runs(landscape: pd.DataFrame | None) -> pd.DataFrame | None:
-    if landscape is None or landscape["run"].nunique() == 1:
-        return None
-    return _counted_over_runs(
-        landscape[landscape["kind"] == "transition"], "item", runs=("barrier", "size"),
-        mean=("barrier", "mean"), lowest=("barrier", "min"), highest=("barrier", "max"),
-        by_the_path_alone=("minimum_action", "mean"), prefactor=("prefactor", "mean"),
     )  # fmt: skip
 
 

@@ -108,7 +108,11 @@ def follow(
             ends[on[near >= 0]] = len(attractors) + near[near >= 0]
         if number % STEPS_PER_CHECK == 0:
             slow = running[speed < ATTRACTOR_DISTANCE * slowest]
-            resting[slow] = _at_rest(dynamics, x[slow], width)
+            for one, slope in zip(slow, dynamics.jacobian(x[slow]), strict=True):
+                # Next to a stable equilibrium one step of Newton's method tells so.
+                if np.isfinite(slope).all() and (np.linalg.eigvals(slope).real < 0).all():
+                    ahead = np.linalg.solve(slope, dynamics.drift(x[one]))
+                    resting[one] = np.abs(ahead / width).max() < ATTRACTOR_DISTANCE / 2
         running = running[~(escaped | resting)[running] & (ends[running] < 0) & (times[running] < horizon)]
         if not len(running):
             break
@@ -117,16 +121,6 @@ def follow(
     first = np.append(0, last[:-1] + 1)
     kept = np.round(np.linspace(first, last, states, axis=1)).astype(int)
     return Descents(np.concatenate(passed)[order][kept], ends, escaped)
-
-
-def _at_rest(dynamics: Dynamics, x: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """Whether states ``(n, d)`` are next to a stable equilibrium, as one step of Newton's method tells."""
-    slopes, found = dynamics.jacobian(x), np.zeros(len(x), dtype=bool)
-    for place in np.flatnonzero(np.isfinite(slopes).all(axis=(1, 2))):
-        if (np.linalg.eigvals(slopes[place]).real < 0).all():
-            step = np.linalg.solve(slopes[place], dynamics.drift(x[place]))
-            found[place] = np.abs(step / width).max() < ATTRACTOR_DISTANCE / 2
-    return found
 
 
 def settled_on(

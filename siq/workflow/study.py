@@ -380,19 +380,14 @@ def load_study_system(study: Study, card: str | Path | None, *, file: str) -> Dy
     if states is not None:
         check_states(study, states, file=file)
     if study.sweep is not None and system is not None:
-        _check_sweep(study.sweep, system, file=file)
+        known = [each.name for each in system.parameters]
+        otherwise = f"use one of {', '.join(known)}" if known else "write it on the card as a parameter"
+        for name, place in zip(study.sweep.names, ("parameter", "second.parameter"), strict=False):
+            if name not in known:
+                fault = f"the card of '{system.name}' has no parameter '{name}'"
+                instead = suggestion(name, known, otherwise=otherwise)
+                raise InputError(file, f"sweep.{place}", fault, instead)
     return system
-
-
-def _check_sweep(sweep: SweepOptions, system: Dynamics, *, file: str) -> None:
-    """Refuse a sweep of parameters that a system has not."""
-    known = [each.name for each in system.parameters]
-    places = ("sweep.parameter", "sweep.second.parameter")
-    for name, place in zip(sweep.names, places, strict=False):
-        if name not in known:
-            otherwise = f"use one of {', '.join(known)}" if known else "write it on the card as a parameter"
-            fault = f"the card of '{system.name}' has no parameter '{name}'"
-            raise InputError(file, place, fault, suggestion(name, known, otherwise=otherwise))
 
 
 def check_states(study: Study, states: Sequence[str], *, file: str) -> None:

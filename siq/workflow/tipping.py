@@ -249,38 +249,22 @@ def _interpolated(table: pd.DataFrame, column: str, value: np.ndarray) -> np.nda
 
 
 class _EarlyWarning(NamedTuple):
-    """What a record that drifts tells of the barrier of its state, and of when it will be left.
+    """What a record that drifts tells of the barrier of its state, and of when it will be left."""
 
-    Attributes
-    ----------
-    state
-        Name of the column.
-    course
-        Barrier and mean time along the record, each with its 90 % interval: ``time barrier_over_noise
-        barrier_lower barrier_upper mean_time mean_time_lower mean_time_upper``. The mean time is that until
-        the state would be left if nothing changed from then on.
-    probability
-        That the state has been left by later times: ``time probability lower upper``. The probability is the
-        mean over all that the record leaves open, and the interval holds 90 % of that.
-    falling
-        The probability that the barrier is lower at the end of the record than at its start; where a draw
-        has no saddle near the record at either, that the state relaxes more slowly.
-    weights
-        Of the equations that were averaged over, by how many powers of x they have, and how many of them
-        change in time.
-    remarks
-        Which presuppositions the record contradicts.
-    time_unit
-        That of the record, None where it does not say.
-    """
-
-    state: str
+    state: str  #: name of the column
+    #: Barrier and mean time along the record, each with its 90 % interval: ``time barrier_over_noise
+    #: barrier_lower barrier_upper mean_time mean_time_lower mean_time_upper``. The mean time is that until
+    #: the state would be left if nothing changed from then on.
     course: pd.DataFrame
+    #: That the state has been left by later times, ``time probability lower upper``: a mean over all that the
+    #: record leaves open, and an interval that holds 90 % of that.
     probability: pd.DataFrame
+    #: Probability that the barrier is lower at the end of the record than at its start; where a draw has no
+    #: saddle near the record at either, that the state relaxes more slowly.
     falling: float
-    weights: dict[tuple[int, int], float]
-    remarks: tuple[Remark, ...]
-    time_unit: str | None
+    weights: dict[tuple[int, int], float]  #: of equations, by how many powers of x, and how many of them move
+    remarks: tuple[Remark, ...]  #: which presuppositions the record contradicts
+    time_unit: str | None  #: of the record, None where it does not say
 
     @property
     def notes(self) -> tuple[str, ...]:

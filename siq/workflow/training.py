@@ -70,7 +70,13 @@ def _outcome_of(block: Block, run: int) -> Outcome:
         return Outcome(run, Step.TRAIN, Status.FAILED, block.failures[run], details)
     if block.options.check is None or run in block.passed:
         return Outcome(run, Step.TRAIN, Status.OK, "", details)
-    return Outcome(run, Step.TRAIN, Status.WARNING, block.unchecked(run), details)
+    reason = block.faults.get(run, "no vector field was identified, so that nothing could be checked")
+    if run in block.checks:
+        reason = block.checks[run].hopeless() or (
+            f"the check passed in none of {block.attempts} trainings of {block.options.steps} steps; raise"
+            " training.steps or training.output_weights"
+        )
+    return Outcome(run, Step.TRAIN, Status.WARNING, reason, details)
 
 
 def _diffusion(settings: PipelineSettings, runs: Runs, data: Mapping[int, TrainingData]) -> Diffusion:

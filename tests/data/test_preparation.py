@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from siq.data.preparation import (
     _checked_for_learning,
     in_stretches,
     joined,
+    outliers,
     unusual,
     without_faults,
     without_velocity,
@@ -267,3 +269,36 @@ def test_a_velocity_on_which_all_noise_acts_is_found_again_from_its_position() -
 @pytest.mark.parametrize("noises", [(0.3, 0.6), (0.3, 0), (0, 0)])
 def test_noise_of_a_position_and_relaxations_keep_the_velocity(noises: tuple[float, float]) -> None:
     assert without_velocity(oscillator(*noises)).names == ("x", "v")
+
+
+def bouncing(t: np.ndarray) -> np.ndarray:
+    """A motion with kinks, such as a ball has that bounces, and with jumps, such as a voltage has."""
+    return np.abs(np.sin(1.3 * t)) + np.where(t % 4.1 < 2, 0.5, 0.0)
+
+
+@pytest.mark.parametrize("motion", [np.cos, bouncing])
+@pytest.mark.parametrize("noise", [1e-9, 0.01])
+def test_outliers_of_a_smooth_motion_are_told_from_kinks_and_jumps(
+    motion: Callable[[np.ndarray], np.ndarray], noise: float
+) -> None:
+    generator = np.random.default_rng(7)
+    t, inputs = np.tile(0.05 * np.arange(500), 3), np.zeros((0, 1500))
+    recording, x = np.repeat(np.arange(3), 500), motion(t) + noise * generator.standard_normal(1500)
+    assert not outliers(t, x, recording, inputs).any()
+    spoiled, rows = x.copy(), np.sort(generator.choice(np.arange(10, 1490, 10), 30, replace=False))
+    rows = rows[(t[rows] > 0.2) & (t[rows] < 24.8)]
+    spoiled[rows] += np.where(generator.random(len(rows)) < 0.5, -1, 1) * generator.uniform(0.7, 9, len(rows))
+    spoiled[700:704] = -3.0  # the sensor drops out
+    spoiled[3] = np.nan
+    found = np.flatnonzero(outliers(t, spoiled, recording, inputs))
+    expected = np.union1d(rows, np.arange(700, 704))
+    assert set(found) <= set(expected)
+    assert len(found) >= (1.0 if motion is np.cos else 0.75) * len(expected)
+
+
+def test_beside_a_pulse_of_an_input_nothing_is_an_outlier() -> None:
+    t, kick = 0.05 * np.arange(600), np.zeros((1, 600))
+    kick[0, 100:600:100] = 1.0
+    x = np.cos(t) + kick[0]
+    assert not outliers(t, x, np.zeros(600, dtype=int), kick).any()
+    assert outliers(t, x, np.zeros(600, dtype=int), 0 * kick).sum() == 5

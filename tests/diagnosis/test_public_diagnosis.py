@@ -104,6 +104,24 @@ def test_table_file_and_recordings_are_the_same_to_it(tmp_path: Path) -> None:
         assert other.kept.labels == first.kept.labels
 
 
+def test_spikes_of_a_sensor_are_left_out_and_told() -> None:
+    t, generator = 0.1 * np.arange(150), np.random.default_rng(2)
+    spikes = generator.random((4, 150)) < 0.02
+    tables = [
+        pd.DataFrame({"recording": f"r{k}", "t": t, "n": 2 / (1 + (2 / start - 1) * np.exp(-0.9 * t))})
+        for k, start in enumerate([0.05, 0.2, 1.0, 5.0])
+    ]
+    table = pd.concat(tables, ignore_index=True)
+    table["n"] += 0.002 * generator.normal(size=600) + spikes.ravel() * generator.uniform(-2, 2, 600)
+    found = siq.diagnose(GROWTH, table)
+    assert [one.label for one in found.mechanisms] == ["self-limitation in n"]
+    (size,) = found.mechanisms[0].parameters.values()
+    assert abs(size.estimate - 0.45) < 3 * size.standard_error < 0.002
+    (told,) = [one for one in found.statement.remarks if one.code == "data.outliers"]
+    assert 0.8 * spikes.sum() < told.values["samples"] <= spikes.sum()
+    assert not comparison_of(GROWTH, table, siq.MismatchStudy(without_outliers=False)).remarks
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -28,10 +28,10 @@ from siq.quasipotential.characteristics import (
     Fan,
     _even_directions,
     _join,
+    _potential_errors,
     _potential_slopes,
     adapted_fan,
     characteristics,
-    potential_errors,
     relative_error,
 )
 from siq.systems.dynamics import Dynamics
@@ -316,7 +316,7 @@ def test_errors_are_exact_where_f_is_downhill(strength: float) -> None:
     x, y = POINTS.T
     parts = np.stack([(x**2 - 1) / 2, (x**4 - 1) / 4, y**2 / (2 * strength)])
     expected = 0.03 * np.sqrt((parts**2).sum(axis=0))
-    assert potential_errors(found, gradient, STABLE, POINTS) == pytest.approx(expected, rel=0.03, abs=1e-5)
+    assert _potential_errors(found, gradient, STABLE, POINTS) == pytest.approx(expected, rel=0.03, abs=1e-5)
     values = (x**2 - 1) ** 2 / 4 + y**2 / (2 * strength)
     whole = np.linalg.norm(expected) / np.linalg.norm(values)
     assert relative_error(found, gradient, STABLE, POINTS, values) == pytest.approx(whole, rel=0.01)
@@ -346,11 +346,11 @@ def test_what_rivals_would_change_adds_to_the_error() -> None:
 
     doubt = np.zeros((1, found.library.size, 2))
     doubt[0, list(found.library.names).index("x"), 0] = 0.1
-    plain = potential_errors(found, gradient, STABLE, POINTS)
-    doubted = potential_errors(replace(found, alternatives=(0 * doubt[0], doubt)), gradient, STABLE, POINTS)
+    plain = _potential_errors(found, gradient, STABLE, POINTS)
+    doubted = _potential_errors(replace(found, alternatives=(0 * doubt[0], doubt)), gradient, STABLE, POINTS)
     expected = np.hypot(plain, 0.1 * np.abs(POINTS[:, 0] ** 2 - 1) / 2)
     assert doubted == pytest.approx(expected, rel=0.03, abs=1e-5)
-    moved = potential_errors(replace(found, alternatives=(doubt[0], 0 * doubt)), gradient, STABLE, POINTS)
+    moved = _potential_errors(replace(found, alternatives=(doubt[0], 0 * doubt)), gradient, STABLE, POINTS)
     assert moved == pytest.approx(expected, rel=0.03, abs=1e-5)
 
 
@@ -370,11 +370,11 @@ def test_the_shape_of_an_estimated_constant_d_has_its_part(strength: float) -> N
     first, second = (x**2 - 1) ** 2 / (4 * one), y**2 / (2 * two)
     of_both = np.abs(second - first) * np.sqrt(2 / samples) / np.sqrt(2)
     # A correlation of both noises would turn the gradient of V: to first order by what lies between.
-    errors = potential_errors(found, gradient, STABLE, POINTS)
+    errors = _potential_errors(found, gradient, STABLE, POINTS)
     assert (errors >= of_both * 0.97 - 1e-5).all()
     on_axis = np.array([[0.4, 0.0], [1.3, 0.0]])
     along = (on_axis[:, 0] ** 2 - 1) ** 2 / (4 * one) / np.sqrt(samples)
-    assert potential_errors(found, gradient, STABLE, on_axis) == pytest.approx(along, rel=0.03)
+    assert _potential_errors(found, gradient, STABLE, on_axis) == pytest.approx(along, rel=0.03)
 
 
 def test_the_formula_of_d_has_its_part() -> None:
@@ -397,17 +397,17 @@ def test_the_formula_of_d_has_its_part() -> None:
         x = 1 + (end - 1) * (nodes + 1) / 2
         turned = (x**3 - x) * x / (1 + slope * x) ** 2
         expected.append(error * abs(weights @ turned * (end - 1) / 2))
-    errors = potential_errors(found, lambda x: (x**3 - x) / (1 + slope * x), np.array([1.0]), ends[:, None])
+    errors = _potential_errors(found, lambda x: (x**3 - x) / (1 + slope * x), np.array([1.0]), ends[:, None])
     assert errors == pytest.approx(expected, rel=0.02)
 
 
 def test_recordings_without_noise_leave_no_error() -> None:
     found = replace(field((X - X**3, -Y), np.eye(2)), residual_ratio=1e-9)
-    assert not potential_errors(found, lambda x: x, STABLE, POINTS).any()
+    assert not _potential_errors(found, lambda x: x, STABLE, POINTS).any()
     assert relative_error(found, lambda x: x, STABLE, POINTS, np.ones(len(POINTS))) == 0
 
 
 def test_errors_are_not_told_where_paths_do_not_come_from_the_attractor() -> None:
     found = field((X - X**3, -Y), np.eye(2))
-    errors = potential_errors(found, lambda x: np.zeros_like(x), STABLE, POINTS)
+    errors = _potential_errors(found, lambda x: np.zeros_like(x), STABLE, POINTS)
     assert np.isnan(errors).all()

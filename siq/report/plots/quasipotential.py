@@ -76,7 +76,11 @@ def _lowest_behind(landscape: LandscapeSummary, grid: np.ndarray, rest: list[int
     points = np.concatenate([np.zeros((0, len(landscape.names))), *fitted])
     places = np.concatenate([*seen, points[:: max(len(points) // 2000, 1)]])[:, rest]
     width = np.ptp(landscape.box, axis=1)[rest]
-    behind = _far_apart(places / width, BEHIND) * width
+    behind = [places[0]]  # each as far as possible from those before it
+    far = np.linalg.norm((places - behind[0]) / width, axis=1)
+    while len(behind) < min(BEHIND, len(places)) and far.max() > 0:
+        behind.append(places[far.argmax()])
+        far = np.minimum(far, np.linalg.norm((places - behind[-1]) / width, axis=1))
     best, lowest = grid.copy(), np.full(len(grid), np.inf)
     for one in behind:
         tried = grid.copy()
@@ -122,16 +126,6 @@ def _take(
 ) -> None:
     better = np.nan_to_num(values, nan=np.inf) < lowest[known]
     best[known[better]], lowest[known[better]] = moved[better], values[better]
-
-
-def _far_apart(points: np.ndarray, count: int) -> np.ndarray:
-    """So many of the points, each as far as possible from those before it."""
-    chosen = [0]
-    distance = np.linalg.norm(points - points[0], axis=1)
-    while len(chosen) < min(count, len(points)) and distance.max() > 0:
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
-    return points[chosen]
 
 
 WIDTH = 4.5  # inches: on a phone of 400 pixels its letters are 11 pixels high
