@@ -384,9 +384,9 @@ def load_study_system(study: Study, card: str | Path | None, *, file: str) -> Dy
         otherwise = f"use one of {', '.join(known)}" if known else "write it on the card as a parameter"
         for name, place in zip(study.sweep.names, ("parameter", "second.parameter"), strict=False):
             if name not in known:
-                fault = f"the card of '{system.name}' has no parameter '{name}'"
-                instead = suggestion(name, known, otherwise=otherwise)
-                raise InputError(file, f"sweep.{place}", fault, instead)
+                lacking = f"the card of '{system.name}' has no parameter '{name}'"
+                remedy = suggestion(name, known, otherwise=otherwise)
+                raise InputError(file, f"sweep.{place}", lacking, remedy)
     return system
 
 
