@@ -52,7 +52,7 @@ from siq.inference.kalman_filter import Noise, Whitened, whiten
 from siq.inference.maximum_likelihood import Fit, first_noise, fit_by_multiple_shooting
 from siq.inference.measurements import Measurements
 from siq.inference.recalibration import fit_with_process_noise_as_needed
-from siq.inference.trajectories import EDGE_SUBSTEPS, jumps_of, spread_edges
+from siq.inference.trajectories import EDGE_SUBSTEPS, spread_edges
 from siq.numerics.randomness import positive
 from siq.systems.dynamics import Dynamics
 
@@ -229,9 +229,8 @@ def _fitted(
     no more than it foresees.
     """
     substeps, noise = begin.substeps, begin.noise.of_states(model.dimension)
-    if jumps_of(model):
-        substeps = max(substeps, EDGE_SUBSTEPS)
-        model = spread_edges(model, data, states, substeps=substeps)
+    model = spread_edges(model, data, states, substeps=max(substeps, EDGE_SUBSTEPS))
+    substeps = max(substeps, EDGE_SUBSTEPS) if model.edges else substeps
     shown = replace(noise, measurement=data.with_known_noise(np.maximum(noise.measurement, rough)))
     known: dict[str, Any] = {"x": states, "estimate_process": True, "substeps": substeps, "budget": budget}
     fit = fit_by_multiple_shooting(model, data, noise=shown, **known)

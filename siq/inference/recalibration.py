@@ -35,7 +35,7 @@ from siq.inference.budget import COMPILATION, Budget, evaluation
 from siq.inference.kalman_filter import Grid, Noise, profile_likelihood, whiten
 from siq.inference.maximum_likelihood import Fit, first_noise, fit_by_multiple_shooting
 from siq.inference.measurements import Measurements, first_states, with_expectations, with_variation
-from siq.inference.trajectories import EDGE_SUBSTEPS, fit_trajectories, jumps_of, run, sharpened, spread_edges
+from siq.inference.trajectories import EDGE_SUBSTEPS, fit_trajectories, run, sharpened, spread_edges
 from siq.numerics.randomness import positive
 from siq.systems.dynamics import Dynamics
 
@@ -219,14 +219,13 @@ def fit_with_and_without_process_noise(
     """
     if budget is not None:
         budget.charge(COMPILATION)
-    states, substeps, jumps = begin.x if x is None else x, begin.substeps, jumps_of(model)
-    if jumps:
-        substeps = max(substeps, EDGE_SUBSTEPS)
-        model = spread_edges(model, data, states, substeps=substeps)
+    states, substeps = begin.x if x is None else x, begin.substeps
+    model = spread_edges(model, data, states, substeps=max(substeps, EDGE_SUBSTEPS))
+    substeps = max(substeps, EDGE_SUBSTEPS) if model.edges else substeps
     noise = begin.noise.of_states(model.dimension)
     same: dict[str, Any] = {"substeps": substeps, "budget": budget}
     loose: Fit | None = None
-    if settled and not jumps:
+    if settled and not model.edges:
         loose = begin
     elif noise.process.any():
         driven = noise.scaled(max(level, 1e-6))
@@ -252,7 +251,7 @@ def fit_with_and_without_process_noise(
     finite = np.isfinite(hopeless)  # otherwise nothing is worked out
     far = finite and loose is not None and _missed_without(loose, data) > hopeless
     # Where f jumps, steps of all samples at once go to and fro.
-    ways = (as_trajectories, at_all_samples) if jumps and not far else (at_all_samples, as_trajectories)
+    ways = (as_trajectories, at_all_samples) if model.edges and not far else (at_all_samples, as_trajectories)
     strict = ways[0]()
     if not (strict.converged or far):
         strict = preferred_fit(strict, ways[1]())
@@ -323,6 +322,7 @@ def recalibrate(model: Dynamics, data: Measurements, *, budget: Budget | None = 
         When neither fit can be made.
     """
     x = first_states(model, data)
+    model = spread_edges(model, data, x, substeps=1)
     noise, fitted = first_noise(model, data, x), partial(fit_by_multiple_shooting, data=data, budget=budget)
     loose = fitted(model, x=x, noise=noise, estimate_process=True)
     # Without process noise, beginning along the simulation as the card has it.

@@ -26,7 +26,7 @@ from siq.inference.maximum_likelihood import Fit, fit_by_multiple_shooting, fit_
 from siq.inference.measurements import Measurements, expectations, first_states
 from siq.numerics.integration import machine_code
 from siq.numerics.randomness import positive
-from siq.systems.dynamics import Dynamics, Tape, symbol
+from siq.systems.dynamics import Dynamics, Tape, roots_of, symbol
 from siq.systems.formulas import compile_values
 
 
@@ -457,18 +457,20 @@ LEAST_SHARE = 0.1  # of what is missing to a goal, that steps twice as fine have
 EDGE = 0.05  # width of a jump, in what its argument passes in a substep
 
 
-def jumps_of(model: Dynamics) -> list[sympy.Expr]:
-    """Arguments that change sign where f jumps, each once, in an order that does not change."""
-    signs = {each for formula in model.equations for each in formula.atoms(sympy.sign)}
-    return sorted((each.args[0] for each in signs), key=str)
+def edges_of(model: Dynamics) -> list[sympy.Expr]:
+    """Arguments at whose zeros f jumps, or begins as a root does, each once, in an order that stays."""
+    signs = {one.args[0] for each in model.equations for one in each.atoms(sympy.sign)}
+    return sorted(signs | {one.base for each in model.equations for one in roots_of(each)}, key=str)
 
 
 def spread_edges(model: Dynamics, data: Measurements, x: np.ndarray, *, substeps: int) -> Dynamics:
-    """The model with its jumps spread over about what their arguments pass in a substep.
+    """The model with its jumps, and its roots at zero, spread over about what arguments pass in a substep.
 
-    It is used along states ``(n, d)``, which are those of all samples of the data.
+    It is used along states ``(n, d)``, which are those of all samples of the data. A root stays what it is
+    where its argument does not come to zero, as that of the level in a tank which is never empty, and where it
+    goes further down, to where it has none.
     """
-    arguments = jumps_of(model)
+    arguments = edges_of(model)
     if not arguments:
         return model
     formulas = [model.evaluable(each) for each in arguments]
@@ -479,10 +481,13 @@ def spread_edges(model: Dynamics, data: Measurements, x: np.ndarray, *, substeps
         *x.T, *further, *signals.inputs, *signals.delayed, *signals.slopes, signals.t, *model.values
     )
     rows = data.begins
-    courses = (np.broadcast_to(course, data.t.shape) for course in along)
-    passed = [float(np.sqrt(np.mean((course[rows + 1] - course[rows]) ** 2))) for course in courses]
-    widths = (EDGE * each / substeps + 1e-300 for each in passed)
-    return replace(model, edges=tuple(zip(arguments, widths, strict=True)))
+    edges, jumps = [], {one.args[0] for each in model.equations for one in each.atoms(sympy.sign)}
+    for argument, course in zip(arguments, along, strict=True):
+        course = np.broadcast_to(course, data.t.shape)
+        passed = float(np.sqrt(np.mean((course[rows + 1] - course[rows]) ** 2)))
+        if argument in jumps or abs(course.min()) <= passed:
+            edges.append((argument, EDGE * passed / substeps + 1e-300))
+    return replace(model, edges=tuple(edges))
 
 
 def sharpened(rough: Fit, data: Measurements, *, goal: float = -np.inf, budget: Budget | None = None) -> Fit:

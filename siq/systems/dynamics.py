@@ -237,6 +237,12 @@ def _derivative(formula: sympy.Expr, by: sympy.Symbol) -> sympy.Expr:
     return formula.diff(by)
 
 
+def roots_of(formula: sympy.Expr) -> set[sympy.Pow]:
+    """Its powers below one of what moves, such as a square root: at zero their slope is infinite."""
+    powers = formula.atoms(sympy.Pow)
+    return {one for one in powers if one.exp.is_number and 0 < one.exp < 1 and one.base.free_symbols}
+
+
 def _without_teeth(formula: sympy.Expr) -> sympy.Expr:
     """A formula whose sawtooth ``atan(tan(z))``, as of rounding, is taken for its mean, zero.
 
@@ -653,8 +659,12 @@ class Dynamics:
         ]  # fmt: skip
 
     def evaluable(self, formula: sympy.Expr, *, wider: float = 1.0) -> sympy.Expr:
-        """A formula with symbols for delayed inputs and its jumps spread, over a multiple of their widths."""
-        spread = {sympy.sign(at): sympy.tanh(at / (wider * width)) for at, width in self.edges}
+        """A formula with symbols for delayed inputs and its edges spread, over a multiple of their widths."""
+        spread: dict[sympy.Expr, sympy.Expr] = {}
+        for at, width in self.edges:
+            spread[sympy.sign(at)] = sympy.tanh(at / (wider * width))
+            for one in (each for each in roots_of(formula) if each.base == at):
+                spread[one] = at * (at**2 + (wider * width) ** 2) ** ((one.exp - 1) / 2)
         return formula.xreplace(spread).xreplace({each: _delayed(k) for k, each in enumerate(self.delays)})
 
     @cached_property

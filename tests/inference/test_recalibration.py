@@ -15,9 +15,9 @@ from siq.inference import maximum_likelihood, recalibration
 from siq.inference.kalman_filter import Noise
 from siq.inference.maximum_likelihood import Fit, _Shooting, fit_by_multiple_shooting
 from siq.inference.measurements import Measurements
-from siq.inference.trajectories import fit_trajectories
+from siq.inference.trajectories import fit_trajectories, spread_edges
 from siq.systems.diffusion import Diffusion
-from siq.systems.dynamics import Dynamics, Parameter
+from siq.systems.dynamics import Dynamics, Input, Parameter
 
 
 def decays() -> tuple[Dynamics, Measurements]:
@@ -139,3 +139,33 @@ def test_no_pole_is_put_among_the_states() -> None:
     for fit in (*recalibration.recalibrate(enzyme, data), damped):
         assert np.isfinite(fit.log_likelihood) and (fit.model.values > 0).all()
         assert (fit.model.values[1] + fit.x > 0).all()
+
+
+@pytest.mark.parametrize("level", ["h", "Max(h, 0)", "Abs(h)"])
+def test_a_tank_that_runs_empty_is_recalibrated(level: str) -> None:
+    """A root begins with an infinite slope, however it is written, and noise brings levels below zero."""
+    h, u, k, a = sympy.symbols("h u k a", real=True)
+    outflow = a * sympy.sqrt(sympy.sympify(level, {"h": h}))
+    parameters = (Parameter("k", 0.1), Parameter("a", 0.05))
+    tank = Dynamics(
+        ("h",), (k * u - outflow,), Diffusion.identity(1), parameters=parameters, inputs=(Input("u", "1"),)
+    )
+    generator, tables = np.random.default_rng(4), []
+    for number in range(3):
+        pumped, x, course = np.repeat(generator.choice([0.0, 0.3, 1.0], 12), 200), 0.5, []
+        for now in pumped:
+            course.append(x)
+            x = max(x + 0.5 * (0.12 * now - 0.055 * np.sqrt(x)), 0.0)
+        seen = np.array(course)[::10] + generator.normal(0, 0.01, 240)
+        tables.append(
+            pd.DataFrame({"recording": number, "t": 5.0 * np.arange(240), "h": seen, "u": pumped[::10]})
+        )
+    data = _measurements_of(pd.concat(tables), tank)
+    assert (data.outputs < 0.02).mean() > 0.1
+    fit, exact = recalibration.recalibrate(tank, data)
+    assert exact.converged and not fit.has_process_noise
+    assert exact.model.values == pytest.approx([0.12, 0.055], rel=0.01)
+    never_empty = replace(data, outputs=data.outputs + 1.0)
+    assert not spread_edges(tank, never_empty, never_empty.outputs, substeps=12).edges
+    below_zero = replace(data, outputs=data.outputs - 1.0)
+    assert len(spread_edges(tank, below_zero, below_zero.outputs, substeps=12).edges) == (level != "h")

@@ -30,8 +30,8 @@ from siq.inference.recalibration import fit_with_and_without_process_noise
 from siq.inference.trajectories import (
     _NormalEquations,
     _run_side_by_side,
+    edges_of,
     fit_trajectories,
-    jumps_of,
     run,
     spread_edges,
 )
@@ -246,14 +246,17 @@ def test_a_held_input_that_lags_pushes_as_much_as_it_should() -> None:
 
 @pytest.mark.parametrize(
     ("formula", "arguments"),
-    [("-sign(v) - sign(x)*v", ["v", "x"]), ("-design*(x + v)", []), ("-Abs(v)", []), ("-tanh(v/sigma)", [])],
-)
-def test_jumps_are_found_in_formulas_and_not_in_their_spelling(formula: str, arguments: list[str]) -> None:
+    [("-sign(v) - sign(x)*v", ["v", "x"]), ("-design*(x + v)", []), ("-Abs(v)", []), ("-tanh(v/sigma)", []),
+     ("-sqrt(Abs(v)) + x**2 + sqrt(2)*v", ["Abs(v)"])],
+)  # fmt: skip
+def test_jumps_and_roots_are_found_in_formulas_and_not_in_their_spelling(
+    formula: str, arguments: list[str]
+) -> None:
     x, v = sympy.symbols("x v", real=True)
     names = {"design": sympy.Symbol("design", real=True), "sigma": sympy.Symbol("sigma", positive=True)}
     force = sympy.sympify(formula, {"x": x, "v": v, **names})
     moving = Dynamics.of((x, v), (v, force), parameters=dict.fromkeys(names.values(), 1.0))
-    assert [str(each) for each in jumps_of(moving)] == arguments
+    assert [str(each) for each in edges_of(moving)] == arguments
 
 
 STORES = {
