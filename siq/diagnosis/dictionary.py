@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from siq.errors import Fault, InputError
 from siq.numerics.files import read_document, validate
+from siq.numerics.randomness import positive
 from siq.systems.cards import Formula, Name
 from siq.systems.dynamics import Dynamics, Signals, symbol
 from siq.systems.formulas import FormulaError, compile_values, parse_formula
@@ -372,7 +373,7 @@ def roles_of(model: Dynamics) -> Roles:
     # What nothing makes more, and no other state less, only decays.
     mixed = {name for name in alone if len(equations[name].free_symbols & {*map(symbol, model.states)}) > 1}
     living = [name for name in alone if units[name] == "1" or births(model, name) != 0 or name in mixed]
-    populations = tuple(name for name in living if name not in levels and _stays_zero(model, name))
+    populations = tuple(name for name in living if name not in levels and _multiplies(model, name))
     feeding = tuple(pair for pair in itertools.permutations(populations, 2) if _feeds(model, *pair))
     formulas = (*model.equations, *dict(model.outputs).values())
     sines = {each for formula in formulas for each in formula.atoms(sympy.sin, sympy.cos)}
@@ -482,13 +483,15 @@ def _turns(model: Dynamics, one: str, other: str) -> bool:
     return bool(np.abs(turning).max() > FORMULA_TOLERANCE * np.abs(x[[first, second]]).max() * size)
 
 
-def _stays_zero(model: Dynamics, name: str) -> bool:
-    (x, signals), place = trial_points(model), model.states.index(name)
+def _multiplies(model: Dynamics, name: str) -> bool:
+    """Whether nobody comes from nobody; or only from elsewhere, where those who are there make more."""
+    (x, signals), place = trial_points(model, either_sign=True), model.states.index(name)
     moving = model.functions.rates(x, signals, model.values)[place]
     x[place] = 0.0
     rate = model.functions.rates(x, signals, model.values)[place]
-    still = np.isfinite(rate).all() and np.abs(rate).max() <= FORMULA_TOLERANCE * np.abs(moving).max()
-    return bool(still and moving.any())
+    least, most = (each / positive(np.abs(moving).max()) for each in (rate.min(), rate.max()))
+    own = births(model, name).has(symbol(name)) and not model.limits[place, 0] < 0
+    return bool(least >= -FORMULA_TOLERANCE and (most <= FORMULA_TOLERANCE or own) and moving.any())
 
 
 def _has_root(equation: sympy.Expr, name: str) -> bool:

@@ -61,6 +61,9 @@ SURFACE: Final = "surface"
 MECHANISM: Final = "mechanism"
 
 
+LASTING = 1000.0  # a choice: times, in those of the lowest frequency, from which on they are for ever
+
+
 def places_of(search: Shape, data: Measurements, model: Dynamics, x: np.ndarray) -> np.ndarray:
     """The values of a shape that a search begins with."""
     factors = np.array(search.at)
@@ -230,13 +233,15 @@ class MechanismCandidate:
         return found
 
     def admits(self, fit: Fit, data: Measurements) -> bool:
-        """Whether a fit has signs that its parameters may have, within errors, and periods that come back."""
+        """Whether a fit has signs that its parameters may have, within errors, and times that can be seen."""
         value_of, errors = {each.name: each.value for each in fit.model.parameters}, fit.error_of
         signs = (value_of[name] >= -2 * errors[name] for name in self.positive & errors.keys())
-        searched = zip(self.shapes, self.searches, strict=False)
-        periodic = [name for name, each in searched if each.frequencies is not None and name in errors]
+        searched = [each for each in zip(self.shapes, self.searches, strict=False) if each[0] in errors]
+        periodic = [name for name, each in searched if each.frequencies is not None]
         slowest = min((abs(value_of[name]) + 2 * errors[name] for name in periodic), default=np.inf)
-        return all(signs) and bool(slowest >= _lowest_frequency(data))
+        lasting = max((value_of[name] for name, each in searched if each.time_of is not None), default=0.0)
+        lowest = _lowest_frequency(data)
+        return all(signs) and bool(slowest >= lowest and lasting * lowest <= LASTING)
 
     def idle(self, fit: Fit, of: Callable[[Iterable[bool]], bool] = any) -> bool:
         """Whether any amplitude of a fit, or all, is zero within errors: a special case of itself, then."""

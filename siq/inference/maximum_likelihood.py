@@ -286,46 +286,27 @@ def _noise_along(
 
 @dataclass(frozen=True)
 class Fit:
-    """A fitted model.
+    """A fitted model."""
 
-    Attributes
-    ----------
-    model, covariance
-        With the estimates as its parameters' values; and of the free ones, shape ``(p, p)``.
-    x
-        Smoothed states at all samples, shape ``(n, d)``.
-    linearised_at, linearisation
-        Where f was taken, shape ``(n, d)``: `x` without process noise, otherwise what the filter knows at
-        each sample; and the linearisation there, at the estimates.
-    spread
-        Covariance of what the filter knows at each sample, shape ``(n, d, d)``; None without process noise.
-    noise
-        Estimates, or what was given.
-    log_likelihood
-        Not the restricted one, which depends on the units in which a model has its states.
-    sum_of_squares, degrees_of_freedom
-        Of the whitened innovations, and of what is expected of parameters; about as many where the model is
-        right: measured values, and what is expected of several parameters together, less initial states and
-        free parameters.
-    substeps
-        Runge–Kutta steps between samples.
-    converged, fault
-        Whether the iteration settled; and why there is no result, empty where there is one, settled or not.
-    """
-
-    model: Dynamics
-    covariance: np.ndarray
-    x: np.ndarray
+    model: Dynamics  #: with the estimates as its parameters' values
+    covariance: np.ndarray  #: of the free ones, shape ``(p, p)``
+    x: np.ndarray  #: smoothed states at all samples, shape ``(n, d)``
+    #: Where f was taken, shape ``(n, d)``: x without process noise, otherwise what the filter knows there.
     linearised_at: np.ndarray
-    spread: np.ndarray | None
-    noise: Noise
-    linearisation: Linearisation
-    log_likelihood: float
+    spread: np.ndarray | None  #: covariance of what it knows there, ``(n, d, d)``; None without process noise
+    noise: Noise  #: estimates, or what was given
+    linearisation: Linearisation  #: there, at the estimates
+    log_likelihood: (
+        float  #: not the restricted one, which depends on the units in which a model has its states
+    )
+    #: Of the whitened innovations, and of what is expected of parameters; about as many where the model is
+    #: right: measured values, and what is expected of several parameters together, less initial states and
+    #: free parameters.
     sum_of_squares: float
     degrees_of_freedom: int
-    substeps: int
-    converged: bool
-    fault: str = ""
+    substeps: int  #: Runge–Kutta steps between samples
+    converged: bool  #: whether the iteration settled
+    fault: str = ""  #: why there is no result, empty where there is one, settled or not
 
     @property
     def standard_errors(self) -> np.ndarray:

@@ -31,30 +31,19 @@ PADDING = 64  # samples by which they are continued, mirrored, so that the ends 
 
 @dataclass(frozen=True)
 class Measurements:
-    """Recordings, one behind the other.
+    """Recordings, one behind the other."""
 
-    Attributes
-    ----------
-    labels, first
-        One per recording; and the row at which each begins, then the number of rows: ``(recordings + 1,)``.
-    t, outputs
-        Times, shape ``(n,)``; and what was measured, shape ``(n, m)``, in the order of the model's outputs.
-    courses
-        For each recording the courses of its inputs in time.
-    sensor_noise
-        Variance of each output's noise where it is known, NaN where it is to be estimated; shape ``(m,)``.
-        None where none is known.
-    restarting
-        Places of the states that begin at zero with every interval, such as a mean over an exposure.
-    """
-
-    labels: tuple[str, ...]
-    first: np.ndarray
-    t: np.ndarray
-    outputs: np.ndarray
-    courses: tuple[tuple[scipy.interpolate.PPoly, ...], ...]
+    labels: tuple[str, ...]  #: of the recordings
+    first: np.ndarray  #: the row at which each begins, then the number of rows: ``(recordings + 1,)``
+    t: np.ndarray  #: times, shape ``(n,)``
+    outputs: np.ndarray  #: what was measured, shape ``(n, m)``, in the order of the model's outputs
+    courses: tuple[tuple[scipy.interpolate.PPoly, ...], ...]  #: for each recording, of its inputs in time
+    #: Variance of each output's noise where it is known, NaN where it is to be estimated, shape ``(m,)``;
+    #: None where none is known.
     sensor_noise: np.ndarray | None = None
-    restarting: tuple[int, ...] = ()
+    restarting: tuple[
+        int, ...
+    ] = ()  #: places of states that begin at zero with every interval, such as means
 
     @property
     def begins(self) -> np.ndarray:

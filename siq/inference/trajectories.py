@@ -457,20 +457,15 @@ LEAST_SHARE = 0.1  # of what is missing to a goal, that steps twice as fine have
 EDGE = 0.05  # width of a jump, in what its argument passes in a substep
 
 
-def edges_of(model: Dynamics) -> list[sympy.Expr]:
-    """Arguments at whose zeros f jumps, or begins as a root does, each once, in an order that stays."""
-    signs = {one.args[0] for each in model.equations for one in each.atoms(sympy.sign)}
-    return sorted(signs | {one.base for each in model.equations for one in roots_of(each)}, key=str)
-
-
 def spread_edges(model: Dynamics, data: Measurements, x: np.ndarray, *, substeps: int) -> Dynamics:
     """The model with its jumps, and its roots at zero, spread over about what arguments pass in a substep.
 
     It is used along states ``(n, d)``, which are those of all samples of the data. A root stays what it is
-    where its argument does not come to zero, as that of the level in a tank which is never empty, and where it
-    goes further down, to where it has none.
+    where its argument does not come to zero, as that of the level in a tank which is never empty, and where
+    it goes further down, to where it has none.
     """
-    arguments = edges_of(model)
+    jumps = {one.args[0] for each in model.equations for one in each.atoms(sympy.sign)}
+    arguments = sorted(jumps | {one.base for each in model.equations for one in roots_of(each)}, key=str)
     if not arguments:
         return model
     formulas = [model.evaluable(each) for each in arguments]
@@ -481,7 +476,7 @@ def spread_edges(model: Dynamics, data: Measurements, x: np.ndarray, *, substeps
         *x.T, *further, *signals.inputs, *signals.delayed, *signals.slopes, signals.t, *model.values
     )
     rows = data.begins
-    edges, jumps = [], {one.args[0] for each in model.equations for one in each.atoms(sympy.sign)}
+    edges = []
     for argument, course in zip(arguments, along, strict=True):
         course = np.broadcast_to(course, data.t.shape)
         passed = float(np.sqrt(np.mean((course[rows + 1] - course[rows]) ** 2)))
