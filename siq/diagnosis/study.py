@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
+from scipy.interpolate import PPoly
 
 from siq.data.preparation import outliers
 from siq.data.recordings import Recordings, read_recordings
@@ -238,6 +239,35 @@ class Comparison:
         system, learn, kept = with_variation(self.system, names, self.learn, self.kept)
         settings = self.settings.model_copy(update={"varies": names})
         return replace(self, system=system, learn=learn, kept=kept, settings=settings)
+
+    def with_held_inputs(self) -> Comparison | None:
+        """The same where inputs are held between samples that nobody says anything of; None without such."""
+        inputs = self.system.inputs
+        held = [
+            each.interpolation is None and len(self.learn.courses[0][k].c) == 2
+            for k, each in enumerate(inputs)
+        ]
+
+        def of(data: Measurements) -> Measurements:
+            each = (zip(courses, held, strict=True) for courses in data.courses)
+            return replace(
+                data, courses=tuple(tuple(PPoly(c.c[-1:], c.x) if h else c for c, h in one) for one in each)
+            )
+
+        named = (
+            replace(each, interpolation="zero_order") if h else each
+            for each, h in zip(inputs, held, strict=True)
+        )
+        system = replace(self.system, inputs=tuple(named))
+        remark = Remark(
+            "diagnosis.held_inputs", {"inputs": [e.name for e, h in zip(inputs, held, strict=True) if h]}
+        )
+        told = (*self.remarks, remark)
+        return (
+            replace(self, system=system, learn=of(self.learn), kept=of(self.kept), remarks=told)
+            if any(held)
+            else None
+        )
 
 
 def comparison_of(

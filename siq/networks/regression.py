@@ -89,38 +89,18 @@ class RegressionOptions:
 
 @plain_dataclass(frozen=True)
 class RegressionResult:
-    """Sparse coefficients of f, V and g over one library.
+    """Sparse coefficients of f, V and g over one library."""
 
-    Attributes
-    ----------
-    vector_field, circulatory
-        Shape ``(q, d)``: column i holds the coefficients of f_i, and of g_i.
-    potential
-        Shape ``(q,)``. The constant of V means nothing.
-    converged
-        Whether SR3 met its tolerance within the iterations allowed.
-    iterations
-        Iterations of SR3 that were taken.
-    constraint_residual
-        Largest violation of ``C Ξ = 0``, in scaled coefficients; rounding after the refit.
-    sparse_constraint_residual
-        The same for the thresholded coefficients of SR3, before the refit.
-    misfit
-        For the targets f_1 … f_d, V, g_1 … g_d: rms misfit of the formulas to the networks over rms of
-        the target.
-    points
-        Number of points used.
-    """
-
-    vector_field: np.ndarray
-    potential: np.ndarray
-    circulatory: np.ndarray
-    converged: bool
-    iterations: int
-    constraint_residual: float
-    sparse_constraint_residual: float
+    vector_field: np.ndarray  #: shape ``(q, d)``: column i holds the coefficients of f_i
+    potential: np.ndarray  #: shape ``(q,)``; the constant of V means nothing
+    circulatory: np.ndarray  #: shape ``(q, d)``: column i holds the coefficients of g_i
+    converged: bool  #: whether SR3 met its tolerance within the iterations allowed
+    iterations: int  #: of SR3 that were taken
+    constraint_residual: float  #: largest violation of ``C Ξ = 0``, scaled; rounding after the refit
+    sparse_constraint_residual: float  #: the same for the thresholded coefficients of SR3, before the refit
+    #: Rms misfit of the formulas to the networks over rms of the target, which are f_1 … f_d, V, g_1 … g_d.
     misfit: np.ndarray
-    points: int
+    points: int  #: so many were used
 
 
 def highest_used(potential: np.ndarray, *, level: float | None) -> float:

@@ -491,41 +491,20 @@ class PipelineSettings:
 
     A task of the workflow is told the parts that it names and nothing else: only their change makes
     its results anew; the rest keeps its default.
-
-    Attributes
-    ----------
-    seed
-        Of everything random.
-    space
-        The states, and D.
-    sampling
-        How samples make pairs.
-    identification, regression, refinement, certificate
-        The parameters of the steps.
-    training
-        How two networks are trained; None trains none, and V comes from the local route alone.
-    published_method
-        Whether the published regression is made of the networks, beside the refined formulas.
-    landscape
-        How the landscape is found; None finds none.
-    simulation
-        What is simulated; None of recordings.
-    invariant
-        Noise intensities ε for which the invariant distribution is computed.
     """
 
-    seed: int = 0
+    seed: int = 0  #: of everything random
     space: StateSpace = StateSpace()
-    sampling: Sampling = Sampling()
+    sampling: Sampling = Sampling()  #: how samples make pairs
     identification: IdentificationOptions = IdentificationOptions()
-    training: TrainingOptions | None = None
-    published_method: bool = True
+    training: TrainingOptions | None = None  #: of two networks; None: V comes from the local route alone
+    published_method: bool = True  #: whether the published regression is made of the networks, too
     regression: RegressionOptions = RegressionOptions()
     refinement: RefinementOptions = RefinementOptions()
     certificate: CertificateOptions = CertificateOptions()
-    landscape: LandscapeOptions | None = LandscapeOptions()
-    simulation: SimulationOptions | None = None
-    invariant: tuple[Annotated[float, Field(gt=0)], ...] = ()
+    landscape: LandscapeOptions | None = LandscapeOptions()  #: how it is found; None finds none
+    simulation: SimulationOptions | None = None  #: of a system; None of recordings
+    invariant: tuple[Annotated[float, Field(gt=0)], ...] = ()  #: ε for which the distribution is computed
 
     def __post_init__(self) -> None:
         if self.training is None:

@@ -104,6 +104,26 @@ def test_table_file_and_recordings_are_the_same_to_it(tmp_path: Path) -> None:
         assert other.kept.labels == first.kept.labels
 
 
+def test_what_a_computer_writes_is_no_clock_offset() -> None:
+    """A smooth input that is held until the next sample comes half a step late on a straight line."""
+    card = {
+        "name": "motor", "states": {"w": {"unit": "rad/s"}}, "inputs": {"u": {"unit": "V"}}, "outputs": {"w": "w"},
+        "parameters": {"K": {"value": 9.0}, "d": {"value": 3.0}}, "equations": {"w": "K*u - d*w"},
+    }  # fmt: skip
+    t, generator, tables = 0.02 * np.arange(400), np.random.default_rng(5), []
+    for number, (slow, quick) in enumerate(generator.uniform((1, 5), (2, 9), (4, 2))):
+        u, w = np.sin(slow * t) + np.sin(quick * t), np.zeros(400)
+        for k in range(399):
+            w[k + 1] = w[k] * np.exp(-3.1 * 0.02) + 9.5 / 3.1 * (1 - np.exp(-3.1 * 0.02)) * u[k]
+        w += 0.003 * generator.normal(size=400)
+        tables.append(pd.DataFrame({"recording": f"r{number}", "t": t, "w": w, "u": u}))
+    found = siq.diagnose(card, pd.concat(tables))
+    assert not found.verdict.mismatch and not found.mechanisms
+    (told,) = [one for one in found.statement.remarks if one.code == "diagnosis.held_inputs"]
+    assert told.values["inputs"] == ["u"]
+    assert "interpolation: zero_order" in found.to_card()
+
+
 def test_spikes_of_a_sensor_are_left_out_and_told() -> None:
     t, generator = 0.1 * np.arange(150), np.random.default_rng(2)
     spikes = generator.random((4, 150)) < 0.02
