@@ -256,7 +256,11 @@ def path_of(
     # Values of a counter or a digitiser have no nearest neighbours.
     steps = np.array([resolution_step(one) or 0.0 for one in values.T])
     draw = np.random.default_rng(0)
-    longest = [_remembered(one, runs, relaxation) for one in smooth.T]
+    some, longest = runs[:: -(-len(runs) // MOST_RUNS)], []  # how long visits to a place are remembered
+    for one in smooth.T:
+        bins = np.searchsorted(np.quantile(one, np.arange(0.1, 1.0, 0.1)), one)
+        times = [correlated_samples((bins == each).astype(float), some) for each in np.unique(bins)]
+        longest.append(max(relaxation, float(np.median(times))) if np.ptp(one) > 0 else relaxation)
     spread_out = smooth + steps * (draw.random(values.shape) - 0.5)
     wells = _wells_of(spread_out, max(longest))
     if len(longest) == 1:
@@ -336,16 +340,6 @@ def path_of(
         return places, continued_visits(core, runs), None, len(wells), False
     path, places = _path_between(values, runs, wells[np.argsort(wells[:, column])])
     return places, path, None, len(wells), False
-
-
-def _remembered(series: np.ndarray, runs: list[slice], relaxation: float) -> float:
-    """How long visits to a place are remembered, hops included, in samples: median over places."""
-    if not np.ptp(series) > 0:
-        return relaxation
-    bins = np.searchsorted(np.quantile(series, np.arange(0.1, 1.0, 0.1)), series)
-    some = runs[:: -(-len(runs) // MOST_RUNS)]
-    times = [correlated_samples((bins == one).astype(float), some) for one in np.unique(bins)]
-    return max(relaxation, float(np.median(times)))
 
 
 def _without_blurred(path: np.ndarray, runs: list[slice], states: int) -> tuple[np.ndarray, bool]:

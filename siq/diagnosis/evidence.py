@@ -175,7 +175,10 @@ def _correlated_probability(
     parts = [white.recording == place for place in range(len(weights))]
     times = [correlation_time_of(left[rows], white.recording[rows], least=0.0) for rows in parts]
     together = float(np.average(times, weights=weights))
-    places = [each.frequencies or len(each.at) for each in candidate.searches]
+    told = int(np.ptp(data.t) / np.median(data.step[data.begins]) / 4)  # frequencies that can be told apart
+    places = [
+        max(each.frequencies, told) if each.frequencies else len(each.at) for each in candidate.searches
+    ]
     alone = float(scipy.stats.chi2.sf(max(gained, 0.0) / together, max(len(candidate.new), 1)))
     return min(1.0, float(np.prod(places)) * alone)
 

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 import scipy.linalg
 import sympy
+from scipy.signal import argrelmax, lombscargle
 
 from siq.data.correlation import resolution_step
 from siq.diagnosis.dictionary import (
@@ -61,6 +62,7 @@ SURFACE: Final = "surface"
 MECHANISM: Final = "mechanism"
 
 
+LINES, MOST_PRODUCTS = 8, 20_000_000  # of a spectrum, that are frequencies to begin with; of work for it
 LASTING = 1000.0  # a choice: times, in those of the lowest frequency, from which on they are for ever
 
 
@@ -71,8 +73,21 @@ def places_of(search: Shape, data: Measurements, model: Dynamics, x: np.ndarray)
     if search.samples:
         return factors * np.median(steps)
     if search.frequencies is not None:
-        # From two periods in the longest recording to four samples a period.
-        return np.linspace(_lowest_frequency(data), np.pi / (2 * np.median(steps)), search.frequencies)
+        # From two periods in the longest recording to four samples a period. Recordings on one clock, far
+        # from each other, tell a frequency better than that: lines in what was measured show where.
+        limits = _lowest_frequency(data), np.pi / (2 * np.median(steps))
+        count = min(int(np.ptp(data.t) / np.median(steps)), MOST_PRODUCTS // len(data.t)) + 2
+        fine = np.linspace(*limits, count)
+        power = np.zeros(len(fine))
+        for column in data.outputs.T:
+            known = np.isfinite(column)
+            with np.errstate(all="ignore"):
+                power += lombscargle(
+                    data.t[known], column[known] - column[known].mean(), fine, normalize=True
+                )
+        lines = argrelmax(power)[0]
+        strongest = fine[lines[np.argsort(-power[lines])[:LINES]]]
+        return np.append(np.linspace(*limits, search.frequencies), strongest)
     if search.recorded is not None:
         place = model.output_names.index(search.recorded)
         values = data.outputs[:, place]
@@ -239,7 +254,9 @@ class MechanismCandidate:
         searched = [each for each in zip(self.shapes, self.searches, strict=False) if each[0] in errors]
         periodic = [name for name, each in searched if each.frequencies is not None]
         slowest = min((abs(value_of[name]) + 2 * errors[name] for name in periodic), default=np.inf)
-        lasting = max((value_of[name] for name, each in searched if each.time_of is not None), default=0.0)
+        lasting = max(
+            (value_of[name] for name, each in searched if each.time_of or each.samples), default=0.0
+        )
         lowest = _lowest_frequency(data)
         return all(signs) and bool(slowest >= lowest and lasting * lowest <= LASTING)
 

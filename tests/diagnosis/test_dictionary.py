@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import sympy
 from homes_of_mechanisms import HOMES, RESIDENTS, candidates, model_of, numbers, recorded, states, truth_of
@@ -20,7 +21,7 @@ from siq.diagnosis.mechanisms import (
     places_of,
 )
 from siq.diagnosis.screening import screen_all
-from siq.diagnosis.study import SearchOptions
+from siq.diagnosis.study import SearchOptions, _measurements_of
 from siq.inference.recalibration import recalibrate
 from siq.systems.dynamics import Dynamics, _without_teeth
 
@@ -236,6 +237,17 @@ def test_the_time_of_a_course_is_that_in_which_it_changes() -> None:
     np.testing.assert_allclose(places, [0.5, 1.5], rtol=0.03)  # 1/ω, less what straight lines cut off
 
 
+def test_recordings_on_one_clock_tell_a_frequency_to_a_part_of_their_span() -> None:
+    model, table, waves = HOMES["mass"].model, [], np.random.default_rng(0)
+    for number in range(3):
+        t = 300.0 * number + 0.4 * np.arange(500)
+        x = np.cos(0.7413 * t) + 0.5 * waves.normal(size=500)
+        table.append(pd.DataFrame({"recording": number, "t": t, "x": x, "u": 0.0}))
+    data = _measurements_of(pd.concat(table), model)
+    places = places_of(Shape(frequencies=90), data, model, np.zeros((1500, 2)))
+    assert np.abs(places - 0.7413).min() < 0.25 / 800  # of a turn over all of them
+
+
 def test_a_period_has_to_come_back_within_a_recording() -> None:
     resident = next(each for each in RESIDENTS if each.name == "periodic forcing")
     data, model = recorded(resident), HOMES[resident.home].model
@@ -248,6 +260,16 @@ def test_a_period_has_to_come_back_within_a_recording() -> None:
         fitted = candidate.begun(model, {name: frequency})
         fit: Any = SimpleNamespace(model=fitted, error_of={name: 0.03 * lowest})
         assert candidate.admits(fit, data) == (frequency > 0.9 * lowest)
+
+
+def test_a_time_that_no_recording_shows_is_no_time_constant() -> None:
+    resident = next(each for each in RESIDENTS if each.name == "actuator lag")
+    data, model, candidate = recorded(resident), HOMES["mass"].model, the("actuator lag", "mass")
+    (name,) = candidate.shapes
+    longest = float(np.ptp(data.t[data.recording == 0]))
+    for time in (0.1 * longest, 1e6 * longest):
+        fit: Any = SimpleNamespace(model=candidate.begun(model, {name: time}), error_of={name: 0.1 * time})
+        assert candidate.admits(fit, data) == (time < longest)
 
 
 # Each is found at home
@@ -523,6 +545,16 @@ def test_those_who_recovered_are_the_rest_of_all() -> None:
     with_rest = the("waning immunity", "epidemic with those who recovered", "in s, r").model
     before = HOMES["epidemic with those who recovered"].model
     assert sympy.expand(sum(with_rest.equations) - sum(before.equations)) == 0
+
+
+def test_who_multiply_may_come_from_elsewhere_too() -> None:
+    light = {"parameters": numbers(g=0.1, k=1.0, b=0.01), "inputs": {"P": {}}, "states": states(s="1")}
+    amplified = {**light, "equations": {"s": "g*P*s - k*s + b"}}  # b: spontaneous emission
+    assert roles_of(model_of(amplified)).populations == ("s",)
+    for equation in ("P - k*s + b", "s - s**3 + P"):  # heated from outside; pushed either way
+        assert roles_of(model_of({**light, "equations": {"s": equation}})).populations == ()
+    of_either_sign = {**amplified, "states": {"s": {"unit": "1", "domain": [-1, 1]}}}
+    assert roles_of(model_of(of_either_sign)).populations == ()
 
 
 def test_what_only_decays_is_no_population_where_it_has_a_unit() -> None:

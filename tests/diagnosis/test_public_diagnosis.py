@@ -107,9 +107,13 @@ def test_table_file_and_recordings_are_the_same_to_it(tmp_path: Path) -> None:
 def test_what_a_computer_writes_is_no_clock_offset() -> None:
     """A smooth input that is held until the next sample comes half a step late on a straight line."""
     card = {
-        "name": "motor", "states": {"w": {"unit": "rad/s"}}, "inputs": {"u": {"unit": "V"}}, "outputs": {"w": "w"},
-        "parameters": {"K": {"value": 9.0}, "d": {"value": 3.0}}, "equations": {"w": "K*u - d*w"},
-    }  # fmt: skip
+        "name": "motor",
+        "states": {"w": {"unit": "rad/s"}},
+        "inputs": {"u": {"unit": "V"}},
+        "outputs": {"w": "w"},
+        "parameters": {"K": {"value": 9.0}, "d": {"value": 3.0}},
+        "equations": {"w": "K*u - d*w"},
+    }
     t, generator, tables = 0.02 * np.arange(400), np.random.default_rng(5), []
     for number, (slow, quick) in enumerate(generator.uniform((1, 5), (2, 9), (4, 2))):
         u, w = np.sin(slow * t) + np.sin(quick * t), np.zeros(400)
