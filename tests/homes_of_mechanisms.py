@@ -89,6 +89,12 @@ def waves(rng: np.random.Generator, t: np.ndarray, *, size: float = 1.0, slowest
     return size * rng.uniform(0.4, 1.6) * np.cos(omega * t + phase).sum(axis=0, keepdims=True)
 
 
+def spun(rng: np.random.Generator, t: np.ndarray) -> np.ndarray:
+    """An angle, and its speed, which rises."""
+    begin, rise = rng.uniform(0.5, 1.5), rng.uniform(0.05, 0.2)
+    return np.stack([begin * t + rise * t**2 / 2, begin + rise * t])
+
+
 def inflow(rng: np.random.Generator, t: np.ndarray, *, size: float = 1.0) -> np.ndarray:
     """An input that is held for a while at a level, and never negative."""
     levels = size * rng.uniform(0.1, 2.0, len(t) // 10 + 1)
@@ -108,6 +114,19 @@ HOMES: Mapping[str, Home] = {
         0.15,
         lambda rng: rng.normal(size=2) * [0.8, 1.0],
         waves,
+    ),
+    "rotor": Home(
+        {
+            "time_unit": "s",
+            "states": states(x="mm", v="mm/s"),
+            "inputs": {"a": {"unit": "rad"}, "w": {"unit": "rad/s"}},
+            "parameters": numbers(k=4.0, d=0.3),
+            "equations": {"x": "v", "v": "-k*x - d*v"},
+            "outputs": {"x": "x"},
+        },
+        0.15,
+        lambda rng: rng.normal(size=2) * [0.8, 1.0],
+        spun,
     ),
     "mass without damping": Home(
         {
@@ -628,6 +647,7 @@ RESIDENTS: Sequence[Resident] = (
     Resident("quadratic drag", "cart", {"c": 0.3}, "relative to u"),
     Resident("input gain", "cart", {"c": 0.3}, "'v', c_1*u"),
     Resident("Joule heating", "lamp", {"c": 2.0}),
+    Resident("unbalance", "rotor", {"c": 0.5, "d": 0.2}),
     Resident("dependence on an input", "cart", {"c": 0.5}, "of d on u"),
     Resident("thrust of a propeller", "cart", {"c": 0.3}, "p*Abs(p)"),
     Resident("actuator lag", "mass", {"tau": 0.5}),

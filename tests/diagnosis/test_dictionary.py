@@ -287,7 +287,7 @@ SCREENED = (
     "product inhibition", "attached oscillator", "rate limit", "magnetic saturation",
     "photoinhibition", "Gompertz growth", "second-order reaction", "asymmetric damping", "wind or current",
     "flow over a weir", "limiting resource", "Joule heating", "dependence on an input",
-    "washout",
+    "washout", "unbalance",
 )  # fmt: skip
 
 
@@ -384,6 +384,13 @@ def test_a_current_heats_with_its_square() -> None:
     change = dict(the("Joule heating", "lamp").changes)["s"]
     c, u = (next(each for each in change.free_symbols if each.name == name) for name in ("c_1", "u"))
     assert change.subs({c: 2, u: 3}) == 18 == change.subs({c: 2, u: -3})
+
+
+def test_an_unbalance_pulls_outwards_with_the_square_of_the_speed() -> None:
+    # Den Hartog (1934): m r ω² once a turn.
+    change = dict(the("unbalance", "rotor").changes)["v"]
+    at = {"c_1": 0.5, "d_1": 2.0, "w": 3.0, "a": sympy.pi / 2}
+    assert change.subs({each: at[each.name] for each in change.free_symbols}) == 18.0
 
 
 def test_a_parameter_goes_with_an_input_in_proportion() -> None:

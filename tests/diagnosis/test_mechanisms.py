@@ -24,7 +24,7 @@ NAMES = (
     "sigmoid functional response", "predator interference", "product inhibition", "limiting resource",
     "photoinhibition", "decay or leakage", "delayed response", "saturation", "rate limit",
     "magnetic saturation", "parametric drive", "parameter drift", "dependence on an input",
-    "periodic forcing", "overflow", "flow over a weir", "leak", "input delay", "hysteresis",
+    "periodic forcing", "unbalance", "overflow", "flow over a weir", "leak", "input delay", "hysteresis",
     "saturated elimination", "second-order reaction", "washout", "diode or exponential loss",
     "outflow through an opening", "thermal radiation", "reverse reaction or backflow", "adaptation",
     "waning immunity", "recruitment", "seasonality", "process noise", "sensor gain or offset",
