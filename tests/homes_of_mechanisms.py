@@ -165,6 +165,19 @@ HOMES: Mapping[str, Home] = {
         0.1,
         lambda rng: rng.normal(size=2) * [1.0, 2.0],
     ),
+    "pendulum on a trolley": Home(
+        {
+            "time_unit": "s",
+            "states": states(th="rad", w="rad/s"),
+            "inputs": {"a": {"unit": "m/s^2"}},
+            "parameters": numbers(k=4.0, c=0.2),
+            "equations": {"th": "w", "w": "-k*sin(th) - c*w - a"},
+            "outputs": {"th": "th"},
+        },
+        0.15,
+        lambda rng: rng.normal(size=2) * [0.8, 1.0],
+        waves,
+    ),
     "arm": Home(
         {
             "time_unit": "s",
@@ -648,6 +661,7 @@ RESIDENTS: Sequence[Resident] = (
     Resident("input gain", "cart", {"c": 0.3}, "'v', c_1*u"),
     Resident("Joule heating", "lamp", {"c": 2.0}),
     Resident("unbalance", "rotor", {"c": 0.5, "d": 0.2}),
+    Resident("lever arm", "pendulum on a trolley", {"c": 1.0}),
     Resident("dependence on an input", "cart", {"c": 0.5}, "of d on u"),
     Resident("thrust of a propeller", "cart", {"c": 0.3}, "p*Abs(p)"),
     Resident("actuator lag", "mass", {"tau": 0.5}),

@@ -268,6 +268,7 @@ def _judged(case: Comparison, budget: Budget) -> tuple[Investigation, HeldOutRun
     return found, shown, replace(statement, remarks=(*case.remarks, *statement.remarks))
 
 
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")  # what overflows shows in its values
 def solve_case(
     case: Comparison,
     *,

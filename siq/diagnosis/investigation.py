@@ -49,7 +49,6 @@ RARE = 0.2  # weight of what few systems have, as in the dictionary
 TURNED = 0.01  # share of a path that is gone back, from which on it is no error of the first velocities
 
 
-@np.errstate(over="ignore", divide="ignore", invalid="ignore")  # what overflows shows in its values
 def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigation:
     """Say whether, where and in which way a simulation differs from the recordings of a case to learn from.
 

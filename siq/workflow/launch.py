@@ -127,8 +127,7 @@ class _Progress:
             self._latest_words = words[-1] + "".join(said[-1:])
         what = "finishing" if self.done == self.total else self._latest_words
         more = f" (and {len(words) - 1} more)" if len(words) > 1 else ""
-        left = self.left()
-        time_left = "" if left is None else f", {_duration(left)}"
+        time_left = "" if (left := self.left()) is None else f", {_duration(left)}"
         return f"{min(self.done + 1, self.total)} of {self.total}: {what}{more}{time_left}"
 
 

@@ -287,7 +287,7 @@ SCREENED = (
     "product inhibition", "attached oscillator", "rate limit", "magnetic saturation",
     "photoinhibition", "Gompertz growth", "second-order reaction", "asymmetric damping", "wind or current",
     "flow over a weir", "limiting resource", "Joule heating", "dependence on an input",
-    "washout", "unbalance",
+    "washout", "unbalance", "lever arm",
 )  # fmt: skip
 
 
@@ -391,6 +391,13 @@ def test_an_unbalance_pulls_outwards_with_the_square_of_the_speed() -> None:
     change = dict(the("unbalance", "rotor").changes)["v"]
     at = {"c_1": 0.5, "d_1": 2.0, "w": 3.0, "a": sympy.pi / 2}
     assert change.subs({each: at[each.name] for each in change.free_symbols}) == 18.0
+
+
+def test_what_a_trolley_does_to_a_pendulum_goes_with_the_cosine() -> None:
+    # Franklin, Powell and Emami-Naeini (1986): I θ'' + m g l sin θ = -m l x'' cos θ.
+    (_, rate) = the("lever arm", "pendulum on a trolley").model.equations
+    at = {"k": 0.0, "c": 0.0, "th": sympy.pi / 3, "w": 0.0, "a": 4.0, "c_1": 1.0}
+    assert rate.subs({each: at[each.name] for each in rate.free_symbols}) == -2.0
 
 
 def test_a_parameter_goes_with_an_input_in_proportion() -> None:
