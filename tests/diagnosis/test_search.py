@@ -106,7 +106,8 @@ def test_every_place_at_which_a_shape_was_looked_for_is_a_chance(decaying: Dynam
         searches=(Shape(frequencies=90), Shape(scale_of="x", at=(1.0, 2.0))), new=("c", "w")
     )
     alone = _correlated_probability(fit, data, once, gained=30.0)
-    assert _correlated_probability(fit, data, often, gained=30.0) == pytest.approx(180 * alone)
+    told_apart = 399 // 4  # frequencies, of 400 samples: more than the ninety at which it was looked for
+    assert _correlated_probability(fit, data, often, gained=30.0) == pytest.approx(2 * told_apart * alone)
 
 
 def test_an_amplitude_that_may_not_be_negative_is_zero_and_leaves_the_special_case(

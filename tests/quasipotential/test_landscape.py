@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import Verdict
 from siq.quasipotential.certificate import Certificate
-from siq.quasipotential.characteristics import potential_errors
+from siq.quasipotential.characteristics import _potential_errors
 from siq.quasipotential.formulas import read_model, write_model
 from siq.quasipotential.landscape import Landscape
 from siq.quasipotential.landscape_assembly import find_landscape
@@ -126,7 +126,7 @@ def test_errors_of_u_of_barriers_and_of_times_are_one_propagation() -> None:
         # U just below the saddle is as uncertain as the barrier is by f.
         well = landscape.potential(way.start)
         below = way.uphill[np.isfinite(well.known_values(way.uphill))]
-        of_f = 2 * potential_errors(landscape.field_estimate, well.gradients, well.attractor, below)
+        of_f = 2 * _potential_errors(landscape.field_estimate, well.gradients, well.attractor, below)
         assert of_f[np.isfinite(of_f)][-1] == pytest.approx(way.standard_error, rel=0.05)
         law = way.exit
         time = law.mean_exit_time(landscape.noise)
