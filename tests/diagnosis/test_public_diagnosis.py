@@ -114,12 +114,12 @@ def test_what_a_computer_writes_is_no_clock_offset() -> None:
         "parameters": {"K": {"value": 9.0}, "d": {"value": 3.0}},
         "equations": {"w": "K*u - d*w"},
     }
-    t, generator, tables = 0.02 * np.arange(400), np.random.default_rng(5), []
+    t, generator, tables = 0.02 * np.arange(150), np.random.default_rng(5), []
     for number, (slow, quick) in enumerate(generator.uniform((1, 5), (2, 9), (4, 2))):
-        u, w = np.sin(slow * t) + np.sin(quick * t), np.zeros(400)
-        for k in range(399):
+        u, w = np.sin(slow * t) + np.sin(quick * t), np.zeros(150)
+        for k in range(149):
             w[k + 1] = w[k] * np.exp(-3.1 * 0.02) + 9.5 / 3.1 * (1 - np.exp(-3.1 * 0.02)) * u[k]
-        w += 0.003 * generator.normal(size=400)
+        w += 0.003 * generator.normal(size=150)
         tables.append(pd.DataFrame({"recording": f"r{number}", "t": t, "w": w, "u": u}))
     found = siq.diagnose(card, pd.concat(tables))
     assert not found.verdict.mismatch and not found.mechanisms
