@@ -259,8 +259,9 @@ def path_of(
     some, longest = runs[:: -(-len(runs) // MOST_RUNS)], []  # how long visits to a place are remembered
     for one in smooth.T:
         bins = np.searchsorted(np.quantile(one, np.arange(0.1, 1.0, 0.1)), one)
-        times = [correlated_samples((bins == each).astype(float), some) for each in np.unique(bins)]
-        longest.append(max(relaxation, float(np.median(times))) if np.ptp(one) > 0 else relaxation)
+        visited = np.unique(bins) if np.ptp(one) > 0 else ()
+        times = [correlated_samples((bins == each).astype(float), some) for each in visited]
+        longest.append(max(relaxation, float(np.median(times or [0.0]))))
     spread_out = smooth + steps * (draw.random(values.shape) - 0.5)
     wells = _wells_of(spread_out, max(longest))
     if len(longest) == 1:

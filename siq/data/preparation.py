@@ -56,7 +56,7 @@ SMALL_STEP, FEWEST_SMALL = 0.2, 0.05  # of the median step; of steps, at least: 
 FEWEST_TOGETHER = 0.1  # a choice: of samples with a new value of any state, those with one of all
 COPIED = 12  # samples of a stretch that is sought a second time
 NEIGHBOURS, NEARBY = 3, 20  # samples on either side: of a cubic; of how well one fits there
-SMOOTH_AROUND = 8  # a choice: times as far off is an outlier as any neighbour is
+SMOOTH_AROUND = 8  # a choice: times as far off is an outlier as any neighbour; a kink at a sample is by five
 MOST_TOGETHER, MOST_ROUNDS = 2, 10  # outliers with values of their own; of taking samples for them
 PULSE = 0.1  # a choice: of the range of an input, up and down within two samples
 MOST_OUTLIERS = 0.05  # a choice: of all samples; what stands apart more often belongs to the system
@@ -315,12 +315,14 @@ def outliers(t: np.ndarray, x: np.ndarray, recording: np.ndarray, inputs: np.nda
         return np.where(end - first >= width, off, 0.0), around.max(axis=1), span
 
     # A cubic through every second sample shows whether a longer time makes it worse: not if it is noise.
-    worse = np.median(cubic(every[::2])[0][::2]) / positive(np.median(cubic(every)[0]))
+    off, around, span = cubic(every)
+    worse = np.median(cubic(every[::2])[0][::2]) / positive(np.median(off))
     power = np.clip(np.log2(positive(worse)), 0, 4)
     step, most = resolution_step(values) or 0.0, -special.ndtri(FALSE_FAULT_RATE / 2 / len(rows))
     for _ in range(MOST_ROUNDS):
         used = np.flatnonzero(~suspects)
-        off, around, span = cubic(used)
+        if suspects.any():
+            off, around, span = cubic(used)
         usual = np.maximum(ndimage.median_filter(off[used], 2 * NEARBY + 1), np.median(off[used]))
         usual = np.maximum(usual / special.ndtri(0.75), step)[np.minimum(np.cumsum(~suspects), len(used) - 1)]
         apart = off > SMOOTH_AROUND * around

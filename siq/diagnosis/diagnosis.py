@@ -302,12 +302,11 @@ def solve_case(
                 same = case.settings.search.same
                 likelier = recalibrate(with_expectations(held.system), held.learn, budget=budget)[0]
                 if likelier.log_likelihood > found.search.recalibrated.log_likelihood + same / 2:
-                    again = _judged(held, budget)
+                    again = other, _, stated = _judged(held, budget)
                     # A name fewer is worth what candidates that are not told apart may differ by.
-                    fewer = not again[2].verdict.mismatch or (
-                        0 < len(again[2].mechanisms) < len(statement.mechanisms)
-                    )
-                    if 2 * (found.final.log_likelihood - again[0].final.log_likelihood) < same * fewer:
+                    named = len(stated.mechanisms)
+                    fewer = not stated.verdict.mismatch or 0 < named < len(statement.mechanisms)
+                    if 2 * (found.final.log_likelihood - other.final.log_likelihood) < same * fewer:
                         case, (found, shown, statement) = held, again
         if statement.verdict.mismatch and not (statement.mechanisms or case.settings.varies):
             # Recordings may differ in a parameter. Where a function describes what is missing, that has to be

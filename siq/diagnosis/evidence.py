@@ -175,7 +175,8 @@ def _correlated_probability(
     parts = [white.recording == place for place in range(len(weights))]
     times = [correlation_time_of(left[rows], white.recording[rows], least=0.0) for rows in parts]
     together = float(np.average(times, weights=weights))
-    told = int(np.ptp(data.t) / np.median(data.step[data.begins]) / 4)  # frequencies that can be told apart
+    # Frequencies up to four samples a period, each a turn over all recordings from the next.
+    told = int(np.ptp(data.t) / np.median(data.step[data.begins]) / 4)
     places = [
         max(each.frequencies, told) if each.frequencies else len(each.at) for each in candidate.searches
     ]

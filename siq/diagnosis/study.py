@@ -136,7 +136,7 @@ class MismatchStudy(BaseModel):
     noise
         Standard deviation of the measurement noise by output, where it is known; by default it is estimated.
     without_outliers
-        Whether single samples of a smooth motion that stand apart from their neighbours are left out: the
+        Whether samples that stand apart from a smooth motion on either side, and drop-outs, are left out: the
         sensor made them. Turn it off where the system itself does something that lasts for one sample.
     varies
         Parameters that differ from recording to recording, such as a friction that the temperature changes.
@@ -241,33 +241,22 @@ class Comparison:
         return replace(self, system=system, learn=learn, kept=kept, settings=settings)
 
     def with_held_inputs(self) -> Comparison | None:
-        """The same where inputs are held between samples that nobody says anything of; None without such."""
-        inputs = self.system.inputs
-        held = [
-            each.interpolation is None and len(self.learn.courses[0][k].c) == 2
-            for k, each in enumerate(inputs)
-        ]
+        """The same with inputs held between samples where the card is silent; None where it never is."""
+        inputs, straight = self.system.inputs, [len(each.c) == 2 for each in self.learn.courses[0]]
+        held = [each.interpolation is None and line for each, line in zip(inputs, straight, strict=True)]
+        if not any(held):
+            return None
 
         def of(data: Measurements) -> Measurements:
             each = (zip(courses, held, strict=True) for courses in data.courses)
-            return replace(
-                data, courses=tuple(tuple(PPoly(c.c[-1:], c.x) if h else c for c, h in one) for one in each)
-            )
+            courses = (tuple(PPoly(c.c[-1:], c.x) if change else c for c, change in one) for one in each)
+            return replace(data, courses=tuple(courses))
 
-        named = (
-            replace(each, interpolation="zero_order") if h else each
-            for each, h in zip(inputs, held, strict=True)
-        )
-        system = replace(self.system, inputs=tuple(named))
-        remark = Remark(
-            "diagnosis.held_inputs", {"inputs": [e.name for e, h in zip(inputs, held, strict=True) if h]}
-        )
-        told = (*self.remarks, remark)
-        return (
-            replace(self, system=system, learn=of(self.learn), kept=of(self.kept), remarks=told)
-            if any(held)
-            else None
-        )
+        named = {each.name for each, change in zip(inputs, held, strict=True) if change}
+        inputs = tuple(replace(e, interpolation="zero_order") if e.name in named else e for e in inputs)
+        remarks = (*self.remarks, Remark("diagnosis.held_inputs", {"inputs": sorted(named)}))
+        system, learn, kept = replace(self.system, inputs=inputs), of(self.learn), of(self.kept)
+        return replace(self, system=system, learn=learn, kept=kept, remarks=remarks)
 
 
 def comparison_of(

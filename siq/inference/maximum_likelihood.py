@@ -296,9 +296,8 @@ class Fit:
     spread: np.ndarray | None  #: covariance of what it knows there, ``(n, d, d)``; None without process noise
     noise: Noise  #: estimates, or what was given
     linearisation: Linearisation  #: there, at the estimates
-    log_likelihood: (
-        float  #: not the restricted one, which depends on the units in which a model has its states
-    )
+    #: Not the restricted one, which depends on the units in which a model has its states.
+    log_likelihood: float
     #: Of the whitened innovations, and of what is expected of parameters; about as many where the model is
     #: right: measured values, and what is expected of several parameters together, less initial states and
     #: free parameters.

@@ -41,9 +41,8 @@ class Measurements:
     #: Variance of each output's noise where it is known, NaN where it is to be estimated, shape ``(m,)``;
     #: None where none is known.
     sensor_noise: np.ndarray | None = None
-    restarting: tuple[
-        int, ...
-    ] = ()  #: places of states that begin at zero with every interval, such as means
+    #: Places of states that begin at zero with every interval, such as a mean over an exposure.
+    restarting: tuple[int, ...] = ()
 
     @property
     def begins(self) -> np.ndarray:

@@ -307,9 +307,11 @@ def _meaning(name: str, entry: Mechanism | None, findings: Findings) -> str:
     """What a formula of a mechanism is; see `siq.diagnosis.mechanisms.MechanismCandidate.changes`."""
     words, forms = texts("tables")["formula_of"], () if entry is None else entry.forms
     measured = name in [output for output, _ in findings.before.outputs]
-    what = "replaced" if any(form.replace for form in forms) else "added"
-    what = what if name in findings.before.states else "new"
-    return str(words["measured" if measured and any(form.outputs for form in forms) else what]).format(name)
+    if measured and any(form.outputs for form in forms):
+        return str(words["measured"]).format(name)
+    if name not in findings.before.states:
+        return str(words["new"]).format(name)
+    return str(words["replaced" if any(form.replace for form in forms) else "added"]).format(name)
 
 
 def _typeset_text(text: str, model: Dynamics, further: Iterable[str] = ()) -> Markup | str:

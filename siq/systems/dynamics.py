@@ -334,8 +334,8 @@ class Dynamics:
     outputs
         What a recording measures, by the name of its column; by default the states.
     edges
-        Arguments of ``sign`` in f and the widths over which the jump is spread when f is evaluated, so that
-        an integrator can follow it: ``sign(e)`` is taken as ``tanh(e/w)``. The formulas keep the sign.
+        Arguments of ``sign`` and of roots in f and widths over which these are spread when f is evaluated, so
+        that an integrator can follow: ``sign(e)`` as ``tanh(e/w)``, ``e^a`` as ``e (e² + w²)^((a - 1)/2)``.
     parameters_of_noise
         Names of the parameters of a card that stand in D, where they count with the card's values.
     expected_together
