@@ -317,42 +317,30 @@ ANYWHERE = (0.5, 1.5)  # where formulas of a state without a domain are compared
 
 @dataclass(frozen=True)
 class Roles:
-    """Names by role.
+    """Names by role."""
 
-    Attributes
-    ----------
-    motions, angles
-        Pairs of position and velocity, ``x' = v``; and positions that are angles: in radians, or within a
-        sine or cosine of the equations.
-    speeds
-        Velocities, by their unit (m/s, rad/s), of which no position is followed.
-    amplitudes
-        Pairs of quadratures: but for a constant drive, the equations look the same from every angle, and turn
-        the state.
-    populations, feeding, contagion
-        States that stay zero once they are, and that do not only decay if they have a unit; pairs of prey and
-        predator, whose meetings make the one fewer and the other more; and those of them in which the one
-        becomes the other, and is not born.
-    levels, cascades
-        States whose own outflow goes with their square root; and pairs of which the first flows into the
-        second.
-    stores
-        All others that have a unit: a charge, a temperature, a concentration. Of a mere number nothing is
-        known that a mechanism could be written for.
-    states
-        All that are not mere derivatives; only in their equations can physics be missing.
-    """
-
+    #: Pairs of position and velocity, ``x' = v``; and positions that are angles: in radians, or within a sine
+    #: or cosine of the equations.
     motions: tuple[tuple[str, str], ...] = ()
     angles: tuple[str, ...] = ()
-    speeds: tuple[str, ...] = ()
+    speeds: tuple[str, ...] = ()  #: velocities, by their unit (m/s, rad/s), of which no position is followed
+    #: Pairs of quadratures: but for a constant drive, the equations look the same from every angle, and turn
+    #: the state.
     amplitudes: tuple[tuple[str, str], ...] = ()
+    #: States that stay zero once they are, and that do not only decay if they have a unit; pairs of prey and
+    #: predator, whose meetings make the one fewer and the other more; and those of them in which the one
+    #: becomes the other, and is not born.
     populations: tuple[str, ...] = ()
     feeding: tuple[tuple[str, str], ...] = ()
     contagion: tuple[tuple[str, str], ...] = ()
+    #: States whose own outflow goes with their square root; and pairs of which the first flows into the
+    #: second.
     levels: tuple[str, ...] = ()
     cascades: tuple[tuple[str, str], ...] = ()
+    #: All others that have a unit: a charge, a temperature, a concentration. Of a mere number nothing is
+    #: known that a mechanism could be written for.
     stores: tuple[str, ...] = ()
+    #: All that are not mere derivatives; only in their equations can physics be missing.
     states: tuple[str, ...] = ()
 
 

@@ -194,31 +194,18 @@ class UpperBound:
 
 @dataclass(frozen=True)
 class Location:
-    """Where a mismatch sits.
+    """Where a mismatch sits."""
 
-    Attributes
-    ----------
-    equations, outputs
-        Share of each equation in the excess, largest first; or what is measured otherwise, for a fault of a
-        sensor.
-    coordinate, unit
-        Along which it acts.
-    region
-        The part of the coordinate's range where it can be seen, by coordinate.
-    time
-        First and last time of it, where it acts along time only.
-    recordings, recordings_total
-        Labels of those that show it, and how many it was sought in.
-    """
-
-    equations: dict[str, float]
-    coordinate: str
+    equations: dict[str, float]  #: share of each in the excess, largest first; none for a fault of a sensor
+    coordinate: str  #: along which it acts
+    #: The part of the coordinate's range where it can be seen, by coordinate.
     region: dict[str, tuple[float, float]]
-    time: tuple[float, float] | None
+    time: tuple[float, float] | None  #: first and last time of it, where it acts along time only
+    #: Labels of those that show it, and how many it was sought in.
     recordings: tuple[str, ...]
     recordings_total: int = 0
-    outputs: tuple[str, ...] = ()
-    unit: str = "1"
+    outputs: tuple[str, ...] = ()  #: what is measured otherwise, for a fault of a sensor
+    unit: str = "1"  #: of the coordinate
 
 
 @dataclass(frozen=True)

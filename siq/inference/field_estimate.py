@@ -46,26 +46,16 @@ HARMLESS_BIAS = 0.5  # of a standard error: with such a bias an error bar holds 
 
 @dataclass(frozen=True)
 class NoiseFormula:
-    """εD(x) as a sum of terms, with errors.
+    """εD(x) as a sum of terms, with errors."""
 
-    Attributes
-    ----------
-    symbols
-        The d states.
-    places, terms
-        The entry (i, j), i ≤ j, of each coefficient, shape ``(p, 2)``; and its function of the states.
-    values, covariance
-        Shapes ``(p,)`` and ``(p, p)``, in the states' units squared per time.
-    probability
-        That a constant D shows as much by chance.
-    """
-
-    symbols: tuple[sympy.Symbol, ...]
+    symbols: tuple[sympy.Symbol, ...]  #: the d states
+    #: The entry (i, j), i ≤ j, of each coefficient, shape ``(p, 2)``; and its function of the states.
     places: np.ndarray
     terms: tuple[sympy.Expr, ...]
+    #: Shapes ``(p,)`` and ``(p, p)``, in the states' units squared per time.
     values: np.ndarray
     covariance: np.ndarray
-    probability: float
+    probability: float  #: that a constant D shows as much by chance
 
     def diffusion(self, intensity: float) -> Diffusion:
         """D, where ε is the intensity."""
@@ -195,59 +185,43 @@ class DiffusionSource(StrEnum):
 
 @dataclass(frozen=True)
 class NoiseDiagnosis:
-    """The noise in recordings about an estimated f.
+    """The noise in recordings about an estimated f."""
 
-    Attributes
-    ----------
-    kind
-        ``none``: only the integrator's error and rounding. ``process``: white process noise. ``sensor``:
-        measurement noise alone, which the estimate allows for. ``measurement``: measurement noise that it
-        does not allow for, so that neighbouring residuals are anticorrelated. ``rounding``: the same, and no
-        more than the values were rounded by when they were written. ``coloured``: residuals of neighbours are
-        correlated though all that is known is allowed for.
-    intensity, intensity_error
-        ε of ``√ε D^(1/2) dW``, and its standard error, None where it follows from the number of pairs.
-    covariance
-        Shape ``(d, d)``: the residuals' covariance per time over the intensity; D, if D is right.
-    correlation, correlation_score
-        Of neighbouring residuals, the strongest over the states; and in standard errors.
-    measurement, measurement_error
-        Shape ``(m,)``: standard deviation of each measured state's noise, zero where none is recognised; and
-        its standard error, None where it was not estimated with f.
-    pairs
-        Number of pairs of samples, or of so many independent ones.
-    diffusion
-        Where D is from.
-    exposure
-        The time over which each sample was taken as a mean; None where as the state itself.
-    lag, lost_time
-        Number of steps from which on the recordings are Markovian, None where they are from sample to sample;
-        and by how much their correlations delay what forces do (`siq.inference.regression.lost_time`).
-    sensor_evidence
-        Twice the log-likelihood ratio to the same terms without measurement noise, where that was estimated.
-    deviation, deviation_score
-        Largest entry of ``D^(-1/2) covariance D^(-1/2) - 1``, and the same in its standard errors.
-    rounding, rounding_bias, decimals
-        How the values were written, in words, None where that is not seen; the largest bias that it brings
-        into a coefficient of f, in its standard errors; and how many decimals would leave no trace.
-    """
-
+    #: ``none``: only the integrator's error and rounding. ``process``: white process noise. ``sensor``:
+    #: measurement noise alone, which the estimate allows for. ``measurement``: measurement noise that it does
+    #: not allow for, so that neighbouring residuals are anticorrelated. ``rounding``: the same, and no more
+    #: than the values were rounded by when they were written. ``coloured``: residuals of neighbours are
+    #: correlated though all that is known is allowed for.
     kind: NoiseKind
-    intensity: float
+    intensity: float  #: ε of ``√ε D^(1/2) dW``
+    #: Shape ``(d, d)``: the residuals' covariance per time over the intensity; D, if D is right.
     covariance: np.ndarray
+    #: Of neighbouring residuals, the strongest over the states; and in standard errors.
     correlation: float
     correlation_score: float
+    #: Shape ``(m,)``: standard deviation of each measured state's noise, zero where none is recognised; and
+    #: its standard error, None where it was not estimated with f.
     measurement: np.ndarray
     measurement_error: np.ndarray | None = None
-    intensity_error: float | None = None
-    pairs: int = 0
-    diffusion: DiffusionSource = DiffusionSource.GIVEN
+    intensity_error: float | None = None  #: of ε; None where it follows from the number of pairs
+    pairs: int = 0  #: number of pairs of samples, or of so many independent ones
+    diffusion: DiffusionSource = DiffusionSource.GIVEN  #: where D is from
+    #: The time over which each sample was taken as a mean; None where as the state itself.
     exposure: float | None = None
+    #: Standard deviation, correlation time and its standard error of what a sensor adds to its white noise;
+    #: None where that is nothing.
+    slow_sensor: tuple[float, float, float] | None = None
+    #: Number of steps from which on the recordings are Markovian, None where they are from sample to sample;
+    #: and by how much their correlations delay what forces do (`siq.inference.regression.lost_time`).
     lag: int | None = None
     lost_time: float = 0.0
+    #: Twice the log-likelihood ratio to the same terms without measurement noise, where that was estimated.
     sensor_evidence: float | None = None
+    #: Largest entry of ``D^(-1/2) covariance D^(-1/2) - 1``, and the same in its standard errors.
     deviation: float = 0.0
     deviation_score: float = 0.0
+    #: How the values were written, in words, None where that is not seen; the largest bias that it brings
+    #: into a coefficient of f, in its standard errors; and how many decimals would leave no trace.
     rounding: str | None = None
     rounding_bias: float = 0.0
     decimals: int = 0
@@ -301,6 +275,8 @@ class NoiseDiagnosis:
             known[name] = np.array(known[name], dtype=float)
         if "measurement_error" in known:
             known["measurement_error"][np.isnan(known["measurement_error"])] = np.inf
+        if "slow_sensor" in known:
+            known["slow_sensor"] = tuple(known["slow_sensor"])
         known["diffusion"] = DiffusionSource(known["diffusion"])
         known["remarks"] = tuple(map(Remark.from_data, known["remarks"]))
         return cls(**known)
@@ -409,7 +385,7 @@ class FieldEstimate:
         noise = self.diagnosis
         if noise is None or noise.kind not in ("process", "sensor") or not (noise.measurement > 0).any():
             return None
-        return noise.measurement**2
+        return noise.measurement**2 + (0.0 if noise.slow_sensor is None else noise.slow_sensor[0] ** 2)
 
     @property
     def hidden_states(self) -> bool:
@@ -427,6 +403,11 @@ class FieldEstimate:
     def exposure(self) -> float | None:
         """The time over which each sample was taken as a mean; None where as the state itself."""
         return None if self.diagnosis is None else self.diagnosis.exposure
+
+    @property
+    def slow_sensor(self) -> tuple[float, float, float] | None:
+        """Size, correlation time and its error of slow measurement noise; None where there is none."""
+        return None if self.diagnosis is None else self.diagnosis.slow_sensor
 
     @property
     def noise_strength(self) -> tuple[float, float] | None:

@@ -25,6 +25,7 @@ import scipy.special
 from siq.data.correlation import MarkovLag, markov_lag
 from siq.data.preparation import joined, repetitions, turns_back
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
+from siq.data.stationarity import usual_step
 from siq.errors import NumericalFailure
 from siq.inference.checks import (
     STATE_BINS,
@@ -147,8 +148,9 @@ def identify(
                     return by_velocities
                 reason = "; ".join(one for one in (found.prediction.reason, advice) if one)
                 found = replace(found, prediction=replace(found.prediction, passed=False, reason=reason))
-        by_force = None if hidden else case.with_slow_force(found)
-        return by_force or (found if hidden else case.with_parts(found))
+        asked = not hidden and len(names) == 1 and not case.complete(found)
+        by_slow_noise = case.with_slow_noise() if asked else None
+        return by_slow_noise or (found if hidden else case.with_parts(found))
     except (NumericalFailure, np.linalg.LinAlgError) as error:
         reason, claim = (str(error), error.claim) if isinstance(error, NumericalFailure) else (SINGULAR, "")
         rounding = rounding_text(recordings, coarse=True)
@@ -163,8 +165,9 @@ def identify(
         advice = case.advice(hidden=hidden)
         if not hidden and advice is not None and (by_velocities := case.with_velocities()) is not None:
             return by_velocities
-        if not hidden and not claim and (by_force := case.with_slow_force()) is not None:
-            return by_force
+        untried = not hidden and not claim and markov_lag(joined(recordings)).remembers
+        if untried and (by_slow_noise := case.with_slow_noise()) is not None:
+            return by_slow_noise
         raise NumericalFailure(reason if advice is None else f"{reason}; {advice}", claim=claim) from error
 
 
@@ -235,7 +238,8 @@ class _Case:
                 odds = again.diagnosis.sensor_evidence + sensors * np.log(8 * np.pi / count)
                 noisy = float(scipy.special.expit(odds / 2))
                 if noisy > 0.5:
-                    return self.finished(again).with_rival(found, 1 - noisy)
+                    slow = self.with_slow_noise(of_sensor=True)
+                    return slow or self.finished(again).with_rival(found, 1 - noisy)
             except (NumericalFailure, np.linalg.LinAlgError) as error:
                 fault = fault or str(error)
             else:  # a fault of the pairs is none of the sensor
@@ -246,6 +250,8 @@ class _Case:
         reason, claim = f"the sensor is noisy, and f with it is not found: {fault}", "gaussian_increments"
         tests = check_claims(found, self.recordings, self.recordings, false_alarms=self.limits.each)
         if claim not in tests or tests[claim].passed:  # of what shows no noise there are no claims
+            if (slow := self.with_slow_noise()) is not None:
+                return slow
             raise NumericalFailure(reason)
         raise NumericalFailure(f"{tests[claim].reason}; {reason}", claim=claim)
 
@@ -309,6 +315,10 @@ class _Case:
                 every = ObservationModel.of(first).every(self.recordings)
                 values = {"exposure": noise.exposure, "unit": self.recordings.time_unit or "", "every": every}
                 remarks.append(Remark("inference.exposure", values))
+            if first.slow_sensor is not None:
+                values = dict(zip(("size", "time", "error"), first.slow_sensor, strict=True))
+                values |= {"state": self.recordings.titles[0], "unit": self.recordings.time_unit or ""}
+                remarks = [Remark("inference.slow_sensor", values)]
             if first.noise is not None and self.given is not None and self.given.constant:
                 remarks.append(Remark("inference.noise_depends_on_state"))
         noise = replace(noise, diffusion=source, pairs=pairs, remarks=tuple(remarks))
@@ -462,33 +472,29 @@ class _Case:
             return None
         return found if found.prediction is not None and found.prediction.passed else None
 
-    def with_slow_force(self, alone: FieldEstimate | None = None) -> FieldEstimate | None:
-        """f with a slow force on the one recorded state; None where none is needed, or it does not do.
+    def with_slow_noise(self, *, of_sensor: bool = False) -> FieldEstimate | None:
+        """f with slow noise about the one recorded state; None where that does not do.
 
-        It is tried where f `alone` fails its test or is refuted by the past, or is not there. It has to
-        take that away, and to foresee recordings held out better than f alone. First it has noise alone, then
-        it follows the state.
+        The sensor has it, or it is a force, which has noise alone or else follows the state. What gains most
+        over white measurement noise is tested first; it has to be worth its parameters, to pass the test of
+        f, and the past may tell nothing more.
         """
-        if self.options.hidden_velocities != "auto" or self.given is not None or self.integrator_step:
-            return None
-        if len(self.recordings.names) != 1 or (alone is not None and alone.noise_free):
-            return None
-        if alone is None:
-            if not markov_lag(joined(self.recordings)).remembers:
-                return None
-        elif alone.prediction is not None and alone.prediction.passed and self._forgets(alone):
+        free = self.options.hidden_velocities == "auto" and self.given is None and not self.integrator_step
+        if not free or len(self.recordings.names) != 1:
             return None
         names = (*self.recordings.names, f"force_{self.recordings.names[0]}")
-        library = field_library(names, self.options)
-        view = ObservationModel(library, Diffusion.identity(2), hidden=True, slow_force=1.0)
-        for follows in (False, True):
+        library, begin = field_library(names, self.options), usual_step(self.recordings)
+        sensor = ObservationModel(self.library, Diffusion.identity(1), sensor_time=begin)
+        force = ObservationModel(library, Diffusion.identity(2), hidden=True, slow_force=1.0)
+        tried = list[tuple[float, FieldEstimate]]()
+        for view in (sensor,) if of_sensor else (sensor, force, replace(force, follows=True)):
             with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
-                found = self.finished(self.by_likelihood(replace(view, follows=follows)))
-                assert found.prediction is not None
-                gain = ObservationModel.of(found).gain(
-                    found, self.training, self.held_out, pair_step=self.pair_step
-                )
-                if gain > 0 and found.prediction.passed and self._forgets(found):
+                found = self.by_likelihood(view)
+                gain = ObservationModel.of(found).gain(found, self.recordings, pair_step=self.pair_step)
+                tried.append((gain, found))
+        for gain, found in sorted(tried, key=lambda one: -one[0]):
+            with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
+                if gain > 0 and self.complete(found := self.finished(found)):
                     return found
         return None
 
@@ -515,8 +521,15 @@ class _Case:
             return self.recordings
         return filtered_recordings(found, self.recordings, pair_step=self.pair_step)
 
-    def _forgets(self, found: FieldEstimate) -> bool:
-        """Whether the past tells nothing more of the next sample than the state does."""
+    def complete(self, found: FieldEstimate) -> bool:
+        """Whether f passed its test, and the past tells nothing more of the next sample than the state does.
+
+        Of what shows no noise nobody asks.
+        """
+        if found.noise_free:
+            return True
+        if found.prediction is None or not found.prediction.passed:
+            return False
         states, limit = self._states(found), self.limits.each
         claims = check_claims(found, states, self.recordings, pair_step=self.pair_step, false_alarms=limit)
         return "state_complete" not in claims or claims["state_complete"].passed

@@ -34,6 +34,7 @@ from siq.systems.dynamics import Dynamics, Input, ParametricFunctions, Signals, 
 INTERVALS = 1 << 14  # numerical: carried together, since their derivatives at three places are much to keep
 MAX_SUBSTEPS = 16
 INSIDE = 1e-9  # share of a substep by which its ends lie inside, where an input jumps between samples
+SLOWEST = 1e-2  # of what is stationary: its rate times all the time that is recorded
 RANK = 1e-9  # numerical: singular values below this share of the largest are rounding
 
 
@@ -157,6 +158,7 @@ class Linearisation:
     measured: np.ndarray
     measured_response: np.ndarray
     residual: np.ndarray
+    stationary: tuple[int, ...] = ()  #: places of states, see `siq.inference.measurements.Measurements`
 
     @property
     def finite(self) -> bool:
@@ -166,7 +168,8 @@ class Linearisation:
 
     def at_rows(self, rows: np.ndarray | slice) -> Linearisation:
         """That of some of the samples."""
-        return Linearisation(*(getattr(self, each.name)[rows] for each in fields(self)))
+        arrays = [each.name for each in fields(self) if each.name != "stationary"]
+        return replace(self, **{name: getattr(self, name)[rows] for name in arrays})
 
     def filtered(
         self,
@@ -182,11 +185,18 @@ class Linearisation:
     ) -> tuple[Any, ...]:
         """Innovations of the filter along it; see `siq.inference.filter_kernels.filter_recursion`.
 
-        By default recordings begin at zero without a covariance; with functions and places of the process
-        noise the likelihood is derived by it.
+        By default recordings begin at zero without a covariance, but for what is stationary; with functions
+        and places of the process noise the likelihood is derived by it.
         """
-        d = self.gap.shape[1]
-        return filter_recursion(
+        d, known = self.gap.shape[1], list(self.stationary)
+        if begin_covariance is None and known:
+            # dz = -z/τ dt + √q dW has the variance qτ/2: so recordings begin, and no state is to be found.
+            row = int(np.argmax(step > 0))
+            kept_share = np.clip(self.transition[row].diagonal()[known], 1e-300, 1.0)
+            decay = np.maximum(-np.log(kept_share) / step[row], SLOWEST / step.sum())
+            begin_covariance = np.zeros((d, d))
+            begin_covariance[known, known] = noise.intensity[0].diagonal()[known] / (2 * decay)
+        found = filter_recursion(
             first, self.transition, self.response, self.gap, self.measured,
             np.ascontiguousarray(self.measured_response),  # each order has machine code of its own
             self.residual, noise.measurement, step, noise.intensity,
@@ -195,6 +205,8 @@ class Linearisation:
             np.zeros((0, 0)) if functions is None else functions,
             np.zeros((0, 3), dtype=np.int64) if places is None else places, places is not None, kept,
         )  # fmt: skip
+        found[0][:, :, [1 + self.response.shape[2] + place for place in known]] = 0.0
+        return found
 
     def smoothed(
         self, first: np.ndarray, step: np.ndarray, noise: Noise, begin: np.ndarray
@@ -225,7 +237,7 @@ class Linearisation:
         """The linearisation after a change of the parameters, which are then no longer free."""
         gap, residual = self.gap + self.response @ change, self.residual - self.measured_response @ change
         none, unseen = np.zeros((*gap.shape, 0)), np.zeros((*residual.shape, 0))
-        return Linearisation(self.transition, none, gap, self.measured, unseen, residual)
+        return replace(self, response=none, gap=gap, measured_response=unseen, residual=residual)
 
 
 def integrate_intervals(model: Dynamics, grid: Grid, values: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -288,13 +300,13 @@ def linearise(
         with np.errstate(invalid="ignore"):
             gap[at] = ends.T - x[at + 1]
     residual = data.outputs - np.where(np.isfinite(simulated), simulated, np.inf)
-    found = Linearisation(transition, response, gap, measured, answered, residual)
+    found = Linearisation(transition, response, gap, measured, answered, residual, data.stationary)
     if noise is None or not answered.any():
         return found
     places = list(without)
     effect = response[:, :, places] @ values[[model.free[place] for place in places]]
-    still = Linearisation(
-        transition, response[:, :, :0], gap - effect, measured, answered[:, :, :0], residual
+    still = replace(
+        found, response=response[:, :, :0], gap=gap - effect, measured_response=answered[:, :, :0]
     )
     *_, before, after, _, _, gains, variances = still.filtered(data.first, data.step, noise, kept=True)
     foreseen, known = (slopes(samples + deviation.T)[1] for deviation in (before, after))
@@ -398,22 +410,15 @@ def _mean_intensity(noise: Diffusion, x: np.ndarray, spread: np.ndarray, step: n
 
 @dataclass(frozen=True)
 class Noise:
-    """Variances of the two kinds of noise.
+    """Variances of the two kinds of noise."""
 
-    Attributes
-    ----------
-    measurement, process
-        R per sample, shape ``(m,)``; and Q per time, shape ``(d,)``, zero where nothing drives the state.
-    shape
-        Of the process noise, where its components are not independent and of constant strength:
-        ``(1, d, d)``, or ``(n, d, d)`` for one at each sample. The intensity is then ``√Q_i shape_ij √Q_j``.
-    field
-        εD(x), whose mean at each sample is the shape; a fit keeps the shape up with it.
-    """
-
+    #: R per sample, shape ``(m,)``; and Q per time, shape ``(d,)``, zero where nothing drives the state.
     measurement: np.ndarray
     process: np.ndarray
+    #: Of the process noise, where its components are not independent and of constant strength: ``(1, d, d)``,
+    #: or ``(n, d, d)`` for one at each sample. The intensity is then ``√Q_i shape_ij √Q_j``.
     shape: np.ndarray | None = None
+    #: εD(x), whose mean at each sample is the shape; a fit keeps the shape up with it.
     field: Diffusion | None = None
 
     @classmethod
@@ -491,22 +496,15 @@ def profile_likelihood(total: float, freedom: int, log_determinant: float) -> fl
 
 @dataclass(frozen=True)
 class Whitened:
-    """Innovations in units of their standard deviation, initial states projected out.
+    """Innovations in units of their standard deviation, initial states projected out."""
 
-    Attributes
-    ----------
-    innovations, columns
-        Shape ``(n·m,)``; and what a unit of each parameter explains of them, shape ``(n·m, p)``.
-    recording, known
-        The recording of each, and which of them were measured, shape ``(n·m,)``.
-    degrees_of_freedom, log_determinant
-        Measured values less initial states; and of the innovations' covariance.
-    """
-
+    #: Shape ``(n·m,)``; and what a unit of each parameter explains of them, shape ``(n·m, p)``.
     innovations: np.ndarray
     columns: np.ndarray
+    #: The recording of each, and which of them were measured, shape ``(n·m,)``.
     recording: np.ndarray
     known: np.ndarray
+    #: Measured values less initial states; and of the innovations' covariance.
     degrees_of_freedom: int
     log_determinant: float
 

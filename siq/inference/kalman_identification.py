@@ -54,6 +54,7 @@ SENSOR_BEGIN = 1e-3  # of what a sample moves by, squared
 NO_SENSOR_NOISE = 1e-6  # of a sensor's variance: as good as none
 MAX_NUMBERS = 4e8  # of the derivatives by all coefficients at all samples: 3 GB
 SHORTEST_FORCE, LONGEST_FORCE = 4, 1 / 30  # steps; of a record: correlation times that a search begins with
+SHORTEST_NOISE = 1  # step: the same of a sensor, whose noise is as good as white below it
 
 
 def identify_by_likelihood(
@@ -95,21 +96,34 @@ def identify_by_likelihood(
             f"{len(everything)} coefficients and {len(data.t)} samples with measurement noise are too much"
             " for the memory; lower identification.degree, or name the functions of f"
         )
-    begins = []
-    if observation.slow_force:
-        begins = _forced(observation, data)
+    begins, slow = [], observation.sensor_time is not None
+    if observation.slow_force or slow:
+        begins = _of_slow_noise(observation, data)
     elif hidden:
         x, noise = smoothed_motion(data, library.states[: d // 2])
         if not noise.process.any():
             raise NumericalFailure("no force is seen: the positions move evenly; record longer")
-        begins = [(np.zeros(len(everything)), x, noise)]
+        begins = [(observation, np.zeros(len(everything)), x, noise)]
     else:
         assert noise is not None
         noise = observation.noise(replace(noise, shape=np.eye(d)[None]))
-        begins = [(np.zeros(len(everything)), observation.states(data), noise)]
-    wholes = [_fit_library(observation.model(everything, one), data, x, noise) for one, x, noise in begins]
-    whole = max(wholes, key=lambda one: one.log_likelihood)
-    likelihood = None if hidden else InnovationLikelihood(library, whole, data)
+        begins = [(observation, np.zeros(len(everything)), observation.states(data), noise)]
+    wholes, faults = list[Fit](), list[NumericalFailure]()
+    for view, one, x, noise in begins:
+        try:
+            wholes.append(_fit_library(view.model(everything, one), data, x, noise))
+        except NumericalFailure as error:
+            faults.append(error)
+    if not wholes:
+        raise faults[0]
+    whole = max(wholes, key=lambda one: one.restricted_likelihood(data))
+    if slow:  # the state is hidden by what has a memory, and steps are small
+        x, values = whole.linearised_at, whole.model.values
+        observation = _with_time_of(whole, observation)
+        model = observation.model(everything, values[: len(everything)])
+        whole = _fit_library(model, data, x, whole.noise, rounds=4 * LIBRARY_ROUNDS)
+        observation = _with_time_of(whole, observation)
+    likelihood = None if hidden or slow else InnovationLikelihood(library, whole, data)
     chance = 1.0 if likelihood is None else likelihood.constant_probability()
     by_state = chance < false_terms and bool(whole.noise.process.any())
     if likelihood is not None and by_state:
@@ -123,10 +137,11 @@ def identify_by_likelihood(
     critical = -ndtri(each * min(false_terms, 0.5) / (2 * each.sum()))
     white = whiten(whole.linearisation, data, whole.noise)
     last = white.solve()[0] if whole.converged else 0.0
-    goal = white.innovations + white.columns @ (whole.model.values - last)
+    columns, known = white.columns[:, : len(everything)], (whole.model.values - last)[: len(everything)]
+    goal = white.innovations + columns @ known
     # Whitened values stand one behind the other, all outputs of a sample together.
     blocks = np.repeat(blocks_of(parent_recordings(data.labels)[data.recording]), data.outputs.shape[1])
-    parts = triangles(white.columns, goal, blocks)
+    parts = triangles(columns, goal, blocks)
 
     def problem_of(triangle: np.ndarray) -> LinearProblem:
         return LinearProblem(triangle[:, :-1], triangle[:, -1], 1.0, critical, everything)
@@ -135,12 +150,15 @@ def identify_by_likelihood(
     support, fit = chosen_terms([problem], library), whole
 
     def fit_terms(support: np.ndarray) -> tuple[Fit, np.ndarray]:
-        nonlocal fit
+        nonlocal fit, observation
         places = problem.places(support)
         # Where functions are nearly alike, those that stay take over what the others did: all begin anew.
         values = problem.solve(places)[places]
         fit = observation.fitted(support, values, data, noise=fit.noise, x=fit.linearised_at)
-        return fit, np.abs(fit.model.values) / fit.standard_errors / critical[places]
+        if slow:
+            observation = _with_time_of(fit, observation)
+        scores = np.abs(fit.model.values) / fit.standard_errors
+        return fit, scores[: len(places)] / critical[places]
 
     fit, support = fit_significant(fit_terms, support)
     if by_state:
@@ -150,6 +168,9 @@ def identify_by_likelihood(
             raise NumericalFailure("the slow force is all the noise that there is, or grows")
         if hidden:  # the search for intensities ends at the least that it tries; of ring-downs there are none
             fit = drop_insignificant_process_noise(fit, data) or fit
+        elif slow:
+            if not fit.noise.process.all():
+                raise NumericalFailure("slow measurement noise is all the noise that there is")
         else:
             strict = fit_by_filter(
                 fit.model, data, x=fit.x, noise=fit.noise.without_process(), estimate_process=False,
@@ -169,26 +190,43 @@ def identify_by_likelihood(
     return replace(found, alternatives=average, stability=shares)
 
 
-def _forced(observation: ObservationModel, data: Measurements) -> list[tuple[np.ndarray, np.ndarray, Noise]]:
-    """Coefficients ``(p,)``, states and noise to begin with, for some correlation times of a slow force.
+def _with_time_of(fit: Fit, observation: ObservationModel) -> ObservationModel:
+    """The observation with the correlation time of the sensor's slow noise that a fit found."""
+    rate = float(fit.model.values[-1])
+    if not rate > 0:
+        raise NumericalFailure("slow measurement noise grows")
+    return replace(observation, sensor_time=1 / rate)
 
-    The likelihood has a maximum where the force is white noise, and others. To begin with it moves the state
-    as much within its correlation time as the white noise does.
+
+def _of_slow_noise(
+    observation: ObservationModel, data: Measurements
+) -> list[tuple[ObservationModel, np.ndarray, np.ndarray, Noise]]:
+    """Observation, coefficients ``(p,)``, states and noise to begin with, for some correlation times.
+
+    The likelihood has a maximum where a slow force is white noise, and others. To begin with it moves the
+    state as much within its correlation time as the white noise does; slow measurement noise moves what is
+    measured as much as the state does.
     """
     moved, step = moved_by(data)
     rate, x = moved[0] / step, observation.states(data)
     longest = len(data.t) / len(data.labels) * len(np.unique(parent_recordings(data.labels))) * LONGEST_FORCE
-    count = max(int(np.log2(max(longest / SHORTEST_FORCE, 1.0)) / 2) + 1, 1)
+    shortest = SHORTEST_FORCE if observation.slow_force else SHORTEST_NOISE
+    count = max(int(np.log2(max(longest / shortest, 1.0)) / 2) + 1, 1)
     found = []
-    for time in SHORTEST_FORCE * step * 4.0 ** np.arange(count):
-        values = np.zeros(len(observation.everything))
-        values[-1] = -1 / time
-        found.append((values, x, Noise(SENSOR_BEGIN * moved, np.array([rate, rate / time**2]))))
+    for time in shortest * step * 4.0 ** np.arange(count):
+        values, view = np.zeros(len(observation.everything)), observation
+        if observation.slow_force:
+            values[-1], process = -1 / time, np.array([rate, rate / time**2])
+        else:
+            view, process = replace(observation, sensor_time=time), np.array([rate, rate]) / 2
+        found.append((view, values, x, Noise(SENSOR_BEGIN * moved, process)))
     return found
 
 
-def _fit_library(model: Dynamics, data: Measurements, x: np.ndarray, noise: Noise) -> Fit:
-    fit = fit_by_filter(model, data, x=x, noise=noise, iterations=LIBRARY_ROUNDS, closure=False)
+def _fit_library(
+    model: Dynamics, data: Measurements, x: np.ndarray, noise: Noise, *, rounds: int = LIBRARY_ROUNDS
+) -> Fit:
+    fit = fit_by_filter(model, data, x=x, noise=noise, iterations=rounds, closure=False)
     if fit.fault:
         raise NumericalFailure(f"the likelihood of the recordings cannot be worked out: {fit.fault}")
     return fit
@@ -210,9 +248,13 @@ def _estimate(
     rate = (intensity[0] if len(intensity) == 1 else intensity[data.begins].mean(axis=0))[:d, :d]
     moved, step = moved_by(data)
     strength, evidence, driven = 0.0, None, slice(observation.hidden_states, d)
-    values, known = fit.model.values, observation.definitions
+    values, known = fit.model.values[: len(support)], observation.definitions
     whole, held = np.zeros((len(known) + len(support),) * 2), np.ones(len(known))
-    whole[len(known) :, len(known) :] = covariance
+    whole[len(known) :, len(known) :] = covariance[: len(support), : len(support)]
+    slow_sensor = None
+    if observation.sensor_time is not None:
+        slow, size = 1 / fit.model.values[-1], float(np.sqrt(intensity[0][-1, -1] / fit.model.values[-1] / 2))
+        slow_sensor = (size, float(slow), float(np.sqrt(covariance[-1, -1]) * slow**2))
     if observation.hidden:
         # The part of D that acts on velocities has the determinant 1.
         force, matrix = rate[driven, driven], np.zeros((d, d))
@@ -254,7 +296,7 @@ def _estimate(
         "process" if rate.any() else "sensor", strength, rate / strength if strength else unit, correlation,
         score, deviation, deviation * sensor_error / 2,
         intensity_error=error if np.isfinite(error) else None, exposure=observation.exposure,
-        sensor_evidence=evidence,
+        slow_sensor=slow_sensor, sensor_evidence=evidence,
     )  # fmt: skip
     if diagnosis.correlated:
         diagnosis = replace(diagnosis, kind="coloured")
@@ -329,9 +371,11 @@ def held_out_innovations(
     follow = observation.followed(other, fit.model, noise=fit.noise, substeps=fit.substeps)
     everything = observation.everything
     values = np.zeros(len(everything))
-    values[[everything.tolist().index(one) for one in support.tolist()]] = fit.model.values
+    values[[everything.tolist().index(one) for one in support.tolist()]] = fit.model.values[: len(support)]
+    if observation.sensor_time is not None:
+        observation = _with_time_of(fit, observation)
     whole = observation.model(everything, values)
-    along = linearise(whole, Grid(other, fit.substeps), values, follow.linearised_at)
+    along = linearise(whole, Grid(other, fit.substeps), whole.values, follow.linearised_at)
     # The innovations are those of the filter itself; the library's columns are along the same states.
     white = whiten(replace(along, gap=follow.linearisation.gap), other, follow.noise)
     if white.degrees_of_freedom <= white.columns.shape[1]:

@@ -312,6 +312,13 @@ class Fit:
         """Of the free parameters, shape ``(p,)``."""
         return np.sqrt(np.diag(self.covariance))
 
+    def restricted_likelihood(self, data: Measurements) -> float:
+        """The log-likelihood in which it counts, too, how well initial states are known, in their units.
+
+        It compares models in which as many of them are unknown.
+        """
+        return self.linearisation.log_likelihood(data.first, data.step, self.noise)
+
     @property
     def error_of(self) -> dict[str, float]:
         """Standard error of every free parameter, by name."""
@@ -464,6 +471,8 @@ class _Shooting:
             begin[place] = solve(part[:, 1:], part[:, 0], least=INEXACT)[0]
         smoothed, known, covariance = still.smoothed(data.first, data.step, noise, begin)
         deviation = known if self.filtered else smoothed
+        for place in data.stationary:  # their mean where a recording begins
+            deviation[data.first[:-1], place] = 0.0
         spread = covariance if noise.process.any() else None
         rows, scale = self.grid.rows, self.scale
         moved = np.einsum("kij,kj->ki", here.transition[rows], deviation[rows])

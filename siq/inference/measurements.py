@@ -43,6 +43,8 @@ class Measurements:
     sensor_noise: np.ndarray | None = None
     #: Places of states that begin at zero with every interval, such as a mean over an exposure.
     restarting: tuple[int, ...] = ()
+    #: Places of states that nothing but noise moves, and each recording finds as spread as noise leaves them.
+    stationary: tuple[int, ...] = ()
 
     @property
     def begins(self) -> np.ndarray:

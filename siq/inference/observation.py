@@ -19,6 +19,9 @@ Or one state was recorded and a slow force z on it was not, which may follow it,
 
     dx = (f(x) + z) dt + noise,    dz = (-z/τ + b x) dt + noise.
 
+Or the sensor's own noise is slow: what is measured is ``x + z``, where z pushes nothing and forgets,
+``dz = -z/τ dt + noise``.
+
 Whether a recorded position has inertia, so that it alone is not the state, is asked of two models with the
 same functions F and measurement noise of their own:
 
@@ -121,7 +124,8 @@ class ObservationModel:
 
     A sample may be a mean over an exposure. Where velocities are hidden they are the second half of the
     states, and samples show nothing of them. What is hidden may be a slow force instead, which is added to
-    ``dx/dt`` times a factor that is known, `slow_force`; it may follow the state, or has noise alone.
+    ``dx/dt`` times a factor that is known, `slow_force`; it may follow the state, or has noise alone. Or the
+    sensor adds noise with a correlation time of its own, `sensor_time`, whose rate is the last parameter.
     """
 
     library: CandidateLibrary
@@ -130,13 +134,15 @@ class ObservationModel:
     hidden: bool = False
     slow_force: float = 0.0
     follows: bool = False
+    sensor_time: float | None = None
 
     @classmethod
     def of(cls, found: FieldEstimate) -> ObservationModel:
         """The one that an estimate was made with."""
         library, slow = found.library, found.slow_force
         follows = bool(slow) and found.coefficients[library.terms.index(library.symbols[0]), 1] != 0
-        return cls(library, found.diffusion, found.exposure, found.hidden_states, slow, follows)
+        time = None if found.slow_sensor is None else found.slow_sensor[1]
+        return cls(library, found.diffusion, found.exposure, found.hidden_states, slow, follows, time)
 
     @property
     def hidden_states(self) -> int:
@@ -174,6 +180,13 @@ class ObservationModel:
             return replace(plain, equations=forced, outputs=plain.outputs[:1])
         if self.hidden:
             return _seen_positions(plain)
+        if self.sensor_time is not None:
+            (name, x), z = plain.outputs[0], symbol(slow := f"_noise_{plain.states[0]}")
+            rate = Parameter(f"_rate{slow}", 1 / self.sensor_time)
+            return Dynamics(
+                (*plain.states, slow), (*plain.equations, -symbol(rate.name) * z), Diffusion.identity(2),
+                parameters=(*plain.parameters, rate), outputs=((name, x + z),),
+            )  # fmt: skip
         if self.exposure is None:
             return plain
         # The states, and their running means, which are what is measured.
@@ -190,6 +203,8 @@ class ObservationModel:
         measured value stands there.
         """
         data = unbroken(recordings, pair_step=pair_step, every=self.every(recordings))
+        if self.sensor_time is not None or (self.slow_force and not self.follows):
+            return replace(data, stationary=(1,))
         if self.exposure is None:
             return data
         d = self.library.dimension
@@ -222,13 +237,16 @@ class ObservationModel:
         """Both noises of an estimate, as they are in the model."""
         assert found.diagnosis is not None
         sensor, rate = found.diagnosis.measurement**2, found.noise_rate
+        if found.slow_sensor is not None:
+            size, time, _ = found.slow_sensor
+            return Noise(sensor, np.append(np.diag(rate), 2 * size**2 / time))
         if found.noise is not None:
             return self.noise(Noise(sensor, np.ones(len(rate)), field=found.noise.diffusion(1.0)))
         return self.noise(Noise.of_rate(sensor, rate))
 
     def states(self, data: Measurements) -> np.ndarray:
         """States of the model to begin with, as they are measured next."""
-        if self.slow_force:
+        if self.slow_force or self.sensor_time is not None:
             return np.column_stack([data.outputs, np.zeros(len(data.t))])
         if self.hidden:
             return smoothed_motion(data, self.library.states[: self.hidden_states])[0]
@@ -258,29 +276,33 @@ class ObservationModel:
             substeps=substeps,
         )  # fmt: skip
 
-    def gain(
-        self, found: FieldEstimate, training: Recordings, unseen: Recordings, *, pair_step: float | None
-    ) -> float:
-        """Log-likelihood of unseen recordings with a slow force, over that without, both fitted to others.
+    def gain(self, found: FieldEstimate, recordings: Recordings, *, pair_step: float | None) -> float:
+        """Log-likelihood with a slow force, or slow measurement noise, over that without, at its price.
 
-        Without it f has the same functions of the state.
+        Without it f has the same functions of the state, and measurement noise is white. The price is
+        Schwarz's, half of ln n for each further parameter.
         """
         support, values = self.unknown(found)
         model, noise = self.model(support, values), self.noise_of(found)
         without = model.equations[0] - self.slow_force * model.symbols[1]
-        of_state = tuple(model.parameters[place] for place in np.flatnonzero(support[:, 0] == 0))
-        alone = Dynamics(model.states[:1], (without,), Diffusion.identity(1), parameters=of_state)
-        views = (
-            (self, model, noise),
-            (replace(self, hidden=False, slow_force=0.0), alone, Noise(noise.measurement, noise.process[:1])),
-        )
-        likelihoods = []
-        for view, begin, level in views:
-            own, other = (view.measured(each, pair_step) for each in (training, unseen))
-            fit = fit_by_filter(begin, own, x=view.states(own), noise=level)
-            follow = view.followed(other, fit.model, noise=fit.noise, substeps=fit.substeps)
-            likelihoods.append(follow.log_likelihood)
-        return likelihoods[0] - likelihoods[1]
+        of_state = [model.parameters[place] for place in np.flatnonzero(support[:, 0] == 0)]
+        if self.follows:  # at once, that is a multiple of the state
+            at_once = Parameter(f"_at_once_{model.states[0]}", self.slow_force * values[-2] / -values[-1])
+            without, of_state = without + symbol(at_once.name) * model.symbols[0], [*of_state, at_once]
+        alone = Dynamics(model.states[:1], (without,), Diffusion.identity(1), parameters=tuple(of_state))
+        data = self.measured(recordings, pair_step)
+        moved, step = moved_by(data)
+        # A search that begins with a quiet sensor may find no way up.
+        quiet, noisy = Noise(noise.measurement, noise.process[:1]), Noise(moved / 3, moved / 3 / step)
+        whole = fit_by_filter(model, data, x=self.states(data), noise=noise)
+        data = replace(data, stationary=())
+        fits = [fit_by_filter(alone, data, x=data.outputs, noise=level) for level in (quiet, noisy)]
+        best = max(one.restricted_likelihood(data) for one in fits)
+        gain = whole.restricted_likelihood(data) - best - (1 + self.follows + 1) * np.log(len(data.t)) / 2
+        if self.follows:  # an initial state that is in one model alone has a spread
+            spread = float(whole.linearised_at[:, 1].var())
+            gain -= len(data.labels) / 2 * np.log(2 * np.pi * np.e * spread) if spread else np.inf
+        return float(gain)
 
 
 def moved_by(data: Measurements) -> tuple[np.ndarray, float]:

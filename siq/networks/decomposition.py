@@ -157,28 +157,17 @@ class TrainedNetworks:
 
     Not to be confused with `siq.networks.networks.Networks`, the tensors of several runs that
     training changes; this is one run of them, at rest.
-
-    Attributes
-    ----------
-    potential
-        Layers of V^NN, from d inputs to one output.
-    circulatory
-        Layers of g^NN, from d inputs to d outputs.
-    mean, scale
-        μ and σ of ``y = (x - μ)/σ``, shape ``(1, d)``, in the units of the states.
-    potential_scale, circulatory_scale
-        η_v and η_g, shape ``(1, 1)``.
-    diffusion
-        D, shape ``(d, d)``.
     """
 
-    potential: tuple[Layer, ...]
-    circulatory: tuple[Layer, ...]
+    potential: tuple[Layer, ...]  #: layers of V^NN, from d inputs to one output
+    circulatory: tuple[Layer, ...]  #: layers of g^NN, from d inputs to d outputs
+    #: μ and σ of ``y = (x - μ)/σ``, shape ``(1, d)``, in the units of the states.
     mean: np.ndarray
     scale: np.ndarray
+    #: η_v and η_g, shape ``(1, 1)``.
     potential_scale: np.ndarray
     circulatory_scale: np.ndarray
-    diffusion: np.ndarray
+    diffusion: np.ndarray  #: D, shape ``(d, d)``
 
     def evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """V ``(n,)``, g and f ``(n, d)`` at points ``(n, d)`` in the units of the states."""
@@ -228,27 +217,19 @@ class TrainedNetworks:
 
 @dataclass(frozen=True)
 class NetworksByWell:
-    """Networks of one run, a pair of them about each attractor, since V has a kink between its wells.
-
-    Attributes
-    ----------
-    parts
-        Networks that hold in the well of each attractor; V of each is zero there.
-    heights
-        What is added to V of each, shape ``(k,)``; zeros where it is not known, as wells end before saddles.
-    levels
-        V of each at its lowest saddle, or where recordings end before it, shape ``(k,)``. Close to there, and
-        beyond, V is less exact than elsewhere.
-    states, attractor_of
-        States ``(n, d)``, and in the well of which attractor each lies, shape ``(n,)``, or `NOWHERE` where
-        none of the networks holds. A point belongs to the well of the nearest of them.
-    """
+    """Networks of one run, a pair of them about each attractor, since V has a kink between its wells."""
 
     NOWHERE: ClassVar[int] = -1
 
+    #: Networks that hold in the well of each attractor; V of each is zero there.
     parts: tuple[TrainedNetworks, ...]
+    #: What is added to V of each, shape ``(k,)``; zeros where it is not known, as wells end before saddles.
     heights: np.ndarray
+    #: V of each at its lowest saddle, or where recordings end before it, shape ``(k,)``. Close to there, and
+    #: beyond, V is less exact than elsewhere.
     levels: np.ndarray
+    #: States ``(n, d)``, and in the well of which attractor each lies, shape ``(n,)``, or `NOWHERE` where
+    #: none of the networks holds. A point belongs to the well of the nearest of them.
     states: np.ndarray
     attractor_of: np.ndarray
 

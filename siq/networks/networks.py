@@ -33,29 +33,17 @@ Layer = tuple[Tensor, Tensor]
 
 @dataclass(frozen=True)
 class Networks:
-    """An orthogonal decomposition ``f = -D∇V + g`` given by two tanh networks, for one or more runs.
+    """An orthogonal decomposition ``f = -D∇V + g`` given by two tanh networks, for one or more runs."""
 
-    Attributes
-    ----------
-    potential
-        Layers of V^NN, from d inputs to one output.
-    circulatory
-        Layers of g^NN, from d inputs to d outputs.
-    mean, scale
-        μ and σ, shape ``(runs, 1, d)``, in the units of the states; constant during training.
-    potential_scale, circulatory_scale
-        η_v and η_g, shape ``(runs, 1, 1)``; constant during training.
-    diffusion
-        D, shape ``(d, d)``.
-    """
-
-    potential: tuple[Layer, ...]
-    circulatory: tuple[Layer, ...]
+    potential: tuple[Layer, ...]  #: layers of V^NN, from d inputs to one output
+    circulatory: tuple[Layer, ...]  #: layers of g^NN, from d inputs to d outputs
+    #: μ and σ, shape ``(runs, 1, d)``, in the units of the states; constant during training.
     mean: Tensor
     scale: Tensor
+    #: η_v and η_g, shape ``(runs, 1, 1)``; constant during training.
     potential_scale: Tensor
     circulatory_scale: Tensor
-    diffusion: Tensor
+    diffusion: Tensor  #: D, shape ``(d, d)``
 
     @property
     def runs(self) -> int:

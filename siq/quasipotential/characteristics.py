@@ -191,32 +191,24 @@ class End(IntEnum):
 
 @dataclass(frozen=True)
 class Fan:
-    """Characteristics of one attractor, each up to its end; all points lie before any caustic of their own.
+    """Characteristics of one attractor, each up to its end: all points before any caustic of their own."""
 
-    Attributes
-    ----------
-    attractor, hessian, level
-        A, shape ``(d,)``; M, shape ``(d, d)``; and the value of V up to which curves were followed.
-    points, momenta, values, hessians, curve
-        x, p = ∇V, V (not U) and ∇²V at all n points of all curves, and which curve a point belongs to; sorted
-        by curve and along it. ∇²V diverges towards a caustic.
-    directions, ends
-        The unit vectors from which the c curves start, in the metric in which M is the unit matrix, shape
-        ``(c, d)``; and an `End` for every curve.
-    caustic_points, caustic_values
-        Shape ``(k, d)`` and ``(k,)``: where those curves that meet a caustic do so first, and V there.
-    """
-
+    #: A, shape ``(d,)``; M, shape ``(d, d)``; and the value of V up to which curves were followed.
     attractor: np.ndarray
     hessian: np.ndarray
     level: float
+    #: x, p = ∇V, V (not U) and ∇²V at all n points of all curves, and which curve a point belongs to; sorted
+    #: by curve and along it. ∇²V diverges towards a caustic.
     points: np.ndarray
     momenta: np.ndarray
     values: np.ndarray
     hessians: np.ndarray
     curve: np.ndarray
+    #: The unit vectors from which the c curves start, in the metric in which M is the unit matrix, shape
+    #: ``(c, d)``; and an `End` for every curve.
     directions: np.ndarray
     ends: np.ndarray
+    #: Shape ``(k, d)`` and ``(k,)``: where those curves that meet a caustic do so first, and V there.
     caustic_points: np.ndarray
     caustic_values: np.ndarray
 

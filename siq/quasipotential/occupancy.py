@@ -210,26 +210,17 @@ def _predicted_visits(
 
 @dataclass(frozen=True)
 class VisitTest:
-    """Visits to one well: as counted, and as predicted.
+    """Visits to one well: as counted, and as predicted."""
 
-    Attributes
-    ----------
-    well, method
-        Index of the attractor; and ``operator``, of Fokker and Planck, or ``law``, of Eyring and Kramers.
-    held_out, whole
-        Counted on recordings of which each is foreseen by a fit that did not see it, and on all.
-    predicted, error
-        Mean time, in the unit of time, and its relative standard error.
-    probability
-        Of a count as far off as the one of the held-out recordings, if the prediction holds within its error.
-    """
-
-    well: int
+    well: int  #: index of the attractor
+    #: Counted on recordings of which each is foreseen by a fit that did not see it, and on all.
     held_out: DwellCount
     whole: DwellCount
+    #: Mean time, in the unit of time, and its relative standard error.
     predicted: float
     error: float
-    method: str
+    method: str  #: ``operator``, of Fokker and Planck, or ``law``, of Eyring and Kramers
+    #: Of a count as far off as the one of the held-out recordings, if the prediction holds within its error.
     probability: float
 
 

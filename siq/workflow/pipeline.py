@@ -150,8 +150,11 @@ def _with_work(
     settings: PipelineSettings, found: FieldEstimate, recordings: Recordings, *, number: int
 ) -> FieldEstimate:
     """f with what samples about its paths of least action tell without a formula; they may refute it."""
-    untold = found.noise_free or found.memory is not None or found.hidden_states or found.library.angles
-    if untold or not found.diffusion.regular:
+    # Behind slow noise the state is known so little that f there is not what moves it in the mean.
+    hidden = found.hidden_states or found.slow_sensor is not None
+    if found.noise_free or found.memory is not None or hidden or found.library.angles:
+        return found
+    if not found.diffusion.regular:
         return found
     pair_step = settings.sampling.pair_step
     if found.sensor_variance is not None:

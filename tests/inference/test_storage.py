@@ -42,7 +42,7 @@ def record() -> FieldEstimate:
         draw.uniform(size=4), formula,
         diagnosis=NoiseDiagnosis(
             "measurement", 0.1, np.eye(2), 1 / 3, -7.0, np.array([0.1, 0.0]), np.array([0.01, np.inf]),
-            pairs=7, diffusion=DiffusionSource.UNIT, lag=3, lost_time=0.1,
+            pairs=7, diffusion=DiffusionSource.UNIT, slow_sensor=(0.1, 1 / 3, 0.01), lag=3, lost_time=0.1,
             remarks=(Remark("inference.rounding", {"written": "so"}),),
         ),
         prediction=Verdict(np.inf, 0.01, False, "measurement noise"),
