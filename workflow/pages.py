@@ -102,7 +102,7 @@ def figures(given: Given, settings: PipelineSettings) -> Any:
         drawn["interactive.html"] = interactive_view(summary, solid=dynamics.dimension > 2)
     if settings.simulation is None and recorded is not None:
         folder.mkdir(parents=True, exist_ok=True)
-        drawn |= inspection_drawn(recorded, folder=folder)
+        drawn |= inspection_drawn(recorded, folder=folder, angles=settings.identification.angles)
     return {"drawn": drawn}
 
 

@@ -30,6 +30,7 @@ it. Each value is then off by up to half a step, with a standard deviation of st
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -189,14 +190,15 @@ class _Increments(NamedTuple):
         return True
 
 
-def markov_lag(recordings: Recordings) -> MarkovLag:
+def markov_lag(recordings: Recordings, *, angles: Mapping[str, Sequence[float]] | None = None) -> MarkovLag:
     """Find the lag from which on recordings are Markovian; evenly spaced stretches of them are looked at.
 
-    Where samples are uneven throughout, increments over the root of their time are, and lags count steps.
+    Where samples are uneven throughout, increments over the root of their time are, and lags count steps. The
+    mean of an increment has the period of states that are angles, each given with both ends of a period.
     """
     d, stretches = len(recordings.names), even_stretches(recordings)
     step, sensor = stretches.step, np.zeros(d)
-    problem = _increments(recordings, stretches)
+    problem = _increments(recordings, stretches, angles or {})
     first = None if problem is None else problem.residuals(0)
     if problem is None or first is None:
         nothing, none = np.zeros((0, d)), np.zeros(0, dtype=int)
@@ -239,7 +241,9 @@ def markov_lag(recordings: Recordings) -> MarkovLag:
     return told(longest.shape, 1 if longest.memory == 0 else lag, seen, most, longest.memory * step)
 
 
-def _increments(recordings: Recordings, stretches: Stretches) -> _Increments | None:
+def _increments(
+    recordings: Recordings, stretches: Stretches, angles: Mapping[str, Sequence[float]]
+) -> _Increments | None:
     most = min(len(stretches.number), MOST_SAMPLES)
     number = stretches.number[:most]
     known = number >= 0
@@ -247,9 +251,14 @@ def _increments(recordings: Recordings, stretches: Stretches) -> _Increments | N
     scale = values.std(axis=0)
     if not known.any() or not (scale > 0).all():
         return None
-    scaled = (values[:-1] - values.mean(axis=0)) / scale
+    columns = list(((recordings.values - values.mean(axis=0)) / scale).T)
+    for name, (low, high) in angles.items():  # its cosine and sine, whose monomials are its Fourier series
+        place = recordings.names.index(name)
+        turns = 2 * np.pi * recordings.values[:, place] / (float(high) - float(low))
+        columns[place] = np.cos(turns)
+        columns.append(np.sin(turns))
+    scaled, d = np.stack(columns, axis=1)[: len(number)], len(columns)
     # Monomials of the highest degree that leaves few enough of them.
-    d = scaled.shape[1]
     degree = max(
         (k for k in range(1, LARGEST_DEGREE + 1) if scipy.special.comb(d + k, k) <= MOST_FUNCTIONS), default=1
     )
@@ -269,7 +278,7 @@ def _increments(recordings: Recordings, stretches: Stretches) -> _Increments | N
     kept = eigenvalues > 1e-10 * eigenvalues[-1]
     increments = np.where(known[:, None], np.diff(values, axis=0) / root, 0.0)
     runs = runs_of(recordings, bridged=True)
-    times = [relaxation_samples(column, runs, noisy=True) for column in recordings.values.T]
+    times = [relaxation_samples(column, runs, noisy=True) for column in columns]
     return _Increments(
         functions @ (vectors[:, kept] / np.sqrt(eigenvalues[kept])),
         increments,

@@ -7,7 +7,7 @@ remarks, whose sentences stand in ``siq/report/templates/remarks/data.yaml``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -193,7 +193,11 @@ class Inspection:
         return found if recordings.time_unit else [*found, Remark("data.no_time_unit")]
 
 
-def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
+def inspect(
+    source: str | Path | Recordings | pd.DataFrame,
+    *,
+    angles: Mapping[str, Sequence[float]] | None = None,
+) -> Inspection:
     """Look at recordings, and say what is in them and what can be learned: seconds, before anything runs.
 
     Parameters
@@ -201,6 +205,8 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
     source
         A file, a folder of files, recordings, or a table with the columns ``t``, the measured ones and, of
         several recordings, ``recording``.
+    angles
+        Both ends of a period of each state that is an angle, which counts its turns.
 
     Raises
     ------
@@ -234,7 +240,7 @@ def inspect(source: str | Path | Recordings | pd.DataFrame) -> Inspection:
         label = different if different < FEWEST_VALUES <= len(x) / MIN_REPETITIONS else None
         low, high = float(x.min()), float(x.max())
         states.append(_StateFacts(name, title, unit, low, high, resolution_step(x), noise, label))
-    memory = markov_lag(recordings)
+    memory = markov_lag(recordings, angles=angles)
     turns = any(one.code in ANGLES for one in unusual(recordings))  # it is where it was, turned
     # Of the cells over the range of one state or two, those that were visited.
     some = recordings.values[:, :2]

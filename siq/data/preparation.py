@@ -61,6 +61,7 @@ MOST_TOGETHER, MOST_ROUNDS = 2, 10  # outliers with values of their own; of taki
 PULSE = 0.1  # a choice: of the range of an input, up and down within two samples
 MOST_OUTLIERS = 0.05  # a choice: of all samples; what stands apart more often belongs to the system
 MOST_DIGITS = 12  # of numbers that were rounded: those of floating point have sixteen
+HARMLESS_SHARE = 2e-4  # of values that repeat themselves: as little is missing of D
 ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 _STRETCH_LABEL = re.compile(r"(?P<label>.*) \((?P<number>\d+) of (?P<of>\d+)\)")
 
@@ -558,7 +559,8 @@ def repetitions(recordings: Recordings, column: int) -> list[tuple[float, str, f
         if most >= 2 * ROUNDED_LINE:
             small = (sizes > (ROUNDED_LINE + 0.5) * width) & (sizes < (most + 0.5) * width)
             usual = max(usual, share * float(small.sum()) / (2 * (most - ROUNDED_LINE)))
-        found.append((float(special.gammainc(count, usual)), kind, count / len(moves)))
+        chance = float(special.gammainc(count, usual)) if count > HARMLESS_SHARE * len(changes) else 1.0
+        found.append((chance, kind, count / len(moves)))
     # A stretch is another one by chance where each of its steps is.
     begins = np.arange(len(x) - COPIED + 1)
     begins = begins[which[begins] == which[begins + COPIED - 1]]

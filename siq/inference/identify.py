@@ -16,7 +16,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -165,7 +165,7 @@ def identify(
         advice = case.advice(hidden=hidden)
         if not hidden and advice is not None and (by_velocities := case.with_velocities()) is not None:
             return by_velocities
-        untried = not hidden and not claim and markov_lag(joined(recordings)).remembers
+        untried = not hidden and not claim and case.memory.remembers
         if untried and (by_slow_noise := case.with_slow_noise()) is not None:
             return by_slow_noise
         raise NumericalFailure(reason if advice is None else f"{reason}; {advice}", claim=claim) from error
@@ -190,6 +190,11 @@ class _Case:
         self.training = self.recordings.select(np.flatnonzero(~held))
         self.held_out = self.recordings.select(np.flatnonzero(held))
 
+    @cached_property
+    def memory(self) -> MarkovLag:
+        """What the recordings remember from sample to sample."""
+        return markov_lag(joined(self.recordings), angles=self.options.angles)
+
     def identified(self) -> FieldEstimate:
         """By the method that noise and correlations of the recordings ask for."""
         self.library.check_origin(self.recordings.values, names=self.recordings.titles)
@@ -197,7 +202,7 @@ class _Case:
         regress = partial(identify_vector_field, self.library, options=self.options, integrator_step=step)
         if not carries_noise(self.library, training, options=self.options, integrator_step=step):
             return self._finished_by_pairs(regress(training))
-        if step is None and (memory := markov_lag(joined(self.recordings))).remembers:
+        if step is None and (memory := self.memory).remembers:
             for exposure in _possible_exposures(memory):
                 unit = Diffusion.identity(self.library.dimension)
                 found = self.by_exposure(ObservationModel(self.library, unit, exposure))

@@ -34,7 +34,7 @@ from siq.systems.dynamics import Dynamics, Input, ParametricFunctions, Signals, 
 INTERVALS = 1 << 14  # numerical: carried together, since their derivatives at three places are much to keep
 MAX_SUBSTEPS = 16
 INSIDE = 1e-9  # share of a substep by which its ends lie inside, where an input jumps between samples
-SLOWEST = 1e-2  # of what is stationary: its rate times all the time that is recorded
+SLOWEST = 1.0  # of what is stationary: its rate times all the time that is recorded
 RANK = 1e-9  # numerical: singular values below this share of the largest are rounding
 
 

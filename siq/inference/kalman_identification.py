@@ -54,6 +54,7 @@ SENSOR_BEGIN = 1e-3  # of what a sample moves by, squared
 NO_SENSOR_NOISE = 1e-6  # of a sensor's variance: as good as none
 MAX_NUMBERS = 4e8  # of the derivatives by all coefficients at all samples: 3 GB
 SHORTEST_FORCE, LONGEST_FORCE = 4, 1 / 30  # steps; of a record: correlation times that a search begins with
+SLOW_SHARE = 0.1  # of the variance of what is measured: slow measurement noise that a search begins with
 SHORTEST_NOISE = 1  # step: the same of a sensor, whose noise is as good as white below it
 
 
@@ -119,10 +120,10 @@ def identify_by_likelihood(
     whole = max(wholes, key=lambda one: one.restricted_likelihood(data))
     if slow:  # the state is hidden by what has a memory, and steps are small
         x, values = whole.linearised_at, whole.model.values
-        observation = _with_time_of(whole, observation)
+        observation = _with_time_of(whole, observation, data)
         model = observation.model(everything, values[: len(everything)])
         whole = _fit_library(model, data, x, whole.noise, rounds=4 * LIBRARY_ROUNDS)
-        observation = _with_time_of(whole, observation)
+        observation = _with_time_of(whole, observation, data)
     likelihood = None if hidden or slow else InnovationLikelihood(library, whole, data)
     chance = 1.0 if likelihood is None else likelihood.constant_probability()
     by_state = chance < false_terms and bool(whole.noise.process.any())
@@ -156,7 +157,7 @@ def identify_by_likelihood(
         values = problem.solve(places)[places]
         fit = observation.fitted(support, values, data, noise=fit.noise, x=fit.linearised_at)
         if slow:
-            observation = _with_time_of(fit, observation)
+            observation = _with_time_of(fit, observation, data)
         scores = np.abs(fit.model.values) / fit.standard_errors
         return fit, scores[: len(places)] / critical[places]
 
@@ -190,12 +191,13 @@ def identify_by_likelihood(
     return replace(found, alternatives=average, stability=shares)
 
 
-def _with_time_of(fit: Fit, observation: ObservationModel) -> ObservationModel:
-    """The observation with the correlation time of the sensor's slow noise that a fit found."""
-    rate = float(fit.model.values[-1])
-    if not rate > 0:
-        raise NumericalFailure("slow measurement noise grows")
-    return replace(observation, sensor_time=1 / rate)
+def _with_time_of(fit: Fit, observation: ObservationModel, data: Measurements) -> ObservationModel:
+    """The observation with the correlation time of slow measurement noise that a fit found.
+
+    What wanders without ever returning lasts as long as all that was recorded.
+    """
+    longest = float(data.step.sum())
+    return replace(observation, sensor_time=1 / max(float(np.exp(fit.model.values[-1])), 1 / longest))
 
 
 def _of_slow_noise(
@@ -204,8 +206,8 @@ def _of_slow_noise(
     """Observation, coefficients ``(p,)``, states and noise to begin with, for some correlation times.
 
     The likelihood has a maximum where a slow force is white noise, and others. To begin with it moves the
-    state as much within its correlation time as the white noise does; slow measurement noise moves what is
-    measured as much as the state does.
+    state as much within its correlation time as the white noise does. Slow measurement noise moves what is
+    measured at most as much as the state does, and has a share of its variance.
     """
     moved, step = moved_by(data)
     rate, x = moved[0] / step, observation.states(data)
@@ -218,7 +220,8 @@ def _of_slow_noise(
         if observation.slow_force:
             values[-1], process = -1 / time, np.array([rate, rate / time**2])
         else:
-            view, process = replace(observation, sensor_time=time), np.array([rate, rate]) / 2
+            added = min(rate / 2, 2 * SLOW_SHARE * float(data.outputs.var()) / time)
+            view, process = replace(observation, sensor_time=time), np.array([rate - added, added])
         found.append((view, values, x, Noise(SENSOR_BEGIN * moved, process)))
     return found
 
@@ -253,8 +256,9 @@ def _estimate(
     whole[len(known) :, len(known) :] = covariance[: len(support), : len(support)]
     slow_sensor = None
     if observation.sensor_time is not None:
-        slow, size = 1 / fit.model.values[-1], float(np.sqrt(intensity[0][-1, -1] / fit.model.values[-1] / 2))
-        slow_sensor = (size, float(slow), float(np.sqrt(covariance[-1, -1]) * slow**2))
+        time = observation.sensor_time
+        size, spread = np.sqrt(intensity[0][-1, -1] * time / 2), np.sqrt(covariance[-1, -1])
+        slow_sensor = (float(size), time, time * (min(float(spread), 1.0) if spread else 1.0))
     if observation.hidden:
         # The part of D that acts on velocities has the determinant 1.
         force, matrix = rate[driven, driven], np.zeros((d, d))
@@ -373,7 +377,7 @@ def held_out_innovations(
     values = np.zeros(len(everything))
     values[[everything.tolist().index(one) for one in support.tolist()]] = fit.model.values[: len(support)]
     if observation.sensor_time is not None:
-        observation = _with_time_of(fit, observation)
+        observation = _with_time_of(fit, observation, own)
     whole = observation.model(everything, values)
     along = linearise(whole, Grid(other, fit.substeps), whole.values, follow.linearised_at)
     # The innovations are those of the filter itself; the library's columns are along the same states.

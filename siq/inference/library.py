@@ -29,27 +29,19 @@ from siq.systems.formulas import FormulaError, compile_formulas, exact_number, p
 
 @dataclass(frozen=True)
 class CandidateLibrary:
-    """Functions in which f, V and g are sought.
+    """Functions in which f, V and g are sought."""
 
-    Attributes
-    ----------
-    states, symbols, terms
-        Names of the d states; the same as symbols; and the q functions θ_k.
-    in_potential, in_circulatory
-        Shape ``(q,)``: which functions V, and g, may use. f may use all of them.
-    derivatives
-        T, shape ``(q, d, q)``: ``derivatives[k, i, j]`` is the coefficient of θ_k in ∂θ_j/∂x_i. Columns
-        of functions that V may not use are zero.
-    angles
-        States of which the functions are periodic: name, and the two ends of a period.
-    """
-
+    #: Names of the d states; the same as symbols; and the q functions θ_k.
     states: tuple[str, ...]
     symbols: tuple[sympy.Symbol, ...]
     terms: tuple[sympy.Expr, ...]
+    #: Shape ``(q,)``: which functions V, and g, may use. f may use all of them.
     in_potential: np.ndarray
     in_circulatory: np.ndarray
+    #: T, shape ``(q, d, q)``: ``derivatives[k, i, j]`` is the coefficient of θ_k in ∂θ_j/∂x_i. Columns of
+    #: functions that V may not use are zero.
     derivatives: np.ndarray
+    #: States of which the functions are periodic: name, and the two ends of a period.
     angles: tuple[tuple[str, float, float], ...] = ()
 
     @staticmethod

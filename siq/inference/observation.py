@@ -125,7 +125,8 @@ class ObservationModel:
     A sample may be a mean over an exposure. Where velocities are hidden they are the second half of the
     states, and samples show nothing of them. What is hidden may be a slow force instead, which is added to
     ``dx/dt`` times a factor that is known, `slow_force`; it may follow the state, or has noise alone. Or the
-    sensor adds noise with a correlation time of its own, `sensor_time`, whose rate is the last parameter.
+    sensor adds noise with a correlation time of its own, `sensor_time`; the logarithm of its rate is the last
+    parameter.
     """
 
     library: CandidateLibrary
@@ -182,10 +183,10 @@ class ObservationModel:
             return _seen_positions(plain)
         if self.sensor_time is not None:
             (name, x), z = plain.outputs[0], symbol(slow := f"_noise_{plain.states[0]}")
-            rate = Parameter(f"_rate{slow}", 1 / self.sensor_time)
+            rate = Parameter(f"_rate{slow}", -float(np.log(self.sensor_time)))  # its logarithm: none grows
             return Dynamics(
-                (*plain.states, slow), (*plain.equations, -symbol(rate.name) * z), Diffusion.identity(2),
-                parameters=(*plain.parameters, rate), outputs=((name, x + z),),
+                (*plain.states, slow), (*plain.equations, -sympy.exp(symbol(rate.name)) * z),
+                Diffusion.identity(2), parameters=(*plain.parameters, rate), outputs=((name, x + z),),
             )  # fmt: skip
         if self.exposure is None:
             return plain

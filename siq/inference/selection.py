@@ -76,20 +76,14 @@ def critical_values(library: CandidateLibrary, *, false_terms: float) -> np.ndar
 
 @dataclass(frozen=True)
 class LinearProblem:
-    """A linear least-squares problem of coefficients of f, through the triangle on which everything depends.
+    """A linear least-squares problem of coefficients of f, by the triangle on which everything depends."""
 
-    Attributes
-    ----------
-    columns, goal, variance
-        Of the q coefficients, shape ``(m, q)``; what they explain, shape ``(m,)``; and that of a residual.
-    critical, labels
-        Standard errors that each coefficient has to be from zero, shape ``(q,)``; and its component of f and
-        function, shape ``(q, 2)``.
-    """
-
+    #: Of the q coefficients, shape ``(m, q)``; what they explain, shape ``(m,)``; and that of a residual.
     columns: np.ndarray
     goal: np.ndarray
     variance: float
+    #: Standard errors that each coefficient has to be from zero, shape ``(q,)``; and its component of f and
+    #: function, shape ``(q, 2)``.
     critical: np.ndarray
     labels: np.ndarray
 

@@ -62,19 +62,12 @@ HISTORY = ("run", "step", "training_loss", "held_out_loss", "dynamics", "orthogo
 
 @dataclass(frozen=True)
 class TrainingData:
-    """The pairs of one run, divided, with its representative points.
+    """The pairs of one run, divided, with its representative points."""
 
-    Attributes
-    ----------
-    training, held_out
-        Pairs of the recordings that train, and of the others.
-    representative_rows
-        Which S of the training pairs have evenly spread X0.
-    """
-
+    #: Pairs of the recordings that train, and of the others.
     training: SnapshotPairs
     held_out: SnapshotPairs
-    representative_rows: np.ndarray
+    representative_rows: np.ndarray  #: which S of the training pairs have evenly spread X0
 
     @property
     def representative(self) -> SnapshotPairs:

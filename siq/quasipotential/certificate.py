@@ -70,27 +70,14 @@ MIN_CLAIMED_SHARE = 0.5  # of the states in a well: a formula that holds at fewe
 
 @dataclass(frozen=True)
 class Certificate:
-    """Whether a method's formulas may be believed, and why.
+    """Whether a method's formulas may be believed, and why."""
 
-    Attributes
-    ----------
-    tests
-        By name.
-    error
-        Relative error of V that has to be stated; infinite where unknown.
-    reason
-        What refused it, or what to know of it, in words.
-    scope
-        ``region``: one formula for the recorded region; ``wells``: one for each attractor.
-    tested_on
-        The points, in words.
-    """
-
-    tests: Mapping[str, Verdict]
-    error: float
-    reason: str
+    tests: Mapping[str, Verdict]  #: by name
+    error: float  #: relative error of V that has to be stated; infinite where unknown
+    reason: str  #: what refused it, or what to know of it, in words
+    #: ``region``: one formula for the recorded region; ``wells``: one for each attractor.
     scope: str = "region"
-    tested_on: str = ""
+    tested_on: str = ""  #: the points, in words
 
     @property
     def independent(self) -> tuple[str, ...]:

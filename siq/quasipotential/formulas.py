@@ -34,27 +34,16 @@ WELL = ("attractor", "level", "saddle", "reach", "tolerance", "residual")
 
 @dataclass(frozen=True)
 class SymbolicDecomposition:
-    """Formulas of ``f = -D∇V + g``.
+    """Formulas of ``f = -D∇V + g``."""
 
-    Attributes
-    ----------
-    symbols
-        The d states.
-    potential
-        V, zero at its minimum; None where no single formula holds over the wells.
-    circulatory, vector_field
-        Components of g, none where there is no V, and of f.
-    wells
-        V about each attractor, zero there and valid below a level, where it was found.
-    standard_errors
-        Of the coefficients, by component (``U``, ``V``, ``f_x``, ``g_x``) and term, where they are known.
-    """
-
-    symbols: tuple[sympy.Symbol, ...]
-    potential: sympy.Expr | None
+    symbols: tuple[sympy.Symbol, ...]  #: the d states
+    potential: sympy.Expr | None  #: V, zero at its minimum; None where no single formula holds over the wells
+    #: Components of g, none where there is no V, and of f.
     circulatory: tuple[sympy.Expr, ...]
     vector_field: tuple[sympy.Expr, ...]
+    #: V about each attractor, zero there and valid below a level, where it was found.
     wells: tuple[Well, ...] = ()
+    #: Of the coefficients, by component (``U``, ``V``, ``f_x``, ``g_x``) and term, where they are known.
     standard_errors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @property

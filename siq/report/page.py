@@ -318,11 +318,13 @@ INSPECTION, SEEN = "inspection.json", "seen.json"
 """Files beside the figures of an inspection: its lines, and the two states that it shows."""
 
 
-def inspection_drawn(recordings: Recordings, *, folder: Path) -> dict[str, Figure]:
+def inspection_drawn(
+    recordings: Recordings, *, folder: Path, angles: Mapping[str, Sequence[float]] | None = None
+) -> dict[str, Figure]:
     """The figures of an inspection by name; what it says is written into the folder."""
     from siq.report.plots.recordings import inspection_figures  # matplotlib
 
-    found = inspect(joined(recordings))
+    found = inspect(joined(recordings), angles=angles)
     seen = None if found.switching is None else found.switching.as_data()
     for file, data in ((INSPECTION, found.lines()), (SEEN, seen)):
         text = json.dumps(data, ensure_ascii=False, allow_nan=False)

@@ -169,3 +169,14 @@ def test_what_fifty_columns_remember_is_asked_in_as_many_functions() -> None:
     walks = np.cumsum(np.random.default_rng(0).standard_normal((1, 4000, 50)), axis=1)
     found = markov_lag(Recordings.from_arrays(np.arange(4000.0), walks, names=[f"x{k}" for k in range(50)]))
     assert found.kind == "white"
+
+
+def test_an_angle_that_turns_remembers_nothing() -> None:
+    """Three wells in a turn, many turns: no polynomial is the mean of its increments, and its waves are."""
+    draw, step, x = np.random.default_rng(4), 0.02, np.zeros(20_000)
+    for k in range(1, len(x)):
+        x[k] = x[k - 1] + step * (1.0 - 6 * np.sin(3 * x[k - 1])) + np.sqrt(3 * step) * draw.standard_normal()
+    assert np.ptp(x) > 20 * np.pi
+    recordings = recorded(np.degrees(x)[None, :, None], step)
+    assert markov_lag(recordings).kind != "white"
+    assert markov_lag(recordings, angles={"x": (0, 360)}).kind == "white"

@@ -32,7 +32,7 @@ def recorded(noise: str, *, unit: float = 1.0) -> tuple[Recordings, np.ndarray]:
     scene = Scene(0.5 / INTENSITY, 0.0, 1.0, 0.0, 1.0, 1, 20_000)
     x = double_wells(draw, scene, 1)[0][::10]
     slow = relaxation(draw, len(x), TIME, step=STEP)
-    added = SIZE * slow if noise == "slow" else SIZE / 2 * draw.standard_normal(len(x))
+    added = {"slow": SIZE * slow, "white": SIZE / 2 * draw.standard_normal(len(x)), "none": 0.0}[noise]
     values = unit * (x + added)[:, None]
     recordings = Recordings.from_arrays([scene.times], [values], names=["x"], time_unit="s")
     return in_stretches(recordings), unit * x
@@ -71,6 +71,17 @@ def test_its_noise_is_told_from_the_state() -> None:
 def test_a_sensor_with_white_noise_has_none() -> None:
     found = identified(recorded("white")[0])
     assert found.slow_sensor is None and found.sensor_variance is not None
+
+
+@pytest.mark.slow
+def test_a_stage_that_wanders_is_told_from_what_it_carries() -> None:
+    recordings, x = recorded("none")
+    wandered = np.cumsum(np.random.default_rng(3).standard_normal(len(x))) * 0.4 / np.sqrt(len(x))
+    found = identified(replace(recordings, values=recordings.values + wandered[:, None]))
+    assert found.slow_sensor is not None and found.slow_sensor[1] > 1000 * STEP
+    # Where the stage is in the mean is not known: of a shifted f the highest power is the same.
+    assert str(found.library.terms[found.support[-1, 1]]) == "x**3"
+    assert abs(found.values[-1] + 1) < 3 * np.sqrt(found.covariance[-1, -1])
 
 
 @pytest.mark.slow

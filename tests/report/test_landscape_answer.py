@@ -70,7 +70,7 @@ def test_a_low_barrier_gives_a_range_and_a_warning() -> None:
 
 def test_a_well_below_the_noise_has_no_time() -> None:
     said = headline(landscape([[-0.5], [0.5]], [0.05, 0.9], noise=NOISE))
-    assert "too shallow to hold the state against this noise" in said
+    assert "less than the noise is strong, so that no law of escape holds" in said
 
 
 def test_where_the_law_fails_it_is_said_why() -> None:

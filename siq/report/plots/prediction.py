@@ -134,7 +134,8 @@ def _binned_residuals(dynamics: Dynamics, recordings: Recordings, place: int) ->
     is one of root mean squares. Where recordings remember, the present state tells which way their noise
     pushes: bins are then along the state so much earlier, which does not.
     """
-    memory = markov_lag(recordings)
+    turning = zip(dynamics.states, dynamics.limits, dynamics.periods, strict=True)
+    memory = markov_lag(recordings, angles={name: ends for name, ends, period in turning if period})
     lag = memory.lag if memory.remembers else None
     if lag is None:
         pairs = snapshot_pairs(recordings)
