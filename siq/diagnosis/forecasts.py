@@ -590,10 +590,14 @@ def _next_rung(
         stateless = {each.label for each in candidates if each.model.dimension == d} - {*fitted, *untried}
         for place in [place for place in order if sites[place].label in stateless][:ATTEMPTS]:
             attempt(sites[place], weights[place])
-    # Of those that are not told apart, the one with the fewest parameters; special cases are asked.
+    # Of those that are not told apart, the one with the fewest parameters; special cases are asked, and what
+    # it is a special case of, if that promises more.
     first = max(leading, key=lambda each: each.weight).candidate
+    promised = max((gains[k] for k, one in named.items() if one.label == first.label), default=np.inf)
     for place, one in named.items():
-        if one.name in first.generalises and one.coordinate == first.coordinate and one.label not in fitted:
+        near = one.coordinate == first.coordinate and one.label not in fitted
+        more = first.name in one.generalises and gains[place] > promised
+        if near and (more or one.name in first.generalises):
             attempt(sites[place])
     heaviest = max(each.weight for each in leading)
     plausible = [each for each in leading if each.weight > heaviest + np.log(PLAUSIBLE)]

@@ -263,9 +263,19 @@ class MechanismCandidate:
         return all(signs) and bool(slowest >= lowest and lasting * lowest <= LASTING)
 
     def idle(self, fit: Fit, of: Callable[[Iterable[bool]], bool] = any) -> bool:
-        """Whether any amplitude of a fit, or all, is zero within errors: a special case of itself, then."""
+        """Whether any amplitude of a fit, or all, is zero within errors: a special case of itself, then.
+
+        Where shapes stay without an amplitude, what stays is no special case: friction that falls to nothing
+        as the speed grows is no dry friction.
+        """
         value_of, errors = {each.name: each.value for each in fit.model.parameters}, fit.error_of
-        return of(abs(value_of[name]) < 2 * errors[name] for name in errors.keys() & self.amplitudes)
+        shapes, asked = set(map(symbol, self.shapes)), set(self.amplitudes) & errors.keys()
+        kept = {
+            name
+            for name in asked
+            if any(change.subs(symbol(name), 0).free_symbols & shapes for _, change in self.changes)
+        }
+        return of(abs(value_of[name]) < 2 * errors[name] for name in (asked if of is all else asked - kept))
 
     def repeats(self, found: MechanismCandidate) -> bool:
         """Whether it is what was found already: the same, or in another form at the same place.

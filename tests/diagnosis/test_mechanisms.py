@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 import sympy
@@ -232,3 +235,19 @@ def test_another_unit_of_a_state_is_no_fault_of_its_sensor(inertia: dict, *, off
     labels = {each.label for each in candidates_of(model, roles_of(model), standard_dictionary())}
     assert ("sensor gain or offset in y, by g_1" in labels) is offered
     assert {"dry friction in w", "clipping on both sides in y"} <= labels
+
+
+def test_what_vanishes_with_its_shapes_is_a_special_case_and_what_leaves_them_is_not(
+    oscillator: Dynamics,
+) -> None:
+    """Of friction that falls with the speed: what stays at high speed may be zero, and what falls may not."""
+    found = candidates_of(oscillator, roles_of(oscillator), standard_dictionary())
+    one = next(each for each in found if each.name == "Stribeck friction")
+    staying, falling = one.amplitudes
+    for zero, idle in ((staying, False), (falling, True)):
+        values = dict.fromkeys(one.new, 1.0) | {zero: 0.01}
+        fit: Any = SimpleNamespace(
+            model=one.model.with_values([values.get(p.name, p.value) for p in one.model.parameters]),
+            error_of=dict.fromkeys(one.new, 0.1),
+        )
+        assert one.idle(fit) is idle and not one.idle(fit, all)
