@@ -243,7 +243,7 @@ class _Case:
                 odds = again.diagnosis.sensor_evidence + sensors * np.log(8 * np.pi / count)
                 noisy = float(scipy.special.expit(odds / 2))
                 if noisy > 0.5:
-                    slow = self.with_slow_noise(of_sensor=True)
+                    slow = self.with_slow_noise(again)
                     return slow or self.finished(again).with_rival(found, 1 - noisy)
             except (NumericalFailure, np.linalg.LinAlgError) as error:
                 fault = fault or str(error)
@@ -477,12 +477,12 @@ class _Case:
             return None
         return found if found.prediction is not None and found.prediction.passed else None
 
-    def with_slow_noise(self, *, of_sensor: bool = False) -> FieldEstimate | None:
+    def with_slow_noise(self, rival: FieldEstimate | None = None) -> FieldEstimate | None:
         """f with slow noise about the one recorded state; None where that does not do.
 
-        The sensor has it, or it is a force, which has noise alone or else follows the state. What gains most
-        over white measurement noise is tested first; it has to be worth its parameters, to pass the test of
-        f, and the past may tell nothing more.
+        The sensor has it, or it is a force, which has noise alone or else follows the state; of the sensor
+        alone it is asked where f with white measurement noise is a rival. What gains most is tested first; it
+        has to be worth its parameters, to pass the test of f, and the past may tell nothing more.
         """
         free = self.options.hidden_velocities == "auto" and self.given is None and not self.integrator_step
         if not free or len(self.recordings.names) != 1:
@@ -492,10 +492,12 @@ class _Case:
         sensor = ObservationModel(self.library, Diffusion.identity(1), sensor_time=begin)
         force = ObservationModel(library, Diffusion.identity(2), hidden=True, slow_force=1.0)
         tried = list[tuple[float, FieldEstimate]]()
-        for view in (sensor,) if of_sensor else (sensor, force, replace(force, follows=True)):
+        views = (sensor,) if rival else (sensor, force, replace(force, follows=True))
+        for view in views:
             with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
                 found = self.by_likelihood(view)
-                gain = ObservationModel.of(found).gain(found, self.recordings, pair_step=self.pair_step)
+                asked = ObservationModel.of(found)
+                gain = asked.gain(found, self.recordings, rival, pair_step=self.pair_step)
                 tried.append((gain, found))
         for gain, found in sorted(tried, key=lambda one: -one[0]):
             with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):

@@ -277,11 +277,14 @@ class ObservationModel:
             substeps=substeps,
         )  # fmt: skip
 
-    def gain(self, found: FieldEstimate, recordings: Recordings, *, pair_step: float | None) -> float:
+    def gain(
+        self, found: FieldEstimate, recordings: Recordings, rival: FieldEstimate | None = None, *,
+        pair_step: float | None,
+    ) -> float:  # fmt: skip
         """Log-likelihood with a slow force, or slow measurement noise, over that without, at its price.
 
-        Without it f has the same functions of the state, and measurement noise is white. The price is
-        Schwarz's, half of ln n for each further parameter.
+        Without it f has the same functions of the state, and measurement noise is white; or it is the rival,
+        whose D may depend on the state. The price is Schwarz's, half of ln n for each further parameter.
         """
         support, values = self.unknown(found)
         model, noise = self.model(support, values), self.noise_of(found)
@@ -298,8 +301,13 @@ class ObservationModel:
         whole = fit_by_filter(model, data, x=self.states(data), noise=noise)
         data = replace(data, stationary=())
         fits = [fit_by_filter(alone, data, x=data.outputs, noise=level) for level in (quiet, noisy)]
-        best = max(one.restricted_likelihood(data) for one in fits)
-        gain = whole.restricted_likelihood(data) - best - (1 + self.follows + 1) * np.log(len(data.t)) / 2
+        best, price = max(one.restricted_likelihood(data) for one in fits), np.log(len(data.t)) / 2
+        if rival is not None:
+            view, terms = ObservationModel.of(rival), 1 if rival.noise is None else len(rival.noise.values)
+            same, level = view.model(*view.unknown(rival)), view.noise_of(rival)
+            other = view.followed(data, same, noise=level, substeps=rival.flow.steps)
+            best = max(best, other.restricted_likelihood(data) - (terms - 1) * price)
+        gain = whole.restricted_likelihood(data) - best - (1 + self.follows + 1) * price
         if self.follows:  # an initial state that is in one model alone has a spread
             spread = float(whole.linearised_at[:, 1].var())
             gain -= len(data.labels) / 2 * np.log(2 * np.pi * np.e * spread) if spread else np.inf

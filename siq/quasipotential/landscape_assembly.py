@@ -61,23 +61,13 @@ UNSEEN_STATES = 1024  # of the domain, and of the box of each well, that no fit 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class EquationSettings:
-    """What the landscape of equations depends on, beside the equations.
+    """What the landscape of equations depends on, beside the equations."""
 
-    Attributes
-    ----------
-    seed
-        Of the sequences of states that stand for the domain.
-    refinement
-        How V about an attractor is sought: degrees, functions, accuracy, reach and tolerance.
-    certificate
-        The limits of its tests.
-    landscape
-        ε for which escape times are given: the first of `noise_intensities`.
-    """
-
-    seed: int = 0
+    seed: int = 0  #: Of the sequences of states that stand for the domain
+    #: How V about an attractor is sought: degrees, functions, accuracy, reach and tolerance.
     refinement: RefinementOptions = RefinementOptions()
-    certificate: CertificateOptions = CertificateOptions()
+    certificate: CertificateOptions = CertificateOptions()  #: the limits of its tests
+    #: ε for which escape times are given: the first of `noise_intensities`.
     landscape: LandscapeOptions = LandscapeOptions()
 
 

@@ -57,24 +57,14 @@ METHODS = (Method.REGRESSION, Method.REFINED)
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one step of one run.
+    """What became of one step of one run."""
 
-    Attributes
-    ----------
-    run
-        Its number.
-    step, status
-        Which step, and how it ended.
-    reason
-        Why it is not ``ok``, in words; of one that is, what has to be known of it.
-    details
-        What else the step says of itself, as plain data.
-    """
-
-    run: int
+    run: int  #: its number
+    #: Which step, and how it ended.
     step: Step
     status: Status = Status.OK
-    reason: str = ""
+    reason: str = ""  #: why it is not ``ok``, in words; of one that is, what has to be known of it
+    #: What else the step says of itself, as plain data.
     details: Mapping[str, Any] = field(default_factory=dict)
 
     @property
