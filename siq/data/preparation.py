@@ -61,7 +61,7 @@ MOST_TOGETHER, MOST_ROUNDS = 2, 10  # outliers with values of their own; of taki
 PULSE = 0.1  # a choice: of the range of an input, up and down within two samples
 MOST_OUTLIERS = 0.05  # a choice: of all samples; what stands apart more often belongs to the system
 MOST_DIGITS = 12  # of numbers that were rounded: those of floating point have sixteen
-HARMLESS_SHARE = 2e-4  # of values that repeat themselves: as little is missing of D
+HARMLESS_SHARE = 2e-4  # a choice: of values that repeat themselves; about as little is missing of D
 ALIKE = 1e-9  # of the rms step: closer values, or steps, are the same
 _STRETCH_LABEL = re.compile(r"(?P<label>.*) \((?P<number>\d+) of (?P<of>\d+)\)")
 

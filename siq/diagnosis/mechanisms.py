@@ -63,9 +63,7 @@ MECHANISM: Final = "mechanism"
 
 
 LINES, MOST_PRODUCTS = 8, 20_000_000  # of a spectrum, that are frequencies to begin with; of work for it
-LASTING = (
-    1000.0  # a choice: radians of the lowest frequency, eighty recordings; what takes longer is for ever
-)
+LASTING = 1000.0  # a choice: radians of the lowest frequency, eighty recordings; what lasts longer stays
 
 
 def places_of(search: Shape, data: Measurements, model: Dynamics, x: np.ndarray) -> np.ndarray:

@@ -393,6 +393,11 @@ class FieldEstimate:
         return self.diagnosis is not None and len(self.diagnosis.measurement) * 2 == self.library.dimension
 
     @property
+    def has_hidden_state(self) -> bool:
+        """Whether a state has a memory and was not recorded: of the system, or of its sensor alone."""
+        return self.hidden_states or self.slow_sensor is not None
+
+    @property
     def slow_force(self) -> float:
         """The factor of a slow force that was not recorded in ``dx/dt``; zero where there is none."""
         if not self.hidden_states or not self.noise_rate[0, 0] > 0:

@@ -477,6 +477,28 @@ class _Case:
             return None
         return found if found.prediction is not None and found.prediction.passed else None
 
+    def _fits(self, *views: ObservationModel) -> list[FieldEstimate]:
+        """By likelihood, those of some views of the recordings that settle."""
+        found = list[FieldEstimate]()
+        for view in views:
+            with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
+                found.append(self.by_likelihood(view))
+        return found
+
+    @cached_property
+    def slow_sensor(self) -> list[FieldEstimate]:
+        """f with slow measurement noise, if it is found; it may be asked for twice."""
+        begin = usual_step(self.recordings)
+        return self._fits(ObservationModel(self.library, Diffusion.identity(1), sensor_time=begin))
+
+    @cached_property
+    def slow_forces(self) -> list[FieldEstimate]:
+        """f with a slow force that has noise alone, and with one that follows the state, if found."""
+        names = (*self.recordings.names, f"force_{self.recordings.names[0]}")
+        library = field_library(names, self.options)
+        force = ObservationModel(library, Diffusion.identity(2), hidden=True, slow_force=1.0)
+        return self._fits(force, replace(force, follows=True))
+
     def with_slow_noise(self, rival: FieldEstimate | None = None) -> FieldEstimate | None:
         """f with slow noise about the one recorded state; None where that does not do.
 
@@ -487,15 +509,9 @@ class _Case:
         free = self.options.hidden_velocities == "auto" and self.given is None and not self.integrator_step
         if not free or len(self.recordings.names) != 1:
             return None
-        names = (*self.recordings.names, f"force_{self.recordings.names[0]}")
-        library, begin = field_library(names, self.options), usual_step(self.recordings)
-        sensor = ObservationModel(self.library, Diffusion.identity(1), sensor_time=begin)
-        force = ObservationModel(library, Diffusion.identity(2), hidden=True, slow_force=1.0)
         tried = list[tuple[float, FieldEstimate]]()
-        views = (sensor,) if rival else (sensor, force, replace(force, follows=True))
-        for view in views:
+        for found in self.slow_sensor if rival else [*self.slow_sensor, *self.slow_forces]:
             with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
-                found = self.by_likelihood(view)
                 asked = ObservationModel.of(found)
                 gain = asked.gain(found, self.recordings, rival, pair_step=self.pair_step)
                 tried.append((gain, found))
@@ -529,11 +545,8 @@ class _Case:
         return filtered_recordings(found, self.recordings, pair_step=self.pair_step)
 
     def complete(self, found: FieldEstimate) -> bool:
-        """Whether f passed its test, and the past tells nothing more of the next sample than the state does.
-
-        Of what shows no noise nobody asks.
-        """
-        if found.noise_free:
+        """Whether f passed its test, and the past tells no more of the next sample than the state does."""
+        if found.noise_free:  # of that nobody asks
             return True
         if found.prediction is None or not found.prediction.passed:
             return False

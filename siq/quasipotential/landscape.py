@@ -271,8 +271,7 @@ class Landscape:
     @property
     def rung(self) -> int:
         """The rung of the ladder of answers, see `siq.quasipotential.certificate.Certificate.rung`."""
-        f = self.field_estimate
-        hidden = f is not None and (f.hidden_states or f.slow_sensor is not None)
+        hidden = self.field_estimate is not None and self.field_estimate.has_hidden_state
         return Certificate.rung(self.certificate, self.recorded_states, hidden=hidden)
 
     @property

@@ -85,8 +85,7 @@ class StudyResults:
         """Of the ladder of answers, see `siq.quasipotential.certificate.Certificate.rung`."""
         found = self.certificates.get(str(self.shown[1]))
         certificate = Certificate.from_data(found) if found and found.get("tests") else None
-        f = self.record
-        hidden = f is not None and (f.hidden_states or f.slow_sensor is not None)
+        hidden = self.record is not None and self.record.has_hidden_state
         return Certificate.rung(certificate, self.seen, hidden=hidden)
 
     def table(self, name: str) -> pd.DataFrame | None:

@@ -151,10 +151,8 @@ def _with_work(
 ) -> FieldEstimate:
     """f with what samples about its paths of least action tell without a formula; they may refute it."""
     # Behind slow noise the state is known so little that f there is not what moves it in the mean.
-    hidden = found.hidden_states or found.slow_sensor is not None
-    if found.noise_free or found.memory is not None or hidden or found.library.angles:
-        return found
-    if not found.diffusion.regular:
+    untold = found.noise_free or found.memory is not None or found.has_hidden_state or found.library.angles
+    if untold or not found.diffusion.regular:
         return found
     pair_step = settings.sampling.pair_step
     if found.sensor_variance is not None:
