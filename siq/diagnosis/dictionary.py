@@ -43,40 +43,28 @@ class Shape(_Part):
     """Where a parameter is looked for that the mechanism does not depend on linearly.
 
     Give one way of looking.
-
-    Attributes
-    ----------
-    at
-        Multiples, or probabilities for `quantiles_of`, that are tried.
-    scale_of
-        A formula: multiples of its root mean square along the recordings are tried.
-    inverse_scale_of
-        The same of its inverse.
-    quantiles_of
-        A formula: its quantiles at these probabilities are tried.
-    time_of
-        A formula: multiples of the time in which it changes by its own spread are tried.
-    lattice_of
-        An output: the step of the lattice on which its recorded values lie. It is known from the recordings
-        and not fitted; where they lie on none that holds zero, the mechanism is not tried.
-    top_of, bottom_of
-        An output: where its recorded values end in a plateau, above or below. Where there is none, the
-        mechanism is not tried.
-    samples
-        Multiples of the time between samples are tried.
-    frequencies
-        So many angular frequencies that the recordings can resolve are tried.
     """
 
+    #: Multiples, or probabilities for `quantiles_of`, that are tried
     at: tuple[float, ...] = (1.0,)
+    #: A formula: multiples of its root mean square along the recordings are tried
     scale_of: str | None = None
+    #: The same of its inverse
     inverse_scale_of: str | None = None
+    #: A formula: its quantiles at these probabilities are tried
     quantiles_of: str | None = None
+    #: A formula: multiples of the time in which it changes by its own spread are tried
     time_of: str | None = None
+    #: An output: the step of the lattice on which its recorded values lie. It is known from the recordings
+    #: and not fitted; where they lie on none that holds zero, the mechanism is not tried.
     lattice_of: str | None = None
+    #: An output: where its recorded values end in a plateau, above or below. Where there is none, the
+    #: mechanism is not tried.
     top_of: str | None = None
     bottom_of: str | None = None
+    #: Multiples of the time between samples are tried
     samples: bool = False
+    #: So many angular frequencies that the recordings can resolve are tried
     frequencies: Annotated[int, Field(ge=2, le=2000)] | None = None
 
     @model_validator(mode="after")
@@ -114,23 +102,15 @@ class MechanismParameter(_Part):
 
 
 class FurtherState(_Part):
-    """A state that a mechanism brings.
+    """A state that a mechanism brings."""
 
-    Attributes
-    ----------
-    equation
-        Its time derivative.
-    unit
-        In terms of the roles.
-    scale
-        A formula of its size.
-    begin
-        A formula of the roles: where it is taken to begin in every recording, until a fit tells.
-    """
-
+    #: Its time derivative
     equation: Formula
+    #: In terms of the roles
     unit: str = "1"
+    #: A formula of its size
     scale: str
+    #: A formula of the roles: where it is taken to begin in every recording, until a fit tells
     begin: Formula = 0
 
 
@@ -210,36 +190,24 @@ class Form(_Part):
 
 
 class Mechanism(_Part):
-    """An entry of the dictionary.
+    """An entry of the dictionary."""
 
-    Attributes
-    ----------
-    name
-        What pages and tables call it.
-    sentence
-        What it means, in a sentence.
-    forms
-        One for each kind of system in which it shows.
-    generalises
-        Mechanisms that are special cases of it.
-    family
-        The kind of physics that it is a member of, by default itself: what recordings tell first.
-    weight
-        How likely it is beforehand, beside one of weight 1. What nearly every system of its kind has
-        weighs 5, what few have weighs 0.2. A family weighs as much as its likeliest member.
-    look_alikes
-        Mechanisms that are easily taken for it.
-    reference
-        Where it is described.
-    """
-
+    #: What pages and tables call it
     name: Annotated[str, Field(min_length=1)]
+    #: What it means, in a sentence
     sentence: str
+    #: One for each kind of system in which it shows
     forms: Annotated[tuple[Form, ...], Field(min_length=1)]
+    #: Mechanisms that are special cases of it
     generalises: tuple[str, ...] = ()
+    #: The kind of physics that it is a member of, by default itself: what recordings tell first
     family: str = ""
+    #: How likely it is beforehand, beside one of weight 1. What nearly every system of its kind has weighs 5,
+    #: what few have weighs 0.2. A family weighs as much as its likeliest member.
     weight: Annotated[float, Field(gt=0)] = 1.0
+    #: Mechanisms that are easily taken for it
     look_alikes: tuple[str, ...] = ()
+    #: Where it is described
     reference: str = ""
 
 

@@ -54,22 +54,15 @@ STATE_BINS = 12  # of each state: any function of it is seen as a value in each
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class PredictionLimits:
-    """Limits of the test of f.
+    """Limits of the test of f."""
 
-    Attributes
-    ----------
-    prediction
-        Median error of long-term prediction, for recordings without noise.
-    held_out_ratio
-        Mean square of the residuals of f on held-out recordings over that on its own, for recordings with
-        noise. The default, a tenth more, is what a systematic error of √0.1 of the noise adds.
-    false_alarms
-        Probability with which a whole certificate is refused by chance where everything is right. The tests
-        that chance can refuse share it evenly, see `each`.
-    """
-
+    #: Median error of long-term prediction, for recordings without noise
     prediction: Annotated[float, Field(gt=0)] = 0.01
+    #: Mean square of the residuals of f on held-out recordings over that on its own, for recordings with
+    #: noise. The default, a tenth more, is what a systematic error of √0.1 of the noise adds.
     held_out_ratio: Annotated[float, Field(gt=1)] = 1.1
+    #: Probability with which a whole certificate is refused by chance where everything is right. The tests
+    #: that chance can refuse share it evenly, see `each`.
     false_alarms: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
 
     @property

@@ -84,6 +84,7 @@ MIN_SHARE, MAX_SHARE = 1e-3, 0.45  # of the residuals' variance: a sensor's shar
 WHOLE_STEP_TOLERANCE = 0.05  # of an exposure, as exactly as residuals show it of some thousand samples
 SINGULAR = "the recordings do not determine f; record more, or more often"
 PREDICTED_RECORDINGS = 200  # held-out ones that are predicted: enough for a median
+UNDECIDED = 2.94  # of a log-likelihood: odds of 19 to 1
 
 
 def identify(
@@ -148,7 +149,7 @@ def identify(
                     return by_velocities
                 reason = "; ".join(one for one in (found.prediction.reason, advice) if one)
                 found = replace(found, prediction=replace(found.prediction, passed=False, reason=reason))
-        asked = not hidden and len(names) == 1 and not case.complete(found)
+        asked = not hidden and len(names) == 1 and not found.slow_sensor and not case.complete(found)
         by_slow_noise = case.with_slow_noise() if asked else None
         return by_slow_noise or (found if hidden else case.with_parts(found))
     except (NumericalFailure, np.linalg.LinAlgError) as error:
@@ -504,7 +505,8 @@ class _Case:
 
         The sensor has it, or it is a force, which has noise alone or else follows the state; of the sensor
         alone it is asked where f with white measurement noise is a rival. What gains most is tested first; it
-        has to be worth its parameters, to pass the test of f, and the past may tell nothing more.
+        has to be worth its parameters, to pass the test of f, and the past may tell nothing more. Where the
+        sensor's noise may as well be white as slow the answer is that of slow noise, refused.
         """
         free = self.options.hidden_velocities == "auto" and self.given is None and not self.integrator_step
         if not free or len(self.recordings.names) != 1:
@@ -517,6 +519,13 @@ class _Case:
                 tried.append((gain, found))
         for gain, found in sorted(tried, key=lambda one: -one[0]):
             with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
+                if rival is not None and abs(gain) < UNDECIDED:
+                    slow = self.finished(found)
+                    assert slow.prediction is not None and slow.slow_sensor is not None
+                    time, unit = slow.slow_sensor[1], self.recordings.time_unit or ""
+                    values = {"time": time, "unit": unit, "by_state": rival.noise is not None}
+                    reason = sentence(Remark("inference.slow_or_white", values))
+                    return replace(slow, prediction=replace(slow.prediction, passed=False, reason=reason))
                 if gain > 0 and self.complete(found := self.finished(found)):
                     return found
         return None

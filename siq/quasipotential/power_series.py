@@ -263,28 +263,20 @@ class CycleFormula(NamedTuple):
 
     is at the power s^k a linear equation ``c_k' + k (∂_s f_s + 4 c_2 D_ss) c_k = r_k`` with one periodic
     solution, r_k being known from lower powers; c_2 is half of the Hessian across.
-
-    Attributes
-    ----------
-    dynamics, cycle
-        f and D, and the cycle.
-    coefficients
-        Shape ``(K - 1, n)``: c_2 … c_K at the points of the cycle.
-    level
-        V up to which the formula holds.
-    residual
-        ``|∇V·(f + D∇V)|/∇V·D∇V`` at most, at states that no step has seen, from a thousandth of the level up
-        to it. By that share V may be off, to first order: along its characteristics it rises at the rate of
-        the denominator.
-    reach
-        The least and the largest s, shape ``(2, m)``, at m phases that are evenly spread.
     """
 
+    #: f and D, and the cycle
     dynamics: Dynamics
     cycle: Cycle
+    #: Shape ``(K - 1, n)``: c_2 … c_K at the points of the cycle
     coefficients: np.ndarray
+    #: V up to which the formula holds
     level: float = 0.0
+    #: ``|∇V·(f + D∇V)|/∇V·D∇V`` at most, at states that no step has seen, from a thousandth of the level up
+    #: to it. By that share V may be off, to first order: along its characteristics it rises at the rate of
+    #: the denominator.
     residual: float = np.inf
+    #: The least and the largest s, shape ``(2, m)``, at m phases that are evenly spread
     reach: np.ndarray = np.zeros((2, 1))
 
     @classmethod

@@ -418,40 +418,26 @@ STRICT = ConfigDict(extra="forbid")
 
 @pydantic_dataclass(frozen=True, config=STRICT)
 class Sampling:
-    """How samples make pairs, and what is taken off them.
+    """How samples make pairs, and what is taken off them."""
 
-    Attributes
-    ----------
-    pair_step
-        Largest time between the two samples of a pair; left out, all neighbours are pairs.
-    integrator_step
-        Step of the Euler–Maruyama simulation that made the recordings; None where none did.
-    background
-        Whether slow drift, baselines of recordings that differ in them, and faults of sensors are taken off.
-    """
-
+    #: Largest time between the two samples of a pair; left out, all neighbours are pairs
     pair_step: Annotated[float, Field(gt=0)] | None = None
+    #: Step of the Euler–Maruyama simulation that made the recordings; None where none did
     integrator_step: Annotated[float, Field(gt=0)] | None = None
+    #: Whether slow drift, baselines of recordings that differ in them, and faults of sensors are taken off
     background: bool = True
 
 
 @pydantic_dataclass(frozen=True, config=STRICT)
 class StateSpace:
-    """The states of a study, and D.
+    """The states of a study, and D."""
 
-    Attributes
-    ----------
-    names
-        Of the states, in order; None where the recordings tell.
-    units
-        Unit of each state by name, and of the time as ``t``; None where not given.
-    diffusion
-        D: ``identity``, its diagonal, or the matrix, of numbers or formulas of the states, in their units
-        squared per unit of time; None where not given, see `siq.inference.field_estimate`.
-    """
-
+    #: Of the states, in order; None where the recordings tell
     names: tuple[str, ...] | None = None
+    #: Unit of each state by name, and of the time as ``t``; None where not given
     units: dict[str, str] | None = None
+    #: D: ``identity``, its diagonal, or the matrix, of numbers or formulas of the states, in their units
+    #: squared per unit of time; None where not given, see `siq.inference.field_estimate`
     diffusion: DiffusionEntry | None = None
 
     def noise(self, states: Sequence[str]) -> Diffusion | None:

@@ -350,38 +350,26 @@ MOST_PARAMETERS = 2
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sweep:
-    """A landscape against one parameter, or two.
+    """A landscape against one parameter, or two."""
 
-    Attributes
-    ----------
-    parameters, states
-        Their names.
-    table
-        One row for every value and well: see ``sweep`` in `siq.workflow.tables`.
-    ways
-        One row for every value and way out of a well, barrier and prefactor; what
-        `siq.probability_of_tipping` reads.
-    branches
-        Equilibria and limit cycles along their branches, stable or not; empty for two parameters.
-    bifurcations
-        Folds, also of cycles, Hopf points and branch points; empty for two parameters.
-    notes
-        What could not be done, in words.
-    units
-        Of the states, by name; of the time as ``t``, and of the parameters by their names.
-    curves
-        Of two parameters, the curves of folds and of Hopf points in their plane, a row for each point; empty
-        for one.
-    """
-
+    #: Their names
     parameters: tuple[str, ...]
     states: tuple[str, ...]
+    #: One row for every value and well: see ``sweep`` in `siq.workflow.tables`
     table: pd.DataFrame
+    #: One row for every value and way out of a well, barrier and prefactor; what `siq.probability_of_tipping`
+    #: reads
     ways: pd.DataFrame
+    #: Equilibria and limit cycles along their branches, stable or not; empty for two parameters
     branches: pd.DataFrame
+    #: Folds, also of cycles, Hopf points and branch points; empty for two parameters
     bifurcations: pd.DataFrame
+    #: What could not be done, in words
     notes: tuple[str, ...] = ()
+    #: Of the states, by name; of the time as ``t``, and of the parameters by their names
     units: Mapping[str, str] = field(default_factory=dict)
+    #: Of two parameters, the curves of folds and of Hopf points in their plane, a row for each point; empty
+    #: for one
     curves: pd.DataFrame = field(default_factory=lambda: as_table("bifurcation_curves", []))
 
     def plot(self) -> Figure:

@@ -73,6 +73,13 @@ def test_a_sensor_with_white_noise_has_none() -> None:
     assert found.slow_sensor is None and found.sensor_variance is not None
 
 
+def test_where_it_may_as_well_be_white_nothing_is_certified(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ObservationModel, "gain", lambda *_, **__: -1.0)  # odds of 2.7 to 1
+    found = identified(recorded("slow")[0])
+    assert found.slow_sensor is not None and found.prediction is not None
+    assert not found.prediction.passed and found.prediction.reason
+
+
 @pytest.mark.slow
 def test_a_stage_that_wanders_is_told_from_what_it_carries() -> None:
     recordings, x = recorded("none")
