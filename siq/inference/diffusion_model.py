@@ -18,6 +18,9 @@ as one does not differ from zero by its own standard error. Over a step φ chang
 Residuals of pairs would show the noise of a sensor as well. The likelihood of a Kalman filter separates them:
 what process noise adds to the covariance of the state over an interval is εD(x), averaged over what the
 filter knows of x there. The variances of the sensors are then scored together with the coefficients of D.
+
+Where one state forgets much of itself from sample to sample, f bends what noise does on the way, and no
+law of residuals is known. Then f and D are fitted together, by the density that they give to each pair.
 """
 
 from __future__ import annotations
@@ -37,6 +40,7 @@ from siq.inference.kalman_filter import Noise, whiten
 from siq.inference.library import CandidateLibrary
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
+from siq.numerics.integration import TransitionDensity, distinct_steps
 from siq.numerics.randomness import positive
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -53,6 +57,17 @@ MAX_RELAXATION = 0.5  # of Jh/2: beyond that a residual hardly knows where its s
 MAX_STEP_RELAXATION = 2.0  # of the rates of J times h: the same of the mean over pairs
 MOST_UNKNOWN = 0.5  # of the pairs: where more have no covariance of the noise, the step is too coarse for f
 AVERAGED_PAIRS = 500  # the mean of a smooth function of the state, to a few per cent of a small term
+LEAST_CELLS, MOST_CELLS = 80, 400  # numerical: of the range of a state
+CELLS_PER_SPREAD = 8  # numerical: of what noise spreads it by within a step; a density is off by 10⁻² at most
+SLIGHT_NOISE = 1e-3  # numerical: of the least where states were recorded
+BEYOND = 1.5  # spreads by which a state may have been outside of what was recorded
+MOST_STEPS = 24  # of different length: each takes a matrix
+RATES = tuple(2.0 ** np.arange(-2, 5))  # of the noise of residuals, with which a search may begin
+MOST_DENSITY_STEPS, FEW_HALVINGS = 25, 8  # numerical: from a start that is any good a few are enough
+DENSITY_STEP, DENSITY_SETTLED = (
+    0.02,
+    1e-4,
+)  # numerical: standard errors; twice the log-likelihood still to gain
 SERIES_TERMS = 24  # of the exponential series, which then is exact to ten digits
 
 
@@ -343,12 +358,170 @@ class ResidualLikelihood(_DiffusionLikelihood):
         return logarithm, score.sum(axis=0), information, score.T @ score
 
 
+def has_densities(found: FieldEstimate, pairs: SnapshotPairs | StreamedPairs) -> bool:
+    """Whether coarse steps are fitted by densities: of one state that is no angle, and of few lengths."""
+    few = isinstance(pairs, SnapshotPairs) and len(distinct_steps(pairs.h)[0]) <= MOST_STEPS
+    return found.flow.coarse and found.library.dimension == 1 and not found.library.angles and few
+
+
+class _Transitions:
+    """Pairs of one state, and the density of each by values of the terms of f and strengths of shapes of εD.
+
+    The shapes are those of a `NoiseFormula`, or the one of a D that is known.
+    """
+
+    def __init__(self, found: FieldEstimate, pairs: SnapshotPairs) -> None:
+        self.x0, self.xh, self.h = pairs.x0[:, 0], pairs.xh[:, 0], pairs.h
+        noise, symbols = found.noise, found.library.symbols
+        self.terms = [found.library.terms[k] for k in found.support[:, 1]]
+
+        def shape(x: np.ndarray) -> np.ndarray:
+            return found.diffusion.at(x.T)[:, 0, 0][None]
+
+        functions = compile_formulas(self.terms, symbols)
+        shapes = shape if noise is None else compile_formulas(list(noise.terms), symbols)
+        self.of_field, self.of_noise = functions(self.x0[None]), shapes(self.x0[None])
+        self.strengths = noise.values if noise else found.noise_rate[0] / self.of_noise.mean(axis=1)
+        # Within a step noise spreads the state by √(εD h), or less where f brings it back.
+        back = 1 + 2 * np.abs(found.dynamics.jacobian(pairs.x0)[:, 0, 0]) * self.h
+        least, most = np.quantile(np.sqrt(self.strengths @ self.of_noise * self.h / back), [0.01, 0.99])
+        low, high = min(self.x0.min(), self.xh.min()), max(self.x0.max(), self.xh.max())
+        aside = min(float(most), (high - low) / 2) * BEYOND
+        count = max(int((high - low + 2 * aside) / least * CELLS_PER_SPREAD), LEAST_CELLS)
+        if count > MOST_CELLS:
+            raise NumericalFailure("noise moves some states by a small part of what it moves others by")
+        self.edges = np.linspace(low - aside, high + aside, count + 1)
+        inner, middle = self.edges[1:-1], (self.edges[1:] + self.edges[:-1]) / 2
+        self._drift, self._between, self._inside = (
+            functions(inner[None]),
+            shapes(inner[None]),
+            shapes(middle[None]),
+        )
+
+    def density(self, values: np.ndarray, strengths: np.ndarray) -> TransitionDensity:
+        """With f and εD of some values; beyond the recorded states εD does not vanish."""
+        least = SLIGHT_NOISE * float((strengths @ self.of_noise).min())
+        between, inside = (np.maximum(strengths @ one, least) for one in (self._between, self._inside))
+        return TransitionDensity.of(self.edges, values @ self._drift, between, inside)
+
+    def log_densities(self, values: np.ndarray, strengths: np.ndarray) -> np.ndarray:
+        """Of each pair; minus infinity where εD is not positive, or f too steep."""
+        if not (strengths @ self.of_noise).min() > 0:
+            return np.full(len(self.h), -np.inf)
+        found = self.density(values, strengths).log_density(self.x0, self.xh, self.h)
+        return np.where(np.isfinite(found), found, -np.inf)
+
+
+def fitted_by_densities(found: FieldEstimate, pairs: SnapshotPairs) -> tuple[FieldEstimate, np.ndarray]:
+    """The terms of f and of εD with the values of the largest likelihood of pairs of one state.
+
+    By steps of the sum of squares of single scores, halved until each gains (Berndt et al., Ann. Econ. Soc.
+    Meas. 3 (1974) 653). And these scores ``(n, p + k)``, by values of f and strengths of εD.
+
+    Raises
+    ------
+    NumericalFailure
+        When the search does not settle.
+    """
+    known, p, symbols = _Transitions(found, pairs), len(found.support), found.library.symbols
+    rate, k = float((known.strengths @ known.of_noise).mean()), len(known.strengths)
+    # Orthonormal functions in the place of monomials, which are nearly the same far from the origin.
+    triangle = np.zeros((p + k, p + k))
+    triangle[:p, :p] = np.linalg.qr((known.of_field * np.sqrt(known.h / rate)).T)[1]
+    triangle[p:, p:] = np.linalg.qr(known.of_noise.T / (np.sqrt(2) * rate))[1]
+    turn, errors = np.linalg.inv(triangle), np.ones(p + k)
+
+    def densities(place: np.ndarray) -> np.ndarray:
+        return known.log_densities(*np.split(turn @ place, [p]))
+
+    starts = [np.append(found.values, known.strengths)]
+    if not found.flow.by_density and found.diffusion.constant:
+        # Where p is the law of a state at rest, 2f/εD is the slope of ln p (Hyvärinen, JMLR 6 (2005) 695).
+        slopes = compile_formulas([term.diff(symbols[0]) for term in known.terms], symbols)(known.x0[None])
+        functions = turn[:p, :p].T @ known.of_field
+        rest = np.linalg.solve(functions @ functions.T, turn[:p, :p].T @ slopes.sum(axis=1))
+        starts += [one * np.append(-turn[:p, :p] @ rest * rate / 2, known.strengths) for one in RATES]
+    now, at = max(
+        ((densities(triangle @ one), triangle @ one) for one in starts), key=lambda one: one[0].sum()
+    )
+    for _ in range(MOST_DENSITY_STEPS):
+        with np.errstate(invalid="ignore"):
+            ends = [densities(at + move) for move in np.diag(DENSITY_STEP * errors)]
+            scores = (np.stack(ends, axis=1) - now[:, None]) / (DENSITY_STEP * errors)
+        if not np.isfinite(scores).all():
+            break
+        covariance, slope = _inverse(scores.T @ scores), scores.sum(axis=0)
+        step, errors = covariance @ slope, np.sqrt(np.diag(covariance))
+        gain = float(step @ slope)
+        for _ in range(FEW_HALVINGS if gain > DENSITY_SETTLED else 0):
+            if (then := densities(at + step)).sum() > now.sum():
+                at, now = at + step, then
+                break
+            step = step / 2
+        else:
+            break
+    if not (np.isfinite(scores).all() and gain < 1.0):
+        raise NumericalFailure("f and D of so long steps are not found; sample more often")
+    values, covariance = turn @ at, turn @ covariance @ turn.T * pairs.copies
+    flow, of_noise = replace(found.flow, by_density=True), covariance[p:, p:]
+    fitted = found.with_values(found.support, values[:p], covariance=covariance[:p, :p], flow=flow)
+    if found.noise is not None:
+        formula = replace(found.noise, values=values[p:], covariance=of_noise)
+        return fitted.with_formula(formula, pairs.x0), scores @ triangle
+    size = known.of_noise.mean()
+    noise_rate, own = values[p:, None] * size, None
+    if found.diffusion.constant:
+        own = replace(constant_noise(symbols, noise_rate, samples=1.0), covariance=of_noise * size**2)
+    return replace(fitted, noise_rate=noise_rate, constant_noise=own), scores @ triangle
+
+
+def noise_formula_by_densities(
+    found: FieldEstimate, pairs: SnapshotPairs, *, false_terms: float
+) -> tuple[FieldEstimate, np.ndarray] | None:
+    """All terms of f with those of a D(x), and the scores; None where a constant D can be held.
+
+    By Wald's test of the strengths of the other shapes of εD; see `_DiffusionLikelihood.selected`.
+    """
+    library = found.library
+    terms = tuple(term for _, term in library.functions(library.symbols, DEGREE, library.angles))
+    places, values = _all_places(1, len(terms)), np.zeros(len(terms))
+    values[0] = found.noise_rate[0, 0]
+    formula = NoiseFormula(library.symbols, places[:, :2], terms, values, np.eye(len(terms)), 1.0)
+    everything = np.stack([np.zeros(library.size, dtype=int), np.arange(library.size)], axis=1)
+    whole = found.with_values(everything, found.coefficients[:, 0]).with_formula(formula, pairs.x0)
+    whole = fitted_by_densities(whole, pairs)[0]
+    assert whole.noise is not None
+    formula, change, spread = whole.noise, whole.noise.values[1:], whole.noise.covariance[1:, 1:]
+    probability = float(scipy.special.chdtrc(len(change), change @ _inverse(spread) @ change))
+    rates = whole.noise_rate_at(pairs.x0)[:, 0, 0]
+    if probability >= false_terms or rates.std() < HARMLESS_CHANGE * rates.mean():
+        return None
+    critical = float(-scipy.special.ndtri(false_terms / (2 * len(terms))))
+    kept, values = _eliminated(places, formula.values, formula.covariance, critical)
+    formula = NoiseFormula(
+        library.symbols, places[kept, :2], tuple(terms[k] for k in kept), values,
+        formula.covariance[np.ix_(kept, kept)], probability,
+    )  # fmt: skip
+    return fitted_by_densities(whole.with_formula(formula, pairs.x0), pairs)
+
+
+def normal_increments(found: FieldEstimate, pairs: SnapshotPairs) -> np.ndarray:
+    """Normal scores of pairs of one state times √(εD h): residuals as of a short step, shape ``(n, 1)``."""
+    known = _Transitions(found, pairs)
+    scores = known.density(found.values, known.strengths).normal_scores(known.x0, known.xh, known.h)
+    if not np.isfinite(scores).all():
+        raise NumericalFailure("f is too steep for so long steps; sample more often")
+    return np.asarray(scores * np.sqrt(known.strengths @ known.of_noise * known.h))[:, None]
+
+
 def process_noise_increments(found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray) -> np.ndarray:
     """Residuals per root of time, with what the system forgot within the step put back: shape ``(n, d)``.
 
     ``∫₀ʰ e^{Js} D e^{Jᵀs} ds`` is ``h e^{Jh/2} D e^{Jᵀh/2}`` but for the second order in Jh. Of coarse steps
     it is the covariance of `siq.numerics.integration.FlowMap.moments`.
     """
+    if found.flow.by_density:
+        return np.asarray(rest / np.sqrt(pairs.h)[:, None])
     if found.flow.coarse:
         rate = np.broadcast_to(found.noise_rate_at(pairs.x0), (len(rest), *found.noise_rate.shape))
         given = np.ascontiguousarray(pairs.x0.T), pairs.h, rate

@@ -431,6 +431,8 @@ class FieldEstimate:
 
     def error_of_strength(self, x0: np.ndarray, h: np.ndarray) -> float:
         """Standard error of ``ln ε`` by residuals of pairs from states ``(n, d)``, h apart."""
+        if self.flow.by_density and self.constant_noise is not None:
+            return float(np.sqrt(self.constant_noise.covariance[0, 0]) / self.constant_noise.values[0])
         # The variance of n residuals of d states has the relative standard error √(2/nd). A step multiplies
         # it by about exp(h tr J/d), which is known as well as the divergence of f is.
         d, (components, terms) = self.library.dimension, self.support.T

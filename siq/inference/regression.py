@@ -20,6 +20,7 @@ which standard errors follow, and the process noise: over longer times it is whi
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -31,7 +32,13 @@ from scipy.special import erfc
 from siq.data.recordings import Recordings, SnapshotPairs, StreamedPairs, parents_of
 from siq.data.stationarity import even_stretches, lagged_covariances, long_run_covariance
 from siq.errors import NumericalFailure
-from siq.inference.diffusion_model import ResidualLikelihood
+from siq.inference.diffusion_model import (
+    ResidualLikelihood,
+    fitted_by_densities,
+    has_densities,
+    noise_formula_by_densities,
+    normal_increments,
+)
 from siq.inference.field_estimate import HARMLESS_BIAS, NOISE_FREE, FieldEstimate
 from siq.inference.library import CandidateLibrary, IdentificationOptions
 from siq.inference.selection import (
@@ -439,9 +446,15 @@ def identify_vector_field(
     samples = len(pairs) / (1.0 if noise_free else pairs.copies)
     problems = LinearProblem.of_components(triangle, samples=samples, critical=critical)
     choose = partial(strong_terms, precision=options.precision) if noise_free else best_support
-    chosen, noise = chosen_terms(problems, library, choose), Diffusion.identity(library.dimension)
-    none, unit = np.zeros(len(chosen)), np.eye(len(chosen))
-    found = FieldEstimate.on_support(library, chosen, none, unit, rate, ratio, flow, noise)
+    everything, unit = regression.support, Diffusion.identity(library.dimension)
+    values = np.concatenate([one.solve(range(library.size)) for one in problems])
+    unknown = np.eye(len(values))
+    found = FieldEstimate.on_support(library, everything, values, unknown, rate, ratio, flow, unit)
+    if isinstance(pairs, SnapshotPairs) and has_densities(found, pairs):
+        with contextlib.suppress(NumericalFailure):  # where no D is nearly constant, weights are found later
+            found, scores = fitted_by_densities(found, pairs)
+            problems = [_problem_of_scores(found, scores, samples=samples, critical=critical)]
+    chosen = chosen_terms(problems, library, choose)
 
     def fit(support: np.ndarray) -> tuple[FieldEstimate, np.ndarray]:
         nonlocal found
@@ -459,8 +472,22 @@ def identify_vector_field(
     return found if noise_free else replace(found, alternatives=model_average(problems, support, library))
 
 
+def _problem_of_scores(
+    found: FieldEstimate, scores: np.ndarray, *, samples: float, critical: np.ndarray
+) -> LinearProblem:
+    """The terms of f of one state about the largest likelihood, by single scores of f and, behind, of D."""
+    # Less what D explains of them; errors are those of n residuals of variance one.
+    basis = np.linalg.qr(scores[:, found.library.size :])[0]
+    columns = scores[:, : found.library.size] - basis @ (basis.T @ scores[:, : found.library.size])
+    triangle = stacked_triangle([np.column_stack([columns, columns @ found.values])])
+    triangle[-1, -1] = np.sqrt(max(samples - found.library.size, 1.0))
+    return LinearProblem.of_components(triangle, samples=samples, critical=critical)[0]
+
+
 def _fit_support(found: FieldEstimate, regression: _PairRegression) -> FieldEstimate:
     """Generalised least squares on a support, with flow, noise and covariance brought up to date."""
+    if found.flow.by_density and isinstance(regression.pairs, SnapshotPairs):
+        return fitted_by_densities(found, regression.pairs)[0]
     d, n, active = found.library.dimension, len(regression.pairs), len(regression.active)
     values, rate, rest, flow = found.values, found.noise_rate, found.noise_rate, found.flow
     if not flow.euler:
@@ -499,7 +526,7 @@ def refit(found: FieldEstimate, pairs: SnapshotPairs) -> FieldEstimate:
     regression = _PairRegression(found.library, pairs, found.support)
     if isinstance(pairs, LaggedPairs):
         return _fit_by_instruments(regression, pairs, found.diffusion)
-    if found.diffusion.constant:
+    if found.diffusion.constant or found.flow.by_density:
         return _fit_support(found, regression)
     for _ in range(WEIGHT_ROUNDS + 1):  # each brings the flow up to date
         triangle, intensity = weighted_triangle(found, pairs, found.support)
@@ -511,7 +538,12 @@ def refit(found: FieldEstimate, pairs: SnapshotPairs) -> FieldEstimate:
 
 
 def residuals(found: FieldEstimate, pairs: SnapshotPairs) -> np.ndarray:
-    """``Xh - E[Xh | X0]`` of pairs, shape ``(n, d)``; correlated noise shifts no mean within a step."""
+    """``Xh - E[Xh | X0]`` of pairs, shape ``(n, d)``; correlated noise shifts no mean within a step.
+
+    Where their densities are known, normal scores as large as these would be over a short step.
+    """
+    if found.flow.by_density and not isinstance(pairs, LaggedPairs):
+        return normal_increments(found, pairs)
     regression = _PairRegression(found.library, pairs, found.support)
     rate = None if isinstance(pairs, LaggedPairs) else found.noise_rate_at(pairs.x0)
     velocity = regression.corrected(found.values, found.flow, rate)
@@ -552,6 +584,18 @@ def with_noise_formula(
         When D depends on the state, and no formula for it is positive at all recorded states; or when an
         equation of f has no significant term.
     """
+    if found.flow.by_density:
+        with contextlib.suppress(NumericalFailure):
+            by_state = noise_formula_by_densities(found, pairs, false_terms=false_terms)
+            if by_state is None:
+                return None
+            critical = critical_values(found.library, false_terms=false_terms)
+            problem = _problem_of_scores(*by_state, samples=len(pairs) / pairs.copies, critical=critical)
+            support = chosen_terms([problem], found.library)
+            values = problem.solve(problem.places(support))[support[:, 1]]
+            found = refit(by_state[0].with_values(support, values), pairs)
+            return replace(found, alternatives=model_average([problem], support, found.library))
+        found = replace(found, flow=replace(found.flow, by_density=False))
     rest = residuals(found, pairs)
     likelihood = ResidualLikelihood(found, pairs, rest)
     probability = likelihood.constant_probability()

@@ -1,0 +1,104 @@
+"""One state that forgets much of itself from sample to sample: f and D by the density of each transition."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from siq.data.recordings import SnapshotPairs
+from siq.inference.diffusion_model import process_noise_increments
+from siq.inference.field_estimate import FieldEstimate
+from siq.inference.library import IdentificationOptions, candidate_library
+from siq.inference.regression import identify_vector_field, refit, residuals, with_noise_formula
+from siq.numerics.integration import TransitionDensity, distinct_steps
+
+RATE, INTENSITY = 1.3, 0.4
+STRENGTH, WITHIN = 0.4, 100  # barriers of 1.25
+
+
+def double_well(step: float, *, bent: float = 0.0, least: float = 1.0, unit: float = 1.0) -> SnapshotPairs:
+    """Records of ``dx = (x - x³) dt + √(ε (least + bent x²)) dW``, a hundred steps between two samples."""
+    draw, x, kept = np.random.default_rng(1), np.linspace(-1.5, 1.5, 200), []
+    for _ in range(101):
+        kept.append(unit * x)
+        for _ in range(WITHIN):
+            kick = np.sqrt(STRENGTH * (least + bent * x**2) * step / WITHIN) * draw.standard_normal(len(x))
+            x = x + (x - x**3) * step / WITHIN + kick
+    states = np.array(kept).T[:, :, None]
+    pairs, count = (states[:, :-1].reshape(-1, 1), states[:, 1:].reshape(-1, 1)), 100 * len(x)
+    return SnapshotPairs(*pairs, np.full(count, step), np.repeat(np.arange(len(x)), 100))
+
+
+def identified(pairs: SnapshotPairs) -> FieldEstimate:
+    return identify_vector_field(candidate_library(("x",), degree=5), pairs, options=IdentificationOptions())
+
+
+def terms_of(found: FieldEstimate) -> dict[str, tuple[float, float]]:
+    errors = np.sqrt(np.diag(found.covariance))
+    names = [str(found.library.terms[k]) for k in found.support[:, 1]]
+    return {name: (value, error) for name, value, error in zip(names, found.values, errors, strict=True)}
+
+
+def test_a_density_is_that_of_a_linear_force() -> None:
+    """Ornstein and Uhlenbeck: a normal law, at two steps, one of which jitters by rounding."""
+    draw = np.random.default_rng(0)
+    h = np.where(np.arange(3000) % 3, 0.5, 1.0) * (1 + 1e-12 * draw.standard_normal(3000))
+    x0, z = 0.5 * draw.standard_normal(3000), draw.standard_normal(3000)
+    spread = np.sqrt(INTENSITY / (2 * RATE) * (1 - np.exp(-2 * RATE * h)))
+    xh = x0 * np.exp(-RATE * h) + spread * z
+    edges = np.linspace(-3, 3, 241)
+    density = TransitionDensity.of(
+        edges, -RATE * edges[1:-1], np.full(239, INTENSITY), np.full(240, INTENSITY)
+    )
+    expected = scipy.stats.norm.logpdf(z) - np.log(spread)
+    assert len(distinct_steps(h)[0]) == 2
+    assert density.log_density(x0, xh, h) == pytest.approx(expected, abs=0.01)
+    assert density.normal_scores(x0, xh, h) == pytest.approx(z, abs=0.005)
+    steep = TransitionDensity.of(edges, np.full(239, 1e30), np.full(239, INTENSITY), np.full(240, INTENSITY))
+    assert np.isnan(steep.log_density(x0, xh, h)).all()
+
+
+@pytest.mark.parametrize("step", [0.5, 1.0])
+def test_f_and_d_are_found_over_steps_as_long_as_the_state_takes_to_relax(step: float) -> None:
+    """Within such a step a state that begins on the top is in either well; it relaxes in 0.5."""
+    pairs = double_well(step)
+    found = identified(pairs)
+    assert found.flow.by_density and found.constant_noise is not None
+    terms = terms_of(found)
+    assert set(terms) == {"x", "x**3"}
+    for name, true in (("x", 1.0), ("x**3", -1.0)):
+        assert abs(terms[name][0] - true) < 3 * terms[name][1]
+    error = np.sqrt(found.constant_noise.covariance[0, 0])
+    assert abs(found.noise_rate[0, 0] - STRENGTH) < 3 * error < 0.1 * STRENGTH
+    assert with_noise_formula(found, pairs, false_terms=0.01) is None
+    scores = process_noise_increments(found, pairs, residuals(found, pairs))[:, 0] / np.sqrt(STRENGTH)
+    assert scipy.stats.kstest(scores, "norm").pvalue > 0.01
+    half = refit(found, pairs.take(slice(None, None, 2)))
+    assert half.flow.by_density and half.values == pytest.approx(found.values, rel=0.2)
+
+
+def test_units_change_nothing_but_units() -> None:
+    one, other = (identified(double_well(0.7, unit=unit)) for unit in (1.0, 250.0))
+    assert other.noise_rate == pytest.approx(250.0**2 * one.noise_rate, rel=1e-3)
+    for name, power in (("x", 0), ("x**3", -2)):
+        assert terms_of(other)[name][0] == pytest.approx(250.0**power * terms_of(one)[name][0], rel=1e-2)
+
+
+def test_a_noise_that_depends_on_the_state_is_found_over_long_steps() -> None:
+    pairs = double_well(0.5, bent=0.5)
+    found = with_noise_formula(identified(pairs), pairs, false_terms=0.01)
+    assert found is not None and found.noise is not None
+    assert [str(term) for term in found.noise.terms] == ["1", "x**2"]
+    expected = STRENGTH * np.array([1, 0.5])
+    assert (np.abs(found.noise.values - expected) < 4 * found.noise.standard_errors).all()
+    terms = terms_of(found)
+    assert all(abs(terms[name][0] - true) < 4 * terms[name][1] for name, true in (("x", 1), ("x**3", -1)))
+
+
+@pytest.mark.slow
+def test_a_noise_that_nearly_vanishes_is_found_by_moments() -> None:
+    pairs = double_well(0.3, bent=1.0, least=1e-5)
+    found = with_noise_formula(identified(pairs), pairs, false_terms=0.01)
+    assert found is not None and found.noise is not None and not found.flow.by_density
+    assert "x**2" in [str(term) for term in found.noise.terms]
