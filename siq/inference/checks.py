@@ -154,7 +154,7 @@ def correlations_between(first: np.ndarray, second: np.ndarray) -> tuple[np.ndar
 def _whitened(found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray) -> np.ndarray:
     """Residuals as noise ``σ(x)⁻¹ r/√h``, of the variance ε everywhere: shape ``(n, d)``."""
     forces = process_noise_increments(found, pairs, rest)
-    return np.asarray((found.diffusion.whitening_at(pairs.x0) @ forces[:, :, None])[:, :, 0])
+    return np.asarray((found.diffusion.whitening_at(found.on_the_way(pairs)) @ forces[:, :, None])[:, :, 0])
 
 
 def _joined(sample: SnapshotPairs, rest: np.ndarray) -> np.ndarray:

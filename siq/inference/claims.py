@@ -86,7 +86,7 @@ class _Residuals:
         force = found.dynamics.drift(pairs.x0) * np.sqrt(pairs.h)[:, None]
         moves = positive(np.sqrt((rest**2).mean(axis=0)))
         if not found.diffusion.constant:
-            whitening = found.diffusion.whitening_at(pairs.x0)
+            whitening = found.diffusion.whitening_at(found.on_the_way(pairs))
             rest, force = (np.einsum("nij,nj->ni", whitening, one) for one in (rest, force))
         moved = np.sqrt(((pairs.xh - pairs.x0) ** 2 / pairs.h[:, None]).mean(axis=0))
         self.noisy = np.sqrt((rest**2).mean(axis=0)) > NOISELESS * moved

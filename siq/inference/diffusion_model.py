@@ -523,7 +523,8 @@ def process_noise_increments(found: FieldEstimate, pairs: SnapshotPairs, rest: n
     if found.flow.by_density:
         return np.asarray(rest / np.sqrt(pairs.h)[:, None])
     if found.flow.coarse:
-        rate = np.broadcast_to(found.noise_rate_at(pairs.x0), (len(rest), *found.noise_rate.shape))
+        rate = found.noise_rate_at(found.on_the_way(pairs))
+        rate = np.broadcast_to(rate, (len(rest), *found.noise_rate.shape))
         given = np.ascontiguousarray(pairs.x0.T), pairs.h, rate
         spread = found.flow.moments(found.dynamics.drift_of_components, *given)[1]
         # Of a few states f leads far away within a step, or D is none, as where formulas of both end.

@@ -440,6 +440,19 @@ class FieldEstimate:
         forgotten = means @ self.library.derivatives[:, components, terms] * 2 * self.flow.response_share / d
         return float(np.sqrt(2 / (len(h) * d) + forgotten @ self.covariance @ forgotten))
 
+    def on_the_way(self, pairs: SnapshotPairs) -> np.ndarray:
+        """States in the middle of the mean way of pairs, ``(n, d)``: there D is that of the step.
+
+        To first order; where it is none, as behind the end of a formula, and of densities, where pairs begin.
+        """
+        if self.diffusion.constant or self.flow.by_density:
+            return pairs.x0
+        middle = pairs.x0 + (self.flow.response_share * pairs.h)[:, None] * self.dynamics.drift(pairs.x0)
+        matrices = self.diffusion.at(middle)
+        positive = np.isfinite(matrices).all(axis=(1, 2))
+        positive[positive] = np.linalg.eigvalsh(matrices[positive])[:, 0] > 0
+        return np.where(positive[:, None], middle, pairs.x0)
+
     def with_rival(self, other: FieldEstimate, probability: float) -> FieldEstimate:
         """With what another estimate, of some probability, leaves open in f and in ε.
 

@@ -449,7 +449,7 @@ class _Case:
             rest, h = residuals(fitted, pairs), pairs.h[:, None]
             if fitted.diffusion.constant:
                 return float((rest**2 / h).mean())
-            return float(fitted.diffusion.squared_speed(pairs.x0, rest / np.sqrt(h)).mean())
+            return float(fitted.diffusion.squared_speed(fitted.on_the_way(pairs), rest / np.sqrt(h)).mean())
 
         probability = mean_residual_probability(fitted, unseen, seen=len(training.h))
         ratio = mean_square(unseen) / mean_square(training)
@@ -537,7 +537,7 @@ class _Case:
             return found
         pairs = found.wrapped(self._pairs(self._states(found)))
         rest = process_noise_increments(found, pairs, residuals(found, pairs))
-        rest = np.einsum("nij,nj->ni", found.diffusion.whitening_at(pairs.x0), rest)
+        rest = np.einsum("nij,nj->ni", found.diffusion.whitening_at(found.on_the_way(pairs)), rest)
         known = found.library.evaluate(pairs.x0)[:, np.unique(found.support[:, 1])]
         known = np.column_stack([np.ones(len(rest)), known]) * np.sqrt(pairs.h)[:, None]
         known = np.linalg.qr(known / positive(np.linalg.norm(known, axis=0)))[0]

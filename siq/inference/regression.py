@@ -545,7 +545,7 @@ def residuals(found: FieldEstimate, pairs: SnapshotPairs) -> np.ndarray:
     if found.flow.by_density and not isinstance(pairs, LaggedPairs):
         return normal_increments(found, pairs)
     regression = _PairRegression(found.library, pairs, found.support)
-    rate = None if isinstance(pairs, LaggedPairs) else found.noise_rate_at(pairs.x0)
+    rate = None if isinstance(pairs, LaggedPairs) else found.noise_rate_at(found.on_the_way(pairs))
     velocity = regression.corrected(found.values, found.flow, rate)
     return (velocity - regression.predicted(found.values)) * pairs.h[:, None]
 
@@ -641,7 +641,8 @@ def weighted_triangle(
     less what f adds to a straight step; or what f leaves of them.
     """
     regression, d = _PairRegression(found.library, pairs, found.support), found.library.dimension
-    velocity = regression.corrected(found.values, found.flow, found.noise_rate_at(pairs.x0))
+    middle = found.on_the_way(pairs)
+    velocity = regression.corrected(found.values, found.flow, found.noise_rate_at(middle))
     left = velocity - regression.predicted(found.values)
     goal = left if of_rest else velocity
     places = all_coefficients(range(d), found.library.size) if places is None else places
@@ -652,7 +653,7 @@ def weighted_triangle(
         nonlocal squares
         part = slice(begin, begin + WEIGHTED_CHUNK)
         x, h = pairs.x0[part], pairs.h[part]
-        whitening = found.diffusion.whitening_at(x) * np.sqrt(h)[:, None, None]
+        whitening = found.diffusion.whitening_at(middle[part]) * np.sqrt(h)[:, None, None]
         terms = found.library.evaluate(x)[:, places[:, 1]]
         block = np.empty((len(x), d, p + 1))
         block[:, :, :-1] = whitening[:, :, places[:, 0]] * terms[:, None, :]

@@ -517,7 +517,7 @@ def with_work_of_samples(
     """
     library, diffusion, (components, terms) = found.library, found.diffusion, found.support.T
     rest = process_noise_increments(found, pairs, residuals(found, pairs))
-    whitening = diffusion.whitening_at(pairs.x0)
+    whitening = diffusion.whitening_at(found.on_the_way(pairs))
     noise = np.einsum("nij,nj->ni", whitening, rest)
     intensity = float((noise**2).mean())
     seen = [one for path in paths if (one := _work_of_samples(found, pairs, noise, intensity, path))]
