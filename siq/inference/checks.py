@@ -340,20 +340,22 @@ def check_prediction(
     errors: np.ndarray | None = None,
     mean_probability: float | None = None,
     held_out_ratio: float = 1.0,
+    held_out_values: float = np.inf,
 ) -> Verdict:
     """Whether f, which every V here is made from, holds for recordings that it was not fitted to.
 
     Without noise by the median of the errors of long-term prediction. Under noise by the mean square of the
-    held-out residuals over that of the others, whose excess is the figure; and by the probability of their
-    mean: where that refuses, the figure is how many powers of ten it lies below 1. A fault of the noise
-    (`NoiseDiagnosis.fault`) refuses before all.
+    held-out residuals over that of the others, whose excess is the figure, less what chance makes of so many
+    values; and by the probability of their mean: where that refuses, the figure is how many powers of ten it
+    lies below 1. A fault of the noise (`NoiseDiagnosis.fault`) refuses before all.
     """
     if noise_fault is not None:
         return Verdict.refused(noise_fault, limits.prediction)
     if errors is not None:
         return Verdict.of(float(np.median(errors)), limits.prediction, UNPREDICTED)
     assert mean_probability is not None
-    value, limit = max(held_out_ratio - 1, 0.0), limits.held_out_ratio - 1
+    chance = float(np.exp(-scipy.special.ndtri(limits.each) * np.sqrt(2 / held_out_values)))
+    value, limit = max(held_out_ratio / chance - 1, 0.0), limits.held_out_ratio - 1
     rarity, rare = -float(np.log10(max(mean_probability, 1e-300))), -float(np.log10(limits.each))
     if value <= limit and not rarity <= rare:
         reason = (

@@ -213,6 +213,8 @@ class _Case:
         # Under noise every recording counts: all give the result, a part of them its test.
         pairs = self._pairs(self.recordings)
         found = with_process_noise_rate(regress(pairs), pairs)
+        if found.flow.by_density and self.given is None:  # a wrong D would look like a noisy sensor
+            found = with_noise_formula(found, pairs, false_terms=self.options.false_terms) or found
         return self.with_sensor_noise(found) or self._finished_by_pairs(found)
 
     def with_sensor_noise(self, found: FieldEstimate) -> FieldEstimate | None:
@@ -234,11 +236,11 @@ class _Case:
         if bias is not None and bias <= HARMLESS_BIAS:
             return None
         # Over long steps f hides most of the correlation, and a search that begins low finds no way up.
-        fault = ""
+        fault, unit = "", Diffusion.identity(self.library.dimension)
         for share in (np.clip(-correlation, MIN_SHARE, MAX_SHARE), np.full(len(rate), MAX_SHARE)):
             noise = Noise(share * variance, rate * (1 - 2 * share))
             try:
-                again = self.by_likelihood(ObservationModel(self.library, found.diffusion), noise)
+                again = self.by_likelihood(ObservationModel(self.library, unit), noise)
                 assert again.diagnosis is not None and again.diagnosis.sensor_evidence is not None
                 sensors, count = int((score < SUSPECT_SCORE).sum()), len(pairs.h)
                 odds = again.diagnosis.sensor_evidence + sensors * np.log(8 * np.pi / count)
@@ -421,7 +423,10 @@ class _Case:
                 check_units(self.recordings.names, self.units)
                 found = diagnosed(found, DiffusionSource.UNIT)
             else:
-                by_state = with_noise_formula(whole, everything, false_terms=false_terms)
+                constant = whole.noise is None
+                by_state = (
+                    with_noise_formula(whole, everything, false_terms=false_terms) if constant else None
+                )
                 found = whole if by_state is None else diagnosed(by_state, DiffusionSource.ESTIMATED)
         noise = found.diagnosis
         assert noise is not None
@@ -458,8 +463,10 @@ class _Case:
     def _tested(self, found: FieldEstimate, **figures: Any) -> FieldEstimate:
         """The estimate with the verdict of `check_prediction` on its figures."""
         assert found.diagnosis is not None
-        fault = found.diagnosis.fault(self.recordings.names)
-        return replace(found, prediction=check_prediction(noise_fault=fault, limits=self.limits, **figures))
+        figures |= {"noise_fault": found.diagnosis.fault(self.recordings.names), "limits": self.limits}
+        return replace(
+            found, prediction=check_prediction(held_out_values=self.held_out.values.size, **figures)
+        )
 
     def with_hidden_states(self) -> FieldEstimate:
         """f, tested, where the second half of the library's states are velocities that were not recorded."""
