@@ -44,38 +44,26 @@ class Recordings:
     """Trajectories as measured, checked: finite numbers, and times that increase within every recording.
 
     Not to be confused with `SnapshotPairs`, which have lost the order in time.
-
-    Attributes
-    ----------
-    names
-        The d measured columns.
-    units
-        The unit of each measured column, None where the file does not say.
-    labels
-        One label per recording, in order of first appearance.
-    recording
-        Shape ``(n,)``: the index of each row's recording in `labels`; it never decreases.
-    t
-        Shape ``(n,)``: the time of each row, in `time_unit`.
-    values
-        Shape ``(n, d)``: what was measured, in `units`.
-    time_unit
-        The unit of `t`, None where the file does not say.
-    headings
-        What the file calls each measured column, where that is no name for a formula: ``bead x`` of
-        ``bead_x``. Empty where all are called by their names.
-    remarks
-        What was assumed or repaired when they were read.
     """
 
+    #: The d measured columns
     names: tuple[str, ...]
+    #: The unit of each measured column, None where the file does not say
     units: tuple[str | None, ...]
+    #: One label per recording, in order of first appearance
     labels: tuple[str, ...]
+    #: Shape ``(n,)``: the index of each row's recording in `labels`; it never decreases
     recording: np.ndarray
+    #: Shape ``(n,)``: the time of each row, in `time_unit`
     t: np.ndarray
+    #: Shape ``(n, d)``: what was measured, in `units`
     values: np.ndarray
+    #: The unit of `t`, None where the file does not say
     time_unit: str | None = None
+    #: What the file calls each measured column, where that is no name for a formula: ``bead x`` of
+    #: ``bead_x``. Empty where all are called by their names.
     headings: tuple[str, ...] = ()
+    #: What was assumed or repaired when they were read
     remarks: tuple[Remark, ...] = ()
 
     @property

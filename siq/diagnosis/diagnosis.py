@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+import sympy
 
 from siq.diagnosis.evidence import NUMERICAL_ERRORS
 from siq.diagnosis.investigation import HeldOutRuns, held_out_runs, investigate
@@ -31,13 +32,13 @@ from siq.diagnosis.verdict import statement_of
 from siq.errors import InputError, NumericalFailure
 from siq.inference.budget import Budget, BudgetSpent
 from siq.inference.kalman_filter import MAX_SUBSTEPS
-from siq.inference.measurements import first_states, with_expectations, without_variation
+from siq.inference.measurements import first_states, with_expectations
 from siq.inference.recalibration import most_varying, recalibrate
 from siq.inference.trajectories import scored_rows
 from siq.remarks import Remark
 from siq.systems.cards import load_system
 from siq.systems.diffusion import Diffusion
-from siq.systems.dynamics import Dynamics
+from siq.systems.dynamics import Dynamics, symbol
 from siq.systems.simulation import Step, with_simulator
 
 if TYPE_CHECKING:
@@ -244,7 +245,18 @@ def _completed(model: Dynamics, x: np.ndarray, *, process: np.ndarray | None = N
     noise = model.diffusion
     if process is not None and (process > 0).any():
         noise = Diffusion(np.diag(process))
-    return without_variation(replace(model, domain=domain, diffusion=noise))
+    mean = {symbol(each.name): sympy.S.Zero for each in model.inputs if each.name.startswith("_")}
+    return replace(
+        model,
+        domain=domain,
+        diffusion=noise,
+        equations=tuple(each.xreplace(mean) for each in model.equations),
+        outputs=tuple((name, formula.xreplace(mean)) for name, formula in model.outputs),
+        inputs=tuple(each for each in model.inputs if not each.name.startswith("_")),
+        parameters=tuple(each for each in model.parameters if not each.name.startswith("_")),
+        expected_together=() if mean else model.expected_together,
+        covariance=None if mean else model.covariance,
+    )
 
 
 def _judged(case: Comparison, budget: Budget) -> tuple[Investigation, HeldOutRuns, Statement]:

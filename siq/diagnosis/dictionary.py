@@ -58,9 +58,9 @@ class Shape(_Part):
     #: An output: the step of the lattice on which its recorded values lie. It is known from the recordings
     #: and not fitted; where they lie on none that holds zero, the mechanism is not tried.
     lattice_of: str | None = None
-    #: An output: where its recorded values end in a plateau, above or below. Where there is none, the
-    #: mechanism is not tried.
+    #: An output: where its recorded values end in a plateau above. Without one the mechanism is not tried.
     top_of: str | None = None
+    #: The same below
     bottom_of: str | None = None
     #: Multiples of the time between samples are tried
     samples: bool = False
@@ -84,20 +84,13 @@ class Shape(_Part):
 
 
 class MechanismParameter(_Part):
-    """A parameter that a mechanism brings: an amplitude, or a shape.
+    """A parameter that a mechanism brings: an amplitude, or a shape."""
 
-    Attributes
-    ----------
-    unit
-        In terms of the roles and the time T: ``v/T/x**3``.
-    sign
-        ``positive`` where passivity, or the meaning of the word, demands it.
-    shape
-        Where to look for it. Left out, it is an amplitude, which is zero where the mechanism is absent.
-    """
-
+    #: In terms of the roles and the time T: ``v/T/x**3``
     unit: str = "1"
+    #: ``positive`` where passivity, or the meaning of the word, demands it
     sign: Literal["any", "positive"] = "any"
+    #: Where to look for it. Left out, it is an amplitude, which is zero where the mechanism is absent.
     shape: Shape | None = None
 
 
@@ -115,61 +108,41 @@ class FurtherState(_Part):
 
 
 class Form(_Part):
-    """How a mechanism shows in one kind of system.
+    """How a mechanism shows in one kind of system."""
 
-    Attributes
-    ----------
-    roles
-        What each name in the formulas stands for. Several roles are filled by different states.
-    terms
-        Formulas that are added to the equation of the state in that role.
-    replace
-        Formulas that take the place of an input or a parameter, wherever it stands.
-    within
-        Formulas that take the place of a state in the equation of another: ``{q: {p: z}}`` puts z in the
-        place of p in the equation of q.
-    outputs
-        Formulas of what a sensor reads instead; ``y`` stands for what it read before.
-    states
-        Further states, by name.
-    noise
-        The state on which process noise acts.
-    parameters
-        What the mechanism's formulas need to know, by name.
-    coordinate
-        Along which role the mechanism acts.
-    variant
-        What tells the form from others of the same roles, in words that follow the name: ``from above``;
-        roles in braces are what fills them.
-    symmetric
-        Whether exchanging the roles gives the same mechanism.
-    units
-        Regular expressions of the units that fill a role.
-    one_unit
-        Whether the states and inputs that fill the roles must have one unit, and not be mere numbers.
-    family
-        Where it is a member of another family than the mechanism's other forms.
-    generalises
-        Mechanisms that are special cases of this form, but not of the others.
-    turning
-        Whether it shows only where the motion turns back: the coordinate is a velocity, and has both signs.
-    """
-
+    #: What each name in the formulas stands for. Several roles are filled by different states.
     roles: dict[Name, Role]
+    #: Formulas that are added to the equation of the state in that role
     terms: dict[Name, Formula] = {}
+    #: Formulas that take the place of an input or a parameter, wherever it stands
     replace: dict[Name, Formula] = {}
+    #: Formulas that take the place of a state in the equation of another: ``{q: {p: z}}`` puts z in the place
+    #: of p in the equation of q
     within: dict[Name, dict[Name, Formula]] = {}
+    #: Formulas of what a sensor reads instead; ``y`` stands for what it read before
     outputs: dict[Name, Formula] = {}
+    #: Further states, by name
     states: dict[Name, FurtherState] = {}
+    #: The state on which process noise acts
     noise: Name | None = None
+    #: What the mechanism's formulas need to know, by name
     parameters: dict[Name, MechanismParameter]
+    #: Along which role the mechanism acts
     coordinate: str
+    #: What tells the form from others of the same roles, in words that follow the name: ``from above``; roles
+    #: in braces are what fills them
     variant: str = ""
+    #: Whether exchanging the roles gives the same mechanism
     symmetric: bool = False
+    #: Regular expressions of the units that fill a role
     units: dict[Name, str] = {}
+    #: Whether the states and inputs that fill the roles must have one unit, and not be mere numbers
     one_unit: bool = False
+    #: Where it is a member of another family than the mechanism's other forms
     family: str = ""
+    #: Mechanisms that are special cases of this form, but not of the others
     generalises: tuple[str, ...] = ()
+    #: Whether it shows only where the motion turns back: the coordinate is a velocity, and has both signs
     turning: bool = False
 
     @model_validator(mode="after")

@@ -93,52 +93,39 @@ class DescribedSurface:
 
 @dataclass(frozen=True, kw_only=True)
 class StatedTerm:
-    """A mechanism that is named, or that describes what has no name; or a part of the model of the latter.
+    """A mechanism that is named, or that describes what has no name; or a part of the model of the latter."""
 
-    Attributes
-    ----------
-    name, label, family, variant
-        Of the dictionary; told apart from its other forms and places; and the kind of physics that it is.
-    kind
-        ``mechanism``: one of the dictionary. ``formula``: a sum of a few powers. ``curve``, ``surface``: a
-        smooth function of one coordinate, or of two, as a sum of Gaussian bumps.
-    terms, parameters
-        What is added, by equation; see `siq.diagnosis.mechanisms.MechanismCandidate.changes`; and what it
-        brings.
-    evidence, beside
-        Why it is believed, and labels of what was in place when it was judged.
-    equations, outputs
-        States in whose equations it changes something; or what is measured otherwise, for a fault of a
-        sensor.
-    share_of_excess, indistinguishable_from, rivals
-        Of a mechanism that was found: what all mechanisms together explain of the excess over noise; names of
-        mechanisms that explain the recordings as well, None where it is not named itself; and what else was
-        fitted in its place, the one that gains most first.
-    coordinates, curve, surface
-        Of a part of a model: what it depends on; and its values, where it is a function of one coordinate or
-        a surface. A curve in two coordinates is the coefficient of the second.
-    shape, formula, sizes, like
-        Of a curve: the simplest formula within its errors (`siq.diagnosis.smooth_functions.FORMS`), its
-        coefficients in the order of the formula, and the mechanism of the dictionary that is such a function.
-        Where no formula is, the shape is ``rising`` or ``falling`` or nothing. Of a hidden state it is
-        ``late`` or ``ringing``, with the time of it.
-    """
-
+    #: Of the dictionary; told apart from its other forms and places; and the kind of physics that it is
     name: str
     label: str
     family: str = ""
     variant: str = ""
+    #: ``mechanism``: one of the dictionary. ``formula``: a sum of a few powers. ``curve``, ``surface``: a
+    #: smooth function of one coordinate, or of two, as a sum of Gaussian bumps.
     kind: Kind = MECHANISM
+    #: What is added, by equation; see `siq.diagnosis.mechanisms.MechanismCandidate.changes`; and what it
+    #: brings
     terms: Mapping[str, str]
     parameters: Mapping[str, Estimate]
+    #: Why it is believed, and labels of what was in place when it was judged
     evidence: Evidence
+    #: Of a mechanism that was found: what all mechanisms together explain of the excess over noise; names of
+    #: mechanisms that explain the recordings as well, None where it is not named itself; and what else was
+    #: fitted in its place, the one that gains most first
     share_of_excess: float = 0.0
     indistinguishable_from: tuple[str, ...] | None = None
+    #: States in whose equations it changes something; or what is measured otherwise, for a fault of a sensor
     equations: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
+    #: Of a part of a model: what it depends on; and its values, where it is a function of one coordinate or a
+    #: surface. A curve in two coordinates is the coefficient of the second.
     coordinates: tuple[str, ...] = ()
     curve: DescribedCurve | None = None
     surface: DescribedSurface | None = None
+    #: Of a curve: the simplest formula within its errors (`siq.diagnosis.smooth_functions.FORMS`), its
+    #: coefficients in the order of the formula, and the mechanism of the dictionary that is such a function.
+    #: Where no formula is, the shape is ``rising`` or ``falling`` or nothing. Of a hidden state it is
+    #: ``late`` or ``ringing``, with the time of it.
     shape: str = ""
     formula: str = ""
     sizes: Mapping[str, Estimate] = field(default_factory=dict)

@@ -22,7 +22,7 @@ from siq.data.recordings import Recordings, read_recordings
 from siq.diagnosis.dictionary import Mechanism, dictionary_of
 from siq.errors import Fault, InputError
 from siq.inference.budget import DEFAULT_SECONDS, DEFAULT_WORK
-from siq.inference.measurements import Measurements, columns_of, measurements, with_variation
+from siq.inference.measurements import Measurements, measurements, with_variation
 from siq.inference.trajectories import PREFIX, SHORTEST_PREFIX
 from siq.numerics.files import read_document, validate
 from siq.remarks import Remark
@@ -36,40 +36,28 @@ MIN_SAMPLES = 8  # of a recording that something can be learned from
 
 
 class SearchOptions(BaseModel):
-    """What counts as found.
-
-    Attributes
-    ----------
-    false_alarms
-        Probability of a mechanism where none is missing, over all candidates together, for each test.
-    same
-        Candidates whose χ² is within this of the best are indistinguishable from it.
-    fitted
-        Most candidates that are fitted after each screening.
-    mechanisms
-        Most mechanisms that are looked for.
-    unnamed
-        Probability beforehand that what a simulation lacks is not in the dictionary.
-    prior
-        By ``physics`` what nearly every system of a kind has is likelier than what few have, as the weights
-        of the dictionary say; ``flat`` makes all mechanisms alike.
-    wrong_names
-        Most probability of a name that is wrong, since something without a name looks alike. What is less
-        certain is detected, and described.
-    blocks
-        Least number of blocks into which recordings are cut for clustered errors, where there are fewer than
-        half as many recordings.
-    """
+    """What counts as found."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    #: Probability of a mechanism where none is missing, over all candidates together, for each test
     false_alarms: Annotated[float, Field(gt=0, lt=1)] = 0.002
+    #: Candidates whose χ² is within this of the best are indistinguishable from it
     same: Annotated[float, Field(gt=0)] = 10.0
+    #: Most candidates that are fitted after each screening
     fitted: Annotated[int, Field(ge=1)] = 6
+    #: Most mechanisms that are looked for
     mechanisms: Annotated[int, Field(ge=1, le=5)] = 3
+    #: Probability beforehand that what a simulation lacks is not in the dictionary
     unnamed: Annotated[float, Field(gt=0, lt=1)] = 0.1
+    #: By ``physics`` what nearly every system of a kind has is likelier than what few have, as the weights of
+    #: the dictionary say; ``flat`` makes all mechanisms alike
     prior: Literal["physics", "flat"] = "physics"
+    #: Most probability of a name that is wrong, since something without a name looks alike. What is less
+    #: certain is detected, and described.
     wrong_names: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
+    #: Least number of blocks into which recordings are cut for clustered errors, where there are fewer than
+    #: half as many recordings
     blocks: Annotated[int, Field(ge=4)] = 10
 
     @property
@@ -98,74 +86,51 @@ class MismatchVerdict(StrEnum):
 
 
 class Allowance(BaseModel):
-    """How much work a case may take.
-
-    Attributes
-    ----------
-    evaluations
-        Of the likelihood for one sample, one state and one column of derivatives
-        (`siq.inference.budget`). The default takes about five minutes of a core.
-    seconds
-        By the clock, a safety net for machines on which that takes far longer.
-    """
+    """How much work a case may take."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    #: Of the likelihood for one sample, one state and one column of derivatives (`siq.inference.budget`). The
+    #: default takes about five minutes of a core.
     evaluations: Annotated[float, Field(gt=0)] = DEFAULT_WORK
+    #: By the clock, a safety net for machines on which that takes far longer
     seconds: Annotated[float, Field(gt=0)] = DEFAULT_SECONDS
 
 
 class MismatchStudy(BaseModel):
-    """The schema of ``config/mismatch/NAME.yaml``, and of ``study.yaml`` in the folder of a case.
-
-    Attributes
-    ----------
-    title
-        What the report is headed.
-    system
-        The simulation: name of a system card, or path of one. In the folder of a case it is ``system.yaml``.
-    recordings
-        Path of the long table. In the folder of a case it is ``recordings.parquet`` or ``.csv``.
-    held_out
-        Recordings that take no part in finding anything: their labels, or their share. Where there is only
-        one recording, the share is its last part.
-    tests
-        Labels of held-out recordings by which somebody else scores: they are shown, and choose nothing. Where
-        all that is held out are tests, a model of what has no name has to predict the parts of the recordings
-        to learn from, each left out of its fit in turn.
-    noise
-        Standard deviation of the measurement noise by output, where it is known; by default it is estimated.
-    without_outliers
-        Whether samples that stand apart from a smooth motion on either side, and drop-outs, are left out: the
-        sensor made them. Turn it off where the system itself does something that lasts for one sample.
-    varies
-        Parameters that differ from recording to recording, such as a friction that the temperature changes.
-    mechanisms
-        Further entries of the dictionary; one of a known name replaces it.
-    without
-        Names of entries that are not to be used.
-    degree
-        Highest degree of formulas that describe what has no name.
-    search
-        What counts as found.
-    budget
-        How much work the search may take before the best answer so far is given.
-    """
+    """The schema of ``config/mismatch/NAME.yaml``, and of ``study.yaml`` in the folder of a case."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    #: What the report is headed
     title: str = ""
+    #: The simulation: name of a system card, or path of one. In the folder of a case it is ``system.yaml``.
     system: str | None = None
+    #: Path of the long table. In the folder of a case it is ``recordings.parquet`` or ``.csv``.
     recordings: str | None = None
+    #: Recordings that take no part in finding anything: their labels, or their share. Where there is only one
+    #: recording, the share is its last part.
     held_out: tuple[str, ...] | Annotated[float, Field(gt=0, lt=1)] = 0.25
+    #: Labels of held-out recordings by which somebody else scores: they are shown, and choose nothing. Where
+    #: all that is held out are tests, a model of what has no name has to predict the parts of the recordings
+    #: to learn from, each left out of its fit in turn.
     tests: tuple[str, ...] = ()
+    #: Standard deviation of the measurement noise by output, where it is known; by default it is estimated
     noise: dict[str, Annotated[float, Field(gt=0)]] = {}
+    #: Whether samples that stand apart from a smooth motion on either side, and drop-outs, are left out: the
+    #: sensor made them. Turn it off where the system itself does something that lasts for one sample.
     without_outliers: bool = True
+    #: Parameters that differ from recording to recording, such as a friction that the temperature changes
     varies: tuple[str, ...] = ()
+    #: Further entries of the dictionary; one of a known name replaces it
     mechanisms: tuple[Mechanism, ...] = ()
+    #: Names of entries that are not to be used
     without: tuple[str, ...] = ()
+    #: Highest degree of formulas that describe what has no name
     degree: Annotated[int, Field(ge=1, le=5)] = 3
+    #: What counts as found
     search: SearchOptions = SearchOptions()
+    #: How much work the search may take before the best answer so far is given
     budget: Allowance = Allowance()
 
 
@@ -183,7 +148,10 @@ def load_mismatch_study(path: str | Path) -> MismatchStudy:
 def _measurements_of(recordings: Recordings | pd.DataFrame | str | Path, system: Dynamics) -> Measurements:
     """The recordings that a simulation is to be compared with, laid out for fitting."""
     file = str(recordings) if isinstance(recordings, str | Path) else "the recordings"
-    columns, states = columns_of(system), dict(zip(system.states, system.units, strict=True))
+    columns, states = (
+        (*system.output_names, *(one.name for one in system.inputs)),
+        dict(zip(system.states, system.units, strict=True)),
+    )
     # The unit of each column, as far as it follows from those of the states and inputs.
     units = {name: states[str(formula)] for name, formula in system.outputs if str(formula) in states}
     units |= {entry.name: entry.unit for entry in system.inputs} | {"t": system.time_unit}

@@ -51,24 +51,16 @@ UNLIMITED = Account(float("inf"), 0.0, 0.0)
 
 @dataclass
 class Budget:
-    """Work that is allowed, and work that was done.
+    """Work that is allowed, and work that was done."""
 
-    Attributes
-    ----------
-    work, seconds
-        Allowed: in the unit of this module, and by the clock.
-    tell
-        Called with what is being done, in words, whenever something new begins.
-    clock
-        Seconds of any clock that does not go back.
-    spent, stopped_by
-        Work done so far; and what ran out before all was done, None as long as nothing had to be left.
-    """
-
+    #: Allowed: in the unit of this module, and by the clock
     work: float = float("inf")
     seconds: float = float("inf")
+    #: Called with what is being done, in words, whenever something new begins
     tell: Callable[[str], None] | None = None
+    #: Seconds of any clock that does not go back
     clock: Callable[[], float] = time.monotonic
+    #: Work done so far; and what ran out before all was done, None as long as nothing had to be left
     spent: float = 0.0
     stopped_by: Literal["work", "clock"] | None = None
     _begun: float = field(default=0.0, init=False)

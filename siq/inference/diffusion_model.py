@@ -40,7 +40,7 @@ from siq.inference.kalman_filter import Noise, whiten
 from siq.inference.library import CandidateLibrary
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
-from siq.numerics.integration import TransitionDensity, distinct_steps
+from siq.numerics.integration import TransitionDensity
 from siq.numerics.randomness import positive
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -358,27 +358,32 @@ class ResidualLikelihood(_DiffusionLikelihood):
         return logarithm, score.sum(axis=0), information, score.T @ score
 
 
-def has_densities(found: FieldEstimate, pairs: SnapshotPairs | StreamedPairs) -> bool:
-    """Whether coarse steps are fitted by densities: of one state that is no angle, and of few lengths."""
-    few = isinstance(pairs, SnapshotPairs) and len(distinct_steps(pairs.h)[0]) <= MOST_STEPS
-    return found.flow.coarse and found.library.dimension == 1 and not found.library.angles and few
+class Transitions:
+    """Pairs of one state over coarse steps, and the density that f and εD give to each.
 
+    f has terms of its library. εD is a sum of shapes, those of a `NoiseFormula` or the one of a D that is
+    known, with a strength each.
 
-class _Transitions:
-    """Pairs of one state, and the density of each by values of the terms of f and strengths of shapes of εD.
-
-    The shapes are those of a `NoiseFormula`, or the one of a D that is known.
+    Raises
+    ------
+    NumericalFailure
+        Where there is no such density: of several states and angles, of steps that are not coarse or of many
+        lengths, and of a D that nearly vanishes.
     """
 
     def __init__(self, found: FieldEstimate, pairs: SnapshotPairs) -> None:
+        several = found.library.dimension > 1 or found.library.angles
+        if several or not found.flow.coarse or len(TransitionDensity.distinct(pairs.h)[0]) > MOST_STEPS:
+            raise NumericalFailure("the density of what noise does between two samples is not worked out")
+        self.found, self.pairs = found, pairs
         self.x0, self.xh, self.h = pairs.x0[:, 0], pairs.xh[:, 0], pairs.h
         noise, symbols = found.noise, found.library.symbols
-        self.terms = [found.library.terms[k] for k in found.support[:, 1]]
+        self._terms = [found.library.terms[k] for k in found.support[:, 1]]
 
         def shape(x: np.ndarray) -> np.ndarray:
             return found.diffusion.at(x.T)[:, 0, 0][None]
 
-        functions = compile_formulas(self.terms, symbols)
+        functions = compile_formulas(self._terms, symbols)
         shapes = shape if noise is None else compile_formulas(list(noise.terms), symbols)
         self.of_field, self.of_noise = functions(self.x0[None]), shapes(self.x0[None])
         self.strengths = noise.values if noise else found.noise_rate[0] / self.of_noise.mean(axis=1)
@@ -391,127 +396,112 @@ class _Transitions:
         if count > MOST_CELLS:
             raise NumericalFailure("noise moves some states by a small part of what it moves others by")
         self.edges = np.linspace(low - aside, high + aside, count + 1)
-        inner, middle = self.edges[1:-1], (self.edges[1:] + self.edges[:-1]) / 2
-        self._drift, self._between, self._inside = (
-            functions(inner[None]),
-            shapes(inner[None]),
-            shapes(middle[None]),
-        )
+        inner, middle = self.edges[None, 1:-1], (self.edges[None, 1:] + self.edges[None, :-1]) / 2
+        self._drift, self._between, self._inside = functions(inner), shapes(inner), shapes(middle)
 
-    def density(self, values: np.ndarray, strengths: np.ndarray) -> TransitionDensity:
+    def _density(self, values: np.ndarray, strengths: np.ndarray) -> TransitionDensity:
         """With f and εD of some values; beyond the recorded states εD does not vanish."""
         least = SLIGHT_NOISE * float((strengths @ self.of_noise).min())
         between, inside = (np.maximum(strengths @ one, least) for one in (self._between, self._inside))
-        return TransitionDensity.of(self.edges, values @ self._drift, between, inside)
+        return TransitionDensity(self.edges, values @ self._drift, between, inside)
 
     def log_densities(self, values: np.ndarray, strengths: np.ndarray) -> np.ndarray:
         """Of each pair; minus infinity where εD is not positive, or f too steep."""
         if not (strengths @ self.of_noise).min() > 0:
             return np.full(len(self.h), -np.inf)
-        found = self.density(values, strengths).log_density(self.x0, self.xh, self.h)
+        found = self._density(values, strengths).log_density(self.x0, self.xh, self.h)
         return np.where(np.isfinite(found), found, -np.inf)
 
-
-def fitted_by_densities(found: FieldEstimate, pairs: SnapshotPairs) -> tuple[FieldEstimate, np.ndarray]:
-    """The terms of f and of εD with the values of the largest likelihood of pairs of one state.
-
-    By steps of the sum of squares of single scores, halved until each gains (Berndt et al., Ann. Econ. Soc.
-    Meas. 3 (1974) 653). And these scores ``(n, p + k)``, by values of f and strengths of εD.
-
-    Raises
-    ------
-    NumericalFailure
-        When the search does not settle.
-    """
-    known, p, symbols = _Transitions(found, pairs), len(found.support), found.library.symbols
-    rate, k = float((known.strengths @ known.of_noise).mean()), len(known.strengths)
-    # Orthonormal functions in the place of monomials, which are nearly the same far from the origin.
-    triangle = np.zeros((p + k, p + k))
-    triangle[:p, :p] = np.linalg.qr((known.of_field * np.sqrt(known.h / rate)).T)[1]
-    triangle[p:, p:] = np.linalg.qr(known.of_noise.T / (np.sqrt(2) * rate))[1]
-    turn, errors = np.linalg.inv(triangle), np.ones(p + k)
-
-    def densities(place: np.ndarray) -> np.ndarray:
-        return known.log_densities(*np.split(turn @ place, [p]))
-
-    starts = [np.append(found.values, known.strengths)]
-    if not found.flow.by_density and found.diffusion.constant:
-        # Where p is the law of a state at rest, 2f/εD is the slope of ln p (Hyvärinen, JMLR 6 (2005) 695).
-        slopes = compile_formulas([term.diff(symbols[0]) for term in known.terms], symbols)(known.x0[None])
-        functions = turn[:p, :p].T @ known.of_field
-        rest = np.linalg.solve(functions @ functions.T, turn[:p, :p].T @ slopes.sum(axis=1))
-        starts += [one * np.append(-turn[:p, :p] @ rest * rate / 2, known.strengths) for one in RATES]
-    now, at = max(
-        ((densities(triangle @ one), triangle @ one) for one in starts), key=lambda one: one[0].sum()
-    )
-    for _ in range(MOST_DENSITY_STEPS):
-        with np.errstate(invalid="ignore"):
-            ends = [densities(at + move) for move in np.diag(DENSITY_STEP * errors)]
-            scores = (np.stack(ends, axis=1) - now[:, None]) / (DENSITY_STEP * errors)
+    def normal_increments(self) -> np.ndarray:
+        """Normal scores times √(εD h): residuals as of a short step, shape ``(n, 1)``."""
+        scores = self._density(self.found.values, self.strengths).normal_scores(self.x0, self.xh, self.h)
         if not np.isfinite(scores).all():
-            break
-        covariance, slope = _inverse(scores.T @ scores), scores.sum(axis=0)
-        step, errors = covariance @ slope, np.sqrt(np.diag(covariance))
-        gain = float(step @ slope)
-        for _ in range(FEW_HALVINGS if gain > DENSITY_SETTLED else 0):
-            if (then := densities(at + step)).sum() > now.sum():
-                at, now = at + step, then
+            raise NumericalFailure("f is too steep for so long steps; sample more often")
+        return np.asarray(scores * np.sqrt(self.strengths @ self.of_noise * self.h))[:, None]
+
+    def fitted(self) -> tuple[FieldEstimate, np.ndarray]:
+        """The terms of f and of εD with the values of the largest likelihood.
+
+        By steps of the sum of squares of single scores, halved until each gains (Berndt et al., Ann. Econ.
+        Soc. Meas. 3 (1974) 653). And these scores ``(n, p + k)``, by values of f and strengths of εD. Where
+        the search does not settle that is a NumericalFailure.
+        """
+        found, p, k = self.found, len(self.found.support), len(self.strengths)
+        rate, symbols = float((self.strengths @ self.of_noise).mean()), found.library.symbols
+        # Orthonormal functions in the place of monomials, which are nearly the same far from the origin.
+        triangle = np.zeros((p + k, p + k))
+        triangle[:p, :p] = np.linalg.qr((self.of_field * np.sqrt(self.h / rate)).T)[1]
+        triangle[p:, p:] = np.linalg.qr(self.of_noise.T / (np.sqrt(2) * rate))[1]
+        turn, errors = np.linalg.inv(triangle), np.ones(p + k)
+
+        def densities(place: np.ndarray) -> np.ndarray:
+            return self.log_densities(*np.split(turn @ place, [p]))
+
+        starts = [np.append(found.values, self.strengths)]
+        if not found.flow.by_density and found.diffusion.constant:
+            # Of a state at rest 2f/εD is the slope of its ln p (Hyvärinen, JMLR 6 (2005) 695).
+            slopes = compile_formulas([term.diff(symbols[0]) for term in self._terms], symbols)(self.x0[None])
+            functions = turn[:p, :p].T @ self.of_field
+            rest = np.linalg.solve(functions @ functions.T, turn[:p, :p].T @ slopes.sum(axis=1))
+            starts += [one * np.append(-turn[:p, :p] @ rest * rate / 2, self.strengths) for one in RATES]
+        places = [triangle @ one for one in starts]
+        now, at = max(((densities(one), one) for one in places), key=lambda one: one[0].sum())
+        for _ in range(MOST_DENSITY_STEPS):
+            with np.errstate(invalid="ignore"):
+                ends = [densities(at + move) for move in np.diag(DENSITY_STEP * errors)]
+                scores = (np.stack(ends, axis=1) - now[:, None]) / (DENSITY_STEP * errors)
+            if not np.isfinite(scores).all():
                 break
-            step = step / 2
-        else:
-            break
-    if not (np.isfinite(scores).all() and gain < 1.0):
-        raise NumericalFailure("f and D of so long steps are not found; sample more often")
-    values, covariance = turn @ at, turn @ covariance @ turn.T * pairs.copies
-    flow, of_noise = replace(found.flow, by_density=True), covariance[p:, p:]
-    fitted = found.with_values(found.support, values[:p], covariance=covariance[:p, :p], flow=flow)
-    if found.noise is not None:
-        formula = replace(found.noise, values=values[p:], covariance=of_noise)
-        return fitted.with_formula(formula, pairs.x0), scores @ triangle
-    size = known.of_noise.mean()
-    noise_rate, own = values[p:, None] * size, None
-    if found.diffusion.constant:
-        own = replace(constant_noise(symbols, noise_rate, samples=1.0), covariance=of_noise * size**2)
-    return replace(fitted, noise_rate=noise_rate, constant_noise=own), scores @ triangle
+            covariance, slope = _inverse(scores.T @ scores), scores.sum(axis=0)
+            step, errors = covariance @ slope, np.sqrt(np.diag(covariance))
+            gain = float(step @ slope)
+            for _ in range(FEW_HALVINGS if gain > DENSITY_SETTLED else 0):
+                if (then := densities(at + step)).sum() > now.sum():
+                    at, now = at + step, then
+                    break
+                step = step / 2
+            else:
+                break
+        if not (np.isfinite(scores).all() and gain < 1.0):
+            raise NumericalFailure("f and D of so long steps are not found; sample more often")
+        values, covariance = turn @ at, turn @ covariance @ turn.T * self.pairs.copies
+        flow, of_noise = replace(found.flow, by_density=True), covariance[p:, p:]
+        found = found.with_values(found.support, values[:p], covariance=covariance[:p, :p], flow=flow)
+        if found.noise is not None:
+            formula = replace(found.noise, values=values[p:], covariance=of_noise)
+            return found.with_formula(formula, self.pairs.x0), scores @ triangle
+        size, known = self.of_noise.mean(), None
+        noise_rate = values[p:, None] * size
+        if found.diffusion.constant:
+            known = replace(constant_noise(symbols, noise_rate, samples=1.0), covariance=of_noise * size**2)
+        return replace(found, noise_rate=noise_rate, constant_noise=known), scores @ triangle
 
+    def fitted_with_formula(self, *, false_terms: float) -> tuple[FieldEstimate, np.ndarray] | None:
+        """All terms of f with those of a D(x), and the scores; None where a constant D can be held.
 
-def noise_formula_by_densities(
-    found: FieldEstimate, pairs: SnapshotPairs, *, false_terms: float
-) -> tuple[FieldEstimate, np.ndarray] | None:
-    """All terms of f with those of a D(x), and the scores; None where a constant D can be held.
-
-    By Wald's test of the strengths of the other shapes of εD; see `_DiffusionLikelihood.selected`.
-    """
-    library = found.library
-    terms = tuple(term for _, term in library.functions(library.symbols, DEGREE, library.angles))
-    places, values = _all_places(1, len(terms)), np.zeros(len(terms))
-    values[0] = found.noise_rate[0, 0]
-    formula = NoiseFormula(library.symbols, places[:, :2], terms, values, np.eye(len(terms)), 1.0)
-    everything = np.stack([np.zeros(library.size, dtype=int), np.arange(library.size)], axis=1)
-    whole = found.with_values(everything, found.coefficients[:, 0]).with_formula(formula, pairs.x0)
-    whole = fitted_by_densities(whole, pairs)[0]
-    assert whole.noise is not None
-    formula, change, spread = whole.noise, whole.noise.values[1:], whole.noise.covariance[1:, 1:]
-    probability = float(scipy.special.chdtrc(len(change), change @ _inverse(spread) @ change))
-    rates = whole.noise_rate_at(pairs.x0)[:, 0, 0]
-    if probability >= false_terms or rates.std() < HARMLESS_CHANGE * rates.mean():
-        return None
-    critical = float(-scipy.special.ndtri(false_terms / (2 * len(terms))))
-    kept, values = _eliminated(places, formula.values, formula.covariance, critical)
-    formula = NoiseFormula(
-        library.symbols, places[kept, :2], tuple(terms[k] for k in kept), values,
-        formula.covariance[np.ix_(kept, kept)], probability,
-    )  # fmt: skip
-    return fitted_by_densities(whole.with_formula(formula, pairs.x0), pairs)
-
-
-def normal_increments(found: FieldEstimate, pairs: SnapshotPairs) -> np.ndarray:
-    """Normal scores of pairs of one state times √(εD h): residuals as of a short step, shape ``(n, 1)``."""
-    known = _Transitions(found, pairs)
-    scores = known.density(found.values, known.strengths).normal_scores(known.x0, known.xh, known.h)
-    if not np.isfinite(scores).all():
-        raise NumericalFailure("f is too steep for so long steps; sample more often")
-    return np.asarray(scores * np.sqrt(known.strengths @ known.of_noise * known.h))[:, None]
+        By Wald's test of the strengths of the other shapes of εD; see `_DiffusionLikelihood.selected`.
+        """
+        found, library, x0 = self.found, self.found.library, self.pairs.x0
+        terms = tuple(term for _, term in library.functions(library.symbols, DEGREE, library.angles))
+        places, values = _all_places(1, len(terms)), np.zeros(len(terms))
+        values[0] = found.noise_rate[0, 0]
+        formula = NoiseFormula(library.symbols, places[:, :2], terms, values, np.eye(len(terms)), 1.0)
+        everything = np.stack([np.zeros(library.size, dtype=int), np.arange(library.size)], axis=1)
+        found = found.with_values(everything, found.coefficients[:, 0]).with_formula(formula, x0)
+        found = Transitions(found, self.pairs).fitted()[0]
+        assert found.noise is not None
+        (values, covariance), rates = (found.noise.values, found.noise.covariance), found.noise_rate_at(x0)
+        statistic = float(values[1:] @ _inverse(covariance[1:, 1:]) @ values[1:])
+        probability = float(scipy.special.chdtrc(len(terms) - 1, statistic))
+        if probability >= false_terms or rates.std() < HARMLESS_CHANGE * rates.mean():
+            return None
+        critical = float(-scipy.special.ndtri(false_terms / (2 * len(terms))))
+        kept, values = _eliminated(places, values, covariance, critical)
+        chosen = tuple(terms[k] for k in kept)
+        formula = NoiseFormula(
+            library.symbols, places[kept, :2], chosen, values, covariance[np.ix_(kept, kept)], probability
+        )
+        return Transitions(found.with_formula(formula, x0), self.pairs).fitted()
 
 
 def process_noise_increments(found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray) -> np.ndarray:

@@ -284,51 +284,37 @@ class NoiseDiagnosis:
 
 @dataclass(frozen=True)
 class FieldEstimate:
-    """A vector field ``f = Θ Ξ`` and its noise, with their uncertainty: the result of an identification.
+    """A vector field ``f = Θ Ξ`` and its noise, with their uncertainty: the result of an identification."""
 
-    Attributes
-    ----------
-    library, coefficients
-        The q functions; and Ξ, shape ``(q, d)``: column i holds the coefficients of f_i.
-    support, covariance
-        The pair (component i, term k) of each of the p coefficients that are not zero, shape ``(p, 2)``; and
-        their covariance, shape ``(p, p)``.
-    noise_rate
-        Shape ``(d, d)``: covariance of the residual per unit of time. For process noise it is εD, once
-        `siq.inference.diffusion_model` has put back what a step forgets.
-    residual_ratio, flow
-        Rms of the residuals over rms of the increments; and the map over a pair's step that was fitted.
-    diffusion
-        D, which recordings do not tell apart from ε: of these only the product, `noise_rate`, is identified.
-    alternatives
-        What other terms that fit nearly as well make of f: bias ``(q, d)`` and spread ``(r, q, d)``, see
-        `siq.inference.selection.model_average`. This and what follows is None where it was not asked for.
-    stability
-        Shape ``(p,)``: the share of resampled recordings in which each term would be chosen
-        (`siq.inference.selection`).
-    noise, constant_noise
-        εD as a formula of the states, where the recordings show that it depends on them; `noise_rate` is its
-        mean over the recorded states then. Or with its errors, where D was estimated and is the same
-        everywhere.
-    diagnosis
-        The noise that the recordings show, and how samples were taken to show the states.
-    prediction
-        Whether f holds for recordings that it was not fitted to.
-    """
-
+    #: The q functions; and Ξ, shape ``(q, d)``: column i holds the coefficients of f_i
     library: CandidateLibrary
     coefficients: np.ndarray
+    #: The pair (component i, term k) of each of the p coefficients that are not zero, shape ``(p, 2)``; and
+    #: their covariance, shape ``(p, p)``
     support: np.ndarray
     covariance: np.ndarray
+    #: Shape ``(d, d)``: covariance of the residual per unit of time. For process noise it is εD, once
+    #: `siq.inference.diffusion_model` has put back what a step forgets.
     noise_rate: np.ndarray
+    #: Rms of the residuals over rms of the increments; and the map over a pair's step that was fitted
     residual_ratio: float
     flow: FlowMap
+    #: D, which recordings do not tell apart from ε: of these only the product, `noise_rate`, is identified
     diffusion: Diffusion
+    #: What other terms that fit nearly as well make of f: bias ``(q, d)`` and spread ``(r, q, d)``, see
+    #: `siq.inference.selection.model_average`. This and what follows is None where it was not asked for.
     alternatives: tuple[np.ndarray, np.ndarray] | None = None
+    #: Shape ``(p,)``: the share of resampled recordings in which each term would be chosen
+    #: (`siq.inference.selection`)
     stability: np.ndarray | None = None
+    #: εD as a formula of the states, where the recordings show that it depends on them; `noise_rate` is its
+    #: mean over the recorded states then. Or with its errors, where D was estimated and is the same
+    #: everywhere.
     noise: NoiseFormula | None = None
     constant_noise: NoiseFormula | None = None
+    #: The noise that the recordings show, and how samples were taken to show the states
     diagnosis: NoiseDiagnosis | None = None
+    #: Whether f holds for recordings that it was not fitted to
     prediction: Verdict | None = None
 
     @classmethod

@@ -282,39 +282,28 @@ def field_dynamics(
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class IdentificationOptions:
-    """In which functions the vector field is sought, and what makes a term significant.
+    """In which functions the vector field is sought, and what makes a term significant."""
 
-    Attributes
-    ----------
-    degree
-        Highest degree of the monomials.
-    functions
-        Further functions of the states, as formulas: roots, fractions and whatever else.
-    false_terms
-        Probability that noise alone brings any false term into f. Each candidate is judged by its own
-        standard error, at its share of this probability, of which high degrees have less than low ones.
-    precision
-        A term that contributes less than this share of f is dropped also from data without noise, whose
-        residuals are the integrator's error and not random.
-    pairs
-        Most pairs used where the data carry no noise; with noise all are.
-    hidden_velocities
-        Whether the recorded states are positions whose velocities were not recorded. These are states then,
-        too, called ``v_x`` for a position x, and f says how forces change them. ``"auto"``: where one
-        position was recorded, its inertia is seen, and f of the position alone is refuted; and where it is
-        refuted otherwise, a slow force that was not recorded is tried, ``force_x``.
-    angles
-        States that are angles, or phases, each with the two ends of a period, such as ``phi: [0, 2*pi]``.
-        They are unwrapped; f is sought in their sines and cosines, and wells are the same a period on.
-        Those of a card say it there.
-    """
-
+    #: Highest degree of the monomials
     degree: Annotated[int, Field(ge=1, le=12)] = 5
+    #: Further functions of the states, as formulas: roots, fractions and whatever else
     functions: tuple[str, ...] = ()
+    #: Probability that noise alone brings any false term into f. Each candidate is judged by its own standard
+    #: error, at its share of this probability, of which high degrees have less than low ones.
     false_terms: Annotated[float, Field(gt=0, lt=0.5)] = 0.02
+    #: A term that contributes less than this share of f is dropped also from data without noise, whose
+    #: residuals are the integrator's error and not random
     precision: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7
+    #: Most pairs used where the data carry no noise; with noise all are
     pairs: Annotated[int, Field(ge=100)] = 8_000
+    #: Whether the recorded states are positions whose velocities were not recorded. These are states then,
+    #: too, called ``v_x`` for a position x, and f says how forces change them. ``"auto"``: where one position
+    #: was recorded, its inertia is seen, and f of the position alone is refuted; and where it is refuted
+    #: otherwise, a slow force that was not recorded is tried, ``force_x``.
     hidden_velocities: bool | Literal["auto"] = "auto"
+    #: States that are angles, or phases, each with the two ends of a period, such as ``phi: [0, 2*pi]``. They
+    #: are unwrapped; f is sought in their sines and cosines, and wells are the same a period on. Those of a
+    #: card say it there.
     angles: dict[str, tuple[Limit, Limit]] = Field(default_factory=dict)
 
     def __post_init__(self) -> None:

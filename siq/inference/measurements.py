@@ -187,7 +187,7 @@ def course_of_input(t: np.ndarray, u: np.ndarray, interpolation: str) -> scipy.i
 def measurements(recordings: Recordings, model: Dynamics) -> Measurements:
     """Lay recordings out as the model needs them: its outputs, and the courses of its inputs.
 
-    Their columns are outputs, then inputs, see `columns_of`. An input of which nothing else is said is held
+    Their columns are outputs, then inputs. An input of which nothing else is said is held
     between samples where it was recorded as a staircase, whose changes have no other right behind.
 
     Raises
@@ -212,11 +212,6 @@ def measurements(recordings: Recordings, model: Dynamics) -> Measurements:
         courses.append(tuple(mine))
     outputs = np.ascontiguousarray(recordings.values[:, :count])
     return Measurements(recordings.labels, first, recordings.t, outputs, tuple(courses))
-
-
-def columns_of(model: Dynamics) -> tuple[str, ...]:
-    """The columns of recordings that a model needs: outputs, then inputs."""
-    return (*model.output_names, *(entry.name for entry in model.inputs))
 
 
 def first_states(model: Dynamics, data: Measurements) -> np.ndarray:
@@ -347,22 +342,6 @@ def with_variation(
         varied,
         replace(data, courses=courses(data, True)),
         replace(further, courses=courses(further, False)),
-    )
-
-
-def without_variation(model: Dynamics) -> Dynamics:
-    """A model with the means of parameters that differ from recording to recording; any other as it is."""
-    change = {symbol(each.name): sympy.S.Zero for each in model.inputs if each.name.startswith("_")}
-    if not change:
-        return model
-    return replace(
-        model,
-        equations=tuple(each.xreplace(change) for each in model.equations),
-        outputs=tuple((name, formula.xreplace(change)) for name, formula in model.outputs),
-        inputs=tuple(each for each in model.inputs if not each.name.startswith("_")),
-        parameters=tuple(each for each in model.parameters if not each.name.startswith("_")),
-        expected_together=(),
-        covariance=None,
     )
 
 

@@ -32,13 +32,7 @@ from scipy.special import erfc
 from siq.data.recordings import Recordings, SnapshotPairs, StreamedPairs, parents_of
 from siq.data.stationarity import even_stretches, lagged_covariances, long_run_covariance
 from siq.errors import NumericalFailure
-from siq.inference.diffusion_model import (
-    ResidualLikelihood,
-    fitted_by_densities,
-    has_densities,
-    noise_formula_by_densities,
-    normal_increments,
-)
+from siq.inference.diffusion_model import ResidualLikelihood, Transitions
 from siq.inference.field_estimate import HARMLESS_BIAS, NOISE_FREE, FieldEstimate
 from siq.inference.library import CandidateLibrary, IdentificationOptions
 from siq.inference.selection import (
@@ -450,9 +444,9 @@ def identify_vector_field(
     values = np.concatenate([one.solve(range(library.size)) for one in problems])
     unknown = np.eye(len(values))
     found = FieldEstimate.on_support(library, everything, values, unknown, rate, ratio, flow, unit)
-    if isinstance(pairs, SnapshotPairs) and has_densities(found, pairs):
-        with contextlib.suppress(NumericalFailure):  # where no D is nearly constant, weights are found later
-            found, scores = fitted_by_densities(found, pairs)
+    if flow.coarse and isinstance(pairs, SnapshotPairs):
+        with contextlib.suppress(NumericalFailure):  # then moments are left
+            found, scores = Transitions(found, pairs).fitted()
             problems = [_problem_of_scores(found, scores, samples=samples, critical=critical)]
     chosen = chosen_terms(problems, library, choose)
 
@@ -487,7 +481,7 @@ def _problem_of_scores(
 def _fit_support(found: FieldEstimate, regression: _PairRegression) -> FieldEstimate:
     """Generalised least squares on a support, with flow, noise and covariance brought up to date."""
     if found.flow.by_density and isinstance(regression.pairs, SnapshotPairs):
-        return fitted_by_densities(found, regression.pairs)[0]
+        return Transitions(found, regression.pairs).fitted()[0]
     d, n, active = found.library.dimension, len(regression.pairs), len(regression.active)
     values, rate, rest, flow = found.values, found.noise_rate, found.noise_rate, found.flow
     if not flow.euler:
@@ -543,7 +537,7 @@ def residuals(found: FieldEstimate, pairs: SnapshotPairs) -> np.ndarray:
     Where their densities are known, normal scores as large as these would be over a short step.
     """
     if found.flow.by_density and not isinstance(pairs, LaggedPairs):
-        return normal_increments(found, pairs)
+        return Transitions(found, pairs).normal_increments()
     regression = _PairRegression(found.library, pairs, found.support)
     rate = None if isinstance(pairs, LaggedPairs) else found.noise_rate_at(found.on_the_way(pairs))
     velocity = regression.corrected(found.values, found.flow, rate)
@@ -586,7 +580,7 @@ def with_noise_formula(
     """
     if found.flow.by_density:
         with contextlib.suppress(NumericalFailure):
-            by_state = noise_formula_by_densities(found, pairs, false_terms=false_terms)
+            by_state = Transitions(found, pairs).fitted_with_formula(false_terms=false_terms)
             if by_state is None:
                 return None
             critical = critical_values(found.library, false_terms=false_terms)

@@ -29,19 +29,14 @@ Order = Literal[2, 4]
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class CheckOptions:
-    """When a training may end before its last step: as soon as output weights follow from where it is.
+    """When a training may end before its last step: as soon as output weights follow from where it is."""
 
-    Attributes
-    ----------
-    first, every
-        Steps before the first check, and between checks.
-    attempts
-        Trainings from fresh networks, if a training ends without having passed; every second one in another
-        way, see `TrainingOptions.attempt`.
-    """
-
+    #: Steps before the first check, and between checks
     first: Annotated[int, Field(ge=1)] = 300
+    #: Steps before the first check, and between checks
     every: Annotated[int, Field(ge=1)] = 300
+    #: Trainings from fresh networks, if a training ends without having passed; every second one in another
+    #: way, see `TrainingOptions.attempt`
     attempts: Annotated[int, Field(ge=1)] = 4
 
 
@@ -51,81 +46,62 @@ class TrainingOptions:
 
     The defaults are those of a short training, seconds on one core, that only has to find the right branch of
     the Hamilton–Jacobi equation. The paper's own are spelled out in the studies ``*-published``.
-
-    Attributes
-    ----------
-    widths
-        Neurons in the hidden layers of both networks.
-    steps
-        Steps of Adam, at most.
-    check
-        When a training may end earlier; None takes all its steps, and leaves the networks as they are then.
-    output_weights
-        Number of random tanh units whose output weights the check solves for, from where the networks have
-        come; what it finds replaces them (`siq.quasipotential.output_weights`). Without a check it has no
-        meaning.
-    batch_size
-        Pairs in the first term of the loss, and representative points in the second, per step.
-    representative_share
-        Share of the pairs of a batch that are drawn from the representative ones, the rest from all. The
-        paper has 0; above it the loss weighs the region away from the attractors more, where pairs are
-        few and fast.
-    learning_rate, decay_rate, decay_steps
-        The rate is ``learning_rate * decay_rate ** (step / decay_steps)``.
-    orthogonality_weight
-        λ.
-    asymmetry
-        δ of w(z, δ).
-    matching, matching_order
-        The pair-matching rule, see `siq.networks.networks.mean_velocity`.
-    relative_dynamics
-        Divide the first term of the loss by the mean square of the observed velocities, so that λ means
-        the same for every system and in any units. The paper does not.
-    slow_speed
-        Judge the mismatch of every pair by its own speed, or by this share of the root mean square speed
-        where it is slower. Left out: by the same measure everywhere, as the paper does, and the fastest
-        region rules. For pairs without noise only, which would add to the speed.
-    thinning_distance
-        r, the distance between representative points, in the units of the states. Left out: a tenth of
-        each state's standard deviation, whatever the units.
-    normalise_on
-        The points from which μ, σ, η_v and η_g are estimated. ``pairs``: all training pairs, as the paper
-        does. ``representative``: the evenly spread ones. Trajectories crowd at attractors, where f is
-        small and some states hardly vary: estimated there, the scales start V several times too small and
-        too narrow, and a short training ends in a V that is flat along a direction.
-    potential_from
-        What η_v is estimated from. ``speed``: ∣∇V∣ is as large as the observed speed, as in the paper.
-        ``descent``: -D∇V is the part of the observed velocity that goes down the initial V. Where the
-        rotation is many times faster than the descent the former starts V as many times too steep.
-    potential_gain
-        Factor on η_v; the paper has 1. A larger one lets V learn faster beside g, which a short training
-        needs: otherwise g takes over what V has not yet learned, and V stays flat along a direction.
-    training_share
-        Share of the recordings that train; the others measure the held-out loss.
-    precision
-        Floating-point type of the networks.
     """
 
+    #: Neurons in the hidden layers of both networks
     widths: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)] = (20, 20)
+    #: Steps of Adam, at most
     steps: Annotated[int, Field(ge=1)] = 900
+    #: When a training may end earlier; None takes all its steps, and leaves the networks as they are then
     check: CheckOptions | None = CheckOptions()
+    #: Number of random tanh units whose output weights the check solves for, from where the networks have
+    #: come; what it finds replaces them (`siq.quasipotential.output_weights`). Without a check it has no
+    #: meaning.
     output_weights: Annotated[int, Field(ge=10)] = 400
+    #: Pairs in the first term of the loss, and representative points in the second, per step
     batch_size: Annotated[int, Field(ge=1)] = 1000
+    #: Share of the pairs of a batch that are drawn from the representative ones, the rest from all. The paper
+    #: has 0; above it the loss weighs the region away from the attractors more, where pairs are few and fast.
     representative_share: Annotated[float, Field(ge=0, le=1)] = 1.0
+    #: The rate is ``learning_rate * decay_rate ** (step / decay_steps)``
     learning_rate: Annotated[float, Field(gt=0)] = 6e-3
+    #: The rate is ``learning_rate * decay_rate ** (step / decay_steps)``
     decay_rate: Annotated[float, Field(gt=0, le=1)] = 0.95
+    #: The rate is ``learning_rate * decay_rate ** (step / decay_steps)``
     decay_steps: Annotated[float, Field(gt=0)] = 90.0
+    #: λ
     orthogonality_weight: Annotated[float, Field(ge=0)] = 1.0
+    #: δ of w(z, δ)
     asymmetry: Annotated[float, Field(ge=0)] = 0.1
+    #: The pair-matching rule, see `siq.networks.networks.mean_velocity`
     matching: MatchingRule = "explicit"
+    #: The pair-matching rule, see `siq.networks.networks.mean_velocity`
     matching_order: Order = 2
+    #: Divide the first term of the loss by the mean square of the observed velocities, so that λ means the
+    #: same for every system and in any units. The paper does not.
     relative_dynamics: bool = True
+    #: Judge the mismatch of every pair by its own speed, or by this share of the root mean square speed where
+    #: it is slower. Left out: by the same measure everywhere, as the paper does, and the fastest region
+    #: rules. For pairs without noise only, which would add to the speed.
     slow_speed: Annotated[float, Field(gt=0)] | None = None
+    #: r, the distance between representative points, in the units of the states. Left out: a tenth of each
+    #: state's standard deviation, whatever the units.
     thinning_distance: Annotated[float, Field(gt=0)] | None = None
+    #: The points from which μ, σ, η_v and η_g are estimated. ``pairs``: all training pairs, as the paper
+    #: does. ``representative``: the evenly spread ones. Trajectories crowd at attractors, where f is small
+    #: and some states hardly vary: estimated there, the scales start V several times too small and too
+    #: narrow, and a short training ends in a V that is flat along a direction.
     normalise_on: Literal["pairs", "representative"] = "representative"
+    #: What η_v is estimated from. ``speed``: ∣∇V∣ is as large as the observed speed, as in the paper.
+    #: ``descent``: -D∇V is the part of the observed velocity that goes down the initial V. Where the rotation
+    #: is many times faster than the descent the former starts V as many times too steep.
     potential_from: Literal["speed", "descent"] = "speed"
+    #: Factor on η_v; the paper has 1. A larger one lets V learn faster beside g, which a short training
+    #: needs: otherwise g takes over what V has not yet learned, and V stays flat along a direction.
     potential_gain: Annotated[float, Field(gt=0)] = 3.0
+    #: Share of the recordings that train; the others measure the held-out loss
     training_share: Annotated[float, Field(gt=0, lt=1)] = 0.7
+    #: Floating-point type of the networks
     precision: Literal["float32", "float64"] = "float32"
 
     def attempt(self, number: int) -> TrainingOptions:

@@ -31,50 +31,35 @@ LOWER_SHARE = 0.75
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class RegressionOptions:
-    """Options of the sparse regression.
+    """Options of the sparse regression."""
 
-    Attributes
-    ----------
-    degree
-        Highest degree of the monomials of the library.
-    potential_degree, circulatory_degree
-        Lower limits for V and g, where wanted.
-    well_degree
-        Highest power about each attractor, where networks come by well.
-    functions
-        Further library functions, as formulas of the states.
-    level
-        τ - min V: the regression uses the points where V_θ lies less than this above its minimum. By
-        default it is where `LOWER_SHARE` of the points lie.
-    threshold
-        Terms below it are dropped.
-    threshold_on
-        Where the threshold acts. ``coefficient``: on the coefficients in the states' own units, as the
-        paper does. ``contribution``, the default: on coefficient × rms of the term / rms of the target,
-        which no choice of units can alter.
-    scaling
-        ``columns``: solve with scaled functions and targets, and with the mean instead of the sum over
-        points. ``none``: the paper's problem to the letter, whose weights depend on units and on the
-        number of points.
-    relaxation
-        ν, how far SR3 lets the sparse coefficients be from the constrained ones.
-    iterations
-        Most iterations of SR3.
-    tolerance
-        SR3 ends when its sparse coefficients change by less (sum of squares, divided by ν).
-    """
-
+    #: Highest degree of the monomials of the library
     degree: Annotated[int, Field(ge=1, le=12)] = 5
+    #: A lower limit for V, where wanted
     potential_degree: Annotated[int, Field(ge=1)] | None = None
+    #: A lower limit for g, where wanted
     circulatory_degree: Annotated[int, Field(ge=0)] | None = None
+    #: Highest power about each attractor, where networks come by well
     well_degree: Annotated[int, Field(ge=2, le=16)] = 10
+    #: Further library functions, as formulas of the states
     functions: tuple[str, ...] = ()
+    #: τ - min V: the regression uses the points where V_θ lies less than this above its minimum. By default
+    #: it is where `LOWER_SHARE` of the points lie.
     level: Annotated[float, Field(gt=0)] | None = None
+    #: Terms below it are dropped
     threshold: Annotated[float, Field(ge=0)] = 0.01
+    #: Where the threshold acts. ``coefficient``: on the coefficients in the states' own units, as the paper
+    #: does. ``contribution``, the default: on coefficient × rms of the term / rms of the target, which no
+    #: choice of units can alter.
     threshold_on: Literal["coefficient", "contribution"] = "contribution"
+    #: ``columns``: solve with scaled functions and targets, and with the mean instead of the sum over points.
+    #: ``none``: the paper's problem to the letter, whose weights depend on units and on the number of points.
     scaling: Literal["columns", "none"] = "columns"
+    #: ν, how far SR3 lets the sparse coefficients be from the constrained ones
     relaxation: Annotated[float, Field(gt=0)] = 100.0
+    #: Most iterations of SR3
     iterations: Annotated[int, Field(ge=10)] = 100  # PySINDy reports on every tenth, and divides by it
+    #: SR3 ends when its sparse coefficients change by less (sum of squares, divided by ν)
     tolerance: Annotated[float, Field(gt=0)] = 1e-8
 
     @model_validator(mode="after")

@@ -229,40 +229,36 @@ class FlowMap:
         return (1 - 1 / self.steps) / 2 if self.euler else 0.5
 
 
-def distinct_steps(h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means of steps that are nearly the same, and which of them each step is, shape ``(n,)``."""
-    _, which = np.unique(np.round(np.log(h) / NEARLY_THE_SAME), return_inverse=True)
-    return np.bincount(which, h) / np.bincount(which), which
-
-
-@dataclass(frozen=True)
 class TransitionDensity:
     """The law ``p(x, h | x₀)`` that one state has a time h later, of ``dx = f dt + √(εD) dW``.
 
-    On cells between reflecting ends the equation of Fokker and Planck,
+    On N cells between reflecting ends the equation of Fokker and Planck,
     ``∂p/∂t = -∂(f p)/∂x + ½ ∂²(εD p)/∂x²``, is a Markov chain, with the fluxes that f and D have where they
     change little from cell to cell (Scharfetter and Gummel, IEEE Trans. Electron Devices 16 (1969) 64). Its
     matrix over h is that over a short time, squared again and again. All terms are positive, so that small
     probabilities are as accurate as large ones.
+
+    Parameters
+    ----------
+    edges
+        Of cells of one width, shape ``(N + 1,)``.
+    drift, between, inside
+        f and εD between cells, shape ``(N - 1,)``, and εD in their middles, ``(N,)``.
     """
 
-    #: Of N cells of one width, shape ``(N + 1,)``.
-    edges: np.ndarray
-    #: Rates at which the chain jumps to the next cell, and back from it, shape ``(N - 1,)``.
-    up: np.ndarray
-    down: np.ndarray
-
-    @classmethod
-    def of(
-        cls, edges: np.ndarray, drift: np.ndarray, between: np.ndarray, inside: np.ndarray
-    ) -> TransitionDensity:
-        """From f and εD `between` cells, shape ``(N - 1,)``, and εD in their middles, ``(N,)``."""
-        width = edges[1] - edges[0]
-        drop = 2 * drift * width / between
+    def __init__(self, edges: np.ndarray, drift: np.ndarray, between: np.ndarray, inside: np.ndarray) -> None:
+        self.first, self.width = edges[0], edges[1] - edges[0]
+        drop = 2 * drift * self.width / between
         with np.errstate(all="ignore"):  # of a trial f
             back = np.where(np.abs(drop) < 1e-8, 1 - drop / 2, drop / np.expm1(drop))
-        rates = inside / (2 * width**2)
-        return cls(edges, rates[:-1] * (back + drop), rates[1:] * back)
+        rates = inside / (2 * self.width**2)
+        self.up, self.down = rates[:-1] * (back + drop), rates[1:] * back  # to the next cell, and from it
+
+    @staticmethod
+    def distinct(h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Means of steps that are nearly the same, and which of them each step is, shape ``(n,)``."""
+        _, which = np.unique(np.round(np.log(h) / NEARLY_THE_SAME), return_inverse=True)
+        return np.bincount(which, h) / np.bincount(which), which
 
     def _interpolated(
         self, of_matrix: Callable[[np.ndarray], np.ndarray], places: np.ndarray, h: np.ndarray
@@ -273,7 +269,7 @@ class TransitionDensity:
         if not fastest * h.max() < SHORT * 2**MAX_DOUBLINGS:
             return found
         stays, up, down = 1 - leaving / fastest, self.up / fastest, self.down / fastest
-        steps, which = distinct_steps(h)
+        steps, which = self.distinct(h)
         for place, one in enumerate(steps):
             doublings = max(int(np.ceil(np.log2(fastest * one / SHORT))), 0)
             jumps = fastest * one / 2**doublings
@@ -291,15 +287,10 @@ class TransitionDensity:
             found[rows] = map_coordinates(of_matrix(matrix), places[:, rows], order=3, mode="nearest")
         return found
 
-    def _places(self, x: np.ndarray) -> np.ndarray:
-        """States in cells behind the first edge."""
-        return np.asarray((x - self.edges[0]) / (self.edges[1] - self.edges[0]))
-
     def log_density(self, x0: np.ndarray, xh: np.ndarray, h: np.ndarray) -> np.ndarray:
         """``ln p(xh, h | x0)`` of states within the edges, shape ``(n,)``; NaN where f is too steep."""
-        width = self.edges[1] - self.edges[0]
-        places = np.stack([self._places(x0), self._places(xh)]) - 0.5
-        return self._interpolated(lambda matrix: np.log(np.maximum(matrix, LEAST) / width), places, h)
+        places = (np.stack([x0, xh]) - self.first) / self.width - 0.5
+        return self._interpolated(lambda matrix: np.log(np.maximum(matrix, LEAST) / self.width), places, h)
 
     def normal_scores(self, x0: np.ndarray, xh: np.ndarray, h: np.ndarray) -> np.ndarray:
         """``z = Φ⁻¹(P(x < xh | x0))``, independent and normal (Rosenblatt, Ann. Math. Stat. 1952)."""
@@ -309,4 +300,5 @@ class TransitionDensity:
             low, high = (ndtri(np.clip(one, LEAST, 0.5)) for one in (below, above))
             return np.where(below < above, low, -high)
 
-        return self._interpolated(scores, np.stack([self._places(x0) - 0.5, self._places(xh) - 1]), h)
+        places = (np.stack([x0, xh]) - self.first) / self.width - np.array([[0.5], [1.0]])
+        return self._interpolated(scores, places, h)

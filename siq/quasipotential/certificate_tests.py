@@ -72,28 +72,17 @@ STANDARD_ERRORS = 4.0  # exceeded by chance once in 16 000 times
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class CertificateOptions(PredictionLimits):
-    """Limits of the tests; those of the first three are widened by what the uncertainty of f explains.
+    """Limits of the tests; those of the first three are widened by what the uncertainty of f explains."""
 
-    Attributes
-    ----------
-    identity
-        Rms of f + D∇V - g over rms of f, both in the metric of D⁻¹.
-    hamilton_jacobi
-        Rms of ``∣∇V·(f + D∇V)∣ / (∣∇V∣ (∣f∣ + ∣D∇V∣))``.
-    branch
-        Largest relative difference of the Hessian from M, in the metric of M.
-    descent
-        Share of the held-out pairs of samples along which V rises, for recordings without noise.
-    error
-        Largest relative error of V that a certificate may state.
-    prediction, held_out_ratio, false_alarms
-        See `PredictionLimits`.
-    """
-
+    #: Rms of f + D∇V - g over rms of f, both in the metric of D⁻¹
     identity: Annotated[float, Field(gt=0)] = 1e-3
+    #: Rms of ``∣∇V·(f + D∇V)∣ / (∣∇V∣ (∣f∣ + ∣D∇V∣))``
     hamilton_jacobi: Annotated[float, Field(gt=0)] = 0.05
+    #: Largest relative difference of the Hessian from M, in the metric of M
     branch: Annotated[float, Field(gt=0)] = 0.01
+    #: Share of the held-out pairs of samples along which V rises, for recordings without noise
     descent: Annotated[float, Field(ge=0, lt=1)] = 0.01
+    #: Largest relative error of V that a certificate may state
     error: Annotated[float, Field(gt=0)] = 0.15
 
 

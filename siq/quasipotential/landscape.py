@@ -49,23 +49,16 @@ MARGIN = 0.15  # of the states that were seen, on each side: there the density e
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class LandscapeOptions:
-    """With what formulas are compared, and what is said of transitions.
+    """With what formulas are compared, and what is said of transitions."""
 
-    Attributes
-    ----------
-    compare_below
-        U below which formulas are compared with the references, where there is a card; by default 1.1 of the
-        highest saddle.
-    noise_intensities
-        ε of √ε dW for which mean escape times are given, in the units of U, and held against a simulation
-        where there is a card.
-    verify_times
-        Whether these times are checked by a simulation that splits (`siq.Landscape.verify_times`): seconds
-        a well where ΔU/ε is 5, some ten where it is 20.
-    """
-
+    #: U below which formulas are compared with the references, where there is a card; by default 1.1 of the
+    #: highest saddle
     compare_below: Annotated[float, Field(gt=0)] | None = None
+    #: Noise intensities ε, of √ε dW, for which mean escape times are given and held against a simulation
+    #: where there is a card
     noise_intensities: tuple[Annotated[float, Field(gt=0)], ...] = ()
+    #: Whether these times are checked by a simulation that splits (`siq.Landscape.verify_times`): seconds a
+    #: well where ΔU/ε is 5, some ten where it is 20
     verify_times: bool = False
 
 

@@ -69,46 +69,33 @@ LimitSet = np.ndarray | Cycle
 
 @dataclass(frozen=True)
 class MinimumActionPath:
-    """The path of least action between two states: a chain, or a solution of Hamilton's equations.
+    """The path of least action between two states: a chain, or a solution of Hamilton's equations."""
 
-    Attributes
-    ----------
-    points, momenta
-        Shape ``(n, d)``, in the states' units, from the start to the end, both included; and p there, which
-        is ∇V where V is smooth. The path follows ``ẋ = f + 2Dp``.
-    values, action
-        Shape ``(n,)``: the action up to each point, that is U, not V, if the start is an attractor; and that
-        of the whole path: the barrier of U, if the end is a saddle.
-    error
-        Estimated error of the finest chain or mesh, from the two finest ones. That of `action`, which like
-        points, momenta and values of a chain is extrapolated from both, is mostly far smaller.
-    residual
-        Largest ``|p·f + p·Dp|`` along the path, as a share of the largest ``|p·f| + p·Dp``.
-    converged
-        Whether the path is a minimum, and its error within the tolerance.
-    rivals
-        Actions of other minima that were found from other first guesses, by rising action; of
-        chains to about a thousandth, as these are short. One with the same action is a mirror image, mostly.
-    times
-        Shape ``(n,)``, of a solution of Hamilton's equations: zero at its last point; infinite at equilibria,
-        where it does not come to. None of a chain.
-    smooth
-        Whether no neighbouring solution crosses the path; only then it is a minimum.
-    downhill
-        Shape ``(m, d)``: how f leads on from the end to another attractor, without any action; None where
-        that was not asked for.
-    """
-
+    #: Shape ``(n, d)``, in the states' units, from the start to the end, both included; and p there, which is
+    #: ∇V where V is smooth. The path follows ``ẋ = f + 2Dp``.
     points: np.ndarray
     momenta: np.ndarray
+    #: Shape ``(n,)``: the action up to each point, that is U, not V, if the start is an attractor; and that
+    #: of the whole path: the barrier of U, if the end is a saddle
     values: np.ndarray
     action: float
+    #: Estimated error of the finest chain or mesh, from the two finest ones. That of `action`, which like
+    #: points, momenta and values of a chain is extrapolated from both, is mostly far smaller.
     error: float
+    #: Largest ``|p·f + p·Dp|`` along the path, as a share of the largest ``|p·f| + p·Dp``
     residual: float
+    #: Whether the path is a minimum, and its error within the tolerance
     converged: bool
+    #: Actions of other minima that were found from other first guesses, by rising action; of chains to about
+    #: a thousandth, as these are short. One with the same action is a mirror image, mostly.
     rivals: tuple[float, ...] = ()
+    #: Shape ``(n,)``, of a solution of Hamilton's equations: zero at its last point; infinite at equilibria,
+    #: where it does not come to. None of a chain.
     times: np.ndarray | None = None
+    #: Whether no neighbouring solution crosses the path; only then it is a minimum
     smooth: bool = True
+    #: Shape ``(m, d)``: how f leads on from the end to another attractor, without any action; None where that
+    #: was not asked for
     downhill: np.ndarray | None = None
 
 

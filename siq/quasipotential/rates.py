@@ -183,50 +183,36 @@ class NoiseStrength:
 
 @dataclass(frozen=True)
 class EscapeRate:
-    """The law ``E[τ] = K exp(ΔU/ε)`` of escape over one saddle, with its errors.
+    """The law ``E[τ] = K exp(ΔU/ε)`` of escape over one saddle, with its errors."""
 
-    Attributes
-    ----------
-    barrier, standard_error
-        ΔU = 2ΔV, in the unit of ε, NaN where it is not known; and its standard error.
-    prefactor
-        K, in time units, the exponential of the integral included; NaN where the law does not hold.
-    exponent
-        ``∫ c dt`` along the path; zero if D is constant and g has no divergence there.
-    remarks
-        What speaks against the law here without refuting it.
-    loss, loss_beyond
-        What one cycle at the height of the saddle loses of U by friction, where noise acts on some states
-        only and they turn: in the well that is left, and in the well beyond, if any. None where not known.
-    particle
-        Whether the system is a damped particle in one dimension, so that the rate is known for any noise.
-    prefactor_error, covariance
-        Standard error of ln K, None where not known, and its covariance with ΔU.
-    leverage
-        Relative standard error of ΔU/ε from an estimated D over that of ε.
-    correction, unknown, skew
-        By how much ln E[τ] grows with ε, in the unit of 1/U; what is not known of that, in ε/ΔU; and by which
-        share ∇V is off M_S (x - S) where the path ends askew: the law errs by about twice that.
-    power, phases
-        Of ways from or over a cycle K depends on ε, ``K = ε^power / Σ r exp(-δ/ε)``: δ, by how much more the
-        path through another phase costs, and r, its part of the rate, shape ``(2, n)``. The prefactor is
-        NaN then; of all other ways these are None and 0.
-    """
-
+    #: ΔU = 2ΔV, in the unit of ε, NaN where it is not known; and its standard error
     barrier: float
+    #: K, in time units, the exponential of the integral included; NaN where the law does not hold
     prefactor: float
+    #: ``∫ c dt`` along the path; zero if D is constant and g has no divergence there
     exponent: float = 0.0
+    #: What speaks against the law here without refuting it
     remarks: tuple[Remark, ...] = ()
+    #: What one cycle at the height of the saddle loses of U by friction, where noise acts on some states only
+    #: and they turn: in the well that is left, and in the well beyond, if any. None where not known.
     loss: float | None = None
     loss_beyond: float | None = None
+    #: Whether the system is a damped particle in one dimension, so that the rate is known for any noise
     particle: bool = False
     standard_error: float = 0.0
+    #: Standard error of ln K, None where not known, and its covariance with ΔU
     prefactor_error: float | None = None
     covariance: float = 0.0
+    #: Relative standard error of ΔU/ε from an estimated D over that of ε
     leverage: float = 1.0
+    #: By how much ln E[τ] grows with ε, in the unit of 1/U; what is not known of that, in ε/ΔU; and by which
+    #: share ∇V is off M_S (x - S) where the path ends askew: the law errs by about twice that
     correction: float = 0.0
     unknown: float = 1.0
     skew: float = 0.0
+    #: Of ways from or over a cycle K depends on ε, ``K = ε^power / Σ r exp(-δ/ε)``: δ, by how much more the
+    #: path through another phase costs, and r, its part of the rate, shape ``(2, n)``. The prefactor is NaN
+    #: then; of all other ways these are None and 0.
     power: float = 0.0
     phases: np.ndarray | None = None
 

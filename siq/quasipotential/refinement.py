@@ -53,47 +53,32 @@ Degree = Annotated[int, Field(ge=2, le=16)]
 
 @pydantic_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class RefinementOptions:
-    """How V is refined, about each attractor and over the whole region.
+    """How V is refined, about each attractor and over the whole region."""
 
-    Attributes
-    ----------
-    degrees
-        Highest powers about an attractor that are tried, one after the other.
-    accuracy
-        Relative Hamilton–Jacobi residual below which no higher power is tried.
-    about
-        Functions of V about an attractor: ``powers``, random tanh ``units``, or ``auto``, units where powers
-        leave an error of more than 0.1 % and units a smaller one.
-    reach
-        Level up to which a formula is sought, as a share of V at the lowest saddle.
-    tolerance
-        Largest relative Hamilton–Jacobi residual at a point where a formula is believed.
-    routes
-        V always comes from the ``local`` one. With ``network`` that of the networks has to agree with it, or
-        no formula is certified; so it is by default where networks are asked for, see `with_routes`.
-    formula_degree
-        Highest power of one formula for the whole region; by default what the identified f allows: one
-        more than that of f, and at least four.
-    functions
-        Further functions that such a formula may use, as formulas of the states, beside those of f.
-    single_formula
-        Largest relative Hamilton–Jacobi residual with which one formula stands for the whole region.
-    false_terms
-        Probability that the uncertainty of f brings any false term into V.
-    precision
-        Terms that contribute less than this share are dropped in any case.
-    """
-
+    #: Highest powers about an attractor that are tried, one after the other
     degrees: Annotated[tuple[Degree, ...], Field(min_length=1)] = (4, 6, 8, 10, 12)
+    #: Relative Hamilton–Jacobi residual below which no higher power is tried
     accuracy: Annotated[float, Field(gt=0)] = MIN_OUTLIER_RESIDUAL
+    #: Functions of V about an attractor: ``powers``, random tanh ``units``, or ``auto``, units where powers
+    #: leave an error of more than 0.1 % and units a smaller one
     about: Literal["auto", "powers", "units"] = "auto"
+    #: Level up to which a formula is sought, as a share of V at the lowest saddle
     reach: Annotated[float, Field(gt=0, le=3)] = 1.2
+    #: Largest relative Hamilton–Jacobi residual at a point where a formula is believed
     tolerance: Annotated[float, Field(gt=0, lt=1)] = RESIDUAL_TOLERANCE
+    #: V always comes from the ``local`` one. With ``network`` that of the networks has to agree with it, or
+    #: no formula is certified; so it is by default where networks are asked for, see `with_routes`.
     routes: Annotated[tuple[Route, ...], Field(min_length=1)] | None = None
+    #: Highest power of one formula for the whole region; by default what the identified f allows: one more
+    #: than that of f, and at least four
     formula_degree: Annotated[int, Field(ge=1, le=12)] | None = None
+    #: Further functions that such a formula may use, as formulas of the states, beside those of f
     functions: tuple[str, ...] = ()
+    #: Largest relative Hamilton–Jacobi residual with which one formula stands for the whole region
     single_formula: Annotated[float, Field(gt=0)] = 0.005
+    #: Probability that the uncertainty of f brings any false term into V
     false_terms: Annotated[float, Field(gt=0, lt=0.5)] = 0.01
+    #: Terms that contribute less than this share are dropped in any case
     precision: Annotated[float, Field(gt=0, lt=0.1)] = 1e-7
 
     def with_routes(self, *, networks: bool) -> RefinementOptions:

@@ -79,47 +79,34 @@ ONE_DIRECTION = 0.01  # of the largest variance: ways of which f of its library 
 
 @dataclass(frozen=True)
 class Transition:
-    """The way out of one well over one saddle.
+    """The way out of one well over one saddle."""
 
-    Attributes
-    ----------
-    start, end, cycle
-        Indices of the attractors, `end` None where the saddle leads back, or out of the recorded region; and
-        the first itself if it is a cycle.
-    saddle, path
-        The saddle, or the unstable cycle; and the path of least action with the way down, None where none was
-        found.
-    barrier, standard_error, formula_share
-        ΔU by the formula and the end of the path, NaN where neither is known; its standard error from that of
-        f; and the share of it that the formula accounts for.
-    by_rivals
-        What other terms of f that fit nearly as well have added to the barrier, in the mean.
-    rate
-        Law of the mean escape time at the action of the path, with the error of its prefactor; None where it
-        fails.
-    leverage
-        Relative standard error of ΔU/ε from an estimated D over that of ε.
-    of_residual
-        What the residual of V leaves open of the part of the barrier that the formula accounts for.
-    turns
-        Of each state, how many of its periods it has gained at the end; empty where no state is periodic.
-    remarks
-        What is not known.
-    """
-
+    #: Indices of the attractors, `end` None where the saddle leads back, or out of the recorded region; and
+    #: the first itself if it is a cycle
     start: int
     end: int | None
+    #: The saddle, or the unstable cycle; and the path of least action with the way down, None where none was
+    #: found
     saddle: Equilibrium | Cycle
     path: MinimumActionPath | None
+    #: ΔU by the formula and the end of the path, NaN where neither is known; its standard error from that of
+    #: f; and the share of it that the formula accounts for
     barrier: float = np.nan
     formula_share: float = np.nan
     standard_error: float = np.nan
+    #: Law of the mean escape time at the action of the path, with the error of its prefactor; None where it
+    #: fails
     rate: EscapeRate | None = None
+    #: What is not known
     remarks: tuple[Remark, ...] = ()
+    #: Relative standard error of ΔU/ε from an estimated D over that of ε
     leverage: float = 1.0
+    #: What other terms of f that fit nearly as well have added to the barrier, in the mean
     by_rivals: float = 0.0
     cycle: Cycle | None = None
+    #: What the residual of V leaves open of the part of the barrier that the formula accounts for
     of_residual: float = 0.0
+    #: Of each state, how many of its periods it has gained at the end; empty where no state is periodic
     turns: tuple[int, ...] = ()
 
     @property

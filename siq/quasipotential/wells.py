@@ -69,43 +69,30 @@ class DegreeTrial:
 
 @dataclass(frozen=True, eq=False)
 class Well(Expansion):
-    """V about an attractor, in powers about it. U is 2V.
+    """V about an attractor, in powers about it. U is 2V."""
 
-    Attributes
-    ----------
-    basis, coefficients
-        The powers about the attractor, and their coefficients, shape ``(m,)``.
-    dynamics, attractor
-        f and D, and where V is zero, shape ``(d,)``.
-    level, saddle
-        V of the lowest saddle and its position; of the last point that recordings reach, and None, where they
-        end before one.
-    residual, points
-        Relative Hamilton–Jacobi residual on the points of the fit, and those, shape ``(n, d)``; none where
-        only the formula was kept.
-    reach
-        V up to which the formula was sought, which may lie beyond the saddle; by default the level.
-    tolerance
-        Largest relative Hamilton–Jacobi residual at a point where the formula is believed.
-    elsewhere
-        Recorded states from which f leads to other attractors, shape ``(m, d)``; None for none.
-    trials
-        The degrees that were tried.
-    instead
-        V in powers, of V over units, for where these are refused; otherwise None.
-    """
-
+    #: The powers about the attractor; their `coefficients` have the shape ``(m,)``
     basis: PowerBasis
+    #: f and D, and where V is zero, shape ``(d,)``
     dynamics: Dynamics
     attractor: np.ndarray
+    #: V of the lowest saddle and its position; of the last point that recordings reach, and None, where they
+    #: end before one
     level: float
     saddle: np.ndarray | None
+    #: Relative Hamilton–Jacobi residual on the points of the fit, and those, shape ``(n, d)``; none where
+    #: only the formula was kept
     residual: float
     points: np.ndarray
+    #: V up to which the formula was sought, which may lie beyond the saddle; by default the level
     reach: float = 0.0
+    #: Largest relative Hamilton–Jacobi residual at a point where the formula is believed
     tolerance: float = RESIDUAL_TOLERANCE
+    #: Recorded states from which f leads to other attractors, shape ``(m, d)``; None for none
     elsewhere: np.ndarray | None = None
+    #: The degrees that were tried
     trials: tuple[DegreeTrial, ...] = ()
+    #: V in powers, of V over units, for where these are refused; otherwise None
     instead: Well | None = None
 
     def __post_init__(self) -> None:

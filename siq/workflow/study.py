@@ -48,24 +48,19 @@ MOST_POINTS = 10_000  # values of one parameter, or of two together: a slip of t
 
 
 class SweptParameter(BaseModel):
-    """The values of one parameter.
-
-    Attributes
-    ----------
-    parameter
-        Name of a parameter of the card.
-    from, to, step
-        The first and the last value, and how far they are apart; in Python `first` and `last`.
-    values
-        The values one by one, in the place of these three.
-    """
+    """The values of one parameter."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
 
+    #: Name of a parameter of the card
     parameter: Name
+    #: The first value, in Python `first`
     first: Annotated[Number | None, Field(alias="from")] = None
+    #: The last value, in Python `last`
     last: Annotated[Number | None, Field(alias="to")] = None
+    #: How far the values are apart
     step: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    #: The values one by one, in the place of these three
     values: Annotated[tuple[Number, ...], Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
@@ -96,15 +91,10 @@ class SweptParameter(BaseModel):
 
 
 class SweepOptions(SweptParameter):
-    """One parameter, or two for a map.
+    """One parameter, or two for a map."""
 
-    Attributes
-    ----------
-    second
-        A second parameter: then every value of the first one is combined with every value of this one, and
-        there is a map in the place of branches.
-    """
-
+    #: A second parameter: then every value of the first one is combined with every value of this one, and
+    #: there is a map in the place of branches
     second: SweptParameter | None = None
 
     @model_validator(mode="after")
@@ -156,45 +146,34 @@ FilePath = Annotated[str, AfterValidator(_usable_path)]
 
 
 class RecordingsOptions(BaseModel):
-    """Recordings in the place of a simulation.
-
-    Attributes
-    ----------
-    file
-        Parquet, CSV, HDF5, MATLAB or NumPy file with columns ``recording``, ``t`` and the states, or a
-        folder with one such file for each recording; a relative path starts from the folder of the study, or
-        else from the folder in which you work, or from the one that the environment variable
-        ``SIQ_RESOURCES`` names.
-    states
-        The columns that are states, in order, by their headings or by their names in formulas; by default the
-        system's, or all of the file's.
-    units
-        The unit of each state, and of the time as ``t``, where the file does not say; nothing is converted,
-        and another unit in the file is refused.
-    pair_step
-        Consecutive samples no further apart than this are pairs; by default those no further apart than
-        one and a half of their median distance, since what is longer is a gap.
-    diffusion
-        D, in the recordings' units, where no system gives it, in numbers or formulas of the states; by
-        default as the noise of the recordings shows it, or else the identity, which states of different units
-        refuse. See `siq.inference.field_estimate`.
-    integrator_step
-        Step of the Euler–Maruyama simulation that made the recordings, where one did: its increments are
-        those of a map, from which the continuous process is then found. Leave it out for measurements.
-    background
-        Whether slow drift of a single recording, the baselines of several that hop and differ in them, and
-        what only a sensor or a file can have added are taken off: hum, samples that stand apart, and values
-        that were filled in. It is noted.
-    """
+    """Recordings in the place of a simulation."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    #: Parquet, CSV, HDF5, MATLAB or NumPy file with columns ``recording``, ``t`` and the states, or a folder
+    #: with one such file for each recording; a relative path starts from the folder of the study, or else
+    #: from the folder in which you work, or from the one that the environment variable ``SIQ_RESOURCES``
+    #: names
     file: FilePath
+    #: The columns that are states, in order, by their headings or by their names in formulas; by default the
+    #: system's, or all of the file's
     states: Annotated[tuple[Name, ...], Field(min_length=1)] | None = None
+    #: The unit of each state, and of the time as ``t``, where the file does not say; nothing is converted,
+    #: and another unit in the file is refused
     units: dict[str, str] | None = None
+    #: Consecutive samples no further apart than this are pairs; by default those no further apart than one
+    #: and a half of their median distance, since what is longer is a gap
     pair_step: Annotated[float, Field(gt=0)] | None = None
+    #: D, in the recordings' units, where no system gives it, in numbers or formulas of the states; by default
+    #: as the noise of the recordings shows it, or else the identity, which states of different units refuse.
+    #: See `siq.inference.field_estimate`.
     diffusion: DiffusionEntry | None = None
+    #: Step of the Euler–Maruyama simulation that made the recordings, where one did: its increments are those
+    #: of a map, from which the continuous process is then found. Leave it out for measurements.
     integrator_step: Annotated[float, Field(gt=0)] | None = None
+    #: Whether slow drift of a single recording, the baselines of several that hop and differ in them, and
+    #: what only a sensor or a file can have added are taken off: hum, samples that stand apart, and values
+    #: that were filled in. It is noted.
     background: bool = True
 
     @field_validator("states", mode="before")
@@ -223,67 +202,51 @@ OF_TRAJECTORIES = (
 
 
 class Study(BaseModel):
-    """The schema of a study.
-
-    Attributes
-    ----------
-    name
-        Names the folder of the results.
-    title
-        What the report is headed.
-    system
-        Name of a system card, or path of one. Simulated, unless there are recordings; then it only lends
-        its states, units, D and exact answers.
-    from
-        Where the landscape comes from, in Python `entrance`. ``trajectories``: recordings, or a simulation of
-        the system. ``equations``: the system's equations alone; nothing is simulated, identified or trained.
-    recordings
-        Measured trajectories in the place of a simulation.
-    runs
-        Number of independent runs: fresh initial states, or resampled recordings, and fresh networks. One
-        is an answer; what the answer varies by is seen in several.
-    seed
-        Seed of everything random.
-    published
-        Published figures to be set beside the results: name of a file in ``config/published``, or path of
-        one.
-    simulation, identification, regression, refinement, certificate
-        The parameters of the steps.
-    training
-        How two networks are trained; ``{}`` takes the defaults. Left out, no networks take part: V comes
-        from the local route alone, and the published regression of networks is not made.
-    invariant
-        Noise intensities ε for which the invariant distribution is computed, and simulated.
-    landscape
-        How the landscape is found: equilibria, a formula for each well, barriers, paths and escape times;
-        by default with the options' own defaults. ``false`` finds none, but for the run that
-        the page shows.
-    beside_equations
-        Whether the landscape of the card's own equations is found, too, and stands beside that of the
-        trajectories: barriers, prefactors and mean times. It scores, and is no input of the method.
-    sweep
-        A control parameter against which the landscape of equations is found, too, or two of them.
-    """
+    """The schema of a study."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
 
+    #: Names the folder of the results
     name: FileName
+    #: What the report is headed
     title: str = ""
+    #: Name of a system card, or path of one. Simulated, unless there are recordings; then it only lends its
+    #: states, units, D and exact answers.
     system: FilePath | None = None
+    #: Where the landscape comes from, in Python `entrance`. ``trajectories``: recordings, or a simulation of
+    #: the system. ``equations``: the system's equations alone; nothing is simulated, identified or trained.
     entrance: Annotated[Entrance, Field(alias="from")] = "trajectories"
+    #: Measured trajectories in the place of a simulation
     recordings: RecordingsOptions | None = None
+    #: Number of independent runs: fresh initial states, or resampled recordings, and fresh networks. One is
+    #: an answer; what the answer varies by is seen in several.
     runs: Annotated[int, Field(ge=1, le=10_000)] = 1
+    #: Seed of everything random
     seed: Annotated[int, Field(ge=0)] = 0
+    #: Published figures to be set beside the results: name of a file in ``config/published``, or path of one
     published: str | None = None
+    #: The parameters of the steps
     simulation: SimulationEntry = SimulationEntry()
+    #: The parameters of the steps
     identification: IdentificationOptions = IdentificationOptions()
+    #: How two networks are trained; ``{}`` takes the defaults. Left out, no networks take part: V comes from
+    #: the local route alone, and the published regression of networks is not made.
     training: TrainingOptions | None = None
+    #: The parameters of the steps
     regression: RegressionOptions = RegressionOptions()
+    #: The parameters of the steps
     refinement: RefinementOptions = RefinementOptions()
+    #: The parameters of the steps
     certificate: CertificateOptions = CertificateOptions()
+    #: Noise intensities ε for which the invariant distribution is computed, and simulated
     invariant: tuple[Annotated[float, Field(gt=0)], ...] = ()
+    #: How the landscape is found: equilibria, a formula for each well, barriers, paths and escape times; by
+    #: default with the options' own defaults. ``false`` finds none, but for the run that the page shows.
     landscape: LandscapeOptions | None = LandscapeOptions()
+    #: Whether the landscape of the card's own equations is found, too, and stands beside that of the
+    #: trajectories: barriers, prefactors and mean times. It scores, and is no input of the method.
     beside_equations: bool = False
+    #: A control parameter against which the landscape of equations is found, too, or two of them
     sweep: SweepOptions | None = None
 
     @field_validator("training", "landscape", mode="before")

@@ -11,7 +11,7 @@ from siq.inference.diffusion_model import process_noise_increments
 from siq.inference.field_estimate import FieldEstimate
 from siq.inference.library import IdentificationOptions, candidate_library
 from siq.inference.regression import identify_vector_field, refit, residuals, with_noise_formula
-from siq.numerics.integration import TransitionDensity, distinct_steps
+from siq.numerics.integration import TransitionDensity
 
 RATE, INTENSITY = 1.3, 0.4
 STRENGTH, WITHIN = 0.4, 100  # barriers of 1.25
@@ -48,14 +48,12 @@ def test_a_density_is_that_of_a_linear_force() -> None:
     spread = np.sqrt(INTENSITY / (2 * RATE) * (1 - np.exp(-2 * RATE * h)))
     xh = x0 * np.exp(-RATE * h) + spread * z
     edges = np.linspace(-3, 3, 241)
-    density = TransitionDensity.of(
-        edges, -RATE * edges[1:-1], np.full(239, INTENSITY), np.full(240, INTENSITY)
-    )
+    density = TransitionDensity(edges, -RATE * edges[1:-1], np.full(239, INTENSITY), np.full(240, INTENSITY))
     expected = scipy.stats.norm.logpdf(z) - np.log(spread)
-    assert len(distinct_steps(h)[0]) == 2
+    assert len(TransitionDensity.distinct(h)[0]) == 2
     assert density.log_density(x0, xh, h) == pytest.approx(expected, abs=0.01)
     assert density.normal_scores(x0, xh, h) == pytest.approx(z, abs=0.005)
-    steep = TransitionDensity.of(edges, np.full(239, 1e30), np.full(239, INTENSITY), np.full(240, INTENSITY))
+    steep = TransitionDensity(edges, np.full(239, 1e30), np.full(239, INTENSITY), np.full(240, INTENSITY))
     assert np.isnan(steep.log_density(x0, xh, h)).all()
 
 
