@@ -9,14 +9,17 @@ from benchmarks.hostile.scores import scored
 
 # Chosen for what they are, and a short computing time; a tilt that swings is in `test_certified_records.py`.
 REFUSED = (
-    "hysteresis", "projected_wells", "growing_noise", "force_with_memory", "white_noise", "brownian_motion",
-    "popcorn", "lost_buffers", "jittered_clock", "duplicated",
+    "projected_wells", "force_with_memory", "white_noise", "brownian_motion", "popcorn", "lost_buffers",
+    "jittered_clock",
 )  # fmt: skip
+LONGER = ("hysteresis", "growing_noise", "duplicated")  # of which slow measurement noise is asked, too
 NAMED = ("held_values",)  # values that repeat themselves are no copies of recordings
 HONEST = ("gate", "swinging_tilt", "two_offsets", "growing_noise")
 
 
-@pytest.mark.parametrize("name", REFUSED + NAMED)
+@pytest.mark.parametrize(
+    "name", [*REFUSED, *NAMED, *(pytest.param(one, marks=pytest.mark.slow) for one in LONGER)]
+)
 def test_nothing_is_certified_that_is_not_so(name: str) -> None:
     score = scored(KINDS[name], 0, 1.0)
     assert not score.false, score.off

@@ -17,17 +17,25 @@ RATE, INTENSITY = 1.3, 0.4
 STRENGTH, WITHIN = 0.4, 100  # barriers of 1.25
 
 
-def double_well(step: float, *, bent: float = 0.0, least: float = 1.0, unit: float = 1.0) -> SnapshotPairs:
+def double_well(
+    step: float,
+    *,
+    bent: float = 0.0,
+    least: float = 1.0,
+    unit: float = 1.0,
+    samples: int = 100,
+    seed: int = 1,
+) -> SnapshotPairs:
     """Records of ``dx = (x - x³) dt + √(ε (least + bent x²)) dW``, a hundred steps between two samples."""
-    draw, x, kept = np.random.default_rng(1), np.linspace(-1.5, 1.5, 200), []
-    for _ in range(101):
+    draw, x, kept = np.random.default_rng(seed), np.linspace(-1.5, 1.5, 200), []
+    for _ in range(samples + 1):
         kept.append(unit * x)
         for _ in range(WITHIN):
             kick = np.sqrt(STRENGTH * (least + bent * x**2) * step / WITHIN) * draw.standard_normal(len(x))
             x = x + (x - x**3) * step / WITHIN + kick
     states = np.array(kept).T[:, :, None]
-    pairs, count = (states[:, :-1].reshape(-1, 1), states[:, 1:].reshape(-1, 1)), 100 * len(x)
-    return SnapshotPairs(*pairs, np.full(count, step), np.repeat(np.arange(len(x)), 100))
+    pairs, count = (states[:, :-1].reshape(-1, 1), states[:, 1:].reshape(-1, 1)), samples * len(x)
+    return SnapshotPairs(*pairs, np.full(count, step), np.repeat(np.arange(len(x)), samples))
 
 
 def identified(pairs: SnapshotPairs) -> FieldEstimate:
@@ -74,6 +82,19 @@ def test_f_and_d_are_found_over_steps_as_long_as_the_state_takes_to_relax(step: 
     assert scipy.stats.kstest(scores, "norm").pvalue > 0.01
     half = refit(found, pairs.take(slice(None, None, 2)))
     assert half.flow.by_density and half.values == pytest.approx(found.values, rel=0.2)
+
+
+@pytest.mark.slow
+def test_errors_over_long_steps_are_as_large_as_they_say() -> None:
+    found = [identified(double_well(0.7, samples=20, seed=seed)) for seed in range(24)]
+    terms, noises = [terms_of(one) for one in found], [one.constant_noise for one in found]
+    assert all({"x", "x**3"} <= set(one) for one in terms)
+    scores = [
+        [(one[name][0] - true) / one[name][1] for one in terms] for name, true in (("x", 1), ("x**3", -1))
+    ]
+    scores.append([(one.values[0] - STRENGTH) / one.standard_errors[0] for one in noises if one is not None])
+    for column in scores:
+        assert 0.6 < np.sqrt(np.mean(np.square(column))) < 1.5 and abs(np.mean(column)) < 0.7
 
 
 def test_units_change_nothing_but_units() -> None:
