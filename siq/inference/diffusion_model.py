@@ -367,13 +367,12 @@ class Transitions:
     Raises
     ------
     NumericalFailure
-        Where there is no such density: of several states and angles, of steps that are not coarse or of many
-        lengths, and of a D that nearly vanishes.
+        Where there is no such density: of several states and angles, of steps that are not coarse, and of a D
+        that nearly vanishes.
     """
 
     def __init__(self, found: FieldEstimate, pairs: SnapshotPairs) -> None:
-        several = found.library.dimension > 1 or found.library.angles
-        if several or not found.flow.coarse or len(TransitionDensity.distinct(pairs.h)[0]) > MOST_STEPS:
+        if found.library.dimension > 1 or found.library.angles or not found.flow.coarse:
             raise NumericalFailure("the density of what noise does between two samples is not worked out")
         self.found, self.pairs = found, pairs
         self.x0, self.xh, self.h = pairs.x0[:, 0], pairs.xh[:, 0], pairs.h
@@ -423,9 +422,11 @@ class Transitions:
         """The terms of f and of εD with the values of the largest likelihood.
 
         By steps of the sum of squares of single scores, halved until each gains (Berndt et al., Ann. Econ.
-        Soc. Meas. 3 (1974) 653). And these scores ``(n, p + k)``, by values of f and strengths of εD. Where
-        the search does not settle that is a NumericalFailure.
+        Soc. Meas. 3 (1974) 653). And these scores ``(n, p + k)``, by values of f and strengths of εD. It is a
+        NumericalFailure where steps are of many lengths, or the search does not settle.
         """
+        if len(TransitionDensity.distinct(self.h)[0]) > MOST_STEPS:
+            raise NumericalFailure("samples follow each other in steps of too many lengths")
         found, p, k = self.found, len(self.found.support), len(self.strengths)
         rate, symbols = float((self.strengths @ self.of_noise).mean()), found.library.symbols
         # Orthonormal functions in the place of monomials, which are nearly the same far from the origin.
