@@ -58,16 +58,14 @@ MAX_STEP_RELAXATION = 2.0  # of the rates of J times h: the same of the mean ove
 MOST_UNKNOWN = 0.5  # of the pairs: where more have no covariance of the noise, the step is too coarse for f
 AVERAGED_PAIRS = 500  # the mean of a smooth function of the state, to a few per cent of a small term
 LEAST_CELLS, MOST_CELLS = 80, 400  # numerical: of the range of a state
-CELLS_PER_SPREAD = 8  # numerical: of what noise spreads it by within a step; a density is off by 10⁻² at most
+CELLS_PER_SPREAD = 6  # numerical: of what noise spreads it by within a step; a density is off by 10⁻² at most
 SLIGHT_NOISE = 1e-3  # numerical: of the least where states were recorded
 BEYOND = 1.5  # spreads by which a state may have been outside of what was recorded
 MOST_STEPS = 24  # of different length: each takes a matrix
 RATES = tuple(2.0 ** np.arange(-2, 5))  # of the noise of residuals, with which a search may begin
-MOST_DENSITY_STEPS, FEW_HALVINGS = 25, 8  # numerical: from a start that is any good a few are enough
-DENSITY_STEP, DENSITY_SETTLED = (
-    0.02,
-    1e-4,
-)  # numerical: standard errors; twice the log-likelihood still to gain
+MOST_DENSITY_STEPS, FEW_HALVINGS = 15, 6  # numerical: from a start that is any good a few are enough
+DENSITY_STEP = 0.02  # numerical: of standard errors, for differences of the likelihood
+DENSITY_SETTLED = 1e-3  # numerical: twice the log-likelihood that is still to gain
 SERIES_TERMS = 24  # of the exponential series, which then is exact to ten digits
 
 
@@ -489,7 +487,7 @@ class Transitions:
         formula = NoiseFormula(library.symbols, places[:, :2], terms, values, np.eye(len(terms)), 1.0)
         everything = np.stack([np.zeros(library.size, dtype=int), np.arange(library.size)], axis=1)
         found = found.with_values(everything, found.coefficients[:, 0]).with_formula(formula, x0)
-        found = Transitions(found, self.pairs).fitted()[0]
+        found, scores = Transitions(found, self.pairs).fitted()
         assert found.noise is not None
         (values, covariance), rates = (found.noise.values, found.noise.covariance), found.noise_rate_at(x0)
         statistic = float(values[1:] @ _inverse(covariance[1:, 1:]) @ values[1:])
@@ -498,6 +496,8 @@ class Transitions:
             return None
         critical = float(-scipy.special.ndtri(false_terms / (2 * len(terms))))
         kept, values = _eliminated(places, values, covariance, critical)
+        if len(kept) == len(terms):
+            return found.with_formula(replace(found.noise, probability=probability), x0), scores
         chosen = tuple(terms[k] for k in kept)
         formula = NoiseFormula(
             library.symbols, places[kept, :2], chosen, values, covariance[np.ix_(kept, kept)], probability

@@ -9,11 +9,15 @@ from benchmarks.hostile.scores import scored
 
 # Chosen for what they are, and a short computing time; a tilt that swings is in `test_certified_records.py`.
 REFUSED = (
-    "projected_wells", "force_with_memory", "white_noise", "brownian_motion", "popcorn", "lost_buffers",
+    "projected_wells",
+    "force_with_memory",
+    "white_noise",
+    "brownian_motion",
+    "popcorn",
     "jittered_clock",
-)  # fmt: skip
-LONGER = ("hysteresis", "growing_noise", "duplicated")  # of which slow measurement noise is asked, too
-NAMED = ("held_values",)  # values that repeat themselves are no copies of recordings
+)
+LONGER = ("hysteresis", "growing_noise", "duplicated", "lost_buffers")
+NAMED = ("held_values",)  # they are no copies of recordings, and what is right without them may be certified
 HONEST = ("gate", "swinging_tilt", "two_offsets", "growing_noise")
 
 
@@ -23,8 +27,8 @@ HONEST = ("gate", "swinging_tilt", "two_offsets", "growing_noise")
 def test_nothing_is_certified_that_is_not_so(name: str) -> None:
     score = scored(KINDS[name], 0, 1.0)
     assert not score.false, score.off
-    assert not score.certified
-    assert name not in NAMED or KINDS[name].named & set(score.codes), score.said
+    assert not score.certified or name in NAMED
+    assert score.certified or name not in NAMED or KINDS[name].named & set(score.codes), score.said
 
 
 @pytest.mark.parametrize("name", HONEST)
