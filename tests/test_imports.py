@@ -39,7 +39,7 @@ UPWARDS: frozenset[tuple[str, str]] = frozenset(
     {
         ("siq.data.inspection", "siq.report.plots.recordings"),
         ("siq.diagnosis.diagnosis", "siq.report.diagnosis_page"),
-        ("siq.diagnosis.statement", "siq.report.diagnosis_text"),
+        ("siq.diagnosis.statement", "siq.report.diagnosis_page"),
         ("siq.quasipotential.landscape", "siq.report.landscape"),
         ("siq.quasipotential.landscape", "siq.report.plots.quasipotential"),
         ("siq.quasipotential.landscape", "siq.workflow.pipeline"),

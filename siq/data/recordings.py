@@ -140,14 +140,9 @@ class Recordings:
 
     @classmethod
     def from_arrays(
-        cls,
-        t: np.ndarray | Sequence[np.ndarray],
-        values: np.ndarray | Sequence[np.ndarray],
-        *,
-        names: Sequence[str],
-        units: Sequence[str | None] | None = None,
-        time_unit: str | None = None,
-    ) -> Recordings:
+        cls, t: np.ndarray | Sequence[np.ndarray], values: np.ndarray | Sequence[np.ndarray], *,
+        names: Sequence[str], units: Sequence[str | None] | None = None, time_unit: str | None = None,
+    ) -> Recordings:  # fmt: skip
         """Recordings from arrays: all of one length, or each of its own.
 
         Parameters

@@ -175,14 +175,9 @@ def in_blocks(squares: np.ndarray) -> tuple[float, ...]:
 
 
 def _refits_left_out(
-    fit: Fit,
-    learned: Measurements,
-    *,
-    noise: Noise,
-    candidates: Iterable[MechanismCandidate] = (),
-    shown: Measurements | None = None,
-    budget: Budget | None = None,
-) -> list[tuple[Fit, np.ndarray]] | None:
+    fit: Fit, learned: Measurements, *, noise: Noise, candidates: Iterable[MechanismCandidate] = (),
+    shown: Measurements | None = None, budget: Budget | None = None,
+) -> list[tuple[Fit, np.ndarray]] | None:  # fmt: skip
     """Fits without each part in turn, and their errors on it, see `errors_left_out`."""
     signed = {name for each in candidates for name in each.positive.intersection(each.amplitudes)}
     spread, found = np.nanvar(learned.outputs[scored_rows(learned)], axis=0), []

@@ -71,15 +71,9 @@ class _Bumps:
 
     @classmethod
     def along(
-        cls,
-        coordinates: tuple[sympy.Expr, ...],
-        courses: np.ndarray,
-        shares: tuple[float, ...],
-        *,
-        deviation: float = 1.0,
-        weight: float = 1.0,
-        most: int | None = None,
-    ) -> _Bumps:
+        cls, coordinates: tuple[sympy.Expr, ...], courses: np.ndarray, shares: tuple[float, ...], *,
+        deviation: float = 1.0, weight: float = 1.0, most: int | None = None,
+    ) -> _Bumps:  # fmt: skip
         """A smooth function with its bumps where the recordings have been.
 
         Parameters
@@ -212,16 +206,9 @@ class SmoothFunction:
 
 
 def _product_of(
-    place: Place,
-    courses: np.ndarray,
-    shares: tuple[float, ...],
-    *,
-    points: np.ndarray,
-    gram: np.ndarray,
-    overlap: np.ndarray,
-    deviation: float,
-    weight: float = 1.0,
-) -> SmoothFunction:
+    place: Place, courses: np.ndarray, shares: tuple[float, ...], *, points: np.ndarray, gram: np.ndarray,
+    overlap: np.ndarray, deviation: float, weight: float = 1.0,
+) -> SmoothFunction:  # fmt: skip
     """The likeliest product, whose lengths may be any of several."""
 
     def basis(side: int, share: float) -> tuple[_Bumps, np.ndarray]:
@@ -288,14 +275,9 @@ class Smoothness:
 
     @classmethod
     def of(
-        cls,
-        fit: Fit,
-        data: Measurements,
-        place: Place,
-        *,
-        known: FittedCandidate | None = None,
+        cls, fit: Fit, data: Measurements, place: Place, *, known: FittedCandidate | None = None,
         alike: bool = False,
-    ) -> Smoothness | None:
+    ) -> Smoothness | None:  # fmt: skip
         """The likeliest smoothness of a function on top of a fit; None where it cannot be worked out.
 
         Parameters

@@ -1,7 +1,7 @@
 """The statement of a diagnosis: what `verdict.json` holds, as data.
 
 The verdict, mechanisms with their parameters, errors and evidence, the place of the mismatch, the errors on
-held-out recordings and bounds of what was not found. `siq.report.diagnosis_text` has the sentences: the page,
+held-out recordings and bounds of what was not found. `siq.report.diagnosis_page` has the sentences: the page,
 the report as text and the terminal all show these, so that none can contradict another.
 """
 
@@ -253,13 +253,13 @@ class Statement:
     @property
     def sentence(self) -> str:
         """The verdict as a colleague would say it, with the numbers."""
-        from siq.report.diagnosis_text import sentences_of  # which stands above this module
+        from siq.report.diagnosis_page import sentences_of  # which stands above this module
 
         return str(sentences_of(self)["sentence"])
 
     def as_data(self) -> dict[str, Any]:
         """The content of ``verdict.json``, sentences included; a number that is not finite is null."""
-        from siq.report.diagnosis_text import sentences_of  # which stands above this module
+        from siq.report.diagnosis_page import sentences_of  # which stands above this module
 
         data: dict[str, Any] = to_jsonable_python(
             self, inf_nan_mode="null", fallback=lambda value: value.item()

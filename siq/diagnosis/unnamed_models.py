@@ -150,15 +150,9 @@ def _asked(
 
 
 def _with_smooth_term(
-    before: tuple[FittedCandidate, ...],
-    fit: Fit,
-    place: Place,
-    cost: float,
-    context: FitContext,
-    *,
-    like: AugmentedModel | None = None,
-    product: bool = False,
-) -> list[AugmentedModel]:
+    before: tuple[FittedCandidate, ...], fit: Fit, place: Place, cost: float, context: FitContext, *,
+    like: AugmentedModel | None = None, product: bool = False,
+) -> list[AugmentedModel]:  # fmt: skip
     """The likeliest model with a smooth function in a place; none where none can be fitted."""
     data = context.data
     likeliest: AugmentedModel | None = None

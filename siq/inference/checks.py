@@ -334,14 +334,9 @@ def prediction_errors(dynamics: Dynamics, recordings: Recordings) -> np.ndarray:
 
 
 def check_prediction(
-    *,
-    noise_fault: str | None,
-    limits: PredictionLimits,
-    errors: np.ndarray | None = None,
-    mean_probability: float | None = None,
-    held_out_ratio: float = 1.0,
-    held_out_values: float = np.inf,
-) -> Verdict:
+    *, noise_fault: str | None, limits: PredictionLimits, errors: np.ndarray | None = None,
+    mean_probability: float | None = None, held_out_ratio: float = 1.0, held_out_values: float = np.inf,
+) -> Verdict:  # fmt: skip
     """Whether f, which every V here is made from, holds for recordings that it was not fitted to.
 
     Without noise by the median of the errors of long-term prediction. Under noise by the mean square of the

@@ -45,14 +45,9 @@ Plan = Mapping[str, Any]
 
 
 def next_experiment(
-    one: Fit,
-    others: Sequence[Fit],
-    data: Measurements,
-    *,
-    variance: np.ndarray,
-    correlated: float,
+    one: Fit, others: Sequence[Fit], data: Measurements, *, variance: np.ndarray, correlated: float,
     enough: float,
-) -> Remark | None:
+) -> Remark | None:  # fmt: skip
     """The experiment that is expected to tell a model from others best; None where nothing can be predicted.
 
     Parameters

@@ -19,8 +19,8 @@ Residuals of pairs would show the noise of a sensor as well. The likelihood of a
 what process noise adds to the covariance of the state over an interval is εD(x), averaged over what the
 filter knows of x there. The variances of the sensors are then scored together with the coefficients of D.
 
-Where one state forgets much of itself from sample to sample, f bends what noise does on the way, and no
-law of residuals is known. Then f and D are fitted together, by the density that they give to each pair.
+Where one state forgets much of itself from sample to sample no law of residuals is known: see
+`siq.inference.transition_densities`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,6 @@ from siq.inference.kalman_filter import Noise, whiten
 from siq.inference.library import CandidateLibrary
 from siq.inference.maximum_likelihood import Fit
 from siq.inference.measurements import Measurements
-from siq.numerics.integration import TransitionDensity
 from siq.numerics.randomness import positive
 from siq.systems.diffusion import Diffusion
 from siq.systems.dynamics import Dynamics
@@ -57,15 +56,6 @@ MAX_RELAXATION = 0.5  # of Jh/2: beyond that a residual hardly knows where its s
 MAX_STEP_RELAXATION = 2.0  # of the rates of J times h: the same of the mean over pairs
 MOST_UNKNOWN = 0.5  # of the pairs: where more have no covariance of the noise, the step is too coarse for f
 AVERAGED_PAIRS = 500  # the mean of a smooth function of the state, to a few per cent of a small term
-LEAST_CELLS, MOST_CELLS = 80, 400  # numerical: of the range of a state
-CELLS_PER_SPREAD = 6  # numerical: of what noise spreads it by in a step; most densities are right to 1 %
-SLIGHT_NOISE = 1e-3  # numerical: of the least where states were recorded
-BEYOND = 1.5  # spreads by which a state may have been outside of what was recorded
-MOST_STEPS = 24  # of different length: each takes a matrix
-RATES = tuple(2.0 ** np.arange(-2, 5))  # of the noise of residuals, with which a search may begin
-MOST_DENSITY_STEPS, FEW_HALVINGS = 15, 6  # numerical: from a start that is any good a few are enough
-DENSITY_STEP = 0.02  # numerical: of standard errors, for differences of the likelihood
-DENSITY_SETTLED = 1e-3  # numerical: twice the log-likelihood that is still to gain
 SERIES_TERMS = 24  # of the exponential series, which then is exact to ten digits
 
 
@@ -226,7 +216,7 @@ class _DiffusionLikelihood:
         while True:
             values, sensor, covariance = self.scored(places, values)
             count = len(values)
-            kept, values = _eliminated(places, values, covariance[:count, :count], critical)
+            kept, values = self._formula(places, values, covariance, probability).eliminated(critical)
             if len(kept) == count:
                 break
             places = places[kept]
@@ -244,30 +234,6 @@ class _DiffusionLikelihood:
         if len(sensor):  # they were left where the search for the terms began
             _, sensor, covariance = self.scored(places, values)
         return formula, sensor, covariance
-
-
-def _eliminated(
-    places: np.ndarray, values: np.ndarray, covariance: np.ndarray, critical: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Backward elimination about the largest likelihood: the coefficients that stay, and what they become.
-
-    The last term of a state's own noise stays: without it there would be none.
-    """
-    kept = np.arange(len(places))
-    while len(kept):
-        own = places[kept, 0] == places[kept, 1]
-        count = np.array([(own & (places[kept, 0] == i)).sum() for i in places[kept, 0]])
-        strength = np.abs(values) / np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
-        strength[own & (count == 1)] = np.inf
-        weakest = int(np.argmin(strength))
-        if strength[weakest] >= critical:
-            break
-        along = covariance[:, weakest] / covariance[weakest, weakest]
-        values = np.delete(values - along * values[weakest], weakest)
-        covariance = covariance - np.outer(along, covariance[weakest])
-        covariance = np.delete(np.delete(covariance, weakest, axis=0), weakest, axis=1)
-        kept = np.delete(kept, weakest)
-    return kept, values
 
 
 def _scaled(matrix: np.ndarray) -> np.ndarray:
@@ -354,155 +320,6 @@ class ResidualLikelihood(_DiffusionLikelihood):
                 left = self.functions[:, places[rows, 2]] * weight[:, None]
                 information[np.ix_(rows, columns)] = left.T @ self.functions[:, places[columns, 2]]
         return logarithm, score.sum(axis=0), information, score.T @ score
-
-
-class Transitions:
-    """Pairs of one state over coarse steps, and the density that f and εD give to each.
-
-    f has terms of its library. εD is a sum of shapes, those of a `NoiseFormula` or the one of a D that is
-    known, with a strength each.
-
-    Raises
-    ------
-    NumericalFailure
-        Where there is no such density: of several states and angles, of steps that are not coarse, and of a D
-        that nearly vanishes.
-    """
-
-    def __init__(self, found: FieldEstimate, pairs: SnapshotPairs) -> None:
-        if found.library.dimension > 1 or found.library.angles or not found.flow.coarse:
-            raise NumericalFailure("the density of what noise does between two samples is not worked out")
-        self.found, self.pairs = found, pairs
-        self.x0, self.xh, self.h = pairs.x0[:, 0], pairs.xh[:, 0], pairs.h
-        noise, symbols = found.noise, found.library.symbols
-        self._terms = [found.library.terms[k] for k in found.support[:, 1]]
-
-        def shape(x: np.ndarray) -> np.ndarray:
-            return found.diffusion.at(x.T)[:, 0, 0][None]
-
-        functions = compile_formulas(self._terms, symbols)
-        shapes = shape if noise is None else compile_formulas(list(noise.terms), symbols)
-        self.of_field, self.of_noise = functions(self.x0[None]), shapes(self.x0[None])
-        self.strengths = noise.values if noise else found.noise_rate[0] / self.of_noise.mean(axis=1)
-        # Within a step noise spreads the state by √(εD h), or less where f brings it back.
-        back = 1 + 2 * np.abs(found.dynamics.jacobian(pairs.x0)[:, 0, 0]) * self.h
-        least, most = np.quantile(np.sqrt(self.strengths @ self.of_noise * self.h / back), [0.01, 0.99])
-        low, high = min(self.x0.min(), self.xh.min()), max(self.x0.max(), self.xh.max())
-        aside = min(float(most), (high - low) / 2) * BEYOND
-        count = max(int((high - low + 2 * aside) / least * CELLS_PER_SPREAD), LEAST_CELLS)
-        if count > MOST_CELLS:
-            raise NumericalFailure("noise moves some states by a small part of what it moves others by")
-        self.edges = np.linspace(low - aside, high + aside, count + 1)
-        inner, middle = self.edges[None, 1:-1], (self.edges[None, 1:] + self.edges[None, :-1]) / 2
-        self._drift, self._between, self._inside = functions(inner), shapes(inner), shapes(middle)
-
-    def _density(self, values: np.ndarray, strengths: np.ndarray) -> TransitionDensity:
-        """With f and εD of some values; beyond the recorded states εD does not vanish."""
-        least = SLIGHT_NOISE * float((strengths @ self.of_noise).min())
-        between, inside = (np.maximum(strengths @ one, least) for one in (self._between, self._inside))
-        return TransitionDensity(self.edges, values @ self._drift, between, inside)
-
-    def log_densities(self, values: np.ndarray, strengths: np.ndarray) -> np.ndarray:
-        """Of each pair; minus infinity where εD is not positive, or f too steep."""
-        if not (strengths @ self.of_noise).min() > 0:
-            return np.full(len(self.h), -np.inf)
-        found = self._density(values, strengths).log_density(self.x0, self.xh, self.h)
-        return np.where(np.isfinite(found), found, -np.inf)
-
-    def normal_increments(self) -> np.ndarray:
-        """Normal scores times √(εD h): residuals as of a short step, shape ``(n, 1)``."""
-        scores = self._density(self.found.values, self.strengths).normal_scores(self.x0, self.xh, self.h)
-        if not np.isfinite(scores).all():
-            raise NumericalFailure("f is too steep for so long steps; sample more often")
-        return np.asarray(scores * np.sqrt(self.strengths @ self.of_noise * self.h))[:, None]
-
-    def fitted(self) -> tuple[FieldEstimate, np.ndarray]:
-        """The terms of f and of εD with the values of the largest likelihood.
-
-        By steps of the sum of squares of single scores, halved until each gains (Berndt et al., Ann. Econ.
-        Soc. Meas. 3 (1974) 653). And these scores ``(n, p + k)``, by values of f and strengths of εD. It is a
-        NumericalFailure where steps are of many lengths, or the search does not settle.
-        """
-        if len(TransitionDensity.distinct(self.h)[0]) > MOST_STEPS:
-            raise NumericalFailure("samples follow each other in steps of too many lengths")
-        found, p, k = self.found, len(self.found.support), len(self.strengths)
-        rate, symbols = float((self.strengths @ self.of_noise).mean()), found.library.symbols
-        # Orthonormal functions in the place of monomials, which are nearly the same far from the origin.
-        triangle = np.zeros((p + k, p + k))
-        triangle[:p, :p] = np.linalg.qr((self.of_field * np.sqrt(self.h / rate)).T)[1]
-        triangle[p:, p:] = np.linalg.qr(self.of_noise.T / (np.sqrt(2) * rate))[1]
-        turn, errors = np.linalg.inv(triangle), np.ones(p + k)
-
-        def densities(place: np.ndarray) -> np.ndarray:
-            return self.log_densities(*np.split(turn @ place, [p]))
-
-        starts = [np.append(found.values, self.strengths)]
-        if not found.flow.by_density and found.diffusion.constant:
-            # Of a state at rest 2f/εD is the slope of its ln p (Hyvärinen, JMLR 6 (2005) 695).
-            slopes = compile_formulas([term.diff(symbols[0]) for term in self._terms], symbols)(self.x0[None])
-            functions = turn[:p, :p].T @ self.of_field
-            rest = np.linalg.solve(functions @ functions.T, turn[:p, :p].T @ slopes.sum(axis=1))
-            starts += [one * np.append(-turn[:p, :p] @ rest * rate / 2, self.strengths) for one in RATES]
-        places = [triangle @ one for one in starts]
-        now, at = max(((densities(one), one) for one in places), key=lambda one: one[0].sum())
-        for _ in range(MOST_DENSITY_STEPS):
-            with np.errstate(invalid="ignore"):
-                ends = [densities(at + move) for move in np.diag(DENSITY_STEP * errors)]
-                scores = (np.stack(ends, axis=1) - now[:, None]) / (DENSITY_STEP * errors)
-            if not np.isfinite(scores).all():
-                break
-            covariance, slope = _inverse(scores.T @ scores), scores.sum(axis=0)
-            step, errors = covariance @ slope, np.sqrt(np.diag(covariance))
-            gain = float(step @ slope)
-            for _ in range(FEW_HALVINGS if gain > DENSITY_SETTLED else 0):
-                if (then := densities(at + step)).sum() > now.sum():
-                    at, now = at + step, then
-                    break
-                step = step / 2
-            else:
-                break
-        if not (np.isfinite(scores).all() and gain < 1.0):
-            raise NumericalFailure("f and D of so long steps are not found; sample more often")
-        values, covariance = turn @ at, turn @ covariance @ turn.T * self.pairs.copies
-        flow, of_noise = replace(found.flow, by_density=True), covariance[p:, p:]
-        found = found.with_values(found.support, values[:p], covariance=covariance[:p, :p], flow=flow)
-        if found.noise is not None:
-            formula = replace(found.noise, values=values[p:], covariance=of_noise)
-            return found.with_formula(formula, self.pairs.x0), scores @ triangle
-        size, known = self.of_noise.mean(), None
-        noise_rate = values[p:, None] * size
-        if found.diffusion.constant:
-            known = replace(constant_noise(symbols, noise_rate, samples=1.0), covariance=of_noise * size**2)
-        return replace(found, noise_rate=noise_rate, constant_noise=known), scores @ triangle
-
-    def fitted_with_formula(self, *, false_terms: float) -> tuple[FieldEstimate, np.ndarray] | None:
-        """All terms of f with those of a D(x), and the scores; None where a constant D can be held.
-
-        By Wald's test of the strengths of the other shapes of εD; see `_DiffusionLikelihood.selected`.
-        """
-        found, library, x0 = self.found, self.found.library, self.pairs.x0
-        terms = tuple(term for _, term in library.functions(library.symbols, DEGREE, library.angles))
-        places, values = _all_places(1, len(terms)), np.zeros(len(terms))
-        values[0] = found.noise_rate[0, 0]
-        formula = NoiseFormula(library.symbols, places[:, :2], terms, values, np.eye(len(terms)), 1.0)
-        everything = np.stack([np.zeros(library.size, dtype=int), np.arange(library.size)], axis=1)
-        found = found.with_values(everything, found.coefficients[:, 0]).with_formula(formula, x0)
-        found, scores = Transitions(found, self.pairs).fitted()
-        assert found.noise is not None
-        (values, covariance), rates = (found.noise.values, found.noise.covariance), found.noise_rate_at(x0)
-        statistic = float(values[1:] @ _inverse(covariance[1:, 1:]) @ values[1:])
-        probability = float(scipy.special.chdtrc(len(terms) - 1, statistic))
-        if probability >= false_terms or rates.std() < HARMLESS_CHANGE * rates.mean():
-            return None
-        critical = float(-scipy.special.ndtri(false_terms / (2 * len(terms))))
-        kept, values = _eliminated(places, values, covariance, critical)
-        if len(kept) == len(terms):
-            return found.with_formula(replace(found.noise, probability=probability), x0), scores
-        chosen = tuple(terms[k] for k in kept)
-        formula = NoiseFormula(
-            library.symbols, places[kept, :2], chosen, values, covariance[np.ix_(kept, kept)], probability
-        )
-        return Transitions(found.with_formula(formula, x0), self.pairs).fitted()
 
 
 def process_noise_increments(found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray) -> np.ndarray:

@@ -40,6 +40,7 @@ NoiseKind = Literal["none", "process", "sensor", "measurement", "rounding", "col
 NOISE_FREE = 1e-6  # residuals below this share of the increments are the integrator's and the rounding's
 STANDARD_ERRORS = 4.0  # derived: chance passes it once in 16 000 pairs of states
 SIGNIFICANT_SCORE = 5.0  # standard errors
+BEYOND_STATES = 2.0  # standard deviations of a sensor, by which values are farther away than any state
 HARMLESS_CORRELATION = 0.02  # a correlation, or a deviation of D, below this is harmless however significant
 HARMLESS_BIAS = 0.5  # of a standard error: with such a bias an error bar holds 0.95 - 0.02 of the time
 
@@ -90,6 +91,27 @@ class NoiseFormula:
         i, j = self.places.T
         share = np.where(i == j, 1.0, 2.0)[:, None] * precision[:, i, j].T * terms
         return np.asarray(share.mean(axis=1) / len(self.symbols))
+
+    def eliminated(self, critical: float) -> tuple[np.ndarray, np.ndarray]:
+        """Backward elimination about the largest likelihood: the coefficients that stay, and their values.
+
+        The last term of a state's own noise stays: without it there would be none.
+        """
+        kept, values, covariance = np.arange(len(self.values)), self.values, self.covariance
+        while len(kept):
+            own = self.places[kept, 0] == self.places[kept, 1]
+            count = np.array([(own & (self.places[kept, 0] == i)).sum() for i in self.places[kept, 0]])
+            strength = np.abs(values) / np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
+            strength[own & (count == 1)] = np.inf
+            weakest = int(np.argmin(strength))
+            if strength[weakest] >= critical:
+                break
+            along = covariance[:, weakest] / covariance[weakest, weakest]
+            values = np.delete(values - along * values[weakest], weakest)
+            covariance = covariance - np.outer(along, covariance[weakest])
+            covariance = np.delete(np.delete(covariance, weakest, axis=0), weakest, axis=1)
+            kept = np.delete(kept, weakest)
+        return kept, values
 
     def as_data(self) -> dict[str, Any]:
         """The terms with their errors, and the covariance, as plain data."""
@@ -430,7 +452,12 @@ class FieldEstimate:
         """States in the middle of the mean way of pairs, ``(n, d)``: there D is that of the step.
 
         To first order; where it is none, as behind the end of a formula, and of densities, where pairs begin.
+        What a noisy sensor shows farthest away is no state.
         """
+        if self.flow.by_density and self.sensor_variance is not None:
+            reach, middle = BEYOND_STATES * np.sqrt(self.sensor_variance), np.median(pairs.x0, axis=0)
+            low, high = pairs.x0.min(axis=0) + reach, pairs.x0.max(axis=0) - reach
+            return np.clip(pairs.x0, np.minimum(low, middle), np.maximum(high, middle))
         if self.diffusion.constant or self.flow.by_density:
             return pairs.x0
         middle = pairs.x0 + (self.flow.response_share * pairs.h)[:, None] * self.dynamics.drift(pairs.x0)

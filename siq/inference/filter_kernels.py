@@ -95,23 +95,11 @@ def carry_linearly(
 
 @machine_code
 def filter_recursion(
-    first: np.ndarray,
-    transition: np.ndarray,
-    response: np.ndarray,
-    gap: np.ndarray,
-    measured: np.ndarray,
-    measured_response: np.ndarray,
-    residual: np.ndarray,
-    variance: np.ndarray,
-    step: np.ndarray,
-    intensity: np.ndarray,
-    begin: np.ndarray,
-    begin_covariance: np.ndarray,
-    functions: np.ndarray,
-    places: np.ndarray,
-    scored: bool,
-    kept: bool,
-) -> tuple[Any, ...]:
+    first: np.ndarray, transition: np.ndarray, response: np.ndarray, gap: np.ndarray, measured: np.ndarray,
+    measured_response: np.ndarray, residual: np.ndarray, variance: np.ndarray, step: np.ndarray,
+    intensity: np.ndarray, begin: np.ndarray, begin_covariance: np.ndarray, functions: np.ndarray,
+    places: np.ndarray, scored: bool, kept: bool,
+) -> tuple[Any, ...]:  # fmt: skip
     """Innovations of the Kalman filter with their derivatives, each divided by its standard deviation.
 
     The initial state of every recording may be unknown: it enters as d further columns, not as a covariance,
@@ -341,16 +329,10 @@ def _simpson(transition: np.ndarray, i: int, j: int, m: int, n: int) -> float:
 
 @machine_code
 def smooth_backwards(
-    first: np.ndarray,
-    transition: np.ndarray,
-    measured: np.ndarray,
-    residual: np.ndarray,
-    innovations: np.ndarray,
-    predicted: np.ndarray,
-    before: np.ndarray,
-    gains: np.ndarray,
+    first: np.ndarray, transition: np.ndarray, measured: np.ndarray, residual: np.ndarray,
+    innovations: np.ndarray, predicted: np.ndarray, before: np.ndarray, gains: np.ndarray,
     variances: np.ndarray,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """The most probable deviation of every state, given all measurements, shape ``(n, d)``.
 
     Modified Bryson–Frazier smoother: it inverts no covariance of states, which is singular where a state

@@ -74,6 +74,7 @@ from siq.inference.regression import (
     with_noise_formula,
     with_stability,
 )
+from siq.inference.transition_densities import Transitions
 from siq.numerics.randomness import Purpose, positive
 from siq.remarks import Remark, sentence
 from siq.systems.diffusion import Diffusion
@@ -84,20 +85,16 @@ MIN_SHARE, MAX_SHARE = 1e-3, 0.45  # of the residuals' variance: a sensor's shar
 WHOLE_STEP_TOLERANCE = 0.05  # of an exposure, as exactly as residuals show it of some thousand samples
 SINGULAR = "the recordings do not determine f; record more, or more often"
 PREDICTED_RECORDINGS = 200  # held-out ones that are predicted: enough for a median
+OF_SENSOR = ("measurement", "measurement_error", "sensor_evidence")  # of a diagnosis
 UNDECIDED = 2.94  # of a log-likelihood: odds of 19 to 1
 
 
 def identify(
-    recordings: Recordings,
-    *,
-    options: IdentificationOptions,
-    draw: Callable[[Purpose], np.random.Generator],
-    diffusion: Diffusion | None = None,
-    units: Sequence[str | None] = (),
-    pair_step: float | None = None,
-    integrator_step: float | None = None,
+    recordings: Recordings, *, options: IdentificationOptions,
+    draw: Callable[[Purpose], np.random.Generator], diffusion: Diffusion | None = None,
+    units: Sequence[str | None] = (), pair_step: float | None = None, integrator_step: float | None = None,
     limits: PredictionLimits | None = None,
-) -> FieldEstimate:
+) -> FieldEstimate:  # fmt: skip
     """f and D of recordings, with their errors, the noise that is in the recordings, and the test of f.
 
     Parameters
@@ -221,19 +218,37 @@ class _Case:
         """By likelihood, where the sensors are noisy; None where they are not.
 
         What could be sensor noise is asked of the likelihood from one standard error on: it would bias f long
-        before it is significant. It is the answer where it is likelier than none, the share of each sensor in
-        the variance of n residuals being uniform from 0 to ½ beforehand, and known to ``1/√n`` (Laplace). The
-        other answer counts in the errors, as likely as it is.
+        before it is significant; of one state over coarse steps it is asked always. It is the answer where
+        it is likelier than none, the share of each sensor in the variance of n residuals being uniform from 0
+        to ½ beforehand, and known to ``1/√n`` (Laplace). The other answer counts in the errors, as likely as
+        it is.
         """
         pairs = self._pairs(self.recordings)
         correlation, score = neighbour_correlations(found, pairs)
-        if not (score < SUSPECT_SCORE).any():
-            return None
         rate, least = np.diag(found.noise_rate), float(correlation.min())
         variance = rate * float(np.median(pairs.h))
         measured = np.sqrt(np.maximum(-correlation, 0.0) * variance)
-        bias = bias_of_rounding(found, pairs, self.recordings, measured, correlation=least)
-        if bias is not None and bias <= HARMLESS_BIAS:
+        suspect, count = int((score < SUSPECT_SCORE).sum()), len(pairs.h)
+
+        def probability(again: FieldEstimate, sensors: int) -> float:
+            assert again.diagnosis is not None and again.diagnosis.sensor_evidence is not None
+            odds = again.diagnosis.sensor_evidence + sensors * np.log(8 * np.pi / count)
+            return float(scipy.special.expit(odds / 2))
+
+        if suspect:
+            bias = bias_of_rounding(found, pairs, self.recordings, measured, correlation=least)
+            if bias is not None and bias <= HARMLESS_BIAS:
+                return None
+        if found.flow.coarse and self.given is None:
+            with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
+                given = Transitions(found, pairs)
+                behind = given.identified_behind_sensor(false_terms=self.options.false_terms)
+                if behind is None:
+                    return None
+                noisy = probability(behind, 1)
+                one, other = (behind, found) if noisy > 0.5 else (found, behind)
+                return self._finished_by_pairs(one).with_rival(other, min(noisy, 1 - noisy))
+        if not suspect:
             return None
         # Over long steps f hides most of the correlation, and a search that begins low finds no way up.
         fault, unit = "", Diffusion.identity(self.library.dimension)
@@ -241,10 +256,7 @@ class _Case:
             noise = Noise(share * variance, rate * (1 - 2 * share))
             try:
                 again = self.by_likelihood(ObservationModel(self.library, unit), noise)
-                assert again.diagnosis is not None and again.diagnosis.sensor_evidence is not None
-                sensors, count = int((score < SUSPECT_SCORE).sum()), len(pairs.h)
-                odds = again.diagnosis.sensor_evidence + sensors * np.log(8 * np.pi / count)
-                noisy = float(scipy.special.expit(odds / 2))
+                noisy = probability(again, suspect)
                 if noisy > 0.5:
                     slow = self.with_slow_noise(again)
                     return slow or self.finished(again).with_rival(found, 1 - noisy)
@@ -297,9 +309,8 @@ class _Case:
                 "no process noise is seen that would show D, and the positions have different units, so that"
                 " no unit matrix can stand for it; scale them to one unit"
             )
-        sizes = zip(noise.measurement, self.recordings.titles, strict=True)
-        sensors = [{"size": float(size), "state": name} for size, name in sizes]
-        remarks = [Remark("inference.measurement_noise", {"sensors": sensors})]
+        remarks = [of_sensors := self._of_sensors(noise)]
+        sensors = of_sensors.values["sensors"]
         if found.slow_force:
             time, slope = float(-1 / found.values[-1]), float(np.sqrt(found.covariance[-1, -1]))
             values = {
@@ -333,6 +344,11 @@ class _Case:
         found = replace(found, diagnosis=noise)
         held_out = held_out_innovations(found, self.training, self.held_out, pair_step=self.pair_step)
         return self._tested(found, mean_probability=held_out[0], held_out_ratio=held_out[1])
+
+    def _of_sensors(self, noise: NoiseDiagnosis) -> Remark:
+        sizes = zip(noise.measurement, self.recordings.titles, strict=True)
+        sensors = [{"size": float(size), "state": name} for size, name in sizes]
+        return Remark("inference.measurement_noise", {"sensors": sensors})
 
     def _strength(self, found: FieldEstimate, diffusion: Diffusion) -> float:
         """ε of another D than was found: the mean of ``tr D⁻¹(x) εD(x) / d`` over the states."""
@@ -408,6 +424,10 @@ class _Case:
         def diagnosed(found: FieldEstimate, source: DiffusionSource) -> FieldEstimate:
             noise = residual_noise(found, self.recordings, pair_step=self.pair_step)
             noise = replace(noise, diffusion=source, pairs=count)
+            if found.diagnosis is not None and found.sensor_variance is not None and noise.kind == "process":
+                remarks = (*noise.remarks, self._of_sensors(found.diagnosis))
+                known = {name: getattr(found.diagnosis, name) for name in OF_SENSOR}
+                noise = replace(noise, remarks=remarks, **known)
             if noise.kind == "process":
                 share = found.error_of_strength(everything.x0, everything.h)
                 noise = replace(noise, intensity_error=noise.intensity * share)
@@ -555,8 +575,11 @@ class _Case:
         return found.with_shape_tested(chance, limit=self.limits.each, along="state")
 
     def _states(self, found: FieldEstimate) -> Recordings:
-        """The states as recorded, or as a filter knows them behind a sensor."""
-        if found.sensor_variance is None and not found.hidden_states:
+        """The states as recorded, or as a filter knows them behind a sensor.
+
+        Of densities as recorded: what the filter knows is in them.
+        """
+        if found.flow.by_density or (found.sensor_variance is None and not found.hidden_states):
             return self.recordings
         return filtered_recordings(found, self.recordings, pair_step=self.pair_step)
 

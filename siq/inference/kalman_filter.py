@@ -172,17 +172,10 @@ class Linearisation:
         return replace(self, **{name: getattr(self, name)[rows] for name in arrays})
 
     def filtered(
-        self,
-        first: np.ndarray,
-        step: np.ndarray,
-        noise: Noise,
-        *,
-        begin: np.ndarray | None = None,
-        begin_covariance: np.ndarray | None = None,
-        functions: np.ndarray | None = None,
-        places: np.ndarray | None = None,
-        kept: bool = False,
-    ) -> tuple[Any, ...]:
+        self, first: np.ndarray, step: np.ndarray, noise: Noise, *, begin: np.ndarray | None = None,
+        begin_covariance: np.ndarray | None = None, functions: np.ndarray | None = None,
+        places: np.ndarray | None = None, kept: bool = False,
+    ) -> tuple[Any, ...]:  # fmt: skip
         """Innovations of the filter along it; see `siq.inference.filter_kernels.filter_recursion`.
 
         By default recordings begin at zero without a covariance, but for what is stationary; with functions
@@ -250,17 +243,10 @@ def integrate_intervals(model: Dynamics, grid: Grid, values: np.ndarray, x: np.n
 
 
 def linearise(
-    model: Dynamics,
-    grid: Grid,
-    values: np.ndarray,
-    x: np.ndarray,
-    *,
-    columns: Columns | None = None,
-    drift: ClosedFunctions | None = None,
-    spread: np.ndarray | None = None,
-    noise: Noise | None = None,
+    model: Dynamics, grid: Grid, values: np.ndarray, x: np.ndarray, *, columns: Columns | None = None,
+    drift: ClosedFunctions | None = None, spread: np.ndarray | None = None, noise: Noise | None = None,
     without: Sequence[int] = (),
-) -> Linearisation:
+) -> Linearisation:  # fmt: skip
     """Integrate every interval from the states in hand ``(n, d)``, with the derivatives.
 
     Free parameters, and behind them further right-hand sides, are the columns of the response; `values` are
@@ -315,14 +301,9 @@ def linearise(
 
 
 def _carried(
-    model: Dynamics,
-    grid: Grid,
-    values: np.ndarray,
-    state: np.ndarray,
-    drift: ParametricFunctions | ClosedFunctions,
-    columns: Columns | None,
-    width: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    model: Dynamics, grid: Grid, values: np.ndarray, state: np.ndarray,
+    drift: ParametricFunctions | ClosedFunctions, columns: Columns | None, width: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """States ``(d, k)`` at the ends of intervals, and their derivatives ``(k, d, d)``, ``(k, d, width)``."""
     delays, step, (d, count) = model.lags(values), grid.step, state.shape
     transition, response = np.repeat(np.eye(d)[:, :, None], count, axis=2), np.zeros((d, width, count))

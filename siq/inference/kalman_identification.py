@@ -20,7 +20,7 @@ from functools import partial
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from siq.data.recordings import Recordings, parent_recordings
+from siq.data.recordings import Recordings, parent_recordings, snapshot_pairs
 from siq.data.stationarity import runs_of
 from siq.errors import NumericalFailure
 from siq.inference.checks import correlations_between, unexplained_probability
@@ -41,6 +41,7 @@ from siq.inference.selection import (
     stability,
     triangles,
 )
+from siq.inference.transition_densities import Transitions
 from siq.numerics.integration import FlowMap
 from siq.numerics.randomness import positive
 from siq.systems.diffusion import Diffusion
@@ -59,14 +60,9 @@ SHORTEST_NOISE = 1  # step: the same of a sensor, whose noise is as good as whit
 
 
 def identify_by_likelihood(
-    observation: ObservationModel,
-    recordings: Recordings,
-    noise: Noise | None = None,
-    *,
-    false_terms: float,
-    generator: np.random.Generator,
-    pair_step: float | None = None,
-) -> FieldEstimate:
+    observation: ObservationModel, recordings: Recordings, noise: Noise | None = None, *,
+    false_terms: float, generator: np.random.Generator, pair_step: float | None = None,
+) -> FieldEstimate:  # fmt: skip
     """f, the process noise and measurement noise together, with the diagnosis.
 
     D is that of the observation, unless it depends on the state, or acts on hidden velocities: there it is
@@ -236,15 +232,10 @@ def _fit_library(
 
 
 def _estimate(
-    observation: ObservationModel,
-    support: np.ndarray,
-    fit: Fit,
-    data: Measurements,
-    sensor_error: np.ndarray,
-    process_error: np.ndarray,
-    covariance: np.ndarray,
+    observation: ObservationModel, support: np.ndarray, fit: Fit, data: Measurements,
+    sensor_error: np.ndarray, process_error: np.ndarray, covariance: np.ndarray,
     joint: np.ndarray | None = None,
-) -> FieldEstimate:
+) -> FieldEstimate:  # fmt: skip
     """The estimate of a fit whose noise has known errors; see `noise_uncertainty`."""
     library, diffusion, d = observation.library, observation.diffusion, observation.library.dimension
     intensity, sensor = fit.noise.intensity, fit.noise.measurement
@@ -311,14 +302,9 @@ def _estimate(
 
 
 def _with_formula(
-    observation: ObservationModel,
-    support: np.ndarray,
-    fit: Fit,
-    data: Measurements,
-    *,
-    false_terms: float,
-    probability: float,
-) -> FieldEstimate:
+    observation: ObservationModel, support: np.ndarray, fit: Fit, data: Measurements, *,
+    false_terms: float, probability: float,
+) -> FieldEstimate:  # fmt: skip
     """The estimate of a fit whose process noise depends on the state, once f and D know of each other."""
     symbols = observation.library.symbols
     for _ in range(DIFFUSION_ROUNDS):
@@ -407,6 +393,18 @@ def filtered_recordings(
     Velocities that were not measured are among them. Their increments have the mean of f, as those of the
     states do; those of the measured values do not.
     """
+    if found.flow.by_density:
+        runs = [one for one in runs_of(recordings, longest=pair_step) if one.stop - one.start > 1]
+        rows = np.concatenate([np.arange(one.start, one.stop) for one in runs])
+        kept = replace(
+            recordings,
+            recording=recordings.recording[rows],
+            t=recordings.t[rows],
+            values=recordings.values[rows].copy(),
+        )
+        later = np.flatnonzero(np.isin(rows, [one.start for one in runs], invert=True))
+        kept.values[later, 0] = Transitions(found, snapshot_pairs(recordings, pair_step=pair_step)).states()
+        return kept
     observation = ObservationModel.of(found)
     data = observation.measured(recordings, pair_step)
     count = observation.library.dimension - observation.hidden_states

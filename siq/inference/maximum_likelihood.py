@@ -256,14 +256,9 @@ def noise_uncertainty(fit: Fit, data: Measurements) -> tuple[np.ndarray, np.ndar
 
 
 def _noise_along(
-    linearisation: Linearisation,
-    data: Measurements,
-    noise: Noise,
-    estimate_process: bool,
-    *,
-    expected: tuple[np.ndarray, np.ndarray],
-    **search: Any,
-) -> Noise:
+    linearisation: Linearisation, data: Measurements, noise: Noise, estimate_process: bool, *,
+    expected: tuple[np.ndarray, np.ndarray], **search: Any,
+) -> Noise:  # fmt: skip
     """The noise along the trajectories in hand, the process noise only where it is to be estimated, too."""
     driven = bool((noise.process > 0).any())
     if estimate_process and driven:
@@ -397,16 +392,9 @@ class _Shooting:
     """
 
     def __init__(
-        self,
-        model: Dynamics,
-        data: Measurements,
-        x: np.ndarray,
-        substeps: int | None,
-        *,
-        filtered: bool = False,
-        closed: ClosedFunctions | None = None,
-        budget: Budget | None = None,
-    ) -> None:
+        self, model: Dynamics, data: Measurements, x: np.ndarray, substeps: int | None, *,
+        filtered: bool = False, closed: ClosedFunctions | None = None, budget: Budget | None = None,
+    ) -> None:  # fmt: skip
         if substeps is None:
             substeps = substeps_needed(model, data, model.values, x, tolerance=SUBSTEP_ERROR)
         about_zero = 2 * np.where(x.any(axis=0), np.abs(x).max(axis=0), 1.0)
@@ -556,15 +544,9 @@ class _Shooting:
 
 @np.errstate(all="ignore")  # what runs away is told as a fault
 def fit_by_multiple_shooting(
-    model: Dynamics,
-    data: Measurements,
-    *,
-    x: np.ndarray,
-    noise: Noise,
-    estimate_process: bool,
-    substeps: int | None = None,
-    budget: Budget | None = None,
-) -> Fit:
+    model: Dynamics, data: Measurements, *, x: np.ndarray, noise: Noise, estimate_process: bool,
+    substeps: int | None = None, budget: Budget | None = None,
+) -> Fit:  # fmt: skip
     """Fit free parameters, states and noise, by Gauss–Newton steps along linearised trajectories.
 
     Where the simulation runs away the fit is not converged, with a log-likelihood of -∞ and its `fault`.
@@ -595,18 +577,10 @@ def fit_by_multiple_shooting(
 
 @np.errstate(all="ignore")  # what runs away is told as a fault
 def fit_by_filter(
-    model: Dynamics,
-    data: Measurements,
-    *,
-    x: np.ndarray,
-    noise: Noise,
-    estimate_process: bool = True,
-    estimate_sensor: bool = True,
-    substeps: int | None = None,
-    iterations: int = ITERATIONS,
-    closure: bool = True,
-    budget: Budget | None = None,
-) -> Fit:
+    model: Dynamics, data: Measurements, *, x: np.ndarray, noise: Noise, estimate_process: bool = True,
+    estimate_sensor: bool = True, substeps: int | None = None, iterations: int = ITERATIONS,
+    closure: bool = True, budget: Budget | None = None,
+) -> Fit:  # fmt: skip
     """The second half of `fit_by_multiple_shooting` alone, for a model that follows the data from the start.
 
     Process noise has to drive the states. Where measurement noise is not estimated, the process noise is as

@@ -184,16 +184,9 @@ def _simpler_fit(loose: Fit | None, strict: Fit) -> Fit:
 
 
 def fit_with_and_without_process_noise(
-    model: Dynamics,
-    data: Measurements,
-    begin: Fit,
-    *,
-    level: float = 1.0,
-    x: np.ndarray | None = None,
-    settled: bool = False,
-    hopeless: float = np.inf,
-    budget: Budget | None = None,
-) -> tuple[Fit | None, Fit]:
+    model: Dynamics, data: Measurements, begin: Fit, *, level: float = 1.0, x: np.ndarray | None = None,
+    settled: bool = False, hopeless: float = np.inf, budget: Budget | None = None,
+) -> tuple[Fit | None, Fit]:  # fmt: skip
     """Fit with process noise estimated, where that was begun with, and without.
 
     Parameters

@@ -32,7 +32,7 @@ from scipy.special import erfc
 from siq.data.recordings import Recordings, SnapshotPairs, StreamedPairs, parents_of
 from siq.data.stationarity import even_stretches, lagged_covariances, long_run_covariance
 from siq.errors import NumericalFailure
-from siq.inference.diffusion_model import ResidualLikelihood, Transitions
+from siq.inference.diffusion_model import ResidualLikelihood
 from siq.inference.field_estimate import HARMLESS_BIAS, NOISE_FREE, FieldEstimate
 from siq.inference.library import CandidateLibrary, IdentificationOptions
 from siq.inference.selection import (
@@ -49,6 +49,7 @@ from siq.inference.selection import (
     strong_terms,
     triangles,
 )
+from siq.inference.transition_densities import Transitions
 from siq.numerics.integration import FlowMap
 from siq.numerics.randomness import positive
 from siq.systems.diffusion import Diffusion
@@ -446,8 +447,7 @@ def identify_vector_field(
     found = FieldEstimate.on_support(library, everything, values, unknown, rate, ratio, flow, unit)
     if flow.coarse and isinstance(pairs, SnapshotPairs):
         with contextlib.suppress(NumericalFailure):  # then moments are left
-            found, scores = Transitions(found, pairs).fitted()
-            problems = [_problem_of_scores(found, scores, samples=samples, critical=critical)]
+            return Transitions(found, pairs).identified(false_terms=options.false_terms)
     chosen = chosen_terms(problems, library, choose)
 
     def fit(support: np.ndarray) -> tuple[FieldEstimate, np.ndarray]:
@@ -464,18 +464,6 @@ def identify_vector_field(
     # With the final support and flow a term may turn out to be superfluous after all.
     found, support = fit_significant(fit, chosen)
     return found if noise_free else replace(found, alternatives=model_average(problems, support, library))
-
-
-def _problem_of_scores(
-    found: FieldEstimate, scores: np.ndarray, *, samples: float, critical: np.ndarray
-) -> LinearProblem:
-    """The terms of f of one state about the largest likelihood, by single scores of f and, behind, of D."""
-    # Less what D explains of them; errors are those of n residuals of variance one.
-    basis = np.linalg.qr(scores[:, found.library.size :])[0]
-    columns = scores[:, : found.library.size] - basis @ (basis.T @ scores[:, : found.library.size])
-    triangle = stacked_triangle([np.column_stack([columns, columns @ found.values])])
-    triangle[-1, -1] = np.sqrt(max(samples - found.library.size, 1.0))
-    return LinearProblem.of_components(triangle, samples=samples, critical=critical)[0]
 
 
 def _fit_support(found: FieldEstimate, regression: _PairRegression) -> FieldEstimate:
@@ -580,15 +568,9 @@ def with_noise_formula(
     """
     if found.flow.by_density:
         with contextlib.suppress(NumericalFailure):
-            by_state = Transitions(found, pairs).fitted_with_formula(false_terms=false_terms)
-            if by_state is None:
-                return None
-            critical = critical_values(found.library, false_terms=false_terms)
-            problem = _problem_of_scores(*by_state, samples=len(pairs) / pairs.copies, critical=critical)
-            support = chosen_terms([problem], found.library)
-            values = problem.solve(problem.places(support))[support[:, 1]]
-            found = refit(by_state[0].with_values(support, values), pairs)
-            return replace(found, alternatives=model_average([problem], support, found.library))
+            constant = Transitions(found, pairs)
+            by_state = constant.fitted_with_formula(false_terms=false_terms)
+            return None if by_state is None else constant.identified(by_state, false_terms=false_terms)
         found = replace(found, flow=replace(found.flow, by_density=False))
     rest = residuals(found, pairs)
     likelihood = ResidualLikelihood(found, pairs, rest)

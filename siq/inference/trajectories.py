@@ -32,16 +32,9 @@ from siq.systems.formulas import compile_values
 
 @machine_code
 def _run_tape(
-    operations: np.ndarray,
-    registers: np.ndarray,
-    base: int,
-    results: np.ndarray,
-    first: np.ndarray,
-    begin: np.ndarray,
-    signals: np.ndarray,
-    step: np.ndarray,
-    states: np.ndarray,
-) -> None:
+    operations: np.ndarray, registers: np.ndarray, base: int, results: np.ndarray, first: np.ndarray,
+    begin: np.ndarray, signals: np.ndarray, step: np.ndarray, states: np.ndarray,
+) -> None:  # fmt: skip
     """Integrate recordings by the Runge–Kutta rule, sample after sample, into `states`."""
     dimension = begin.shape[1]
     known = signals.shape[1]
@@ -196,14 +189,9 @@ def _run_side_by_side(model: Dynamics, grid: Grid, begin: np.ndarray) -> np.ndar
 
 
 def fit_trajectories(
-    model: Dynamics,
-    data: Measurements,
-    *,
-    begin: np.ndarray,
-    noise: Noise,
-    substeps: int,
+    model: Dynamics, data: Measurements, *, begin: np.ndarray, noise: Noise, substeps: int,
     budget: Budget | None = None,
-) -> Fit:
+) -> Fit:  # fmt: skip
     """Fit free parameters and initial states, without process noise, by damped steps.
 
     Slower by far than `siq.inference.maximum_likelihood.fit_by_multiple_shooting`, for it simulates
@@ -382,14 +370,9 @@ def normalised_rms(run: np.ndarray, data: Measurements) -> float | None:
 
 
 def free_run(
-    model: Dynamics,
-    data: Measurements,
-    *,
-    noise: Noise,
-    substeps: int,
-    told: int | None = None,
+    model: Dynamics, data: Measurements, *, noise: Noise, substeps: int, told: int | None = None,
     usual: np.ndarray | None = None,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Outputs ``(n, m)`` of recordings simulated from states that their prefixes tell.
 
     They are NaN from where the simulation ran away.

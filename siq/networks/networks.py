@@ -195,14 +195,9 @@ def orthogonality_loss(
 
 
 def mean_velocity(
-    vector_field: Callable[[Tensor], Tensor],
-    x0: Tensor,
-    xh: Tensor,
-    h: Tensor,
-    *,
-    kind: MatchingRule,
+    vector_field: Callable[[Tensor], Tensor], x0: Tensor, xh: Tensor, h: Tensor, *, kind: MatchingRule,
     order: Order,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Mean velocity over the pair that the vector field predicts, to be compared with (Xh - X0)/h.
 
     A rule of order p has a bias of O(h^p) in f:

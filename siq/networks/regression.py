@@ -100,15 +100,9 @@ def points_below(potential: np.ndarray, *, level: float | None) -> np.ndarray:
 
 
 def sparse_decomposition(
-    library: CandidateLibrary,
-    x: np.ndarray,
-    potential: np.ndarray,
-    circulatory: np.ndarray,
-    vector_field: np.ndarray,
-    *,
-    diffusion: Diffusion,
-    options: RegressionOptions,
-) -> RegressionResult:
+    library: CandidateLibrary, x: np.ndarray, potential: np.ndarray, circulatory: np.ndarray,
+    vector_field: np.ndarray, *, diffusion: Diffusion, options: RegressionOptions,
+) -> RegressionResult:  # fmt: skip
     """Sparse formulas of V, g and f = -D∇V + g from their values at points.
 
     Parameters
@@ -198,14 +192,9 @@ def _scales(
 
 
 def _initial_coefficients(
-    library: CandidateLibrary,
-    matrix: np.ndarray,
-    goals: np.ndarray,
-    diffusion: Diffusion,
-    thresholds: np.ndarray,
-    ratio: np.ndarray,
-    options: RegressionOptions,
-) -> np.ndarray:
+    library: CandidateLibrary, matrix: np.ndarray, goals: np.ndarray, diffusion: Diffusion,
+    thresholds: np.ndarray, ratio: np.ndarray, options: RegressionOptions,
+) -> np.ndarray:  # fmt: skip
     """Ξ⁰ of Appendix A: V and g regressed on their own, f from both."""
     d = library.dimension
     scaled = np.zeros_like(goals)
@@ -224,14 +213,9 @@ def _initial_coefficients(
 
 
 def _relaxed_regression(
-    matrix: np.ndarray,
-    goals: np.ndarray,
-    thresholds: np.ndarray,
-    options: RegressionOptions,
-    *,
-    constraints: np.ndarray | None = None,
-    initial: np.ndarray | None = None,
-) -> tuple[np.ndarray, bool, int]:
+    matrix: np.ndarray, goals: np.ndarray, thresholds: np.ndarray, options: RegressionOptions, *,
+    constraints: np.ndarray | None = None, initial: np.ndarray | None = None,
+) -> tuple[np.ndarray, bool, int]:  # fmt: skip
     """SR3 by PySINDy: thresholded coefficients ``(q, targets)``, convergence, iterations."""
     with needs_extra("networks"):
         import pysindy  # takes seconds to import, and only regressions need it

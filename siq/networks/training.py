@@ -122,14 +122,9 @@ class _Batches:
     """
 
     def __init__(
-        self,
-        data: Sequence[TrainingData],
-        *,
-        options: TrainingOptions,
-        seeds: Sequence[np.random.SeedSequence],
-        device: torch.device,
-        dtype: torch.dtype,
-    ) -> None:
+        self, data: Sequence[TrainingData], *, options: TrainingOptions,
+        seeds: Sequence[np.random.SeedSequence], device: torch.device, dtype: torch.dtype,
+    ) -> None:  # fmt: skip
         self.data, self.seeds, self.device, self.dtype = data, seeds, device, dtype
         self.size = options.batch_size
         self.representative_size = round(options.representative_share * options.batch_size)
@@ -276,17 +271,11 @@ def _failed_runs(state: _TrainingState) -> dict[int, str]:
 
 
 def train(
-    state: _TrainingState,
-    data: Sequence[TrainingData],
-    *,
-    options: TrainingOptions,
-    seeds: Sequence[np.random.SeedSequence],
-    device: torch.device | str = "cpu",
-    log_every: int = 500,
-    checkpoint_every: int = 1000,
-    checkpoint: Callable[[_TrainingState], None] | None = None,
+    state: _TrainingState, data: Sequence[TrainingData], *, options: TrainingOptions,
+    seeds: Sequence[np.random.SeedSequence], device: torch.device | str = "cpu", log_every: int = 500,
+    checkpoint_every: int = 1000, checkpoint: Callable[[_TrainingState], None] | None = None,
     finished: Callable[[int, Networks], bool] | None = None,
-) -> _TrainingState:
+) -> _TrainingState:  # fmt: skip
     """Train from a state to the last step, or until it is finished.
 
     Parameters
@@ -374,14 +363,9 @@ class _Objective:
     """The two terms of the loss at a batch, with what does not change from step to step."""
 
     def __init__(
-        self,
-        data: Sequence[TrainingData],
-        *,
-        options: TrainingOptions,
-        diffusion: Tensor,
-        device: torch.device,
-        dtype: torch.dtype,
-    ) -> None:
+        self, data: Sequence[TrainingData], *, options: TrainingOptions, diffusion: Tensor,
+        device: torch.device, dtype: torch.dtype,
+    ) -> None:  # fmt: skip
         self.options = options
         self.diffusion = diffusion
         noise = Diffusion(diffusion.detach().double().cpu().numpy())
@@ -489,18 +473,10 @@ class Block:
     """
 
     def __init__(
-        self,
-        data: Mapping[int, TrainingData],
-        checks: Mapping[int, Check],
-        *,
-        options: TrainingOptions,
-        diffusion: Diffusion,
-        seed: int,
-        folder: Path | None,
-        mark: str,
-        device: torch.device,
+        self, data: Mapping[int, TrainingData], checks: Mapping[int, Check], *, options: TrainingOptions,
+        diffusion: Diffusion, seed: int, folder: Path | None, mark: str, device: torch.device,
         faults: Mapping[int, str] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.data, self.checks, self.options = data, checks, options
         self.diffusion, self.seed = diffusion, seed
         self.folder, self.mark, self.device, self.faults = folder, mark, device, faults or {}

@@ -21,8 +21,6 @@ from typing import TypeVar, cast
 import numba
 import numpy as np
 from scipy.integrate import DOP853
-from scipy.ndimage import map_coordinates
-from scipy.special import ndtri
 
 Rates = Callable[[np.ndarray], np.ndarray]
 """Time derivative of states: ``(n, s)`` to ``(n, s)``, row by row."""
@@ -34,10 +32,6 @@ SAFETY = 0.9
 SMALLEST_FACTOR, LARGEST_FACTOR = 0.2, 5.0
 ORDER = 8  # of the rule
 MAX_REFINEMENT = 64  # Runge–Kutta steps within one step of a map
-SHORT = 0.5  # mean number of jumps of a chain, of which a series of so many terms is exact
-SERIES_TERMS, MAX_DOUBLINGS = 14, 40
-NEARLY_THE_SAME = 0.02  # relative, of steps: what is off by so much in both directions is right in the mean
-LEAST = 1e-300  # of a probability, so that it has a logarithm
 
 
 def dormand_prince_step(
@@ -227,78 +221,3 @@ class FlowMap:
         rule sees the noise only after each of its steps.
         """
         return (1 - 1 / self.steps) / 2 if self.euler else 0.5
-
-
-class TransitionDensity:
-    """The law ``p(x, h | x₀)`` that one state has a time h later, of ``dx = f dt + √(εD) dW``.
-
-    On N cells between reflecting ends the equation of Fokker and Planck,
-    ``∂p/∂t = -∂(f p)/∂x + ½ ∂²(εD p)/∂x²``, is a Markov chain, with the fluxes that f and D have where they
-    change little from cell to cell (Scharfetter and Gummel, IEEE Trans. Electron Devices 16 (1969) 64). Its
-    matrix over h is that over a short time, squared again and again. All terms are positive, so that small
-    probabilities are as accurate as large ones.
-
-    Parameters
-    ----------
-    edges
-        Of cells of one width, shape ``(N + 1,)``.
-    drift, between, inside
-        f and εD between cells, shape ``(N - 1,)``, and εD in their middles, ``(N,)``.
-    """
-
-    def __init__(self, edges: np.ndarray, drift: np.ndarray, between: np.ndarray, inside: np.ndarray) -> None:
-        self.first, self.width = edges[0], edges[1] - edges[0]
-        drop = 2 * drift * self.width / between
-        with np.errstate(all="ignore"):  # of a trial f
-            back = np.where(np.abs(drop) < 1e-8, 1 - drop / 2, drop / np.expm1(drop))
-        rates = inside / (2 * self.width**2)
-        self.up, self.down = rates[:-1] * (back + drop), rates[1:] * back  # to the next cell, and from it
-
-    @staticmethod
-    def distinct(h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Means of steps that are nearly the same, and which of them each step is, shape ``(n,)``."""
-        _, which = np.unique(np.round(np.log(h) / NEARLY_THE_SAME), return_inverse=True)
-        return np.bincount(which, h) / np.bincount(which), which
-
-    def _interpolated(
-        self, of_matrix: Callable[[np.ndarray], np.ndarray], places: np.ndarray, h: np.ndarray
-    ) -> np.ndarray:
-        """A smooth function of the chain's matrix ``(N, N)`` at places in cells ``(2, n)``."""
-        leaving, found = np.append(self.up, 0.0) + np.append(0.0, self.down), np.full(len(h), np.nan)
-        fastest = float(leaving.max())
-        if not fastest * h.max() < SHORT * 2**MAX_DOUBLINGS:
-            return found
-        stays, up, down = 1 - leaving / fastest, self.up / fastest, self.down / fastest
-        steps, which = self.distinct(h)
-        for place, one in enumerate(steps):
-            doublings = max(int(np.ceil(np.log2(fastest * one / SHORT))), 0)
-            jumps = fastest * one / 2**doublings
-            term = np.exp(-jumps) * np.eye(len(leaving))
-            matrix = term.copy()
-            for order in range(1, SERIES_TERMS):
-                further = term * stays
-                further[:, 1:] += term[:, :-1] * up
-                further[:, :-1] += term[:, 1:] * down
-                term = jumps / order * further
-                matrix += term
-            for _ in range(doublings):
-                matrix = matrix @ matrix
-            rows = np.flatnonzero(which == place)
-            found[rows] = map_coordinates(of_matrix(matrix), places[:, rows], order=3, mode="nearest")
-        return found
-
-    def log_density(self, x0: np.ndarray, xh: np.ndarray, h: np.ndarray) -> np.ndarray:
-        """``ln p(xh, h | x0)`` of states within the edges, shape ``(n,)``; NaN where f is too steep."""
-        places = (np.stack([x0, xh]) - self.first) / self.width - 0.5
-        return self._interpolated(lambda matrix: np.log(np.maximum(matrix, LEAST) / self.width), places, h)
-
-    def normal_scores(self, x0: np.ndarray, xh: np.ndarray, h: np.ndarray) -> np.ndarray:
-        """``z = Φ⁻¹(P(x < xh | x0))``, independent and normal (Rosenblatt, Ann. Math. Stat. 1952)."""
-
-        def scores(matrix: np.ndarray) -> np.ndarray:
-            below, above = matrix.cumsum(axis=1)[:, :-1], matrix[:, ::-1].cumsum(axis=1)[:, -2::-1]
-            low, high = (ndtri(np.clip(one, LEAST, 0.5)) for one in (below, above))
-            return np.where(below < above, low, -high)
-
-        places = (np.stack([x0, xh]) - self.first) / self.width - np.array([[0.5], [1.0]])
-        return self._interpolated(scores, places, h)

@@ -286,18 +286,10 @@ class Fan:
 
 
 def characteristics(
-    dynamics: Dynamics,
-    attractor: np.ndarray,
-    *,
-    level: float,
-    box: np.ndarray,
-    directions: np.ndarray,
-    start: float = 1e-6,
-    start_degree: int = 4,
-    spacing: float = 0.05,
-    tolerance: float = 1e-10,
+    dynamics: Dynamics, attractor: np.ndarray, *, level: float, box: np.ndarray, directions: np.ndarray,
+    start: float = 1e-6, start_degree: int = 4, spacing: float = 0.05, tolerance: float = 1e-10,
     most_steps: int = MAX_STEPS,
-) -> Fan:
+) -> Fan:  # fmt: skip
     """Follow characteristics to a level of V, a caustic, the rim of a box, or for 60 of the slowest times.
 
     Parameters
@@ -461,18 +453,10 @@ def _even_directions(dimension: int, count: int, *, generator: np.random.Generat
 
 
 def adapted_fan(
-    dynamics: Dynamics,
-    attractor: np.ndarray,
-    *,
-    level: float,
-    box: np.ndarray,
-    generator: np.random.Generator,
-    count: int = 64,
-    most: int = 512,
-    rounds: int = 5,
-    gap: float = 0.1,
+    dynamics: Dynamics, attractor: np.ndarray, *, level: float, box: np.ndarray,
+    generator: np.random.Generator, count: int = 64, most: int = 512, rounds: int = 5, gap: float = 0.1,
     **options: Any,
-) -> Fan:
+) -> Fan:  # fmt: skip
     """A fan whose curves end close together, as far as a number of curves allows.
 
     Parameters
@@ -545,18 +529,10 @@ def fastest_rate(dynamics: Dynamics, x: np.ndarray, width: np.ndarray) -> float:
 
 
 def ascending_integrals(
-    gradient: Function,
-    dynamics: Dynamics,
-    x: np.ndarray,
-    integrand: Callable[..., np.ndarray],
-    *,
-    middle: np.ndarray,
-    width: np.ndarray,
-    slowest: float,
-    fastest: float,
-    fewest_steps: int = MIN_PATH_STEPS,
-    beginning: Callable[[np.ndarray], np.ndarray] | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    gradient: Function, dynamics: Dynamics, x: np.ndarray, integrand: Callable[..., np.ndarray], *,
+    middle: np.ndarray, width: np.ndarray, slowest: float, fastest: float,
+    fewest_steps: int = MIN_PATH_STEPS, beginning: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Integrals over time along the paths ``dx/dt = f + 2D∇V`` that end at points, by Heun's rule.
 
     Parameters

@@ -156,14 +156,9 @@ class Dissipation(NamedTuple):
 
     @classmethod
     def of(
-        cls,
-        dynamics: Dynamics,
-        intensity: float,
-        box: np.ndarray,
-        *,
-        draws: Sequence[tuple[Dynamics, float]] = (),
-        cells: int | None = None,
-    ) -> Dissipation:
+        cls, dynamics: Dynamics, intensity: float, box: np.ndarray, *,
+        draws: Sequence[tuple[Dynamics, float]] = (), cells: int | None = None,
+    ) -> Dissipation:  # fmt: skip
         """Σ̇ in a box.
 
         Parameters
@@ -212,14 +207,9 @@ class Rotation(NamedTuple):
 
     @classmethod
     def of(
-        cls,
-        dynamics: Dynamics,
-        intensity: float,
-        state: str | None = None,
-        *,
-        box: np.ndarray | None = None,
-        draws: Sequence[tuple[Dynamics, float]] = (),
-    ) -> Rotation:
+        cls, dynamics: Dynamics, intensity: float, state: str | None = None, *,
+        box: np.ndarray | None = None, draws: Sequence[tuple[Dynamics, float]] = (),
+    ) -> Rotation:  # fmt: skip
         """By the formulas of the module, for any ε, with wells or without.
 
         Parameters

@@ -76,14 +76,9 @@ class GlobalFormula:
         return float(np.sqrt(np.maximum(variance, 0).sum()) / size)
 
     def with_circulation(
-        self,
-        found: FieldEstimate,
-        points: np.ndarray,
-        *,
-        false_terms: float,
-        precision: float,
+        self, found: FieldEstimate, points: np.ndarray, *, false_terms: float, precision: float,
         single_formula: float,
-    ) -> GlobalFormula | None:
+    ) -> GlobalFormula | None:  # fmt: skip
         """The circulation g = f + D∇V with its uncertainty, on the terms that differ from zero.
 
         Under noise V and g are fitted together: V may fail the Hamilton–Jacobi equation of the identified f
@@ -139,14 +134,9 @@ def fit_values(
 
 
 def refine_globally(
-    start: np.ndarray,
-    found: FieldEstimate,
-    points: np.ndarray,
-    *,
-    false_terms: float = 0.01,
-    precision: float = 1e-7,
-    sparse: bool = True,
-) -> GlobalFormula:
+    start: np.ndarray, found: FieldEstimate, points: np.ndarray, *, false_terms: float = 0.01,
+    precision: float = 1e-7, sparse: bool = True,
+) -> GlobalFormula:  # fmt: skip
     """Refine V from a start, and keep only the terms that the data support.
 
     Parameters

@@ -312,9 +312,8 @@ class RefinementContext:
             record = OccupancyCheck(missing=Remark("quasipotential.reason", {"reason": str(error)}))
         if not found.noise_free:
             each = self.limits.each
-            claims = check_claims(
-                found, self.recordings, self.measured, pair_step=self.pair_step, false_alarms=each
-            )
+            states = self.measured if found.flow.by_density else self.recordings
+            claims = check_claims(found, states, self.measured, pair_step=self.pair_step, false_alarms=each)
             certificate = certificate.with_tests(claims | record.verdicts(false_alarms=each))
         return Refinement(formulas, certificate, record, (*refined.remarks, *caustics))
 
@@ -323,7 +322,9 @@ class RefinementContext:
 
         Of hidden velocities f follows from whole recordings alone: all of them have the f of all.
         """
-        found, recordings = self.found, self.recordings
+        # The densities of noisy samples are of measured values.
+        found = self.found
+        recordings = self.measured if found.flow.by_density else self.recordings
         parents = parent_recordings(recordings.labels)
         second = np.searchsorted(np.unique(parents), parents) % 2 == 1
         if found.noise_free or found.hidden_states or second.all() or not second.any():

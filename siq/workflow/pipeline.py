@@ -155,7 +155,7 @@ def _with_work(
     if untold or not found.diffusion.regular:
         return found
     pair_step = settings.sampling.pair_step
-    if found.sensor_variance is not None:
+    if found.sensor_variance is not None and not found.flow.by_density:
         recordings = filtered_recordings(found, recordings, pair_step=pair_step)
     pairs = snapshot_pairs(recordings, pair_step=pair_step)
     points = pairs.x0[evenly_spread(pairs.x0, generator=generator(settings.seed, number, Purpose.LANDSCAPE))]

@@ -27,8 +27,8 @@ from siq.diagnosis.study import MismatchVerdict
 from siq.diagnosis.verdict import statement_of_failure
 from siq.numerics.text import p_text, percent
 from siq.remarks import Remark
-from siq.report import diagnosis_text
-from siq.report.diagnosis_text import sentences_of
+from siq.report import diagnosis_page
+from siq.report.diagnosis_page import sentences_of
 
 NAMES = ("dry friction", "Stribeck friction", "hysteresis", "quadratic drag", "cubic damping", "input delay")
 SAME = 10.0
@@ -360,5 +360,5 @@ def test_a_statement_is_read_as_it_was_written(verdict):
 def test_a_value_below_its_error_is_said_to_be_uncertain_and_not_zero() -> None:
     # Of two compartments of which one is measured the recordings tell two rates, and not the three.
     sizes = {"c": Estimate(0.7655, 16083.5, "1/h"), "d": Estimate(2.2941, 0.0079, "1/s")}
-    said = " ".join(str(diagnosis_text._templates().numbers(sizes)).split())
+    said = " ".join(str(diagnosis_page._templates().numbers(sizes)).split())
     assert said == "c ≈ 0.77 1/h (uncertain by more than that), d = 2.2941 ± 0.0079 1/s"

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.stats
 
 from siq.data.recordings import SnapshotPairs
+from siq.inference.checks import neighbour_correlations
 from siq.inference.diffusion_model import process_noise_increments
 from siq.inference.field_estimate import FieldEstimate
 from siq.inference.library import IdentificationOptions, candidate_library
-from siq.inference.regression import identify_vector_field, refit, residuals, with_noise_formula
-from siq.numerics.integration import TransitionDensity
+from siq.inference.regression import (
+    identify_vector_field,
+    refit,
+    residuals,
+    with_noise_formula,
+)
+from siq.inference.transition_densities import TransitionDensity, Transitions
 
 RATE, INTENSITY = 1.3, 0.4
 STRENGTH, WITHIN = 0.4, 100  # barriers of 1.25
@@ -36,6 +44,17 @@ def double_well(
     states = np.array(kept).T[:, :, None]
     pairs, count = (states[:, :-1].reshape(-1, 1), states[:, 1:].reshape(-1, 1)), samples * len(x)
     return SnapshotPairs(*pairs, np.full(count, step), np.repeat(np.arange(len(x)), samples))
+
+
+def behind_sensor(pairs: SnapshotPairs, noise: float) -> SnapshotPairs:
+    """The same as a sensor with normal noise shows it: what ends one pair begins the next."""
+    draw, n = np.random.default_rng(7), len(pairs)
+    later = noise * draw.standard_normal((n, 1))
+    first = np.diff(pairs.recording, prepend=-1) != 0
+    earlier = np.where(first[:, None], noise * draw.standard_normal((n, 1)), np.roll(later, 1, axis=0))
+    x0, xh = pairs.x0 + earlier, pairs.xh + later
+    x0[~first] = xh[np.flatnonzero(~first) - 1]
+    return replace(pairs, x0=x0, xh=xh)
 
 
 def identified(pairs: SnapshotPairs) -> FieldEstimate:
@@ -63,6 +82,93 @@ def test_a_density_is_that_of_a_linear_force() -> None:
     assert density.normal_scores(x0, xh, h) == pytest.approx(z, abs=0.005)
     steep = TransitionDensity(edges, np.full(239, 1e30), np.full(239, INTENSITY), np.full(240, INTENSITY))
     assert np.isnan(steep.log_density(x0, xh, h)).all()
+
+
+def test_densities_behind_a_sensor_are_those_of_a_kalman_filter() -> None:
+    """Of a linear force that filter is exact; two recordings, each of which begins with what is measured."""
+    draw, noise, h, n = np.random.default_rng(3), 0.3, 0.4, 400
+    kept, variance = np.exp(-RATE * h), INTENSITY / (2 * RATE) * (1 - np.exp(-2 * RATE * h))
+    x = np.zeros((2, n + 1))
+    for k in range(n):
+        x[:, k + 1] = kept * x[:, k] + np.sqrt(variance) * draw.standard_normal(2)
+    seen = x + noise * draw.standard_normal(x.shape)
+    expected = []
+    for record in seen:
+        mean, spread = record[0], noise**2
+        for value in record[1:]:
+            mean, spread = kept * mean, kept**2 * spread + variance
+            score = (value - mean) / np.sqrt(whole := spread + noise**2)
+            mean, spread = mean + spread / whole * (value - mean), spread * noise**2 / whole
+            expected.append((-(score**2) / 2 - np.log(2 * np.pi * whole) / 2, score, mean))
+    edges, begins = np.linspace(-3, 3, 241), np.arange(2 * n) % n == 0
+    density = TransitionDensity(edges, -RATE * edges[1:-1], np.full(239, INTENSITY), np.full(240, INTENSITY))
+    found = density.foreseen(
+        seen[:, :-1].ravel(), seen[:, 1:].ravel(), np.full(2 * n, h), begins, noise
+    )  # fmt: skip
+    for one, other in zip(found, np.transpose(expected), strict=True):
+        assert one == pytest.approx(other, abs=0.003)
+    steep = TransitionDensity(edges, np.full(239, 1e30), np.full(239, INTENSITY), np.full(240, INTENSITY))
+    assert np.isnan(steep.foreseen(np.zeros(2), np.zeros(2), np.full(2, h), begins[:2], noise)[0]).all()
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.3])
+def test_f_and_d_are_found_behind_a_sensor_over_such_steps(noise: float) -> None:
+    """Without its noise D is 1.1 and 2 times as large. It is seen, f and D are right, all else is white."""
+    pairs = behind_sensor(double_well(0.5, samples=20), noise)
+    without = identified(pairs)
+    assert without.noise_rate[0, 0] > 1.05 * STRENGTH
+    found = Transitions(without, pairs).identified_behind_sensor(false_terms=0.01)
+    assert found is not None
+    terms, seen = terms_of(found), found.diagnosis
+    assert set(terms) == {"x", "x**3"} and seen is not None and found.constant_noise is not None
+    assert seen.sensor_evidence is not None and seen.sensor_evidence > 5
+    for value, error, true in (
+        *((*terms[name], true) for name, true in (("x", 1.0), ("x**3", -1.0))),
+        (found.noise_rate[0, 0], found.constant_noise.standard_errors[0], STRENGTH),
+        (seen.measurement[0], np.asarray(seen.measurement_error)[0], noise),
+    ):
+        assert abs(value - true) < 3.5 * error < 0.7 * abs(true)
+    scores = (
+        process_noise_increments(found, pairs, residuals(found, pairs))[:, 0] / found.noise_rate[0, 0] ** 0.5
+    )
+    assert scipy.stats.kstest(scores, "norm").pvalue > 0.01
+    assert (np.abs(neighbour_correlations(found, pairs)[1]) < 3).all()
+    half = refit(found, pairs.take(slice(0, len(pairs) // 2)))
+    assert half.values == pytest.approx(found.values, rel=0.3)
+
+
+def test_a_sensor_without_noise_has_none() -> None:
+    pairs = double_well(0.5, samples=20)
+    found = Transitions(identified(pairs), pairs).identified_behind_sensor(false_terms=0.01)
+    evidence = None if found is None or found.diagnosis is None else found.diagnosis.sensor_evidence
+    assert evidence is None or evidence < 5
+
+
+@pytest.mark.slow
+def test_errors_behind_a_sensor_are_as_large_as_they_say() -> None:
+    scores = []
+    for seed in range(16):
+        pairs = behind_sensor(double_well(0.5, samples=20, seed=seed), 0.2)
+        found = Transitions(identified(pairs), pairs).identified_behind_sensor(false_terms=0.01)
+        assert found is not None
+        terms, seen = terms_of(found), found.diagnosis
+        assert {"x", "x**3"} <= set(terms) and seen is not None
+        own = [(terms[name][0] - true) / terms[name][1] for name, true in (("x", 1), ("x**3", -1))]
+        if found.constant_noise is not None:
+            own.append((found.noise_rate[0, 0] - STRENGTH) / found.constant_noise.standard_errors[0])
+        scores.append([*own, ((seen.measurement - 0.2) / seen.measurement_error)[0]])
+    for column in zip(*(one for one in scores if len(one) == 4), strict=True):
+        assert 0.5 < np.sqrt(np.mean(np.square(column))) < 1.6 and abs(np.mean(column)) < 0.8
+
+
+@pytest.mark.slow
+def test_a_noise_that_depends_on_the_state_is_found_behind_a_sensor() -> None:
+    pairs = behind_sensor(double_well(0.5, bent=1.0), 0.15)
+    found = Transitions(identified(pairs), pairs).identified_behind_sensor(false_terms=0.01)
+    assert found is not None and found.noise is not None and found.diagnosis is not None
+    assert [str(term) for term in found.noise.terms] == ["1", "x**2"]
+    assert (np.abs(found.noise.values - STRENGTH) < 4 * found.noise.standard_errors).all()
+    assert found.diagnosis.measurement[0] == pytest.approx(0.15, rel=0.1)
 
 
 @pytest.mark.parametrize("step", [0.5, 1.0])

@@ -18,7 +18,7 @@ PARTS = {"lead", "states", "evidence", "record", "landscape", "sweep", "runs", "
 
 @pytest.mark.parametrize("name", TEXT)
 def test_a_template_uses_filters_and_tests_that_there_are(name: str) -> None:
-    if name != "diagnosis.j2":  # which has some of its own, see siq.report.diagnosis_text
+    if name != "diagnosis.j2":  # which has some of its own, see siq.report.diagnosis_page
         environment().get_template(name)
 
 

@@ -1,0 +1,459 @@
+"""f and D of one state by the density of each transition, where a step is as long as the state remembers.
+
+From sample to sample f bends what noise does on the way, so that no law of residuals is known. But the
+density ``p(x, h | x₀)`` solves the equation of Fokker and Planck. On cells of the state that equation is a
+Markov chain (`TransitionDensity`). Coefficients of f and of εD are those of the largest likelihood of all
+pairs, by steps of the sum of squares of single scores; terms are chosen by these scores.
+
+Behind a noisy sensor a pair shows two states and the noise of both. Then the density is that of a measured
+value given all earlier ones of its record: a filter follows what is known of the state from cell to cell, and
+needs neither a straight f nor a normal law, as that of Kalman does. The variance of the sensor is one more
+parameter.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+import scipy.special
+from scipy.ndimage import map_coordinates
+from scipy.special import ndtri
+
+from siq.data.recordings import SnapshotPairs
+from siq.errors import NumericalFailure
+from siq.inference.diffusion_model import DEGREE, HARMLESS_CHANGE, constant_noise
+from siq.inference.field_estimate import FieldEstimate, NoiseDiagnosis, NoiseFormula
+from siq.inference.selection import (
+    LinearProblem,
+    all_coefficients,
+    chosen_terms,
+    critical_values,
+    fit_significant,
+    model_average,
+    stacked_triangle,
+)
+from siq.numerics.integration import machine_code
+from siq.numerics.randomness import positive
+from siq.systems.diffusion import Diffusion
+from siq.systems.formulas import compile_formulas
+
+SHORT = 0.5  # mean number of jumps of a chain, of which a series of so many terms is exact
+SERIES_TERMS, MAX_DOUBLINGS = 14, 40
+NEARLY_THE_SAME = 0.02  # relative, of steps: what is off by so much in both directions is right in the mean
+FAR = 8.0  # standard deviations, beyond which a normal law has nothing
+LEAST = 1e-300  # of a probability, so that it has a logarithm
+LEAST_CELLS, MOST_CELLS = 80, 400  # numerical: of the range of a state
+CELLS_PER_NOISE, FEWEST_PER_NOISE = 1.25, 0.6  # numerical: of a sensor's, to begin with, and at least
+CELLS_PER_SPREAD = 6  # numerical: of what noise spreads it by in a step; most densities are right to 1 %
+SLIGHT_NOISE = 1e-3  # numerical: of the least where states were recorded
+BEYOND = 1.5  # spreads by which a state may have been outside of what was recorded
+MOST_PRODUCTS = 2e9  # numerical: of a filter along all samples, a second
+MOST_STEPS = 24  # of different length: each takes a matrix
+RATES = tuple(2.0 ** np.arange(-2, 5))  # of the noise of residuals, with which a search may begin
+MOST_DENSITY_STEPS, FEW_HALVINGS = 15, 6  # numerical: from a start that is any good a few are enough
+DENSITY_STEP = 0.02  # numerical: of a standard error, for differences of the likelihood
+DENSITY_SETTLED = 1e-3  # numerical: twice the log-likelihood that is still to gain
+SENSOR_SHARES = (0.45, 0.15, 0.05, 0.015, 0.005)  # of a sensor, in what moves a state from sample to sample
+
+
+class TransitionDensity:
+    """The law ``p(x, h | x₀)`` that one state has a time h later, of ``dx = f dt + √(εD) dW``.
+
+    On N cells between reflecting ends the equation of Fokker and Planck,
+    ``∂p/∂t = -∂(f p)/∂x + ½ ∂²(εD p)/∂x²``, is a Markov chain, with the fluxes that f and D have where they
+    change little from cell to cell (Scharfetter and Gummel, IEEE Trans. Electron Devices 16 (1969) 64). Its
+    matrix over h is that over a short time, squared again and again. All terms are positive, so that small
+    probabilities are as accurate as large ones.
+
+    Parameters
+    ----------
+    edges
+        Of cells of one width, shape ``(N + 1,)``.
+    drift, between, inside
+        f and εD between cells, shape ``(N - 1,)``, and εD in their middles, ``(N,)``.
+    """
+
+    def __init__(self, edges: np.ndarray, drift: np.ndarray, between: np.ndarray, inside: np.ndarray) -> None:
+        self.first, self.width = edges[0], edges[1] - edges[0]
+        drop = 2 * drift * self.width / between
+        with np.errstate(all="ignore"):  # of a trial f
+            back = np.where(np.abs(drop) < 1e-8, 1 - drop / 2, drop / np.expm1(drop))
+        rates = inside / (2 * self.width**2)
+        self.up, self.down = rates[:-1] * (back + drop), rates[1:] * back  # to the next cell, and from it
+
+    @staticmethod
+    def distinct(h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Means of steps that are nearly the same, and which of them each step is, shape ``(n,)``."""
+        _, which = np.unique(np.round(np.log(h) / NEARLY_THE_SAME), return_inverse=True)
+        return np.bincount(which, h) / np.bincount(which), which
+
+    def _matrices(self, steps: np.ndarray) -> Iterator[np.ndarray]:
+        """The chain's matrix ``(N, N)`` over each step; none where f is too steep."""
+        leaving = np.append(self.up, 0.0) + np.append(0.0, self.down)
+        fastest = float(leaving.max())
+        if not fastest * steps.max() < SHORT * 2**MAX_DOUBLINGS:
+            return
+        stays, up, down = 1 - leaving / fastest, self.up / fastest, self.down / fastest
+        for one in steps:
+            doublings = max(int(np.ceil(np.log2(fastest * one / SHORT))), 0)
+            jumps = fastest * one / 2**doublings
+            term = np.exp(-jumps) * np.eye(len(leaving))
+            matrix = term.copy()
+            for order in range(1, SERIES_TERMS):
+                further = term * stays
+                further[:, 1:] += term[:, :-1] * up
+                further[:, :-1] += term[:, 1:] * down
+                term = jumps / order * further
+                matrix += term
+            for _ in range(doublings):
+                matrix = matrix @ matrix
+            yield matrix
+
+    def _interpolated(
+        self, of_matrix: Callable[[np.ndarray], np.ndarray], places: np.ndarray, h: np.ndarray
+    ) -> np.ndarray:
+        """A smooth function of the matrix at places in cells ``(2, n)``; NaN where f is too steep."""
+        (steps, which), found = self.distinct(h), np.full(len(h), np.nan)
+        for place, matrix in enumerate(self._matrices(steps)):
+            rows = np.flatnonzero(which == place)
+            found[rows] = map_coordinates(of_matrix(matrix), places[:, rows], order=3, mode="nearest")
+        return found
+
+    def log_density(self, x0: np.ndarray, xh: np.ndarray, h: np.ndarray) -> np.ndarray:
+        """``ln p(xh, h | x0)`` of states within the edges, shape ``(n,)``; NaN where f is too steep."""
+        places = (np.stack([x0, xh]) - self.first) / self.width - 0.5
+        return self._interpolated(lambda matrix: np.log(np.maximum(matrix, LEAST) / self.width), places, h)
+
+    def normal_scores(self, x0: np.ndarray, xh: np.ndarray, h: np.ndarray) -> np.ndarray:
+        """``z = Φ⁻¹(P(x < xh | x0))``, independent and normal (Rosenblatt, Ann. Math. Stat. 1952)."""
+
+        def scores(matrix: np.ndarray) -> np.ndarray:
+            below, above = matrix.cumsum(axis=1)[:, :-1], matrix[:, ::-1].cumsum(axis=1)[:, -2::-1]
+            low, high = (ndtri(np.clip(one, LEAST, 0.5)) for one in (below, above))
+            return np.where(below < above, low, -high)
+
+        places = (np.stack([x0, xh]) - self.first) / self.width - np.array([[0.5], [1.0]])
+        return self._interpolated(scores, places, h)
+
+    def foreseen(
+        self, x0: np.ndarray, xh: np.ndarray, h: np.ndarray, begins: np.ndarray, deviation: float, *,
+        whole: bool = True,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+        """The same two of values that a sensor shows with normal noise, given all earlier ones of a record.
+
+        A filter on the cells, which where a record `begins` knows its first value alone. The third is the
+        mean of the state, once the later value is known, too. All are ``(n,)``, NaN where f is too steep; of
+        scores that are not wanted, as they take longest, nothing is said.
+        """
+        steps, which = self.distinct(h)
+        matrices = list(self._matrices(steps))
+        if not matrices:
+            return (np.full(len(h), np.nan),) * 3
+        middles = self.first + self.width * (np.arange(len(matrices[0])) + 0.5)
+        given = x0, xh, which, begins, np.stack(matrices), middles, deviation, whole
+        logarithms, below, above, means = _filtered(*given)
+        low, high = (ndtri(np.clip(one, LEAST, 0.5)) for one in (below, above))
+        return logarithms, np.where(below < above, low, -high), means
+
+
+@machine_code
+def _filtered(
+    x0: np.ndarray, xh: np.ndarray, which: np.ndarray, begins: np.ndarray, matrices: np.ndarray,
+    middles: np.ndarray, deviation: float, whole: bool,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Log-density of each measured value, probabilities of lower and of higher ones, and the state's mean."""
+    logarithms, below, above, means = np.zeros((4, len(xh)))
+    share = np.zeros_like(middles)
+    for k in range(len(xh)):
+        if begins[k]:
+            share = np.exp(-(((x0[k] - middles) / deviation) ** 2) / 2)
+            share = share / share.sum()
+        ahead = share @ matrices[which[k]]
+        for cell in range(len(middles)):
+            away = (xh[k] - middles[cell]) / deviation
+            share[cell] = ahead[cell] * math.exp(-(away**2) / 2)
+            if not whole:
+                continue
+            higher = math.erfc(away / math.sqrt(2.0)) / 2 if abs(away) < FAR else (away < 0) * 1.0
+            below[k] += ahead[cell] * (1 - higher)
+            above[k] += ahead[cell] * higher
+        density = share.sum()
+        logarithms[k] = math.log(max(density, LEAST) / (deviation * math.sqrt(2 * math.pi)))
+        share = share / density if density > LEAST else ahead
+        means[k] = (share * middles).sum()
+    return logarithms, below, above, means
+
+
+def _explained(scores: np.ndarray) -> float:
+    """Twice what the likelihood gains by single scores ``(n, p)``, to second order: Rao's statistic."""
+    basis = np.linalg.qr(scores / positive(np.linalg.norm(scores, axis=0)))[0]
+    return float((basis.sum(axis=0) ** 2).sum())
+
+
+class Transitions:
+    """Pairs of one state over coarse steps, and the density that f and εD give to each.
+
+    f has terms of its library. εD is a sum of shapes, those of a `NoiseFormula` or the one of a D that is
+    known, with a strength each. Behind a noisy sensor, which an estimate knows by its diagnosis, the density
+    is that of the second value given all of its record up to the first.
+
+    Raises
+    ------
+    NumericalFailure
+        Where there is no such density: of several states and angles, of steps that are not coarse, and of a D
+        that nearly vanishes.
+    """
+
+    def __init__(self, found: FieldEstimate, pairs: SnapshotPairs) -> None:
+        if found.library.dimension > 1 or found.library.angles or not found.flow.coarse:
+            raise NumericalFailure("the density of what noise does between two samples is not worked out")
+        self.found, self.pairs = found, pairs
+        self.x0, self.xh, self.h = pairs.x0[:, 0], pairs.xh[:, 0], pairs.h
+        self.begins = np.append(
+            True, (pairs.recording[1:] != pairs.recording[:-1]) | (self.xh[:-1] != self.x0[1:])
+        )
+        noise, symbols, sensor = found.noise, found.library.symbols, found.sensor_variance
+        self.sensor = np.zeros(0) if sensor is None else np.log(sensor)
+        self._terms = [found.library.terms[k] for k in found.support[:, 1]]
+
+        def shape(x: np.ndarray) -> np.ndarray:
+            return found.diffusion.at(x.T)[:, 0, 0][None]
+
+        functions = compile_formulas(self._terms, symbols)
+        shapes = shape if noise is None else compile_formulas(list(noise.terms), symbols)
+        inside = found.on_the_way(pairs)
+        self.of_field, self.of_noise = functions(self.x0[None]), shapes(inside.T)
+        self.strengths = noise.values if noise else found.noise_rate[0] / self.of_noise.mean(axis=1)
+        # Within a step noise spreads the state by √(εD h), or less where f brings it back.
+        back = 1 + 2 * np.abs(found.dynamics.jacobian(inside)[:, 0, 0]) * self.h
+        least, most = np.quantile(np.sqrt(self.strengths @ self.of_noise * self.h / back), [0.01, 0.99])
+        low, high = min(self.x0.min(), self.xh.min()), max(self.x0.max(), self.xh.max())
+        aside = min(float(most), (high - low) / 2) * BEYOND
+        count = max(int((high - low + 2 * aside) / least * CELLS_PER_SPREAD), LEAST_CELLS)
+        if sensor is not None:  # which blurs what cells do not resolve
+            of_sensor = int((high - low + 2 * aside) / np.sqrt(sensor[0]) * CELLS_PER_NOISE)
+            count = min(max(count, of_sensor), MOST_CELLS)
+            if len(self.h) * count**2 > MOST_PRODUCTS:
+                raise NumericalFailure("there are too many samples to follow all that their states may be")
+        if count > MOST_CELLS:
+            raise NumericalFailure("noise moves some states by a small part of what it moves others by")
+        self.edges = np.linspace(low - aside, high + aside, count + 1)
+        inner, middle = self.edges[None, 1:-1], (self.edges[None, 1:] + self.edges[None, :-1]) / 2
+        self._drift, self._between, self._inside = functions(inner), shapes(inner), shapes(middle)
+
+    def _density(self, values: np.ndarray, strengths: np.ndarray) -> TransitionDensity:
+        """With f and εD of some values; beyond the recorded states εD does not vanish."""
+        least = SLIGHT_NOISE * float((strengths @ self.of_noise).min())
+        between, inside = (np.maximum(strengths @ one, least) for one in (self._between, self._inside))
+        return TransitionDensity(self.edges, values @ self._drift, between, inside)
+
+    def _deviation(self, sensor: np.ndarray) -> float:
+        """Of the sensor's noise, from the logarithm of its variance; cells tell none that is too small."""
+        return max(float(np.exp(sensor[0] / 2)), FEWEST_PER_NOISE * float(self.edges[1] - self.edges[0]))
+
+    def log_densities(self, values: np.ndarray, strengths: np.ndarray, sensor: np.ndarray) -> np.ndarray:
+        """Of each pair; minus infinity where εD is not positive, or f too steep."""
+        if not (strengths @ self.of_noise).min() > 0:
+            return np.full(len(self.h), -np.inf)
+        density, ends = self._density(values, strengths), (self.x0, self.xh, self.h)
+        if len(sensor):
+            found = density.foreseen(*ends, self.begins, self._deviation(sensor), whole=False)[0]
+        else:
+            found = density.log_density(*ends)
+        return np.where(np.isfinite(found), found, -np.inf)
+
+    @property
+    def log_likelihood(self) -> float:
+        """Of the estimate as it is."""
+        return float(self.log_densities(self.found.values, self.strengths, self.sensor).sum())
+
+    def normal_increments(self) -> np.ndarray:
+        """Normal scores times √(εD h): residuals as of a short step, shape ``(n, 1)``."""
+        density, ends = self._density(self.found.values, self.strengths), (self.x0, self.xh, self.h)
+        if len(self.sensor):
+            scores = density.foreseen(*ends, self.begins, self._deviation(self.sensor))[1]
+        else:
+            scores = density.normal_scores(*ends)
+        if not np.isfinite(scores).all():
+            raise NumericalFailure("f is too steep for so long steps; sample more often")
+        return np.asarray(scores * np.sqrt(self.strengths @ self.of_noise * self.h))[:, None]
+
+    def states(self) -> np.ndarray:
+        """Means of the states at the ends of pairs, as a noisy sensor shows them, shape ``(n,)``."""
+        density, ends = self._density(self.found.values, self.strengths), (self.x0, self.xh, self.h)
+        return density.foreseen(*ends, self.begins, self._deviation(self.sensor))[2]
+
+    @cached_property
+    def start(self) -> tuple[np.ndarray, np.ndarray]:
+        """Parameters of f, of εD, and of the sensor; and axes for `scored`, as of short steps."""
+        p, k, m = len(self.of_field), len(self.strengths), len(self.sensor)
+        rate, triangle = float((self.strengths @ self.of_noise).mean()), np.eye(p + k + m)
+        triangle[:p, :p] = np.linalg.qr((self.of_field * np.sqrt(self.h / rate)).T)[1]
+        triangle[p : p + k, p : p + k] = np.linalg.qr(self.of_noise.T / (np.sqrt(2) * rate))[1]
+        triangle[p + k :, p + k :] *= np.sqrt(len(self.h) / 2)
+        return np.concatenate([self.found.values, self.strengths, self.sensor]), np.linalg.inv(triangle)
+
+    def densities(self, place: np.ndarray) -> np.ndarray:
+        """Logarithms, of each pair, at some parameters."""
+        p = len(self.of_field)
+        return self.log_densities(*np.split(place, [p, p + len(self.strengths)]))
+
+    def scored(self, place: np.ndarray, axes: np.ndarray, now: np.ndarray) -> np.ndarray:
+        """Derivatives of the densities `now` along axes ``(p, p)`` of parameters, shape ``(n, p)``.
+
+        Along each a step of one is about a standard error, and they are independent, so that differences are
+        accurate where functions are nearly alike.
+        """
+        with np.errstate(invalid="ignore"):
+            ends = [self.densities(place + DENSITY_STEP * axis) for axis in axes.T]
+            return np.asarray((np.stack(ends, axis=1) - now[:, None]) / DENSITY_STEP)
+
+    def fitted(self) -> tuple[FieldEstimate, np.ndarray]:
+        """The terms of f and of εD with the values of the largest likelihood.
+
+        By steps of the sum of squares of single scores, halved until each gains (Berndt et al., Ann. Econ.
+        Soc. Meas. 3 (1974) 653). And these scores ``(n, p + k)``, by values of f and strengths of εD; of a
+        noisy sensor by the logarithm of its variance, too. It is a NumericalFailure where steps are of many
+        lengths, or the search does not settle.
+        """
+        if len(TransitionDensity.distinct(self.h)[0]) > MOST_STEPS:
+            raise NumericalFailure("samples follow each other in steps of too many lengths")
+        found, p, k = self.found, len(self.found.support), len(self.strengths)
+        (at, axes), symbols = self.start, found.library.symbols
+        starts = [at]
+        if not found.flow.by_density and found.diffusion.constant:
+            # Of a state at rest 2f/εD is the slope of its ln p (Hyvärinen, JMLR 6 (2005) 695).
+            rate = float((self.strengths @ self.of_noise).mean())
+            slopes = compile_formulas([term.diff(symbols[0]) for term in self._terms], symbols)(self.x0[None])
+            functions = axes[:p, :p].T @ self.of_field
+            rest = np.linalg.solve(functions @ functions.T, axes[:p, :p].T @ slopes.sum(axis=1))
+            slope = -axes[:p, :p] @ rest * rate / 2
+            starts += [np.concatenate([one * slope, one * self.strengths, self.sensor]) for one in RATES]
+        now, at = max(((self.densities(one), one) for one in starts), key=lambda one: one[0].sum())
+        gain = np.inf
+        for _ in range(MOST_DENSITY_STEPS):
+            along = self.scored(at, axes, now)
+            if not np.isfinite(along).all() or np.linalg.matrix_rank(along) < len(at):
+                gain = np.inf
+                break
+            scores, root = along @ np.linalg.inv(axes), np.linalg.inv(np.linalg.qr(along, mode="r"))
+            gain, axes = _explained(along), axes @ root
+            step = axes @ (root.T @ along.sum(axis=0))
+            for _ in range(FEW_HALVINGS if gain > DENSITY_SETTLED else 0):
+                if (then := self.densities(at + step)).sum() > now.sum():
+                    at, now = at + step, then
+                    break
+                step = step / 2
+            else:
+                break
+        if not gain < 1.0:
+            raise NumericalFailure("f and D of so long steps are not found; sample more often")
+        (values, strengths, sensor), covariance = np.split(at, [p, p + k]), axes @ axes.T * self.pairs.copies
+        flow, of_noise = replace(found.flow, by_density=True), covariance[p : p + k, p : p + k]
+        found = found.with_values(found.support, values, covariance=covariance[:p, :p], flow=flow)
+        if found.diagnosis is not None and len(sensor):
+            deviation = np.exp(sensor / 2)
+            error = deviation / 2 * np.sqrt(np.diag(covariance)[p + k :])
+            measured = replace(found.diagnosis, measurement=deviation, measurement_error=error)
+            found = replace(found, diagnosis=measured)
+        if found.noise is not None:
+            formula = replace(found.noise, values=strengths, covariance=of_noise)
+            return found.with_formula(formula, found.on_the_way(self.pairs)), scores
+        size, known = self.of_noise.mean(), None
+        noise_rate = strengths[:, None] * size
+        if found.diffusion.constant:
+            known = replace(constant_noise(symbols, noise_rate, samples=1.0), covariance=of_noise * size**2)
+        return replace(found, noise_rate=noise_rate, constant_noise=known), scores
+
+    def fitted_with_formula(self, *, false_terms: float) -> tuple[FieldEstimate, np.ndarray] | None:
+        """All terms of f with those of a D(x), and the scores; None where a constant D can be held.
+
+        By Rao's test of the strengths of the other shapes of εD; see `_DiffusionLikelihood.selected`.
+        """
+        found, library, x0 = self.found, self.found.library, self.found.on_the_way(self.pairs)
+        terms = tuple(term for _, term in library.functions(library.symbols, DEGREE, library.angles))
+        places, values = np.zeros((len(terms), 2), dtype=int), np.zeros(len(terms))
+        values[0] = found.noise_rate[0, 0]
+        formula = NoiseFormula(library.symbols, places, terms, values, np.eye(len(terms)), 1.0)
+        everything = all_coefficients([0], library.size)
+        found = found.with_values(everything, found.coefficients[:, 0]).with_formula(formula, x0)
+        whole = Transitions(found, self.pairs)
+        place, axes = whole.start
+        now = whole.densities(place)
+        axes = axes @ np.linalg.pinv(np.linalg.qr(whole.scored(place, axes, now), mode="r"))
+        scores = whole.scored(place, axes, now) @ np.linalg.pinv(axes)
+        statistic = _explained(scores)
+        statistic -= _explained(np.delete(scores, library.size + np.arange(1, len(terms)), axis=1))
+        probability = float(scipy.special.chdtrc(len(terms) - 1, statistic))
+        if probability >= false_terms:
+            return None
+        found, scores = whole.fitted()
+        assert found.noise is not None
+        formula, rates = replace(found.noise, probability=probability), found.noise_rate_at(x0)
+        if rates.std() < HARMLESS_CHANGE * rates.mean():
+            return None
+        kept, values = formula.eliminated(float(-scipy.special.ndtri(false_terms / (2 * len(terms)))))
+        if len(kept) == len(terms):
+            return found.with_formula(formula, x0), scores
+        covariance, chosen = formula.covariance[np.ix_(kept, kept)], tuple(terms[k] for k in kept)
+        formula = replace(formula, places=places[kept], terms=chosen, values=values, covariance=covariance)
+        return Transitions(found.with_formula(formula, x0), self.pairs).fitted()
+
+    def identified(
+        self, whole: tuple[FieldEstimate, np.ndarray] | None = None, *, false_terms: float
+    ) -> FieldEstimate:
+        """The significant terms of f, by the single scores of a fit of all terms, or of this one of them."""
+        found, scores = whole or self.fitted()
+        library, samples = found.library, len(self.pairs) / self.pairs.copies
+        # Less what D explains of them; errors are those of n residuals of variance one.
+        of_field, others = np.split(scores, [library.size], axis=1)
+        basis = np.linalg.qr(others)[0]
+        columns = of_field - basis @ (basis.T @ of_field)
+        triangle = stacked_triangle([np.column_stack([columns, columns @ found.values])])
+        triangle[-1, -1] = np.sqrt(max(samples - library.size, 1.0))
+        critical = critical_values(library, false_terms=false_terms)
+        problem = LinearProblem.of_components(triangle, samples=samples, critical=critical)[0]
+
+        def fit(support: np.ndarray) -> tuple[FieldEstimate, np.ndarray]:
+            values = problem.solve(problem.places(support))[support[:, 1]]
+            again = Transitions(found.with_values(support, values), self.pairs).fitted()[0]
+            return again, np.abs(again.values) / np.sqrt(np.diag(again.covariance)) / critical[support[:, 1]]
+
+        again, support = fit_significant(fit, chosen_terms([problem], library))
+        return replace(again, alternatives=model_average([problem], support, library))
+
+    def identified_behind_sensor(self, *, false_terms: float) -> FieldEstimate | None:
+        """f, D and the noise of a sensor, from an estimate without that; None where none gains.
+
+        At whatever share of what moves the state from sample to sample the search begins. The
+        `sensor_evidence` of the diagnosis is Schwarz's, but for the sensor.
+        """
+        found, pairs, rate = self.found, self.pairs, self.found.noise_rate
+        everything = all_coefficients([0], found.library.size)
+        base = replace(
+            found.with_values(everything, found.coefficients[:, 0]),
+            noise=None, constant_noise=None, diffusion=Diffusion.identity(1), diagnosis=None,
+        )  # fmt: skip
+        tried = [(Transitions(base, pairs).log_likelihood, base)]
+        for share in SENSOR_SHARES:
+            deviation = np.sqrt(share * rate[0] * float(np.median(pairs.h)))
+            seen = NoiseDiagnosis("process", float(rate[0, 0]), np.eye(1), 0.0, 0.0, deviation)
+            for kept in (1.0, 1 - share):
+                start = replace(base, diagnosis=seen, noise_rate=kept * rate)
+                tried.append((Transitions(start, pairs).log_likelihood, start))
+        best = max(tried, key=lambda one: one[0])[1]
+        if best is base:
+            return None
+        whole = Transitions(best, pairs).fitted()
+        constant = Transitions(whole[0], pairs)
+        whole = constant.fitted_with_formula(false_terms=false_terms) or whole
+        behind = constant.identified(whole, false_terms=false_terms)
+        assert behind.diagnosis is not None
+        other = Transitions(behind, pairs)
+        further = len(behind.support) + len(other.strengths) - len(found.support) - len(self.strengths)
+        evidence = 2 * (other.log_likelihood - self.log_likelihood) - further * np.log(len(pairs))
+        return replace(behind, diagnosis=replace(behind.diagnosis, sensor_evidence=float(evidence)))
