@@ -26,7 +26,14 @@ from siq.data.recordings import (
     snapshot_pairs,
 )
 from siq.data.states import switching
-from siq.data.stationarity import background_of, change_of, correlated_samples, runs_of, usual_step
+from siq.data.stationarity import (
+    HARMLESS_LINE,
+    background_of,
+    change_of,
+    correlated_samples,
+    runs_of,
+    usual_step,
+)
 from siq.errors import InputError
 from siq.numerics.randomness import positive
 from siq.remarks import Remark
@@ -44,9 +51,20 @@ FALSE_FAULT_RATE = 1e-3  # probability with which a record of white noise has a 
 FEW_JUMPS, MOST_APART = 0.05, 0.01  # that stay, a sample that does not; of all samples
 MOST_ALIKE = 0.1  # of all samples, where most that stand apart are one number; of held values, one number
 QUARTERS, SAME_WAVE = 4, 0.5  # of a recording, in which a hum has one amplitude and phase, to a half of it
+BY_CHANCE = 2.5  # standard errors of such an amplitude and phase: four in five records are within
 SLIGHT_HUM = 0.1  # of the variance of a state: what moves it more may be the state itself, which circulates
 SEASONS = {"day": 86_400.0, "year": 31_556_952.0}  # seconds: what the sun does to what stands outdoors
-_SECONDS = {"s(ec.*)?": 1, "min.*": 60, "h.*": 3600, "d.*": 86_400, "week.*": 604_800, "y.*": 31_556_952}
+MAINS, MAINS_VARY = np.outer((50.0, 60.0), (1, 2, 3, 4)), 0.002  # hertz; relative, in most grids
+_SECONDS = {
+    "[uµμ]s": 1e-6,
+    "m(s|sec|illisec.*)": 1e-3,
+    "s(ec.*)?": 1,
+    "min.*": 60,
+    "h.*": 3600,
+    "d.*": 86_400,
+    "week.*": 604_800,
+    "y.*": 31_556_952,
+}
 FEWEST_SEASONS, MOST_HARMONICS = 4, 4
 KNOWN_SCALE = 0.01  # a choice: relative error to which a velocity tells how its position moves
 SMALL_CHANGE = 0.3  # standard deviations: up to there a distribution is flat
@@ -225,8 +243,9 @@ def without_faults(recordings: Recordings) -> Recordings:
     makes one in all of the record, and lead back to where it came from; so do several of one value, where
     most such faults last one sample only. Where more than a few such steps do not lead back, the state
     itself jumps, and nothing is left out. A hum is a line in the spectrum of the steps that keeps its
-    amplitude and its phase in every quarter of a recording, and that hardly moves the state. What has the
-    period of a day or of a year, and is alike in each, is the weather's.
+    amplitude and its phase in every quarter of a recording, and that hardly moves the state; at 50 or 60 Hz,
+    or a multiple, it may be as slight as it likes. What has the period of a day or of a year, and is alike in
+    each, is the weather's.
     """
     if noise_floors(recordings) is None:
         return recordings
@@ -267,7 +286,8 @@ def without_faults(recordings: Recordings) -> Recordings:
             found.values[:, state] -= season
             values = {"column": found.titles[state], "period": name, "range": float(np.ptp(season))}
             remarks.append(Remark("data.season_taken_off", {**values, "unit": found.units[state]}))
-    for state in [place for place, floor in enumerate(noise_floors(found) or ()) if floor.process]:
+    driven = [place for place, floor in enumerate(noise_floors(found) or ()) if floor.process]
+    for state in np.repeat(driven, MOST_HARMONICS):
         hum, period = _hum_of(found, found.values[:, state])
         amplitude = float(np.sqrt(2) * hum.std())
         if amplitude > (resolution_step(found.values[:, state]) or 0.0):
@@ -391,12 +411,19 @@ def _without_filled(recordings: Recordings) -> Recordings:
     return replace(_without_rows(recordings, filled.max(axis=1)), remarks=(*recordings.remarks, *told))
 
 
+def _seconds_of(recordings: Recordings) -> float:
+    """In the unit of time; 0 where that is not known."""
+    return next(
+        (size for one, size in _SECONDS.items() if re.fullmatch(one, recordings.time_unit or "")), 0.0
+    )
+
+
 def _season_of(recordings: Recordings, values: np.ndarray, name: str) -> np.ndarray:
     """What recurs each day or year in a series, ``(n,)``; zero where it is not alike in all of them.
 
     The amplitude of a harmonic is the mean of those of single periods, and is held against how these differ.
     """
-    unit = next((size for one, size in _SECONDS.items() if re.fullmatch(one, recordings.time_unit or "")), 0)
+    unit = _seconds_of(recordings)
     season, step = np.zeros(len(values)), usual_step(recordings)
     samples = SEASONS[name] / (unit * step) if unit * step > 0 else 0.0  # in a period
     harmonics = np.arange(1, min(MOST_HARMONICS, int(samples / 4)) + 1)
@@ -428,11 +455,19 @@ def _hum_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, flo
     parts = [slice(int(a), int(b)) for a, b in pairwise(bounds) if b - a > QUARTERS]
     nothing, steps = np.zeros(len(values)), np.append(np.diff(values), 0.0)
     steps[bounds[1:] - 1] = 0.0
-    period = change_of(recordings, steps, np.zeros(len(steps), dtype=int)) if parts else None
-    if period is None or not np.isfinite(period):
+    if not parts:
         return nothing, 0.0
-    about = 2 * np.pi / (period * usual_step(recordings))
     width = np.pi / max(float(np.ptp(recordings.t[part])) for part in parts)
+    for harmless in (HARMLESS_LINE, 0.0):
+        period = change_of(recordings, steps, np.zeros(len(steps), dtype=int), harmless=harmless)
+        if period is None or not np.isfinite(period):
+            continue
+        about = 2 * np.pi / (period * usual_step(recordings))
+        hertz = about / (2 * np.pi * (_seconds_of(recordings) or np.inf))
+        if harmless or (np.abs(hertz / MAINS - 1) < max(MAINS_VARY, width / about)).any():
+            break
+    else:
+        return nothing, 0.0
 
     def amplitude(frequency: float, part: slice) -> complex:
         """That of the hum, by the steps of a part: those of ``exp(iωt)`` are known."""
@@ -450,7 +485,9 @@ def _hum_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, flo
         whole, length = amplitude(frequency, part), part.stop - part.start
         cuts = part.start + length * np.arange(QUARTERS + 1) // QUARTERS
         each = [amplitude(frequency, slice(int(a), int(b))) for a, b in pairwise(cuts)]
-        if max(abs(one - whole) for one in each) > SAME_WAVE * abs(whole):
+        moved = np.abs(np.diff(np.exp(1j * frequency * recordings.t[part]))).mean()
+        error = steps[part].std() * np.sqrt(2 * QUARTERS / length) / moved
+        if max(abs(one - whole) for one in each) > SAME_WAVE * abs(whole) + BY_CHANCE * error:
             return nothing, 0.0
         hum[part] = (whole * np.exp(1j * frequency * recordings.t[part])).real
     return (hum, 2 * np.pi / frequency) if hum.var() < SLIGHT_HUM * values.var() else (nothing, 0.0)

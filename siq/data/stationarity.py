@@ -155,13 +155,16 @@ def correlated_samples(values: np.ndarray, runs: list[slice]) -> float:
     return max(float(kept.sum()) - 0.5, 0.5)
 
 
-def change_of(recordings: Recordings, values: np.ndarray, path: np.ndarray) -> float | None:
+def change_of(
+    recordings: Recordings, values: np.ndarray, path: np.ndarray, *, harmless: float = HARMLESS_LINE
+) -> float | None:
     """The period with which states change, in samples; infinite where they do slowly, None where not at all.
 
     The state at each sample, `path` ``(n,)`` with -1 where it is not known, the distance of the `values`
     ``(n,)`` from the mean of their state, and its square are asked for a straight line, in the course of all
     recordings and of each, and for a frequency that stands out from its neighbours: with power P there and
-    L at these, ``P/L`` has the F distribution in any stationary process whose spectrum is smooth.
+    L at these, ``P/L`` has the F distribution in any stationary process whose spectrum is smooth. A line is
+    passed over that has a `harmless` share of the variance.
     """
     inside = (path[:, None] == np.arange(path.max() + 1)).astype(float)
     shares = np.maximum(inside.sum(axis=0), 1.0)
@@ -211,7 +214,7 @@ def change_of(recordings: Recordings, values: np.ndarray, path: np.ndarray) -> f
         others, own = 2 * reach - 6, power[frequencies]
         level = (around - below[frequencies + 4] + below[frequencies - 3]) / others
         chance = price * special.fdtrc(2 * count, count * others, own / np.maximum(level, 1e-300))
-        chance[2 * (own - level) < HARMLESS_LINE * power[1:].sum()] = 1.0
+        chance[2 * (own - level) < harmless * power[1:].sum()] = 1.0
         if chance.min() < FALSE_CHANGE_RATE / 2:
             return float(2 * longest / frequencies[chance.argmin()])
     return None

@@ -188,6 +188,22 @@ def test_a_hum_is_taken_off_to_its_phase() -> None:
     assert told["amplitude"] == pytest.approx(0.2, rel=0.02)
 
 
+def test_a_slight_hum_is_taken_off_where_it_is_of_the_mains() -> None:
+    """Of a frequency that no grid has it may be a force, and is left to the certificate."""
+    x = hopping()
+    given = Recordings.from_arrays(np.arange(len(x)), x, names=["x"], time_unit="ms")
+    turns = 2 * np.pi * given.t / 1000
+    lines = np.array([0.035 * np.sin(60 * turns), 0.013 * np.cos(180 * turns)])
+    assert (np.diff(lines).var(axis=1) < 1e-2 * np.diff(x, axis=0).var()).all()
+    hum = lines.sum(axis=0)[:, None]
+    found = without_faults(replace(given, values=x + hum))
+    periods = [one.values["period"] for one in found.remarks if one.code == "data.hum_taken_off"]
+    assert sorted(periods) == pytest.approx([1000 / 180, 1000 / 60], rel=1e-3)
+    assert float(np.std(found.values - x)) < 0.4 * float(np.std(hum))
+    other = replace(given, values=x + 0.035 * np.sin(70 * turns)[:, None])
+    assert without_faults(other) is other
+
+
 @pytest.mark.parametrize(
     ("unit", "step"), [("h", 1.0), ("d", 1.0), ("year", 1 / 12)], ids=["day", "year", "months"]
 )
