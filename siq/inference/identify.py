@@ -85,7 +85,7 @@ MIN_SHARE, MAX_SHARE = 1e-3, 0.45  # of the residuals' variance: a sensor's shar
 WHOLE_STEP_TOLERANCE = 0.05  # of an exposure, as exactly as residuals show it of some thousand samples
 SINGULAR = "the recordings do not determine f; record more, or more often"
 PREDICTED_RECORDINGS = 200  # held-out ones that are predicted: enough for a median
-OF_SENSOR = ("measurement", "measurement_error", "sensor_evidence")  # of a diagnosis
+OF_SENSOR = ("measurement", "measurement_error", "sensor_evidence", "exposure")  # of a diagnosis
 UNDECIDED = 2.94  # of a log-likelihood: odds of 19 to 1
 
 
@@ -201,7 +201,12 @@ class _Case:
         if not carries_noise(self.library, training, options=self.options, integrator_step=step):
             return self._finished_by_pairs(regress(training))
         if step is None and (memory := self.memory).remembers:
-            for exposure in _possible_exposures(memory):
+            for exposure in (*_possible_exposures(memory), None):
+                found = self.by_density(regress(self._pairs(self.recordings)), exposure)
+                if found is not None and self.complete(found):
+                    return found
+                if exposure is None:
+                    break
                 unit = Diffusion.identity(self.library.dimension)
                 found = self.by_exposure(ObservationModel(self.library, unit, exposure))
                 if found is not None:
@@ -275,6 +280,19 @@ class _Case:
             raise NumericalFailure(reason)
         raise NumericalFailure(f"{tests[claim].reason}; {reason}", claim=claim)
 
+    def by_density(self, found: FieldEstimate, exposure: float | None) -> FieldEstimate | None:
+        """By the densities of noisy samples, or of means over an exposure; None where that does not do.
+
+        Of one state over coarse steps, from an estimate that takes samples for states.
+        """
+        if not found.flow.coarse or self.given is not None:
+            return None
+        with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
+            given, false_terms = Transitions(found, self._pairs(self.recordings)), self.options.false_terms
+            behind = given.identified_behind_sensor(exposure=exposure, false_terms=false_terms)
+            return None if behind is None else self._finished_by_pairs(behind)
+        return None
+
     def by_exposure(self, observation: ObservationModel) -> FieldEstimate | None:
         """By the likelihood of samples that are means over an exposure; None where they are no such means.
 
@@ -332,8 +350,7 @@ class _Case:
             noise = replace(noise, intensity=strength, intensity_error=error, covariance=covariance)
             if noise.exposure is not None:
                 every = ObservationModel.of(first).every(self.recordings)
-                values = {"exposure": noise.exposure, "unit": self.recordings.time_unit or "", "every": every}
-                remarks.append(Remark("inference.exposure", values))
+                remarks.append(self._of_exposure(noise.exposure, every))
             if first.slow_sensor is not None:
                 values = dict(zip(("size", "time", "error"), first.slow_sensor, strict=True))
                 values |= {"state": self.recordings.titles[0], "unit": self.recordings.time_unit or ""}
@@ -349,6 +366,10 @@ class _Case:
         sizes = zip(noise.measurement, self.recordings.titles, strict=True)
         sensors = [{"size": float(size), "state": name} for size, name in sizes]
         return Remark("inference.measurement_noise", {"sensors": sensors})
+
+    def _of_exposure(self, exposure: float, every: int) -> Remark:
+        values = {"exposure": exposure, "unit": self.recordings.time_unit or "", "every": every}
+        return Remark("inference.exposure", values)
 
     def _strength(self, found: FieldEstimate, diffusion: Diffusion) -> float:
         """ε of another D than was found: the mean of ``tr D⁻¹(x) εD(x) / d`` over the states."""
@@ -424,10 +445,14 @@ class _Case:
         def diagnosed(found: FieldEstimate, source: DiffusionSource) -> FieldEstimate:
             noise = residual_noise(found, self.recordings, pair_step=self.pair_step)
             noise = replace(noise, diffusion=source, pairs=count)
-            if found.diagnosis is not None and found.sensor_variance is not None and noise.kind == "process":
-                remarks = (*noise.remarks, self._of_sensors(found.diagnosis))
-                known = {name: getattr(found.diagnosis, name) for name in OF_SENSOR}
-                noise = replace(noise, remarks=remarks, **known)
+            if (seen := found.diagnosis) is not None and noise.kind == "process":
+                remarks = list(noise.remarks)
+                if found.sensor_variance is not None:
+                    remarks.append(self._of_sensors(seen))
+                if seen.exposure is not None:
+                    remarks.append(self._of_exposure(seen.exposure, 1))
+                known = {name: getattr(seen, name) for name in OF_SENSOR}
+                noise = replace(noise, remarks=tuple(remarks), **known)
             if noise.kind == "process":
                 share = found.error_of_strength(everything.x0, everything.h)
                 noise = replace(noise, intensity_error=noise.intensity * share)
@@ -443,7 +468,8 @@ class _Case:
                 check_units(self.recordings.names, self.units)
                 found = diagnosed(found, DiffusionSource.UNIT)
             else:
-                constant = whole.noise is None
+                # Behind a sensor it was asked for together with that.
+                constant = whole.noise is None and whole.diagnosis.measurement_error is None
                 by_state = (
                     with_noise_formula(whole, everything, false_terms=false_terms) if constant else None
                 )

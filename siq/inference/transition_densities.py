@@ -44,13 +44,17 @@ from siq.systems.formulas import compile_formulas
 SHORT = 0.5  # mean number of jumps of a chain, of which a series of so many terms is exact
 SERIES_TERMS, MAX_DOUBLINGS = 14, 40
 NEARLY_THE_SAME = 0.02  # relative, of steps: what is off by so much in both directions is right in the mean
+UNLIKELY, FAR_AWAY = 1e-9, 6.5  # numerical: of what else is possible; standard deviations, the same
+EXPOSED = 1e-3  # numerical: of a step, that passes at least before it
 FAR = 8.0  # standard deviations, beyond which a normal law has nothing
 LEAST = 1e-300  # of a probability, so that it has a logarithm
 LEAST_CELLS, MOST_CELLS = 80, 400  # numerical: of the range of a state
 CELLS_PER_NOISE, FEWEST_PER_NOISE = 1.25, 0.6  # numerical: of a sensor's, to begin with, and at least
 CELLS_PER_SPREAD = 6  # numerical: of what noise spreads it by in a step; most densities are right to 1 %
+CELLS_IF_BLURRED = 3  # numerical: the same behind a sensor; estimates are off by 0.03 of their errors
 SLIGHT_NOISE = 1e-3  # numerical: of the least where states were recorded
 BEYOND = 1.5  # spreads by which a state may have been outside of what was recorded
+LONGEST_EXPOSURE = 1.001  # of a step: no two exposures overlap
 MOST_PRODUCTS = 2e9  # numerical: of a filter along all samples, a second
 MOST_STEPS = 24  # of different length: each takes a matrix
 RATES = tuple(2.0 ** np.arange(-2, 5))  # of the noise of residuals, with which a search may begin
@@ -91,8 +95,11 @@ class TransitionDensity:
         _, which = np.unique(np.round(np.log(h) / NEARLY_THE_SAME), return_inverse=True)
         return np.bincount(which, h) / np.bincount(which), which
 
-    def _matrices(self, steps: np.ndarray) -> Iterator[np.ndarray]:
-        """The chain's matrix ``(N, N)`` over each step; none where f is too steep."""
+    def _short_steps(self, steps: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
+        """The chain's matrix ``(N, N)`` over a short step, and how often that is doubled to reach each step.
+
+        None where f is too steep.
+        """
         leaving = np.append(self.up, 0.0) + np.append(0.0, self.down)
         fastest = float(leaving.max())
         if not fastest * steps.max() < SHORT * 2**MAX_DOUBLINGS:
@@ -109,9 +116,32 @@ class TransitionDensity:
                 further[:, :-1] += term[:, 1:] * down
                 term = jumps / order * further
                 matrix += term
+            yield matrix, doublings
+
+    def _matrices(self, steps: np.ndarray) -> Iterator[np.ndarray]:
+        """The chain's matrix ``(N, N)`` over each step; none where f is too steep."""
+        for matrix, doublings in self._short_steps(steps):
             for _ in range(doublings):
                 matrix = matrix @ matrix
             yield matrix
+
+    def _exposed(self, exposure: float) -> np.ndarray:
+        """The matrix over an exposure, with mean and variance of the state within it: ``(3, N, N)``.
+
+        Given where it begins and ends, from the first and the second moment of the integral, which over two
+        times add up as ``A₁P₂ + P₁A₂`` and ``B₁P₂ + 2A₁A₂ + P₁B₂``; without any, where f is too steep.
+        """
+        for matrix, doublings in self._short_steps(np.array([exposure])):
+            places = np.arange(len(matrix)) + 0.5
+            middle = (places[:, None] + places) / 2
+            first, second = middle * matrix, middle**2 * matrix
+            for _ in range(doublings):
+                second = (second @ matrix + 2 * first @ first + matrix @ second) / 4
+                first, matrix = (first @ matrix + matrix @ first) / 2, matrix @ matrix
+            mean = first / np.maximum(matrix, LEAST)
+            spread = np.maximum(second / np.maximum(matrix, LEAST) - mean**2, 0.0)
+            return np.stack([matrix, self.first + self.width * mean, self.width**2 * spread])
+        return np.zeros((0, 0, 0))
 
     def _interpolated(
         self, of_matrix: Callable[[np.ndarray], np.ndarray], places: np.ndarray, h: np.ndarray
@@ -141,21 +171,28 @@ class TransitionDensity:
 
     def foreseen(
         self, x0: np.ndarray, xh: np.ndarray, h: np.ndarray, begins: np.ndarray, deviation: float, *,
-        whole: bool = True,
+        exposure: float = 0.0, whole: bool = True,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
         """The same two of values that a sensor shows with normal noise, given all earlier ones of a record.
 
         A filter on the cells, which where a record `begins` knows its first value alone. The third is the
         mean of the state, once the later value is known, too. All are ``(n,)``, NaN where f is too steep; of
-        scores that are not wanted, as they take longest, nothing is said.
+        scores that are not wanted, as they take longest, nothing is said. A value may be a mean over the time
+        `exposure` before it; of a normal law, given where the state was at both of its ends.
         """
         steps, which = self.distinct(h)
-        matrices = list(self._matrices(steps))
-        if not matrices:
+        waiting = np.maximum(steps - exposure, EXPOSED * steps) if exposure else steps
+        matrices, within = list(self._matrices(waiting)), self._exposed(exposure) if exposure else None
+        if not matrices or (within is not None and not len(within)):
             return (np.full(len(h), np.nan),) * 3
         middles = self.first + self.width * (np.arange(len(matrices[0])) + 0.5)
-        given = x0, xh, which, begins, np.stack(matrices), middles, deviation, whole
-        logarithms, below, above, means = _filtered(*given)
+        given = x0, xh, which, begins, np.stack(matrices), middles
+        if within is None:
+            logarithms, below, above, means = _filtered(*given, deviation, whole)
+        else:
+            logarithms, below, above, means = _filtered_means(
+                *given, within[0], within[1], np.sqrt(within[2] + deviation**2), whole
+            )
         low, high = (ndtri(np.clip(one, LEAST, 0.5)) for one in (below, above))
         return logarithms, np.where(below < above, low, -high), means
 
@@ -184,6 +221,48 @@ def _filtered(
         density = share.sum()
         logarithms[k] = math.log(max(density, LEAST) / (deviation * math.sqrt(2 * math.pi)))
         share = share / density if density > LEAST else ahead
+        means[k] = (share * middles).sum()
+    return logarithms, below, above, means
+
+
+@machine_code
+def _filtered_means(
+    x0: np.ndarray, xh: np.ndarray, which: np.ndarray, begins: np.ndarray, matrices: np.ndarray,
+    middles: np.ndarray, matrix: np.ndarray, mean: np.ndarray, deviation: np.ndarray, whole: bool,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """The same of means over an exposure, whose law follows from where the state was at both ends of it."""
+    logarithms, below, above, means = np.zeros((4, len(xh)))
+    count = len(middles)
+    share, ahead = np.zeros(count), np.zeros(count)
+    reached = np.zeros((count, 2), dtype=np.int64)  # first and last cells in which it ends with any chance
+    for start in range(count):
+        likely = np.flatnonzero(matrix[start] > UNLIKELY)
+        reached[start] = likely[0], likely[-1] + 1
+    for k in range(len(xh)):
+        for first in range(2 if begins[k] else 1):
+            value = x0[k] if begins[k] and not first else xh[k]
+            if begins[k] and not first:
+                ahead[:] = 1.0 / count
+            else:
+                ahead = share @ matrices[which[k]]
+                below[k] = above[k] = 0.0
+            share = np.zeros(count)
+            least = UNLIKELY * ahead.max()
+            for start in range(count):
+                if ahead[start] < least:
+                    continue
+                for end in range(reached[start, 0], reached[start, 1]):
+                    chance = ahead[start] * matrix[start, end]
+                    away = (value - mean[start, end]) / deviation[start, end]
+                    if whole:
+                        higher = math.erfc(away / math.sqrt(2.0)) / 2 if abs(away) < FAR else (away < 0) * 1.0
+                        below[k] += chance * (1 - higher)
+                        above[k] += chance * higher
+                    if abs(away) < FAR_AWAY:
+                        share[end] += chance / deviation[start, end] * math.exp(-(away**2) / 2)
+            density = share.sum()
+            logarithms[k] = math.log(max(density, LEAST) / math.sqrt(2 * math.pi))
+            share = share / density if density > LEAST else ahead @ matrix
         means[k] = (share * middles).sum()
     return logarithms, below, above, means
 
@@ -217,7 +296,9 @@ class Transitions:
             True, (pairs.recording[1:] != pairs.recording[:-1]) | (self.xh[:-1] != self.x0[1:])
         )
         noise, symbols, sensor = found.noise, found.library.symbols, found.sensor_variance
-        self.sensor = np.zeros(0) if sensor is None else np.log(sensor)
+        self.sensor, self.exposure = np.zeros(0) if sensor is None else np.log(sensor), found.exposure or 0.0
+        if self.exposure > LONGEST_EXPOSURE * self.h.min():
+            raise NumericalFailure("exposures overlap")
         self._terms = [found.library.terms[k] for k in found.support[:, 1]]
 
         def shape(x: np.ndarray) -> np.ndarray:
@@ -233,10 +314,12 @@ class Transitions:
         least, most = np.quantile(np.sqrt(self.strengths @ self.of_noise * self.h / back), [0.01, 0.99])
         low, high = min(self.x0.min(), self.xh.min()), max(self.x0.max(), self.xh.max())
         aside = min(float(most), (high - low) / 2) * BEYOND
-        count = max(int((high - low + 2 * aside) / least * CELLS_PER_SPREAD), LEAST_CELLS)
-        if sensor is not None:  # which blurs what cells do not resolve
-            of_sensor = int((high - low + 2 * aside) / np.sqrt(sensor[0]) * CELLS_PER_NOISE)
-            count = min(max(count, of_sensor), MOST_CELLS)
+        per_spread = CELLS_IF_BLURRED if self.filtered else CELLS_PER_SPREAD
+        count = max(int((high - low + 2 * aside) / least * per_spread), LEAST_CELLS)
+        if self.filtered:  # what blurs is known, and what cells do not resolve is blurred
+            within = float(least) ** 2 * self.exposure / float(np.median(self.h)) / 12
+            blur = np.sqrt(np.exp(self.sensor).sum() + within)
+            count = min(max(count, int((high - low + 2 * aside) / blur * CELLS_PER_NOISE)), MOST_CELLS)
             if len(self.h) * count**2 > MOST_PRODUCTS:
                 raise NumericalFailure("there are too many samples to follow all that their states may be")
         if count > MOST_CELLS:
@@ -251,19 +334,30 @@ class Transitions:
         between, inside = (np.maximum(strengths @ one, least) for one in (self._between, self._inside))
         return TransitionDensity(self.edges, values @ self._drift, between, inside)
 
-    def _deviation(self, sensor: np.ndarray) -> float:
-        """Of the sensor's noise, from the logarithm of its variance; cells tell none that is too small."""
-        return max(float(np.exp(sensor[0] / 2)), FEWEST_PER_NOISE * float(self.edges[1] - self.edges[0]))
+    @property
+    def filtered(self) -> bool:
+        """Whether samples do not show the states themselves."""
+        return bool(len(self.sensor)) or self.exposure > 0
+
+    def _foreseen(
+        self, density: TransitionDensity, sensor: np.ndarray, *, whole: bool = True
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """By the sensor's noise, from the logarithm of its variance; cells tell none that is too small."""
+        deviation = float(np.exp(sensor[0] / 2)) if len(sensor) else 0.0
+        if not self.exposure:
+            deviation = max(deviation, FEWEST_PER_NOISE * density.width)
+        ends = self.x0, self.xh, self.h, self.begins, deviation
+        return density.foreseen(*ends, exposure=self.exposure, whole=whole)
 
     def log_densities(self, values: np.ndarray, strengths: np.ndarray, sensor: np.ndarray) -> np.ndarray:
         """Of each pair; minus infinity where εD is not positive, or f too steep."""
         if not (strengths @ self.of_noise).min() > 0:
             return np.full(len(self.h), -np.inf)
-        density, ends = self._density(values, strengths), (self.x0, self.xh, self.h)
-        if len(sensor):
-            found = density.foreseen(*ends, self.begins, self._deviation(sensor), whole=False)[0]
+        density = self._density(values, strengths)
+        if self.filtered:
+            found = self._foreseen(density, sensor, whole=False)[0]
         else:
-            found = density.log_density(*ends)
+            found = density.log_density(self.x0, self.xh, self.h)
         return np.where(np.isfinite(found), found, -np.inf)
 
     @property
@@ -273,19 +367,18 @@ class Transitions:
 
     def normal_increments(self) -> np.ndarray:
         """Normal scores times √(εD h): residuals as of a short step, shape ``(n, 1)``."""
-        density, ends = self._density(self.found.values, self.strengths), (self.x0, self.xh, self.h)
-        if len(self.sensor):
-            scores = density.foreseen(*ends, self.begins, self._deviation(self.sensor))[1]
+        density = self._density(self.found.values, self.strengths)
+        if self.filtered:
+            scores = self._foreseen(density, self.sensor)[1]
         else:
-            scores = density.normal_scores(*ends)
+            scores = density.normal_scores(self.x0, self.xh, self.h)
         if not np.isfinite(scores).all():
             raise NumericalFailure("f is too steep for so long steps; sample more often")
         return np.asarray(scores * np.sqrt(self.strengths @ self.of_noise * self.h))[:, None]
 
     def states(self) -> np.ndarray:
         """Means of the states at the ends of pairs, as a noisy sensor shows them, shape ``(n,)``."""
-        density, ends = self._density(self.found.values, self.strengths), (self.x0, self.xh, self.h)
-        return density.foreseen(*ends, self.begins, self._deviation(self.sensor))[2]
+        return self._foreseen(self._density(self.found.values, self.strengths), self.sensor)[2]
 
     @cached_property
     def start(self) -> tuple[np.ndarray, np.ndarray]:
@@ -426,29 +519,39 @@ class Transitions:
         again, support = fit_significant(fit, chosen_terms([problem], library))
         return replace(again, alternatives=model_average([problem], support, library))
 
-    def identified_behind_sensor(self, *, false_terms: float) -> FieldEstimate | None:
+    def identified_behind_sensor(
+        self, *, exposure: float | None = None, false_terms: float
+    ) -> FieldEstimate | None:
         """f, D and the noise of a sensor, from an estimate without that; None where none gains.
 
-        At whatever share of what moves the state from sample to sample the search begins. The
-        `sensor_evidence` of the diagnosis is Schwarz's, but for the sensor.
+        At whatever share of what moves the state from sample to sample the search begins. Of means over an
+        exposure there is an estimate without such noise, too. The `sensor_evidence` of the diagnosis is
+        Schwarz's, but for the sensor.
         """
         found, pairs, rate = self.found, self.pairs, self.found.noise_rate
         everything = all_coefficients([0], found.library.size)
         base = replace(
             found.with_values(everything, found.coefficients[:, 0]),
-            noise=None, constant_noise=None, diffusion=Diffusion.identity(1), diagnosis=None,
+            noise=None, constant_noise=None, diffusion=Diffusion.identity(1),
         )  # fmt: skip
-        tried = [(Transitions(base, pairs).log_likelihood, base)]
-        for share in SENSOR_SHARES:
+        tried = []
+        for share in (0.0, *SENSOR_SHARES):
             deviation = np.sqrt(share * rate[0] * float(np.median(pairs.h)))
-            seen = NoiseDiagnosis("process", float(rate[0, 0]), np.eye(1), 0.0, 0.0, deviation)
+            seen = NoiseDiagnosis(
+                "process", float(rate[0, 0]), np.eye(1), 0.0, 0.0, deviation, exposure=exposure
+            )
             for kept in (1.0, 1 - share):
                 start = replace(base, diagnosis=seen, noise_rate=kept * rate)
                 tried.append((Transitions(start, pairs).log_likelihood, start))
         best = max(tried, key=lambda one: one[0])[1]
-        if best is base:
+        if best.sensor_variance is None and exposure is None:
             return None
-        whole = Transitions(best, pairs).fitted()
+        try:
+            whole = Transitions(best, pairs).fitted()
+        except NumericalFailure:
+            if exposure is None or best.sensor_variance is None:
+                raise
+            whole = Transitions(tried[0][1], pairs).fitted()
         constant = Transitions(whole[0], pairs)
         whole = constant.fitted_with_formula(false_terms=false_terms) or whole
         behind = constant.identified(whole, false_terms=false_terms)
