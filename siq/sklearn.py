@@ -73,15 +73,9 @@ class LandscapeRegressor(RegressorMixin, BaseEstimator):
     """
 
     def __init__(
-        self,
-        *,
-        degree: int = 5,
-        functions: Sequence[str] = (),
-        false_terms: float = 0.02,
-        diffusion: DiffusionEntry | None = None,
-        time_step: float = 1.0,
-        random_state: int = 0,
-    ) -> None:
+        self, *, degree: int = 5, functions: Sequence[str] = (), false_terms: float = 0.02,
+        diffusion: DiffusionEntry | None = None, time_step: float = 1.0, random_state: int = 0,
+    ) -> None:  # fmt: skip
         self.degree = degree
         self.functions = functions
         self.false_terms = false_terms

@@ -159,13 +159,9 @@ class Diagnosis:
 
 
 def diagnose(
-    system: Dynamics | Mapping[str, Any] | str | Path,
-    recordings: Recordings | pd.DataFrame | str | Path,
-    *,
-    simulate: Step | None = None,
-    step: float | None = None,
-    settings: MismatchStudy | None = None,
-) -> Diagnosis:
+    system: Dynamics | Mapping[str, Any] | str | Path, recordings: Recordings | pd.DataFrame | str | Path,
+    *, simulate: Step | None = None, step: float | None = None, settings: MismatchStudy | None = None,
+) -> Diagnosis:  # fmt: skip
     """Say whether, where and in which way a simulation differs from recordings of the system.
 
     Main arguments

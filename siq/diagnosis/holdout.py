@@ -204,13 +204,9 @@ def _refits_left_out(
 
 
 def errors_left_out(
-    fit: Fit,
-    learned: Measurements,
-    *,
-    noise: Noise,
-    candidates: Iterable[MechanismCandidate] = (),
+    fit: Fit, learned: Measurements, *, noise: Noise, candidates: Iterable[MechanismCandidate] = (),
     budget: Budget | None = None,
-) -> np.ndarray | None:
+) -> np.ndarray | None:  # fmt: skip
     """Normalised squared errors of free runs of the parts left out, one behind the other, ``(values,)``.
 
     The fit to all of the recordings is made again without each part, from where it is. Amplitudes of

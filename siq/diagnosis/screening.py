@@ -409,13 +409,9 @@ nothing to judge."""
 
 
 def rank(
-    fit: Fit,
-    data: Measurements,
-    terms: Sequence[AnyTerm],
-    *,
-    judge: Judge[AnyTerm],
+    fit: Fit, data: Measurements, terms: Sequence[AnyTerm], *, judge: Judge[AnyTerm],
     budget: Budget | None = None,
-) -> tuple[list[Ranked[AnyTerm]], list[tuple[AnyTerm, Exception]]]:
+) -> tuple[list[Ranked[AnyTerm]], list[tuple[AnyTerm, Exception]]]:  # fmt: skip
     """Judge terms on top of a fit, and say why the others could not be worked out.
 
     The budget is charged for the work; terms that it does not reach are in neither list.
@@ -477,13 +473,9 @@ def by_likelihood(
 
 
 def screen_all(
-    data: Measurements,
-    current: Fit,
-    candidates: Sequence[MechanismCandidate],
-    *,
-    fruitless: Collection[str] = (),
-    budget: Budget | None = None,
-) -> tuple[list[Ranked[Probe]], list[NotFitted]]:
+    data: Measurements, current: Fit, candidates: Sequence[MechanismCandidate], *,
+    fruitless: Collection[str] = (), budget: Budget | None = None,
+) -> tuple[list[Ranked[Probe]], list[NotFitted]]:  # fmt: skip
     """Screen every candidate on top of a fit, with its shapes at all places where they are looked for.
 
     One whose shape the recordings themselves show promises as much as the best, unless it was fitted before

@@ -165,13 +165,9 @@ def _joined(sample: SnapshotPairs, rest: np.ndarray) -> np.ndarray:
 
 
 def bias_of_rounding(
-    found: FieldEstimate,
-    pairs: SnapshotPairs,
-    recordings: Recordings,
-    measured: np.ndarray,
-    *,
+    found: FieldEstimate, pairs: SnapshotPairs, recordings: Recordings, measured: np.ndarray, *,
     correlation: float,
-) -> float | None:
+) -> float | None:  # fmt: skip
     """The largest bias of a coefficient of f where measured noise is that of rounding; None where not.
 
     The noise is in standard deviations ``(d,)``, and the correlation that of neighbouring residuals: of
@@ -229,13 +225,9 @@ def rounding_text(recordings: Recordings, *, coarse: bool = False) -> str | None
 
 
 def unexplained_probability(
-    columns: np.ndarray,
-    rest: np.ndarray,
-    *,
-    freedom: int | None = None,
-    variance: np.ndarray | None = None,
-    inflation: float = 1.0,
-) -> float:
+    columns: np.ndarray, rest: np.ndarray, *, freedom: int | None = None,
+    variance: np.ndarray | None = None, inflation: float = 1.0,
+) -> float:  # fmt: skip
     """Probability of residuals having no part left that columns explain: tiny where f misses a term.
 
     An F test of the regression of the residuals on the columns, or a χ² test where their variance is known.

@@ -194,13 +194,9 @@ def _verdict(claim: str, probability: float, limit: float, **values: object) -> 
 
 
 def check_claims(
-    found: FieldEstimate,
-    states: Recordings,
-    measured: Recordings,
-    *,
-    pair_step: float | None = None,
+    found: FieldEstimate, states: Recordings, measured: Recordings, *, pair_step: float | None = None,
     false_alarms: float,
-) -> dict[str, Verdict]:
+) -> dict[str, Verdict]:  # fmt: skip
     """Whether recordings bear out what an estimate of f and D presumes, by the names of the claims.
 
     Parameters

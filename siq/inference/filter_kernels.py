@@ -21,13 +21,9 @@ from siq.numerics.integration import machine_code
 
 @machine_code
 def carry_linearly(
-    step: np.ndarray,
-    by_state: np.ndarray,
-    by_parameter: np.ndarray,
-    begin: int,
-    transition: np.ndarray,
+    step: np.ndarray, by_state: np.ndarray, by_parameter: np.ndarray, begin: int, transition: np.ndarray,
     response: np.ndarray,
-) -> None:
+) -> None:  # fmt: skip
     """Carry deviations of the state over one substep, in place: ``S' = J S + F`` by the Runge–Kutta rule.
 
     The four stages are multiplied out: with A, B, C for J at the start, the middle and the end,

@@ -153,14 +153,10 @@ class CandidateLibrary:
 
 
 def candidate_library(
-    states: Sequence[str],
-    *,
-    degree: int,
-    potential_degree: int | None = None,
-    circulatory_degree: int | None = None,
-    further: Sequence[str] = (),
+    states: Sequence[str], *, degree: int, potential_degree: int | None = None,
+    circulatory_degree: int | None = None, further: Sequence[str] = (),
     angles: Mapping[str, Sequence[float]] | None = None,
-) -> CandidateLibrary:
+) -> CandidateLibrary:  # fmt: skip
     """Monomials up to a total degree, and whatever further functions a study lists.
 
     Of a periodic state sines and cosines stand in the place of its powers: the k-th harmonics have degree k.
@@ -189,13 +185,9 @@ def candidate_library(
 
 @lru_cache(maxsize=64)
 def _candidate_library(
-    states: tuple[str, ...],
-    degree: int,
-    potential_degree: int,
-    circulatory_degree: int,
-    further: tuple[str, ...],
-    angles: tuple[tuple[str, float, float], ...],
-) -> CandidateLibrary:
+    states: tuple[str, ...], degree: int, potential_degree: int, circulatory_degree: int,
+    further: tuple[str, ...], angles: tuple[tuple[str, float, float], ...],
+) -> CandidateLibrary:  # fmt: skip
     """`candidate_library`, once for the same functions: every step of a run asks for them, and every run."""
     symbols = tuple(sympy.Symbol(name, real=True) for name in states)
     known = CandidateLibrary.functions(symbols, degree, angles)
@@ -253,13 +245,9 @@ def linear_combination(expression: sympy.Expr) -> dict[sympy.Expr, float]:
 
 
 def field_dynamics(
-    library: CandidateLibrary,
-    support: np.ndarray,
-    values: np.ndarray,
-    *,
-    diffusion: Diffusion,
+    library: CandidateLibrary, support: np.ndarray, values: np.ndarray, *, diffusion: Diffusion,
     covariance: np.ndarray | None = None,
-) -> Dynamics:
+) -> Dynamics:  # fmt: skip
     """Dynamics whose parameters are the coefficients of f over some terms of a library.
 
     Their values ``(p,)`` and covariance ``(p, p)`` belong to a support ``(p, 2)`` of components and terms.

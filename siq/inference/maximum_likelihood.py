@@ -80,14 +80,10 @@ def first_noise(model: Dynamics, data: Measurements, x: np.ndarray) -> Noise:
 
 
 def _estimate_noise(
-    linearisation: Linearisation,
-    data: Measurements,
-    start: Noise,
-    *,
-    expected: tuple[np.ndarray, np.ndarray],
-    charge: Callable[[float], None] | None = None,
+    linearisation: Linearisation, data: Measurements, start: Noise, *,
+    expected: tuple[np.ndarray, np.ndarray], charge: Callable[[float], None] | None = None,
     coarse: bool = False,
-) -> Noise:
+) -> Noise:  # fmt: skip
     """The noise of highest restricted likelihood along the trajectories in hand."""
     # The parameters are those that are best for the noise that the search begins with: they depend little on
     # it, and a fit returns here once they have settled.
@@ -165,13 +161,9 @@ def _lowest(
 
 
 def _corrected(
-    vector: np.ndarray,
-    whole: Callable[[np.ndarray], float],
-    some: Callable[[np.ndarray], float],
-    *,
-    ratio: float,
-    bounds: Sequence[tuple[float, float]],
-) -> np.ndarray:
+    vector: np.ndarray, whole: Callable[[np.ndarray], float], some: Callable[[np.ndarray], float], *,
+    ratio: float, bounds: Sequence[tuple[float, float]],
+) -> np.ndarray:  # fmt: skip
     """The minimum of a cost from that of a part of it, by one Newton step with the curvature of the part."""
     # What is left is of second order in the difference of the two, which many samples make small; where they
     # differ so much that the step leads upwards all is searched. The whole is larger by the ratio, and a

@@ -88,13 +88,9 @@ class Measurements:
         return np.repeat(np.arange(len(self.labels)), np.diff(self.first))
 
     def signals(
-        self,
-        t: np.ndarray,
-        recording: np.ndarray,
-        *,
-        delays: Sequence[tuple[int, float]],
+        self, t: np.ndarray, recording: np.ndarray, *, delays: Sequence[tuple[int, float]],
         width: np.ndarray | float = 0.0,
-    ) -> Signals:
+    ) -> Signals:  # fmt: skip
         """Inputs at instants, each in its recording.
 
         Parameters

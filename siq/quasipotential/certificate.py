@@ -167,13 +167,9 @@ class Evidence:
 
 
 def certify(
-    formulas: SymbolicDecomposition | Sequence[Well],
-    evidence: Evidence,
-    *,
-    networks: AnyNetworks | None = None,
-    compared: bool = False,
-    relative_error: float = 0.0,
-) -> Certificate:
+    formulas: SymbolicDecomposition | Sequence[Well], evidence: Evidence, *,
+    networks: AnyNetworks | None = None, compared: bool = False, relative_error: float = 0.0,
+) -> Certificate:  # fmt: skip
     """Certificate of one formula for the region, or of one for each attractor, the worst of them deciding.
 
     The Hessian of the local route is M by construction, so that its branch test passes by itself; what tests
@@ -488,13 +484,9 @@ def _level(
 
 
 def _fan(
-    dynamics: Dynamics,
-    portrait: PhasePortrait,
-    attractor: np.ndarray,
-    level: float,
-    seed: int,
+    dynamics: Dynamics, portrait: PhasePortrait, attractor: np.ndarray, level: float, seed: int,
     **options: Any,
-) -> Fan:
+) -> Fan:  # fmt: skip
     return adapted_fan(
         dynamics, attractor, level=level, box=portrait.box, generator=np.random.default_rng(seed),
         gap=END_GAP, spacing=_spacing(len(attractor)), most_steps=MAX_STEPS, start=START_LEVEL,

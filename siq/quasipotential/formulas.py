@@ -95,13 +95,9 @@ def exact_decomposition(dynamics: Dynamics, quasipotential: sympy.Expr) -> Symbo
 
 
 def decomposition_from_coefficients(
-    library: CandidateLibrary,
-    *,
-    potential: np.ndarray,
-    circulatory: np.ndarray,
-    vector_field: np.ndarray,
+    library: CandidateLibrary, *, potential: np.ndarray, circulatory: np.ndarray, vector_field: np.ndarray,
     points: np.ndarray,
-) -> SymbolicDecomposition:
+) -> SymbolicDecomposition:  # fmt: skip
     """Formulas from coefficients over a library, with V shifted to be zero at its minimum.
 
     Coefficients of V have the shape ``(q,)``, those of g and f ``(q, d)``. The minimum is sought within the

@@ -303,16 +303,9 @@ class HamiltonJacobi:
         return np.sqrt(np.asarray(steepness.mean(axis=0)))
 
     def robust_fit(
-        self,
-        start: np.ndarray,
-        free: np.ndarray,
-        *,
-        rounds: int,
-        finest: float,
-        steps: int,
-        orthonormal: bool = False,
-        damping: float = 0.0,
-    ) -> np.ndarray:
+        self, start: np.ndarray, free: np.ndarray, *, rounds: int, finest: float, steps: int,
+        orthonormal: bool = False, damping: float = 0.0,
+    ) -> np.ndarray:  # fmt: skip
         """Coefficients by Gauss–Newton with weights that fall with the square of the residual (Cauchy's).
 
         Where V stops to be smooth, by caustics or by a kink, the residual is large and counts for nothing,
@@ -338,14 +331,9 @@ class HamiltonJacobi:
         return np.asarray(turned @ theta) if orthonormal else theta
 
     def gauss_newton(
-        self,
-        start: np.ndarray,
-        *,
-        free: np.ndarray | None = None,
-        steps: int = 60,
-        tolerance: float = 1e-13,
-        damping: float = 0.0,
-    ) -> tuple[np.ndarray, float]:
+        self, start: np.ndarray, *, free: np.ndarray | None = None, steps: int = 60,
+        tolerance: float = 1e-13, damping: float = 0.0,
+    ) -> tuple[np.ndarray, float]:  # fmt: skip
         """Coefficients with the least squares of the residual, relative to the size of ∇V; and what is left.
 
         The residual alone would draw a bad start to V = 0, which solves the equation, too. What is left is

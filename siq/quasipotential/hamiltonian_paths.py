@@ -200,14 +200,9 @@ def _on_mesh(solution: PPoly) -> _States:
 
 
 def hamiltonian_paths(
-    dynamics: Dynamics,
-    attractor: np.ndarray,
-    end: np.ndarray,
-    *,
-    beside: np.ndarray | None = None,
-    tolerance: float = 1e-5,
-    curves: Sequence[np.ndarray] = (),
-) -> list[MinimumActionPath]:
+    dynamics: Dynamics, attractor: np.ndarray, end: np.ndarray, *, beside: np.ndarray | None = None,
+    tolerance: float = 1e-5, curves: Sequence[np.ndarray] = (),
+) -> list[MinimumActionPath]:  # fmt: skip
     """Solutions from an attractor to a state, by rising action, those that are minima first.
 
     Parameters

@@ -75,13 +75,9 @@ class DensityComparison:
 
     @classmethod
     def of_samples(
-        cls,
-        samples: np.ndarray,
-        edges: Sequence[np.ndarray],
-        expected: Sequence[float] | np.ndarray,
-        *,
+        cls, samples: np.ndarray, edges: Sequence[np.ndarray], expected: Sequence[float] | np.ndarray, *,
         counted: np.ndarray | None = None,
-    ) -> DensityComparison:
+    ) -> DensityComparison:  # fmt: skip
         """Of samples ``(1 or 2, times, walkers)`` and probabilities of bins, row by row of the second state.
 
         A further bin is what lies outside the box. `counted` masks the samples that count; by default all.
@@ -215,14 +211,9 @@ def _gauss_legendre(bounds: np.ndarray, count: int, panels: int = 1) -> tuple[np
 
 
 def marginal_density(
-    quasipotential: sympy.Expr,
-    symbols: Sequence[sympy.Symbol],
-    *,
-    intensity: float,
-    box: np.ndarray,
-    points: int = 201,
-    nodes: int = 128,
-) -> StationaryDensity:
+    quasipotential: sympy.Expr, symbols: Sequence[sympy.Symbol], *, intensity: float, box: np.ndarray,
+    points: int = 201, nodes: int = 128,
+) -> StationaryDensity:  # fmt: skip
     """The density of the first two states, or of the only one, the others integrated out; with Z of all.
 
     Parameters

@@ -247,15 +247,9 @@ def _fault_over_domain(dynamics: Dynamics) -> tuple[str, str] | None:
 
 
 def _assembled(
-    found: AnyField,
-    portrait: PhasePortrait,
-    wells: Sequence[Well | None],
-    ways: Sequence[Transition],
-    remarks: list[Remark],
-    *,
-    certificate: Certificate | None,
-    noise: NoiseStrength | None,
-) -> Landscape:
+    found: AnyField, portrait: PhasePortrait, wells: Sequence[Well | None], ways: Sequence[Transition],
+    remarks: list[Remark], *, certificate: Certificate | None, noise: NoiseStrength | None,
+) -> Landscape:  # fmt: skip
     """The landscape of what was found, with the heights of its attractors."""
     left = None if certificate is None else certificate.tests.get("error")
     if left is not None and np.isfinite(left.value):

@@ -125,14 +125,9 @@ class ReferenceLandscape:
 
 
 def reference_landscape(
-    dynamics: Dynamics,
-    portrait: PhasePortrait,
-    *,
-    box: np.ndarray,
-    reach: float,
-    generator: np.random.Generator,
-    mesh: Callable[[np.ndarray, float], Potential | None] | None = None,
-) -> ReferenceLandscape:
+    dynamics: Dynamics, portrait: PhasePortrait, *, box: np.ndarray, reach: float,
+    generator: np.random.Generator, mesh: Callable[[np.ndarray, float], Potential | None] | None = None,
+) -> ReferenceLandscape:  # fmt: skip
     """Compute the references.
 
     Parameters
@@ -373,15 +368,9 @@ def differences(
 
 
 def _difference(
-    item: str,
-    quantity: str,
-    equations: float = np.nan,
-    trajectories: float = np.nan,
-    standard_error: float = np.nan,
-    *,
-    noise: float = np.nan,
-    note: str = "",
-) -> dict[str, object]:
+    item: str, quantity: str, equations: float = np.nan, trajectories: float = np.nan,
+    standard_error: float = np.nan, *, noise: float = np.nan, note: str = "",
+) -> dict[str, object]:  # fmt: skip
     """One number by the equations and by the trajectories; the standard error is that of the latter."""
     relative = trajectories / equations - 1 if equations else np.nan
     in_errors = (trajectories - equations) / standard_error if standard_error > 0 else np.nan

@@ -90,14 +90,9 @@ class _VisitProcess(CellProcess):
     """
 
     def __init__(
-        self,
-        dynamics: Dynamics,
-        intensity: float,
-        box: np.ndarray,
-        cores: Sequence[Neighbourhood],
-        *,
+        self, dynamics: Dynamics, intensity: float, box: np.ndarray, cores: Sequence[Neighbourhood], *,
         cells: int | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__(dynamics, intensity, box, cells=cells)
         self._given = (intensity, box, cores, cells)
         self.force = dynamics.drift(self.points)
@@ -165,13 +160,9 @@ def _core_of(cores: Sequence[Neighbourhood], points: np.ndarray) -> np.ndarray:
 
 
 def _predicted_visits(
-    found: FieldEstimate,
-    portrait: PhasePortrait,
-    noise: NoiseStrength,
-    cores: Sequence[Neighbourhood],
-    *,
+    found: FieldEstimate, portrait: PhasePortrait, noise: NoiseStrength, cores: Sequence[Neighbourhood], *,
     seed: int = 0,
-) -> tuple[list[tuple[int, float, float]], list[_VisitProcess], Remark]:
+) -> tuple[list[tuple[int, float, float]], list[_VisitProcess], Remark]:  # fmt: skip
     """Well, mean time of visits and its relative error by f, D and ε, core to core, where that is known.
 
     It is by the operator of f and of draws of it, which is returned too, or else by the law; and what is not
@@ -379,15 +370,10 @@ def _errors_along(
 
 
 def check_occupancy(
-    found: FieldEstimate,
-    portrait: PhasePortrait,
-    noise: NoiseStrength | None,
-    recordings: Recordings,
-    parts: Sequence[tuple[FieldEstimate, np.ndarray]],
-    *,
-    measured: Recordings | None = None,
+    found: FieldEstimate, portrait: PhasePortrait, noise: NoiseStrength | None, recordings: Recordings,
+    parts: Sequence[tuple[FieldEstimate, np.ndarray]], *, measured: Recordings | None = None,
     seed: int = 0,
-) -> OccupancyCheck:
+) -> OccupancyCheck:  # fmt: skip
     """Hold what was identified against the record's own hops and histogram.
 
     Parameters

@@ -169,14 +169,9 @@ class OutputWeights:
     """
 
     def __init__(
-        self,
-        data: TrainingData,
-        *,
-        diffusion: Diffusion,
-        units: int,
-        generator: np.random.Generator,
+        self, data: TrainingData, *, diffusion: Diffusion, units: int, generator: np.random.Generator,
         found: FieldEstimate | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.diffusion, self.units, self.generator, self.found = diffusion, units, generator, found
         most = POINTS_PER_UNIT * units
         pairs, others = (

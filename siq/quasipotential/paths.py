@@ -73,14 +73,9 @@ ACTION_DIFFERENCE = 0.02  # share of the action by which two of them differ
 
 
 def minimum_action_path(
-    dynamics: Dynamics,
-    start: LimitSet,
-    end: LimitSet,
-    *,
-    nodes: int = 100,
-    tolerance: float = 1e-4,
+    dynamics: Dynamics, start: LimitSet, end: LimitSet, *, nodes: int = 100, tolerance: float = 1e-4,
     initial: Sequence[np.ndarray] | None = None,
-) -> MinimumActionPath:
+) -> MinimumActionPath:  # fmt: skip
     """The path of least action from one state to another: the lowest minimum found.
 
     No method promises that there is no lower one: `rivals` tells which others the first guesses led to.
@@ -217,15 +212,9 @@ def _extrapolated(
 
 
 def transition_path(
-    dynamics: Dynamics,
-    start: LimitSet,
-    over: LimitSet,
-    end: LimitSet | None,
-    *,
-    box: np.ndarray | None = None,
-    nodes: int = 100,
-    **options: Any,
-) -> MinimumActionPath:
+    dynamics: Dynamics, start: LimitSet, over: LimitSet, end: LimitSet | None, *,
+    box: np.ndarray | None = None, nodes: int = 100, **options: Any,
+) -> MinimumActionPath:  # fmt: skip
     """The path of least action to what parts two basins, with the way that f leads on from there.
 
     Parameters

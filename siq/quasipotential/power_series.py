@@ -205,13 +205,9 @@ class _Homogeneous:
         return matrix
 
     def expanded(
-        self,
-        name: str,
-        formulas: Sequence[sympy.Expr],
-        symbols: Sequence[sympy.Symbol],
-        center: np.ndarray,
-        degree: int,
-    ) -> list[np.ndarray]:
+        self, name: str, formulas: Sequence[sympy.Expr], symbols: Sequence[sympy.Symbol],
+        center: np.ndarray, degree: int,
+    ) -> list[np.ndarray]:  # fmt: skip
         """Taylor coefficients of formulas at the center: for each degree of each formula, ``(m, n)``."""
         parts = [np.zeros((len(formulas), len(self.exponents[k]))) for k in range(degree + 1)]
         if all(formula.is_polynomial(*symbols) for formula in formulas):

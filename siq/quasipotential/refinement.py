@@ -116,13 +116,9 @@ def _formula_library(found: FieldEstimate, options: RefinementOptions) -> Candid
 
 
 def refine(
-    found: FieldEstimate,
-    portrait: PhasePortrait,
-    *,
-    points: np.ndarray,
-    options: RefinementOptions,
+    found: FieldEstimate, portrait: PhasePortrait, *, points: np.ndarray, options: RefinementOptions,
     seed: int = 0,
-) -> _Refined:
+) -> _Refined:  # fmt: skip
     """V about each attractor, and one formula over the recorded states ``(n, d)`` where one holds.
 
     The seed decides which points are used where there are too many.
@@ -251,17 +247,9 @@ class RefinementContext:
     """
 
     def __init__(
-        self,
-        recordings: Recordings,
-        found: FieldEstimate,
-        networks: AnyNetworks | None,
-        *,
-        number: int,
-        seed: int,
-        pair_step: float | None,
-        refinement: RefinementOptions,
-        limits: CertificateOptions,
-    ) -> None:
+        self, recordings: Recordings, found: FieldEstimate, networks: AnyNetworks | None, *, number: int,
+        seed: int, pair_step: float | None, refinement: RefinementOptions, limits: CertificateOptions,
+    ) -> None:  # fmt: skip
         self.found, self.networks = found, networks
         self.number, self.seed, self.limits = number, seed, limits
         self.options = refinement.with_routes(networks=networks is not None)

@@ -287,14 +287,9 @@ def _escape_rate_over_cycle(
 
 
 def _fan(
-    problem: PathProblem,
-    begin: LevelSet,
-    side: float,
-    places: np.ndarray,
-    level: float,
-    sense: float,
+    problem: PathProblem, begin: LevelSet, side: float, places: np.ndarray, level: float, sense: float,
     short_of: Callable[[np.ndarray], np.ndarray],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Trajectories of Hamilton's equations from where the cost is as given, until they come somewhere.
 
     They begin on one side of a tube, or on an ellipse, at places that are counted from 0 to `FAN` around it,

@@ -256,15 +256,9 @@ HELD_OUT_STRIDE = 4  # every so manieth point is kept for choosing the degree
 
 
 def local_well(
-    dynamics: Dynamics,
-    portrait: PhasePortrait,
-    index: int,
-    *,
-    options: RefinementOptions,
-    seed: int = 0,
-    saddle: Equilibrium | Cycle | None = None,
-    path: MinimumActionPath | None = None,
-) -> Well:
+    dynamics: Dynamics, portrait: PhasePortrait, index: int, *, options: RefinementOptions, seed: int = 0,
+    saddle: Equilibrium | Cycle | None = None, path: MinimumActionPath | None = None,
+) -> Well:  # fmt: skip
     """V about one attractor, of the lowest degree that no other betters by much.
 
     Parameters
@@ -394,15 +388,9 @@ def best_trial(trials: Sequence[DegreeTrial]) -> int:
 
 
 def _grow_well(
-    dynamics: Dynamics,
-    attractor: Equilibrium,
-    basin: Basin,
-    saddles: Sequence[Equilibrium | Cycle],
-    *,
-    degree: int,
-    generator: np.random.Generator,
-    depth: float | None = None,
-) -> Well:
+    dynamics: Dynamics, attractor: Equilibrium, basin: Basin, saddles: Sequence[Equilibrium | Cycle], *,
+    degree: int, generator: np.random.Generator, depth: float | None = None,
+) -> Well:  # fmt: skip
     """V about an attractor up to the lowest of the saddles, from M outwards; `depth` is V there, if known."""
     hessian = hessian_at(dynamics, attractor.position)
     extent = np.sqrt(np.diag(np.linalg.inv(hessian)))
@@ -429,21 +417,10 @@ def _grow_well(
 
 
 def grown(
-    dynamics: Dynamics,
-    basin: Basin,
-    saddles: Sequence[Equilibrium | Cycle],
-    basis: PowerBasis,
-    coefficients: np.ndarray,
-    *,
-    free: np.ndarray,
-    metric: np.ndarray,
-    level: float,
-    fitted: np.ndarray,
-    generator: np.random.Generator,
-    depth: float | None = None,
-    damping: float = 0.0,
-    steps: int = 40,
-) -> Well:
+    dynamics: Dynamics, basin: Basin, saddles: Sequence[Equilibrium | Cycle], basis: PowerBasis,
+    coefficients: np.ndarray, *, free: np.ndarray, metric: np.ndarray, level: float, fitted: np.ndarray,
+    generator: np.random.Generator, depth: float | None = None, damping: float = 0.0, steps: int = 40,
+) -> Well:  # fmt: skip
     """V grown from a start, level by level, to its lowest saddle or to the end of the recorded region.
 
     `metric` is the curvature of V at the attractor, in which distances are measured; `fitted` has the rows of
@@ -525,16 +502,10 @@ def grown(
 
 
 def _extend_well(
-    well: Well,
-    basin: Basin,
-    *,
-    goal: float,
-    rows: np.ndarray | None = None,
-    path: MinimumActionPath | None = None,
-    generator: np.random.Generator | None = None,
-    by_path: bool = True,
-    first: float | None = None,
-) -> Well:
+    well: Well, basin: Basin, *, goal: float, rows: np.ndarray | None = None,
+    path: MinimumActionPath | None = None, generator: np.random.Generator | None = None,
+    by_path: bool = True, first: float | None = None,
+) -> Well:  # fmt: skip
     """Take a formula on, from its well to a higher level `goal`, by robust fits of the equation.
 
     Only states that lead to the attractor are asked: across the ridge another well begins. Where the path to

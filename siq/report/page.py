@@ -147,16 +147,9 @@ class _PageWriter:
         return ""
 
     def table(
-        self,
-        caption: str,
-        frame: pd.DataFrame | None,
-        *,
-        data: pd.DataFrame | None = None,
-        file: str = "",
-        rows: int = 30,
-        named: bool = False,
-        help: Mapping[str, str] | None = None,
-    ) -> str:
+        self, caption: str, frame: pd.DataFrame | None, *, data: pd.DataFrame | None = None,
+        file: str = "", rows: int = 30, named: bool = False, help: Mapping[str, str] | None = None,
+    ) -> str:  # fmt: skip
         """A table of a section, or that of the answer; left out if it has no rows.
 
         `help` says what columns mean, by their names without units.

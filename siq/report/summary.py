@@ -298,14 +298,10 @@ class LandscapeSummary:
 
 
 def summarise(
-    landscape: Landscape | LandscapeSummary | None,
-    recordings: Recordings | np.ndarray | None = None,
-    *,
-    dynamics: Dynamics | None = None,
-    formula: SymbolicDecomposition | None = None,
-    record: pd.DataFrame | None = None,
-    run: int = 0,
-) -> LandscapeSummary:
+    landscape: Landscape | LandscapeSummary | None, recordings: Recordings | np.ndarray | None = None, *,
+    dynamics: Dynamics | None = None, formula: SymbolicDecomposition | None = None,
+    record: pd.DataFrame | None = None, run: int = 0,
+) -> LandscapeSummary:  # fmt: skip
     """The summary of a landscape, be it in memory or read from its file; one of a summary is itself.
 
     Parameters

@@ -47,15 +47,9 @@ class Descents:
 
 
 def follow(
-    dynamics: Dynamics,
-    starts: np.ndarray,
-    attractors: Sequence[Equilibrium],
-    *,
-    box: np.ndarray,
-    states: int = 48,
-    patience: int = 1,
-    cycles: Sequence[Cycle] = (),
-) -> Descents:
+    dynamics: Dynamics, starts: np.ndarray, attractors: Sequence[Equilibrium], *, box: np.ndarray,
+    states: int = 48, patience: int = 1, cycles: Sequence[Cycle] = (),
+) -> Descents:  # fmt: skip
     """Follow f from starts ``(n, d)`` to where trajectories may end.
 
     Parameters
@@ -135,13 +129,9 @@ def settled_on(
 
 
 def sides_of(
-    dynamics: Dynamics,
-    over: Sequence[Equilibrium | Cycle],
-    attractors: Sequence[Equilibrium],
-    *,
-    box: np.ndarray,
-    cycles: Sequence[Cycle] = (),
-) -> list[np.ndarray]:
+    dynamics: Dynamics, over: Sequence[Equilibrium | Cycle], attractors: Sequence[Equilibrium], *,
+    box: np.ndarray, cycles: Sequence[Cycle] = (),
+) -> list[np.ndarray]:  # fmt: skip
     """Where f leads from both sides of saddles, or unstable cycles, followed together; see `_ends_of`."""
     if not over:
         return []
@@ -157,13 +147,9 @@ def sides_of(
 
 
 def _ends_of(
-    dynamics: Dynamics,
-    starts: np.ndarray,
-    attractors: Sequence[Equilibrium],
-    cycles: Sequence[Cycle],
-    *,
+    dynamics: Dynamics, starts: np.ndarray, attractors: Sequence[Equilibrium], cycles: Sequence[Cycle], *,
     box: np.ndarray,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Where f leads from some states: the number of an attractor, or of a cycle after these; -1 elsewhere."""
     ways = follow(dynamics, starts, attractors, box=box, states=2, cycles=cycles, patience=dynamics.dimension)
     near = settled_on(ways.paths[:, -1], cycles, box=box)
@@ -185,15 +171,9 @@ SADDLE_DISTANCE = 0.2  # of the box: so close to the edge a root of f has to be 
 
 
 def tracked_edge(
-    dynamics: Dynamics,
-    one: int,
-    two: int,
-    attractors: Sequence[Equilibrium],
-    cycles: Sequence[Cycle] = (),
-    *,
-    box: np.ndarray,
-    generator: np.random.Generator,
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    dynamics: Dynamics, one: int, two: int, attractors: Sequence[Equilibrium],
+    cycles: Sequence[Cycle] = (), *, box: np.ndarray, generator: np.random.Generator,
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:  # fmt: skip
     """States on the boundary of a basin as f moves along it, from a way to another attractor on.
 
     `one` is the number of the basin, `two` of the other attractor; those of cycles follow on. The generator
@@ -246,14 +226,9 @@ def tracked_edge(
 
 
 def edge_saddle(
-    dynamics: Dynamics,
-    one: int,
-    two: int,
-    attractors: Sequence[Equilibrium],
-    *,
-    box: np.ndarray,
+    dynamics: Dynamics, one: int, two: int, attractors: Sequence[Equilibrium], *, box: np.ndarray,
     generator: np.random.Generator,
-) -> Equilibrium | None:
+) -> Equilibrium | None:  # fmt: skip
     """A saddle on the boundary of the basin of `one`, towards `two`; None where tracking comes to none.
 
     Both are numbers of attractors; the box is the domain. See `tracked_edge`, which the generator is for.
@@ -350,15 +325,9 @@ class Basin:
 
 
 def basin_of(
-    dynamics: Dynamics,
-    descents: Descents,
-    index: int,
-    attractors: Sequence[Equilibrium],
-    *,
-    box: np.ndarray,
-    generator: np.random.Generator,
-    near: tuple[int, float] | None = None,
-) -> Basin:
+    dynamics: Dynamics, descents: Descents, index: int, attractors: Sequence[Equilibrium], *,
+    box: np.ndarray, generator: np.random.Generator, near: tuple[int, float] | None = None,
+) -> Basin:  # fmt: skip
     """The points from which f leads to an attractor.
 
     Parameters

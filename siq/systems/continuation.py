@@ -647,13 +647,9 @@ def follow_branches(
 
 
 def _follow_cycles(
-    family: _Family,
-    parameter: str,
-    branches: list[Branch],
-    found: list[Bifurcation],
-    remarks: list[Remark],
-    seeds: Sequence[tuple[float, np.ndarray, float]],
-) -> None:
+    family: _Family, parameter: str, branches: list[Branch], found: list[Bifurcation],
+    remarks: list[Remark], seeds: Sequence[tuple[float, np.ndarray, float]],
+) -> None:  # fmt: skip
     """Add branches of cycles to those of equilibria, folds of cycles to what was found, and remarks."""
     first = len(branches)
     starts: list[tuple[_Cycles, np.ndarray, np.ndarray]] = []

@@ -397,15 +397,11 @@ class Dynamics:
 
     @classmethod
     def of(
-        cls,
-        symbols: Sequence[sympy.Symbol],
-        equations: Sequence[sympy.Expr],
-        *,
+        cls, symbols: Sequence[sympy.Symbol], equations: Sequence[sympy.Expr], *,
         diffusion: Diffusion | np.ndarray | Sequence[Sequence[sympy.Expr | float]] | None = None,
         domain: Sequence[Sequence[float]] | np.ndarray | None = None,
-        parameters: Mapping[sympy.Symbol, float] | None = None,
-        periodic: Sequence[str] = (),
-    ) -> Dynamics:
+        parameters: Mapping[sympy.Symbol, float] | None = None, periodic: Sequence[str] = (),
+    ) -> Dynamics:  # fmt: skip
         """Dynamics of formulas alone, with D = 1 unless another is given.
 
         Parameters

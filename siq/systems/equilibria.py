@@ -73,13 +73,9 @@ class _VectorField(Protocol):
 
 
 def find_equilibria(
-    dynamics: _VectorField,
-    points: np.ndarray,
-    *,
-    box: np.ndarray | None = None,
-    margin: float = BOX_MARGIN,
-    rate: float | None = None,
-) -> list[Equilibrium]:
+    dynamics: _VectorField, points: np.ndarray, *, box: np.ndarray | None = None,
+    margin: float = BOX_MARGIN, rate: float | None = None,
+) -> list[Equilibrium]:  # fmt: skip
     """All isolated equilibria that Newton's method finds from points ``(n, d)``, by their first state.
 
     Parameters
@@ -96,13 +92,9 @@ def find_equilibria(
 
 
 def distinct_roots(
-    dynamics: _VectorField,
-    starts: np.ndarray,
-    *,
-    box: np.ndarray,
-    margin: float,
+    dynamics: _VectorField, starts: np.ndarray, *, box: np.ndarray, margin: float,
     known: Sequence[np.ndarray] = (),
-) -> list[np.ndarray]:
+) -> list[np.ndarray]:  # fmt: skip
     """Where f vanishes, as far as Newton's method comes there from some starts; each root once.
 
     Parameters

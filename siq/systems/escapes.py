@@ -142,16 +142,9 @@ class _EscapeTimes:
 
 
 def simulate_escapes(
-    dynamics: Dynamics,
-    start: np.ndarray,
-    targets: Sequence[Neighbourhood],
-    *,
-    intensity: float,
-    longest: float,
-    generator: np.random.Generator,
-    walkers: int = 1000,
-    step: float | None = None,
-) -> _EscapeTimes:
+    dynamics: Dynamics, start: np.ndarray, targets: Sequence[Neighbourhood], *, intensity: float,
+    longest: float, generator: np.random.Generator, walkers: int = 1000, step: float | None = None,
+) -> _EscapeTimes:  # fmt: skip
     """Follow walkers until they reach one of some neighbourhoods, from which f leads on to its attractor.
 
     Parameters
@@ -245,15 +238,9 @@ class _SplitTime(NamedTuple):
 
 
 def split_escapes(
-    dynamics: Dynamics,
-    start: Neighbourhood,
-    targets: Sequence[Neighbourhood],
-    *,
-    intensity: float,
-    progress: Callable[[np.ndarray], np.ndarray],
-    generator: np.random.Generator,
-    runs: int = RUNS,
-) -> _SplitTime:
+    dynamics: Dynamics, start: Neighbourhood, targets: Sequence[Neighbourhood], *, intensity: float,
+    progress: Callable[[np.ndarray], np.ndarray], generator: np.random.Generator, runs: int = RUNS,
+) -> _SplitTime:  # fmt: skip
     """The mean time from the middle of one neighbourhood until one of some others is reached, by splitting.
 
     Parameters

@@ -424,17 +424,9 @@ class Formula:
 
     @classmethod
     def of_powers(
-        cls,
-        name: str,
-        symbols: Sequence[sympy.Symbol],
-        *,
-        center: np.ndarray,
-        scale: np.ndarray,
-        exponents: np.ndarray,
-        coefficients: np.ndarray,
-        units: Sequence[str] = (),
-        title: str = "",
-    ) -> Formula:
+        cls, name: str, symbols: Sequence[sympy.Symbol], *, center: np.ndarray, scale: np.ndarray,
+        exponents: np.ndarray, coefficients: np.ndarray, units: Sequence[str] = (), title: str = "",
+    ) -> Formula:  # fmt: skip
         """``Σ_k c_k Π_i ((x_i - center_i)/scale_i)^e_ki``, written in the units of the states.
 
         Parameters

@@ -399,13 +399,9 @@ def _cycles_backwards(
 
 
 def _separatrix_cycles(
-    dynamics: Dynamics,
-    attractors: Sequence[Equilibrium],
-    cycles: Sequence[Cycle],
-    *,
-    box: np.ndarray,
+    dynamics: Dynamics, attractors: Sequence[Equilibrium], cycles: Sequence[Cycle], *, box: np.ndarray,
     generator: np.random.Generator,
-) -> tuple[Cycle, ...]:
+) -> tuple[Cycle, ...]:  # fmt: skip
     """Cycles with one unstable direction on boundaries of basins, where a cycle is on one side of them."""
     pairs = itertools.combinations(range(len(attractors) + len(cycles)), 2)
     with_cycle = [pair for pair in pairs if max(pair) >= len(attractors)]

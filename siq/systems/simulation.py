@@ -200,17 +200,9 @@ def simulate_snapshots(
 
 
 def simulate_stationary(
-    dynamics: Dynamics,
-    *,
-    intensity: float,
-    start: np.ndarray,
-    step: float,
-    burn_in: int,
-    steps: int,
-    thin: int = 1,
-    generator: np.random.Generator,
-    rule: Callable[..., np.ndarray] = euler_maruyama_step,
-) -> np.ndarray:
+    dynamics: Dynamics, *, intensity: float, start: np.ndarray, step: float, burn_in: int, steps: int,
+    thin: int = 1, generator: np.random.Generator, rule: Callable[..., np.ndarray] = euler_maruyama_step,
+) -> np.ndarray:  # fmt: skip
     """Samples of walkers in noise, shape ``(d, steps // thin, walkers)``, after a long time.
 
     The walkers share nothing but the equation ``dx = f dt + sqrt(ε) D^(1/2) dW``; the spread among them

@@ -111,13 +111,9 @@ DIRECTIONS = 360  # numerical: of the starting ellipse, a degree apart
 
 
 def _start(
-    drift: Callable[[np.ndarray], np.ndarray],
-    attractor: np.ndarray,
-    hessian: np.ndarray,
-    box: np.ndarray,
-    widths: np.ndarray,
-    diffusion: Diffusion,
-) -> tuple[float, float]:
+    drift: Callable[[np.ndarray], np.ndarray], attractor: np.ndarray, hessian: np.ndarray, box: np.ndarray,
+    widths: np.ndarray, diffusion: Diffusion,
+) -> tuple[float, float]:  # fmt: skip
     """V at the rim of the starting ellipse, and r, how fast f turns there; wrong input is refused."""
     scale = np.sqrt(np.abs(np.diag(hessian)))
     ratio = hessian / np.maximum(np.outer(scale, scale), np.finfo(float).tiny)
@@ -418,18 +414,10 @@ CHUNK = 1 << 18  # points at which f is evaluated in one call
 
 
 def mesh_quasipotential(
-    drift: Callable[[np.ndarray], np.ndarray],
-    attractor: np.ndarray,
-    *,
-    hessian: np.ndarray,
-    box: np.ndarray,
-    shape: tuple[int, int],
-    diffusion: Diffusion,
-    reach: int | None = None,
-    level: float | None = None,
-    stop_at_boundary: bool = True,
-    as_published: bool = False,
-) -> _MeshQuasipotential:
+    drift: Callable[[np.ndarray], np.ndarray], attractor: np.ndarray, *, hessian: np.ndarray,
+    box: np.ndarray, shape: tuple[int, int], diffusion: Diffusion, reach: int | None = None,
+    level: float | None = None, stop_at_boundary: bool = True, as_published: bool = False,
+) -> _MeshQuasipotential:  # fmt: skip
     """V with respect to an attractor, or to a stable limit cycle, on a mesh.
 
     Parameters

@@ -78,17 +78,10 @@ def reference_systems() -> dict[str, _ReferenceSystem]:
 
 
 def _system(
-    name: str,
-    *,
-    about: str,
-    source: str,
-    states: Mapping[str, Sequence[float]],
-    equations: Sequence[str],
-    diffusion: Sequence[Sequence[float | str]] | None = None,
-    quasipotential: str | None = None,
-    ways: Sequence[Mapping[str, Sequence[float]]] = (),
-    barriers: Sequence[Mapping[str, Any]] = (),
-) -> _ReferenceSystem:
+    name: str, *, about: str, source: str, states: Mapping[str, Sequence[float]], equations: Sequence[str],
+    diffusion: Sequence[Sequence[float | str]] | None = None, quasipotential: str | None = None,
+    ways: Sequence[Mapping[str, Sequence[float]]] = (), barriers: Sequence[Mapping[str, Any]] = (),
+) -> _ReferenceSystem:  # fmt: skip
     """A system as the file has it: states with their domains, formulas, and barriers where they are known."""
     symbols = {state: symbol(state) for state in states}
     dynamics = Dynamics.of(

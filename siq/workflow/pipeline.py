@@ -308,16 +308,10 @@ def refine_run(
 
 
 def landscape_of_run(
-    settings: PipelineSettings,
-    recordings: Recordings | None,
-    record: FieldEstimate | None,
-    *,
-    number: int,
-    wells: Sequence[Well] = (),
-    seek_wells: bool = True,
-    certificate: Certificate | None = None,
-    visits: tuple[VisitTest, ...] = (),
-) -> StepResult[Landscape]:
+    settings: PipelineSettings, recordings: Recordings | None, record: FieldEstimate | None, *,
+    number: int, wells: Sequence[Well] = (), seek_wells: bool = True,
+    certificate: Certificate | None = None, visits: tuple[VisitTest, ...] = (),
+) -> StepResult[Landscape]:  # fmt: skip
     """The landscape of the identified f within the recorded region.
 
     The wells are those of the refinement, with their certificate, and `visits` those that its test against

@@ -387,14 +387,10 @@ class Sweep:
 
 
 def sweep(
-    system: str | Path | Dynamics,
-    parameter: str,
-    values: Sequence[float] | np.ndarray,
-    *,
-    second: tuple[str, Sequence[float] | np.ndarray] | None = None,
-    noise: float | None = None,
+    system: str | Path | Dynamics, parameter: str, values: Sequence[float] | np.ndarray, *,
+    second: tuple[str, Sequence[float] | np.ndarray] | None = None, noise: float | None = None,
     seed: int = 0,
-) -> Sweep:
+) -> Sweep:  # fmt: skip
     """The landscape of equations against a parameter: equilibria, barriers, escape times and weights.
 
     Parameters

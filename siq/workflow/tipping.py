@@ -79,13 +79,9 @@ REFUSED = 0.01  # probability with which each claim is refused of a record for w
 
 
 def probability_of_tipping(
-    found: Sweep,
-    course: Callable[[np.ndarray], np.ndarray] | np.ndarray,
-    times: np.ndarray,
-    *,
-    well: int,
+    found: Sweep, course: Callable[[np.ndarray], np.ndarray] | np.ndarray, times: np.ndarray, *, well: int,
     noise: float,
-) -> pd.DataFrame:
+) -> pd.DataFrame:  # fmt: skip
     """The probability that a well has been left by each of some times; returns to it are not counted.
 
     Parameters
@@ -390,13 +386,9 @@ def early_warning(
 
 
 def _bias(
-    values: np.ndarray,
-    noise: float,
-    t: np.ndarray,
-    x: np.ndarray,
-    first: np.ndarray,
+    values: np.ndarray, noise: float, t: np.ndarray, x: np.ndarray, first: np.ndarray,
     generator: np.random.Generator,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Mean error of coefficients that are fitted to a record which stays in its state, shape ``(p,)``.
 
     Restoring forces come out too strong: a little from any finite record, since a step depends on the noise

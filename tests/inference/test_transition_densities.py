@@ -32,15 +32,23 @@ def double_well(
     least: float = 1.0,
     unit: float = 1.0,
     samples: int = 100,
+    exposed: bool = False,
     seed: int = 1,
 ) -> SnapshotPairs:
-    """Records of ``dx = (x - x³) dt + √(ε (least + bent x²)) dW``, a hundred steps between two samples."""
+    """Records of ``dx = (x - x³) dt + √(ε (least + bent x²)) dW``, a hundred steps between two samples.
+
+    Samples are states, or means since the last one.
+    """
     draw, x, kept = np.random.default_rng(seed), np.linspace(-1.5, 1.5, 200), []
     for _ in range(samples + 1):
         kept.append(unit * x)
+        total = np.zeros_like(x)
         for _ in range(WITHIN):
             kick = np.sqrt(STRENGTH * (least + bent * x**2) * step / WITHIN) * draw.standard_normal(len(x))
             x = x + (x - x**3) * step / WITHIN + kick
+            total += x / WITHIN
+        if exposed:
+            kept[-1] = unit * total
     states = np.array(kept).T[:, :, None]
     pairs, count = (states[:, :-1].reshape(-1, 1), states[:, 1:].reshape(-1, 1)), samples * len(x)
     return SnapshotPairs(*pairs, np.full(count, step), np.repeat(np.arange(len(x)), samples))
@@ -109,6 +117,54 @@ def test_densities_behind_a_sensor_are_those_of_a_kalman_filter() -> None:
         assert one == pytest.approx(other, abs=0.003)
     steep = TransitionDensity(edges, np.full(239, 1e30), np.full(239, INTENSITY), np.full(240, INTENSITY))
     assert np.isnan(steep.foreseen(np.zeros(2), np.zeros(2), np.full(2, h), begins[:2], noise)[0]).all()
+
+
+@pytest.mark.parametrize("share", [1.0, 0.4])
+def test_densities_of_means_are_those_of_a_kalman_filter(share: float) -> None:
+    """Of a linear force state and integral are jointly normal: van Kampen, Stochastic Processes, VIII.1."""
+    draw, noise, h, n = np.random.default_rng(4), 0.1, 0.6, 300
+    time = share * h
+    kept, gone = np.exp(-RATE * time), (1 - np.exp(-RATE * time)) / RATE
+    spread = INTENSITY / (2 * RATE) * (1 - kept**2)
+    to_both = np.array([[kept], [gone / time]])
+    second = INTENSITY / RATE**2 * (time - 2 * gone + (1 - kept**2) / (2 * RATE)) / time**2
+    shared = INTENSITY / 2 * gone**2 / time
+    both = np.array([[spread, shared], [shared, second + noise**2]])
+    waited = np.exp(-RATE * (h - time))
+    while_waiting = INTENSITY / (2 * RATE) * (1 - waited**2)
+    root, x, seen = np.linalg.cholesky(both), 0.3, []
+    for _ in range(n + 1):
+        x = waited * x + np.sqrt(while_waiting) * draw.standard_normal()
+        x, value = to_both[:, 0] * x + root @ draw.standard_normal(2)
+        seen.append(value)
+    mean, variance, expected = 0.0, 1e6, []
+    for value in seen:
+        joint = to_both * variance @ to_both.T + both
+        ahead, gain = to_both[:, 0] * mean, joint[0, 1] / joint[1, 1]
+        score = (value - ahead[1]) / np.sqrt(joint[1, 1])
+        state = ahead[0] + gain * (value - ahead[1])
+        expected.append((-(score**2) / 2 - np.log(2 * np.pi * joint[1, 1]) / 2, score, state))
+        left = joint[0, 0] - gain * joint[0, 1]
+        mean, variance = waited * state, waited**2 * left + while_waiting
+    edges, seen = np.linspace(-3, 3, 241), np.array(seen)
+    density = TransitionDensity(edges, -RATE * edges[1:-1], np.full(239, INTENSITY), np.full(240, INTENSITY))
+    ends = seen[:-1], seen[1:], np.full(n, h), np.arange(n) == 0, noise
+    for one, other in zip(density.foreseen(*ends, exposure=time), np.transpose(expected[1:]), strict=True):
+        assert one == pytest.approx(other, abs=0.006)
+
+
+def test_f_and_d_are_found_of_means_over_such_steps() -> None:
+    pairs = behind_sensor(double_well(0.5, samples=8, exposed=True), 0.1)
+    found = Transitions(identified(pairs), pairs).identified_behind_sensor(exposure=0.5, false_terms=0.01)
+    assert found is not None and found.exposure == 0.5
+    terms, noise = terms_of(found), found.constant_noise
+    assert set(terms) == {"x", "x**3"} and noise is not None and found.diagnosis is not None
+    for value, error, true in (
+        *((*terms[name], true) for name, true in (("x", 1.0), ("x**3", -1.0))),
+        (found.noise_rate[0, 0], noise.standard_errors[0], STRENGTH),
+    ):
+        assert abs(value - true) < 3.5 * error < 0.5 * abs(true)
+    assert found.diagnosis.measurement[0] == pytest.approx(0.1, rel=0.25)
 
 
 @pytest.mark.parametrize("noise", [0.1, 0.3])

@@ -60,13 +60,9 @@ WORDS = {
 
 @drawn_to_be_read
 def plot_before_after(
-    table: pd.DataFrame,
-    *,
-    after: str,
-    noise: Mapping[str, float] | None = None,
-    units: Mapping[str, str] | None = None,
-    time_unit: str = "1",
-) -> Figure | None:
+    table: pd.DataFrame, *, after: str, noise: Mapping[str, float] | None = None,
+    units: Mapping[str, str] | None = None, time_unit: str = "1",
+) -> Figure | None:  # fmt: skip
     """Draw the held-out recording that differs most, with the simulation before and after.
 
     The course stands above, simulation minus recording below. `after` is the simulation that the verdict ends
@@ -299,13 +295,9 @@ SIMULATED: dict[str, dict[str, Any]] = {
 
 
 def plot_diagnosis(
-    diagnosis: Diagnosis,
-    *,
-    output: str | None = None,
-    recording: str | None = None,
-    legend: bool = True,
+    diagnosis: Diagnosis, *, output: str | None = None, recording: str | None = None, legend: bool = True,
     ax: Axes | None = None,
-) -> Axes:
+) -> Axes:  # fmt: skip
     """Draw a recording that was held out, and the simulation before and after.
 
     Main arguments
@@ -539,14 +531,9 @@ def _limits_of(curves: Iterable[pd.DataFrame]) -> tuple[float, float]:
 
 @drawn_to_be_read
 def plot_missing(
-    points: np.ndarray,
-    missing: Mapping[str, np.ndarray],
-    *,
-    names: tuple[str, str],
-    units: Mapping[str, str] | None = None,
-    time_unit: str = "1",
-    source: str = "",
-) -> Figure | None:
+    points: np.ndarray, missing: Mapping[str, np.ndarray], *, names: tuple[str, str],
+    units: Mapping[str, str] | None = None, time_unit: str = "1", source: str = "",
+) -> Figure | None:  # fmt: skip
     """Draw the missing part of equations over a plane of the state space, given by the `names` of two states.
 
     At points ``(n, 2)`` of the plane `missing` is what must be added to each equation, shape ``(n,)`` each.

@@ -43,13 +43,9 @@ ACCURACY = 0.01  # of an integrator's step, times the norm of the Jacobian
 
 
 def plot_residuals(
-    found: Landscape | Diagnosis,
-    recordings: Recordings | None = None,
-    *,
-    state: str | None = None,
-    legend: bool = True,
-    ax: Axes | None = None,
-) -> Axes:
+    found: Landscape | Diagnosis, recordings: Recordings | None = None, *, state: str | None = None,
+    legend: bool = True, ax: Axes | None = None,
+) -> Axes:  # fmt: skip
     """Draw what a vector field leaves of the recordings: noise about zero, if nothing is missing.
 
     Main arguments

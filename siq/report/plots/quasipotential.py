@@ -98,13 +98,9 @@ def _lowest_behind(landscape: LandscapeSummary, grid: np.ndarray, rest: list[int
 
 
 def _descend(
-    potential: Callable[[np.ndarray], np.ndarray],
-    best: np.ndarray,
-    lowest: np.ndarray,
-    known: np.ndarray,
-    place: int,
-    size: float,
-) -> None:
+    potential: Callable[[np.ndarray], np.ndarray], best: np.ndarray, lowest: np.ndarray, known: np.ndarray,
+    place: int, size: float,
+) -> None:  # fmt: skip
     """Move points along one state to the lowest place of a parabola, where U really is lower there."""
     middle, centre = lowest[known].copy(), best[known].copy()
     sides = []
@@ -157,14 +153,10 @@ RECORDED: dict[str, Any] = {
 
 
 def plot_quasipotential(
-    landscape: Landscape | LandscapeSummary,
-    *,
-    recordings: Recordings | None = None,
-    states: Sequence[str] | None = None,
-    view: View = "projection",
-    legend: bool = True,
+    landscape: Landscape | LandscapeSummary, *, recordings: Recordings | None = None,
+    states: Sequence[str] | None = None, view: View = "projection", legend: bool = True,
     ax: Axes | None = None,
-) -> Axes:
+) -> Axes:  # fmt: skip
     """Draw U with its wells, saddles and most probable paths, and the recorded states.
 
     Main arguments

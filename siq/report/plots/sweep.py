@@ -36,16 +36,10 @@ OUTLINED = (withStroke(linewidth=2.4, foreground=BLACK),)  # seen on the dark an
 
 @drawn_in_style
 def plot_sweep(
-    table: pd.DataFrame,
-    branches: pd.DataFrame,
-    bifurcations: pd.DataFrame,
-    *,
-    parameters: Sequence[str],
-    states: Sequence[str],
-    units: Mapping[str, str] | None = None,
-    state: str | None = None,
+    table: pd.DataFrame, branches: pd.DataFrame, bifurcations: pd.DataFrame, *, parameters: Sequence[str],
+    states: Sequence[str], units: Mapping[str, str] | None = None, state: str | None = None,
     curves: pd.DataFrame | None = None,
-) -> Figure:
+) -> Figure:  # fmt: skip
     """Draw a sweep.
 
     Parameters

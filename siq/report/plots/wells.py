@@ -50,13 +50,9 @@ COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY_BLUE)
 
 
 def plot_wells(
-    landscape: Landscape | LandscapeSummary,
-    *,
-    recordings: Recordings | None = None,
-    states: Sequence[str] | None = None,
-    legend: bool = True,
-    ax: Axes | None = None,
-) -> Axes:
+    landscape: Landscape | LandscapeSummary, *, recordings: Recordings | None = None,
+    states: Sequence[str] | None = None, legend: bool = True, ax: Axes | None = None,
+) -> Axes:  # fmt: skip
     """Draw which recorded states belong to which well, and how far each well reaches.
 
     Main arguments
