@@ -200,20 +200,22 @@ class _Case:
         regress = partial(identify_vector_field, self.library, options=self.options, integrator_step=step)
         if not carries_noise(self.library, training, options=self.options, integrator_step=step):
             return self._finished_by_pairs(regress(training))
+        # Under noise every recording counts: all give the result, a part of them its test.
+        pairs = self._pairs(self.recordings)
         if step is None and (memory := self.memory).remembers:
-            for exposure in (*_possible_exposures(memory), None):
-                found = self.by_density(regress(self._pairs(self.recordings)), exposure)
-                if found is not None and self.complete(found):
-                    return found
-                if exposure is None:
-                    break
+            exposures = _possible_exposures(memory)
+            with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
+                plain = regress(pairs)
+                for exposure in (*exposures, None):
+                    found = self.by_density(plain, pairs, exposure)
+                    if found is not None and self.complete(found):
+                        return found
+            for exposure in exposures:
                 unit = Diffusion.identity(self.library.dimension)
                 found = self.by_exposure(ObservationModel(self.library, unit, exposure))
                 if found is not None:
                     return found
             return self.by_instruments(memory)
-        # Under noise every recording counts: all give the result, a part of them its test.
-        pairs = self._pairs(self.recordings)
         found = with_process_noise_rate(regress(pairs), pairs)
         if found.flow.by_density and self.given is None:  # a wrong D would look like a noisy sensor
             found = with_noise_formula(found, pairs, false_terms=self.options.false_terms) or found
@@ -280,7 +282,9 @@ class _Case:
             raise NumericalFailure(reason)
         raise NumericalFailure(f"{tests[claim].reason}; {reason}", claim=claim)
 
-    def by_density(self, found: FieldEstimate, exposure: float | None) -> FieldEstimate | None:
+    def by_density(
+        self, found: FieldEstimate, pairs: SnapshotPairs, exposure: float | None
+    ) -> FieldEstimate | None:
         """By the densities of noisy samples, or of means over an exposure; None where that does not do.
 
         Of one state over coarse steps, from an estimate that takes samples for states.
@@ -288,7 +292,7 @@ class _Case:
         if not found.flow.coarse or self.given is not None:
             return None
         with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
-            given, false_terms = Transitions(found, self._pairs(self.recordings)), self.options.false_terms
+            given, false_terms = Transitions(found, pairs), self.options.false_terms
             behind = given.identified_behind_sensor(exposure=exposure, false_terms=false_terms)
             return None if behind is None else self._finished_by_pairs(behind)
         return None

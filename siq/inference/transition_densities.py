@@ -54,8 +54,9 @@ CELLS_PER_SPREAD = 6  # numerical: of what noise spreads it by in a step; most d
 CELLS_IF_BLURRED = 3  # numerical: the same behind a sensor; estimates are off by 0.03 of their errors
 SLIGHT_NOISE = 1e-3  # numerical: of the least where states were recorded
 BEYOND = 1.5  # spreads by which a state may have been outside of what was recorded
+MUCH_FORGOTTEN = 0.3  # of Jh: a normal law has the variance to 1 % at 0.4, and to 3 to 5 % at 0.8
 LONGEST_EXPOSURE = 1.001  # of a step: no two exposures overlap
-MOST_PRODUCTS = 2e9  # numerical: of a filter along all samples, a second
+MOST_PRODUCTS, DEARER = 2e9, 3  # numerical: of a filter along all samples, a second; of means three
 MOST_STEPS = 24  # of different length: each takes a matrix
 RATES = tuple(2.0 ** np.arange(-2, 5))  # of the noise of residuals, with which a search may begin
 MOST_DENSITY_STEPS, FEW_HALVINGS = 15, 6  # numerical: from a start that is any good a few are enough
@@ -310,7 +311,8 @@ class Transitions:
         self.of_field, self.of_noise = functions(self.x0[None]), shapes(inside.T)
         self.strengths = noise.values if noise else found.noise_rate[0] / self.of_noise.mean(axis=1)
         # Within a step noise spreads the state by √(εD h), or less where f brings it back.
-        back = 1 + 2 * np.abs(found.dynamics.jacobian(inside)[:, 0, 0]) * self.h
+        forgotten = np.abs(found.dynamics.jacobian(inside)[:, 0, 0]) * self.h
+        back, self.forgotten = 1 + 2 * forgotten, float(forgotten.mean())
         least, most = np.quantile(np.sqrt(self.strengths @ self.of_noise * self.h / back), [0.01, 0.99])
         low, high = min(self.x0.min(), self.xh.min()), max(self.x0.max(), self.xh.max())
         aside = min(float(most), (high - low) / 2) * BEYOND
@@ -320,7 +322,7 @@ class Transitions:
             within = float(least) ** 2 * self.exposure / float(np.median(self.h)) / 12
             blur = np.sqrt(np.exp(self.sensor).sum() + within)
             count = min(max(count, int((high - low + 2 * aside) / blur * CELLS_PER_NOISE)), MOST_CELLS)
-            if len(self.h) * count**2 > MOST_PRODUCTS:
+            if len(self.h) * count**2 * (DEARER if self.exposure else 1) > MOST_PRODUCTS:
                 raise NumericalFailure("there are too many samples to follow all that their states may be")
         if count > MOST_CELLS:
             raise NumericalFailure("noise moves some states by a small part of what it moves others by")
@@ -526,8 +528,11 @@ class Transitions:
 
         At whatever share of what moves the state from sample to sample the search begins. Of means over an
         exposure there is an estimate without such noise, too. The `sensor_evidence` of the diagnosis is
-        Schwarz's, but for the sensor.
+        Schwarz's, but for the sensor. Where little is forgotten within a step, and a filter that supposes a
+        normal law does, that is a NumericalFailure.
         """
+        if self.forgotten < MUCH_FORGOTTEN:
+            raise NumericalFailure("steps are so short that the law of what noise does is nearly normal")
         found, pairs, rate = self.found, self.pairs, self.found.noise_rate
         everything = all_coefficients([0], found.library.size)
         base = replace(

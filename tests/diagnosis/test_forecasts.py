@@ -241,6 +241,7 @@ def test_the_density_does_not_depend_on_units_of_columns() -> None:
 # Names
 
 
+@pytest.mark.slow
 def test_damping_is_named_beside_forces_that_last() -> None:
     model, data = pendulum(), recorded(0.15, 0.2)
     context = context_of(model, data)

@@ -68,6 +68,7 @@ def test_its_noise_is_told_from_the_state() -> None:
     assert view.sensor_time == time and view.gain(found, recordings, pair_step=None) > 10
 
 
+@pytest.mark.slow
 def test_a_sensor_with_white_noise_has_none() -> None:
     found = identified(recorded("white")[0])
     assert found.slow_sensor is None and found.sensor_variance is not None

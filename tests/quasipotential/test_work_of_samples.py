@@ -90,7 +90,13 @@ def test_samples_between_wells_agree_with_an_f_of_the_library() -> None:
     assert np.sqrt(np.mean(np.square(scores))) < 1.5
 
 
-@pytest.mark.parametrize("force", [lambda x: np.tanh(6 * x) - x, lambda x: x - x**3], ids=["edge", "cubic"])
+@pytest.mark.parametrize(
+    "force",
+    [
+        pytest.param(lambda x: np.tanh(6 * x) - x, marks=pytest.mark.slow, id="edge"),
+        pytest.param(lambda x: x - x**3, id="cubic"),
+    ],
+)
 def test_a_function_of_a_state_that_f_lacks_shows_among_several_states(
     force: Callable[[np.ndarray], np.ndarray],
 ) -> None:
