@@ -78,6 +78,7 @@ from siq.inference.transition_densities import Transitions
 from siq.numerics.randomness import Purpose, positive
 from siq.remarks import Remark, sentence
 from siq.systems.diffusion import Diffusion
+from siq.systems.formulas import compile_formulas
 
 SUSPECT_SCORE = -1.0  # standard errors of the correlation of neighbouring residuals
 SENSOR_SHARE = 0.1  # of what means move by: a search finds its way down to no sensor noise, but not up
@@ -588,20 +589,32 @@ class _Case:
         return None
 
     def with_parts(self, found: FieldEstimate) -> FieldEstimate:
-        """f of several states, tested: parts of each may explain no more of its residuals than chance."""
-        regular = found.diffusion.regular and found.library.dimension > 1
+        """f, tested: parts of each state may explain no more of its residuals than chance.
+
+        Of several states; or of one over coarse steps, where parts may explain no more of the squares either.
+        Of one over short steps paths of least action are asked (`siq.quasipotential.transitions`).
+        """
+        coarse = found.flow.by_density
+        regular = found.diffusion.regular and (found.library.dimension > 1 or coarse)
         if found.noise_free or found.memory is not None or not regular or found.prediction is None:
             return found
         pairs = found.wrapped(self._pairs(self._states(found)))
         rest = process_noise_increments(found, pairs, residuals(found, pairs))
         rest = np.einsum("nij,nj->ni", found.diffusion.whitening_at(found.on_the_way(pairs)), rest)
-        known = found.library.evaluate(pairs.x0)[:, np.unique(found.support[:, 1])]
-        known = np.column_stack([np.ones(len(rest)), known]) * np.sqrt(pairs.h)[:, None]
-        known = np.linalg.qr(known / positive(np.linalg.norm(known, axis=0)))[0]
-        columns = pairs.state_parts(STATE_BINS) * np.sqrt(pairs.h)[:, None]
-        columns = columns - known @ (known.T @ columns)
-        freedom = len(rest) - known.shape[1]
-        chance = unexplained_probability(columns, rest, freedom=freedom, inflation=pairs.copies)
+        weight, terms = np.sqrt(pairs.h)[:, None], np.unique(found.support[:, 1])
+        known = np.column_stack([np.ones(len(rest)), found.library.evaluate(pairs.x0)[:, terms]])
+        asked = [(known * weight, pairs.state_parts(STATE_BINS) * weight, rest)]
+        if coarse:
+            shapes = compile_formulas(() if found.noise is None else found.noise.terms, found.library.symbols)
+            strength = np.column_stack([np.ones(len(rest)), *shapes(pairs.x0.T)])
+            asked.append((strength, pairs.state_parts(STATE_BINS) * 1.0, rest**2 / (rest**2).mean() - 1))
+        chances = []
+        for known, columns, values in asked:
+            known = np.linalg.qr(known / positive(np.linalg.norm(known, axis=0)))[0]
+            columns = columns - known @ (known.T @ columns)
+            freedom = len(rest) - known.shape[1]
+            chances.append(unexplained_probability(columns, values, freedom=freedom, inflation=pairs.copies))
+        chance = min(min(chances) * len(chances), 1.0)
         return found.with_shape_tested(chance, limit=self.limits.each, along="state")
 
     def _states(self, found: FieldEstimate) -> Recordings:
