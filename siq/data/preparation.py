@@ -244,8 +244,8 @@ def without_faults(recordings: Recordings) -> Recordings:
     most such faults last one sample only. Where more than a few such steps do not lead back, the state
     itself jumps, and nothing is left out. A hum is a line in the spectrum of the steps that keeps its
     amplitude and its phase in every quarter of a recording, and that hardly moves the state; at 50 or 60 Hz,
-    or a multiple, it may be as slight as it likes. What has the period of a day or of a year, and is alike in
-    each, is the weather's.
+    and up to four times that, it may be as slight as it likes. Of each state four such lines are taken off at
+    most. What has the period of a day or of a year, and is alike in each, is the weather's.
     """
     if noise_floors(recordings) is None:
         return recordings
@@ -286,11 +286,12 @@ def without_faults(recordings: Recordings) -> Recordings:
             found.values[:, state] -= season
             values = {"column": found.titles[state], "period": name, "range": float(np.ptp(season))}
             remarks.append(Remark("data.season_taken_off", {**values, "unit": found.units[state]}))
-    driven = [place for place, floor in enumerate(noise_floors(found) or ()) if floor.process]
-    for state in np.repeat(driven, MOST_HARMONICS):
-        hum, period = _hum_of(found, found.values[:, state])
-        amplitude = float(np.sqrt(2) * hum.std())
-        if amplitude > (resolution_step(found.values[:, state]) or 0.0):
+    for state in [place for place, floor in enumerate(noise_floors(found) or ()) if floor.process]:
+        for _ in range(MOST_HARMONICS):
+            hum, period = _hum_of(found, found.values[:, state])
+            amplitude = float(np.sqrt(2) * hum.std())
+            if not amplitude > (resolution_step(found.values[:, state]) or 0.0):
+                break
             found.values[:, state] -= hum
             told = {"column": found.titles[state], "period": period, "amplitude": amplitude}
             units = {"unit": found.units[state], "time_unit": found.time_unit}
@@ -458,12 +459,13 @@ def _hum_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, flo
     if not parts:
         return nothing, 0.0
     width = np.pi / max(float(np.ptp(recordings.t[part])) for part in parts)
-    for harmless in (HARMLESS_LINE, 0.0):
+    seconds = _seconds_of(recordings)
+    for harmless in (HARMLESS_LINE, 0.0) if seconds else (HARMLESS_LINE,):
         period = change_of(recordings, steps, np.zeros(len(steps), dtype=int), harmless=harmless)
         if period is None or not np.isfinite(period):
             continue
         about = 2 * np.pi / (period * usual_step(recordings))
-        hertz = about / (2 * np.pi * (_seconds_of(recordings) or np.inf))
+        hertz = about / (2 * np.pi * (seconds or np.inf))
         if harmless or (np.abs(hertz / MAINS - 1) < max(MAINS_VARY, width / about)).any():
             break
     else:

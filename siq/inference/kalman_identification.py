@@ -393,26 +393,20 @@ def filtered_recordings(
     Velocities that were not measured are among them. Their increments have the mean of f, as those of the
     states do; those of the measured values do not.
     """
-    if found.flow.by_density:
-        runs = [one for one in runs_of(recordings, longest=pair_step) if one.stop - one.start > 1]
-        rows = np.concatenate([np.arange(one.start, one.stop) for one in runs])
-        kept = replace(
-            recordings,
-            recording=recordings.recording[rows],
-            t=recordings.t[rows],
-            values=recordings.values[rows].copy(),
-        )
-        later = np.flatnonzero(np.isin(rows, [one.start for one in runs], invert=True))
-        kept.values[later, 0] = Transitions(found, snapshot_pairs(recordings, pair_step=pair_step)).states()
-        return kept
     observation = ObservationModel.of(found)
-    data = observation.measured(recordings, pair_step)
     count = observation.library.dimension - observation.hidden_states
-    model, noise = observation.model(*observation.unknown(found)), observation.noise_of(found)
-    follow = observation.followed(data, model, noise=noise, substeps=found.flow.steps)
     runs, every = runs_of(recordings, longest=pair_step), observation.every(recordings)
+    if found.flow.by_density:  # of each run the first value is all that is known of its state
+        runs = [run for run in runs if run.stop - run.start > 1]
     rows = np.concatenate([np.arange(run.start, run.stop, every) for run in runs])
-    states = follow.linearised_at[~np.isnan(data.outputs).all(axis=1)]
+    if found.flow.by_density:
+        later, states = np.isin(rows, [run.start for run in runs], invert=True), recordings.values[rows]
+        states[later, 0] = Transitions(found, snapshot_pairs(recordings, pair_step=pair_step)).states()
+    else:
+        data = observation.measured(recordings, pair_step)
+        model, noise = observation.model(*observation.unknown(found)), observation.noise_of(found)
+        follow = observation.followed(data, model, noise=noise, substeps=found.flow.steps)
+        states = follow.linearised_at[~np.isnan(data.outputs).all(axis=1)]
     seen = replace(
         recordings,
         recording=recordings.recording[rows],

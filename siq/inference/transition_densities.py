@@ -8,7 +8,8 @@ pairs, by steps of the sum of squares of single scores; terms are chosen by thes
 Behind a noisy sensor a pair shows two states and the noise of both. Then the density is that of a measured
 value given all earlier ones of its record: a filter follows what is known of the state from cell to cell, and
 needs neither a straight f nor a normal law, as that of Kalman does. The variance of the sensor is one more
-parameter.
+parameter. A value that is a mean over an exposure is supposed to be normal, given where the state was at both
+ends of it: that is exact of a linear force, and otherwise has the right mean and variance.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ LEAST = 1e-300  # of a probability, so that it has a logarithm
 LEAST_CELLS, MOST_CELLS = 80, 400  # numerical: of the range of a state
 CELLS_PER_NOISE, FEWEST_PER_NOISE = 1.25, 0.6  # numerical: of a sensor's, to begin with, and at least
 CELLS_PER_SPREAD = 6  # numerical: of what noise spreads it by in a step; most densities are right to 1 %
-CELLS_IF_BLURRED = 3  # numerical: the same behind a sensor; estimates are off by 0.03 of their errors
+CELLS_IF_BLURRED = 3  # numerical: the same behind a sensor; 0.03 errors, of four double wells
 SLIGHT_NOISE = 1e-3  # numerical: of the least where states were recorded
 BEYOND = 1.5  # spreads by which a state may have been outside of what was recorded
 MUCH_FORGOTTEN = 0.3  # of Jh: a normal law has the variance to 1 % at 0.4, and to 3 to 5 % at 0.8
@@ -479,6 +480,7 @@ class Transitions:
         whole = Transitions(found, self.pairs)
         place, axes = whole.start
         now = whole.densities(place)
+        # Once more, along axes that are independent: those of short steps are not, and differences inexact.
         axes = axes @ np.linalg.pinv(np.linalg.qr(whole.scored(place, axes, now), mode="r"))
         scores = whole.scored(place, axes, now) @ np.linalg.pinv(axes)
         statistic = _explained(scores)
@@ -545,7 +547,7 @@ class Transitions:
             seen = NoiseDiagnosis(
                 "process", float(rate[0, 0]), np.eye(1), 0.0, 0.0, deviation, exposure=exposure
             )
-            for kept in (1.0, 1 - share):
+            for kept in (1.0, 1 - share) if share else (1.0,):
                 start = replace(base, diagnosis=seen, noise_rate=kept * rate)
                 tried.append((Transitions(start, pairs).log_likelihood, start))
         best = max(tried, key=lambda one: one[0])[1]
