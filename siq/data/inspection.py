@@ -26,7 +26,7 @@ from siq.data.correlation import (
     rounding_error,
 )
 from siq.data.preparation import ANGLES, turns_back, unusual, without_faults
-from siq.data.recordings import LONGEST_STEP, SINGLE_RECORDING_REMEDY, Recordings
+from siq.data.recordings import SINGLE_RECORDING_REMEDY, Recordings, longest_step
 from siq.data.states import RecordStates, switching
 from siq.numerics.randomness import positive
 from siq.remarks import Remark, sentence
@@ -229,7 +229,7 @@ def inspect(
     first = np.cumsum(counts) - counts
     gaps = np.diff(recordings.t)[np.diff(recordings.recording) == 0]
     steps = _span(gaps) if len(gaps) else None
-    near = 0 if steps is None else int((gaps <= LONGEST_STEP * steps.usual * (1 + 1e-6)).sum())
+    near = 0 if steps is None else int((gaps <= longest_step(gaps) * (1 + 1e-6)).sum())
     states = []
     floors = noise_floors(recordings) or (None,) * len(recordings.names)
     columns = zip(

@@ -239,13 +239,14 @@ def without_faults(recordings: Recordings) -> Recordings:
     """Recordings less what the system did not do.
 
     Values that were filled in and samples that stand apart are left out, day and year and the hum of mains
-    taken off. A sample stands apart whose steps from the last and to the next are both larger than noise
-    makes one in all of the record, and lead back to where it came from; so do several of one value, where
-    most such faults last one sample only. Where more than a few such steps do not lead back, the state
-    itself jumps, and nothing is left out. A hum is a line in the spectrum of the steps that keeps its
-    amplitude and its phase in every quarter of a recording, and that hardly moves the state; at 50 or 60 Hz,
-    and up to four times that, it may be as slight as it likes. Of each state four such lines are taken off at
-    most. What has the period of a day or of a year, and is alike in each, is the weather's.
+    taken off. A sample stands apart whose steps from the last and to the next are larger than noise makes one
+    in all of the record, or one of them and the other nearly, and lead back to where it came from; so do two
+    samples together, and several of one value, where most such faults last one sample only. Where more than a
+    few such steps do not lead back, the state itself jumps, and nothing is left out. A hum is a line in the
+    spectrum of the steps that keeps its amplitude and its phase in every quarter of a recording, and that
+    hardly moves the state; at 50 or 60 Hz, and up to four times that, it may be as slight as it likes. Of
+    each state four such lines are taken off at most. What has the period of a day or of a year, and is alike
+    in each, is the weather's.
     """
     if noise_floors(recordings) is None:
         return recordings
@@ -262,15 +263,23 @@ def without_faults(recordings: Recordings) -> Recordings:
         usual = np.repeat([np.median(one) for one in blocks], [len(one) for one in blocks])
         scale = np.maximum(usual, np.median(usual)) / special.ndtri(0.75)
         largest = -special.ndtri(FALSE_FAULT_RATE / 2 / len(steps)) * scale
-        large = np.abs(steps) > largest
-        alone = large[:-1] & large[1:] & (np.abs(steps[:-1] + steps[1:]) <= largest[1:])
+        size, large = np.abs(steps), np.abs(steps) > largest
+        # One step may be just too short to be large; and a fault may follow another.
+        either = np.maximum(size[:-1], size[1:]) > largest[1:]
+        both = np.minimum(size[:-1], size[1:]) > largest[1:] / 2
+        alone = either & both & (np.abs(steps[:-1] + steps[1:]) <= largest[1:])
+        back = np.abs(steps[:-2] + steps[1:-1] + steps[2:]) <= largest[1:-1]
+        pair = large[:-2] & large[2:] & back & ~alone[:-1] & ~alone[1:]
+        alone[:-1] |= pair
+        alone[1:] |= pair
         if 2 * (alone & (lasts[1:-1] == 1)).sum() < alone.sum():
             alone &= lasts[1:-1] == 1
         left_out = np.repeat(np.r_[False, alone, False], lasts)
         numbers, times = np.unique(recordings.values[left_out, state], return_counts=True)
         if alike := times.max(initial=0) > max(times.sum() / 2, 1):  # what lies between two of them is right
             left_out &= recordings.values[:, state] == numbers[np.argmax(times)]
-        jumps, count = int(large.sum()) - 2 * int(alone.sum()), int(left_out.sum())
+        jumps = int((large & ~(np.r_[alone, False] | np.r_[False, alone])).sum())
+        count = int(left_out.sum())
         most = (MOST_ALIKE if alike else MOST_APART) * len(recordings.t)
         few = jumps <= FEW_JUMPS * alone.sum() and 0 < count <= most
         # What jumps where there is no noise was measured; large faults would hide the noise.
@@ -433,7 +442,9 @@ def _season_of(recordings: Recordings, values: np.ndarray, name: str) -> np.ndar
     each = []  # amplitudes in single periods
     for part in np.split(np.arange(len(values)), same) if len(harmonics) else ():
         turn = (phase[part] - phase[part[0]]) // (2 * np.pi)
-        for rows in np.split(part, np.flatnonzero(np.diff(turn)) + 1):
+        periods = np.split(part, np.flatnonzero(np.diff(turn)) + 1)
+        # How recordings begin may be alike in all of them, and is no season.
+        for rows in periods if len(same) == 0 else periods[1:]:
             if len(rows) > 0.8 * samples:
                 waves = np.exp(1j * np.outer(phase[rows], harmonics))
                 line = np.vander(np.linspace(-1, 1, len(rows)), 2)

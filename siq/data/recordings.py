@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 TABLE = "the table"  # what messages call what is in no file
 LONGEST_STEP = 1.5  # of the median step: a missing sample makes two of it, jitter rarely a half more
+UNEVEN_SHARE = 0.1  # of all steps, up to twice as long as the longest: samples come as they come (a choice)
 HELD_OUT_SHARE = 0.2
 FAR = 10.0  # half ranges from the origin within which powers are alike for other reasons
 ROUNDED_TURN = 1e-6  # of a period, by which a wrapped angle may exceed it
@@ -397,17 +398,21 @@ class SnapshotPairs:
 
     def state_parts(self, parts: int) -> np.ndarray:
         """Whether pairs begin in each of so many equal parts by a state but its first: ``(n, columns)``."""
-        columns = []
-        for state in self.x0.T:
-            edges = np.unique(np.quantile(state, np.linspace(0, 1, parts + 1)[1:-1]))
-            part = np.searchsorted(edges, state, side="right")
-            columns.append(part[:, None] == np.arange(1, len(edges) + 1))
-        return np.concatenate(columns, axis=1)
+        return np.concatenate([_in_parts(state, parts) for state in self.x0.T], axis=1)
+
+    def step_parts(self, parts: int) -> np.ndarray:
+        """Whether steps are in each of so many equal parts by length but the first: ``(n, columns)``."""
+        return _in_parts(np.round(self.h / np.median(self.h), 2), parts)
 
     def take(self, rows: np.ndarray | slice) -> SnapshotPairs:
         """Some of the pairs, by their indices or by a mask."""
         parts = self.x0[rows], self.xh[rows], self.h[rows], self.recording[rows]
         return SnapshotPairs(*parts, copies=self.copies)
+
+
+def _in_parts(values: np.ndarray, parts: int) -> np.ndarray:
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, parts + 1)[1:-1]))
+    return np.asarray(np.searchsorted(edges, values, side="right")[:, None] == np.arange(1, len(edges) + 1))
 
 
 class StreamedPairs:
@@ -421,7 +426,7 @@ class StreamedPairs:
     path
         A Parquet file with the columns ``t``, the states, and ``recording`` where there are several.
     pair_step
-        See `snapshot_pairs`; by default from the median step of the first block.
+        See `snapshot_pairs`; by default from the steps of the first block.
     rows
         Samples in a block.
 
@@ -442,7 +447,7 @@ class StreamedPairs:
         count, squares = 0, np.zeros(len(self.names))
         for block in self.blocks():
             if self.pair_step is None:
-                self.pair_step = LONGEST_STEP * float(np.quantile(block.h, 0.5, method="lower"))
+                self.pair_step = longest_step(block.h)
             count, squares = count + len(block), squares + block.mean_square_speed * len(block)
         self._count, self.mean_square_speed, self._wanted = count, squares / max(count, 1), np.array([])
 
@@ -573,6 +578,21 @@ def write_recordings(path: str | Path, recordings: Recordings) -> None:
         parquet.write_table(table, partial, compression="zstd", use_dictionary=["recording"])
 
 
+def longest_step(steps: np.ndarray) -> float:
+    """The longest of the times between neighbouring samples, ``(n,)``, that is no gap.
+
+    It is `LONGEST_STEP` median steps, and twice as long as often as this takes in `UNEVEN_SHARE` of all:
+    where clouds hide every other image, or samples are taken as they come, long steps are no gaps.
+    """
+    # Of the two middle ones the shorter: pairs with gaps between them have about as many of either.
+    longest = LONGEST_STEP * float(np.quantile(steps, 0.5, method="lower"))
+    while True:
+        longer = np.sum((steps > longest * (1 + 1e-6)) & (steps <= 2 * longest * (1 + 1e-6)))
+        if not longer - np.sqrt(longer) >= max(UNEVEN_SHARE * len(steps), 1):  # of few steps one may be a gap
+            return longest
+        longest *= 2
+
+
 def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) -> SnapshotPairs:
     """Pair every sample with the next one of the same recording.
 
@@ -581,7 +601,7 @@ def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) ->
     recordings
         The trajectories.
     pair_step
-        The longest gap that still makes a pair, in the unit of `t`; by default `LONGEST_STEP` median steps.
+        The longest gap that still makes a pair, in the unit of `t`; by default that of `longest_step`.
         This is a limit, not the step h of the pairs, of which each has its own.
 
     Raises
@@ -595,8 +615,7 @@ def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) ->
     gap = np.diff(t)
     keep = recording[1:] == recording[:-1]
     if pair_step is None and keep.any():
-        # Of the two middle ones the shorter: pairs with gaps between them have about as many of either.
-        pair_step = LONGEST_STEP * float(np.quantile(gap[keep], 0.5, method="lower"))
+        pair_step = longest_step(gap[keep])
     if pair_step is not None:
         # Times such as 0.1·k, or seconds since 1970, carry rounding errors into their differences.
         keep &= gap <= pair_step * (1 + 1e-6) + 2 * np.spacing(np.abs(t[1:]))

@@ -182,9 +182,9 @@ def _valleys(
     every = -(-len(values) // MOST_POINTS)
     parts: list[list[np.ndarray]] = [[] for _ in runs]
     for one, relaxation in zip(values.T, relaxations, strict=True):
-        # Levels of a digitiser are no peaks, which bins that are as narrow would make of them.
+        # Levels of a digitiser are no peaks, which bins make of them that hold one level or two by turns.
         step = resolution_step(one) if len(np.unique(one)) >= FEWEST_VALUES else None
-        if step is not None and BINS * step > np.ptp(one):
+        if step is not None:
             one = one + step * (generator.random(len(one)) - 0.5)
         # As it is, and less a straight line in every stretch, the last of a run longer: slow hops need the
         # one, quick hops over a drift the other.

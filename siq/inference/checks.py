@@ -49,6 +49,9 @@ CHANCE_TESTS = (  # of a certificate: those that chance can refuse
     "record",
 )  # fmt: skip
 UNPREDICTED = "f does not predict held-out recordings"
+FEWEST_FOR_LAW = 200  # samples, that tell how a sensor's noise depends on what it shows
+FALSE_LAW_RATE = 1e-3  # probability with which noise that is the same everywhere is taken for another
+SHARED_SAMPLES = 4  # neighbours whose residuals have samples in common with those of one
 STATE_BINS = 12  # of each state: any function of it is seen as a value in each
 
 
@@ -149,6 +152,52 @@ def correlations_between(first: np.ndarray, second: np.ndarray) -> tuple[np.ndar
     product = first * second
     size = np.sqrt((first**2).mean(axis=0) * (second**2).mean(axis=0))
     return product.mean(axis=0) / size, product.sum(axis=0) / np.sqrt((product**2).sum(axis=0))
+
+
+def sensor_law(found: FieldEstimate, sample: SnapshotPairs) -> np.ndarray | None:
+    """How the variance of each sensor's noise depends on what it shows; None where it does not.
+
+    Of counts it grows with them, of a gain that is noisy with their square. Residuals r of f about the sample
+    y_k in the middle share its noise, so that ``E[-r_k r_{k+1}] = F'(y_k) E[R(y_k)]``, whatever process noise
+    does. R is a quadratic of y_k, or linear, by instrumental variables: the samples before and behind these
+    residuals, whose noise is none of theirs (Reiersøl 1945). Chance is allowed for by covariances of as many
+    neighbours as have samples in common (Newey and West 1987).
+
+    Returns
+    -------
+    numpy.ndarray or None
+        Coefficients of 1, y and y² in units of the mean variance, shape ``(m, 3)``.
+    """
+    rest = residuals(replace(found, flow=replace(found.flow, by_density=False)), sample)
+    joined = _joined(sample, rest)
+    at = np.flatnonzero(joined[:-2] & joined[1:-1] & joined[2:]) + 1  # the first of two residuals
+    laws = np.tile([1.0, 0.0, 0.0], (rest.shape[1], 1))
+    rates = np.einsum("nii->ni", found.dynamics.jacobian(sample.x0[at + 1])) * sample.h[at + 1, None]
+    shared = -rest[at] * rest[at + 1] / np.exp(np.minimum(rates, 1.0))
+    for state, one in enumerate(shared.T if len(at) >= FEWEST_FOR_LAW else ()):
+        y = sample.xh[:, state]
+        middle, width, mean = float(y[at].mean()), float(y[at].std()), float(one.mean())
+        if not (width > 0 and mean > 0):
+            continue
+        scaled, first = (y - middle) / width, (sample.x0[:, state] - middle) / width
+        apart, near = (first[at - 1] + scaled[at + 2]) / 2, (first[at] + scaled[at + 1]) / 2
+        powers = np.stack([np.ones(len(at)), scaled[at], scaled[at] * near], axis=1)
+        for count in (3, 2):
+            instruments = apart[:, None] ** np.arange(count)
+            inverse = np.linalg.pinv(instruments.T @ powers[:, :count])
+            known = inverse @ (instruments.T @ one)
+            scores = instruments * (one - powers[:, :count] @ known)[:, None]
+            together = scores.T @ scores
+            for lag in range(1, SHARED_SAMPLES + 1):
+                later = scores[:-lag].T @ scores[lag:]
+                together += (1 - lag / (SHARED_SAMPLES + 1)) * (later + later.T)
+            error = float(np.sqrt(inverse[-1] @ together @ inverse[-1]))
+            if abs(known[-1]) > -scipy.special.ndtri(FALSE_LAW_RATE / 4) * error:
+                line = np.polynomial.Polynomial([-middle / width, 1 / width])
+                law = np.polynomial.Polynomial(known / mean)(line).coef
+                laws[state] = np.append(law, np.zeros(3 - count))
+                break
+    return laws if laws[:, 1:].any() else None
 
 
 def _whitened(found: FieldEstimate, pairs: SnapshotPairs, rest: np.ndarray) -> np.ndarray:

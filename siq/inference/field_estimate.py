@@ -235,6 +235,9 @@ class NoiseDiagnosis:
     #: Standard deviation, correlation time and its standard error of what a sensor adds to its white noise;
     #: None where that is nothing.
     slow_sensor: tuple[float, float, float] | None = None
+    #: Coefficients ``(m, 3)`` of 1, y and y² in the variance of each sensor's noise over its mean; None where
+    #: it is the same everywhere.
+    sensor_law: np.ndarray | None = None
     #: Number of steps from which on the recordings are Markovian, None where they are from sample to sample;
     #: and by how much their correlations delay what forces do (`siq.inference.regression.lost_time`).
     lag: int | None = None
@@ -295,7 +298,7 @@ class NoiseDiagnosis:
     def from_data(cls, data: Mapping[str, Any]) -> NoiseDiagnosis:
         """A diagnosis as `as_data` stored it."""
         known: dict[str, Any] = {name: value for name, value in data.items() if value is not None}
-        for name in {"covariance", "measurement", "measurement_error"} & known.keys():
+        for name in {"covariance", "measurement", "measurement_error", "sensor_law"} & known.keys():
             known[name] = np.array(known[name], dtype=float)
         if "measurement_error" in known:
             known["measurement_error"][np.isnan(known["measurement_error"])] = np.inf

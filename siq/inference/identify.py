@@ -37,6 +37,7 @@ from siq.inference.checks import (
     prediction_errors,
     residual_noise,
     rounding_text,
+    sensor_law,
     unexplained_probability,
 )
 from siq.inference.claims import check_claims
@@ -62,6 +63,7 @@ from siq.inference.kalman_identification import (
     identify_by_likelihood,
 )
 from siq.inference.library import CandidateLibrary, IdentificationOptions, field_library
+from siq.inference.measurements import relative_variance
 from siq.inference.observation import INTERVAL, ObservationModel, inertia_test, moved_by, velocity_names
 from siq.inference.regression import (
     carries_noise,
@@ -86,7 +88,9 @@ MIN_SHARE, MAX_SHARE = 1e-3, 0.45  # of the residuals' variance: a sensor's shar
 WHOLE_STEP_TOLERANCE = 0.05  # of an exposure, as exactly as residuals show it of some thousand samples
 SINGULAR = "the recordings do not determine f; record more, or more often"
 PREDICTED_RECORDINGS = 200  # held-out ones that are predicted: enough for a median
-OF_SENSOR = ("measurement", "measurement_error", "sensor_evidence", "exposure")  # of a diagnosis
+OF_SENSOR = (  # of a diagnosis
+    "measurement", "measurement_error", "sensor_evidence", "exposure", "sensor_law",
+)  # fmt: skip
 UNDECIDED = 2.94  # of a log-likelihood: odds of 19 to 1
 
 
@@ -211,12 +215,14 @@ class _Case:
                     found = self.by_density(plain, pairs, exposure)
                     if found is not None and self.complete(found):
                         return found
-            for exposure in exposures:
-                unit = Diffusion.identity(self.library.dimension)
+            # A sensor's white noise is taken for an exposure, or a memory, in one record of twenty.
+            unit, fits = Diffusion.identity(self.library.dimension), list[FieldEstimate]()
+            for exposure in (*exposures, None) if memory.sensor.any() else exposures:
                 found = self.by_exposure(ObservationModel(self.library, unit, exposure))
-                if found is not None:
+                if found is not None and self.complete(found):
                     return found
-            return self.by_instruments(memory)
+                fits += [found] if found is not None and exposure is not None else []
+            return fits[0] if fits else self.by_instruments(memory)
         found = with_process_noise_rate(regress(pairs), pairs)
         if found.flow.by_density and self.given is None:  # a wrong D would look like a noisy sensor
             found = with_noise_formula(found, pairs, false_terms=self.options.false_terms) or found
@@ -249,8 +255,7 @@ class _Case:
                 return None
         if found.flow.coarse and self.given is None:
             with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
-                given = Transitions(found, pairs)
-                behind = given.identified_behind_sensor(false_terms=self.options.false_terms)
+                behind = self.behind_sensor(found, pairs, None)
                 if behind is None:
                     return None
                 noisy = probability(behind, 1)
@@ -266,6 +271,7 @@ class _Case:
                 again = self.by_likelihood(ObservationModel(self.library, unit), noise)
                 noisy = probability(again, suspect)
                 if noisy > 0.5:
+                    again = self.with_sensor_law(again) or again
                     slow = self.with_slow_noise(again)
                     return slow or self.finished(again).with_rival(found, 1 - noisy)
             except (NumericalFailure, np.linalg.LinAlgError) as error:
@@ -283,6 +289,22 @@ class _Case:
             raise NumericalFailure(reason)
         raise NumericalFailure(f"{tests[claim].reason}; {reason}", claim=claim)
 
+    def with_sensor_law(self, found: FieldEstimate) -> FieldEstimate | None:
+        """By likelihood where the noise of sensors depends on what they show; None where it does not.
+
+        It does where the recordings are likelier so, at Schwarz's price of the further parameters.
+        """
+        pairs = self._pairs(self.recordings)
+        law = sensor_law(found, pairs)
+        if law is None:
+            return None
+        view = replace(ObservationModel.of(found), diffusion=Diffusion.identity(self.library.dimension))
+        with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
+            assert found.diagnosis is not None
+            noise = Noise(found.diagnosis.measurement**2, np.diag(found.noise_rate))
+            return _with_law(found, self.by_likelihood(replace(view, sensor_law=law), noise), pairs)
+        return None
+
     def by_density(
         self, found: FieldEstimate, pairs: SnapshotPairs, exposure: float | None
     ) -> FieldEstimate | None:
@@ -293,19 +315,40 @@ class _Case:
         if not found.flow.coarse or self.given is not None:
             return None
         with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
-            given, false_terms = Transitions(found, pairs), self.options.false_terms
-            behind = given.identified_behind_sensor(exposure=exposure, false_terms=false_terms)
+            behind = self.behind_sensor(found, pairs, exposure)
             return None if behind is None else self._finished_by_pairs(behind)
         return None
+
+    def behind_sensor(
+        self, found: FieldEstimate, pairs: SnapshotPairs, exposure: float | None
+    ) -> FieldEstimate | None:
+        """By densities of noisy samples, whose noise may depend on what is measured; None without any."""
+        behind_sensor = partial(
+            Transitions(found, pairs).identified_behind_sensor,
+            exposure=exposure, false_terms=self.options.false_terms,
+        )  # fmt: skip
+        behind = behind_sensor()
+        law = None if behind is None else sensor_law(behind, pairs)
+        if behind is not None and law is not None:
+            with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
+                again = behind_sensor(law=law)
+                return (_with_law(behind, again, pairs) if again else None) or behind
+        return behind
 
     def by_exposure(self, observation: ObservationModel) -> FieldEstimate | None:
         """By the likelihood of samples that are means over an exposure; None where they are no such means.
 
-        They are such means if nothing is left in the innovations that neighbours share.
+        They are such means if nothing is left in the innovations that neighbours share. Without an exposure
+        they show the state behind noise of the sensor alone.
         """
         try:
             moved, step = moved_by(observation.measured(self.recordings, self.pair_step))
-            found = self.by_likelihood(observation, Noise(SENSOR_SHARE * moved, moved / step))
+            share, driven = (
+                (MAX_SHARE / 2, 1 - MAX_SHARE) if observation.exposure is None else (SENSOR_SHARE, 1)
+            )
+            found = self.by_likelihood(observation, Noise(share * moved, driven * moved / step))
+            if observation.exposure is None:
+                found = self.with_sensor_law(found) or found
         except (NumericalFailure, np.linalg.LinAlgError):
             return None
         assert found.diagnosis is not None
@@ -369,7 +412,12 @@ class _Case:
 
     def _of_sensors(self, noise: NoiseDiagnosis) -> Remark:
         sizes = zip(noise.measurement, self.recordings.titles, strict=True)
-        sensors = [{"size": float(size), "state": name} for size, name in sizes]
+        sensors = [{"size": float(size), "state": name, "along": []} for size, name in sizes]
+        if noise.sensor_law is not None:
+            levels = np.quantile(self.recordings.values, [0.05, 0.95], axis=0)
+            along = noise.measurement * np.sqrt(relative_variance(noise.sensor_law, levels))
+            for place in np.flatnonzero(noise.sensor_law[:, 1:].any(axis=1)):
+                sensors[place]["along"] = np.stack([levels, along], axis=2)[:, place].tolist()
         return Remark("inference.measurement_noise", {"sensors": sensors})
 
     def _of_exposure(self, exposure: float, every: int) -> Remark:
@@ -658,6 +706,15 @@ class _Case:
             f"{said}: set 'identification.hidden_velocities: true', in Python hidden_velocities=True, and the"
             " velocity is a state that was not recorded"
         )
+
+
+def _with_law(found: FieldEstimate, again: FieldEstimate, pairs: SnapshotPairs) -> FieldEstimate | None:
+    """The estimate where the noise of sensors follows a law, if it is likelier than the one without."""
+    one, other = found.diagnosis, again.diagnosis
+    assert one is not None and one.sensor_evidence is not None
+    assert other is not None and other.sensor_evidence is not None and other.sensor_law is not None
+    price = np.count_nonzero(other.sensor_law[:, 1:]) * np.log(len(pairs.h))
+    return again if other.sensor_evidence - one.sensor_evidence > price else None
 
 
 def _possible_exposures(found: MarkovLag) -> list[float]:

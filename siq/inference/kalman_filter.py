@@ -25,7 +25,7 @@ import sympy
 
 from siq.errors import NumericalFailure
 from siq.inference.filter_kernels import carry_linearly, filter_recursion, projected_sums, smooth_backwards
-from siq.inference.measurements import Measurements
+from siq.inference.measurements import Measurements, relative_variance
 from siq.inference.selection import triangle_of
 from siq.numerics.randomness import positive
 from siq.systems.diffusion import Diffusion
@@ -159,6 +159,9 @@ class Linearisation:
     measured_response: np.ndarray
     residual: np.ndarray
     stationary: tuple[int, ...] = ()  #: places of states, see `siq.inference.measurements.Measurements`
+    #: Where the sensor's noise depends on what it shows, outputs are in units of it: ln of its variance there
+    #: over its mean, shape ``(n, m)``.
+    logarithms: np.ndarray | None = None
 
     @property
     def finite(self) -> bool:
@@ -168,7 +171,7 @@ class Linearisation:
 
     def at_rows(self, rows: np.ndarray | slice) -> Linearisation:
         """That of some of the samples."""
-        arrays = [each.name for each in fields(self) if each.name != "stationary"]
+        arrays = [one.name for one in fields(self) if isinstance(getattr(self, one.name), np.ndarray)]
         return replace(self, **{name: getattr(self, name)[rows] for name in arrays})
 
     def filtered(
@@ -199,7 +202,9 @@ class Linearisation:
             np.zeros((0, 3), dtype=np.int64) if places is None else places, places is not None, kept,
         )  # fmt: skip
         found[0][:, :, [1 + self.response.shape[2] + place for place in known]] = 0.0
-        return found
+        if self.logarithms is None:
+            return found
+        return (found[0], found[1] + float(self.logarithms[~np.isnan(self.residual)].sum()), *found[2:])
 
     def smoothed(
         self, first: np.ndarray, step: np.ndarray, noise: Noise, begin: np.ndarray
@@ -286,7 +291,18 @@ def linearise(
         with np.errstate(invalid="ignore"):
             gap[at] = ends.T - x[at + 1]
     residual = data.outputs - np.where(np.isfinite(simulated), simulated, np.inf)
-    found = Linearisation(transition, response, gap, measured, answered, residual, data.stationary)
+    logarithms = None
+    if data.sensor_law is not None:
+        # By what was foreseen, which knows nothing of the sample's own noise.
+        foreseen = x.copy()
+        foreseen[rows + 1] += gap[rows]
+        levels = compiled.outputs(np.ascontiguousarray(foreseen.T), signals, values).T
+        variance = relative_variance(data.sensor_law, levels)
+        residual, logarithms = residual / np.sqrt(variance), np.log(variance)
+        measured, answered = (one / np.sqrt(variance)[:, :, None] for one in (measured, answered))
+    found = Linearisation(
+        transition, response, gap, measured, answered, residual, data.stationary, logarithms
+    )  # fmt: skip
     if noise is None or not answered.any():
         return found
     places = list(without)

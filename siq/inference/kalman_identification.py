@@ -291,7 +291,7 @@ def _estimate(
         "process" if rate.any() else "sensor", strength, rate / strength if strength else unit, correlation,
         score, deviation, deviation * sensor_error / 2,
         intensity_error=error if np.isfinite(error) else None, exposure=observation.exposure,
-        slow_sensor=slow_sensor, sensor_evidence=evidence,
+        slow_sensor=slow_sensor, sensor_evidence=evidence, sensor_law=observation.sensor_law,
     )  # fmt: skip
     if diagnosis.correlated:
         diagnosis = replace(diagnosis, kind="coloured")

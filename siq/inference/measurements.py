@@ -25,6 +25,7 @@ from siq.systems.dynamics import Dynamics, Input, JointExpectation, Parameter, S
 OVERSAMPLING = 16  # of band-limited inputs, between whose dense samples cubics are exact enough
 FOLDS = 4  # of which one is left out at a time: a quarter, as is held out by default
 MIN_STRETCH_SAMPLES = 16  # of a stretch that an initial state and an error can be told from
+LEAST_VARIANCE = 0.05  # of the mean one: a quadratic may vanish where hardly anything was measured (a choice)
 STAIRCASE = 0.25  # of squared changes that go on in the next: none in a staircase, 0.36 of normal ones
 PADDING = 64  # samples by which they are continued, mirrored, so that the ends do not ring
 
@@ -41,6 +42,9 @@ class Measurements:
     #: Variance of each output's noise where it is known, NaN where it is to be estimated, shape ``(m,)``;
     #: None where none is known.
     sensor_noise: np.ndarray | None = None
+    #: Variance of each output's noise as a quadratic of what is measured, in units of its mean: coefficients
+    #: of 1, y and y², shape ``(m, 3)``; None where it is the same everywhere.
+    sensor_law: np.ndarray | None = None
     #: Places of states that begin at zero with every interval, such as a mean over an exposure.
     restarting: tuple[int, ...] = ()
     #: Places of states that nothing but noise moves, and each recording finds as spread as noise leaves them.
@@ -149,6 +153,12 @@ class Measurements:
     def _part(self, rows: Sequence[np.ndarray], **changes: Any) -> Measurements:
         at, first = np.concatenate(rows), np.cumsum([0, *map(len, rows)])
         return replace(self, first=first, t=self.t[at], outputs=self.outputs[at], **changes)
+
+
+def relative_variance(law: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """Variance of sensors' noise over its mean, at levels ``(n, m)``, by a law as in `Measurements`."""
+    found = np.einsum("mk,nmk->nm", law, levels[:, :, None] ** np.arange(3))
+    return np.where(np.isfinite(found), np.maximum(found, LEAST_VARIANCE), 1.0)
 
 
 def course_of_input(t: np.ndarray, u: np.ndarray, interpolation: str) -> scipy.interpolate.PPoly:

@@ -126,7 +126,8 @@ class ObservationModel:
     states, and samples show nothing of them. What is hidden may be a slow force instead, which is added to
     ``dx/dt`` times a factor that is known, `slow_force`; it may follow the state, or has noise alone. Or the
     sensor adds noise with a correlation time of its own, `sensor_time`; the logarithm of its rate is the last
-    parameter.
+    parameter. The variance of white measurement noise may depend on what is measured, by a law as in
+    `siq.inference.measurements.Measurements`.
     """
 
     library: CandidateLibrary
@@ -136,6 +137,7 @@ class ObservationModel:
     slow_force: float = 0.0
     follows: bool = False
     sensor_time: float | None = None
+    sensor_law: np.ndarray | None = None
 
     @classmethod
     def of(cls, found: FieldEstimate) -> ObservationModel:
@@ -143,7 +145,8 @@ class ObservationModel:
         library, slow = found.library, found.slow_force
         follows = bool(slow) and found.coefficients[library.terms.index(library.symbols[0]), 1] != 0
         time = None if found.slow_sensor is None else found.slow_sensor[1]
-        return cls(library, found.diffusion, found.exposure, found.hidden_states, slow, follows, time)
+        law = None if found.diagnosis is None else found.diagnosis.sensor_law
+        return cls(library, found.diffusion, found.exposure, found.hidden_states, slow, follows, time, law)
 
     @property
     def hidden_states(self) -> int:
@@ -204,6 +207,7 @@ class ObservationModel:
         measured value stands there.
         """
         data = unbroken(recordings, pair_step=pair_step, every=self.every(recordings))
+        data = replace(data, sensor_law=self.sensor_law)
         if self.sensor_time is not None or (self.slow_force and not self.follows):
             return replace(data, stationary=(1,))
         if self.exposure is None:
@@ -305,6 +309,7 @@ class ObservationModel:
         if rival is not None:
             view, terms = ObservationModel.of(rival), 1 if rival.noise is None else len(rival.noise.values)
             same, level = view.model(*view.unknown(rival)), view.noise_of(rival)
+            data = replace(data, sensor_law=view.sensor_law)
             other = view.followed(data, same, noise=level, substeps=rival.flow.steps)
             best = max(best, other.restricted_likelihood(data) - (terms - 1) * price)
         gain = whole.restricted_likelihood(data) - best - (1 + self.follows + 1) * price
@@ -333,7 +338,7 @@ def moved_by(data: Measurements) -> tuple[np.ndarray, float]:
 def unbroken(recordings: Recordings, *, pair_step: float | None = None, every: int = 1) -> Measurements:
     """Recordings as measurements of their states, a new one behind every gap; of `every` so many samples one.
 
-    Samples belong together up to the time `pair_step`, by default one and a half median steps.
+    Samples belong together up to the time `pair_step`, by default that of `siq.data.recordings.longest_step`.
     """
     runs = [np.arange(run.start, run.stop, every) for run in runs_of(recordings, longest=pair_step)]
     rows = np.concatenate(runs)

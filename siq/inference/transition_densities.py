@@ -28,6 +28,7 @@ from siq.data.recordings import SnapshotPairs
 from siq.errors import NumericalFailure
 from siq.inference.diffusion_model import DEGREE, HARMLESS_CHANGE, constant_noise
 from siq.inference.field_estimate import FieldEstimate, NoiseDiagnosis, NoiseFormula
+from siq.inference.measurements import relative_variance
 from siq.inference.selection import (
     LinearProblem,
     all_coefficients,
@@ -172,15 +173,16 @@ class TransitionDensity:
         return self._interpolated(scores, places, h)
 
     def foreseen(
-        self, x0: np.ndarray, xh: np.ndarray, h: np.ndarray, begins: np.ndarray, deviation: float, *,
-        exposure: float = 0.0, whole: bool = True,
+        self, x0: np.ndarray, xh: np.ndarray, h: np.ndarray, begins: np.ndarray,
+        deviation: Callable[[np.ndarray], np.ndarray], *, exposure: float = 0.0, whole: bool = True,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
         """The same two of values that a sensor shows with normal noise, given all earlier ones of a record.
 
         A filter on the cells, which where a record `begins` knows its first value alone. The third is the
         mean of the state, once the later value is known, too. All are ``(n,)``, NaN where f is too steep; of
         scores that are not wanted, as they take longest, nothing is said. A value may be a mean over the time
-        `exposure` before it; of a normal law, given where the state was at both of its ends.
+        `exposure` before it; of a normal law, given where the state was at both of its ends. The deviation of
+        the sensor is a function of states, of any shape.
         """
         steps, which = self.distinct(h)
         waiting = np.maximum(steps - exposure, EXPOSED * steps) if exposure else steps
@@ -190,11 +192,10 @@ class TransitionDensity:
         middles = self.first + self.width * (np.arange(len(matrices[0])) + 0.5)
         given = x0, xh, which, begins, np.stack(matrices), middles
         if within is None:
-            logarithms, below, above, means = _filtered(*given, deviation, whole)
+            logarithms, below, above, means = _filtered(*given, deviation(middles), whole)
         else:
-            logarithms, below, above, means = _filtered_means(
-                *given, within[0], within[1], np.sqrt(within[2] + deviation**2), whole
-            )
+            blurred = np.sqrt(within[2] + deviation(within[1]) ** 2)
+            logarithms, below, above, means = _filtered_means(*given, within[0], within[1], blurred, whole)
         low, high = (ndtri(np.clip(one, LEAST, 0.5)) for one in (below, above))
         return logarithms, np.where(below < above, low, -high), means
 
@@ -202,26 +203,26 @@ class TransitionDensity:
 @machine_code
 def _filtered(
     x0: np.ndarray, xh: np.ndarray, which: np.ndarray, begins: np.ndarray, matrices: np.ndarray,
-    middles: np.ndarray, deviation: float, whole: bool,
+    middles: np.ndarray, deviation: np.ndarray, whole: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Log-density of each measured value, probabilities of lower and of higher ones, and the state's mean."""
     logarithms, below, above, means = np.zeros((4, len(xh)))
     share = np.zeros_like(middles)
     for k in range(len(xh)):
         if begins[k]:
-            share = np.exp(-(((x0[k] - middles) / deviation) ** 2) / 2)
+            share = np.exp(-(((x0[k] - middles) / deviation) ** 2) / 2) / deviation
             share = share / share.sum()
         ahead = share @ matrices[which[k]]
         for cell in range(len(middles)):
-            away = (xh[k] - middles[cell]) / deviation
-            share[cell] = ahead[cell] * math.exp(-(away**2) / 2)
+            away = (xh[k] - middles[cell]) / deviation[cell]
+            share[cell] = ahead[cell] * math.exp(-(away**2) / 2) / deviation[cell]
             if not whole:
                 continue
             higher = math.erfc(away / math.sqrt(2.0)) / 2 if abs(away) < FAR else (away < 0) * 1.0
             below[k] += ahead[cell] * (1 - higher)
             above[k] += ahead[cell] * higher
         density = share.sum()
-        logarithms[k] = math.log(max(density, LEAST) / (deviation * math.sqrt(2 * math.pi)))
+        logarithms[k] = math.log(max(density, LEAST) / math.sqrt(2 * math.pi))
         share = share / density if density > LEAST else ahead
         means[k] = (share * middles).sum()
     return logarithms, below, above, means
@@ -346,9 +347,15 @@ class Transitions:
         self, density: TransitionDensity, sensor: np.ndarray, *, whole: bool = True
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """By the sensor's noise, from the logarithm of its variance; cells tell none that is too small."""
-        deviation = float(np.exp(sensor[0] / 2)) if len(sensor) else 0.0
-        if not self.exposure:
-            deviation = max(deviation, FEWEST_PER_NOISE * density.width)
+        size = float(np.exp(sensor[0] / 2)) if len(sensor) else 0.0
+        law = None if self.found.diagnosis is None else self.found.diagnosis.sensor_law
+
+        def deviation(x: np.ndarray) -> np.ndarray:
+            shape = np.ones(x.shape)
+            if law is not None:
+                shape = np.sqrt(relative_variance(law, x.reshape(-1, 1))).reshape(x.shape)
+            return np.maximum(size * shape, 0.0 if self.exposure else FEWEST_PER_NOISE * density.width)
+
         ends = self.x0, self.xh, self.h, self.begins, deviation
         return density.foreseen(*ends, exposure=self.exposure, whole=whole)
 
@@ -524,12 +531,13 @@ class Transitions:
         return replace(again, alternatives=model_average([problem], support, library))
 
     def identified_behind_sensor(
-        self, *, exposure: float | None = None, false_terms: float
+        self, *, exposure: float | None = None, law: np.ndarray | None = None, false_terms: float
     ) -> FieldEstimate | None:
         """f, D and the noise of a sensor, from an estimate without that; None where none gains.
 
         At whatever share of what moves the state from sample to sample the search begins. Of means over an
-        exposure there is an estimate without such noise, too. The `sensor_evidence` of the diagnosis is
+        exposure there is an estimate without such noise, too. The noise may follow a law of what is measured,
+        as in `siq.inference.measurements.Measurements`. The `sensor_evidence` of the diagnosis is
         Schwarz's, but for the sensor. Where little is forgotten within a step, and a filter that supposes a
         normal law does, that is a NumericalFailure.
         """
@@ -545,8 +553,9 @@ class Transitions:
         for share in (0.0, *SENSOR_SHARES):
             deviation = np.sqrt(share * rate[0] * float(np.median(pairs.h)))
             seen = NoiseDiagnosis(
-                "process", float(rate[0, 0]), np.eye(1), 0.0, 0.0, deviation, exposure=exposure
-            )
+                "process", float(rate[0, 0]), np.eye(1), 0.0, 0.0, deviation,
+                exposure=exposure, sensor_law=law,
+            )  # fmt: skip
             for kept in (1.0, 1 - share) if share else (1.0,):
                 start = replace(base, diagnosis=seen, noise_rate=kept * rate)
                 tried.append((Transitions(start, pairs).log_likelihood, start))

@@ -80,6 +80,20 @@ def test_samples_that_stand_apart_are_left_out_and_nothing_else() -> None:
     assert without_faults(seen(x)).values.shape == x.shape
 
 
+def test_faults_that_follow_each_other_or_are_just_too_small_are_no_jumps() -> None:
+    x, rows = hopping(), np.arange(50, 19_950, 500)
+    usual = float(np.median(np.abs(np.diff(x[:, 0])))) / 0.6745
+    spoiled = x.copy()
+    spoiled[rows, 0] += 12.0 * usual
+    spoiled[rows[:6] + 1, 0] -= 9.0 * usual  # a second fault behind the first
+    small = rows[6:10] + 200  # of two steps one is large: the state itself moves back as the fault ends
+    spoiled[small, 0] = x[small - 1, 0] + 5.9 * usual
+    spoiled[small + 1, 0] = x[small - 1, 0] + 1.5 * usual
+    found = without_faults(seen(spoiled))
+    left_out = np.setdiff1d(np.arange(len(x)), np.round(found.t / 0.04).astype(int))
+    assert set(rows) | set(rows[:6] + 1) <= set(left_out) and len(left_out) < len(rows) + 30
+
+
 def held(x: np.ndarray, generator: np.random.Generator, *, every: int = 0) -> np.ndarray:
     """Values that stay until the next one is measured, every so many samples or at half of them."""
     fresh = np.arange(len(x)) % every == 0 if every else generator.random(len(x)) < 0.5
@@ -202,6 +216,13 @@ def test_a_slight_hum_is_taken_off_where_it_is_of_the_mains() -> None:
     assert float(np.std(found.values - x)) < 0.4 * float(np.std(hum))
     other = replace(given, values=x + 0.035 * np.sin(70 * turns)[:, None])
     assert without_faults(other) is other
+
+
+def test_how_recordings_begin_is_no_season() -> None:
+    t = 2.0 * np.arange(600)  # less than a day
+    x = hopping()[: 20 * 600].reshape(20, 600, 1) + 25 * np.exp(-t / 60)[:, None]
+    recordings = Recordings.from_arrays(t, x, names=["x"], time_unit="min")
+    assert "data.season_taken_off" not in {one.code for one in without_faults(recordings).remarks}
 
 
 @pytest.mark.parametrize(

@@ -451,6 +451,17 @@ def test_by_default_a_gap_is_no_pair_and_jitter_no_gap() -> None:
     np.testing.assert_array_equal(snapshot_pairs(ours).h.round(2), [0.1, 0.11, 0.09, 0.1, 0.1])
 
 
+def test_long_steps_of_uneven_samples_are_pairs() -> None:
+    """Of images that clouds hide half of, and of samples taken as they came; not the breaks of bursts."""
+    generator = np.random.default_rng(0)
+    clouds = np.flatnonzero(generator.random(4000) < 0.5).astype(float)
+    uneven = np.cumsum(generator.exponential(1.0, 2000))
+    bursts = (20.0 * np.arange(300)[:, None] + np.arange(3)).ravel()
+    for t, share in ((clouds, 0.88), (uneven, 0.95), (bursts, 2 / 3)):
+        recordings = Recordings.from_arrays(t, np.zeros((len(t), 1)), names=["x"])
+        assert len(snapshot_pairs(recordings)) == pytest.approx(share * len(t), rel=0.05)
+
+
 def test_other_clocks_and_labels_are_no_states() -> None:
     t, x = np.arange(60.0), np.random.default_rng(0).standard_normal(60)
     table = pd.DataFrame({"t": t, "x": x, "age": 1000 - 10 * t, "state": (x > 0).astype(float)})

@@ -360,3 +360,18 @@ def test_levels_without_any_noise_are_states(seed: int) -> None:
 def test_levels_of_a_coarse_digitiser_are_no_states() -> None:
     for step in (2.0, 1.5):
         assert not found_in(np.round(noise(0, 10_000, memory=np.exp(-1 / 20)) / step) * step).supported
+
+
+def test_one_well_of_whole_numbers_is_no_two_states() -> None:
+    """Bins that hold one number or two by turns have valleys that surrogates have not."""
+    generator = np.random.default_rng(1)
+    x = np.full(20, 8.0)
+    counts = np.empty((20, 600))
+    for k in range(600):
+        counts[:, k] = np.floor(x)
+        for _ in range(20):
+            born = 0.8 + 9 * x**4 / (60.0**4 + x**4)
+            kick = np.sqrt(0.3 * (born + 0.1 * x)) * generator.standard_normal(20)
+            x = np.maximum(x + 0.1 * (born - 0.1 * x) + kick, 0.0)
+    found = switching(Recordings.from_arrays(np.arange(600.0), counts[:, :, None], names=["x"]))
+    assert found is not None and not found.supported and found.probability > 0.1

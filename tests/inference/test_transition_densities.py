@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -92,6 +93,11 @@ def test_a_density_is_that_of_a_linear_force() -> None:
     assert np.isnan(steep.log_density(x0, xh, h)).all()
 
 
+def same(noise: float) -> Callable[[np.ndarray], np.ndarray]:
+    """A deviation that is the same everywhere."""
+    return lambda x: np.full(x.shape, noise)
+
+
 def test_densities_behind_a_sensor_are_those_of_a_kalman_filter() -> None:
     """Of a linear force that filter is exact; two recordings, each of which begins with what is measured."""
     draw, noise, h, n = np.random.default_rng(3), 0.3, 0.4, 400
@@ -111,12 +117,12 @@ def test_densities_behind_a_sensor_are_those_of_a_kalman_filter() -> None:
     edges, begins = np.linspace(-3, 3, 241), np.arange(2 * n) % n == 0
     density = TransitionDensity(edges, -RATE * edges[1:-1], np.full(239, INTENSITY), np.full(240, INTENSITY))
     found = density.foreseen(
-        seen[:, :-1].ravel(), seen[:, 1:].ravel(), np.full(2 * n, h), begins, noise
+        seen[:, :-1].ravel(), seen[:, 1:].ravel(), np.full(2 * n, h), begins, same(noise)
     )  # fmt: skip
     for one, other in zip(found, np.transpose(expected), strict=True):
         assert one == pytest.approx(other, abs=0.003)
     steep = TransitionDensity(edges, np.full(239, 1e30), np.full(239, INTENSITY), np.full(240, INTENSITY))
-    assert np.isnan(steep.foreseen(np.zeros(2), np.zeros(2), np.full(2, h), begins[:2], noise)[0]).all()
+    assert np.isnan(steep.foreseen(np.zeros(2), np.zeros(2), np.full(2, h), begins[:2], same(noise))[0]).all()
 
 
 @pytest.mark.parametrize("share", [1.0, 0.4])
@@ -148,7 +154,7 @@ def test_densities_of_means_are_those_of_a_kalman_filter(share: float) -> None:
         mean, variance = waited * state, waited**2 * left + while_waiting
     edges, seen = np.linspace(-3, 3, 241), np.array(seen)
     density = TransitionDensity(edges, -RATE * edges[1:-1], np.full(239, INTENSITY), np.full(240, INTENSITY))
-    ends = seen[:-1], seen[1:], np.full(n, h), np.arange(n) == 0, noise
+    ends = seen[:-1], seen[1:], np.full(n, h), np.arange(n) == 0, same(noise)
     for one, other in zip(density.foreseen(*ends, exposure=time), np.transpose(expected[1:]), strict=True):
         assert one == pytest.approx(other, abs=0.006)
 
