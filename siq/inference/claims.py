@@ -75,9 +75,10 @@ class _Residuals:
     """White residuals of pairs, with what is known where each begins.
 
     `noise` are the residuals of the states that noise acts on, uncorrelated, of variance one, less what
-    functions of the state, or of the step, explain: ``(n, c)``. `basis` are these, orthonormal, ``(n, q)``;
-    `states` are one and the states, scaled, ``(n, 1 + d)``; `runs` are slices of the pairs of a recording,
-    one after the other; gaps between them are passed over.
+    functions of the state explain: ``(n, c)``. `basis` are these functions, orthonormal, ``(n, q)``; `states`
+    are one and the states, scaled, ``(n, 1 + d)``; `power` are the squares of the noise less one, less what
+    the length of steps explains, too; `runs` are slices of the pairs of a recording, one after the other;
+    gaps between them are passed over.
     """
 
     def __init__(self, found: FieldEstimate, pairs: SnapshotPairs) -> None:
@@ -101,7 +102,6 @@ class _Residuals:
             found.library.evaluate(pairs.x0)[:, functions],
             np.ones((n, 1)),
             pairs.state_parts(STATE_BINS),
-            pairs.step_parts(STATE_BINS),  # what long steps forget, and short ones owe to the sensor
         ]
         together = np.concatenate(columns, axis=1) * np.sqrt(pairs.h / pairs.h.mean())[:, None]
         self.basis = _orthonormal(together)
@@ -112,14 +112,16 @@ class _Residuals:
         self.noise = self.without(rest[:, self.noisy])
         self.noise = _orthonormal(self.noise) * np.sqrt(n)
         self.near = _orthonormal(self._standardised(self.past(self.noise, 0.0, delay=1)))
-        self.power = self._standardised(self.noise**2 - 1)
+        # Long steps forget a part of their noise, and of short ones a filter knows less than all.
+        steps, power = _orthonormal(pairs.step_parts(STATE_BINS) * 1.0), self.noise**2 - 1
+        self.power = self._standardised(power - steps @ (steps.T @ power))
 
     def _standardised(self, values: np.ndarray) -> np.ndarray:
         values = self.without(values)
         return values / positive(np.sqrt((values**2).mean(axis=0)))
 
     def without(self, values: np.ndarray) -> np.ndarray:
-        """Columns less what functions of the state, and the length of the step, explain."""
+        """Columns less what functions of the state explain."""
         return np.asarray(values - self.basis @ (self.basis.T @ values))
 
     def past(self, values: np.ndarray, memory: float, *, delay: int = 2) -> np.ndarray:

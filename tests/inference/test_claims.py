@@ -233,4 +233,4 @@ def test_steps_that_grow_along_a_record_are_no_drift_of_its_noise() -> None:
     for k in range(2999):
         x[:, k + 1, 0] = x[:, k, 0] + h[k] * (x[:, k, 0] - x[:, k, 0] ** 3) + kicks[:, k]
     t = np.cumsum(h) - h
-    assert sum(claims(one, times=t)["unchanged"].passed for one in x) >= 5
+    assert all(claims(one, times=t)["unchanged"].passed for one in x)
