@@ -255,9 +255,11 @@ class _Case:
                 return None
         if found.flow.coarse and self.given is None:
             with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
-                behind = self.behind_sensor(found, pairs, None)
+                given = Transitions(found, pairs)
+                behind = given.identified_behind_sensor(false_terms=self.options.false_terms)
                 if behind is None:
                     return None
+                behind = self.with_sensor_law(behind) or behind
                 noisy = probability(behind, 1)
                 one, other = (behind, found) if noisy > 0.5 else (found, behind)
                 return self._finished_by_pairs(one).with_rival(other, min(noisy, 1 - noisy))
@@ -290,20 +292,47 @@ class _Case:
         raise NumericalFailure(f"{tests[claim].reason}; {reason}", claim=claim)
 
     def with_sensor_law(self, found: FieldEstimate) -> FieldEstimate | None:
-        """By likelihood where the noise of sensors depends on what they show; None where it does not.
+        """An estimate whose sensors have noise that depends on what they show; None where it does not.
 
-        It does where the recordings are likelier so, at Schwarz's price of the further parameters.
+        It does where the recordings are likelier so, at Schwarz's price of the further parameters. Of one
+        state by densities: what the size of the noise tells of the state is not linear.
         """
-        pairs = self._pairs(self.recordings)
-        law = sensor_law(found, pairs)
+        pairs, known = self._pairs(self.recordings), found.diagnosis
+        law = None if known is None or known.exposure is not None else sensor_law(found, pairs)
         if law is None:
             return None
-        view = replace(ObservationModel.of(found), diffusion=Diffusion.identity(self.library.dimension))
+        assert known is not None and known.sensor_evidence is not None
+        price, again = np.count_nonzero(law[:, 1:]) * np.log(len(pairs.h)), found
         with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
-            assert found.diagnosis is not None
-            noise = Noise(found.diagnosis.measurement**2, np.diag(found.noise_rate))
-            return _with_law(found, self.by_likelihood(replace(view, sensor_law=law), noise), pairs)
-        return None
+            if not found.flow.by_density:
+                view = replace(
+                    ObservationModel.of(found), diffusion=Diffusion.identity(len(known.covariance))
+                )
+                noise = Noise(known.measurement**2, np.diag(found.noise_rate))
+                again = self.by_likelihood(replace(view, sensor_law=law), noise)
+                if not 2 * (self._likelihood(again) - self._likelihood(found)) > price:
+                    return None
+            if self.library.dimension > 1 or self.library.angles or self.given is not None:
+                return again
+        with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
+            given, false_terms = Transitions(again, pairs), self.options.false_terms
+            finer = given.identified_behind_sensor(law=law, false_terms=false_terms)
+            if (
+                finer is not None
+                and finer.diagnosis is not None
+                and finer.diagnosis.sensor_evidence is not None
+            ):
+                gain = finer.diagnosis.sensor_evidence
+                evidence = known.sensor_evidence + gain
+                finer = replace(finer, diagnosis=replace(finer.diagnosis, sensor_evidence=evidence))
+                again = finer if again is not found or gain > price else again
+        return None if again is found else again
+
+    def _likelihood(self, found: FieldEstimate) -> float:
+        view = ObservationModel.of(found)
+        data, model = view.measured(self.recordings, self.pair_step), view.model(*view.unknown(found))
+        fit = view.followed(data, model, noise=view.noise_of(found), substeps=found.flow.steps)
+        return fit.restricted_likelihood(data)
 
     def by_density(
         self, found: FieldEstimate, pairs: SnapshotPairs, exposure: float | None
@@ -315,25 +344,10 @@ class _Case:
         if not found.flow.coarse or self.given is not None:
             return None
         with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
-            behind = self.behind_sensor(found, pairs, exposure)
-            return None if behind is None else self._finished_by_pairs(behind)
+            given = Transitions(found, pairs)
+            behind = given.identified_behind_sensor(exposure=exposure, false_terms=self.options.false_terms)
+            return None if behind is None else self.finished(self.with_sensor_law(behind) or behind)
         return None
-
-    def behind_sensor(
-        self, found: FieldEstimate, pairs: SnapshotPairs, exposure: float | None
-    ) -> FieldEstimate | None:
-        """By densities of noisy samples, whose noise may depend on what is measured; None without any."""
-        behind_sensor = partial(
-            Transitions(found, pairs).identified_behind_sensor,
-            exposure=exposure, false_terms=self.options.false_terms,
-        )  # fmt: skip
-        behind = behind_sensor()
-        law = None if behind is None else sensor_law(behind, pairs)
-        if behind is not None and law is not None:
-            with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
-                again = behind_sensor(law=law)
-                return (_with_law(behind, again, pairs) if again else None) or behind
-        return behind
 
     def by_exposure(self, observation: ObservationModel) -> FieldEstimate | None:
         """By the likelihood of samples that are means over an exposure; None where they are no such means.
@@ -365,7 +379,9 @@ class _Case:
         return snapshot_pairs(recordings, pair_step=self.pair_step)
 
     def finished(self, found: FieldEstimate) -> FieldEstimate:
-        """An estimate by likelihood with its D, its strength, and its test."""
+        """An estimate behind sensors with its D, its strength, and its test."""
+        if found.flow.by_density:
+            return self._finished_by_pairs(found)
         noise, pairs = found.diagnosis, len(self._pairs(self.recordings).h)
         assert noise is not None and noise.measurement_error is not None
         forced = bool(found.noise_rate.any())
@@ -706,15 +722,6 @@ class _Case:
             f"{said}: set 'identification.hidden_velocities: true', in Python hidden_velocities=True, and the"
             " velocity is a state that was not recorded"
         )
-
-
-def _with_law(found: FieldEstimate, again: FieldEstimate, pairs: SnapshotPairs) -> FieldEstimate | None:
-    """The estimate where the noise of sensors follows a law, if it is likelier than the one without."""
-    one, other = found.diagnosis, again.diagnosis
-    assert one is not None and one.sensor_evidence is not None
-    assert other is not None and other.sensor_evidence is not None and other.sensor_law is not None
-    price = np.count_nonzero(other.sensor_law[:, 1:]) * np.log(len(pairs.h))
-    return again if other.sensor_evidence - one.sensor_evidence > price else None
 
 
 def _possible_exposures(found: MarkovLag) -> list[float]:

@@ -59,6 +59,7 @@ BEYOND = 1.5  # spreads by which a state may have been outside of what was recor
 MUCH_FORGOTTEN = 0.3  # of Jh: a normal law has the variance to 1 % at 0.4, and to 3 to 5 % at 0.8
 LONGEST_EXPOSURE = 1.001  # of a step: no two exposures overlap
 MOST_PRODUCTS, DEARER = 2e9, 3  # numerical: of a filter along all samples, a second; of means three
+NATURAL_GRID = 2001  # numerical: of the scale on which a sensor's noise is normal
 MOST_STEPS = 24  # of different length: each takes a matrix
 RATES = tuple(2.0 ** np.arange(-2, 5))  # of the noise of residuals, with which a search may begin
 MOST_DENSITY_STEPS, FEW_HALVINGS = 15, 6  # numerical: from a start that is any good a few are enough
@@ -174,15 +175,16 @@ class TransitionDensity:
 
     def foreseen(
         self, x0: np.ndarray, xh: np.ndarray, h: np.ndarray, begins: np.ndarray,
-        deviation: Callable[[np.ndarray], np.ndarray], *, exposure: float = 0.0, whole: bool = True,
+        shown: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], *, exposure: float = 0.0,
+        whole: bool = True,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
         """The same two of values that a sensor shows with normal noise, given all earlier ones of a record.
 
         A filter on the cells, which where a record `begins` knows its first value alone. The third is the
         mean of the state, once the later value is known, too. All are ``(n,)``, NaN where f is too steep; of
         scores that are not wanted, as they take longest, nothing is said. A value may be a mean over the time
-        `exposure` before it; of a normal law, given where the state was at both of its ends. The deviation of
-        the sensor is a function of states, of any shape.
+        `exposure` before it; of a normal law, given where the state was at both of its ends. What is
+        `shown` of states, of any shape, are the mean of a value and the deviation of a sensor.
         """
         steps, which = self.distinct(h)
         waiting = np.maximum(steps - exposure, EXPOSED * steps) if exposure else steps
@@ -190,12 +192,14 @@ class TransitionDensity:
         if not matrices or (within is not None and not len(within)):
             return (np.full(len(h), np.nan),) * 3
         middles = self.first + self.width * (np.arange(len(matrices[0])) + 0.5)
-        given = x0, xh, which, begins, np.stack(matrices), middles
-        if within is None:
-            logarithms, below, above, means = _filtered(*given, deviation(middles), whole)
-        else:
-            blurred = np.sqrt(within[2] + deviation(within[1]) ** 2)
-            logarithms, below, above, means = _filtered_means(*given, within[0], within[1], blurred, whole)
+        if within is None:  # the state itself, and not what it does on the way
+            nothing = np.zeros((len(middles),) * 2)
+            within = np.stack([np.eye(len(middles)), nothing + middles, nothing])
+        mean, deviation = shown(within[1])
+        logarithms, below, above, means = _filtered(
+            x0, xh, which, begins, np.stack(matrices), middles, within[0], mean,
+            np.sqrt(within[2] + deviation**2), whole,
+        )  # fmt: skip
         low, high = (ndtri(np.clip(one, LEAST, 0.5)) for one in (below, above))
         return logarithms, np.where(below < above, low, -high), means
 
@@ -203,60 +207,45 @@ class TransitionDensity:
 @machine_code
 def _filtered(
     x0: np.ndarray, xh: np.ndarray, which: np.ndarray, begins: np.ndarray, matrices: np.ndarray,
-    middles: np.ndarray, deviation: np.ndarray, whole: bool,
+    middles: np.ndarray, within: np.ndarray, shown: np.ndarray, deviation: np.ndarray, whole: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Log-density of each measured value, probabilities of lower and of higher ones, and the state's mean."""
-    logarithms, below, above, means = np.zeros((4, len(xh)))
-    share = np.zeros_like(middles)
-    for k in range(len(xh)):
-        if begins[k]:
-            share = np.exp(-(((x0[k] - middles) / deviation) ** 2) / 2) / deviation
-            share = share / share.sum()
-        ahead = share @ matrices[which[k]]
-        for cell in range(len(middles)):
-            away = (xh[k] - middles[cell]) / deviation[cell]
-            share[cell] = ahead[cell] * math.exp(-(away**2) / 2) / deviation[cell]
-            if not whole:
-                continue
-            higher = math.erfc(away / math.sqrt(2.0)) / 2 if abs(away) < FAR else (away < 0) * 1.0
-            below[k] += ahead[cell] * (1 - higher)
-            above[k] += ahead[cell] * higher
-        density = share.sum()
-        logarithms[k] = math.log(max(density, LEAST) / math.sqrt(2 * math.pi))
-        share = share / density if density > LEAST else ahead
-        means[k] = (share * middles).sum()
-    return logarithms, below, above, means
+    """Log-density of each measured value, probabilities of lower and of higher ones, and the state's mean.
 
-
-@machine_code
-def _filtered_means(
-    x0: np.ndarray, xh: np.ndarray, which: np.ndarray, begins: np.ndarray, matrices: np.ndarray,
-    middles: np.ndarray, matrix: np.ndarray, mean: np.ndarray, deviation: np.ndarray, whole: bool,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """The same of means over an exposure, whose law follows from where the state was at both ends of it."""
+    The state is carried on by one of the matrices, and then by the one `within` an exposure; what is shown,
+    and its deviation, follow from where it was at both ends of that.
+    """
     logarithms, below, above, means = np.zeros((4, len(xh)))
     count = len(middles)
     share, ahead = np.zeros(count), np.zeros(count)
-    reached = np.zeros((count, 2), dtype=np.int64)  # first and last cells in which it ends with any chance
-    for start in range(count):
-        likely = np.flatnonzero(matrix[start] > UNLIKELY)
-        reached[start] = likely[0], likely[-1] + 1
+    reached = np.zeros(
+        (len(matrices) + 1, count, 2), dtype=np.int64
+    )  # cells in which it ends with any chance
+    for place in range(len(reached)):
+        matrix = matrices[place] if place < len(matrices) else within
+        for start in range(count):
+            likely = np.flatnonzero(matrix[start] > UNLIKELY)
+            reached[place, start] = likely[0], likely[-1] + 1
     for k in range(len(xh)):
         for first in range(2 if begins[k] else 1):
             value = x0[k] if begins[k] and not first else xh[k]
             if begins[k] and not first:
                 ahead[:] = 1.0 / count
             else:
-                ahead = share @ matrices[which[k]]
+                ahead[:] = 0.0
+                least = UNLIKELY * share.max()
+                for start in range(count):
+                    if share[start] > least:
+                        low, high = reached[which[k], start]
+                        ahead[low:high] += share[start] * matrices[which[k], start, low:high]
                 below[k] = above[k] = 0.0
             share = np.zeros(count)
             least = UNLIKELY * ahead.max()
             for start in range(count):
                 if ahead[start] < least:
                     continue
-                for end in range(reached[start, 0], reached[start, 1]):
-                    chance = ahead[start] * matrix[start, end]
-                    away = (value - mean[start, end]) / deviation[start, end]
+                for end in range(reached[-1, start, 0], reached[-1, start, 1]):
+                    chance = ahead[start] * within[start, end]
+                    away = (value - shown[start, end]) / deviation[start, end]
                     if whole:
                         higher = math.erfc(away / math.sqrt(2.0)) / 2 if abs(away) < FAR else (away < 0) * 1.0
                         below[k] += chance * (1 - higher)
@@ -265,7 +254,7 @@ def _filtered_means(
                         share[end] += chance / deviation[start, end] * math.exp(-(away**2) / 2)
             density = share.sum()
             logarithms[k] = math.log(max(density, LEAST) / math.sqrt(2 * math.pi))
-            share = share / density if density > LEAST else ahead @ matrix
+            share = share / density if density > LEAST else ahead @ within
         means[k] = (share * middles).sum()
     return logarithms, below, above, means
 
@@ -291,7 +280,8 @@ class Transitions:
     """
 
     def __init__(self, found: FieldEstimate, pairs: SnapshotPairs) -> None:
-        if found.library.dimension > 1 or found.library.angles or not found.flow.coarse:
+        near = not found.flow.coarse and found.sensor_variance is None
+        if found.library.dimension > 1 or found.library.angles or near:
             raise NumericalFailure("the density of what noise does between two samples is not worked out")
         self.found, self.pairs = found, pairs
         self.x0, self.xh, self.h = pairs.x0[:, 0], pairs.xh[:, 0], pairs.h
@@ -324,7 +314,8 @@ class Transitions:
             within = float(least) ** 2 * self.exposure / float(np.median(self.h)) / 12
             blur = np.sqrt(np.exp(self.sensor).sum() + within)
             count = min(max(count, int((high - low + 2 * aside) / blur * CELLS_PER_NOISE)), MOST_CELLS)
-            if len(self.h) * count**2 * (DEARER if self.exposure else 1) > MOST_PRODUCTS:
+            reach = 2 * FAR_AWAY * max(float(most), float(blur)) * count / (high - low + 2 * aside)
+            if len(self.h) * min(count, reach) ** 2 * (DEARER if self.exposure else 1) > MOST_PRODUCTS:
                 raise NumericalFailure("there are too many samples to follow all that their states may be")
         if count > MOST_CELLS:
             raise NumericalFailure("noise moves some states by a small part of what it moves others by")
@@ -346,18 +337,31 @@ class Transitions:
     def _foreseen(
         self, density: TransitionDensity, sensor: np.ndarray, *, whole: bool = True
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """By the sensor's noise, from the logarithm of its variance; cells tell none that is too small."""
-        size = float(np.exp(sensor[0] / 2)) if len(sensor) else 0.0
-        law = None if self.found.diagnosis is None else self.found.diagnosis.sensor_law
+        """By the sensor's noise, from the logarithm of its variance; cells tell none that is too small.
 
-        def deviation(x: np.ndarray) -> np.ndarray:
-            shape = np.ones(x.shape)
-            if law is not None:
-                shape = np.sqrt(relative_variance(law, x.reshape(-1, 1))).reshape(x.shape)
-            return np.maximum(size * shape, 0.0 if self.exposure else FEWEST_PER_NOISE * density.width)
+        Of a law V(x) the noise has the skewness of counts, of which the third cumulant is ``V V'``: it is
+        nearly normal in ``t = ∫ V^(-1/3) dx``, which of counts is their power of 2/3 (Anscombe 1953).
+        """
+        size, least = float(np.exp(sensor[0] / 2)) if len(sensor) else 0.0, FEWEST_PER_NOISE * density.width
+        ends = (self.h, self.begins)
+        if (law := None if self.found.diagnosis is None else self.found.diagnosis.sensor_law) is None:
 
-        ends = self.x0, self.xh, self.h, self.begins, deviation
-        return density.foreseen(*ends, exposure=self.exposure, whole=whole)
+            def plain(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+                return x, np.full(x.shape, size if self.exposure else max(size, least))
+
+            return density.foreseen(self.x0, self.xh, *ends, plain, exposure=self.exposure, whole=whole)
+        grid = np.linspace(self.edges[0], self.edges[-1], NATURAL_GRID)
+        variance = relative_variance(law, grid[:, None])[:, 0]
+        slope, bent = np.cbrt(1 / variance), np.gradient(variance, grid)
+        natural = np.append(0.0, np.cumsum((slope[1:] + slope[:-1]) / 2 * np.diff(grid)))
+
+        def shown(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            mean = natural - size**2 * bent * slope / 6
+            return np.interp(x, grid, mean), np.maximum(size * np.interp(x, grid, variance ** (1 / 6)), least)
+
+        first, second = (np.interp(one, grid, natural) for one in (self.x0, self.xh))
+        logarithms, scores, means = density.foreseen(first, second, *ends, shown, whole=whole)
+        return logarithms + np.log(np.interp(self.xh, grid, slope)), scores, means
 
     def log_densities(self, values: np.ndarray, strengths: np.ndarray, sensor: np.ndarray) -> np.ndarray:
         """Of each pair; minus infinity where εD is not positive, or f too steep."""
@@ -537,11 +541,11 @@ class Transitions:
 
         At whatever share of what moves the state from sample to sample the search begins. Of means over an
         exposure there is an estimate without such noise, too. The noise may follow a law of what is measured,
-        as in `siq.inference.measurements.Measurements`. The `sensor_evidence` of the diagnosis is
-        Schwarz's, but for the sensor. Where little is forgotten within a step, and a filter that supposes a
-        normal law does, that is a NumericalFailure.
+        as in `siq.inference.measurements.Measurements`, from an estimate with one that does not. The
+        `sensor_evidence` of the diagnosis is Schwarz's, but for the sensor. Where little is forgotten within
+        a step, and a filter that supposes a normal law does, that is a NumericalFailure.
         """
-        if self.forgotten < MUCH_FORGOTTEN:
+        if self.forgotten < MUCH_FORGOTTEN and law is None:
             raise NumericalFailure("steps are so short that the law of what noise does is nearly normal")
         found, pairs, rate = self.found, self.pairs, self.found.noise_rate
         everything = all_coefficients([0], found.library.size)
@@ -549,9 +553,11 @@ class Transitions:
             found.with_values(everything, found.coefficients[:, 0]),
             noise=None, constant_noise=None, diffusion=Diffusion.identity(1),
         )  # fmt: skip
+        moved = rate[0] * float(np.median(pairs.h))
+        shares = (0.0, *SENSOR_SHARES) if found.sensor_variance is None else (0.0,)
         tried = []
-        for share in (0.0, *SENSOR_SHARES):
-            deviation = np.sqrt(share * rate[0] * float(np.median(pairs.h)))
+        for share in shares:
+            deviation = np.sqrt(share * moved if found.sensor_variance is None else found.sensor_variance)
             seen = NoiseDiagnosis(
                 "process", float(rate[0, 0]), np.eye(1), 0.0, 0.0, deviation,
                 exposure=exposure, sensor_law=law,

@@ -93,9 +93,9 @@ def test_a_density_is_that_of_a_linear_force() -> None:
     assert np.isnan(steep.log_density(x0, xh, h)).all()
 
 
-def same(noise: float) -> Callable[[np.ndarray], np.ndarray]:
-    """A deviation that is the same everywhere."""
-    return lambda x: np.full(x.shape, noise)
+def same(noise: float) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """What a sensor shows with a deviation that is the same everywhere."""
+    return lambda x: (x, np.full(x.shape, noise))
 
 
 def test_densities_behind_a_sensor_are_those_of_a_kalman_filter() -> None:
