@@ -280,13 +280,10 @@ def _increments(
     runs = runs_of(recordings, bridged=True)
     times = [relaxation_samples(column, runs, noisy=True) for column in columns]
     return _Increments(
-        functions @ (vectors[:, kept] / np.sqrt(eigenvalues[kept])),
-        increments,
-        Stretches(number, stretches.step),
-        np.sqrt((increments[known] ** 2).mean(axis=0)),
-        root,
+        functions @ (vectors[:, kept] / np.sqrt(eigenvalues[kept])), increments,
+        Stretches(number, stretches.step), np.sqrt((increments[known] ** 2).mean(axis=0)), root,
         min((time for time in times if time is not None), default=float("nan")) * usual_step(recordings),
-    )
+    )  # fmt: skip
 
 
 def _significant(values: np.ndarray, errors: np.ndarray) -> np.ndarray:

@@ -387,10 +387,8 @@ def _read_cells(
     parsing = arrow_csv.ParseOptions(delimiter=separator, invalid_row_handler=None if numbers else keep_first)
     converting = arrow_csv.ConvertOptions(
         column_types={name: pa.float64() if name in numbers else pa.string() for name in names},
-        decimal_point=decimal_mark,
-        null_values=[*_MISSING, *_DASHES],
-        quoted_strings_can_be_null=True,
-    )
+        decimal_point=decimal_mark, null_values=[*_MISSING, *_DASHES], quoted_strings_can_be_null=True,
+    )  # fmt: skip
     if numbers:
         return arrow_csv.read_csv(pa.BufferReader(body), reading, parsing, converting)
     with _reading(file, "CSV"):
@@ -592,11 +590,9 @@ def _open_numpy(file: str) -> ColumnFile:
 READERS: dict[str, Callable[[str], ColumnFile]] = {
     ".parquet": _open_parquet,
     **dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".lvm", ".asc", ".rdb"), _open_text),
-    **dict.fromkeys((".h5", ".hdf5"), _open_hdf5),
-    ".nc": _open_netcdf,
-    ".mat": _open_matlab,
+    **dict.fromkeys((".h5", ".hdf5"), _open_hdf5), ".nc": _open_netcdf, ".mat": _open_matlab,
     **dict.fromkeys((".npz", ".npy"), _open_numpy),
-}
+}  # fmt: skip
 """How the columns of a file are read, by the suffix of its name."""
 
 

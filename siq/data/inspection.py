@@ -26,7 +26,7 @@ from siq.data.correlation import (
     rounding_error,
 )
 from siq.data.preparation import ANGLES, turns_back, unusual, without_faults
-from siq.data.recordings import SINGLE_RECORDING_REMEDY, Recordings, longest_step
+from siq.data.recordings import SINGLE_RECORDING_REMEDY, Recordings
 from siq.data.states import RecordStates, switching
 from siq.numerics.randomness import positive
 from siq.remarks import Remark, sentence
@@ -229,7 +229,7 @@ def inspect(
     first = np.cumsum(counts) - counts
     gaps = np.diff(recordings.t)[np.diff(recordings.recording) == 0]
     steps = _span(gaps) if len(gaps) else None
-    near = 0 if steps is None else int((gaps <= longest_step(gaps) * (1 + 1e-6)).sum())
+    near = int((gaps <= recordings.longest_step * (1 + 1e-6)).sum())
     states = []
     floors = noise_floors(recordings) or (None,) * len(recordings.names)
     columns = zip(
@@ -248,18 +248,12 @@ def inspect(
     place = np.floor((some - low) / positive(high - low) * CELLS).astype(int)
     visits, _ = np.histogramdd(place, bins=[np.arange(CELLS + 1) - 0.5] * place.shape[1])
     return Inspection(
-        file=str(source) if isinstance(source, str | Path) else named,
-        recordings=recordings,
-        states=tuple(states),
-        samples=_span(counts),
-        durations=_span(recordings.t[first + counts - 1] - recordings.t[first]),
-        steps=steps,
-        pairs=near,
-        gaps=len(gaps) - near,
-        memory=memory,
-        coverage=float((visits >= VISITED_SAMPLES).mean()),
+        file=str(source) if isinstance(source, str | Path) else named, recordings=recordings,
+        states=tuple(states), samples=_span(counts),
+        durations=_span(recordings.t[first + counts - 1] - recordings.t[first]), steps=steps, pairs=near,
+        gaps=len(gaps) - near, memory=memory, coverage=float((visits >= VISITED_SAMPLES).mean()),
         switching=switching(recordings) if memory.may_hop and not turns else None,
-    )
+    )  # fmt: skip
 
 
 def _span(values: np.ndarray | Sequence[float]) -> _Span:

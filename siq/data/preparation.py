@@ -56,15 +56,9 @@ SLIGHT_HUM = 0.1  # of the variance of a state: what moves it more may be the st
 SEASONS = {"day": 86_400.0, "year": 31_556_952.0}  # seconds: what the sun does to what stands outdoors
 MAINS, MAINS_VARY = np.outer((50.0, 60.0), (1, 2, 3, 4)), 0.002  # hertz; relative, in most grids
 _SECONDS = {
-    "[uµμ]s": 1e-6,
-    "m(s|sec|illisec.*)": 1e-3,
-    "s(ec.*)?": 1,
-    "min.*": 60,
-    "h.*": 3600,
-    "d.*": 86_400,
-    "week.*": 604_800,
-    "y.*": 31_556_952,
-}
+    "[uµμ]s": 1e-6, "m(s|sec|illisec.*)": 1e-3, "s(ec.*)?": 1, "min.*": 60, "h.*": 3600, "d.*": 86_400,
+    "week.*": 604_800, "y.*": 31_556_952,
+}  # fmt: skip
 FEWEST_SEASONS, MOST_HARMONICS = 4, 4
 KNOWN_SCALE = 0.01  # a choice: relative error to which a velocity tells how its position moves
 SMALL_CHANGE = 0.3  # standard deviations: up to there a distribution is flat
@@ -209,11 +203,9 @@ def in_stretches(recordings: Recordings, *, hidden_velocities: bool | Literal["a
     label = recordings.labels[0]
     remark = Remark("data.cut_recording", {"stretches": cut})
     return replace(
-        recordings,
-        labels=tuple(f"{label} ({number} of {cut})" for number in range(1, cut + 1)),
-        recording=np.arange(count) * cut // count,
-        remarks=(*recordings.remarks, remark),
-    )
+        recordings, labels=tuple(f"{label} ({number} of {cut})" for number in range(1, cut + 1)),
+        recording=np.arange(count) * cut // count, remarks=(*recordings.remarks, remark),
+    )  # fmt: skip
 
 
 def joined(recordings: Recordings) -> Recordings:

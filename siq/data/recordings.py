@@ -68,6 +68,15 @@ class Recordings:
     remarks: tuple[Remark, ...] = ()
 
     @property
+    def longest_step(self) -> float:
+        """The longest time between neighbouring samples that is no gap; NaN where no recording has two.
+
+        It is `LONGEST_STEP` median steps, and twice as long as often as this takes in `UNEVEN_SHARE` of all:
+        where clouds hide every other image, or samples are taken as they come, long steps are no gaps.
+        """
+        return _longest(np.diff(self.t)[np.diff(self.recording) == 0])
+
+    @property
     def titles(self) -> tuple[str, ...]:
         """What people call each state: its heading in the file, or else its name."""
         return self.headings or self.names
@@ -410,6 +419,16 @@ class SnapshotPairs:
         return SnapshotPairs(*parts, copies=self.copies)
 
 
+def _longest(steps: np.ndarray) -> float:
+    # Of the two middle ones the shorter: pairs with gaps between them have about as many of either.
+    longest = LONGEST_STEP * float(np.quantile(steps, 0.5, method="lower")) if len(steps) else np.nan
+    while True:
+        longer = np.sum((steps > longest * (1 + 1e-6)) & (steps <= 2 * longest * (1 + 1e-6)))
+        if not longer - np.sqrt(longer) >= max(UNEVEN_SHARE * len(steps), 1):  # of few steps one may be a gap
+            return longest
+        longest *= 2
+
+
 def _in_parts(values: np.ndarray, parts: int) -> np.ndarray:
     edges = np.unique(np.quantile(values, np.linspace(0, 1, parts + 1)[1:-1]))
     return np.asarray(np.searchsorted(edges, values, side="right")[:, None] == np.arange(1, len(edges) + 1))
@@ -447,7 +466,7 @@ class StreamedPairs:
         count, squares = 0, np.zeros(len(self.names))
         for block in self.blocks():
             if self.pair_step is None:
-                self.pair_step = longest_step(block.h)
+                self.pair_step = _longest(block.h)
             count, squares = count + len(block), squares + block.mean_square_speed * len(block)
         self._count, self.mean_square_speed, self._wanted = count, squares / max(count, 1), np.array([])
 
@@ -578,21 +597,6 @@ def write_recordings(path: str | Path, recordings: Recordings) -> None:
         parquet.write_table(table, partial, compression="zstd", use_dictionary=["recording"])
 
 
-def longest_step(steps: np.ndarray) -> float:
-    """The longest of the times between neighbouring samples, ``(n,)``, that is no gap.
-
-    It is `LONGEST_STEP` median steps, and twice as long as often as this takes in `UNEVEN_SHARE` of all:
-    where clouds hide every other image, or samples are taken as they come, long steps are no gaps.
-    """
-    # Of the two middle ones the shorter: pairs with gaps between them have about as many of either.
-    longest = LONGEST_STEP * float(np.quantile(steps, 0.5, method="lower"))
-    while True:
-        longer = np.sum((steps > longest * (1 + 1e-6)) & (steps <= 2 * longest * (1 + 1e-6)))
-        if not longer - np.sqrt(longer) >= max(UNEVEN_SHARE * len(steps), 1):  # of few steps one may be a gap
-            return longest
-        longest *= 2
-
-
 def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) -> SnapshotPairs:
     """Pair every sample with the next one of the same recording.
 
@@ -601,7 +605,7 @@ def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) ->
     recordings
         The trajectories.
     pair_step
-        The longest gap that still makes a pair, in the unit of `t`; by default that of `longest_step`.
+        The longest gap that still makes a pair, in the unit of `t`; by default `Recordings.longest_step`.
         This is a limit, not the step h of the pairs, of which each has its own.
 
     Raises
@@ -615,7 +619,7 @@ def snapshot_pairs(recordings: Recordings, *, pair_step: float | None = None) ->
     gap = np.diff(t)
     keep = recording[1:] == recording[:-1]
     if pair_step is None and keep.any():
-        pair_step = longest_step(gap[keep])
+        pair_step = recordings.longest_step
     if pair_step is not None:
         # Times such as 0.1·k, or seconds since 1970, carry rounding errors into their differences.
         keep &= gap <= pair_step * (1 + 1e-6) + 2 * np.spacing(np.abs(t[1:]))

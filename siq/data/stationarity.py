@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
-from siq.data.recordings import Recordings, longest_step
+from siq.data.recordings import Recordings
 
 SHORTEST_STRETCH = 12  # samples of the shortest stretch looked at
 SHORTEST_RUN = 96  # samples, of which at least one run has as many: fewer tell no relaxation
@@ -48,7 +48,7 @@ def usual_step(recordings: Recordings) -> float:
 def runs_of(recordings: Recordings, *, longest: float | None = None, bridged: bool = False) -> list[slice]:
     """Rows of one recording without a gap between them, each a slice.
 
-    A time between samples is a gap beyond the longest, by default that of `longest_step`. Where gaps are
+    A time between samples is a gap beyond the longest, by default `Recordings.longest_step`. Where gaps are
     `bridged`, they end a run only if they are longer than what the record remembers: the least local
     relaxation time (`relaxation_samples`), or `BRIDGED` of the correlation time. What lasts longer, such as a
     visit to a state or a drift, is not ended by samples that are missing; increments are.
@@ -56,7 +56,7 @@ def runs_of(recordings: Recordings, *, longest: float | None = None, bridged: bo
     broken = np.diff(recordings.recording) != 0
     if longest is None:
         step, steps = usual_step(recordings), np.diff(recordings.t)[~broken]
-        longest = longest_step(steps) if len(steps) else np.inf
+        longest = recordings.longest_step
         if bridged and (steps > longest * (1 + 1e-6)).any():
             whole, times = runs_of(recordings, longest=np.inf), []
             some = whole[:: -(-len(whole) // MOST_RUNS)]
@@ -318,7 +318,7 @@ def even_stretches(recordings: Recordings) -> Stretches:
         near = inside & (np.abs(gap - usual) <= ROUNDED_STEP * usual)
         even = near if len(np.unique(np.round(gap[near] / usual, 3))) <= 3 else even
     if 2 * even.sum() < inside.sum():
-        even = inside & (gap <= longest_step(gap[inside]) * (1 + 1e-6))
+        even = inside & (gap <= recordings.longest_step * (1 + 1e-6))
     return Stretches(np.where(even, np.cumsum(~even), -1), usual)
 
 

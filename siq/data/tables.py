@@ -154,16 +154,11 @@ def _checked(
     rows = _in_order(rows, numbers, layout.recording is not None, remarks)
     check_times(file, numbers[0][rows.order], rows.recording, rows.labels, rows.order)
     found = Recordings(
-        names=layout.names,
-        units=tuple(found_units[1:]),
-        labels=rows.labels,
-        recording=rows.recording,
-        t=numbers[0][rows.order],
-        values=np.ascontiguousarray(numbers[1:, rows.order].T),
-        time_unit=found_units[0],
-        headings=() if layout.titles == layout.names else layout.titles,
+        names=layout.names, units=tuple(found_units[1:]), labels=rows.labels, recording=rows.recording,
+        t=numbers[0][rows.order], values=np.ascontiguousarray(numbers[1:, rows.order].T),
+        time_unit=found_units[0], headings=() if layout.titles == layout.names else layout.titles,
         remarks=tuple(remarks),
-    )
+    )  # fmt: skip
     return found if columns is not None else _without_clocks_and_labels(found)
 
 
@@ -203,13 +198,10 @@ def _stacked(source: ColumnFile) -> ColumnFile:
     remark = Remark("data.side_by_side", values)
     new = ["t [year]" if years else "recording", f"x [{unit}]" if unit else "x"]
     return replace(
-        source,
-        headings=(*(source.headings[place] for place in rest), *new),
-        units=(*(source.units[place] for place in rest), None, source.units[own[0]]),
-        load=load,
-        titles=(),
+        source, headings=(*(source.headings[place] for place in rest), *new),
+        units=(*(source.units[place] for place in rest), None, source.units[own[0]]), load=load, titles=(),
         remarks=(*source.remarks, remark),
-    )
+    )  # fmt: skip
 
 
 def _past_midnight(times: pd.Series) -> pd.Series:
@@ -596,13 +588,9 @@ def _joined(files: Sequence[Path], tables: Sequence[Recordings], folder: str) ->
         values = {"files": having, "all": len(tables), "text": text}
         remarks.append(remark if having == len(tables) else Remark("data.in_some_files", values))
     return Recordings(
-        names=first.names,
-        units=tuple(units),
-        labels=tuple(labels),
+        names=first.names, units=tuple(units), labels=tuple(labels),
         recording=np.concatenate([table.recording for table in tables]) + np.repeat(starts, lengths),
         t=np.concatenate([table.t for table in tables]),
         values=np.concatenate([table.values[:, [*map(table.names.index, first.names)]] for table in tables]),
-        time_unit=time_unit,
-        headings=first.headings,
-        remarks=tuple(remarks),
-    )
+        time_unit=time_unit, headings=first.headings, remarks=tuple(remarks),
+    )  # fmt: skip

@@ -70,13 +70,11 @@ def _withdrawn(found: Investigation) -> Investigation:
         or Remainder.of(context.data, recalibrated, recalibrated, context.roles).structured
     ):
         return replace(
-            found,
-            verdict=found.quiet_verdict,
-            search=replace(found.search, found=(), fit=recalibrated),
+            found, verdict=found.quiet_verdict, search=replace(found.search, found=(), fit=recalibrated),
             log_odds=(),
             remarks=(*found.remarks, Remark("diagnosis.refuted", {"names": " and ".join(names)})),
             account=budget.account(),
-        )
+        )  # fmt: skip
     return replace(
         found, verdict=MismatchVerdict.UNEXPLAINED, models=models, withdrawn=True, account=budget.account()
     )
@@ -243,16 +241,14 @@ def _completed(model: Dynamics, x: np.ndarray, *, process: np.ndarray | None = N
         noise = Diffusion(np.diag(process))
     mean = {symbol(each.name): sympy.S.Zero for each in model.inputs if each.name.startswith("_")}
     return replace(
-        model,
-        domain=domain,
-        diffusion=noise,
+        model, domain=domain, diffusion=noise,
         equations=tuple(each.xreplace(mean) for each in model.equations),
         outputs=tuple((name, formula.xreplace(mean)) for name, formula in model.outputs),
         inputs=tuple(each for each in model.inputs if not each.name.startswith("_")),
         parameters=tuple(each for each in model.parameters if not each.name.startswith("_")),
         expected_together=() if mean else model.expected_together,
         covariance=None if mean else model.covariance,
-    )
+    )  # fmt: skip
 
 
 def _judged(case: Comparison, budget: Budget) -> tuple[Investigation, HeldOutRuns, Statement]:
@@ -342,11 +338,9 @@ def solve_case(
     return Diagnosis(
         statement=statement,
         augmented=_completed(model, final.x, process=final.noise.process if found.process_noise else None),
-        recalibrated=_completed(recalibrated.model, recalibrated.x),
-        case=case,
-        investigation=found,
+        recalibrated=_completed(recalibrated.model, recalibrated.x), case=case, investigation=found,
         held_out=shown,
-    )
+    )  # fmt: skip
 
 
 CURVE_COLUMNS = [

@@ -355,11 +355,9 @@ def trial_points(
         x[~known] *= generator.choice([-1.0, 1.0], size=(int((~known).sum()), count))
         inputs *= generator.choice([-1.0, 1.0], size=inputs.shape)
     return x, Signals(
-        inputs=inputs,
-        delayed=delayed,
-        slopes=np.zeros_like(delayed),
+        inputs=inputs, delayed=delayed, slopes=np.zeros_like(delayed),
         t=generator.uniform(0.0, 1.0, size=count),
-    )
+    )  # fmt: skip
 
 
 def _feeds(model: Dynamics, prey: str, predator: str) -> bool:
@@ -446,11 +444,9 @@ def assignments(form: Form, model: Dynamics, roles: Roles) -> Iterator[dict[str,
         ("position", "velocity"): roles.motions,
         ("displacement", "velocity"): tuple(pair for pair in roles.motions if pair[0] not in roles.angles),
         ("angle", "velocity"): tuple(pair for pair in roles.motions if pair[0] in roles.angles),
-        ("amplitude", "amplitude"): roles.amplitudes,
-        ("prey", "predator"): roles.feeding,
-        ("susceptible", "infectious"): roles.contagion,
-        ("upper level", "lower level"): roles.cascades,
-    }
+        ("amplitude", "amplitude"): roles.amplitudes, ("prey", "predator"): roles.feeding,
+        ("susceptible", "infectious"): roles.contagion, ("upper level", "lower level"): roles.cascades,
+    }  # fmt: skip
     alone: dict[str, tuple[str, ...]] = {}
     for both, motions in pairs.items():
         for side, kind in enumerate(both):

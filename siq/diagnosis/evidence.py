@@ -63,13 +63,11 @@ class FittedCandidate:
         gained = 2 * (trial.log_likelihood - before.log_likelihood)
         count = trial.degrees_of_freedom + len(trial.model.free)
         return cls(
-            candidate=candidate,
-            fit=trial,
-            delta_chi2=gained,
+            candidate=candidate, fit=trial, delta_chi2=gained,
             delta_bic=-gained + extra * np.log(count) + beginnings * np.log(max(count / len(data.labels), 2)),
             p_white=float(scipy.stats.chi2.sf(max(gained, 0.0), extra + beginnings)),
             p_cluster=probability_by_chance(trial, before, data, candidate, blocks=blocks),
-        )
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

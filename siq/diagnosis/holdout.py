@@ -88,11 +88,9 @@ class HeldOutErrors:
         known = {name: each for name, each in runs.items() if each is not None}
         further |= {name: float(np.sqrt(each.mean())) for name, each in known.items()}
         return cls(
-            noise_floor=noise_floor,
-            values=max(map(len, known.values()), default=0),
-            squares={name: in_blocks(each) for name, each in known.items()},
-            **further,
-        )
+            noise_floor=noise_floor, values=max(map(len, known.values()), default=0),
+            squares={name: in_blocks(each) for name, each in known.items()}, **further,
+        )  # fmt: skip
 
     @property
     def better_without(self) -> Run:

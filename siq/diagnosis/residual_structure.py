@@ -71,12 +71,10 @@ def _structure_of(data: Measurements, fit: Fit, roles: Roles, *, noise: Noise | 
     curves.sort(key=lambda each: -each.gain)
     best = min((each.p_value for each in curves), default=1.0)
     return Structure(
-        curves=tuple(curves),
-        p_curves=min(1.0, best * max(len(curves), 1)),
+        curves=tuple(curves), p_curves=min(1.0, best * max(len(curves), 1)),
         p_autocorrelation=_autocorrelation(left, white.recording, white.known, len(fit.model.outputs)),
-        total=total,
-        freedom=freedom,
-    )
+        total=total, freedom=freedom,
+    )  # fmt: skip
 
 
 def _autocorrelation(left: np.ndarray, recording: np.ndarray, known: np.ndarray, outputs: int) -> float:
@@ -176,17 +174,14 @@ def remaining_forces(fit: Fit, data: Measurements, roles: Roles) -> list[Remark]
         size = float(np.sqrt(np.mean(force**2)))
         lasts = correlation_time_of(force, data.recording[rows], outputs=1)
         values = {
-            "state": name,
-            "size": size,
+            "state": name, "size": size,
             "unit": unit_of("_x/_t", {"_x": units.get(name, "1"), "_t": unit_of_time}),
             "share": size / max(float(np.sqrt(np.mean(rates[:, place] ** 2))), 1e-300),
             "intensity": float(fit.noise.process[place]),
             "intensity_unit": unit_of("_x**2/_t", {"_x": units.get(name, "1"), "_t": unit_of_time}),
-            "samples": lasts,
-            "lasts": lasts * float(np.median(step)),
-            "time_unit": unit_of_time,
+            "samples": lasts, "lasts": lasts * float(np.median(step)), "time_unit": unit_of_time,
             "along": "" if best is None else best.term.words[0],
-        }
+        }  # fmt: skip
         found.append(Remark("diagnosis.remains", values))
     return found
 

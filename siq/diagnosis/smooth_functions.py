@@ -360,15 +360,9 @@ class Smoothness:
             return SmoothFunction(place, (bumps,), np.zeros(bumps.width))
         gram, overlap = self._by_value
         return _product_of(
-            place,
-            self.courses,
-            tuple(times * share for share in LENGTH_SCALES),
-            points=self.fine.centres,
-            gram=gram,
-            overlap=overlap,
-            deviation=self.deviation,
-            weight=weight,
-        )
+            place, self.courses, tuple(times * share for share in LENGTH_SCALES), points=self.fine.centres,
+            gram=gram, overlap=overlap, deviation=self.deviation, weight=weight,
+        )  # fmt: skip
 
     @property
     def _by_value(self) -> tuple[np.ndarray, np.ndarray]:

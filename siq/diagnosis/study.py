@@ -162,11 +162,9 @@ def _measurements_of(recordings: Recordings | pd.DataFrame | str | Path, system:
                 raise InputError(file, "", f"the column '{name}' is missing", remedy)
         places = [recordings.names.index(name) for name in columns]
         chosen = replace(
-            recordings,
-            names=tuple(columns),
-            units=tuple(recordings.units[place] for place in places),
+            recordings, names=tuple(columns), units=tuple(recordings.units[place] for place in places),
             values=np.ascontiguousarray(recordings.values[:, places]),
-        )
+        )  # fmt: skip
         for name, unit in {"t": chosen.time_unit, **dict(zip(columns, chosen.units, strict=True))}.items():
             if unit is not None and name in units and unit != units[name]:
                 fault = f"its unit is {unit}, and in the simulation it is {units[name]}"

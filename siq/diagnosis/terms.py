@@ -139,16 +139,11 @@ class Place:
         parameters = [Parameter(name, 0.0, unit) for name, unit in zip(names, units, strict=True)]
         name = f"a function of {' and '.join(self.words)}"
         return added(
-            model,
-            {name: formula * factor for name, factor in self.equations},
-            {name: formula * factor for name, factor in self.outputs},
-            parameters,
-            name=name,
+            model, {name: formula * factor for name, factor in self.equations},
+            {name: formula * factor for name, factor in self.outputs}, parameters, name=name,
             label=f"{name} in {'the measurement of ' if self.outputs else ''}{', '.join(self.targets)}",
-            coordinate="measurement" if self.outputs else ", ".join(self.words),
-            kind=FORMULA,
-            place=self,
-        )
+            coordinate="measurement" if self.outputs else ", ".join(self.words), kind=FORMULA, place=self,
+        )  # fmt: skip
 
     def unit(self, model: Dynamics, first: int, second: int) -> str:
         """Unit of the coefficient of a term with so many factors of either coordinate."""

@@ -373,11 +373,9 @@ def _memory_forms() -> Iterator[Form]:
         return Form(terms=terms, parameters=parameters, variant=variant, **usual)
 
     pairs: tuple[dict[str, Role], ...] = (
-        {"q": "state"},
-        {"x": "state", "q": "state"},
-        {"x": "position", "q": "state"},
+        {"q": "state"}, {"x": "state", "q": "state"}, {"x": "position", "q": "state"},
         {"x": "input", "q": "state"},
-    )
+    )  # fmt: skip
     for roles in pairs:
         of = next(iter(roles))
         yield form(of, {"q": "c*z"}, f"q/T/{of}", roles=roles)

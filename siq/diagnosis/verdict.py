@@ -334,16 +334,10 @@ def _stated_function(
         shape = {"shape": "late" if len(candidate.shapes) == 1 else "ringing", "sizes": {name: time}}
     measured = [name for name, _ in candidate.changes if name in fit.model.output_names]
     return _stated(
-        part,
-        fit,
-        kind=candidate.kind,
-        outputs=() if candidate.equations else tuple(measured),
-        coordinates=tuple(candidate.coordinate.split(", ")) if place is None else place.words,
-        curve=curve,
-        surface=surface,
-        beside=beside,
-        **shape,
-    )
+        part, fit, kind=candidate.kind, outputs=() if candidate.equations else tuple(measured),
+        coordinates=tuple(candidate.coordinate.split(", ")) if place is None else place.words, curve=curve,
+        surface=surface, beside=beside, **shape,
+    )  # fmt: skip
 
 
 def _shape_of(

@@ -99,10 +99,8 @@ class _Residuals:
         self.pairs, n = pairs, len(pairs.h)
         functions = np.unique(found.support[:, 1])
         columns = [
-            found.library.evaluate(pairs.x0)[:, functions],
-            np.ones((n, 1)),
-            pairs.state_parts(STATE_BINS),
-        ]
+            found.library.evaluate(pairs.x0)[:, functions], np.ones((n, 1)), pairs.state_parts(STATE_BINS),
+        ]  # fmt: skip
         together = np.concatenate(columns, axis=1) * np.sqrt(pairs.h / pairs.h.mean())[:, None]
         self.basis = _orthonormal(together)
         scaled = (pairs.x0 - pairs.x0.mean(axis=0)) / positive(pairs.x0.std(axis=0))
@@ -234,11 +232,9 @@ def check_claims(
     slow = {"gaussian_force": _gaussian_force(found, states, false_alarms)} if found.slow_force else {}
     return {
         "one_system": _one_system(rest, whole.labels, false_alarms),
-        "unchanged": _unchanged(rest, false_alarms),
-        "state_complete": _state_complete(rest, false_alarms),
-        "gaussian_increments": _gaussian(rest, measured, false_alarms),
-        **slow,
-    }
+        "unchanged": _unchanged(rest, false_alarms), "state_complete": _state_complete(rest, false_alarms),
+        "gaussian_increments": _gaussian(rest, measured, false_alarms), **slow,
+    }  # fmt: skip
 
 
 def _gaussian_force(found: FieldEstimate, states: Recordings, limit: float) -> Verdict:

@@ -144,13 +144,10 @@ def _plans(fit: Fit, data: Measurements) -> tuple[list[Plan], Measurements, np.n
         ]
         courses = [()] * len(plans)
     proposed = replace(
-        data,
-        labels=tuple(str(k) for k in range(len(plans))),
-        first=count * np.arange(len(plans) + 1),
-        t=np.tile(t, len(plans)),
-        outputs=np.zeros((count * len(plans), data.outputs.shape[1])),
+        data, labels=tuple(str(k) for k in range(len(plans))), first=count * np.arange(len(plans) + 1),
+        t=np.tile(t, len(plans)), outputs=np.zeros((count * len(plans), data.outputs.shape[1])),
         courses=tuple(courses),
-    )
+    )  # fmt: skip
     return plans, proposed, begin
 
 

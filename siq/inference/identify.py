@@ -63,7 +63,7 @@ from siq.inference.kalman_identification import (
     identify_by_likelihood,
 )
 from siq.inference.library import CandidateLibrary, IdentificationOptions, field_library
-from siq.inference.measurements import relative_variance
+from siq.inference.measurements import Measurements
 from siq.inference.observation import INTERVAL, ObservationModel, inertia_test, moved_by, velocity_names
 from siq.inference.regression import (
     carries_noise,
@@ -297,36 +297,27 @@ class _Case:
         It does where the recordings are likelier so, at Schwarz's price of the further parameters. Of one
         state by densities: what the size of the noise tells of the state is not linear.
         """
-        pairs, known = self._pairs(self.recordings), found.diagnosis
+        pairs, known, again, gain = self._pairs(self.recordings), found.diagnosis, found, 0.0
         law = None if known is None or known.exposure is not None else sensor_law(found, pairs)
-        if law is None:
+        if known is None or law is None:
             return None
-        assert known is not None and known.sensor_evidence is not None
-        price, again = np.count_nonzero(law[:, 1:]) * np.log(len(pairs.h)), found
+        price = np.count_nonzero(law[:, 1:]) * np.log(len(pairs.h))
         with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
             if not found.flow.by_density:
-                view = replace(
-                    ObservationModel.of(found), diffusion=Diffusion.identity(len(known.covariance))
-                )
+                view, unit = ObservationModel.of(found), Diffusion.identity(self.library.dimension)
                 noise = Noise(known.measurement**2, np.diag(found.noise_rate))
-                again = self.by_likelihood(replace(view, sensor_law=law), noise)
-                if not 2 * (self._likelihood(again) - self._likelihood(found)) > price:
-                    return None
-            if self.library.dimension > 1 or self.library.angles or self.given is not None:
-                return again
-        with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
-            given, false_terms = Transitions(again, pairs), self.options.false_terms
-            finer = given.identified_behind_sensor(law=law, false_terms=false_terms)
-            if (
-                finer is not None
-                and finer.diagnosis is not None
-                and finer.diagnosis.sensor_evidence is not None
-            ):
-                gain = finer.diagnosis.sensor_evidence
-                evidence = known.sensor_evidence + gain
-                finer = replace(finer, diagnosis=replace(finer.diagnosis, sensor_evidence=evidence))
-                again = finer if again is not found or gain > price else again
-        return None if again is found else again
+                again = self.by_likelihood(replace(view, diffusion=unit, sensor_law=law), noise)
+                gain = 2 * (self._likelihood(again) - self._likelihood(found))
+        plain = self.library.dimension == 1 and not self.library.angles and self.given is None
+        if plain and (gain > price or found.flow.by_density):
+            with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
+                given, false_terms = Transitions(again, pairs), self.options.false_terms
+                finer = given.identified_behind_sensor(law=law, false_terms=false_terms)
+                if finer is not None and finer.diagnosis is not None:
+                    gain += finer.diagnosis.sensor_evidence or 0.0
+                    evidence = (known.sensor_evidence or 0.0) + gain
+                    again = replace(finer, diagnosis=replace(finer.diagnosis, sensor_evidence=evidence))
+        return again if gain > price else None
 
     def _likelihood(self, found: FieldEstimate) -> float:
         view = ObservationModel.of(found)
@@ -353,14 +344,12 @@ class _Case:
         """By the likelihood of samples that are means over an exposure; None where they are no such means.
 
         They are such means if nothing is left in the innovations that neighbours share. Without an exposure
-        they show the state behind noise of the sensor alone.
+        they show the state behind measurement noise alone.
         """
+        share = MAX_SHARE / 2 if observation.exposure is None else SENSOR_SHARE
         try:
             moved, step = moved_by(observation.measured(self.recordings, self.pair_step))
-            share, driven = (
-                (MAX_SHARE / 2, 1 - MAX_SHARE) if observation.exposure is None else (SENSOR_SHARE, 1)
-            )
-            found = self.by_likelihood(observation, Noise(share * moved, driven * moved / step))
+            found = self.by_likelihood(observation, Noise(share * moved, moved / step))
             if observation.exposure is None:
                 found = self.with_sensor_law(found) or found
         except (NumericalFailure, np.linalg.LinAlgError):
@@ -431,7 +420,7 @@ class _Case:
         sensors = [{"size": float(size), "state": name, "along": []} for size, name in sizes]
         if noise.sensor_law is not None:
             levels = np.quantile(self.recordings.values, [0.05, 0.95], axis=0)
-            along = noise.measurement * np.sqrt(relative_variance(noise.sensor_law, levels))
+            along = noise.measurement * np.sqrt(Measurements.relative_variance(noise.sensor_law, levels))
             for place in np.flatnonzero(noise.sensor_law[:, 1:].any(axis=1)):
                 sensors[place]["along"] = np.stack([levels, along], axis=2)[:, place].tolist()
         return Remark("inference.measurement_noise", {"sensors": sensors})

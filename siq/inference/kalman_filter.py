@@ -25,7 +25,7 @@ import sympy
 
 from siq.errors import NumericalFailure
 from siq.inference.filter_kernels import carry_linearly, filter_recursion, projected_sums, smooth_backwards
-from siq.inference.measurements import Measurements, relative_variance
+from siq.inference.measurements import Measurements
 from siq.inference.selection import triangle_of
 from siq.numerics.randomness import positive
 from siq.systems.diffusion import Diffusion
@@ -297,7 +297,7 @@ def linearise(
         foreseen = x.copy()
         foreseen[rows + 1] += gap[rows]
         levels = compiled.outputs(np.ascontiguousarray(foreseen.T), signals, values).T
-        variance = relative_variance(data.sensor_law, levels)
+        variance = Measurements.relative_variance(data.sensor_law, levels)
         residual, logarithms = residual / np.sqrt(variance), np.log(variance)
         measured, answered = (one / np.sqrt(variance)[:, :, None] for one in (measured, answered))
     found = Linearisation(

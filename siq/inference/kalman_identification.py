@@ -408,11 +408,9 @@ def filtered_recordings(
         follow = observation.followed(data, model, noise=noise, substeps=found.flow.steps)
         states = follow.linearised_at[~np.isnan(data.outputs).all(axis=1)]
     seen = replace(
-        recordings,
-        recording=recordings.recording[rows],
-        t=recordings.t[rows],
+        recordings, recording=recordings.recording[rows], t=recordings.t[rows],
         values=states[:, :count].copy(),
-    )
+    )  # fmt: skip
     if not observation.hidden:
         return seen
 

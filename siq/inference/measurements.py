@@ -86,6 +86,12 @@ class Measurements:
             return measurement
         return np.where(np.isfinite(self.sensor_noise), self.sensor_noise, measurement)
 
+    @staticmethod
+    def relative_variance(law: np.ndarray, levels: np.ndarray) -> np.ndarray:
+        """Variance of sensors' noise over its mean, by a law as of `sensor_law`, at levels ``(n, m)``."""
+        found = np.einsum("mk,nmk->nm", law, levels[:, :, None] ** np.arange(3))
+        return np.where(np.isfinite(found), np.maximum(found, LEAST_VARIANCE), 1.0)
+
     @property
     def recording(self) -> np.ndarray:
         """Place of each row's recording in `labels`."""
@@ -153,12 +159,6 @@ class Measurements:
     def _part(self, rows: Sequence[np.ndarray], **changes: Any) -> Measurements:
         at, first = np.concatenate(rows), np.cumsum([0, *map(len, rows)])
         return replace(self, first=first, t=self.t[at], outputs=self.outputs[at], **changes)
-
-
-def relative_variance(law: np.ndarray, levels: np.ndarray) -> np.ndarray:
-    """Variance of sensors' noise over its mean, at levels ``(n, m)``, by a law as in `Measurements`."""
-    found = np.einsum("mk,nmk->nm", law, levels[:, :, None] ** np.arange(3))
-    return np.where(np.isfinite(found), np.maximum(found, LEAST_VARIANCE), 1.0)
 
 
 def course_of_input(t: np.ndarray, u: np.ndarray, interpolation: str) -> scipy.interpolate.PPoly:
@@ -336,14 +336,11 @@ def with_variation(
         return tuple((*own, *mark) for own, mark in zip(of.courses, marks, strict=True))
 
     varied = replace(
-        model,
-        equations=tuple(each.xreplace(change) for each in model.equations),
+        model, equations=tuple(each.xreplace(change) for each in model.equations),
         outputs=tuple((name, formula.xreplace(change)) for name, formula in model.outputs),
-        inputs=(*model.inputs, *signs),
-        parameters=(*model.parameters, *parameters),
-        expected_together=(*model.expected_together, *expected),
-        covariance=None,
-    )
+        inputs=(*model.inputs, *signs), parameters=(*model.parameters, *parameters),
+        expected_together=(*model.expected_together, *expected), covariance=None,
+    )  # fmt: skip
     return (
         varied,
         replace(data, courses=courses(data, True)),

@@ -338,7 +338,7 @@ def moved_by(data: Measurements) -> tuple[np.ndarray, float]:
 def unbroken(recordings: Recordings, *, pair_step: float | None = None, every: int = 1) -> Measurements:
     """Recordings as measurements of their states, a new one behind every gap; of `every` so many samples one.
 
-    Samples belong together up to the time `pair_step`, by default that of `siq.data.recordings.longest_step`.
+    Samples belong together up to the time `pair_step`, by default `Recordings.longest_step`.
     """
     runs = [np.arange(run.start, run.stop, every) for run in runs_of(recordings, longest=pair_step)]
     rows = np.concatenate(runs)

@@ -28,7 +28,7 @@ from siq.data.recordings import SnapshotPairs
 from siq.errors import NumericalFailure
 from siq.inference.diffusion_model import DEGREE, HARMLESS_CHANGE, constant_noise
 from siq.inference.field_estimate import FieldEstimate, NoiseDiagnosis, NoiseFormula
-from siq.inference.measurements import relative_variance
+from siq.inference.measurements import Measurements
 from siq.inference.selection import (
     LinearProblem,
     all_coefficients,
@@ -351,7 +351,7 @@ class Transitions:
 
             return density.foreseen(self.x0, self.xh, *ends, plain, exposure=self.exposure, whole=whole)
         grid = np.linspace(self.edges[0], self.edges[-1], NATURAL_GRID)
-        variance = relative_variance(law, grid[:, None])[:, 0]
+        variance = Measurements.relative_variance(law, grid[:, None])[:, 0]
         slope, bent = np.cbrt(1 / variance), np.gradient(variance, grid)
         natural = np.append(0.0, np.cumsum((slope[1:] + slope[:-1]) / 2 * np.diff(grid)))
 

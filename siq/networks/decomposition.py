@@ -115,12 +115,10 @@ class TrainingOptions:
         if number % 2 == 0:
             return self
         return replace(
-            self,
-            orthogonality_weight=10 * self.orthogonality_weight,
-            potential_from="descent",
+            self, orthogonality_weight=10 * self.orthogonality_weight, potential_from="descent",
             potential_gain=1.0,
             slow_speed=(self.slow_speed or 0.1) if self.matching == "symmetric" else self.slow_speed,
-        )
+        )  # fmt: skip
 
 
 Layer = tuple[np.ndarray, np.ndarray]

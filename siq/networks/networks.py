@@ -50,6 +50,10 @@ class Networks:
         """Number of independent runs."""
         return self.mean.shape[0]
 
+    def of_run(self, run: int) -> Networks:
+        """The networks of one of the runs, as networks with a single run."""
+        return replace(self, **_mapped(lambda tensor: tensor[run : run + 1], self))
+
     def parameters(self) -> list[Tensor]:
         """Everything that training changes: weights and biases of both networks."""
         return [tensor for layer in (*self.potential, *self.circulatory) for tensor in layer]
@@ -96,11 +100,6 @@ def _mapped(function: Callable[..., Any], *sources: Networks | TrainedNetworks) 
     stacks, numbers = ("potential", "circulatory"), ("mean", "scale", "potential_scale", "circulatory_scale")
     mapped = {name: layers(*(getattr(one, name) for one in sources)) for name in stacks}
     return mapped | {name: function(*(getattr(one, name) for one in sources)) for name in numbers}
-
-
-def select_run(networks: Networks, run: int) -> Networks:
-    """The networks of one of the runs, as networks with a single run."""
-    return replace(networks, **_mapped(lambda tensor: tensor[run : run + 1], networks))
 
 
 def at_rest(networks: Networks, run: int) -> TrainedNetworks:

@@ -164,16 +164,12 @@ def sparse_decomposition(
     coefficients = scaled / ratio
     d = library.dimension
     return RegressionResult(
-        vector_field=coefficients[:, :d],
-        potential=coefficients[:, d],
-        circulatory=coefficients[:, d + 1 :],
-        converged=converged,
-        iterations=iterations,
+        vector_field=coefficients[:, :d], potential=coefficients[:, d], circulatory=coefficients[:, d + 1 :],
+        converged=converged, iterations=iterations,
         constraint_residual=float(np.abs(constraints @ scaled.T.ravel()).max()),
         sparse_constraint_residual=float(np.abs(constraints @ sparse.T.ravel()).max()),
-        misfit=np.sqrt(residual) / np.where(size > 0, size, 1.0),
-        points=len(x),
-    )
+        misfit=np.sqrt(residual) / np.where(size > 0, size, 1.0), points=len(x),
+    )  # fmt: skip
 
 
 def _scales(
@@ -234,12 +230,9 @@ def _relaxed_regression(
         optimizer = pysindy.SR3(**settings)
     else:
         optimizer = pysindy.ConstrainedSR3(
-            **settings,
-            constraint_lhs=constraints.copy(),
-            constraint_rhs=np.zeros(len(constraints)),
-            constraint_order="target",
-            equality_constraints=True,
-        )
+            **settings, constraint_lhs=constraints.copy(), constraint_rhs=np.zeros(len(constraints)),
+            constraint_order="target", equality_constraints=True,
+        )  # fmt: skip
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         optimizer.fit(matrix, goals)

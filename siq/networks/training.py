@@ -41,7 +41,6 @@ from siq.networks.networks import (
     mean_velocity,
     move,
     orthogonality_loss,
-    select_run,
     side_by_side,
 )
 from siq.numerics.randomness import Purpose, representative_subset, seed_sequence
@@ -206,7 +205,7 @@ def _initial_networks(
     )
     potential_scales, circulatory_scales = [], []
     for run, pairs in enumerate(sources):
-        one = select_run(networks, run)
+        one = networks.of_run(run)
         # A few thousand pairs fix a single number well; the whole data would only cost memory.
         rows = np.linspace(0, len(pairs.h) - 1, min(len(pairs.h), 20_000)).astype(int)
         _, slope, turning, _ = evaluate(one, torch.from_numpy(pairs.x0[rows]).to(dtype)[None])

@@ -130,15 +130,11 @@ class Certificate:
     def as_data(self) -> dict[str, Any]:
         """As it stands in model.json."""
         return {
-            "certified": self.certified,
-            "times_certified": self.times_certified,
-            "scope": self.scope,
-            "stated_error": float(self.error) if np.isfinite(self.error) else None,
-            "reason": self.reason,
-            "tested_on": self.tested_on,
-            "independent": list(self.independent),
+            "certified": self.certified, "times_certified": self.times_certified, "scope": self.scope,
+            "stated_error": float(self.error) if np.isfinite(self.error) else None, "reason": self.reason,
+            "tested_on": self.tested_on, "independent": list(self.independent),
             "tests": {name: verdict.as_data() for name, verdict in self.tests.items()},
-        }
+        }  # fmt: skip
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any]) -> Certificate:

@@ -435,13 +435,10 @@ class OutputWeights:
         lowest = -(np.tanh(basis.biases) @ of_units) / steepness  # V is zero at μ
         return TrainedNetworks(
             potential=(layers, (of_units[:, None] / steepness, np.full((1, 1), lowest))),
-            circulatory=(layers, (of_g[:-1], of_g[-1:])),
-            mean=basis.center[None],
-            scale=basis.scale[None],
-            potential_scale=np.array([[steepness]]),
-            circulatory_scale=np.ones((1, 1)),
+            circulatory=(layers, (of_g[:-1], of_g[-1:])), mean=basis.center[None], scale=basis.scale[None],
+            potential_scale=np.array([[steepness]]), circulatory_scale=np.ones((1, 1)),
             diffusion=self.diffusion.matrix,
-        )
+        )  # fmt: skip
 
     def _leaves(self, attractor: np.ndarray, basis: _UnitBasis, weights: np.ndarray) -> bool:
         """Whether paths of least action leave an attractor at which f comes to rest."""

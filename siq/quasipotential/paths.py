@@ -159,15 +159,11 @@ def minimum_action_path(
             trees.append(tree(y))
     points, momenta = np.split(line[:, :-1], 2, axis=1)
     return MinimumActionPath(
-        points=problem.points(points),
-        momenta=problem.momenta(momenta),
-        values=problem.unit * line[:, -1],
-        action=problem.unit * float(line[-1, -1]),
-        error=problem.unit * error,
-        residual=problem.residual(points, momenta),
-        converged=minimum and known,
+        points=problem.points(points), momenta=problem.momenta(momenta), values=problem.unit * line[:, -1],
+        action=problem.unit * float(line[-1, -1]), error=problem.unit * error,
+        residual=problem.residual(points, momenta), converged=minimum and known,
         rivals=tuple(float(problem.unit * line[-1, -1] * share) for share in rivals),
-    )
+    )  # fmt: skip
 
 
 def _path_nodes(problem: PathProblem, y: np.ndarray) -> np.ndarray:

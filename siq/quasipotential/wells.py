@@ -217,11 +217,9 @@ class Well(Expansion):
         basin = portrait.basins[index]
         along = self.values(basin.states.reshape(-1, basin.states.shape[2])).reshape(basin.states.shape[:2])
         return replace(
-            self,
-            dynamics=dynamics,
-            points=basin.points(basin.below(along, self.reach)),
+            self, dynamics=dynamics, points=basin.points(basin.below(along, self.reach)),
             elsewhere=portrait.states_elsewhere(index),
-        )
+        )  # fmt: skip
 
 
 FIRST_LEVEL_SHARE = 0.05  # of a known depth: the first level

@@ -93,15 +93,11 @@ def mismatch_answer(statement: Statement, *, title: str) -> dict[str, Any]:
     """
     errors = statement.errors
     return {
-        "title": title,
-        "sentence": statement.sentence,
-        "verdict": str(statement.verdict),
-        "outcome": statement.outcome,
-        "compared": errors.noise_floor is not None,
-        "held_out_before": errors.before,
-        "held_out_after": getattr(errors, statement.final_simulation),
+        "title": title, "sentence": statement.sentence, "verdict": str(statement.verdict),
+        "outcome": statement.outcome, "compared": errors.noise_floor is not None,
+        "held_out_before": errors.before, "held_out_after": getattr(errors, statement.final_simulation),
         "held_out_noise": errors.noise_floor,
-    }
+    }  # fmt: skip
 
 
 @cache

@@ -151,25 +151,16 @@ def environment() -> Environment:
         lstrip_blocks=True,
     )  # fmt: skip
     made.filters |= {
-        "value": value_text,
-        "number": number_text,
-        "share": percent,
-        "relative": _relative_text,
-        "percent": percent_text,
-        "p": p_text,
-        "range": lambda ends, **options: range_text(*ends, **options),
-        "unit": unit_text,
-        "listed": lambda names, word="and": listed(list(names), word),
+        "value": value_text, "number": number_text, "share": percent, "relative": _relative_text,
+        "percent": percent_text, "p": p_text, "range": lambda ends, **options: range_text(*ends, **options),
+        "unit": unit_text, "listed": lambda names, word="and": listed(list(names), word),
         "capital": lambda text: text[:1].upper() + text[1:],
         "lower_first": lambda text: text[:1].lower() + text[1:],
-        "count_word": lambda count: COUNTS[count] if count < len(COUNTS) else str(count),
-        "term": term_text,
+        "count_word": lambda count: COUNTS[count] if count < len(COUNTS) else str(count), "term": term_text,
         "one_line": lambda text: " ".join(in_paragraphs(text)),
         "time": lambda mean, unit: time_text(mean, unit if unit_text(unit) else "time units"),
-        "counted": counted_text,
-        "predicted": predicted_text,
-        "place": _position_text,
-    }
+        "counted": counted_text, "predicted": predicted_text, "place": _position_text,
+    }  # fmt: skip
     made.tests["finite"] = lambda value: bool(np.isfinite(value))
     made.globals["law_from"] = MIN_BARRIER_OVER_NOISE
     return made

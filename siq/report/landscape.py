@@ -85,13 +85,11 @@ def landscape_tables(
         names = ("wells", "exits", "equilibria", "cycles", "times", "checked")
         return dict.fromkeys(names, (pd.DataFrame(), None))
     return {
-        "wells": _wells_table(summary),
-        "exits": _exits_table(summary),
-        "equilibria": (_equilibria_table(summary), None),
-        "cycles": (_cycles_table(summary), None),
+        "wells": _wells_table(summary), "exits": _exits_table(summary),
+        "equilibria": (_equilibria_table(summary), None), "cycles": (_cycles_table(summary), None),
         "times": (_times_table(summary, noises if summary.has_times else ()), None),
         "checked": (_checked_table(summary), summary.checked_times),
-    }
+    }  # fmt: skip
 
 
 def _wells_table(summary: LandscapeSummary) -> tuple[pd.DataFrame, pd.DataFrame]:

@@ -203,11 +203,8 @@ def render_report(content: object, *, template: str = "report.html.j2", folder: 
     package = PackageLoader("siq.report")
     environment = Environment(
         loader=package if folder is None else ChoiceLoader([FileSystemLoader(folder), package]),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
     environment.filters |= {
         "cell": _cell_text,
         "is_number": lambda column: is_numeric_dtype(column) and not is_bool_dtype(column),
@@ -378,12 +375,10 @@ def _times_view(landscape: LandscapeSummary) -> Markup | None:
     ]
     view = {
         "data": {"noises": [value_text(one) for one in strengths], "rows": rows},
-        "first": strengths.index(first),
-        "known": landscape.noise is not None,
+        "first": strengths.index(first), "known": landscape.noise is not None,
         "noise": with_unit("noise strength ε", landscape.energy_unit),
-        "time": with_unit("lasts", landscape.time_unit),
-        "wells": [one.label for one in landscape.wells],
-    }
+        "time": with_unit("lasts", landscape.time_unit), "wells": [one.label for one in landscape.wells],
+    }  # fmt: skip
     return Markup(render_report(view, template="times.html.j2"))
 
 
@@ -449,13 +444,10 @@ def _solid_view(landscape: LandscapeSummary) -> Markup | None:
     }
     rest = [place for place in range(count) if place not in shown]
     view = {
-        "names": names,
-        "data": data,
+        "names": names, "data": data,
         "held": [f"{landscape.names[place]} = {lowest[place]:.3g}" for place in rest],
-        "flat": len(shown) == 2,
-        "level": round(1000 * share),
-        "plane": [shown.index(state) for state in first],
-        "wells": [one.label for one in landscape.wells],
+        "flat": len(shown) == 2, "level": round(1000 * share),
+        "plane": [shown.index(state) for state in first], "wells": [one.label for one in landscape.wells],
         "ways": bool(landscape.ways),
-    }
+    }  # fmt: skip
     return Markup(render_report(view, template="interactive.html.j2"))

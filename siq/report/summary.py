@@ -415,20 +415,14 @@ def _well(
     lowest = min(ways, key=lambda way: way.barrier, default=None)
     place, known = settled(attractor.position, np.nan if errors is None else errors[index], size)
     return WellSummary(
-        label=well_name(index),
-        position=place,
-        position_errors=known,
-        height=height,
-        basin=float(landscape.basins[index]),
-        depth=math.nan if lowest is None else lowest.barrier,
+        label=well_name(index), position=place, position_errors=known, height=height,
+        basin=float(landscape.basins[index]), depth=math.nan if lowest is None else lowest.barrier,
         depth_error=math.nan if lowest is None else lowest.error,
         beyond=None if lowest is None or lowest.end is None else well_name(lowest.end),
-        known_up_to=math.nan if formula is None else 2 * formula.level,
-        exits=tuple(landscape.exits(index)),
-        leverage=1.0 if lowest is None else lowest.leverage,
-        visits=visits,
+        known_up_to=math.nan if formula is None else 2 * formula.level, exits=tuple(landscape.exits(index)),
+        leverage=1.0 if lowest is None else lowest.leverage, visits=visits,
         cycle=attractor if isinstance(attractor, Cycle) else None,
-    )
+    )  # fmt: skip
 
 
 def settled(position: Any, errors: Any, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

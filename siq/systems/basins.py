@@ -254,12 +254,10 @@ def _saddle_near(dynamics: Dynamics, x: np.ndarray, box: np.ndarray) -> Equilibr
         if not roots:
             with np.errstate(all="ignore"):  # a step to where f is beyond all numbers is taken back
                 solved = scipy.optimize.root(
-                    lambda share: dynamics.drift((share * width)[None])[0] / width,
-                    start / width,
+                    lambda share: dynamics.drift((share * width)[None])[0] / width, start / width,
                     jac=lambda share: dynamics.jacobian((share * width)[None])[0] * width / width[:, None],
-                    method="lm",
-                    options={"xtol": 1e-12, "ftol": 1e-12, "maxiter": LEVENBERG_STEPS},
-                )
+                    method="lm", options={"xtol": 1e-12, "ftol": 1e-12, "maxiter": LEVENBERG_STEPS},
+                )  # fmt: skip
             roots = distinct_roots(dynamics, (solved.x * width)[None], box=box, margin=0.0)
         for place in roots:
             if (np.abs(place - x) / width).max() < SADDLE_DISTANCE:

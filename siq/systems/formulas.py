@@ -41,19 +41,10 @@ from sympy.printing.str import StrPrinter
 from siq.errors import Fault, suggestion
 
 FUNCTIONS: Mapping[str, Callable[..., sympy.Expr]] = {
-    "sin": sympy.sin,
-    "cos": sympy.cos,
-    "tan": sympy.tan,
-    "exp": sympy.exp,
-    "log": sympy.log,
-    "sqrt": sympy.sqrt,
-    "tanh": sympy.tanh,
-    "atan": sympy.atan,
-    "Abs": sympy.Abs,
-    "sign": sympy.sign,
-    "Max": sympy.Max,
-    "Min": sympy.Min,
-}
+    "sin": sympy.sin, "cos": sympy.cos, "tan": sympy.tan, "exp": sympy.exp, "log": sympy.log,
+    "sqrt": sympy.sqrt, "tanh": sympy.tanh, "atan": sympy.atan, "Abs": sympy.Abs, "sign": sympy.sign,
+    "Max": sympy.Max, "Min": sympy.Min,
+}  # fmt: skip
 """The functions that a formula may use, by the names that it uses for them."""
 OTHER_NAMES = {"abs": "Abs", "max": "Max", "min": "Min", "ln": "log", "arctan": "atan"}  # of the same
 
@@ -80,11 +71,9 @@ LONGEST_WORK = 10.0  # seconds of processor time: cards of ten states take less 
 MAX_FORMULA_LENGTH = 20_000  # characters, a guard against files that are no formulas
 
 _OPERATORS: Mapping[type[ast.operator], Callable[[sympy.Expr, sympy.Expr], sympy.Expr]] = {
-    ast.Add: lambda left, right: left + right,
-    ast.Sub: lambda left, right: left - right,
-    ast.Mult: lambda left, right: left * right,
-    ast.Div: lambda left, right: left / right,
-}
+    ast.Add: lambda left, right: left + right, ast.Sub: lambda left, right: left - right,
+    ast.Mult: lambda left, right: left * right, ast.Div: lambda left, right: left / right,
+}  # fmt: skip
 
 
 class FormulaError(Fault):

@@ -190,13 +190,11 @@ def simulate_snapshots(
     starts = options.interval * np.arange(1, options.pairs + 1)
     times = np.stack([starts, starts + options.pair_step], axis=1).ravel()
     return Recordings(
-        names=dynamics.states,
-        units=dynamics.units,
+        names=dynamics.states, units=dynamics.units,
         labels=tuple(f"trajectory{index:0{len(str(count - 1))}d}" for index in range(count)),
-        recording=np.repeat(np.arange(count), 2 * options.pairs),
-        t=np.tile(times, count),
+        recording=np.repeat(np.arange(count), 2 * options.pairs), t=np.tile(times, count),
         values=samples.reshape(-1, dynamics.dimension),
-    )
+    )  # fmt: skip
 
 
 def simulate_stationary(

@@ -179,10 +179,8 @@ def reference_table(*, points: int = 100) -> pd.DataFrame:
             ]
         for barrier in each.barriers:
             way: dict[str, Any] = {
-                "at": list(barrier.start),
-                "by": list(barrier.saddle),
-                "to": list(barrier.end),
-            }
+                "at": list(barrier.start), "by": list(barrier.saddle), "to": list(barrier.end),
+            }  # fmt: skip
             way["how"] = barrier.how
             rows.append(own | way | {"quantity": "barrier", "value": barrier.value, "error": barrier.error})
             if np.isfinite(barrier.prefactor):

@@ -30,17 +30,9 @@ MARK = "\x1e"
 """Begins a line that is an event, as the logger plugin of the workflow writes them."""
 
 SECONDS = {
-    "diagnosis": 40.0,
-    "escapes": 15.0,
-    "figures": 5.0,
-    "identify": 2.0,
-    "landscape_figures": 2.5,
-    "mismatch_figures": 5.0,
-    "mismatch_landscape": 3.0,
-    "reference": 15.0,
-    "refine": 6.0,
-    "train": 17.0,
-}
+    "diagnosis": 40.0, "escapes": 15.0, "figures": 5.0, "identify": 2.0, "landscape_figures": 2.5,
+    "mismatch_figures": 5.0, "mismatch_landscape": 3.0, "reference": 15.0, "refine": 6.0, "train": 17.0,
+}  # fmt: skip
 """What jobs take beside one another, measured on studies of two and three states; others about a second.
 Only their ratios matter once a job has ended: the speed of the machine then follows."""
 
@@ -373,14 +365,10 @@ def _answered(request: Request, pages: Sequence[Path]) -> Exit:
     paths += [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
     ours = {"PYTHONPATH": os.pathsep.join(paths), "PYTHONIOENCODING": "utf-8", PARENT: "1"}
     process = subprocess.Popen(
-        request.command(),
-        env=os.environ | ours | ({} if request.verbose else {FOLLOWED: "1"}),
-        stdin=subprocess.PIPE,
-        stdout=None if request.verbose else subprocess.PIPE,
-        stderr=None if request.verbose else subprocess.STDOUT,
-        encoding="utf-8",
-        errors="replace",
-    )
+        request.command(), env=os.environ | ours | ({} if request.verbose else {FOLLOWED: "1"}),
+        stdin=subprocess.PIPE, stdout=None if request.verbose else subprocess.PIPE,
+        stderr=None if request.verbose else subprocess.STDOUT, encoding="utf-8", errors="replace",
+    )  # fmt: skip
     progress, said = _Progress(), []
 
     def stop(number: int, frame: object) -> None:

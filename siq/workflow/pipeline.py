@@ -202,13 +202,11 @@ def regress_run(
     status = Status.OK if found.converged else Status.WARNING
     reason = "" if found.converged else f"SR3 did not settle in {found.iterations - 1} iterations"
     details = {
-        "points": found.points,
-        "converged": found.converged,
-        "iterations": found.iterations,
+        "points": found.points, "converged": found.converged, "iterations": found.iterations,
         "constraint_residual": found.constraint_residual,
         "sparse_constraint_residual": found.sparse_constraint_residual,
         "misfit": np.round(found.misfit, 12).tolist(),
-    }
+    }  # fmt: skip
     return StepResult(formulas, Outcome(number, Step.REGRESS, status, reason, details))
 
 

@@ -334,12 +334,10 @@ def _exits(point: SweptPoint, index: int, number: Sequence[int], noise: float | 
     if time is not None and not time.complete:
         notes.append(sentence(Remark("workflow.exit_without_rate")))
     return {
-        "barrier": lowest.barrier,
-        "exit": None if lowest.end is None else number[lowest.end],
+        "barrier": lowest.barrier, "exit": None if lowest.end is None else number[lowest.end],
         "mean_time": np.nan if time is None else time.value,
-        "law_error": np.nan if time is None else time.law_error,
-        "note": "; ".join(dict.fromkeys(notes)),
-    }
+        "law_error": np.nan if time is None else time.law_error, "note": "; ".join(dict.fromkeys(notes)),
+    }  # fmt: skip
 
 
 if TYPE_CHECKING:

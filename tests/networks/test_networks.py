@@ -10,7 +10,7 @@ from known_settings import PAPER
 from siq.data.recordings import SnapshotPairs
 from siq.errors import NumericalFailure
 from siq.networks import decomposition
-from siq.networks.networks import Networks, at_rest, evaluate, initial_layers, move, select_run, side_by_side
+from siq.networks.networks import Networks, at_rest, evaluate, initial_layers, move, side_by_side
 from siq.networks.training import _initial_networks, prepare_data
 from siq.numerics.randomness import generator
 from siq.systems.diffusion import Diffusion
@@ -93,7 +93,7 @@ def test_two_runs_together_equal_each_alone() -> None:
     x = points(2, 3)
     together = evaluate(nets, x)
     for run in range(2):
-        alone = evaluate(select_run(nets, run), x[run : run + 1])
+        alone = evaluate(nets.of_run(run), x[run : run + 1])
         for both, single in zip(together, alone, strict=True):
             torch.testing.assert_close(both[run], single[0], rtol=1e-13, atol=1e-14)
 
@@ -112,7 +112,7 @@ def test_networks_at_rest_have_the_values_of_those_in_training(monkeypatch: pyte
     x = generator(2).normal(size=(25, 3))
     for run in range(2):
         one = at_rest(nets, run)
-        potential, _, circulatory, field = evaluate(select_run(nets, run), torch.from_numpy(x)[None])
+        potential, _, circulatory, field = evaluate(nets.of_run(run), torch.from_numpy(x)[None])
         whole = one.evaluate(x)
         with monkeypatch.context() as patch:
             patch.setattr(decomposition, "CHUNK", 7)

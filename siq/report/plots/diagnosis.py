@@ -203,12 +203,9 @@ def _draw(
 def _legend_of(axes: Axes) -> None:
     """A legend of a panel's curves above the whole figure."""
     axes.figure.legend(
-        *axes.get_legend_handles_labels(),
-        loc="outside upper left",
-        ncols=2,
-        handlelength=1.6,
+        *axes.get_legend_handles_labels(), loc="outside upper left", ncols=2, handlelength=1.6,
         columnspacing=1.2,
-    )
+    )  # fmt: skip
 
 
 POINTS = 200
