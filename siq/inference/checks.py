@@ -318,14 +318,17 @@ def mean_residual_probability(found: FieldEstimate, pairs: SnapshotPairs, *, see
         spread = np.diag(found.noise_rate) * float(np.median(pairs.h)) * pairs.copies
         return unexplained_probability(pairs.directions(library), rest, variance=spread, inflation=inflation)
     inflation *= pairs.copies  # copies of resampled recordings are no evidence
-    if not found.diffusion.constant:
+    if not found.diffusion.constant and not found.flow.by_density:
         triangle = weighted_triangle(found, pairs, None, of_rest=True)[0]
         freedom = len(pairs.h) * library.dimension
         return unexplained_probability(
             triangle[:, :-1], triangle[:, -1:], freedom=freedom, inflation=inflation
         )
+    # By densities there is one state, and residuals are as large as its noise is there.
+    deviation = np.sqrt(found.diffusion.at(found.on_the_way(pairs))[:, 0]) if found.flow.by_density else 1.0
     weight = np.sqrt(pairs.h)[:, None]
-    columns, rest = library.evaluate(pairs.x0) * weight, residuals(found, pairs) / weight
+    columns = library.evaluate(pairs.x0) * weight / deviation
+    rest = residuals(found, pairs) / weight / deviation
     return unexplained_probability(columns, rest, inflation=inflation)
 
 

@@ -274,7 +274,7 @@ class _Case:
                 noisy = probability(again, suspect)
                 if noisy > 0.5:
                     again = self.with_sensor_law(again) or again
-                    slow = self.with_slow_noise(again)
+                    slow = None if again.flow.by_density else self.with_slow_noise(again)
                     return slow or self.finished(again).with_rival(found, 1 - noisy)
             except (NumericalFailure, np.linalg.LinAlgError) as error:
                 fault = fault or str(error)

@@ -460,7 +460,7 @@ class Transitions:
         if not gain < 1.0:
             raise NumericalFailure("f and D of so long steps are not found; sample more often")
         (values, strengths, sensor), covariance = np.split(at, [p, p + k]), axes @ axes.T * self.pairs.copies
-        flow, of_noise = replace(found.flow, by_density=True), covariance[p : p + k, p : p + k]
+        flow, of_noise = replace(found.flow, coarse=True, by_density=True), covariance[p : p + k, p : p + k]
         found = found.with_values(found.support, values, covariance=covariance[:p, :p], flow=flow)
         if found.diagnosis is not None and len(sensor):
             deviation = np.exp(sensor / 2)
