@@ -49,8 +49,8 @@ CHANCE_TESTS = (  # of a certificate: those that chance can refuse
     "record",
 )  # fmt: skip
 UNPREDICTED = "f does not predict held-out recordings"
-FEWEST_FOR_LAW = 200  # samples, that tell how a sensor's noise depends on what it shows
-FALSE_LAW_RATE = 1e-3  # probability with which noise that is the same everywhere is taken for another
+FEWEST_FOR_LAW, FALSE_LAW_RATE = 200, 1e-3  # samples that tell one; probability of one by chance
+INSIDE = 0.05, 0.95  # quantiles between which it is positive, or no law of a variance
 SHARED_SAMPLES = 4  # neighbours whose residuals have samples in common with those of one
 STATE_BINS = 12  # of each state: any function of it is seen as a value in each
 
@@ -194,8 +194,9 @@ def sensor_law(found: FieldEstimate, sample: SnapshotPairs) -> np.ndarray | None
             error = float(np.sqrt(inverse[-1] @ together @ inverse[-1]))
             if abs(known[-1]) > -scipy.special.ndtri(FALSE_LAW_RATE / 4) * error:
                 line = np.polynomial.Polynomial([-middle / width, 1 / width])
-                law = np.polynomial.Polynomial(known / mean)(line).coef
-                laws[state] = np.append(law, np.zeros(3 - count))
+                law = np.polynomial.Polynomial(known / mean)(line)
+                if (law(np.quantile(y[at], np.linspace(*INSIDE, STATE_BINS))) > 0).all():
+                    laws[state] = np.append(law.coef, np.zeros(3 - count))
                 break
     return laws if laws[:, 1:].any() else None
 

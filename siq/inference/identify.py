@@ -321,9 +321,9 @@ class _Case:
 
     def _likelihood(self, found: FieldEstimate) -> float:
         view = ObservationModel.of(found)
-        data, model = view.measured(self.recordings, self.pair_step), view.model(*view.unknown(found))
-        fit = view.followed(data, model, noise=view.noise_of(found), substeps=found.flow.steps)
-        return fit.restricted_likelihood(data)
+        data, noise = view.measured(self.recordings, self.pair_step), view.noise_of(found)
+        model = view.model(*view.unknown(found))
+        return view.followed(data, model, noise=noise, substeps=found.flow.steps).restricted_likelihood(data)
 
     def by_density(
         self, found: FieldEstimate, pairs: SnapshotPairs, exposure: float | None

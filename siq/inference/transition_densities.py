@@ -217,14 +217,14 @@ def _filtered(
     logarithms, below, above, means = np.zeros((4, len(xh)))
     count = len(middles)
     share, ahead = np.zeros(count), np.zeros(count)
-    reached = np.zeros(
-        (len(matrices) + 1, count, 2), dtype=np.int64
-    )  # cells in which it ends with any chance
+    # First and last cells in which it ends with any chance.
+    reached = np.zeros((len(matrices) + 1, count, 2), dtype=np.int64)
     for place in range(len(reached)):
         matrix = matrices[place] if place < len(matrices) else within
         for start in range(count):
             likely = np.flatnonzero(matrix[start] > UNLIKELY)
-            reached[place, start] = likely[0], likely[-1] + 1
+            if len(likely):
+                reached[place, start] = likely[0], likely[-1] + 1
     for k in range(len(xh)):
         for first in range(2 if begins[k] else 1):
             value = x0[k] if begins[k] and not first else xh[k]
@@ -266,7 +266,7 @@ def _explained(scores: np.ndarray) -> float:
 
 
 class Transitions:
-    """Pairs of one state over coarse steps, and the density that f and εD give to each.
+    """Pairs of one state, over coarse steps or behind a sensor, and the density that f and εD give to each.
 
     f has terms of its library. εD is a sum of shapes, those of a `NoiseFormula` or the one of a D that is
     known, with a strength each. Behind a noisy sensor, which an estimate knows by its diagnosis, the density
@@ -275,8 +275,8 @@ class Transitions:
     Raises
     ------
     NumericalFailure
-        Where there is no such density: of several states and angles, of steps that are not coarse, and of a D
-        that nearly vanishes.
+        Where there is no such density: of several states and angles, of steps that are not coarse without a
+        noisy sensor, and of a D that nearly vanishes.
     """
 
     def __init__(self, found: FieldEstimate, pairs: SnapshotPairs) -> None:
@@ -343,13 +343,13 @@ class Transitions:
         nearly normal in ``t = ∫ V^(-1/3) dx``, which of counts is their power of 2/3 (Anscombe 1953).
         """
         size, least = float(np.exp(sensor[0] / 2)) if len(sensor) else 0.0, FEWEST_PER_NOISE * density.width
-        ends = (self.h, self.begins)
         if (law := None if self.found.diagnosis is None else self.found.diagnosis.sensor_law) is None:
 
             def plain(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
                 return x, np.full(x.shape, size if self.exposure else max(size, least))
 
-            return density.foreseen(self.x0, self.xh, *ends, plain, exposure=self.exposure, whole=whole)
+            ends = self.x0, self.xh, self.h, self.begins
+            return density.foreseen(*ends, plain, exposure=self.exposure, whole=whole)
         grid = np.linspace(self.edges[0], self.edges[-1], NATURAL_GRID)
         variance = Measurements.relative_variance(law, grid[:, None])[:, 0]
         slope, bent = np.cbrt(1 / variance), np.gradient(variance, grid)
@@ -360,8 +360,8 @@ class Transitions:
             return np.interp(x, grid, mean), np.maximum(size * np.interp(x, grid, variance ** (1 / 6)), least)
 
         first, second = (np.interp(one, grid, natural) for one in (self.x0, self.xh))
-        logarithms, scores, means = density.foreseen(first, second, *ends, shown, whole=whole)
-        return logarithms + np.log(np.interp(self.xh, grid, slope)), scores, means
+        known = density.foreseen(first, second, self.h, self.begins, shown, whole=whole)
+        return known[0] + np.log(np.interp(self.xh, grid, slope)), *known[1:]
 
     def log_densities(self, values: np.ndarray, strengths: np.ndarray, sensor: np.ndarray) -> np.ndarray:
         """Of each pair; minus infinity where εD is not positive, or f too steep."""
@@ -553,11 +553,10 @@ class Transitions:
             found.with_values(everything, found.coefficients[:, 0]),
             noise=None, constant_noise=None, diffusion=Diffusion.identity(1),
         )  # fmt: skip
-        moved = rate[0] * float(np.median(pairs.h))
-        shares = (0.0, *SENSOR_SHARES) if found.sensor_variance is None else (0.0,)
+        moved, known = rate[0] * float(np.median(pairs.h)), found.sensor_variance
         tried = []
-        for share in shares:
-            deviation = np.sqrt(share * moved if found.sensor_variance is None else found.sensor_variance)
+        for share in (0.0, *SENSOR_SHARES) if known is None else (0.0,):
+            deviation = np.sqrt(share * moved if known is None else known)
             seen = NoiseDiagnosis(
                 "process", float(rate[0, 0]), np.eye(1), 0.0, 0.0, deviation,
                 exposure=exposure, sensor_law=law,
