@@ -4,8 +4,9 @@
 
 Each is a double well, simulated, seen by a sensor as it is usual somewhere, and written as a file that
 `siq.Landscape.from_recordings` reads with default settings. No flaw is put in that should be refused: what is
-asked is whether a physicist has an answer, and whether its errors hold. A table has a row for each record:
-whether it is certified, the heights of both barriers over ε with their errors, and what is true.
+asked is whether a physicist has an answer, and whether its errors hold. Rules of siq were mended on such
+records, so that a new kind is better evidence than new seeds. A table has a row for each record: whether it
+is certified, the heights of both barriers over ε with their errors, and what is true.
 """
 
 from __future__ import annotations

@@ -590,9 +590,11 @@ def _open_numpy(file: str) -> ColumnFile:
 READERS: dict[str, Callable[[str], ColumnFile]] = {
     ".parquet": _open_parquet,
     **dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".lvm", ".asc", ".rdb"), _open_text),
-    **dict.fromkeys((".h5", ".hdf5"), _open_hdf5), ".nc": _open_netcdf, ".mat": _open_matlab,
+    **dict.fromkeys((".h5", ".hdf5"), _open_hdf5),
+    ".nc": _open_netcdf,
+    ".mat": _open_matlab,
     **dict.fromkeys((".npz", ".npy"), _open_numpy),
-}  # fmt: skip
+}
 """How the columns of a file are read, by the suffix of its name."""
 
 

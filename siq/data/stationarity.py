@@ -55,15 +55,14 @@ def runs_of(recordings: Recordings, *, longest: float | None = None, bridged: bo
     """
     broken = np.diff(recordings.recording) != 0
     if longest is None:
-        step, steps = usual_step(recordings), np.diff(recordings.t)[~broken]
-        longest = recordings.longest_step
+        steps, longest = np.diff(recordings.t)[~broken], recordings.longest_step
         if bridged and (steps > longest * (1 + 1e-6)).any():
             whole, times = runs_of(recordings, longest=np.inf), []
             some = whole[:: -(-len(whole) // MOST_RUNS)]
             for one in recordings.values.T:
                 relaxation = relaxation_samples(one, whole) or 0.0
                 times.append(max(relaxation, BRIDGED * correlated_samples(one, some)))
-            longest = max(longest, min(times) * step)
+            longest = max(longest, min(times) * usual_step(recordings))
     if np.isfinite(longest):
         broken |= np.diff(recordings.t) > longest * (1 + 1e-6)
     bounds = np.concatenate([[0], np.flatnonzero(broken) + 1, [len(recordings.t)]])

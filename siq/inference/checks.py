@@ -49,8 +49,8 @@ CHANCE_TESTS = (  # of a certificate: those that chance can refuse
     "record",
 )  # fmt: skip
 UNPREDICTED = "f does not predict held-out recordings"
-FEWEST_FOR_LAW, FALSE_LAW_RATE = 200, 1e-3  # samples that tell one; probability of one by chance
-INSIDE = 0.05, 0.95  # quantiles between which it is positive, or no law of a variance
+FEWEST_FOR_LAW, FALSE_LAW_RATE = 200, 1e-3  # samples that tell a sensor's law; its probability by chance
+INSIDE = 0.05, 0.95  # quantiles of what is measured, between which a law of its variance is positive
 SHARED_SAMPLES = 4  # neighbours whose residuals have samples in common with those of one
 STATE_BINS = 12  # of each state: any function of it is seen as a value in each
 

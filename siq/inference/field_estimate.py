@@ -40,9 +40,7 @@ NoiseKind = Literal["none", "process", "sensor", "measurement", "rounding", "col
 NOISE_FREE = 1e-6  # residuals below this share of the increments are the integrator's and the rounding's
 STANDARD_ERRORS = 4.0  # derived: chance passes it once in 16 000 pairs of states
 SIGNIFICANT_SCORE = 5.0  # standard errors
-BEYOND_STATES = (
-    2.0  # a choice: standard deviations of a sensor, by which values are farther away than any state
-)
+BEYOND_STATES = 2.0  # standard deviations of a sensor, by which values are beyond any state (a choice)
 HARMLESS_CORRELATION = 0.02  # a correlation, or a deviation of D, below this is harmless however significant
 HARMLESS_BIAS = 0.5  # of a standard error: with such a bias an error bar holds 0.95 - 0.02 of the time
 

@@ -88,9 +88,7 @@ MIN_SHARE, MAX_SHARE = 1e-3, 0.45  # of the residuals' variance: a sensor's shar
 WHOLE_STEP_TOLERANCE = 0.05  # of an exposure, as exactly as residuals show it of some thousand samples
 SINGULAR = "the recordings do not determine f; record more, or more often"
 PREDICTED_RECORDINGS = 200  # held-out ones that are predicted: enough for a median
-OF_SENSOR = (  # of a diagnosis
-    "measurement", "measurement_error", "sensor_evidence", "exposure", "sensor_law",
-)  # fmt: skip
+OF_SENSOR = ("measurement", "measurement_error", "sensor_evidence", "exposure", "sensor_law")
 UNDECIDED = 2.94  # of a log-likelihood: odds of 19 to 1
 
 
@@ -215,7 +213,7 @@ class _Case:
                     found = self.by_density(plain, pairs, exposure)
                     if found is not None and self.complete(found):
                         return found
-            # A sensor's white noise is taken for an exposure, or a memory, in one record of twenty.
+            # A sensor's white noise was taken for an exposure, or a memory, in 2 of 36 records.
             unit, fits = Diffusion.identity(self.library.dimension), list[FieldEstimate]()
             for exposure in (*exposures, None) if memory.sensor.any() else exposures:
                 found = self.by_exposure(ObservationModel(self.library, unit, exposure))

@@ -542,8 +542,8 @@ class Transitions:
         At whatever share of what moves the state from sample to sample the search begins. Of means over an
         exposure there is an estimate without such noise, too. The noise may follow a law of what is measured,
         as in `siq.inference.measurements.Measurements`, from an estimate with one that does not. The
-        `sensor_evidence` of the diagnosis is Schwarz's, but for the sensor. Where little is forgotten within
-        a step, and a filter that supposes a normal law does, that is a NumericalFailure.
+        `sensor_evidence` of the diagnosis is Schwarz's, but for the sensor. Without such a law it is a
+        NumericalFailure where little is forgotten within a step: a filter that supposes a normal law does.
         """
         if self.forgotten < MUCH_FORGOTTEN and law is None:
             raise NumericalFailure("steps are so short that the law of what noise does is nearly normal")

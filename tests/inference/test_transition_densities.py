@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from siq.data.recordings import SnapshotPairs
+from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
 from siq.inference.checks import neighbour_correlations
 from siq.inference.diffusion_model import process_noise_increments
-from siq.inference.field_estimate import FieldEstimate
+from siq.inference.field_estimate import FieldEstimate, NoiseDiagnosis
 from siq.inference.library import IdentificationOptions, candidate_library
 from siq.inference.regression import (
     identify_vector_field,
@@ -21,6 +21,8 @@ from siq.inference.regression import (
     with_noise_formula,
 )
 from siq.inference.transition_densities import TransitionDensity, Transitions
+from siq.numerics.integration import FlowMap
+from siq.systems.diffusion import Diffusion
 
 RATE, INTENSITY = 1.3, 0.4
 STRENGTH, WITHIN = 0.4, 100  # barriers of 1.25
@@ -289,3 +291,33 @@ def test_a_noise_that_nearly_vanishes_is_found_by_moments() -> None:
     found = with_noise_formula(identified(pairs), pairs, false_terms=0.01)
     assert found is not None and found.noise is not None and not found.flow.by_density
     assert "x**2" in [str(term) for term in found.noise.terms]
+
+
+def test_counts_behind_a_law_are_as_likely_as_poisson_says() -> None:
+    """The same filter on cells, with the probability of each count by the law of Poisson."""
+    draw, h, n = np.random.default_rng(5), 0.1, 1500
+    x = 100.0 + np.zeros(n + 1)
+    for k in range(n):
+        x[k + 1] = x[k] - h * (x[k] - 100) + np.sqrt(900 * h) * draw.standard_normal()
+    counts = draw.poisson(np.maximum(x, 1.0)).astype(float)
+    pairs = snapshot_pairs(Recordings.from_arrays(h * np.arange(n + 1), counts[:, None], names=["x"]))
+    library, mean = candidate_library(["x"], degree=1), float(counts.mean())
+    seen = NoiseDiagnosis(
+        "process", 900.0, np.eye(1), 0.0, 0.0, np.array([np.sqrt(mean)]),
+        sensor_law=np.array([[0.0, 1 / mean, 0.0]]),
+    )  # fmt: skip
+    support = np.array([[0, library.names.index(name)] for name in ("1", "x")])
+    found = FieldEstimate.on_support(
+        library, support, np.array([100.0, -1.0]), np.eye(2), np.array([[900.0]]), 0.1,
+        FlowMap(1, coarse=True), Diffusion.identity(1), diagnosis=seen,
+    )  # fmt: skip
+    given = Transitions(found, pairs)
+    ours = given.log_densities(found.values, given.strengths, given.sensor)
+    density = given._density(found.values, given.strengths)
+    (matrix,) = density._matrices(np.array([h]))
+    cells = density.first + density.width * (np.arange(len(matrix)) + 0.5)
+    share, exact = scipy.stats.poisson.pmf(counts[0], np.maximum(cells, 1e-9)), []
+    for value in counts[1:]:
+        share = (share / share.sum()) @ matrix * scipy.stats.poisson.pmf(value, np.maximum(cells, 1e-9))
+        exact.append(np.log(share.sum()))
+    assert np.abs(ours - exact).mean() < 0.002 and abs(ours.sum() - sum(exact)) < 0.5
