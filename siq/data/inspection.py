@@ -194,10 +194,8 @@ class Inspection:
 
 
 def inspect(
-    source: str | Path | Recordings | pd.DataFrame,
-    *,
-    angles: Mapping[str, Sequence[float]] | None = None,
-) -> Inspection:
+    source: str | Path | Recordings | pd.DataFrame, *, angles: Mapping[str, Sequence[float]] | None = None,
+) -> Inspection:  # fmt: skip
     """Look at recordings, and say what is in them and what can be learned: seconds, before anything runs.
 
     Parameters

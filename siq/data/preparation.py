@@ -79,12 +79,9 @@ _STRETCH_LABEL = re.compile(r"(?P<label>.*) \((?P<number>\d+) of (?P<of>\d+)\)")
 
 
 def read_pairs(
-    path: str | Path,
-    *,
-    states: Sequence[str] | None,
-    units: Mapping[str, str] | None,
+    path: str | Path, *, states: Sequence[str] | None, units: Mapping[str, str] | None,
     pair_step: float | None,
-) -> tuple[Recordings, SnapshotPairs]:
+) -> tuple[Recordings, SnapshotPairs]:  # fmt: skip
     """Read recordings that something is to be learned from (`read_recordings`), and their `snapshot_pairs`.
 
     Raises

@@ -107,12 +107,9 @@ class Recordings:
 
     @classmethod
     def from_frame(
-        cls,
-        frame: pd.DataFrame,
-        *,
-        columns: Sequence[str] | None = None,
+        cls, frame: pd.DataFrame, *, columns: Sequence[str] | None = None,
         units: Mapping[str, str] | None = None,
-    ) -> Recordings:
+    ) -> Recordings:  # fmt: skip
         """Recordings from a table in memory, checked as a file is.
 
         Parameters
@@ -516,12 +513,9 @@ class StreamedPairs:
 
 
 def read_recordings(
-    path: str | Path,
-    *,
-    columns: Sequence[str] | None = None,
-    units: Mapping[str, str] | None = None,
+    path: str | Path, *, columns: Sequence[str] | None = None, units: Mapping[str, str] | None = None,
     gaps: bool = True,
-) -> Recordings:
+) -> Recordings:  # fmt: skip
     """Read a long table of trajectories and check it.
 
     Rows of one recording need not stand together; they are grouped, in order of first appearance. What had to

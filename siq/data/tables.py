@@ -54,6 +54,7 @@ FEWEST_ON_A_LINE = 10  # steps: fewer may lie on one by themselves
 MOST_LAGGED = 10  # rows, by which a column may be behind the one that it copies
 MOST_MISSING = 0.5  # of the values of a column, where other columns are fuller
 NOISY = 0.25  # share of the steps at which a column turns back, half of what white forces do
+LARGEST = 1e100  # numerical: of a value, whose square is finite, too
 
 Fault = tuple[int, InputError]
 """The row, counted from 1, of the first cell of a column that cannot be used, and what is wrong there."""
@@ -68,12 +69,9 @@ class _Rows(NamedTuple):
 
 
 def read_tables(
-    source: str | Path | pd.DataFrame | xarray.Dataset,
-    *,
-    columns: Sequence[str] | None,
-    units: Mapping[str, str] | None,
-    gaps: bool = True,
-) -> Recordings:
+    source: str | Path | pd.DataFrame | xarray.Dataset, *, columns: Sequence[str] | None, units: Mapping[str,
+    str] | None, gaps: bool = True,
+) -> Recordings:  # fmt: skip
     """Read a table, in memory or in a file, or a folder that holds one file per recording.
 
     See `siq.data.recordings.read_recordings`.
@@ -85,11 +83,9 @@ def read_tables(
 
 
 def _checked(
-    table: str | Path | pd.DataFrame | xarray.Dataset,
-    columns: Sequence[str] | None,
-    units: Mapping[str, str] | None,
-    gaps: bool,
-) -> Recordings:
+    table: str | Path | pd.DataFrame | xarray.Dataset, columns: Sequence[str] | None,
+    units: Mapping[str, str] | None, gaps: bool,
+) -> Recordings:  # fmt: skip
     """Read and check a table; raises InputError for the first thing that cannot be used."""
     file, source = str(table) if isinstance(table, str | Path) else TABLE, open_columns(table)
     if columns is None:
@@ -285,11 +281,12 @@ def _parse_numbers(file: str, name: str, cells: Column) -> tuple[np.ndarray, str
     except pa.ArrowInvalid:
         remedy = "subtract a constant, such as the time of the first sample"
         raise InputError(file, f"column {name}", "its integers are too large to be exact", remedy) from None
-    infinite = np.isinf(values)
-    row = int(np.argmax(infinite)) + 1
-    if infinite.any() and (fault is None or row < fault[0]):
-        remedy = "remove the row or write a finite number"
-        fault = row, InputError(file, f"row {row}, column {name}", "the value is infinite", remedy)
+    endless = np.abs(values) > LARGEST
+    row = int(np.argmax(endless)) + 1
+    if endless.any() and (fault is None or row < fault[0]):
+        remedy = "remove the row or write a finite number; where a simulation ran away, end the file before"
+        infinite = "the value is infinite, or beyond 10¹⁰⁰"
+        fault = row, InputError(file, f"row {row}, column {name}", infinite, remedy)
     return values, unit or None, fault
 
 

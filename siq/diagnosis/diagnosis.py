@@ -274,11 +274,9 @@ def _judged(case: Comparison, budget: Budget) -> tuple[Investigation, HeldOutRun
 
 @np.errstate(over="ignore", divide="ignore", invalid="ignore")  # what overflows shows in its values
 def solve_case(
-    case: Comparison,
-    *,
-    tell: Callable[[str], None] = LOGGER.info,
+    case: Comparison, *, tell: Callable[[str], None] = LOGGER.info,
     clock: Callable[[], float] = time.monotonic,
-) -> Diagnosis:
+) -> Diagnosis:  # fmt: skip
     """Diagnose what `siq.read_case` has read; see `diagnose`.
 
     Parameters

@@ -366,12 +366,9 @@ def _gained(
 
 
 def _gains(
-    horizons: Sequence[Horizon],
-    sites: Sequence[_Site],
-    leading: MechanismCandidate | None,
-    budget: Budget,
+    horizons: Sequence[Horizon], sites: Sequence[_Site], leading: MechanismCandidate | None, budget: Budget,
     untried: dict[str, NotFitted],
-) -> tuple[list[_Site], np.ndarray]:
+) -> tuple[list[_Site], np.ndarray]:  # fmt: skip
     """The sites that may matter, and what they gain: means over horizons, ``(sites,)``.
 
     All are asked one sample ahead, and those that promise most there, with their best shapes, at the
@@ -539,11 +536,9 @@ def _fitted_at(
 
 
 def _next_rung(
-    horizons: Sequence[Horizon],
-    candidates: Sequence[MechanismCandidate],
-    context: FitContext,
+    horizons: Sequence[Horizon], candidates: Sequence[MechanismCandidate], context: FitContext,
     untried: dict[str, NotFitted],
-) -> _Rung | None:
+) -> _Rung | None:  # fmt: skip
     """The mechanism that stands first on top of fits; None where none is likelier than what has no name."""
     options, base, budget = context.study.search, horizons[0].fit, context.budget
     budget.says("comparing forecasts of what was left out")

@@ -287,12 +287,9 @@ class MechanismCandidate:
 
 
 def added(
-    model: Dynamics,
-    equations: Mapping[str, sympy.Expr],
-    outputs: Mapping[str, sympy.Expr],
-    parameters: Sequence[Parameter],
-    **about: Any,
-) -> MechanismCandidate:
+    model: Dynamics, equations: Mapping[str, sympy.Expr], outputs: Mapping[str, sympy.Expr],
+    parameters: Sequence[Parameter], **about: Any,
+) -> MechanismCandidate:  # fmt: skip
     """A candidate that adds formulas to equations and outputs, by name; its parameters are amplitudes."""
     rows = zip(model.states, model.equations, strict=True)
     return MechanismCandidate(

@@ -358,11 +358,9 @@ class Projection:
 
 
 def at_noise_levels(
-    response: Linearisation,
-    fit: Fit,
-    data: Measurements,
+    response: Linearisation, fit: Fit, data: Measurements,
     prepare: Callable[[Whitened], tuple[Whitened, int]] | None = None,
-) -> Iterator[tuple[float, Projection]]:
+) -> Iterator[tuple[float, Projection]]:  # fmt: skip
     """The problem at each level of process noise at which it can be worked out; one where a fit has none.
 
     Innovations may be prepared, and are then returned with the number of parameters that are left.

@@ -226,12 +226,9 @@ class Comparison:
 
 
 def comparison_of(
-    system: Dynamics,
-    recordings: Recordings | pd.DataFrame | str | Path,
-    settings: MismatchStudy | None = None,
-    *,
-    file: str = "the settings",
-) -> Comparison:
+    system: Dynamics, recordings: Recordings | pd.DataFrame | str | Path,
+    settings: MismatchStudy | None = None, *, file: str = "the settings",
+) -> Comparison:  # fmt: skip
     """Check a simulation, recordings and settings against each other.
 
     Parameters

@@ -266,12 +266,9 @@ def _with_function(
 
 
 def _formulas(
-    before: tuple[FittedCandidate, ...],
-    fit: Fit,
-    ranked: Sequence[Ranked[Place]],
-    cost: float,
+    before: tuple[FittedCandidate, ...], fit: Fit, ranked: Sequence[Ranked[Place]], cost: float,
     context: FitContext,
-) -> list[AugmentedModel]:
+) -> list[AugmentedModel]:  # fmt: skip
     """Formulas in the likeliest places, each once."""
     knots = {(each.term.targets, each.term.words): each.term.knots for each in ranked}
     done: set[frozenset[tuple[str, sympy.Expr]]] = set()

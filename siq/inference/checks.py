@@ -17,6 +17,7 @@ P being the projection on the q functions, if f misses no term. Without noise re
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -26,9 +27,22 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from siq.data.correlation import decimals_of, resolution_step, rounding_error
 from siq.data.recordings import Recordings, SnapshotPairs, snapshot_pairs
-from siq.inference.diffusion_model import process_noise_increments
+from siq.inference.diffusion_model import (
+    ResidualLikelihood,
+    process_noise_increments,
+    with_process_noise_rate,
+)
 from siq.inference.field_estimate import HARMLESS_BIAS, NOISE_FREE, FieldEstimate, NoiseDiagnosis, Verdict
-from siq.inference.regression import LaggedPairs, refit, residuals, weighted_triangle
+from siq.inference.library import IdentificationOptions
+from siq.inference.regression import (
+    LaggedPairs,
+    identify_vector_field,
+    refit,
+    residuals,
+    weighted_triangle,
+    with_noise_formula,
+)
+from siq.inference.transition_densities import Transitions
 from siq.numerics.integration import runge_kutta_step
 from siq.numerics.randomness import positive
 from siq.remarks import Remark, sentence
@@ -51,6 +65,8 @@ CHANCE_TESTS = (  # of a certificate: those that chance can refuse
 UNPREDICTED = "f does not predict held-out recordings"
 FEWEST_FOR_LAW, FALSE_LAW_RATE = 200, 1e-3  # samples that tell a sensor's law; its probability by chance
 INSIDE = 0.05, 0.95  # quantiles of what is measured, between which a law of its variance is positive
+NEARLY_EVEN = 1e-3  # of steps, that a simulation made all alike: clocks and decimals
+UNDECIDED = 2.94  # of a log-likelihood: odds of 19 to 1
 SHARED_SAMPLES = 4  # neighbours whose residuals have samples in common with those of one
 STATE_BINS = 12  # of each state: any function of it is seen as a value in each
 
@@ -212,6 +228,56 @@ def _joined(sample: SnapshotPairs, rest: np.ndarray) -> np.ndarray:
     usual = (np.abs(rest) < OUTLIER * np.median(np.abs(rest), axis=0)).all(axis=1)
     same = (sample.recording[1:] == sample.recording[:-1]) & (sample.xh[:-1] == sample.x0[1:]).all(axis=1)
     return np.asarray(same & usual[1:] & usual[:-1])
+
+
+def simulation_step(
+    found: FieldEstimate, by_state: FieldEstimate | None, pairs: SnapshotPairs, *,
+    options: IdentificationOptions,
+) -> tuple[float, float] | None:  # fmt: skip
+    """The step of the Euler–Maruyama simulation that made pairs, and the probability that chance says so.
+
+    A step of Euler's rule forgets nothing of its noise on the way: read as continuous in time, a D that is
+    the same everywhere looks weaker where f spreads states than where f gathers them. If a constant D is
+    refuted so, and not by the rule, with one step or two for each pair, the rule made the record. The same is
+    true if neither is constant, and the pairs are likelier by the rule, at Schwarz's price of the parameters.
+    In continuous time `found` has a constant D; `by_state` has D(x), None where that was not asked for.
+    """
+    step, false_terms = float(np.median(pairs.h)), options.false_terms
+
+    def constant(one: FieldEstimate) -> float:
+        return ResidualLikelihood(one, pairs, residuals(one, pairs)).constant_probability()
+
+    if np.ptp(pairs.h) > NEARLY_EVEN * step or (probability := constant(found)) > false_terms**2:
+        return None
+    regress = partial(identify_vector_field, found.library, pairs, options=options)
+    fits = [
+        (each, with_process_noise_rate(regress(integrator_step=each), pairs)) for each in (step, step / 2)
+    ]
+    chance, best = max((constant(one), each) for each, one in fits)
+    if by_state is None or chance >= false_terms:
+        return (best, probability) if chance >= false_terms else None
+
+    def worth(one: FieldEstimate | None) -> float:
+        if one is None or one.noise is None:
+            return -np.inf
+        return _log_likelihood(one, pairs) - np.log(len(pairs.h)) / 2 * len([*one.values, *one.noise.values])
+
+    by_formula = partial(with_noise_formula, pairs=pairs, false_terms=false_terms)
+    most, best = max((worth(by_formula(one)), each) for each, one in fits)
+    return (best, probability) if most - worth(by_state) > UNDECIDED else None
+
+
+def _log_likelihood(found: FieldEstimate, pairs: SnapshotPairs) -> float:
+    """Of pairs, by the densities of their ends where they are known, else by normal laws."""
+    if found.flow.by_density:
+        return Transitions(found, pairs).log_likelihood
+    # What puts back what a step forgot is linear, and known by what it makes of the axes.
+    axes = np.eye(found.library.dimension)[:, None] * np.ones((len(pairs.h), 1))
+    turned = np.stack([process_noise_increments(found, pairs, axis) for axis in axes], axis=2)
+    forces = process_noise_increments(found, pairs, residuals(found, pairs))[:, :, None]
+    rate = np.broadcast_to(found.noise_rate_at(found.on_the_way(pairs)), turned.shape)
+    sizes = np.linalg.slogdet(turned)[1] - np.linalg.slogdet(2 * np.pi * rate)[1] / 2
+    return float(sizes.sum() - (forces * np.linalg.solve(rate, forces)).sum() / 2)
 
 
 def bias_of_rounding(

@@ -230,6 +230,7 @@ class NoiseDiagnosis:
     diffusion: DiffusionSource = DiffusionSource.GIVEN  #: where D is from
     #: The time over which each sample was taken as a mean; None where as the state itself.
     exposure: float | None = None
+    thinned: int = 1  #: of how many samples one was used, as neighbours share more than the state
     #: Standard deviation, correlation time and its standard error of what a sensor adds to its white noise;
     #: None where that is nothing.
     slow_sensor: tuple[float, float, float] | None = None

@@ -29,6 +29,7 @@ from siq.data.stationarity import usual_step
 from siq.errors import NumericalFailure
 from siq.inference.checks import (
     STATE_BINS,
+    UNDECIDED,
     PredictionLimits,
     bias_of_rounding,
     check_prediction,
@@ -38,6 +39,7 @@ from siq.inference.checks import (
     residual_noise,
     rounding_text,
     sensor_law,
+    simulation_step,
     unexplained_probability,
 )
 from siq.inference.claims import check_claims
@@ -88,8 +90,9 @@ MIN_SHARE, MAX_SHARE = 1e-3, 0.45  # of the residuals' variance: a sensor's shar
 WHOLE_STEP_TOLERANCE = 0.05  # of an exposure, as exactly as residuals show it of some thousand samples
 SINGULAR = "the recordings do not determine f; record more, or more often"
 PREDICTED_RECORDINGS = 200  # held-out ones that are predicted: enough for a median
+THINNED = (2, 4, 8, 16)  # of how many samples one is used, where neighbours share more than the state
+MAX_STEP_RATE = 0.4  # of hidden velocities, times the step: their noise is found 2 % too strong, 3 at 0.6
 OF_SENSOR = ("measurement", "measurement_error", "sensor_evidence", "exposure", "sensor_law")
-UNDECIDED = 2.94  # of a log-likelihood: odds of 19 to 1
 
 
 def identify(
@@ -222,9 +225,29 @@ class _Case:
                 fits += [found] if found is not None and exposure is not None else []
             return fits[0] if fits else self.by_instruments(memory)
         found = with_process_noise_rate(regress(pairs), pairs)
+        by_state = None
         if found.flow.by_density and self.given is None:  # a wrong D would look like a noisy sensor
-            found = with_noise_formula(found, pairs, false_terms=self.options.false_terms) or found
+            by_state = with_noise_formula(found, pairs, false_terms=self.options.false_terms)
+        if step is None and (simulated := self.as_simulated(found, by_state, pairs)) is not None:
+            return simulated
+        found = by_state or found
         return self.with_sensor_noise(found) or self._finished_by_pairs(found)
+
+    def as_simulated(
+        self, found: FieldEstimate, by_state: FieldEstimate | None, pairs: SnapshotPairs
+    ) -> FieldEstimate | None:
+        """By Euler's rule, where samples are steps of its simulation, or every second; None elsewhere."""
+        asked = None
+        if self.given is None and estimated_diffusion(found, pairs=len(pairs.h)) is not None:
+            with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
+                asked = simulation_step(found, by_state, pairs, options=self.options)
+        if asked is None:
+            return None
+        found = replace(self, integrator_step=asked[0]).identified()
+        assert found.diagnosis is not None
+        values = {"step": asked[0], "unit": self.recordings.time_unit or "", "probability": asked[1]}
+        remarks = (*found.diagnosis.remarks, Remark("inference.simulated", values))
+        return replace(found, diagnosis=replace(found.diagnosis, remarks=remarks))
 
     def with_sensor_noise(self, found: FieldEstimate) -> FieldEstimate | None:
         """By likelihood, where the sensors are noisy; None where they are not.
@@ -389,7 +412,8 @@ class _Case:
             }  # fmt: skip
             remarks, source = [Remark("inference.slow_force", values)], DiffusionSource.ESTIMATED
         elif found.hidden_states:
-            remarks = [Remark("inference.hidden_velocities", {"sensors": sensors, "process_noise": forced})]
+            values = {"sensors": sensors, "process_noise": forced, "every": noise.thinned}
+            remarks = [Remark("inference.hidden_velocities", values)]
             source = DiffusionSource.OF_VELOCITIES if forced else DiffusionSource.UNIT_OF_VELOCITIES
         else:
             first, error = found, noise.intensity_error
@@ -571,9 +595,22 @@ class _Case:
         )
 
     def with_hidden_states(self) -> FieldEstimate:
-        """f, tested, where the second half of the library's states are velocities that were not recorded."""
+        """f, tested, where the second half of the library's states are velocities that were not recorded.
+
+        Steps of a simulation are no motion under white noise from one to the next, and neither is what a
+        filter lets through of one: where innovations show that, fewer samples do.
+        """
         hidden = ObservationModel(self.library, Diffusion.identity(self.library.dimension), hidden=True)
-        return self.finished(self.by_likelihood(hidden))
+        found = first = self.finished(self.by_likelihood(hidden))
+        resting = np.concatenate([self.recordings.values, 0 * self.recordings.values], axis=1)
+        with contextlib.suppress(NumericalFailure, np.linalg.LinAlgError):
+            rates = np.abs(np.linalg.eigvals(found.dynamics.jacobian(resting))).max(axis=1)
+            for thinned in THINNED:
+                resolved = np.median(rates) * thinned * usual_step(self.recordings) < MAX_STEP_RATE
+                if found.diagnosis is None or not found.diagnosis.correlated or not resolved:
+                    break
+                found = self.finished(self.by_likelihood(replace(hidden, thinned=thinned)))
+        return found if found.prediction is not None and found.prediction.passed else first
 
     def with_velocities(self) -> FieldEstimate | None:
         """f with the velocity as a further state; None where it was not to be tried, or fails its test."""

@@ -289,8 +289,8 @@ def _estimate(
     unit = diffusion.matrix if observation.hidden else np.eye(d)
     diagnosis = NoiseDiagnosis(
         "process" if rate.any() else "sensor", strength, rate / strength if strength else unit, correlation,
-        score, deviation, deviation * sensor_error / 2,
-        intensity_error=error if np.isfinite(error) else None, exposure=observation.exposure,
+        score, deviation, deviation * sensor_error / 2, exposure=observation.exposure,
+        thinned=observation.thinned, intensity_error=error if np.isfinite(error) else None,
         slow_sensor=slow_sensor, sensor_evidence=evidence, sensor_law=observation.sensor_law,
     )  # fmt: skip
     if diagnosis.correlated:

@@ -127,7 +127,7 @@ class ObservationModel:
     ``dx/dt`` times a factor that is known, `slow_force`; it may follow the state, or has noise alone. Or the
     sensor adds noise with a correlation time of its own, `sensor_time`; the logarithm of its rate is the last
     parameter. The variance of white measurement noise may depend on what is measured, by a law as in
-    `siq.inference.measurements.Measurements`.
+    `siq.inference.measurements.Measurements`. Of so many samples one may be used, `thinned`.
     """
 
     library: CandidateLibrary
@@ -138,6 +138,7 @@ class ObservationModel:
     follows: bool = False
     sensor_time: float | None = None
     sensor_law: np.ndarray | None = None
+    thinned: int = 1
 
     @classmethod
     def of(cls, found: FieldEstimate) -> ObservationModel:
@@ -145,8 +146,10 @@ class ObservationModel:
         library, slow = found.library, found.slow_force
         follows = bool(slow) and found.coefficients[library.terms.index(library.symbols[0]), 1] != 0
         time = None if found.slow_sensor is None else found.slow_sensor[1]
-        law = None if found.diagnosis is None else found.diagnosis.sensor_law
-        return cls(library, found.diffusion, found.exposure, found.hidden_states, slow, follows, time, law)
+        law, each = (None, 1) if (seen := found.diagnosis) is None else (seen.sensor_law, seen.thinned)
+        return cls(
+            library, found.diffusion, found.exposure, found.hidden_states, slow, follows, time, law, each
+        )
 
     @property
     def hidden_states(self) -> int:
@@ -223,10 +226,8 @@ class ObservationModel:
 
     def every(self, recordings: Recordings) -> int:
         """Of how many samples one is kept, so that exposures do not overlap."""
-        if self.exposure is None:
-            return 1
-        steps = self.exposure / usual_step(recordings)
-        return max(int(np.ceil(steps * (1 - INSTANT_TOLERANCE))), 1)
+        steps = 0.0 if self.exposure is None else self.exposure / usual_step(recordings)
+        return max(int(np.ceil(steps * (1 - INSTANT_TOLERANCE))), self.thinned)
 
     def noise(self, noise: Noise) -> Noise:
         """The noise of the states, as it drives the model: nothing drives running means."""

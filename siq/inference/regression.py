@@ -155,11 +155,9 @@ class _PairRegression:
     """Pairs with the functions of a support, by default all, at X0, and what the current f makes of them."""
 
     def __init__(
-        self,
-        library: CandidateLibrary,
-        pairs: SnapshotPairs | StreamedPairs,
+        self, library: CandidateLibrary, pairs: SnapshotPairs | StreamedPairs,
         support: np.ndarray | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.library, self.pairs = library, pairs
         everything = all_coefficients(range(library.dimension), library.size)
         self.support = everything if support is None else support
@@ -382,12 +380,9 @@ def _evenly(count: int, most: int) -> np.ndarray:
 
 
 def carries_noise(
-    library: CandidateLibrary,
-    pairs: SnapshotPairs | StreamedPairs,
-    *,
-    options: IdentificationOptions,
+    library: CandidateLibrary, pairs: SnapshotPairs | StreamedPairs, *, options: IdentificationOptions,
     integrator_step: float | None = None,
-) -> bool:
+) -> bool:  # fmt: skip
     """Whether pairs are more than an integrator's error away from any f in the library."""
     if len(pairs) < 2 * library.size:
         raise NumericalFailure(
@@ -399,12 +394,9 @@ def carries_noise(
 
 
 def identify_vector_field(
-    library: CandidateLibrary,
-    pairs: SnapshotPairs | StreamedPairs,
-    *,
-    options: IdentificationOptions,
+    library: CandidateLibrary, pairs: SnapshotPairs | StreamedPairs, *, options: IdentificationOptions,
     integrator_step: float | None = None,
-) -> FieldEstimate:
+) -> FieldEstimate:  # fmt: skip
     """f of pairs; by instruments of `LaggedPairs`, the library's functions of the earlier states.
 
     D is the unit matrix; f does not depend on it.
@@ -533,12 +525,9 @@ def residuals(found: FieldEstimate, pairs: SnapshotPairs) -> np.ndarray:
 
 
 def with_stability(
-    found: FieldEstimate,
-    pairs: SnapshotPairs,
-    *,
-    options: IdentificationOptions,
+    found: FieldEstimate, pairs: SnapshotPairs, *, options: IdentificationOptions,
     generator: np.random.Generator,
-) -> FieldEstimate:
+) -> FieldEstimate:  # fmt: skip
     """An estimate of noisy pairs with the share of resampled recordings in which each term is chosen."""
     regression = _PairRegression(found.library, pairs)
     velocity = regression.corrected(found.coefficients.T.ravel(), found.flow, found.noise_rate)
@@ -570,7 +559,11 @@ def with_noise_formula(
         with contextlib.suppress(NumericalFailure):
             constant = Transitions(found, pairs)
             by_state = constant.fitted_with_formula(false_terms=false_terms)
-            return None if by_state is None else constant.identified(by_state, false_terms=false_terms)
+            if by_state is None:
+                return None
+            found_by_state = constant.identified(by_state, false_terms=false_terms)
+            Transitions(found_by_state, pairs)  # whose D may need more cells than there can be
+            return found_by_state
         found = replace(found, flow=replace(found.flow, by_density=False))
     rest = residuals(found, pairs)
     likelihood = ResidualLikelihood(found, pairs, rest)

@@ -218,12 +218,9 @@ def best_support(problem: LinearProblem) -> tuple[int, ...]:
 
 
 def chosen_terms(
-    problems: Sequence[LinearProblem],
-    library: CandidateLibrary,
-    choose: Callable[[LinearProblem], Sequence[int]] = best_support,
-    *,
-    reason: str = "; record longer",
-) -> np.ndarray:
+    problems: Sequence[LinearProblem], library: CandidateLibrary, choose: Callable[[LinearProblem],
+    Sequence[int]] = best_support, *, reason: str = "; record longer",
+) -> np.ndarray:  # fmt: skip
     """The support ``(p, 2)`` of independent problems; a NumericalFailure where an equation has no term."""
     chosen = np.concatenate([problem.labels[list(choose(problem))] for problem in problems])
     for component in np.unique(np.concatenate([problem.labels[:, 0] for problem in problems])):
@@ -291,12 +288,9 @@ def triangles(columns: np.ndarray, goals: np.ndarray, block: np.ndarray) -> tupl
 
 
 def stability(
-    parts: Sequence[np.ndarray],
-    problems_of: Callable[[np.ndarray], Sequence[LinearProblem]],
-    support: np.ndarray,
-    *,
-    generator: np.random.Generator,
-) -> np.ndarray:
+    parts: Sequence[np.ndarray], problems_of: Callable[[np.ndarray], Sequence[LinearProblem]],
+    support: np.ndarray, *, generator: np.random.Generator,
+) -> np.ndarray:  # fmt: skip
     """Share of resampled recordings in which each term of a support ``(p, 2)`` is chosen again: ``(p,)``.
 
     Blocks, of which the triangles are known (`triangles`), are drawn with replacement; the search in the

@@ -278,12 +278,9 @@ class _NormalEquations:
     """
 
     def __init__(
-        self,
-        along: Linearisation,
-        data: Measurements,
-        variance: np.ndarray,
-        expected: tuple[np.ndarray, np.ndarray],
-    ) -> None:
+        self, along: Linearisation, data: Measurements, variance: np.ndarray, expected: tuple[np.ndarray,
+        np.ndarray],
+    ) -> None:  # fmt: skip
         along = replace(along, gap=np.zeros_like(along.gap))
         noise = Noise(variance, np.zeros(along.gap.shape[1]))
         white = along.filtered(data.first, data.step, noise)[0]

@@ -53,7 +53,7 @@ LEAST = 1e-300  # of a probability, so that it has a logarithm
 LEAST_CELLS, MOST_CELLS = 80, 400  # numerical: of the range of a state
 CELLS_PER_NOISE, FEWEST_PER_NOISE = 1.25, 0.6  # numerical: of a sensor's, to begin with, and at least
 CELLS_PER_SPREAD = 6  # numerical: of what noise spreads it by in a step; most densities are right to 1 %
-CELLS_IF_BLURRED = 3  # numerical: the same behind a sensor; 0.03 errors, of four double wells
+CELLS_IF_BLURRED = 3  # numerical: the same behind a sensor, and at least; 0.03 errors, of four double wells
 SLIGHT_NOISE = 1e-3  # numerical: of the least where states were recorded
 BEYOND = 1.5  # spreads by which a state may have been outside of what was recorded
 MUCH_FORGOTTEN = 0.3  # of Jh: a normal law has the variance to 1 % at 0.4, and to 3 to 5 % at 0.8
@@ -317,9 +317,9 @@ class Transitions:
             reach = 2 * FAR_AWAY * max(float(most), float(blur)) * count / (high - low + 2 * aside)
             if len(self.h) * min(count, reach) ** 2 * (DEARER if self.exposure else 1) > MOST_PRODUCTS:
                 raise NumericalFailure("there are too many samples to follow all that their states may be")
-        if count > MOST_CELLS:
+        if count * CELLS_IF_BLURRED > MOST_CELLS * per_spread:
             raise NumericalFailure("noise moves some states by a small part of what it moves others by")
-        self.edges = np.linspace(low - aside, high + aside, count + 1)
+        self.edges = np.linspace(low - aside, high + aside, min(count, MOST_CELLS) + 1)
         inner, middle = self.edges[None, 1:-1], (self.edges[None, 1:] + self.edges[None, :-1]) / 2
         self._drift, self._between, self._inside = functions(inner), shapes(inner), shapes(middle)
 

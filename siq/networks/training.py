@@ -179,12 +179,9 @@ def _table(pairs: SnapshotPairs) -> Tensor:
 
 
 def _initial_networks(
-    data: Sequence[TrainingData],
-    *,
-    options: TrainingOptions,
-    diffusion: Diffusion,
+    data: Sequence[TrainingData], *, options: TrainingOptions, diffusion: Diffusion,
     generators: Sequence[np.random.Generator],
-) -> Networks:
+) -> Networks:  # fmt: skip
     """Random networks, normalised and rescaled to the data of each run (paper, Eqs. eta_v, eta_g)."""
     dtype = getattr(torch, options.precision)
     dimension = diffusion.dimension
@@ -243,12 +240,9 @@ class _TrainingState:
 
 
 def start(
-    data: Sequence[TrainingData],
-    *,
-    options: TrainingOptions,
-    diffusion: Diffusion,
+    data: Sequence[TrainingData], *, options: TrainingOptions, diffusion: Diffusion,
     seeds: Sequence[np.random.SeedSequence],
-) -> _TrainingState:
+) -> _TrainingState:  # fmt: skip
     """The state of a training before its first step."""
     generators = [np.random.default_rng(_child_seed(seed, 0)) for seed in seeds]
     networks = _initial_networks(data, options=options, diffusion=diffusion, generators=generators)

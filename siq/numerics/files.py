@@ -173,7 +173,10 @@ def _known_keys(model: Any, keys: Keys) -> list[str]:
 
     def options_of(node: dict[str, Any]) -> list[dict[str, Any]]:
         options = [node, *node.get("anyOf", []), *node.get("allOf", [])]
-        return [_resolve(schema, option) for option in options]
+        for place, option in enumerate(options):
+            while "$ref" in option:
+                options[place] = option = schema["$defs"][option["$ref"].rsplit("/", 1)[-1]]
+        return options
 
     node = schema
     for key in keys:
@@ -188,12 +191,6 @@ def _known_keys(model: Any, keys: Keys) -> list[str]:
             return []
         node = found[0]
     return [name for option in options_of(node) for name in option.get("properties", {})]
-
-
-def _resolve(schema: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
-    while "$ref" in node:
-        node = schema["$defs"][node["$ref"].rsplit("/", 1)[-1]]
-    return node
 
 
 def _collect_lines(file: str, node: yaml.Node, keys: Keys, lines: dict[Keys, int]) -> None:

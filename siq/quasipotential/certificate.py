@@ -302,12 +302,9 @@ def _candidate_in_well(well: Well, evidence: Evidence) -> Candidate:
 
 
 def check_agreement(
-    networks: AnyNetworks,
-    formulas: SymbolicDecomposition | Sequence[Well],
-    evidence: Evidence,
-    *,
+    networks: AnyNetworks, formulas: SymbolicDecomposition | Sequence[Well], evidence: Evidence, *,
     error: float = 0.0,
-) -> Verdict:
+) -> Verdict:  # fmt: skip
     """Whether the networks' own V is that of formulas about every attractor, up to a constant.
 
     Formulas come from the identified f, networks from pairs of samples. They share the recordings; and where

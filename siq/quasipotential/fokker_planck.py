@@ -629,11 +629,9 @@ def _invariant_density(rates: sparse.csr_matrix, dimension: int) -> np.ndarray:
 
 
 def cores_about(
-    dynamics: Dynamics,
-    attractors: Sequence[Equilibrium | Cycle],
-    saddles: Sequence[Sequence[Equilibrium | Cycle]],
-    intensity: float,
-) -> list[Neighbourhood]:
+    dynamics: Dynamics, attractors: Sequence[Equilibrium | Cycle],
+    saddles: Sequence[Sequence[Equilibrium | Cycle]], intensity: float,
+) -> list[Neighbourhood]:  # fmt: skip
     """The core of each attractor: U below ε, or below half of what it is at the next saddle or attractor.
 
     `saddles` are those about each of them.

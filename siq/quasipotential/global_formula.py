@@ -201,12 +201,9 @@ def _forcing(equation: HamiltonJacobi, coefficients: np.ndarray, found: FieldEst
 
 
 def _eliminate(
-    equation: HamiltonJacobi,
-    coefficients: np.ndarray,
-    found: FieldEstimate,
-    critical: float,
+    equation: HamiltonJacobi, coefficients: np.ndarray, found: FieldEstimate, critical: float,
     precision: float,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Backward elimination in the linearised equation: positions of the terms to be kept."""
     jacobian = equation.jacobian(coefficients)
     goal = jacobian @ coefficients - equation.residual(coefficients)

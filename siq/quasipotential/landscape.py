@@ -163,12 +163,9 @@ class Landscape:
 
     @classmethod
     def from_recordings(
-        cls,
-        recordings: str | Path | Recordings | pd.DataFrame,
-        settings: PipelineSettings | None = None,
-        *,
+        cls, recordings: str | Path | Recordings | pd.DataFrame, settings: PipelineSettings | None = None, *,
         hidden_velocities: bool | Literal["auto"] = "auto",
-    ) -> Landscape:
+    ) -> Landscape:  # fmt: skip
         r"""The landscape that recordings show: f identified, V refined and certified, transitions found.
 
         Parameters

@@ -273,12 +273,9 @@ def descent(dynamics: Dynamics, saddle: np.ndarray, target: np.ndarray, nodes: i
 
 
 def _arriving(
-    rates: Callable[[float, np.ndarray], np.ndarray],
-    starts: Sequence[np.ndarray] | np.ndarray,
-    longest: float,
-    events: Sequence[Any],
-    **options: Any,
-) -> Any:
+    rates: Callable[[float, np.ndarray], np.ndarray], starts: Sequence[np.ndarray] | np.ndarray,
+    longest: float, events: Sequence[Any], **options: Any,
+) -> Any:  # fmt: skip
     """The first solution from some starts that ends with the first of the events, or None.
 
     Most arrive within a hundredth of the longest time; one that goes round a cycle takes all of it.

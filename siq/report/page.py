@@ -208,10 +208,19 @@ def render_report(content: object, *, template: str = "report.html.j2", folder: 
     environment.filters |= {
         "cell": _cell_text,
         "is_number": lambda column: is_numeric_dtype(column) and not is_bool_dtype(column),
-        "kept_columns": _kept_columns,
+        # Without columns that say nothing: of missing values, or of empty texts.
+        "kept_columns": lambda frame: (
+            frame
+            if frame.empty
+            else frame.loc[:, (frame.notna() & (frame.astype(str) != "")).any().to_numpy()]
+        ),
         # An SVG inside <img> keeps its identifiers to itself and cannot run or load anything.
         "data_address": lambda figure: _address(figure.kind, figure.image),
-        "figure_download": _figure_download,
+        "figure_download": lambda figure: (
+            ("svg", _address("svg", figure.vector))
+            if figure.vector is not None and len(figure.vector) <= LARGEST_VECTOR
+            else (figure.kind, _address(figure.kind, figure.image))
+        ),
         "table_download": lambda table: _address(
             "csv",
             (table.frame if table.data is None else table.data)
@@ -231,24 +240,11 @@ def render_report(content: object, *, template: str = "report.html.j2", folder: 
     return environment.get_template(template).render(content=content)
 
 
-def _kept_columns(frame: pd.DataFrame) -> pd.DataFrame:
-    """The table without columns that say nothing: of missing values, or of empty texts."""
-    said = [not (frame[name].isna() | (frame[name].astype(str) == "")).all() for name in frame.columns]
-    return frame if all(said) or frame.empty else frame.loc[:, said]
-
-
 _KINDS = {"svg": "image/svg+xml", "png": "image/png", "csv": "text/csv;charset=utf-8"}
 
 
 def _address(kind: str, content: bytes) -> str:
     return f"data:{_KINDS[kind]};base64,{base64.b64encode(content).decode('ascii')}"
-
-
-def _figure_download(figure: Any) -> tuple[str, str]:
-    """What a figure is downloaded as: its kind and its address."""
-    if figure.vector is not None and len(figure.vector) <= LARGEST_VECTOR:
-        return "svg", _address("svg", figure.vector)
-    return figure.kind, _address(figure.kind, figure.image)
 
 
 def _short_caption(caption: str) -> str:

@@ -579,13 +579,9 @@ def _branch_through(
 
 
 def follow_branches(
-    dynamics: Dynamics,
-    parameter: str,
-    limits: tuple[float, float],
-    seeds: Sequence[tuple[float, np.ndarray]],
-    *,
-    cycles: Sequence[tuple[float, np.ndarray, float]] | None = None,
-) -> tuple[list[Branch], list[Bifurcation], list[Remark]]:
+    dynamics: Dynamics, parameter: str, limits: tuple[float, float], seeds: Sequence[tuple[float,
+    np.ndarray]], *, cycles: Sequence[tuple[float, np.ndarray, float]] | None = None,
+) -> tuple[list[Branch], list[Bifurcation], list[Remark]]:  # fmt: skip
     """Branches of equilibria, and of cycles if asked for, within a range of a parameter λ and the domain.
 
     Seeds are known equilibria: the value of λ and the state, shape ``(d,)``. A branch through none of them is

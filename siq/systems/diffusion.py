@@ -92,12 +92,9 @@ class Diffusion:
 
     @classmethod
     def of_rows(
-        cls,
-        symbols: Sequence[sympy.Symbol],
-        rows: Sequence[Sequence[str | float]],
-        *,
+        cls, symbols: Sequence[sympy.Symbol], rows: Sequence[Sequence[str | float]], *,
         parse: Callable[[str | float], sympy.Expr] | None = None,
-    ) -> Diffusion:
+    ) -> Diffusion:  # fmt: skip
         """D from plain data, see `rows`; raises as `of_formulas`, or `FormulaError`.
 
         `parse` reads a formula; by default it may have the states in it, and nothing else.

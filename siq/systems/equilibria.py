@@ -139,12 +139,9 @@ def distinct_roots(
 
 
 def _newton(
-    dynamics: _VectorField,
-    starts: np.ndarray,
-    low: np.ndarray,
-    width: np.ndarray,
+    dynamics: _VectorField, starts: np.ndarray, low: np.ndarray, width: np.ndarray,
     known: Sequence[np.ndarray],
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Where Newton's method has come from some starts; what has run away is left out."""
     x = starts.copy()
     for _ in range(NEWTON_STEPS):

@@ -463,12 +463,9 @@ def _edge_saddles(
 
 
 def _harmless(
-    dynamics: Dynamics,
-    equilibria: Sequence[Equilibrium],
-    attractors: Sequence[Equilibrium],
-    box: np.ndarray,
+    dynamics: Dynamics, equilibria: Sequence[Equilibrium], attractors: Sequence[Equilibrium], box: np.ndarray,
     generator: np.random.Generator,
-) -> tuple[tuple[Equilibrium, ...], list[Remark]]:
+) -> tuple[tuple[Equilibrium, ...], list[Remark]]:  # fmt: skip
     """Degenerate equilibria from all about which f leads to one attractor: they part no wells."""
     found, remarks, width = [], [], np.ptp(box, axis=1)
     for one in equilibria:

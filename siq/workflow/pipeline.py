@@ -246,12 +246,9 @@ class _RefinedRun:
 
 
 def refine_run(
-    settings: PipelineSettings,
-    recordings: Recordings | None,
-    identified: StepResult[FieldEstimate],
-    trained: StepResult[AnyNetworks],
-    regressed: SymbolicDecomposition | None = None,
-) -> _RefinedRun:
+    settings: PipelineSettings, recordings: Recordings | None, identified: StepResult[FieldEstimate],
+    trained: StepResult[AnyNetworks], regressed: SymbolicDecomposition | None = None,
+) -> _RefinedRun:  # fmt: skip
     """V about every attractor of the identified f, or over the region, with its certificate.
 
     It follows from trajectories and f alone; networks are a second route, which has to agree.
@@ -405,11 +402,9 @@ def analyse(
 
 
 def landscape_from_recordings(
-    recordings: str | Path | Recordings | pd.DataFrame,
-    settings: PipelineSettings | None = None,
-    *,
+    recordings: str | Path | Recordings | pd.DataFrame, settings: PipelineSettings | None = None, *,
     hidden_velocities: bool | Literal["auto"] = "auto",
-) -> Landscape:
+) -> Landscape:  # fmt: skip
     """The landscape that recordings show; see `siq.Landscape.from_recordings`."""
     settings, trajectories = settings or PipelineSettings(), Recordings.of(recordings)
     if hidden_velocities != "auto":

@@ -223,12 +223,9 @@ def _position_text(state: np.ndarray | Sequence[float]) -> str:
 
 
 def _seeds(
-    system: Dynamics,
-    names: tuple[str, ...],
-    points: Sequence[SweptPoint],
-    limits: tuple[float, float],
+    system: Dynamics, names: tuple[str, ...], points: Sequence[SweptPoint], limits: tuple[float, float],
     along: int,
-) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:  # fmt: skip
     """Folds and Hopf points on all lines along one parameter."""
     other = 1 - along
     for value in sorted({point.values[other] for point in points}):

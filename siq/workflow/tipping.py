@@ -275,12 +275,9 @@ class _EarlyWarning(NamedTuple):
 
 
 def early_warning(
-    recordings: Recordings | pd.DataFrame | str | Path,
-    *,
-    until: float,
-    state: str | None = None,
+    recordings: Recordings | pd.DataFrame | str | Path, *, until: float, state: str | None = None,
     seed: int = 0,
-) -> _EarlyWarning:
+) -> _EarlyWarning:  # fmt: skip
     """How soon will a state be left, by a record of it that drifts?
 
     Parameters

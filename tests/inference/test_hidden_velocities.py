@@ -130,6 +130,26 @@ def test_two_coupled_positions() -> None:
     assert all(abs(named[one][0] - value) <= 3.5 * named[one][1] for one, value in true.items())
 
 
+@pytest.mark.parametrize("steps", [1, 20])
+def test_of_the_steps_of_a_simulation_fewer_are_used(steps: int) -> None:
+    # Duffing's oscillator by Euler's rule, each step or twentieth a sample: its rates differ by h.
+    draw, step, samples, runs = np.random.default_rng(3), 0.04, 400, 60
+    x, v, kept = np.repeat([-1.0, 1.0], runs // 2), np.zeros(runs), []
+    for count in range(samples * steps):
+        if count % steps == 0:
+            kept.append(x)
+        kick = np.sqrt(2 * FRICTION * TEMPERATURE * step / steps) * draw.standard_normal(runs)
+        x, v = x + v * step / steps, v + (x - x**3 - FRICTION * v) * step / steps + kick
+    positions = np.array(kept).T[:, :, None]
+    recordings = Recordings.from_arrays(step * np.arange(samples), positions, names=["x"])
+    done = pipeline.identify_run(SETTINGS, recordings, number=0)
+    assert done.outcome.status == Status.OK and done.result is not None
+    assert done.result.diagnosis is not None and (done.result.diagnosis.thinned > 1) == (steps == 1)
+    assert ("samples one was used" in done.outcome.reason) == (steps == 1)
+    errors = np.sqrt(np.diag(done.result.covariance))[1:]
+    assert (np.abs(done.result.values[1:] - [1, -FRICTION, -1]) < 3.5 * errors + 2 * step).all()
+
+
 def test_nothing_but_noise_is_a_spline_through_the_samples() -> None:
     recordings, velocities = particle(2, records=2, samples=1000)
     states, noise = smoothed_motion(unbroken(recordings), ["x"])

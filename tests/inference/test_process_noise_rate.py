@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.integrate import quad_vec
@@ -12,9 +14,11 @@ import siq
 from siq.data.recordings import snapshot_pairs
 from siq.errors import NumericalFailure
 from siq.inference.diffusion_model import with_process_noise_rate
+from siq.inference.identify import identify
 from siq.inference.library import IdentificationOptions, field_library
 from siq.inference.regression import identify_vector_field
 from siq.numerics.integration import FlowMap
+from siq.numerics.randomness import generator
 
 SYSTEMS = {
     "one state, relaxing twice a second": (np.array([[-2.0]]), np.array([[0.25]])),
@@ -116,3 +120,25 @@ def _forces(recordings: siq.Recordings, *, integrator_step: float | None = None)
     library = field_library(list(recordings.names), options)
     found = identify_vector_field(library, pairs, options=options, integrator_step=integrator_step)
     return with_process_noise_rate(found, pairs).noise_rate
+
+
+@pytest.mark.parametrize("parts", [1, 2, 40])
+def test_steps_of_a_simulation_are_known_by_their_noise(parts: int) -> None:
+    # dx = (x - x³) dt + √0.25 dW by Euler's rule, each step or second a sample; or as good as continuous.
+    step, x, samples = 0.06, np.linspace(-1.5, 1.5, 200), []
+    draw = np.random.default_rng(7)
+    for _ in range(200):
+        samples.append(x)
+        for _ in range(parts):
+            x = x + (x - x**3) * step / parts + np.sqrt(0.25 * step / parts) * draw.standard_normal(len(x))
+    recordings = siq.Recordings.from_arrays(
+        step * np.arange(200), np.array(samples).T[:, :, None], names=["x"]
+    )
+    options = IdentificationOptions(degree=3)
+    found = identify(recordings, options=options, draw=partial(generator, 0, 0))
+    assert found.diagnosis is not None and found.noise is None
+    of_rule = [one for one in found.diagnosis.remarks if one.code == "inference.simulated"]
+    assert found.flow.euler == (parts < 3) == bool(of_rule)
+    if of_rule:
+        assert of_rule[0].values["step"] == pytest.approx(step / parts)
+    assert (np.abs(found.values - [1.0, -1.0]) < 3 * np.sqrt(np.diag(found.covariance))).all()

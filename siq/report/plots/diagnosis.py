@@ -423,12 +423,9 @@ STAGES = {
 
 @drawn_to_be_read
 def plot_curves(
-    curves: pd.DataFrame,
-    *,
-    named: tuple[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
+    curves: pd.DataFrame, *, named: tuple[str, str] | None = None, units: Mapping[str, str] | None = None,
     time_unit: str = "1",
-) -> Figure | None:
+) -> Figure | None:  # fmt: skip
     """Draw what is missing in equations against coordinates, before and after mechanisms were added.
 
     There are up to three panels, by what a function of the coordinate alone explains, with bands of ± 2
