@@ -73,7 +73,7 @@ class RegressionOptions:
 
 
 @plain_dataclass(frozen=True)
-class RegressionResult:
+class _RegressionResult:
     """Sparse coefficients of f, V and g over one library."""
 
     vector_field: np.ndarray  #: shape ``(q, d)``: column i holds the coefficients of f_i
@@ -102,7 +102,7 @@ def points_below(potential: np.ndarray, *, level: float | None) -> np.ndarray:
 def sparse_decomposition(
     library: CandidateLibrary, x: np.ndarray, potential: np.ndarray, circulatory: np.ndarray,
     vector_field: np.ndarray, *, diffusion: Diffusion, options: RegressionOptions,
-) -> RegressionResult:  # fmt: skip
+) -> _RegressionResult:  # fmt: skip
     """Sparse formulas of V, g and f = -D∇V + g from their values at points.
 
     Parameters
@@ -163,7 +163,7 @@ def sparse_decomposition(
     size = np.sqrt(np.linalg.norm(goals, axis=0) ** 2 + np.linalg.norm(rest, axis=0) ** 2)
     coefficients = scaled / ratio
     d = library.dimension
-    return RegressionResult(
+    return _RegressionResult(
         vector_field=coefficients[:, :d], potential=coefficients[:, d], circulatory=coefficients[:, d + 1 :],
         converged=converged, iterations=iterations,
         constraint_residual=float(np.abs(constraints @ scaled.T.ravel()).max()),

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from known_systems import exact_archetype
 
 from siq.errors import NumericalFailure
 from siq.inference.library import CandidateLibrary, candidate_library
-from siq.networks.regression import RegressionOptions, RegressionResult, points_below, sparse_decomposition
+from siq.networks.regression import RegressionOptions, points_below, sparse_decomposition
 from siq.quasipotential.formulas import term_coefficients
 from siq.systems.diffusion import Diffusion
 from workflow.scoring import _exact_values
@@ -29,7 +30,7 @@ def regress(
     states: str = "xy",
     diffusion: np.ndarray | None = None,
     **options: object,
-) -> tuple[CandidateLibrary, RegressionResult]:
+) -> tuple[CandidateLibrary, Any]:
     settings = RegressionOptions(**{**PAPERS, "degree": 3, **options})
     library = candidate_library(
         tuple(states), degree=settings.degree, potential_degree=settings.potential_degree,
