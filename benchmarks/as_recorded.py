@@ -24,12 +24,20 @@ import siq
 WITHIN = 20  # steps of the simulation in a step between samples
 
 
-def double_well(draw: np.random.Generator, steps: np.ndarray, *, height: float, time_: float) -> np.ndarray:
-    """Samples of ``U/ε = height (x² - 1)²``, which relaxes in the wells within a time: shape ``(n + 1,)``."""
-    rate, x, seen = 1 / (8 * height * time_), 1.0, [1.0]
-    for step, kicks in zip(steps / WITHIN, draw.standard_normal((len(steps), WITHIN)), strict=True):
+def double_well(
+    draw: np.random.Generator, steps: np.ndarray, *, height: float, time_: float, within: int = WITHIN,
+    bent: float = 0.0,
+) -> np.ndarray:  # fmt: skip
+    """Samples of ``U/ε = height (x² - 1)²``, which relaxes in the wells within a time: shape ``(n + 1,)``.
+
+    By Euler's rule, with so many steps `within` each of those between samples; D is in proportion to
+    ``1 + bent x²``.
+    """
+    rate, x, seen = 1 / (8 * height * time_ * (1 + bent)), 1.0, [1.0]
+    for step, kicks in zip(steps / within, draw.standard_normal((len(steps), within)), strict=True):
         for kick in np.sqrt(2 * rate * step) * kicks:
-            x += -4 * height * rate * x * (x * x - 1) * step + kick
+            noise = 1 + bent * x * x
+            x += -4 * height * rate * noise * x * (x * x - 1) * step + np.sqrt(noise) * kick
         seen.append(x)
     return np.array(seen)
 
@@ -82,8 +90,33 @@ def faulty(draw: np.random.Generator) -> tuple[pd.DataFrame, float]:
     return table[draw.random(len(x)) > 0.01], 1.5
 
 
+def steps(draw: np.random.Generator) -> tuple[pd.DataFrame, float]:
+    """A simulation by Euler's rule, every step of it written down, which relaxes within twelve."""
+    x = double_well(draw, np.full(60_000, 0.04), height=2.0, time_=0.5, within=1)
+    return pd.DataFrame({"t": (0.04 * np.arange(len(x))).round(4), "x": x}), 2.0
+
+
+def steps_of_noisy_states(draw: np.random.Generator) -> tuple[pd.DataFrame, float]:
+    """The same, with a noise that is stronger away from the middle."""
+    x = double_well(draw, np.full(60_000, 0.04), height=2.0, time_=0.5, within=1, bent=0.5)
+    return pd.DataFrame({"t": (0.04 * np.arange(len(x))).round(4), "x": x}), 2.0
+
+
+def oscillator(draw: np.random.Generator) -> tuple[pd.DataFrame, float]:
+    """Duffing's oscillator by the symplectic rule, position and velocity of every step."""
+    step, friction, height, seen = 0.03, 0.5, 2.0, []
+    x, v = 1.0, 0.0
+    for kick in np.sqrt(2 * friction * step / (4 * height)) * draw.standard_normal(120_000):
+        seen.append((x, v))
+        v += (x - x**3 - friction * v) * step + kick
+        x += v * step
+    table = pd.DataFrame(seen, columns=["x", "v"])
+    return table.assign(t=(step * np.arange(len(table))).round(4)), height
+
+
 KINDS: dict[str, Callable[[np.random.Generator], tuple[pd.DataFrame, float]]] = {
-    one.__name__: one for one in (counted, frames, core, clouds, visits, faulty)
+    one.__name__: one
+    for one in (counted, frames, core, clouds, visits, faulty, steps, steps_of_noisy_states, oscillator)
 }
 
 

@@ -74,7 +74,6 @@ from siq.inference.regression import (
     lost_time,
     refit,
     residuals,
-    with_given_noise,
     with_noise_formula,
     with_stability,
 )
@@ -539,8 +538,8 @@ class _Case:
             return replace(found, diagnosis=noise)
 
         if self.given is not None:
-            given = with_given_noise(found, everything, self.given, false_terms=false_terms)
-            found = diagnosed(given, DiffusionSource.GIVEN)
+            given = with_noise_formula(found, everything, false_terms=false_terms, given=self.given)
+            found = diagnosed(given or found, DiffusionSource.GIVEN)
         else:
             estimated = None if found.noise_free else estimated_diffusion(found, pairs=count)
             whole = None if estimated is None else diagnosed(*self._with_diffusion(found, count))
@@ -550,10 +549,8 @@ class _Case:
             else:
                 # Behind a sensor it was asked for together with that.
                 constant = whole.noise is None and whole.diagnosis.measurement_error is None
-                by_state = (
-                    with_noise_formula(whole, everything, false_terms=false_terms) if constant else None
-                )
-                found = whole if by_state is None else diagnosed(by_state, DiffusionSource.ESTIMATED)
+                formula = constant and with_noise_formula(whole, everything, false_terms=false_terms)
+                found = diagnosed(formula, DiffusionSource.ESTIMATED) if formula else whole
         noise = found.diagnosis
         assert noise is not None
         if self.given is not None and noise.kind == "process" and found.diffusion.constant:

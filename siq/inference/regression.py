@@ -541,13 +541,13 @@ def with_stability(
 
 
 def with_noise_formula(
-    found: FieldEstimate, pairs: SnapshotPairs, *, false_terms: float
+    found: FieldEstimate, pairs: SnapshotPairs, *, false_terms: float, given: Diffusion | None = None
 ) -> FieldEstimate | None:
     """f and D for a noise that depends on the state; None where a constant one can be held.
 
-    From f as it was found with one weight for all of its pairs. With the probability `false_terms` a constant
-    D is given up by chance; or chance brings any false term into f, or into D. Over the recorded states the
-    determinant of D has the geometric mean one.
+    From f as it was found with one weight for all of its pairs; or f alone, where D is `given`. With the
+    probability `false_terms` a constant D is given up by chance; or chance brings any false term into f, or
+    into D. Over the recorded states the determinant of D has the geometric mean one.
 
     Raises
     ------
@@ -555,6 +555,10 @@ def with_noise_formula(
         When D depends on the state, and no formula for it is positive at all recorded states; or when an
         equation of f has no significant term.
     """
+    if given is not None:
+        found = replace(found, diffusion=given)
+        weighted = not (found.noise_free or given.constant)
+        return _identify_weighted(found, pairs, false_terms=false_terms) if weighted else found
     if found.flow.by_density:
         with contextlib.suppress(NumericalFailure):
             constant = Transitions(found, pairs)
@@ -577,16 +581,6 @@ def with_noise_formula(
         likelihood = ResidualLikelihood(found, pairs, residuals(found, pairs))
     formula = likelihood.selected(false_terms=false_terms, probability=probability)[0]
     return refit(found.with_formula(formula, pairs.x0), pairs)
-
-
-def with_given_noise(
-    found: FieldEstimate, pairs: SnapshotPairs, diffusion: Diffusion, *, false_terms: float
-) -> FieldEstimate:
-    """f with the weights of a given D; see `with_noise_formula`."""
-    found = replace(found, diffusion=diffusion)
-    if found.noise_free or diffusion.constant:
-        return found
-    return _identify_weighted(found, pairs, false_terms=false_terms)
 
 
 def _identify_weighted(found: FieldEstimate, pairs: SnapshotPairs, *, false_terms: float) -> FieldEstimate:

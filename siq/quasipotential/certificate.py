@@ -47,6 +47,7 @@ from siq.quasipotential.characteristics import (
     relative_error as field_error,
 )
 from siq.quasipotential.formulas import SymbolicDecomposition
+from siq.quasipotential.transitions import Transition
 from siq.quasipotential.wells import MIN_EXPLAINED_ERROR, Well
 from siq.remarks import Remark, sentence
 from siq.systems.dynamics import Dynamics
@@ -379,15 +380,18 @@ START_QUANTILE = 0.9  # share of the recorded starts below the first level where
 
 
 def references_about(
-    dynamics: Dynamics, portrait: PhasePortrait, *, depths: Sequence[float] | None = None, seed: int = 0
+    dynamics: Dynamics, portrait: PhasePortrait, *, ways: Sequence[Transition] = (), seed: int = 0
 ) -> tuple[Reference, ...]:
     """V by characteristics about every attractor of a phase portrait.
 
-    `depths` are V at the lowest saddle of each well, where it is known: higher up nothing is compared. The
-    seed draws directions where there are more than two states, and thins the points.
+    Above the lowest of the `ways` out of a well, where they are known, nothing is compared. The seed draws
+    directions where there are more than two states, and thins the points.
     """
-    known = [np.inf] * len(portrait.attractors) if depths is None else depths
-    return tuple(_follow_well(dynamics, portrait, *each, seed=seed) for each in enumerate(known))
+    depths = [np.inf] * len(portrait.attractors)
+    for way in ways:
+        if way.path is not None and way.start < len(depths):
+            depths[way.start] = min(depths[way.start], way.path.action / 2)
+    return tuple(_follow_well(dynamics, portrait, *each, seed=seed) for each in enumerate(depths))
 
 
 def _follow_well(

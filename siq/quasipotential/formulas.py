@@ -212,10 +212,9 @@ def _wells_from_data(method: Mapping[str, Any], symbols: tuple[sympy.Symbol, ...
 
 
 def write_model(
-    path: str | Path,
-    decompositions: Mapping[str, SymbolicDecomposition],
+    path: str | Path, decompositions: Mapping[str, SymbolicDecomposition],
     certificates: Mapping[str, Mapping[str, Any]],
-) -> None:
+) -> None:  # fmt: skip
     """Write decompositions by method, with a certificate for each, whole or not at all.
 
     Certificates of what is no method, such as a randomised network, stand beside them.

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import sympy
@@ -30,31 +29,24 @@ from siq.quasipotential.certificate import (
 )
 from siq.quasipotential.certificate_tests import CertificateOptions
 from siq.quasipotential.global_formula import heights_of_attractors
-from siq.quasipotential.hamilton_jacobi import MAX_POWERS
 from siq.quasipotential.landscape import Landscape, LandscapeOptions, NoLandscape
-from siq.quasipotential.path_chains import evenly
 from siq.quasipotential.rates import NoiseStrength
-from siq.quasipotential.refinement import RefinementOptions
+from siq.quasipotential.refinement import RefinementOptions, local_wells
 from siq.quasipotential.transitions import Transition, position_standard_errors, transitions, ways_out
-from siq.quasipotential.wells import Well, local_well
+from siq.quasipotential.wells import Well
 from siq.remarks import Remark, sentence
-from siq.systems.basins import basin_of, follow
 from siq.systems.cards import load_system
 from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
-from siq.systems.equilibria import Equilibrium, hessian_at, spread_evenly, unreached_states
+from siq.systems.equilibria import Equilibrium, spread_evenly, unreached_states
 from siq.systems.formulas import FormulaError, compile_formulas, formulas_in_time
 from siq.systems.phase_portrait import (
-    LEVEL_BEYOND_SADDLE,
     MOST_SEARCHED,
-    STARTS_NEAR_ATTRACTOR,
     PhasePortrait,
     phase_portrait,
 )
 
 ATTRACTOR_MATCH_TOLERANCE = 1e-6  # of the recorded box: one attractor, from different starts
-STATES_ALONG_PATH = 300  # from the neighbourhood of which further descents start
-PATH_NEIGHBOURHOOD = (0.02, 0.05, 0.1)  # of the extent of the well: how far from the path
 TRIED_STATES = 400  # of the domain, at which equations must have a value
 UNSEEN_STATES = 1024  # of the domain, and of the box of each well, that no fit sees
 
@@ -98,19 +90,23 @@ def find_landscape(
     fault, kept = portrait.fault(), list[Well | None]()
     remarks = [] if fault is None else [fault]
     width = portrait.box[:, 1] - portrait.box[:, 0]
-    for index, one in enumerate(portrait.attractors):
-        if wells is None:
-            kept.append(_local_well(found.dynamics, portrait, index, remarks, options=options, seed=seed))
-            continue
-        away = [np.abs((well.attractor - one.position) / width).max() for well in wells]
-        same = [well for well, far in zip(wells, away, strict=True) if far < ATTRACTOR_MATCH_TOLERANCE]
-        kept.append(same[0].surveyed(found.dynamics, portrait, index) if same else None)
-        if not same:
-            remarks.append(Remark("quasipotential.no_refined_formula", {"place": _place(one.position)}))
+    paths = ways_out(found.dynamics, portrait)
+    if wells is None:
+        draw = generator(seed, Purpose.LANDSCAPE)
+        kept, _, more = local_wells(found.dynamics, portrait, paths, options=options, seed=seed, draw=draw)
+        remarks += more
+    else:
+        for index, one in enumerate(portrait.attractors):
+            away = [np.abs((well.attractor - one.position) / width).max() for well in wells]
+            same = [well for well, far in zip(wells, away, strict=True) if far < ATTRACTOR_MATCH_TOLERANCE]
+            kept.append(same[0].surveyed(found.dynamics, portrait, index) if same else None)
+            if not same:
+                place = one.position.round(4).tolist()
+                remarks.append(Remark("quasipotential.no_refined_formula", {"place": place}))
     # What no certificate vouches for says nothing of barriers: paths of least action alone do.
     test = None if certificate is None else certificate.tests.get("error")
     told = kept if test is None or test.passed else [None] * len(kept)
-    ways = transitions(found, ways_out(found.dynamics, portrait), told)
+    ways = transitions(found, paths, told)
     return _assembled(found, portrait, kept, ways, remarks, certificate=certificate, noise=noise)
 
 
@@ -148,26 +144,16 @@ def landscape_from_equations(
         remarks.append(Remark("quasipotential.too_many_states", {"states": system.dimension}))
     elif formulas and points:
         draw, seed = generator(settings.seed, Purpose.LANDSCAPE), settings.seed
-        # Of each well the way out with the least action.
-        known = sorted(
-            (way for way in ways if way.path), key=lambda way: way.path.action if way.path else 0.0
+        wells, portrait, more = local_wells(
+            system, portrait, ways, options=settings.refinement, seed=seed, draw=draw
         )
-        lowest = [next((way for way in known if way.start == index), None) for index in range(points)]
-        portrait = _with_states_along_paths(system, portrait, lowest, draw)
-        wells = [
-            _local_well(
-                system, portrait, index, remarks, options=settings.refinement, seed=seed,
-                saddle=None if way is None else way.saddle, path=None if way is None else way.path,
-            )
-            for index, way in enumerate(lowest)
-        ]  # fmt: skip
+        remarks += more
         sought = [well for well in wells if well is not None]
         boxes = [np.stack([well.points.min(axis=0), well.points.max(axis=0)], axis=1) for well in sought]
         unseen = [spread_evenly(box, UNSEEN_STATES, generator=draw) for box in (system.box, *boxes)]
-        depths = [np.inf if way is None or way.path is None else way.path.action / 2 for way in lowest]
         evidence = Evidence(
             system, portrait, np.concatenate(unseen), options=settings.certificate, seed=seed,
-            references=references_about(system, portrait, depths=depths, seed=seed),
+            references=references_about(system, portrait, ways=ways, seed=seed),
         )  # fmt: skip
         wells, certificate = certify_wells(wells, evidence)
         remarks += caustics_below(evidence.references, certificate.error)
@@ -272,44 +258,3 @@ def _assembled(
         noise, None if isinstance(found, Dynamics) else found,
         given=isinstance(found, Dynamics), parting=portrait.parting,
     )  # fmt: skip
-
-
-def _local_well(
-    dynamics: Dynamics, portrait: PhasePortrait, index: int, remarks: list[Remark], **how: Any
-) -> Well | None:
-    """V about one attractor by the local route; a remark where it found none."""
-    try:
-        return local_well(dynamics, portrait, index, **how)
-    except NumericalFailure as error:
-        values = {"place": _place(portrait.attractors[index].position), "reason": str(error)}
-        remarks.append(Remark("quasipotential.no_formula", values))
-        return None
-
-
-def _place(position: np.ndarray) -> list[float]:
-    return [float(value) for value in position.round(4)]
-
-
-def _with_states_along_paths(
-    system: Dynamics, portrait: PhasePortrait, lowest: Sequence[Transition | None], draw: np.random.Generator
-) -> PhasePortrait:
-    """The portrait with more states about the lowest way out of each well, where it may be narrow."""
-    basins = list(portrait.basins)
-    for index, (one, way) in enumerate(zip(portrait.attractors, lowest, strict=True)):
-        if way is None or way.path is None or system.dimension == 1:
-            continue
-        metric = np.linalg.cholesky(hessian_at(system, one.position))
-        depth, places = way.path.action / 2, basins[index].points(np.arange(len(basins[index].chosen)))
-        heights = np.sum(((places - one.position) @ metric) ** 2, axis=1) / 2
-        if (heights < depth).sum() < 2 * MAX_POWERS:  # V at the saddle is far lower than M alone had it
-            near = (STARTS_NEAR_ATTRACTOR, LEVEL_BEYOND_SADDLE * depth)
-            basins[index] = basin_of(
-                system, portrait.descents, index, portrait.attractors, box=portrait.box, generator=draw,
-                near=near,
-            )  # fmt: skip
-        extent = np.linalg.inv(metric) * np.sqrt(way.path.action)
-        along = evenly(way.path.points, STATES_ALONG_PATH)
-        starts = [along + share * draw.standard_normal(along.shape) @ extent for share in PATH_NEIGHBOURHOOD]
-        ways = follow(system, np.concatenate(starts), portrait.attractors, box=portrait.box)
-        basins[index] = basins[index].enlarged(ways.paths[ways.ends == index], one.position, generator=draw)
-    return replace(portrait, basins=tuple(basins))

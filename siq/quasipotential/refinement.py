@@ -9,7 +9,7 @@ put in random order.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, Any, Literal
@@ -40,12 +40,28 @@ from siq.quasipotential.certificate import (
 from siq.quasipotential.certificate_tests import MAX_PAIRS, MIN_POINTS, CertificateOptions
 from siq.quasipotential.formulas import SymbolicDecomposition, decomposition_from_coefficients
 from siq.quasipotential.global_formula import GlobalFormula, fit_values, refine_globally
-from siq.quasipotential.hamilton_jacobi import affordable_degree
+from siq.quasipotential.hamilton_jacobi import MAX_POWERS, affordable_degree
 from siq.quasipotential.occupancy import OccupancyCheck, check_occupancy
+from siq.quasipotential.path_chains import evenly
 from siq.quasipotential.rates import NoiseStrength
+from siq.quasipotential.transitions import Transition, ways_out
 from siq.quasipotential.wells import MIN_OUTLIER_RESIDUAL, RESIDUAL_TOLERANCE, Well, local_well
 from siq.remarks import Remark
-from siq.systems.phase_portrait import PhasePortrait, RecordedRegion, evenly_spread, phase_portrait
+from siq.systems.basins import basin_of, follow
+from siq.systems.dynamics import Dynamics
+from siq.systems.equilibria import hessian_at
+from siq.systems.phase_portrait import (
+    LEVEL_BEYOND_SADDLE,
+    STARTS_NEAR_ATTRACTOR,
+    PhasePortrait,
+    RecordedRegion,
+    evenly_spread,
+    phase_portrait,
+)
+
+STATES_ALONG_PATH = 300  # from the neighbourhood of which further descents start
+OF_FORMULAS = {"hamilton_jacobi", "descent", "characteristics", "error"}  # tests of V alone, given f
+PATH_NEIGHBOURHOOD = (0.02, 0.05, 0.1)  # of the extent of the well: how far from the path
 
 Route = Literal["network", "local"]
 Degree = Annotated[int, Field(ge=2, le=16)]
@@ -116,19 +132,20 @@ def _formula_library(found: FieldEstimate, options: RefinementOptions) -> Candid
 
 
 def refine(
-    found: FieldEstimate, portrait: PhasePortrait, *, points: np.ndarray, options: RefinementOptions,
-    seed: int = 0,
+    found: FieldEstimate, portrait: PhasePortrait, ways: Sequence[Transition], *, points: np.ndarray,
+    options: RefinementOptions, seed: int = 0,
 ) -> _Refined:  # fmt: skip
     """V about each attractor, and one formula over the recorded states ``(n, d)`` where one holds.
 
-    The seed decides which points are used where there are too many.
+    The `ways` out say how deep wells are. The seed decides which points are used where there are too many.
     """
+    draw = np.random.default_rng(seed)
+    local, _, remarks = local_wells(found.dynamics, portrait, ways, options=options, seed=seed, draw=draw)
+    wells = tuple(well for well in local if well is not None)
     if found.library.angles:  # one formula of V that is periodic, or not, would have to be chosen
-        wells, remarks = _local_wells(found, portrait, options=options, seed=seed)
         return _Refined(found, wells, (*remarks, Remark("quasipotential.no_single_formula")))
     library = _formula_library(found, options)
     found = _over_library(found, library)
-    wells, remarks = _local_wells(found, portrait, options=options, seed=seed)
     # The errors of f make some of the residual with which one formula is believed to hold.
     errors = np.abs(np.sqrt(np.diag(found.covariance)) / found.values)
     noise = 0.0 if found.noise_free else 3 * float(np.sqrt((errors**2).mean()))
@@ -185,17 +202,55 @@ def _over_library(found: FieldEstimate, library: CandidateLibrary) -> FieldEstim
     return replace(found, library=library, coefficients=coefficients, support=support, alternatives=average)
 
 
-def _local_wells(
-    found: FieldEstimate, portrait: PhasePortrait, *, options: RefinementOptions, seed: int = 0
-) -> tuple[tuple[Well, ...], list[Remark]]:
-    """V about each attractor, and where that was not possible."""
-    wells, remarks = [], []
-    for index in range(len(portrait.attractors)):
+def local_wells(
+    dynamics: Dynamics, portrait: PhasePortrait, ways: Sequence[Transition], *, options: RefinementOptions,
+    seed: int, draw: np.random.Generator,
+) -> tuple[list[Well | None], PhasePortrait, list[Remark]]:  # fmt: skip
+    """V about each attractor, the portrait with states along paths, and where there is no V, and why.
+
+    Of each well the way out with the least action, where there is one, says how deep the well is.
+    """
+    known = sorted((way for way in ways if way.path), key=lambda way: way.path.action if way.path else 0.0)
+    least = {way.start: way for way in reversed(known)}
+    lowest = [least.get(index) for index in range(len(portrait.attractors))]
+    portrait = _with_states_along_paths(dynamics, portrait, lowest, draw)
+    wells, remarks = list[Well | None](), list[Remark]()
+    for index, way in enumerate(lowest):
+        saddle, path = (None, None) if way is None else (way.saddle, way.path)
         try:
-            wells.append(local_well(found.dynamics, portrait, index, options=options, seed=seed))
+            wells.append(
+                local_well(dynamics, portrait, index, options=options, seed=seed, saddle=saddle, path=path)
+            )
         except NumericalFailure as error:
-            remarks.append(Remark("quasipotential.route_failed", {"route": "local", "reason": str(error)}))
-    return tuple(wells), remarks
+            place = portrait.attractors[index].position.round(4).tolist()
+            remarks.append(Remark("quasipotential.no_formula", {"place": place, "reason": str(error)}))
+            wells.append(None)
+    return wells, portrait, remarks
+
+
+def _with_states_along_paths(
+    system: Dynamics, portrait: PhasePortrait, lowest: Sequence[Transition | None], draw: np.random.Generator
+) -> PhasePortrait:
+    """The portrait with more states about the lowest way out of each well, where it may be narrow."""
+    basins = list(portrait.basins)
+    for index, (one, way) in enumerate(zip(portrait.attractors, lowest, strict=True)):
+        if way is None or way.path is None or system.dimension == 1:
+            continue
+        metric = np.linalg.cholesky(hessian_at(system, one.position))
+        depth, places = way.path.action / 2, basins[index].points(np.arange(len(basins[index].chosen)))
+        heights = np.sum(((places - one.position) @ metric) ** 2, axis=1) / 2
+        if (heights < depth).sum() < 2 * MAX_POWERS:  # V at the saddle is far lower than M alone had it
+            near = (STARTS_NEAR_ATTRACTOR, LEVEL_BEYOND_SADDLE * depth)
+            basins[index] = basin_of(
+                system, portrait.descents, index, portrait.attractors, box=portrait.box, generator=draw,
+                near=near,
+            )  # fmt: skip
+        extent = np.linalg.inv(metric) * np.sqrt(way.path.action)
+        along = evenly(way.path.points, STATES_ALONG_PATH)
+        starts = [along + share * draw.standard_normal(along.shape) @ extent for share in PATH_NEIGHBOURHOOD]
+        ways = follow(system, np.concatenate(starts), portrait.attractors, box=portrait.box)
+        basins[index] = basins[index].enlarged(ways.paths[ways.ends == index], one.position, generator=draw)
+    return replace(portrait, basins=tuple(basins))
 
 
 def _refined_decomposition(refined: _Refined, points: np.ndarray) -> SymbolicDecomposition:
@@ -321,10 +376,8 @@ class RefinementContext:
         for mask in (second, ~second):
             other = recordings.select(np.flatnonzero(~mask))
             try:
-                if (memory := found.memory) is not None:
-                    fit = refit(found, lagged_pairs(other, memory[0]))
-                else:
-                    fit = refit(found, snapshot_pairs(other, pair_step=self.pair_step))
+                near = snapshot_pairs(other, pair_step=self.pair_step)
+                fit = refit(found, lagged_pairs(other, memory[0]) if (memory := found.memory) else near)
             except (NumericalFailure, np.linalg.LinAlgError, ValueError):
                 fit = found
             halves.append((fit, mask))
@@ -349,9 +402,29 @@ class RefinementContext:
         return uncertified(reason) | {"tests": {"agreement": verdict.as_data()}}
 
     def _certified(self) -> tuple[_Refined, SymbolicDecomposition, Certificate]:
-        """V about the attractors and over the region, with the certificate of what is to stand."""
+        """V about the attractors and over the region, with the certificate of what is to stand.
+
+        Formulas that grow by themselves are the shortest. Where they are refused as formulas, they are sought
+        once more, up to where paths of least action say that wells end.
+        """
+        first = self._certified_up_to((), self.evidence)
+        refused = {name for name, test in first[2].tests.items() if test.tested and not test.passed}
+        if first[2].certified or not refused <= OF_FORMULAS:
+            return first
+        ways = ways_out(self.found.dynamics, self.portrait)
+        references = references_about(self.found.dynamics, self.portrait, ways=ways, seed=self.number)
+        evidence = replace(self.evidence, references=references)
+        again = self._certified_up_to(ways, evidence)
+        if not again[2].certified:
+            return first
+        self.evidence = evidence
+        return again
+
+    def _certified_up_to(
+        self, ways: Sequence[Transition], evidence: Evidence
+    ) -> tuple[_Refined, SymbolicDecomposition, Certificate]:
         refined = refine(
-            self.found, self.portrait, points=self.points, options=self.options, seed=self.number
+            self.found, self.portrait, ways, points=self.points, options=self.options, seed=self.number
         )
         formulas, whole = _refined_decomposition(refined, self.points), refined.formula
         told: dict[str, Any] = {
@@ -363,13 +436,13 @@ class RefinementContext:
             error = 0.0
             if whole is not None and not self.found.noise_free:
                 error = whole.relative_error(refined.found.library.evaluate(self.points))
-            certificate = certify(formulas, self.evidence, relative_error=error, **told)
+            certificate = certify(formulas, evidence, relative_error=error, **told)
             if certificate.certified or not refined.wells:
                 return refined, formulas, certificate
             # One formula for all wells is an extra. What refuses it is no word against the wells.
             refused = Remark("quasipotential.single_formula_refused", {"reason": certificate.reason})
             alone = replace(refined, formula=None, remarks=(*refined.remarks, refused))
-        wells, of_wells = certify_wells(refined.wells, self.evidence, **told)
+        wells, of_wells = certify_wells(refined.wells, evidence, **told)
         if formulas.potential is not None and not of_wells.certified:
             return refined, formulas, certificate
         alone = replace(alone, wells=tuple(well for well in wells if well is not None))

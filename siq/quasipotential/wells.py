@@ -318,7 +318,8 @@ def local_well(
     if depth is None:
         # No formula tells V of the saddle as well as the finest does.
         goal = options.reach * wells[-1].level
-        wells = [_extend_well(well, basin, goal=goal, rows=kept) for well in wells]
+        taken = [_extend_well(well, basin, goal=goal, rows=kept) for well in wells]  # some may run away
+        wells = [new if new.level > 0 else old for new, old in zip(taken, wells, strict=True)]
     elsewhere = portrait.states_elsewhere(index)
     wells = [replace(well, tolerance=options.tolerance, elsewhere=elsewhere) for well in wells]
     x = basin.points(rows[rows % HELD_OUT_STRIDE == 0])

@@ -373,28 +373,16 @@ def summarise(
         texts = (place_text(one.position) for one in attractors)
         visits = {index: visits_of(rows[place]) for index, place in enumerate(texts) if place in rows}
     return LandscapeSummary(
-        names=tuple(symbol.name for symbol in dynamics.symbols),
-        units=units,
-        time_unit=dynamics.time_unit,
+        names=tuple(symbol.name for symbol in dynamics.symbols), units=units, time_unit=dynamics.time_unit,
         wells=tuple(
             _well(landscape, index, float(heights[index]), size, visits.get(index))
             for index in range(len(attractors))
         ),
-        ways=ways,
-        noise=landscape.noise,
-        given=landscape.given,
-        checked_times=landscape.checked_times,
-        run=run,
-        remarks=tuple(map(sentence, landscape.remarks)),
-        unstable_cycles=landscape.parting,
-        formulas=landscape.wells,
-        points=points,
-        dynamics=dynamics,
-        matched=matched,
-        formula=formula,
-        equilibria=equilibria,
-        size=size,
-    )
+        ways=ways, noise=landscape.noise, given=landscape.given, checked_times=landscape.checked_times,
+        run=run, remarks=tuple(map(sentence, landscape.remarks)), unstable_cycles=landscape.parting,
+        formulas=landscape.wells, points=points, dynamics=dynamics, matched=matched, formula=formula,
+        equilibria=equilibria, size=size,
+    )  # fmt: skip
 
 
 def visits_of(row: Mapping[Any, Any]) -> VisitTest:

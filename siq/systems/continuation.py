@@ -763,10 +763,9 @@ def _bifurcations(equations: _Equilibria, branch: Branch, number: int) -> list[B
 
 
 def follow_curves(
-    dynamics: Dynamics,
-    limits: Mapping[str, tuple[float, float]],
+    dynamics: Dynamics, limits: Mapping[str, tuple[float, float]],
     seeds: Sequence[tuple[str, np.ndarray, np.ndarray]],
-) -> tuple[list[Branch], list[Remark]]:
+) -> tuple[list[Branch], list[Remark]]:  # fmt: skip
     """Curves of folds and of Hopf points within the ranges of two parameters and the domain of the states.
 
     Seeds are known points of curves: the kind, ``fold`` or ``Hopf``, the values of the two parameters

@@ -12,7 +12,7 @@ from siq.inference.checks import mean_residual_probability
 from siq.inference.diffusion_model import ResidualLikelihood, with_process_noise_rate
 from siq.inference.field_estimate import FieldEstimate, read_field, write_field
 from siq.inference.library import IdentificationOptions, candidate_library
-from siq.inference.regression import identify_vector_field, residuals, with_given_noise, with_noise_formula
+from siq.inference.regression import identify_vector_field, residuals, with_noise_formula
 from siq.systems.dynamics import Dynamics
 
 X, Y = sympy.symbols("x y", real=True)
@@ -135,7 +135,9 @@ def test_a_field_with_a_formula_of_its_noise_survives_its_file(found: FieldEstim
 
 
 def test_a_given_formula_of_d_weighs_the_residuals(pairs: SnapshotPairs) -> None:
-    given = with_given_noise(identified(MULTIPLIED, pairs), pairs, MULTIPLIED.diffusion, false_terms=FALSE)
+    first, known = identified(MULTIPLIED, pairs), MULTIPLIED.diffusion
+    given = with_noise_formula(first, pairs, false_terms=FALSE, given=known)
+    assert given is not None
     assert terms_of(given) == {(0, "x"), (0, "x**3")}
     assert given.diffusion is MULTIPLIED.diffusion
 

@@ -971,7 +971,8 @@ def test_where_they_cross_the_place_is_told_and_a_margin_between_sheets_stated()
 
 
 def test_where_a_barrier_is_known_they_are_followed_no_further() -> None:
-    (low, high) = references_about(KNOWN.dynamics, PORTRAIT, depths=[0.1, np.inf])
+    way = SimpleNamespace(start=0, path=SimpleNamespace(action=0.2))
+    (low, high) = references_about(KNOWN.dynamics, PORTRAIT, ways=[way])
     assert low.level == 0.1 and low.values.max() <= LEVEL_SHARE * 0.1 * (1 + 1e-9)
     assert high.level == pytest.approx(0.25, rel=0.05)
 

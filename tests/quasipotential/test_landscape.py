@@ -30,6 +30,7 @@ from siq.quasipotential.landscape_assembly import find_landscape
 from siq.quasipotential.landscape_files import read_landscape, write_landscape
 from siq.quasipotential.rates import NoiseStrength
 from siq.quasipotential.refinement import RefinementOptions, _refined_decomposition, refine
+from siq.quasipotential.transitions import ways_out
 from siq.remarks import Remark
 from siq.report.summary import summarise
 from siq.systems.diffusion import Diffusion
@@ -53,8 +54,9 @@ def said(reason: str) -> Remark:
 def test_the_wells_of_both_files_are_the_same(tmp_path: Path) -> None:
     known = maier_stein(3)
     found, points = exact_field(known, 3), uniform_points(known, 300)
+    portrait = portrait_of(known)
     refined = refine(
-        found, portrait_of(known), points=points,
+        found, portrait, ways_out(known.dynamics, portrait), points=points,
         options=RefinementOptions(routes=("local",), degrees=(4, 6)),
     )  # fmt: skip
     model = tmp_path / "model.json"

@@ -24,7 +24,8 @@ from siq.networks.decomposition import TrainedNetworks, TrainingOptions
 from siq.networks.training import TrainingData, prepare_data
 from siq.numerics.integration import runge_kutta_step
 from siq.quasipotential.output_weights import OutputWeights, _UnitBasis, formulas_by_well
-from siq.quasipotential.refinement import RefinementOptions, _local_wells
+from siq.quasipotential.refinement import RefinementOptions, local_wells
+from siq.quasipotential.transitions import ways_out
 from siq.systems.phase_portrait import evenly_spread, phase_portrait
 
 STEP = 0.01
@@ -101,8 +102,12 @@ def test_a_kink_between_wells_is_met_by_networks_about_each_attractor() -> None:
     assert networks is not None and len(networks.parts) == 2
     x = data.training.x0
     portrait = phase_portrait(known.dynamics, x[evenly_spread(x, generator=np.random.default_rng(0))])
-    wells, _ = _local_wells(exact, portrait, options=RefinementOptions())
+    wells, *_ = local_wells(
+        known.dynamics, portrait, ways_out(known.dynamics, portrait), options=RefinementOptions(), seed=0,
+        draw=np.random.default_rng(0),
+    )  # fmt: skip
     for well in wells:
+        assert well is not None
         places = well.inside(0.9)
         mine = networks.potential_at(places) - networks.potential_at(well.attractor[None])
         assert np.linalg.norm(mine - well.values(places)) < 0.01 * np.linalg.norm(well.values(places))

@@ -12,7 +12,7 @@ import sympy
 from siq.data.recordings import SnapshotPairs
 from siq.inference.field_estimate import Verdict
 from siq.quasipotential import refinement
-from siq.quasipotential.certificate import Certificate
+from siq.quasipotential.certificate import Certificate, Evidence
 from siq.quasipotential.global_formula import GlobalFormula
 from siq.quasipotential.refinement import (
     RefinementContext,
@@ -58,7 +58,7 @@ def test_the_wells_carry_the_certificate_where_one_formula_is_refused(
         found=found.found, portrait=None, points=None, number=0, evidence=None, networks=None,
         options=RefinementOptions(),
     )  # fmt: skip
-    refined, formulas, made = RefinementContext._certified(context)
+    refined, formulas, made = RefinementContext._certified_up_to(context, (), context.evidence)
     assert made.scope == scope
     assert (formulas.potential is not None) == whole
     assert made.certified == (PASSED in (formula, wells))
@@ -79,3 +79,26 @@ def test_recordings_of_every_well_are_held_out_where_they_stay_in_theirs() -> No
     found = _every_well_held_out(portrait, pairs, mask)
     assert found.tolist()[:2] == [True, False] and found[2:].sum() == 1
     assert _every_well_held_out(portrait, pairs, found).tolist() == found.tolist()
+
+
+@pytest.mark.parametrize(("fault", "tried"), [("characteristics", 2), ("prediction", 1)])
+def test_what_is_refused_as_a_formula_alone_is_sought_up_to_the_paths(
+    fault: str, tried: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = list[object]()
+
+    def certified_up_to(context: object, ways: object, evidence: Evidence) -> tuple[str, str, Certificate]:
+        asked.append((ways, evidence.references))
+        tests = {"characteristics": PASSED, fault: PASSED if ways else REFUSED}
+        return "refined", "formulas", Certificate(tests, 0.0, "")
+
+    context = object.__new__(RefinementContext)
+    found: Any = SimpleNamespace(dynamics=None)
+    context.found, context.portrait, context.number = found, found, 0
+    context.evidence = Evidence(found, found, np.zeros((0, 2)))
+    monkeypatch.setattr(refinement, "ways_out", lambda *_: ["a way"])
+    monkeypatch.setattr(refinement, "references_about", lambda *_, ways, seed: ways)
+    monkeypatch.setattr(RefinementContext, "_certified_up_to", certified_up_to)
+    assert context._certified()[2].certified == (tried == 2)
+    assert asked == [((), ()), (["a way"], ["a way"])][:tried]
+    assert context.evidence.references == (["a way"] if tried == 2 else ())

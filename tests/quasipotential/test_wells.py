@@ -27,9 +27,13 @@ from pydantic import ValidationError
 from siq.errors import NumericalFailure
 from siq.quasipotential.characteristics import adapted_fan
 from siq.quasipotential.hamilton_jacobi import HamiltonJacobi
-from siq.quasipotential.landscape_assembly import _with_states_along_paths
 from siq.quasipotential.power_series import quasipotential_series
-from siq.quasipotential.refinement import RefinementOptions, refine
+from siq.quasipotential.refinement import (
+    RefinementOptions,
+    _with_states_along_paths,
+    local_wells,
+    refine,
+)
 from siq.quasipotential.transitions import ways_out
 from siq.quasipotential.wells import (
     DegreeTrial,
@@ -234,18 +238,19 @@ def test_the_formula_of_a_well_has_its_values() -> None:
 
 def test_refinement_keeps_the_best_degree_of_a_well() -> None:
     known = maier_stein(3)
-    found = exact_field(known, 3)
+    found, portrait = exact_field(known, 3), portrait_of(known)
+    ways = ways_out(known.dynamics, portrait)
     refined = refine(
-        found, portrait_of(known), points=uniform_points(known, 300),
-        options=RefinementOptions(routes=("local",), degrees=(4, 6, 8)),
+        found, portrait, ways, points=uniform_points(known, 300),
+        options=RefinementOptions(routes=("local",), degrees=(4, 6, 8), about="powers"),
     )  # fmt: skip
     assert refined.formula is None
     for well in refined.wells:
         assert [trial.degree for trial in well.trials] == [4, 6, 8]
         assert well.trials[best_trial(well.trials)].degree == well.degree
     with_one = refine(
-        found, portrait_of(known), points=uniform_points(known, 300),
-        options=RefinementOptions(routes=("local",), degrees=(6,)),
+        found, portrait, ways, points=uniform_points(known, 300),
+        options=RefinementOptions(routes=("local",), degrees=(6,), about="powers"),
     )  # fmt: skip
     assert [well.degree for well in with_one.wells] == [6, 6]
 
@@ -588,6 +593,26 @@ def test_a_well_far_lower_than_its_curvature_says_has_states_enough() -> None:
     for index, way in enumerate(lowest):
         well = local_well(laser, more, index, options=options, saddle=way.saddle, path=way.path)
         assert len(well.points) > 2 * well.basis.size
+
+
+def test_paths_of_least_action_say_how_deep_a_well_is() -> None:
+    # Powers that grow by themselves end where they seem to meet a saddle.
+    x, y = sympy.symbols("x y", real=True)
+    system = Dynamics.of(
+        (x, y), (x - x**3 + y / 2, -1.5 * y - x / 2 + x**3 / 2), diffusion=[[1.6, 0.75], [0.75, 1.0]],
+        domain=[(-2, 2), (-1.5, 1.5)],
+    )  # fmt: skip
+    draw = np.random.default_rng(0)
+    portrait = phase_portrait(system, draw.uniform((-1.7, -1.1), (1.7, 1.1), (1500, 2)))
+    ways, options = ways_out(system, portrait), RefinementOptions(degrees=(6,), about="powers")
+    depths = [way.path.action / 2 for way in ways if way.path]
+    levels = []
+    for told in ((), ways):
+        wells, *_ = local_wells(system, portrait, told, options=options, seed=0, draw=draw)
+        levels.append([well.level if well is not None else np.nan for well in wells])
+    np.testing.assert_allclose(depths, 0.0989, rtol=0.01)  # of both, as they mirror one another
+    np.testing.assert_allclose(levels[1], depths)
+    assert np.nanmax(np.abs(np.array(levels[0]) / depths - 1)) > 0.2
 
 
 def test_without_recorded_states_there_is_no_formula() -> None:
