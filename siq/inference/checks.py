@@ -236,11 +236,10 @@ def simulation_step(
 ) -> tuple[float, float] | None:  # fmt: skip
     """The step of the Euler–Maruyama simulation that made pairs, and the probability that chance says so.
 
-    A step of Euler's rule forgets nothing of its noise on the way: read as continuous in time, a D that is
-    the same everywhere looks weaker where f spreads states than where f gathers them. If a constant D is
-    refuted so, and not by the rule, with one step or two for each pair, the rule made the record. The same is
-    true if neither is constant, and the pairs are likelier by the rule, at Schwarz's price of the parameters.
-    In continuous time `found` has a constant D; `by_state` has D(x), None where that was not asked for.
+    A step of Euler's rule forgets nothing of its noise: read as continuous in time, a constant D looks weaker
+    where f spreads states than where f gathers them. If it is refuted so, and not by the rule, with one step
+    or two for each pair, the rule made the record; or if no constant D can be held, and pairs are likelier
+    by the rule than `by_state`, the estimate of D(x) in continuous time, at Schwarz's price of parameters.
     """
     step, false_terms = float(np.median(pairs.h)), options.false_terms
 

@@ -245,6 +245,7 @@ class _Case:
         found = replace(self, integrator_step=asked[0]).identified()
         assert found.diagnosis is not None
         values = {"step": asked[0], "unit": self.recordings.time_unit or "", "probability": asked[1]}
+        values |= {"by_state": found.noise is not None}
         remarks = (*found.diagnosis.remarks, Remark("inference.simulated", values))
         return replace(found, diagnosis=replace(found.diagnosis, remarks=remarks))
 
