@@ -69,8 +69,8 @@ class _Rows(NamedTuple):
 
 
 def read_tables(
-    source: str | Path | pd.DataFrame | xarray.Dataset, *, columns: Sequence[str] | None, units: Mapping[str,
-    str] | None, gaps: bool = True,
+    source: str | Path | pd.DataFrame | xarray.Dataset, *, columns: Sequence[str] | None,
+    units: Mapping[str, str] | None, gaps: bool = True,
 ) -> Recordings:  # fmt: skip
     """Read a table, in memory or in a file, or a folder that holds one file per recording.
 

@@ -241,17 +241,15 @@ def simulation_step(
     or two for each pair, the rule made the record; or if no constant D can be held, and pairs are likelier
     by the rule than `by_state`, the estimate of D(x) in continuous time, at Schwarz's price of parameters.
     """
-    step, false_terms = float(np.median(pairs.h)), options.false_terms
+    h, false_terms = float(np.median(pairs.h)), options.false_terms
 
     def constant(one: FieldEstimate) -> float:
         return ResidualLikelihood(one, pairs, residuals(one, pairs)).constant_probability()
 
-    if np.ptp(pairs.h) > NEARLY_EVEN * step or (probability := constant(found)) > false_terms**2:
+    if np.ptp(pairs.h) > NEARLY_EVEN * h or (probability := constant(found)) > false_terms**2:
         return None
     regress = partial(identify_vector_field, found.library, pairs, options=options)
-    fits = [
-        (each, with_process_noise_rate(regress(integrator_step=each), pairs)) for each in (step, step / 2)
-    ]
+    fits = [(each, with_process_noise_rate(regress(integrator_step=each), pairs)) for each in (h, h / 2)]
     chance, best = max((constant(one), each) for each, one in fits)
     if by_state is None or chance >= false_terms:
         return (best, probability) if chance >= false_terms else None

@@ -218,8 +218,8 @@ def best_support(problem: LinearProblem) -> tuple[int, ...]:
 
 
 def chosen_terms(
-    problems: Sequence[LinearProblem], library: CandidateLibrary, choose: Callable[[LinearProblem],
-    Sequence[int]] = best_support, *, reason: str = "; record longer",
+    problems: Sequence[LinearProblem], library: CandidateLibrary,
+    choose: Callable[[LinearProblem], Sequence[int]] = best_support, *, reason: str = "; record longer",
 ) -> np.ndarray:  # fmt: skip
     """The support ``(p, 2)`` of independent problems; a NumericalFailure where an equation has no term."""
     chosen = np.concatenate([problem.labels[list(choose(problem))] for problem in problems])

@@ -278,8 +278,8 @@ class _NormalEquations:
     """
 
     def __init__(
-        self, along: Linearisation, data: Measurements, variance: np.ndarray, expected: tuple[np.ndarray,
-        np.ndarray],
+        self, along: Linearisation, data: Measurements, variance: np.ndarray,
+        expected: tuple[np.ndarray, np.ndarray],
     ) -> None:  # fmt: skip
         along = replace(along, gap=np.zeros_like(along.gap))
         noise = Noise(variance, np.zeros(along.gap.shape[1]))

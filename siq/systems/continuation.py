@@ -579,8 +579,9 @@ def _branch_through(
 
 
 def follow_branches(
-    dynamics: Dynamics, parameter: str, limits: tuple[float, float], seeds: Sequence[tuple[float,
-    np.ndarray]], *, cycles: Sequence[tuple[float, np.ndarray, float]] | None = None,
+    dynamics: Dynamics, parameter: str, limits: tuple[float, float],
+    seeds: Sequence[tuple[float, np.ndarray]], *,
+    cycles: Sequence[tuple[float, np.ndarray, float]] | None = None,
 ) -> tuple[list[Branch], list[Bifurcation], list[Remark]]:  # fmt: skip
     """Branches of equilibria, and of cycles if asked for, within a range of a parameter λ and the domain.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from siq.quasipotential.certificate import references_about
 from siq.quasipotential.certificate_tests import CertificateOptions, Reference
 from siq.quasipotential.formulas import _decomposition_data, exact_decomposition
 from siq.quasipotential.refinement import RefinementOptions
+from siq.quasipotential.transitions import Transition
 from siq.systems.dynamics import Dynamics
 from siq.systems.phase_portrait import PhasePortrait
 from siq.systems.simulation import SimulationOptions
@@ -84,11 +86,13 @@ def known_references() -> dict[Any, Any]:
 def followed_once(known_references: dict[Any, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """Characteristics of the same f from the same attractors, which no networks change: once for all."""
 
-    def references(dynamics: Dynamics, portrait: PhasePortrait, *, seed: int) -> tuple[Reference, ...]:
+    def references(
+        dynamics: Dynamics, portrait: PhasePortrait, *, seed: int, ways: Sequence[Transition] = ()
+    ) -> tuple[Reference, ...]:
         attractors = [one.position.tobytes() for one in portrait.attractors]
-        key = (seed, *map(str, dynamics.formulas), portrait.box.tobytes(), *attractors)
+        key = (seed, len(ways), *map(str, dynamics.formulas), portrait.box.tobytes(), *attractors)
         if key not in known_references:
-            known_references[key] = references_about(dynamics, portrait, seed=seed)
+            known_references[key] = references_about(dynamics, portrait, ways=ways, seed=seed)
         return known_references[key]
 
     monkeypatch.setattr(quasipotential_refinement, "references_about", references)
