@@ -234,7 +234,7 @@ def simulation_step(
     found: FieldEstimate, by_state: FieldEstimate | None, pairs: SnapshotPairs, *,
     options: IdentificationOptions,
 ) -> tuple[float, float] | None:  # fmt: skip
-    """The step of the Euler–Maruyama simulation that made pairs, and the probability that chance says so.
+    """The step of the Euler–Maruyama simulation that made pairs, and how probable a constant D is without it.
 
     A step of Euler's rule forgets nothing of its noise: read as continuous in time, a constant D looks weaker
     where f spreads states than where f gathers them. If it is refuted so, and not by the rule, with one step
@@ -246,6 +246,7 @@ def simulation_step(
     def constant(one: FieldEstimate) -> float:
         return ResidualLikelihood(one, pairs, residuals(one, pairs)).constant_probability()
 
+    # That D depends on the state just as the rule has it would be a second coincidence.
     if np.ptp(pairs.h) > NEARLY_EVEN * h or (probability := constant(found)) > false_terms**2:
         return None
     regress = partial(identify_vector_field, found.library, pairs, options=options)

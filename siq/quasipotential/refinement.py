@@ -60,8 +60,8 @@ from siq.systems.phase_portrait import (
 )
 
 STATES_ALONG_PATH = 300  # from the neighbourhood of which further descents start
-OF_FORMULAS = {"hamilton_jacobi", "descent", "characteristics", "error"}  # tests of V alone, given f
 PATH_NEIGHBOURHOOD = (0.02, 0.05, 0.1)  # of the extent of the well: how far from the path
+OF_FORMULAS = {"hamilton_jacobi", "descent", "characteristics", "error"}  # tests of V alone, given f
 
 Route = Literal["network", "local"]
 Degree = Annotated[int, Field(ge=2, le=16)]
@@ -376,8 +376,10 @@ class RefinementContext:
         for mask in (second, ~second):
             other = recordings.select(np.flatnonzero(~mask))
             try:
-                near = snapshot_pairs(other, pair_step=self.pair_step)
-                fit = refit(found, lagged_pairs(other, memory[0]) if (memory := found.memory) else near)
+                if (memory := found.memory) is not None:
+                    fit = refit(found, lagged_pairs(other, memory[0]))
+                else:
+                    fit = refit(found, snapshot_pairs(other, pair_step=self.pair_step))
             except (NumericalFailure, np.linalg.LinAlgError, ValueError):
                 fit = found
             halves.append((fit, mask))

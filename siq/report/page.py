@@ -209,11 +209,7 @@ def render_report(content: object, *, template: str = "report.html.j2", folder: 
         "cell": _cell_text,
         "is_number": lambda column: is_numeric_dtype(column) and not is_bool_dtype(column),
         # Without columns that say nothing: of missing values, or of empty texts.
-        "kept_columns": lambda frame: (
-            frame
-            if frame.empty
-            else frame.loc[:, (frame.notna() & (frame.astype(str) != "")).any().to_numpy()]
-        ),
+        "kept_columns": lambda one: one.loc[:, one.empty | (one.notna() & (one.astype(str) != "")).any()],
         # An SVG inside <img> keeps its identifiers to itself and cannot run or load anything.
         "data_address": lambda figure: _address(figure.kind, figure.image),
         "figure_download": lambda figure: (
