@@ -38,6 +38,7 @@ FALSE_WELL = 3.5  # standard errors by which a well has to stand out: of the man
 LEAST_NEIGHBOURS = 16  # independent ones: a density is then known to a quarter
 NO_VARIANCE = 1e-6  # of columns that repeat each other
 LINKS = 24  # neighbours that a sample is linked with
+LOWEST_SINC = -0.217  # of sin(x)/x, the memory of noise behind an ideal low-pass filter
 MOST_FILTERED = 20  # samples in which the memory of a filter is sought; beyond half of them there is none
 MOST_ITERATIONS = 200  # of a hidden Markov model
 DRAWS = 200  # of the transition matrix: ends of intervals are then known to a tenth of their width
@@ -169,7 +170,7 @@ class _Levels(NamedTuple):
         """From how many samples on the noise about the levels is white, 1 where no filter correlates it.
 
         What relaxes forgets the same share in every step. A filter before sampling forgets little at first,
-        then all.
+        then all; what falls below the memory of an ideal one swings by itself.
         """
         rest = self.rest(series)
         sums = [
@@ -180,7 +181,8 @@ class _Levels(NamedTuple):
             return 1
         memory = np.array(sums) / sums[0]
         from_here = 1 + int(np.flatnonzero(np.abs(memory) >= WHITE_CORRELATION)[-1])
-        quick = memory[2] < memory[1] ** 2 - FALSE_WELL * 2 / np.sqrt(len(series))
+        error = FALSE_WELL / np.sqrt(len(series))
+        quick = memory[2] < memory[1] ** 2 - 2 * error and memory.min() > LOWEST_SINC - error
         return from_here if quick and 2 * from_here <= MOST_FILTERED else 1
 
 
@@ -230,8 +232,8 @@ def _levels_of(
 
 def path_of(
     values: np.ndarray, runs: list[slice], relaxation: float, *, column: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, int, bool]:
-    """Places of the states ``(k, d)``, the path ``(n,)``, expected transitions, wells, and whether levels.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, int, int]:
+    """Places of states ``(k, d)``, path ``(n,)``, expected transitions, wells, and samples to a level.
 
     Parameters
     ----------
@@ -246,7 +248,8 @@ def path_of(
     tuple
         The path is -1 before a state was reached. Transitions between samples ``(k, k)`` are those of a
         hidden Markov model, None where the path goes from core to core. Wells are those of the density.
-        Levels are nearly all that neighbouring samples share.
+        Levels are nearly all that neighbouring samples share: then one of so many samples was looked at,
+        behind a filter more than 1, and stands for them. It is 0 where there are none.
     """
     series = values[:, column]
     width = max(int(AVERAGING_TIME * relaxation), 1)
@@ -313,7 +316,7 @@ def path_of(
                 whole = np.where(levels.path >= 0, np.argsort(order)[levels.path], -1)
                 path, blurred = _without_blurred(whole, runs, states)
                 counts = None if blurred or every > 1 else levels.counts[order][:, order]
-                return places[order], path, counts, len(wells), True
+                return places[order], path, counts, len(wells), every
     if len(wells) <= max(len(alone), 2):
         states = max(len(alone), 2)
         means: list[np.ndarray] = []
@@ -325,7 +328,7 @@ def path_of(
                 rows.append(slice(first, first + len(begins)))
                 means.append(series[begins[:, None] + np.arange(width)].mean(axis=1))
         if not means or not np.ptp(guess(states)) > 0:
-            return np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None, len(wells), False
+            return np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None, len(wells), 0
         levels = _levels_of(np.concatenate(means), rows, guess(states))
         centre = guess(states) if levels is None else levels.centre
         distance = np.abs(series[:, None] - centre)
@@ -338,9 +341,9 @@ def path_of(
         core[(core == states - 1) & (series < centre[-1])] = -1
         places = _places(values, near, states)
         places[:, column] = centre
-        return places, continued_visits(core, runs), None, len(wells), False
+        return places, continued_visits(core, runs), None, len(wells), 0
     path, places = _path_between(values, runs, wells[np.argsort(wells[:, column])])
-    return places, path, None, len(wells), False
+    return places, path, None, len(wells), 0
 
 
 def _without_blurred(path: np.ndarray, runs: list[slice], states: int) -> tuple[np.ndarray, bool]:

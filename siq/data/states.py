@@ -502,7 +502,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     drifting = ((chances >= SIGNIFICANCE) == [True, False]).all(axis=1).astype(int)
     background, baseline = drifts[drifting, :, columns].T, np.zeros_like(values)
     places, path, expected = np.median(values, axis=0)[None], np.zeros(len(values), dtype=int), None
-    wells, levels = 1, False
+    wells, levels = 1, 0
     for _ in range(MOST_PASSES if probability < SIGNIFICANCE else 0):
         flat = values - background
         places, path, expected, wells, levels = path_of(flat, runs, relaxation, column=column)
@@ -521,7 +521,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     own = values[:, column] - background[:, column]
     if supported and _crossed_as_often(own, places[:, column], runs, relaxation) >= SIGNIFICANCE:
         # What swings from one to the other is driven, and no linear noise.
-        supported = bool(np.isfinite(change_of(recordings, own, path) or np.inf))
+        supported = bool(np.isfinite(change_of(recordings, own, path, held=levels) or np.inf))
     profile = Profile.of(own, runs, path, places[:, column]) if supported else None
     if profile is not None and wanted and wells == 1 and not levels:
         supported = bool((profile.tops[:, ::2] > FALSE_WELL * profile.tops[:, 1::2]).all())
@@ -547,7 +547,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
     )  # fmt: skip
     if not rungs or not supported:
         return found
-    if (period := change_of(recordings, own, path)) is not None:
+    if (period := change_of(recordings, own, path, held=levels)) is not None:
         known = step * period if np.isfinite(period) else None
         return replace(
             found, limit=Remark("data.not_stationary", {"period": known, "unit": recordings.time_unit})

@@ -155,15 +155,17 @@ def correlated_samples(values: np.ndarray, runs: list[slice]) -> float:
 
 
 def change_of(
-    recordings: Recordings, values: np.ndarray, path: np.ndarray, *, harmless: float = HARMLESS_LINE
-) -> float | None:
+    recordings: Recordings, values: np.ndarray, path: np.ndarray, *, harmless: float = HARMLESS_LINE,
+    held: int = 1,
+) -> float | None:  # fmt: skip
     """The period with which states change, in samples; infinite where they do slowly, None where not at all.
 
     The state at each sample, `path` ``(n,)`` with -1 where it is not known, the distance of the `values`
     ``(n,)`` from the mean of their state, and its square are asked for a straight line, in the course of all
     recordings and of each, and for a frequency that stands out from its neighbours: with power P there and
     L at these, ``P/L`` has the F distribution in any stationary process whose spectrum is smooth. A line is
-    passed over that has a `harmless` share of the variance.
+    passed over that has a `harmless` share of the variance, or is faster than the path tells, which is `held`
+    for so many samples.
     """
     inside = (path[:, None] == np.arange(path.max() + 1)).astype(float)
     shares = np.maximum(inside.sum(axis=0), 1.0)
@@ -200,7 +202,7 @@ def change_of(
     # At half the distance of independent frequencies, so that none falls between two of them; slow ones are
     # compared with fewer, so that none of these is that of the mean, which was taken off.
     near = 2 * max(int(np.ceil(NEIGHBOURS / max(count, 1.0))), FEWEST_NEIGHBOURS)
-    frequencies = np.arange(2 * FEWEST_NEIGHBOURS + 3, longest - near)
+    frequencies = np.arange(2 * FEWEST_NEIGHBOURS + 3, longest // max(held, 1) - near)
     if not used or not len(frequencies):
         return None
     reach = np.minimum(near, frequencies - 2)

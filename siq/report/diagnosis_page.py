@@ -227,15 +227,8 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str], or
     compared = (MismatchVerdict.MISSING_PHYSICS, MismatchVerdict.UNEXPLAINED)
     told = len(statement.explanations) > 1 and statement.verdict in compared
     content = compose(
-        "diagnosis_page.j2",
-        title=title,
-        **sentences_of(statement),
-        st=statement,
-        d=findings,
-        commands=commands,
-        origin=origin,
-        largest=largest,
-        units=of_outputs,
+        "diagnosis_page.j2", title=title, **sentences_of(statement), st=statement, d=findings,
+        commands=commands, origin=origin, largest=largest, units=of_outputs,
         mechanism_sentences=[
             (each.name, entry.sentence) for each, entry in named if not statement.random_forces
         ],
@@ -301,7 +294,7 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str], or
             ]
         ),
         candidates=_candidates(findings),
-    )
+    )  # fmt: skip
     return render_report(content)
 
 

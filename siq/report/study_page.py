@@ -144,31 +144,17 @@ def study_page(
     return compose(
         "study.j2",
         title=study.title or (given.title if given is not None else "") or study.name,
-        interactive=results.interactive,
-        study=study,
-        results=results,
-        s=summary,
-        given=given is not None,
-        run=run,
-        method=str(method),
-        beside_paper=beside_paper,
-        command=command,
-        origin=origin,
-        help=texts("help"),
-        words=texts("certificate"),
+        interactive=results.interactive, study=study, results=results, s=summary, given=given is not None,
+        run=run, method=str(method), beside_paper=beside_paper, command=command, origin=origin,
+        help=texts("help"), words=texts("certificate"),
         answer=_answer(results),
         certificate=certificate if summary is None else summary.stating(certificate),
-        lead=lead,
-        figures=figures,
+        lead=lead, figures=figures, record=record,
         certified=0 if rrmse is None else int(rrmse[rrmse["method"] == method]["certified"].sum()),
         refusals=list(dict(zip(refused["test"], refused["reason"], strict=True)).values()),
         landscape=landscape_tables(summary, noises),
-        states=None
-        if results.seen is None or not results.seen.supported
-        else _states_table(results.seen, summary),
-        formulas=_formulas(results),
-        coefficients=_coefficients(results),
-        record=record,
+        states=_states_table(results.seen, summary) if results.seen and results.seen.supported else None,
+        formulas=_formulas(results), coefficients=_coefficients(results),
         no_record_test=str((certificate or {}).get("no_record_test") or ""),
         record_table=None if record is None else record_table(record, results.time_unit),
         run_lines=paragraphs("runs.j2", r=_run_figures(results.tables, runs=study.runs, method=str(method))),
@@ -222,7 +208,7 @@ def study_page(
         machine=f"{named}; {machine}, {os.cpu_count()} cores",
         printed=str(yaml.safe_dump(printed, sort_keys=False, allow_unicode=True)),
         spent={} if timings is None else timings.groupby("step")["seconds"].sum().to_dict(),
-    )
+    )  # fmt: skip
 
 
 LEADING = ("quasipotential", "landscape", "states")

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
 from siq.data.inspection import inspect
-from siq.data.kinetics import MarkovModel
+from siq.data.kinetics import MarkovModel, _levels_of
 from siq.data.preparation import without_background
 from siq.data.recordings import Recordings
 from siq.data.states import DwellCount, RecordStates, _valley_depths, switching
@@ -270,6 +270,26 @@ def test_ten_seasons_are_a_period() -> None:
     assert change_of(recorded(x), x, (x > 1.5).astype(int)) == pytest.approx(season, rel=0.05)
     hops = chain(6, np.array([[-0.04, 0.04], [0.04, -0.04]]), len(t))
     assert change_of(recorded(hops), hops + 0.2 * noise(7, len(t)), hops) is None
+
+
+def test_what_swings_about_its_levels_is_no_filter() -> None:
+    """A swing forgets little at first, too, as what is filtered does, and then falls below any filter's."""
+    levels = 3.0 * chain(9, np.array([[-0.02, 0.02], [0.02, -0.02]]), 8000)
+    runs, white = [slice(0, len(levels))], noise(9, len(levels))
+    swinging, filtered = lfilter([0.57], [1, -1.1, 0.67], white), gaussian_filter1d(1.5 * white, 0.66)
+    every = []
+    for about in (swinging, filtered):
+        found = _levels_of(levels + about, runs, np.array([0.0, 3.0]))
+        assert found is not None
+        every.append(found.filtered(levels + about, runs))
+    assert every[0] == 1 < every[1]
+
+
+def test_levels_that_stand_for_many_samples_have_no_period() -> None:
+    path = chain(6, np.array([[-0.2, 0.2], [0.2, -0.2]]), 5000)
+    seen, held = path + 0.2 * noise(7, len(path)), np.repeat(path[::10], 10)
+    assert change_of(recorded(seen), seen, held) == pytest.approx(10)
+    assert change_of(recorded(seen), seen, held, held=10) is None
 
 
 @pytest.mark.slow
