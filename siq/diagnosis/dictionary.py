@@ -218,10 +218,14 @@ def dictionary_of(
 
 
 def units_of(model: Dynamics) -> dict[str, str]:
-    """Units of everything that a coordinate may be: states, inputs and the time, by name."""
+    """Units of everything that a coordinate may be: states, inputs, the time and outputs, by name."""
     units = dict(zip(model.states, model.units, strict=True))
-    units |= {entry.name: entry.unit for entry in model.inputs}
-    return units | {"t": model.time_unit}
+    units |= {entry.name: entry.unit for entry in model.inputs} | {"t": model.time_unit}
+    known = units | {entry.name: entry.unit for entry in model.parameters}
+    for name, formula in model.outputs:
+        _, term = sympy.Add.make_args(sympy.expand(formula))[0].as_coeff_Mul()
+        units.setdefault(name, unit_of(str(term), known) if term.is_rational_function() else "1")
+    return units
 
 
 def unit_of(formula: str, units: Mapping[str, str]) -> str:

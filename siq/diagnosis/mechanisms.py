@@ -116,7 +116,8 @@ def _lowest_frequency(data: Measurements) -> float:
 def _sized(search: Shape, factors: np.ndarray, course: np.ndarray) -> np.ndarray:
     """Quantiles of a course, or multiples of its root mean square, or of the inverse of that."""
     if search.quantiles_of is not None:
-        return np.quantile(course, factors)
+        known = course[np.isfinite(course)]
+        return np.quantile(known if len(known) else [1.0], factors)
     size = float(np.sqrt(np.mean(course**2))) or 1.0
     return factors * size if search.scale_of is not None else factors / size
 
@@ -341,8 +342,6 @@ def _build_candidate(
     if tuple(equations.values()) == model.equations and outputs == dict(model.outputs):
         return None
     known = units_of(model) | {entry.name: entry.unit for entry in model.parameters}
-    for name, formula in model.outputs:
-        known.setdefault(name, known.get(str(formula), "1"))
     units = {role: known.get(name, "1") for role, name in assignment.items()} | {"T": model.time_unit}
     shapes = {name: entry.shape for name, entry in form.parameters.items() if entry.shape is not None}
     values = {symbol(each.name): each.value for each in model.parameters}  # as they are to begin with

@@ -277,6 +277,8 @@ def _stated(trial: FittedCandidate, fit: Fit, *, log_odds: float | None = None, 
     """What was fitted, with the estimates of a fit that has it."""
     candidate, errors = trial.candidate, fit.error_of
     known = {entry.name: entry for entry in fit.model.parameters}
+    seen = () if candidate.equations else fit.model.output_names
+    measured = tuple(name for name, _ in candidate.changes if name in seen)
     return StatedTerm(
         name=candidate.name, label=candidate.label, family=candidate.family, variant=candidate.variant,
         terms={name: str(formula) for name, formula in candidate.changes},
@@ -286,7 +288,7 @@ def _stated(trial: FittedCandidate, fit: Fit, *, log_odds: float | None = None, 
             if name in known
         },
         evidence=Evidence(trial.delta_chi2, trial.delta_bic, trial.p_white, trial.p_cluster, log_odds),
-        equations=candidate.equations, **further,
+        **{"equations": candidate.equations, "outputs": measured, **further},
     )  # fmt: skip
 
 

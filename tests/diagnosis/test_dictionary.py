@@ -287,7 +287,7 @@ SCREENED = (
     "product inhibition", "attached oscillator", "rate limit", "magnetic saturation",
     "photoinhibition", "Gompertz growth", "second-order reaction", "asymmetric damping", "wind or current",
     "flow over a weir", "limiting resource", "Joule heating", "dependence on an input",
-    "washout", "unbalance", "lever arm",
+    "washout", "unbalance", "lever arm", "ground effect", "pull across a gap", "overpotential",
 )  # fmt: skip
 
 
@@ -332,6 +332,51 @@ def test_drag_in_a_stream_goes_with_the_square_of_the_relative_speed() -> None:
     change = dict(the("quadratic drag", "cart", "relative to u").changes)["v"]
     c, u, v = (next(each for each in change.free_symbols if each.name == name) for name in ("c_1", "u", "v"))
     assert change.subs({c: 2, u: 3, v: 1}) == 8 and change.subs({c: 2, u: 1, v: 3}) == -8
+
+
+def test_a_fan_drives_a_stream_whose_drag_goes_with_the_relative_speed() -> None:
+    change = dict(the("quadratic drag", "ball in a tube", "that u drives").changes)["v"]
+    at = {"c_1": 2, "k_1": 3, "u": 2, "v": 1}
+    assert change.subs({each: at[each.name] for each in change.free_symbols}) == 2 * (3 * 2 - 1) ** 2
+
+
+def test_a_rotor_lifts_more_near_the_ground() -> None:
+    # Cheeseman and Bennett (1955): T / T∞ = 1 / (1 - (R / 4z)²), of which this is the first term.
+    rate = the("ground effect", "drone").model.equations[-1]
+    radius, height = 0.5, 1.5
+    at = {"u": 10.0, "h": height, "c_1": (radius / 4) ** 2, "v": 0.0, "m": 1.0, "g": 0.0, "c": 0.0}
+    lift = rate.subs({each: at[each.name] for each in rate.free_symbols})
+    assert float(lift) == pytest.approx(10.0 / (1 - (radius / (4 * height)) ** 2), rel=1e-4)
+
+
+def test_a_plate_is_pulled_by_the_square_of_the_field_in_the_gap() -> None:
+    # Nathanson et al. (1967): F = ε A V² / 2 (d - x)².
+    rate = the("pull across a gap", "plate").model.equations[-1]
+    gap, x, force = 2.5, 1.0, 0.08
+    at = {"u": 2.0, "x": x, "v": 0.0, "k": 0.0, "d": 0.0, "e": force / 4, "c_1": 1 / gap}
+    pulled = rate.subs({each: at[each.name] for each in rate.free_symbols})
+    assert float(pulled) == pytest.approx(force * gap**2 / (gap - x) ** 2)
+
+
+def test_a_cell_under_a_current_polarises_as_a_resistor_with_a_capacitor_does() -> None:
+    # Plett (2015), chapter 2: the voltage falls by R I (1 - exp(-t / R C)).
+    model = the("overpotential", "cell").model
+    rate, (seen,) = model.equations[-1], dict(model.outputs).values()
+    assert {each.name for each in rate.free_symbols} >= {"u", "tau_1"}
+    at = {"a": 3.0, "b": 0.0, "q": 0.0, "R": 0.0, "u": 2.0, "c_1": 0.1, "tau_1": 5.0}
+    (hidden,) = {each for each in seen.free_symbols if each.name not in at}
+    known = {each: at[each.name] for each in (rate.free_symbols | seen.free_symbols) - {hidden}}
+    assert float(rate.subs({**known, hidden: 0.5})) == pytest.approx((2.0 - 0.5) / 5.0)
+    assert float(seen.subs({**known, hidden: 2.0})) == pytest.approx(3.0 - 0.1 * 2.0)
+
+
+def test_what_an_enzyme_made_stays_with_it() -> None:
+    # Cornish-Bowden (2012): v = V s / (K (1 + p / w) + s).
+    rate = the("product inhibition", "enzyme", "(K, p)").model.equations[-1]
+    at = {"V": 3.0, "K": 2.0, "s": 4.0, "p": 6.0, "w_1": 3.0}
+    assert float(rate.subs({each: at[each.name] for each in rate.free_symbols})) == pytest.approx(
+        3 * 4 / (2 * 3 + 4)
+    )
 
 
 def test_what_coasts_has_a_resistance_that_is_constant_and_one_that_grows_with_the_square() -> None:
