@@ -125,8 +125,8 @@ HOMES: Mapping[str, Home] = {
             "outputs": {"h": "h"},
         },
         0.05,
-        lambda rng: rng.normal(size=2) * [0.3, 0.3],
-        lambda rng, t: 1.55 + waves(rng, t, size=0.03, slowest=1.5),
+        lambda rng: rng.normal(size=2) * [0.3, 1.5],
+        lambda rng, t: 1.55 + waves(rng, t, size=0.15, slowest=1.5),
     ),
     "plate": Home(
         {
@@ -402,6 +402,18 @@ HOMES: Mapping[str, Home] = {
         },
         0.15,
         lambda rng: np.array([rng.uniform(6, 14), rng.uniform(0.3, 2), rng.uniform(0, 4)]),
+    ),
+    "chemostat": Home(
+        {
+            "time_unit": "h",
+            "states": states(s="g/L", n="g/L"),
+            "inputs": {"u": {"unit": "1/h", "interpolation": "zero_order"}},
+            "parameters": {"m": {"value": 0.5, "unit": "1/h"}, **numbers(k=1.0, y=0.5, f_=15.0)},
+            "equations": {"s": "u*(f - s) - m*s/(k + s)*n/y", "n": "m*s/(k + s)*n - u*n"},
+        },
+        0.4,
+        lambda rng: np.array([rng.uniform(1, 14), rng.uniform(1, 4)]),
+        lambda rng, t: np.repeat(rng.uniform(0.02, 0.2, (1, 8)), -(-len(t) // 8), axis=1)[:, : len(t)],
     ),
     "fermenter with a feed": Home(
         {
@@ -686,9 +698,10 @@ RESIDENTS: Sequence[Resident] = (
     Resident("mortality", "crop of known growth", {"c": 0.3}),
     Resident("harvest", "crop", {"c": 1.0, "w": 0.8}),
     Resident("Allee effect", "crop", {"c": 1.6, "w": 1.0}),
-    Resident("product inhibition", "fermenter", {"w": 4.0}, "of m in"),
-    Resident("product inhibition", "fermenter", {"c": 0.05}, "in proportion"),
-    Resident("product inhibition", "enzyme", {"w": 3.0}, "(K, p)"),
+    Resident("inhibition", "fermenter", {"w": 4.0}, "of m by q in"),
+    Resident("inhibition", "fermenter", {"c": 0.05}, "in proportion"),
+    Resident("inhibition", "chemostat", {"w": 5.0}, "of m by s in"),
+    Resident("inhibition", "enzyme", {"w": 3.0}, "by p"),
     Resident("prey refuge", "prey and predator", {"m": 0.8}),
     Resident("sigmoid functional response", "prey with limits and predator", {"w": 1.5}, "with satiation"),
     Resident("sigmoid functional response", "prey and predator", {"w": 0.8}, "without satiation"),

@@ -598,8 +598,12 @@ def _next_rung(
     plausible = [each for each in leading if each.weight > heaviest + np.log(PLAUSIBLE)]
     leader = min(plausible, key=lambda each: (len(each.candidate.new), -each.weight))
     errors = cache(lambda one: _left_out(one.horizons[0].fit, [one.candidate], base.noise, context))
-    # All others are compared in the place of one that brings no states of its own.
-    steady = [each for each in leading if each.candidate.model.dimension == d]
+    # All others are compared in the place of one that brings no state of its own, nor a clock - of a population
+    # that swings by itself, any season of its period foresees as much - and that is absent where it is zero,
+    # which the end of a sensor's range is not.
+    apart = [[s.frequencies or s.top_of or s.bottom_of for s in each.searches] for each in candidates]
+    free = {e.label for e, one in zip(candidates, apart, strict=True) if any(one) or e.model.dimension > d}
+    steady = [each for each in leading if each.site.label not in free]
     if steady:
         ground = leader if leader in steady else max(steady, key=lambda each: each.weight)
         # What is a simpler mechanism and hardly more has to take most of what that one leaves: a gain beside
@@ -619,7 +623,7 @@ def _next_rung(
         if near:
             # A state that follows the motion may be a simple mechanism and something simple at a time, or
             # what lasts of an error of the model, for which white noise is all that is allowed.
-            plain = [one for one in remaining if one.candidate is None or one.candidate.model.dimension == d]
+            plain = [one for one in remaining if one.candidate is None or one.label not in free]
             above, more = _gains(ground.horizons, plain, None, budget, untried)
             both = ground.weight + max([0.0, *(more + np.array([site.prior for site in above]))])
             outdone = {
@@ -644,7 +648,7 @@ def _next_rung(
     for site in suspects[:SUSPECTS]:
         attempt(site)
     contained, equal = set[str](), set[str]()
-    if leader in steady:
+    if leader.candidate.model.dimension == d:
         contained, equal = _containing(leader.horizons[0], sites, leader.candidate)
     else:  # a lag of what drives and one of what measures are the same to a linear system
         ours = leader.site.family[0], len(leader.candidate.new)

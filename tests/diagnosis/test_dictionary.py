@@ -284,7 +284,7 @@ SCREENED = (
     "cogging or gear ripple", "saturated elimination", "diode or exponential loss",
     "outflow through an opening", "thermal radiation",
     "reverse reaction or backflow", "adaptation", "waning immunity", "eddy-current brake",
-    "product inhibition", "attached oscillator", "rate limit", "magnetic saturation",
+    "inhibition", "attached oscillator", "rate limit", "magnetic saturation",
     "photoinhibition", "Gompertz growth", "second-order reaction", "asymmetric damping", "wind or current",
     "flow over a weir", "limiting resource", "Joule heating", "dependence on an input",
     "washout", "unbalance", "lever arm", "ground effect", "pull across a gap", "overpotential",
@@ -372,11 +372,20 @@ def test_a_cell_under_a_current_polarises_as_a_resistor_with_a_capacitor_does() 
 
 def test_what_an_enzyme_made_stays_with_it() -> None:
     # Cornish-Bowden (2012): v = V s / (K (1 + p / w) + s).
-    rate = the("product inhibition", "enzyme", "(K, p)").model.equations[-1]
+    rate = the("inhibition", "enzyme", "by p").model.equations[-1]
     at = {"V": 3.0, "K": 2.0, "s": 4.0, "p": 6.0, "w_1": 3.0}
     assert float(rate.subs({each: at[each.name] for each in rate.free_symbols})) == pytest.approx(
         3 * 4 / (2 * 3 + 4)
     )
+
+
+def test_too_much_of_what_is_eaten_slows_growth() -> None:
+    # Andrews (1968): M S / (K + S + S² / W), here with M = m w / (w + k), K = k w / (w + k) and W = w + k.
+    rate = the("inhibition", "chemostat", "of m by s in").model.equations[0]
+    k, m, s, w = 1.0, 0.5, 3.0, 5.0
+    at = {"u": 0.0, "f": 0.0, "m": m, "k": k, "y": 1.0, "n": 2.0, "s": s, "w_1": w}
+    found = float(rate.subs({each: at[each.name] for each in rate.free_symbols}))
+    assert found == pytest.approx(-2.0 * m * w / (w + k) * s / (k * w / (w + k) + s + s**2 / (w + k)))
 
 
 def test_what_coasts_has_a_resistance_that_is_constant_and_one_that_grows_with_the_square() -> None:
@@ -694,12 +703,12 @@ def test_below_its_threshold_a_population_dies_out() -> None:
 
 def test_a_product_stops_those_who_make_it() -> None:
     # Levenspiel (1980): growth ends at a concentration of the product; yields stay as they are.
-    candidate, before = the("product inhibition", "fermenter", "in proportion"), HOMES["fermenter"].model
+    candidate, before = the("inhibition", "fermenter", "in proportion"), HOMES["fermenter"].model
     c, q = (next(e for e in candidate.model.equations[1].free_symbols if e.name == k) for k in ("c_1", "q"))
     for after, rate in zip(candidate.model.equations, before.equations, strict=True):
         assert sympy.simplify(after - rate * (1 - c * q)) == 0
     # In a chain of reactions without organisms it would be saturated elimination by another name.
-    assert not {"product inhibition"} & names(HOMES["two bodies"].model)
+    assert not {"inhibition"} & names(HOMES["two bodies"].model)
 
 
 def test_an_absorber_stills_what_it_is_tuned_to() -> None:

@@ -24,7 +24,7 @@ NAMES = (
     "asymmetric damping", "Stribeck friction", "eddy-current brake", "position-dependent damping",
     "constant bias", "wind or current", "linear coupling", "attached oscillator", "nonlinear coupling",
     "self-limitation", "Gompertz growth", "mortality", "harvest", "Allee effect", "prey refuge",
-    "sigmoid functional response", "predator interference", "product inhibition", "limiting resource",
+    "sigmoid functional response", "predator interference", "inhibition", "limiting resource",
     "photoinhibition", "decay or leakage", "delayed response", "saturation", "rate limit",
     "magnetic saturation", "parametric drive", "parameter drift", "dependence on an input",
     "periodic forcing", "lever arm", "unbalance", "overflow", "flow over a weir", "leak",
