@@ -598,9 +598,9 @@ def _next_rung(
     plausible = [each for each in leading if each.weight > heaviest + np.log(PLAUSIBLE)]
     leader = min(plausible, key=lambda each: (len(each.candidate.new), -each.weight))
     errors = cache(lambda one: _left_out(one.horizons[0].fit, [one.candidate], base.noise, context))
-    # All others are compared in the place of one that brings no state of its own, nor a clock - of a population
-    # that swings by itself, any season of its period foresees as much - and that is absent where it is zero,
-    # which the end of a sensor's range is not.
+    # All others are compared in the place of one that brings no state of its own; nor a clock, since of what
+    # swings by itself any season of its period foresees as much; and that is absent where it is zero, which
+    # the end of a sensor's range is not.
     apart = [[s.frequencies or s.top_of or s.bottom_of for s in each.searches] for each in candidates]
     free = {e.label for e, one in zip(candidates, apart, strict=True) if any(one) or e.model.dimension > d}
     steady = [each for each in leading if each.site.label not in free]
