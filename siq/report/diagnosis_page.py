@@ -244,42 +244,33 @@ def mismatch_page(findings: Findings, *, title: str, commands: Sequence[str], or
             for each in statement.described
         ],
         look_alikes=[(name, names) for name, names in alike if names],
-        evidence=pd.DataFrame(
-            [
-                {
-                    "mechanism": part.label,
-                    "gain in χ²": round(evidence.delta_chi2),
-                    "ΔBIC": round(evidence.delta_bic or 0),
-                    "odds of the name": _odds_text(evidence.log_odds),
-                    "p, independent errors": p_text(evidence.p_white or 0),
-                    "p, errors of a recording together": p_text(evidence.p_cluster or 0),
-                }
-                for part in findings.named
-                if (evidence := part.evidence).delta_chi2 is not None
-            ]
-        ),
-        explanations=pd.DataFrame(
-            [
-                {"explanation": what, "log-evidence": round(value, 1)}
-                for what, value in (statement.explanations.items() if told else ())
-            ]
-        ),
+        evidence=pd.DataFrame([
+            {
+                "mechanism": part.label, "gain in χ²": round(evidence.delta_chi2),
+                "ΔBIC": round(evidence.delta_bic or 0), "odds of the name": _odds_text(evidence.log_odds),
+                "p, independent errors": p_text(evidence.p_white or 0),
+                "p, errors of a recording together": p_text(evidence.p_cluster or 0),
+            }
+            for part in findings.named
+            if (evidence := part.evidence).delta_chi2 is not None
+        ]),
+        explanations=pd.DataFrame([
+            {"explanation": what, "log-evidence": round(value, 1)}
+            for what, value in (statement.explanations.items() if told else ())
+        ]),
         wells=None
         if findings.wells.empty
         else findings.wells.replace({"": None})
         .replace({"simulation": texts("tables")["simulations"]})
         .dropna(axis=1, how="all"),
         escape=_escape_times(findings.escape),
-        bounds=pd.DataFrame(
-            [
-                {
-                    "mechanism": label,
-                    "parameter": bound.parameter,
-                    "at most (95 %)": value_text(bound.upper_bound_95, unit=bound.unit, digits=2),
-                }
-                for label, bound in statement.excluded.items()
-            ]
-        ),
+        bounds=pd.DataFrame([
+            {
+                "mechanism": label, "parameter": bound.parameter,
+                "at most (95 %)": value_text(bound.upper_bound_95, unit=bound.unit, digits=2),
+            }
+            for label, bound in statement.excluded.items()
+        ]),
         parameters=pd.DataFrame(
             [
                 {
