@@ -154,6 +154,18 @@ HOMES: Mapping[str, Home] = {
         lambda rng: np.array([rng.uniform(0.9, 1.6), 0.0]),
         lambda rng, t: 14.45 + waves(rng, t, size=0.3, slowest=1.0),
     ),
+    "lake": Home(
+        {
+            "time_unit": "a",
+            "states": states(p="1"),
+            "inputs": {"u": {"unit": "1/a"}},
+            "parameters": numbers(s=0.6),
+            "equations": {"p": "u - s*p"},
+        },
+        0.6,
+        lambda rng: rng.uniform(0.2, 2.0, size=1),
+        lambda rng, t: 0.3 + waves(rng, t, size=0.04, slowest=0.2),
+    ),
     "cell": Home(
         {
             "time_unit": "s",
@@ -744,6 +756,7 @@ RESIDENTS: Sequence[Resident] = (
     Resident("quadratic drag", "ball in a tube", {"c": 0.35, "k": 3.2}, "that u drives"),
     Resident("ground effect", "drone", {"c": 0.03}),
     Resident("pull across a gap", "plate", {"c": 0.4}),
+    Resident("sigmoid feedback", "lake", {"c": 0.5, "w": 1.0, "n": 4.0}),
     Resident("overpotential", "cell", {"c": 0.03, "tau": 60.0}),
     Resident("input gain", "cart", {"c": 0.3}, "'v', c_1*u"),
     Resident("Joule heating", "lamp", {"c": 2.0}),

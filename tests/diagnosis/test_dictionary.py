@@ -288,6 +288,7 @@ SCREENED = (
     "photoinhibition", "Gompertz growth", "second-order reaction", "asymmetric damping", "wind or current",
     "flow over a weir", "limiting resource", "Joule heating", "dependence on an input",
     "washout", "unbalance", "lever arm", "ground effect", "pull across a gap", "overpotential",
+    "sigmoid feedback",
 )  # fmt: skip
 
 
@@ -377,6 +378,15 @@ def test_what_an_enzyme_made_stays_with_it() -> None:
     assert float(rate.subs({each: at[each.name] for each in rate.free_symbols})) == pytest.approx(
         3 * 4 / (2 * 3 + 4)
     )
+
+
+def test_a_lake_recycles_from_a_threshold_on() -> None:
+    # Carpenter, Ludwig and Brock (1999): r P^q / (m^q + P^q), half of it at the threshold.
+    change = dict(the("sigmoid feedback", "lake").changes)["p"]
+    at = {"c_1": 3.0, "w_1": 2.0, "n_1": 8.0}
+    for level, expected in ((2.0, 1.5), (1.0, 3.0 / 257), (4.0, 3.0 * 256 / 257)):
+        known = {each: {**at, "p": level}[each.name] for each in change.free_symbols}
+        assert float(change.subs(known)) == pytest.approx(expected)
 
 
 def test_too_much_of_what_is_eaten_slows_growth() -> None:
