@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -49,7 +49,7 @@ class Home:
     samples: int = 80
     recordings: int = 4
 
-    @property
+    @cached_property
     def model(self) -> Dynamics:
         """The simulation that lacks something."""
         return model_of(self.card)

@@ -40,7 +40,8 @@ def answer_lines(summary: LandscapeSummary, *, seen: RecordStates | None = None,
     elsewhere = seen is not None and rung < 6 and _stays_elsewhere(summary, seen)
     alone = rung < 4 and len(summary.wells) > 1
     said = "" if seen is None else seen.sentence() or (sentence(seen.rest()) if alone else "")
-    return paragraphs("answer.j2", s=summary, seen=said, rung=rung, elsewhere=elsewhere)
+    changes = seen is not None and seen.limit is not None and seen.limit.code == "data.not_stationary"
+    return paragraphs("answer.j2", s=summary, seen=said, rung=rung, elsewhere=elsewhere, changes=changes)
 
 
 def _stays_elsewhere(summary: LandscapeSummary, seen: RecordStates) -> bool:

@@ -16,6 +16,7 @@ from siq.data.recordings import Recordings
 from siq.data.states import RecordStates
 from siq.inference.library import IdentificationOptions
 from siq.quasipotential.landscape import Landscape, NoLandscape
+from siq.remarks import Remark
 from siq.report.landscape import answer_lines
 from siq.report.summary import summarise
 from siq.workflow.pipeline import PipelineSettings
@@ -119,6 +120,9 @@ def test_nothing_is_added_to_what_is_certified() -> None:
     first, second, *_ = answer_lines(two, seen=replace(seen, levels=(-0.5, 0.5)), rung=3)
     assert first.startswith("The record has two states of x")
     assert second.startswith("What was identified did not pass every test against the record")
+    limit = Remark("data.not_stationary", {"period": None, "unit": None})
+    _, second, *_ = answer_lines(two, seen=replace(seen, levels=(-0.5, 0.5), rung=1, limit=limit), rung=1)
+    assert second.startswith("What was identified knows nothing of that change")
     first, *_ = answer_lines(two, seen=replace(seen, supported=False), rung=0)
     assert first.startswith("By itself the record shows one state of x")
 
