@@ -266,7 +266,7 @@ class Statement:
         )
         by = (data["description"] or {}).get("by", ())
         for each in (*data["mechanisms"], *by):
-            for name in ("kind", "outputs", "coordinates", "curve", "surface", *SHAPE):
+            for name in ("kind", "coordinates", "curve", "surface", *SHAPE):
                 del each[name]
         for each in data["described"]:
             for name in ("share_of_excess", "indistinguishable_from", "rivals"):

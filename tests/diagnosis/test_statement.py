@@ -357,6 +357,18 @@ def test_a_statement_is_read_as_it_was_written(verdict):
         assert Statement.from_data(data).as_data() == data
 
 
+def test_a_fault_of_a_sensor_is_in_what_it_measures_and_not_in_a_state_of_its_own() -> None:
+    lag = StatedTerm(
+        name="sensor lag", label="sensor lag in y", terms={"y": "z_1", "z_1": "(x - z_1)/tau_1"},
+        parameters={}, evidence=Evidence(500.0, -490.0, 0.0, 0.0, 9.0), outputs=("y",),
+        indistinguishable_from=(),
+    )  # fmt: skip
+    statement = Statement(MismatchVerdict.MISSING_PHYSICS, mechanisms=(lag,))
+    again = Statement.from_data(json.loads(json.dumps(statement.as_data())))
+    assert said(statement) == said(again)
+    assert said(again).startswith("Sensor lag is missing in the measurement of y.")
+
+
 def test_a_value_below_its_error_is_said_to_be_uncertain_and_not_zero() -> None:
     # Of two compartments of which one is measured the recordings tell two rates, and not the three.
     sizes = {"c": Estimate(0.7655, 16083.5, "1/h"), "d": Estimate(2.2941, 0.0079, "1/s")}
