@@ -5,10 +5,9 @@ deviations, and process noise adds
 
     ``∫₀ʰ Φ(h - s) Q Φ(h - s)ᵀ ds``
 
-to its covariance, here by Simpson's rule with ``3 - 8 / (3 + Φ)`` in the middle: Padé's form of √Φ, as
-long as Φ for a rotation, and finite for all that decays. At each sample something is measured. What is
-linear in a chain is worked out here, compiled, since every fit and every candidate passes through it many
-times. The statistics is in `siq.inference.maximum_likelihood`.
+to its covariance, here by Simpson's rule; at each of them something is measured. What is linear in a chain is
+worked out here, compiled, since every fit and every candidate passes through it many times. The statistics is
+in `siq.inference.maximum_likelihood`.
 """
 
 from __future__ import annotations
@@ -146,19 +145,27 @@ def filter_recursion(
     log_determinant = 0.0
     count = len(places)
     size = count + outputs if scored else 0
-    score, information, squares = np.zeros(size), np.zeros((size, size)), np.zeros((size, size))
-    # Derivatives of the mean and of the covariance.
-    slopes, bends = np.empty((size, dimension)), np.empty((size, dimension, dimension))
-    turned, single = np.empty((size, dimension)), np.empty(size)
-    by_variance, by_innovation = np.empty(size), np.empty(size)
+    score = np.zeros(size)
+    information = np.zeros((size, size))
+    squares = np.zeros((size, size))
+    slopes = np.empty((size, dimension))  # derivatives of the mean
+    bends = np.empty((size, dimension, dimension))  # derivatives of the covariance
+    turned = np.empty((size, dimension))
+    by_variance = np.empty(size)
+    by_innovation = np.empty(size)
+    single = np.empty(size)
     stored = rows if kept else 0
-    predicted, filtered = np.empty((stored, dimension)), np.empty((stored, dimension))
+    predicted = np.empty((stored, dimension))
+    filtered = np.empty((stored, dimension))
     before = np.empty((stored, dimension, dimension))
     after = np.empty((stored, dimension, dimension))
-    gains, variances = np.zeros((stored, outputs, dimension)), np.ones((stored, outputs))
-    state, carried = np.empty((dimension, width)), np.empty((dimension, width))
-    half, middle = np.empty((dimension, dimension)), np.empty((dimension, dimension))
-    gain, shown = np.empty(dimension), np.empty(width)
+    gains = np.zeros((stored, outputs, dimension))
+    variances = np.ones((stored, outputs))
+    state = np.empty((dimension, width))
+    carried = np.empty((dimension, width))
+    half = np.empty((dimension, dimension))
+    gain = np.empty(dimension)
+    shown = np.empty(width)
     driven = np.empty((dimension * dimension, 2), dtype=np.int64)
     drives = 0
     for m in range(dimension):
@@ -265,8 +272,6 @@ def filter_recursion(
                     for m in range(dimension):
                         value += transition[k, i, m] * covariance[m, j]
                     half[i, j] = value
-            if drives > 0 or count > 0:
-                _carry_halfway(transition[k], middle)
             for i in range(dimension):
                 for j in range(i + 1):
                     value = 0.0
@@ -274,9 +279,10 @@ def filter_recursion(
                         value += half[i, m] * transition[k, j, m]
                     for pair in range(drives):
                         m, n = driven[pair, 0], driven[pair, 1]
-                        added = transition[k, i, m] * transition[k, j, n] + 4.0 * middle[i, m] * middle[j, n]
-                        if i == m and j == n:
-                            added += 1.0
+                        a, b = transition[k, i, m], transition[k, j, n]
+                        same_i = 1.0 if i == m else 0.0
+                        same_j = 1.0 if j == n else 0.0
+                        added = a * b + (a + same_i) * (b + same_j) + same_i * same_j
                         value += intensity[row, m, n] * added * step[k] / 6.0
                     covariance[i, j] = value
                     covariance[j, i] = value
@@ -294,9 +300,9 @@ def filter_recursion(
                     strength = functions[k, places[c, 2]] * step[k] / 6.0
                     for i in range(dimension):
                         for j in range(dimension):
-                            value = _simpson(transition[k], middle, i, j, m, n)
+                            value = _simpson(transition[k], i, j, m, n)
                             if m != n:
-                                value += _simpson(transition[k], middle, i, j, n, m)
+                                value += _simpson(transition[k], i, j, n, m)
                             bends[c, i, j] += strength * value
     for c in range(size):
         for e in range(c):
@@ -309,34 +315,12 @@ def filter_recursion(
 
 
 @machine_code
-def _carry_halfway(transition: np.ndarray, middle: np.ndarray) -> None:
-    """``3 - 8 / (3 + Φ)``, about √Φ, into `middle`; a mean that begins anew at a sample stays until then."""
-    dimension = len(transition)
-    middle[:] = transition
-    for i in range(dimension):
-        middle[i, i] = 3.0 + (transition[i, i] if transition[i, i] != 0.0 else 1.0)
-    for m in range(dimension):
-        pivot = 1.0 / middle[m, m]
-        middle[m, m] = 1.0
-        for j in range(dimension):
-            middle[m, j] *= pivot
-        for i in range(dimension):
-            if i != m:
-                factor = middle[i, m]
-                middle[i, m] = 0.0
-                for j in range(dimension):
-                    middle[i, j] -= factor * middle[m, j]
-    for i in range(dimension):
-        for j in range(dimension):
-            middle[i, j] *= -8.0
-        middle[i, i] += 3.0
-
-
-@machine_code
-def _simpson(transition: np.ndarray, middle: np.ndarray, i: int, j: int, m: int, n: int) -> float:
-    """Six times the mean of ``Φ_im Φ_jn`` over an interval, by Simpson's rule."""
-    begin = 1.0 if i == m and j == n else 0.0
-    return transition[i, m] * transition[j, n] + 4.0 * middle[i, m] * middle[j, n] + begin
+def _simpson(transition: np.ndarray, i: int, j: int, m: int, n: int) -> float:
+    """Six times the mean of ``Φ_im Φ_jn`` over an interval, by Simpson's rule from Φ at its ends."""
+    a, b = transition[i, m], transition[j, n]
+    same_i = 1.0 if i == m else 0.0
+    same_j = 1.0 if j == n else 0.0
+    return a * b + (a + same_i) * (b + same_j) + same_i * same_j
 
 
 @machine_code

@@ -90,7 +90,7 @@ WHOLE_STEP_TOLERANCE = 0.05  # of an exposure, as exactly as residuals show it o
 SINGULAR = "the recordings do not determine f; record more, or more often"
 PREDICTED_RECORDINGS = 200  # held-out ones that are predicted: enough for a median
 THINNED = (2, 4, 8, 16)  # of how many samples one is used, where neighbours share more than the state
-MAX_STEP_RATE = 0.8  # of hidden velocities, times the step; there their noise is found 2 % too strong
+MAX_STEP_RATE = 0.4  # of hidden velocities, times the step; there Duffing's noise is found 2 % too strong
 OF_SENSOR = ("measurement", "measurement_error", "sensor_evidence", "exposure", "sensor_law")
 
 
