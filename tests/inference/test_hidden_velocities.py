@@ -150,6 +150,13 @@ def test_of_the_steps_of_a_simulation_fewer_are_used(steps: int) -> None:
     assert (np.abs(done.result.values[1:] - [1, -FRICTION, -1]) < 3.5 * errors + 2 * step).all()
 
 
+def test_steps_that_blur_the_noise_of_velocities_end_with_a_reason() -> None:
+    """At a step of 0.6 a barrier would be found 11 % too low, and certified."""
+    recordings, _ = particle(1, step=0.6, samples=500, within=30, sensor=0.0)
+    done = pipeline.identify_run(SETTINGS, recordings, number=0)
+    assert done.result is None and "too far apart for velocities" in done.outcome.reason
+
+
 def test_nothing_but_noise_is_a_spline_through_the_samples() -> None:
     recordings, velocities = particle(2, records=2, samples=1000)
     states, noise = smoothed_motion(unbroken(recordings), ["x"])
