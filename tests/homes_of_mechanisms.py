@@ -182,8 +182,8 @@ HOMES: Mapping[str, Home] = {
         },
         10.0,
         lambda rng: rng.uniform(0.6, 0.9, size=1),
-        lambda rng, t: rng.choice([-1.0, 0.0, 0.0, 1.0, 2.0], size=len(t) // 8 + 1)[None, :][
-            :, (np.arange(len(t)) // 8)
+        lambda rng, t: rng.choice([-1.0, 0.0, 0.0, 1.0, 2.0], size=(1, len(t) // 8 + 1))[
+            :, np.arange(len(t)) // 8
         ],
     ),
     "enzyme": Home(

@@ -91,7 +91,7 @@ SINGULAR = "the recordings do not determine f; record more, or more often"
 PREDICTED_RECORDINGS = 200  # held-out ones that are predicted: enough for a median
 THINNED = (2, 4, 8, 16)  # of how many samples one is used, where neighbours share more than the state
 MAX_STEP_RATE = 0.4  # of hidden velocities, times the step; there Duffing's noise is found 2 % too strong
-BLURRED = 0.6  # the same, from which on noise and barriers are off by more than their errors: by 11 % at 0.85
+BLURRED = 0.6  # the same at most: at 0.85 Duffing's barrier was 11 % too low, 3.6 errors of 20,000 samples
 OF_SENSOR = ("measurement", "measurement_error", "sensor_evidence", "exposure", "sensor_law")
 
 
@@ -612,9 +612,9 @@ class _Case:
                     break
                 found = self.finished(self.by_likelihood(replace(hidden, thinned=thinned)))
         if first.noise_rate.any() and turned > BLURRED:
-            raise NumericalFailure(
-                "samples are too far apart for velocities that were not recorded; record more often"
-            )
+            longest = usual_step(self.recordings) * BLURRED / turned
+            reason = "samples are too far apart for velocities that were not recorded; record with a step of"
+            raise NumericalFailure(f"{reason} at most {longest:.2g}")
         return found if found.prediction is not None and found.prediction.passed else first
 
     def with_velocities(self) -> FieldEstimate | None:

@@ -151,7 +151,7 @@ def test_of_the_steps_of_a_simulation_fewer_are_used(steps: int) -> None:
 
 
 def test_steps_that_blur_the_noise_of_velocities_end_with_a_reason() -> None:
-    """At a step of 0.6 a barrier would be found 11 % too low, and certified."""
+    """At kT = 0.12 and this step, the barrier of x alone was found 11 % too low, and certified."""
     recordings, _ = particle(1, step=0.6, samples=500, within=30, sensor=0.0)
     done = pipeline.identify_run(SETTINGS, recordings, number=0)
     assert done.result is None and "too far apart for velocities" in done.outcome.reason
