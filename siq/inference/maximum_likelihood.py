@@ -352,7 +352,7 @@ def _ended(at: Fit, data: Measurements, *, converged: bool, resolution: float) -
     innovations = np.append(white.innovations, expected[1])
     total = float(innovations @ innovations)
     together = sum(len(each.roots) for each in at.model.expected_together)
-    there = _changed(at.model, change) if converged else at.model
+    there = at.model.moved(change) if converged else at.model
     if (_sides(there, data, at.x) != _sides(at.model, data, at.x)).any():
         there = at.model  # before a pole of f, where what is likeliest lies beyond it
     return replace(
@@ -403,15 +403,12 @@ class _Shooting:
 
     def change_of(self, now: Fit, white: Whitened, expected: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         """The change of the free parameters that is asked for; what stands before a pole of f stays there."""
-        at, free = now.model.values, list(self.model.free)
-        moves = np.ones(len(free))
+        moves = np.ones(len(now.model.free))
         while True:
             rows = (expected[0] * moves, expected[1])
             change = replace(white, columns=white.columns * moves).solve(rows, least=self.resolution)[0]
-            stuck = [
-                self.crosses(at + np.eye(len(at))[place] * SHORTEST_STEP * one, now.linearised_at)
-                for place, one in zip(free, change * moves, strict=True)
-            ]
+            alone = np.diag(SHORTEST_STEP * change * moves)
+            stuck = [self.crosses(now.model.moved(one).values, now.linearised_at) for one in alone]
             if not np.any(stuck):
                 return change
             moves = np.where(stuck, 0.0, moves)
@@ -463,7 +460,7 @@ class _Shooting:
         usual = np.sqrt(np.mean((here.gap[rows] / scale) ** 2)) if self.filtered else 0.0
         length = 1.0
         while length >= SHORTEST_STEP:
-            model, x = _changed(now.model, length * change), now.linearised_at + length * deviation
+            model, x = now.model.moved(length * change), now.linearised_at + length * deviation
             along = self.linearised(model.values, x, spread, noise)
             if along.finite and not self.crosses(model.values, x):
                 expected = (1 - length) * here.gap[rows] + length * foreseen
@@ -597,10 +594,3 @@ def _stands_still(totals: list[float]) -> bool:
     """Whether a fit moves without becoming better: where f jumps its derivatives are never exact."""
     recent = totals[-4:]
     return max(recent) - min(recent) < STANDSTILL * max(recent)
-
-
-def _changed(model: Dynamics, change: np.ndarray) -> Dynamics:
-    """The dynamics after a change of the free parameters."""
-    values = model.values.copy()
-    values[list(model.free)] += change
-    return model.with_values(values)

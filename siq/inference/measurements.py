@@ -273,15 +273,19 @@ def expectations(model: Dynamics, values: np.ndarray | None = None) -> tuple[np.
     """Priors of changes of the free parameters: combinations of them ``(r, p)`` are normal, of unit width.
 
     With how far the values of all parameters, by default the model's own, fall short of what is expected of
-    each combination, shape ``(r,)``.
+    each combination, shape ``(r,)``. What divides a term is expected by its inverse: x²/K and b x² are one,
+    and a capacity may be infinite.
     """
     now = (model.values if values is None else values)[list(model.free)]
     free = {model.parameters[place].name: column for column, place in enumerate(model.free)}
     fixed = {each.name: each.value for each in model.parameters}
     sizes = [model.parameters[place].expected or 0.0 for place in model.free]
     told = np.flatnonzero(sizes)
-    rows = [np.eye(len(free))[told] / np.abs(np.array(sizes)[told])[:, None]]
-    middle = [np.sign(np.array(sizes)[told])]
+    size, inverse = np.array(sizes)[told], np.isin(np.array(model.free)[told], [*model.divisors])
+    # Of K about K₀, -K₀/K about -1: its change by K, and what is short of it where K is now.
+    at = np.where(inverse, now[told], 1.0)
+    rows = [np.eye(len(free))[told] * np.where(inverse, size / at**2, 1 / np.abs(size))[:, None]]
+    middle = [np.where(inverse, 2 * size / at - 1, np.sign(size))]
     for each in model.expected_together:
         mine = [place for place, name in enumerate(each.names) if name in free]
         if mine:

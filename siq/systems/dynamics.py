@@ -152,6 +152,7 @@ class ParametricFunctions:
         # integration, and carries deviations across the jump as they are carried in the mean.
         self._smooth = [dynamics.evaluable(each, wider=JUMP_WIDTHS) for each in dynamics.equations]
         self._free = [symbol(dynamics.parameters[place].name) for place in dynamics.free]
+        self._divisors = [symbol(dynamics.parameters[place].name) for place in dynamics.divisors]
         self._compiled: dict[str, tuple[int, Compiled]] = {}
 
     @cached_property
@@ -180,7 +181,7 @@ class ParametricFunctions:
     def sides(self, x: np.ndarray, signals: Signals, values: np.ndarray) -> np.ndarray:
         """On which side of each pole of f all states lie: 1 or -1, and 0 where it lies among them, ``(k,)``.
 
-        Of poles that move with a free parameter, as that of s/(K + s) does.
+        Of poles that move with a free parameter, as that of s/(K + s) does, and of `divisors`.
         """
         side = np.sign(self._evaluated("denominators", x, signals, values))
         return np.where((side == side[:, :1]).all(axis=1), side[:, 0], 0.0)
@@ -207,8 +208,9 @@ class ParametricFunctions:
         if what == "denominators":
             powers = set[sympy.Pow]().union(*(each.atoms(sympy.Pow) for each in self._equations))
             below = {each.base: each.base.free_symbols for each in powers if each.exp.is_negative}
-            both = [one for one, names in below.items() if names & {*self._states} and names & {*self._free}]
-            return sorted(both, key=str)
+            states, free = {*self._states}, {*self._free}
+            moving = [one for one, names in below.items() if names & states and names & free]
+            return sorted([*moving, *self._divisors], key=str)
         smooth, formulas = self._smooth, self._equations
         if what == "output_slopes":
             smooth, formulas = [_without_teeth(each) for each in self._measured], self._measured
@@ -300,7 +302,7 @@ class JointExpectation:
     weight: float = 1.0
 
 
-COMPILED = ("functions", "delays", "free", "symbols", "_lags")
+COMPILED = ("functions", "delays", "free", "divisors", "symbols", "_lags")
 """Cached properties that do not depend on the values of the parameters."""
 
 
@@ -512,6 +514,40 @@ class Dynamics:
             for place, parameter in enumerate(self.parameters)
             if not parameter.fixed and symbol(parameter.name) in used
         )
+
+    @cached_property
+    def divisors(self) -> dict[int, int | None]:
+        """Places of free parameters that only divide, and only some terms, as K of ``r N (1 - N/K)``.
+
+        Those terms are absent where it is infinite. With the place of what multiplies them all, r, if that is
+        one free parameter. A mass or a time constant divides the whole rate of a state, and is none of them.
+        """
+        formulas, found = (*self.equations, *dict(self.outputs).values()), dict[int, int | None]()
+        powers = set[sympy.Pow]().union(*(each.atoms(sympy.Pow) for each in formulas))
+        below = {one: sympy.S.One for one in powers if one.base.is_Symbol and one.exp == -1}
+        elsewhere = set().union(*(each.xreplace(below).free_symbols for each in formulas))
+        named = {symbol(self.parameters[place].name): place for place in self.free}
+        for one in named.keys() & {each.base for each in below} - elsewhere:
+            parts = [sympy.Add.make_args(each.expand()) for each in formulas if one in each.free_symbols]
+            terms = [[term for term in part if 1 / one in term.args] for part in parts]
+            if all(0 < len(each) < len(part) for each, part in zip(terms, parts, strict=True)):
+                shared = set.intersection(*({*term.args} for each in terms for term in each)) & named.keys()
+                found[named[one]] = named[shared.pop()] if len(shared) == 1 else None
+        return found
+
+    def moved(self, change: np.ndarray) -> Dynamics:
+        """The dynamics after a change ``(p,)`` of its free parameters that their slopes ask for.
+
+        What divides a term moves so that f changes straight: ``r'/K' = r/K + d(r/K)``.
+        """
+        values, step = self.values, np.zeros(len(self.parameters))
+        step[list(self.free)] = change
+        new = values + step
+        for place, beside in self.divisors.items():
+            weight, more = (1.0, 0.0) if beside is None else (values[beside], step[beside])
+            if share := (weight + more - weight * step[place] / values[place]) / values[place]:
+                new[place] = (weight + more) / share
+        return self.with_values(new)
 
     @property
     def names(self) -> dict[str, sympy.Symbol]:

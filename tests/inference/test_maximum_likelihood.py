@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.linalg
+import sympy
 
 from siq.inference.kalman_filter import Grid, Linearisation, Noise, linearise, whiten
 from siq.inference.maximum_likelihood import (
@@ -15,10 +16,17 @@ from siq.inference.maximum_likelihood import (
     first_noise,
     fit_by_multiple_shooting,
 )
-from siq.inference.measurements import Measurements, course_of_input, expectations, first_states
+from siq.inference.measurements import (
+    Measurements,
+    course_of_input,
+    expectations,
+    first_states,
+    with_expectations,
+)
 from siq.numerics.files import Document, validate
 from siq.systems.cards import SystemCard, build_system
-from siq.systems.dynamics import Dynamics
+from siq.systems.diffusion import Diffusion
+from siq.systems.dynamics import Dynamics, Parameter
 
 pytestmark = pytest.mark.portable
 
@@ -295,3 +303,60 @@ def test_the_products_of_columns_are_eliminated_as_by_projection(linearised) -> 
     change = np.linalg.lstsq(white.columns, white.innovations, rcond=None)[0]
     assert total == pytest.approx(float(((white.innovations - white.columns @ change) ** 2).sum()), rel=1e-8)
     assert freedom == white.degrees_of_freedom
+
+
+TUMOUR = {
+    "name": "tumour",
+    "time_unit": "d",
+    "states": {"n": {"unit": "1", "domain": [0, 1000]}},
+    "parameters": {"r": {"value": 0.116}, "K": {"value": 878.0}, "c": {"value": 0.0}},
+    "equations": {"n": "r*n*(1 - n/K) - c*n*log(n**2)/2"},
+    "outputs": {"n": "n"},
+}
+
+
+def growths(noise: float) -> Measurements:
+    """Tumours of Gompertz's law, ``n' = 0.08 n ln(900/n)``, whose solution is known."""
+    t, begins = np.arange(60.0), np.array([10.0, 30.0, 80.0, 200.0])
+    n = np.concatenate([900 * (begin / 900) ** np.exp(-0.08 * t) for begin in begins])
+    n += noise * np.random.default_rng(5).normal(size=len(n))
+    return Measurements(
+        labels=tuple("abcd"), first=60 * np.arange(5), t=np.tile(t, 4), outputs=n[:, None], courses=((),) * 4
+    )
+
+
+@pytest.mark.parametrize("expected", [False, True])
+def test_steps_bend_with_a_valley_in_which_a_capacity_becomes_infinite(*, expected: bool) -> None:
+    # r, K and c do nearly the same: a straight step that is long enough to matter leaves the valley.
+    model, data = model_of(TUMOUR), growths(6.0)
+    if expected:
+        model = with_expectations(model.with_values(np.array([0.2, 800.0, 0.0])))
+    model = model.with_values(np.array([0.116, 878.0, 0.0]))
+    x = first_states(model, data)
+    fit = fit_by_multiple_shooting(model, data, x=x, noise=first_noise(model, data, x), estimate_process=True)
+    found = {each.name: each.value for each in fit.model.parameters}
+    errors = dict(zip(found, np.sqrt(np.diag(fit.covariance)), strict=True))
+    assert fit.converged and found["K"] > 1e5
+    assert abs(found["c"] - 0.08) < 3 * errors["c"] and errors["c"] < 0.003
+    assert fit.noise.measurement[0] == pytest.approx(36.0, rel=0.25)
+
+
+def test_a_capacity_and_a_loss_are_expected_alike() -> None:
+    x, b, capacity = sympy.symbols("x b K", real=True)
+    t = np.arange(0, 2, 0.25)
+    exact = np.exp(t) / (1 + np.expm1(t))  # of x' = x - x²
+    outputs = (exact + 0.1 * np.random.default_rng(2).normal(size=len(t)))[:, None]
+    data = Measurements(labels=("a",), first=np.array([0, 8]), t=t, outputs=outputs, courses=((),))
+    fits = []
+    for rate, parameter in ((x - b * x**2, Parameter("b", 2.0)), (x - x**2 / capacity, Parameter("K", 0.5))):
+        model = with_expectations(
+            Dynamics(
+                ("x",), (rate,), Diffusion.identity(1), domain=np.array([[0.0, 2.0]]), parameters=(parameter,)
+            )
+        )
+        begin = first_states(model, data)
+        noise = Noise(np.array([0.01]), np.zeros(1))
+        fits.append(fit_by_multiple_shooting(model, data, x=begin, noise=noise, estimate_process=False))
+    one, other = (each.model.values[0] for each in fits)
+    assert all(each.converged for each in fits) and one == pytest.approx(1 / other, rel=1e-3)
+    assert abs(one - 1) > 0.02  # the prior draws it towards 2

@@ -79,3 +79,20 @@ def test_symbols_without_assumptions_are_the_states_all_the_same() -> None:
 def test_a_symbol_without_a_value_is_named() -> None:
     with pytest.raises(ValueError, match="'b' is no state and no parameter"):
         Dynamics.of((x,), (b * x - x**3,))
+
+
+def test_what_formulas_divide_by_changes_by_its_inverse() -> None:
+    n, r, k, half = sympy.symbols("n r K half", real=True)
+    model = Dynamics(
+        ("n",), (r * n * (1 - n / k) - n / (half + n),), Diffusion.identity(1), domain=np.array([[0.0, 9.0]]),
+        parameters=(Parameter("r", 1.0), Parameter("K", 4.0), Parameter("half", 2.0)),
+    )  # fmt: skip
+    assert model.divisors == {1: 0}
+    tau = sympy.Symbol("tau", real=True)
+    decay = Dynamics.of((n,), (-n / tau,), domain=[(0, 9)], parameters={tau: 2.0})
+    assert decay.divisors == {}
+    # r/K changes straight: by its slopes at first, and twice as much along twice the way.
+    near, twice = (model.moved(each * np.array([0.1, 1.0, 0.2])).values for each in (1e-6, 2e-6))
+    assert near[0] / near[1] - 1 / 4 == pytest.approx(1e-6 * (0.1 / 4 - 1 / 16), rel=1e-6)
+    assert twice[0] / twice[1] - 1 / 4 == pytest.approx(2 * (near[0] / near[1] - 1 / 4), rel=1e-6)
+    np.testing.assert_allclose(twice[[0, 2]], [1 + 2e-7, 2 + 4e-7])
