@@ -54,6 +54,8 @@ QUARTERS, SAME_WAVE = 4, 0.5  # of a recording, in which a hum has one amplitude
 BY_CHANCE = 2.5  # standard errors of such an amplitude and phase: four in five records are within
 SLIGHT_HUM = 0.1  # of the variance of a state: what moves it more may be the state itself, which circulates
 SEASONS = {"day": 86_400.0, "year": 31_556_952.0}  # seconds: what the sun does to what stands outdoors
+DRIFT_DEGREE = 7  # of the mean step by the state, for wells and the hills between them
+HUM_ROUNDS = 4  # over a hum and the mean step, each in turn
 MAINS, MAINS_VARY = np.outer((50.0, 60.0), (1, 2, 3, 4)), 0.002  # hertz; relative, in most grids
 _SECONDS = {
     "[uµμ]s": 1e-6, "m(s|sec|illisec.*)": 1e-3, "s(ec.*)?": 1, "min.*": 60, "h.*": 3600, "d.*": 86_400,
@@ -451,30 +453,52 @@ def _season_of(recordings: Recordings, values: np.ndarray, name: str) -> np.ndar
 
 
 def _hum_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, float]:
-    """The hum in a series, ``(n,)`` and zero where there is none, and its period in the unit of time."""
+    """The hum in a series, ``(n,)`` and zero where there is none, and its period in the unit of time.
+
+    Hops hide a slight one. At mains the mean step from a state is taken off, and ``h(t + Δt) - s h(t)`` is
+    left of a hum h, where a share s of the state stays. Elsewhere a force that swings would be taken for one.
+    """
     bounds = np.searchsorted(recordings.recording, np.arange(len(recordings.labels) + 1))
     parts = [slice(int(a), int(b)) for a, b in pairwise(bounds) if b - a > QUARTERS]
-    nothing, steps = np.zeros(len(values)), np.append(np.diff(values), 0.0)
-    steps[bounds[1:] - 1] = 0.0
+    nothing, last = np.zeros(len(values)), bounds[1:] - 1
     if not parts:
         return nothing, 0.0
     width = np.pi / max(float(np.ptp(recordings.t[part])) for part in parts)
     seconds = _seconds_of(recordings)
-    for harmless in (HARMLESS_LINE, 0.0) if seconds else (HARMLESS_LINE,):
-        period = change_of(recordings, steps, np.zeros(len(steps), dtype=int), harmless=harmless)
+
+    def moves(series: np.ndarray, *, back: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Steps from each value, less their mean where that is taken off, and the share that stays."""
+        steps, stays = np.append(np.diff(series), 0.0), np.ones(len(series))
+        if back:
+            place = np.clip(series, *(domain := np.quantile(series, [0.001, 0.999])))
+            known = np.delete(np.stack([place, steps]), last, axis=1)
+            mean = np.polynomial.Legendre.fit(*known, DRIFT_DEGREE, domain=domain)
+            steps, stays = steps - mean(place), 1 + mean.deriv()(place)
+        steps[last] = 0.0
+        return steps, stays
+
+    for harmless, back in ((HARMLESS_LINE, False), (0.0, False), (0.0, True))[: 3 if seconds else 1]:
+        series, path = moves(values, back=back)[0], np.zeros(len(values), dtype=int)
+        period = change_of(recordings, series, path, harmless=harmless)
         if period is None or not np.isfinite(period):
             continue
         about = 2 * np.pi / (period * usual_step(recordings))
         hertz = about / (2 * np.pi * (seconds or np.inf))
-        if harmless or (np.abs(hertz / MAINS - 1) < max(MAINS_VARY, width / about)).any():
+        mains = bool((np.abs(hertz / MAINS - 1) < max(MAINS_VARY, width / about)).any())
+        if harmless or mains:
             break
     else:
         return nothing, 0.0
+    steps, stays = moves(values, back=mains)
+
+    def of_wave(frequency: float, part: slice) -> np.ndarray:
+        """What ``exp(iωt)`` does to the steps of a part."""
+        wave = np.exp(1j * frequency * recordings.t[part])
+        return np.asarray(wave[1:] - stays[part][:-1] * wave[:-1])
 
     def amplitude(frequency: float, part: slice) -> complex:
-        """That of the hum, by the steps of a part: those of ``exp(iωt)`` are known."""
-        wave = np.diff(np.exp(1j * frequency * recordings.t[part]))
-        columns = np.column_stack([wave.real, -wave.imag])
+        """That of the hum, by the steps of a part."""
+        columns = of_wave(frequency, part)[:, None].view(float) * [1, -1]
         return complex(*np.linalg.lstsq(columns, steps[part][:-1], rcond=None)[0])
 
     def lost(frequency: float) -> float:
@@ -483,15 +507,18 @@ def _hum_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, flo
     bounds_of_line = (about - width, about + width)
     frequency = float(optimize.minimize_scalar(lost, bounds=bounds_of_line, method="bounded").x)
     hum = nothing.copy()
-    for part in parts:
-        whole, length = amplitude(frequency, part), part.stop - part.start
-        cuts = part.start + length * np.arange(QUARTERS + 1) // QUARTERS
-        each = [amplitude(frequency, slice(int(a), int(b))) for a, b in pairwise(cuts)]
-        moved = np.abs(np.diff(np.exp(1j * frequency * recordings.t[part]))).mean()
-        error = steps[part].std() * np.sqrt(2 * QUARTERS / length) / moved
-        if max(abs(one - whole) for one in each) > SAME_WAVE * abs(whole) + BY_CHANCE * error:
-            return nothing, 0.0
-        hum[part] = (whole * np.exp(1j * frequency * recordings.t[part])).real
+    for number in range(HUM_ROUNDS if mains else 1):  # a strong hum blurs the mean step at first
+        steps, stays = moves(values - hum, back=mains)
+        for part in parts:
+            whole, length = amplitude(frequency, part), part.stop - part.start
+            cuts = part.start + length * np.arange(QUARTERS + 1) // QUARTERS
+            each = [amplitude(frequency, slice(int(a), int(b))) for a, b in pairwise(cuts)]
+            moved = np.abs(of_wave(frequency, part)).mean()
+            error = steps[part].std() * np.sqrt(2 * QUARTERS / length) / moved
+            apart = max(abs(one - whole) for one in each)
+            if number == 0 and apart > SAME_WAVE * abs(whole) + BY_CHANCE * error:
+                return nothing, 0.0
+            hum[part] += (whole * np.exp(1j * frequency * recordings.t[part])).real
     return (hum, 2 * np.pi / frequency) if hum.var() < SLIGHT_HUM * values.var() else (nothing, 0.0)
 
 
