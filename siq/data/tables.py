@@ -49,6 +49,7 @@ RESTART_SHARE = 0.1  # of the time that a recording took: where it starts over, 
 # Of the steps lead back in time where rows are shuffled: recordings of three samples, one after another, have
 # as many.
 SHUFFLED_SHARE = 1 / 3
+ROUNDED_TIME = 0.75  # of what times are rounded to, by which they are off at most, and a little for the fit
 DAY = 86_400.0  # seconds
 FEWEST_ON_A_LINE = 10  # steps: fewer may lie on one by themselves
 MOST_LAGGED = 10  # rows, by which a column may be behind the one that it copies
@@ -147,6 +148,7 @@ def _checked(
     if faults:
         raise min(faults, key=lambda each: each[0])[1]
     rows = _complete(file, rows, numbers, ["t", *layout.titles], gaps, remarks)
+    _with_all_digits(rows, numbers, remarks)
     rows = _in_order(rows, numbers, layout.recording is not None, remarks)
     check_times(file, numbers[0][rows.order], rows.recording, rows.labels, rows.order)
     found = Recordings(
@@ -482,6 +484,26 @@ def _complete(
     return rows
 
 
+def _with_all_digits(rows: _Rows, numbers: np.ndarray, remarks: list[Remark]) -> None:
+    """Times that were rounded to more than a step, and so repeat, as those of the even clock that they round.
+
+    Where each time stands equally often, nothing tells a fast clock from several measurements at each time.
+    """
+    units = list[float]()
+    for own in np.split(rows.order, np.searchsorted(rows.recording, np.arange(1, len(rows.labels)))):
+        t, number = numbers[0][own], np.arange(len(own))
+        often = np.diff(np.flatnonzero(np.r_[True, np.diff(t) != 0, True]))[1:-1]
+        if len(own) < 2 * FEWEST_ON_A_LINE or (np.diff(t) < 0).any() or len(np.unique(often)) < 2:
+            continue
+        (slope, begin), unit = np.polyfit(number, t, 1), float(np.diff(np.unique(t)).min())
+        if slope < unit and np.abs(t - begin - slope * number).max() <= ROUNDED_TIME * unit:
+            # A step has fewer digits than its mean over all of a recording.
+            numbers[0][own] = t[0] + float(f"{slope:.6g}") * number
+            units.append(unit)
+    if units:
+        remarks.append(Remark("data.times_rounded", {"count": len(units), "unit": max(units)}))
+
+
 def _in_order(rows: _Rows, numbers: np.ndarray, labelled: bool, remarks: list[Remark]) -> _Rows:
     """Without rows that stand twice, sorted where in no order; a recording begins where the time starts over.
 
@@ -549,7 +571,7 @@ def check_times(
     label, before, now = labels[recording[earlier]], float(t[earlier]), float(t[earlier + 1])
     if now == before:
         fault = f"the time {now} of recording '{label}' is repeated (row {rows[earlier] + 1} has it too)"
-        remedy = "keep one of the two rows, or label them as two recordings"
+        remedy = "keep one of the two rows, label them as two recordings, or write times with more digits"
     else:
         fault = f"the times of recording '{label}' are unsorted ({now} comes after {before})"
         remedy = "sort its rows by t, or begin a new label where a new recording begins"

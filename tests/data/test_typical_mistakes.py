@@ -673,3 +673,25 @@ def test_an_inspection_says_what_is_there(tmp_path: Path) -> None:
     lines = found.lines()
     assert "Process noise is seen" in lines[-3] and "Measurement noise" in lines[-2]
     assert "unit the time is" in lines[-1]
+
+
+@pytest.mark.parametrize("digits", [1, 2])
+def test_times_rounded_to_more_than_a_step_are_those_of_an_even_clock(tmp_path: Path, digits: int) -> None:
+    step = 0.37 * 10.0**-digits
+    lines = [f"{5 + step * k:.{digits}f},{k // 3}" for k in range(400)]  # values repeat, too
+    found = read_recordings(put(tmp_path, "a.csv", "t [h],x\n" + "\n".join(lines) + "\n"))
+    np.testing.assert_allclose(found.t, found.t[0] + step * np.arange(400), atol=2 * step)
+    np.testing.assert_array_equal(found.values[:, 0], np.arange(400) // 3)
+    assert any("samples are taken as evenly spaced" in sentence(each) for each in found.remarks)
+
+
+@pytest.mark.parametrize(
+    "t",
+    [np.repeat(np.arange(30), 3), np.append(np.arange(30), 29), np.minimum(np.arange(30), 9)],
+    ids=["three of each", "one twice", "a clock that stops"],
+)
+def test_other_times_that_repeat_are_refused(tmp_path: Path, t: np.ndarray) -> None:
+    lines = [f"{time},{number}" for number, time in enumerate(t)]
+    with pytest.raises(InputError, match="is repeated") as fault:
+        read_recordings(put(tmp_path, "a.csv", "t,x\n" + "\n".join(lines) + "\n"))
+    assert "write times with more digits" in str(fault.value)
