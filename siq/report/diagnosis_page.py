@@ -113,7 +113,11 @@ def _templates() -> Any:
             entry.estimate, entry.standard_error if error else None, unit=entry.unit, digits=digits
         ),
         "after": lambda each: value_text(each.after, each.standard_error, unit=each.unit),
-        "before": lambda each: _card_value(each.before),
+        "before": lambda each: (
+            number_text(each.before)  # as a card has it
+            if "e" in (text := f"{each.before:.6g}")
+            else text.replace("-", "−")
+        ),
         "changes": _changes,
     }
     made.filters |= further
@@ -160,12 +164,6 @@ def _changes(recalibration: Mapping[str, Recalibrated]) -> list[tuple[str, Recal
         if change:
             found.append((name, each, change / error if error > 0 else float("inf")))
     return sorted(found, key=lambda each: -each[2])
-
-
-def _card_value(value: float) -> str:
-    """A value as a card has it."""
-    text = f"{value:.6g}"
-    return number_text(value) if "e" in text else text.replace("-", "−")
 
 
 def _error_text(value: float | None, errors: HeldOutErrors) -> str:

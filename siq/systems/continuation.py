@@ -607,15 +607,6 @@ def follow_branches(
     >>> _, found, _ = follow_branches(cusp, "h", (-1.0, 1.0), [(0.0, np.array([1.0]))])
     >>> [(one.kind, round(one.value, 10)) for one in found]
     [('fold', -0.3849001795), ('fold', 0.3849001795)]
-
-    Cycles ``r² = (1 ± √(1 + 4a))/2`` of a normal form begin at ``a = 0``, and fold at ``a = -1/4``:
-
-    >>> a, x, y = sympy.symbols("a x y", real=True)
-    >>> grow = a + (x**2 + y**2) - (x**2 + y**2) ** 2
-    >>> form = Dynamics.of((x, y), (x * grow - y, y * grow + x), domain=[(-2, 2)] * 2, parameters={a: 0.0})
-    >>> _, found, _ = follow_branches(form, "a", (-0.5, 0.5), [(0.1, np.zeros(2))], cycles=())
-    >>> [(one.kind, round(one.value, 8)) for one in found]
-    [('fold of cycles', -0.25), ('Hopf', 0.0)]
     """
     family = _Family(dynamics, {parameter: limits})
     equations, along = _Equilibria(family), np.eye(family.count)[-1]

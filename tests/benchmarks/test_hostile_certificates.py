@@ -19,7 +19,7 @@ LONGER = (
     "lost_buffers",
 )
 NAMED = ("held_values",)  # they are no copies of recordings, and what is right without them may be certified
-HONEST = ("gate", "swinging_tilt", "two_offsets")
+HONEST, HONEST_LONGER = ("gate",), ("swinging_tilt", "two_offsets")
 
 
 @pytest.mark.parametrize(
@@ -32,7 +32,9 @@ def test_nothing_is_certified_that_is_not_so(name: str) -> None:
     assert score.certified or name not in NAMED or KINDS[name].named & set(score.codes), score.said
 
 
-@pytest.mark.parametrize("name", HONEST)
+@pytest.mark.parametrize(
+    "name", [*HONEST, *(pytest.param(one, marks=pytest.mark.slow) for one in HONEST_LONGER)]
+)
 def test_an_honest_record_that_looks_alike_is_certified(name: str) -> None:
     score = scored(KINDS[name], 0, 1.0, honest=True)
     assert score.certified, score.said

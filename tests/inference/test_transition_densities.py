@@ -161,6 +161,7 @@ def test_densities_of_means_are_those_of_a_kalman_filter(share: float) -> None:
         assert one == pytest.approx(other, abs=0.006)
 
 
+@pytest.mark.slow
 def test_f_and_d_are_found_of_means_over_such_steps() -> None:
     pairs = behind_sensor(double_well(0.5, samples=8, exposed=True), 0.1)
     found = Transitions(identified(pairs), pairs).identified_behind_sensor(exposure=0.5, false_terms=0.01)

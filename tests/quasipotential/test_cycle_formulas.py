@@ -44,6 +44,7 @@ def test_a_circle_has_its_three_terms_and_no_others(turn: int) -> None:
     assert (exact[~known] > 0.9 * found.level).all()
 
 
+@pytest.mark.slow
 def test_a_cycle_that_is_no_circle_has_the_exact_potential() -> None:
     """V = k (h - c)²/2 with h = (x² + y²)/2 - x³/3 and a field along its levels, 6 here."""
     level, half = RADIUS / 2 - x**3 / 3, sympy.Rational("0.08")

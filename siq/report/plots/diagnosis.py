@@ -318,24 +318,6 @@ def plot_diagnosis(
     matplotlib.axes.Axes
         Measured values as a broad line, and the simulation as given, with its own parameters refitted, and
         with what was found.
-
-    Examples
-    --------
-    >>> import pandas as pd, sympy
-    >>> import siq
-    >>> from matplotlib.figure import Figure
-    >>> from siq.systems.dynamics import Parameter
-    >>> n, r = sympy.symbols("n r", real=True)
-    >>> growth = siq.Dynamics(("n",), (r * n,), siq.Diffusion.identity(1), parameters=(Parameter("r", 1.0),))
-    >>> t, noise = np.arange(0, 8, 0.4), np.random.default_rng(1)
-    >>> recordings = pd.concat(
-    ...     pd.DataFrame({"recording": f"r{k}", "t": t, "n": 2 / (1 + (2 / start - 1) * np.exp(-0.9 * t))})
-    ...     for k, start in enumerate([0.05, 0.2, 1.0, 5.0])
-    ... )
-    >>> recordings["n"] += 0.005 * noise.normal(size=len(recordings))
-    >>> axes = plot_diagnosis(siq.diagnose(growth, recordings), ax=Figure().add_subplot())
-    >>> axes.get_ylabel()
-    '$n$'
     """
     axes = new_axes() if ax is None else ax
     case, place, rows = _shown(diagnosis, output, recording)

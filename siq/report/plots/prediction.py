@@ -75,16 +75,6 @@ def plot_residuals(
     ------
     ValueError
         When the recordings of a landscape are missing or have other states, or the state is unknown.
-
-    Examples
-    --------
-    >>> from matplotlib.figure import Figure
-    >>> t, starts = np.linspace(0, 3, 61), np.random.default_rng(0).uniform(-1.5, 1.5, 60)
-    >>> x = starts / np.sqrt(starts**2 + (1 - starts**2) * np.exp(-2 * t[:, None]))  # dx/dt = x - x³
-    >>> recordings = Recordings.from_arrays(t, x.T[:, :, None], names=["x"])
-    >>> axes = plot_residuals(Landscape.from_recordings(recordings), recordings, ax=Figure().add_subplot())
-    >>> axes.get_xlabel()
-    '$x$'
     """
     if not isinstance(found, Landscape):
         axes = new_axes() if ax is None else ax

@@ -185,16 +185,6 @@ def plot_quasipotential(
     matplotlib.axes.Axes
         Of one state a curve, with a band of two standard errors where the error of f is known; of more a map.
         Where U is not known nothing is drawn.
-
-    Examples
-    --------
-    >>> import siq, sympy
-    >>> from matplotlib.figure import Figure
-    >>> x = sympy.Symbol("x", real=True)
-    >>> wells = siq.Landscape.from_equations(siq.Dynamics.of([x], [x - x**3], domain=[(-2, 2)]))
-    >>> axes = plot_quasipotential(wells, ax=Figure().add_subplot())
-    >>> axes.get_xlabel(), axes.get_ylabel()
-    ('$x$', '$U$ (unit of ε)')
     """
     shown = summarise(landscape, recordings)
     axes = new_axes() if ax is None else ax

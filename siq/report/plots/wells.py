@@ -77,16 +77,6 @@ def plot_wells(
         A colour for each well. Of one state its curve of U; of two and more its states, and a line around
         those that lie below its lowest saddle. A state is the well's whose formula holds there and gives the
         lowest U; one where no formula holds is grey.
-
-    Examples
-    --------
-    >>> import siq, sympy
-    >>> from matplotlib.figure import Figure
-    >>> x = sympy.Symbol("x", real=True)
-    >>> wells = siq.Landscape.from_equations(siq.Dynamics.of([x], [x - x**3], domain=[(-2, 2)]))
-    >>> axes = plot_wells(wells, ax=Figure().add_subplot())
-    >>> [text.get_text() for text in axes.get_legend().get_texts()]
-    ['well A', 'well B', 'saddle']
     """
     shown = summarise(landscape, recordings)
     axes = new_axes() if ax is None else ax
@@ -133,16 +123,6 @@ def plot_paths(
     ------
     ValueError
         When no way out of any well is known.
-
-    Examples
-    --------
-    >>> import siq, sympy
-    >>> from matplotlib.figure import Figure
-    >>> x = sympy.Symbol("x", real=True)
-    >>> wells = siq.Landscape.from_equations(siq.Dynamics.of([x], [x - x**3], domain=[(-2, 2)]))
-    >>> axes = plot_paths(wells, ax=Figure().add_subplot())
-    >>> [line.get_label() for line in axes.lines][:2]
-    ['A to B', 'B to A']
     """
     shown = summarise(landscape)
     ways = [way for way in shown.ways if len(way.uphill)]
@@ -315,16 +295,6 @@ def plot_barriers(landscape: Landscape | LandscapeSummary, *, ax: Axes | None = 
     ------
     ValueError
         When no barrier is known.
-
-    Examples
-    --------
-    >>> import siq, sympy
-    >>> from matplotlib.figure import Figure
-    >>> x = sympy.Symbol("x", real=True)
-    >>> wells = siq.Landscape.from_equations(siq.Dynamics.of([x], [x - x**3], domain=[(-2, 2)]))
-    >>> axes = plot_barriers(wells, ax=Figure().add_subplot())
-    >>> [label.get_text().splitlines()[0] for label in axes.get_xticklabels()]
-    ['A', 'B']
     """
     shown = summarise(landscape)
     if not any(np.isfinite(way.barrier) for way in shown.ways):
