@@ -472,7 +472,7 @@ def _hum_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, flo
         if back:
             place = np.clip(series, *(domain := np.quantile(series, [0.001, 0.999])))
             known = np.delete(np.stack([place, steps]), last, axis=1)
-            mean = np.polynomial.Legendre.fit(*known, DRIFT_DEGREE, domain=domain)
+            mean = np.polynomial.Legendre.fit(known[0], known[1], DRIFT_DEGREE, domain=domain)
             steps, stays = steps - mean(place), 1 + mean.deriv()(place)
         steps[last] = 0.0
         return steps, stays

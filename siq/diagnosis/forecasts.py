@@ -603,7 +603,7 @@ def _next_rung(
     # the end of a sensor's range is not.
     apart = [[s.frequencies or s.top_of or s.bottom_of for s in each.searches] for each in candidates]
     free = {e.label for e, one in zip(candidates, apart, strict=True) if any(one) or e.model.dimension > d}
-    steady = [each for each in leading if each.site.label not in free]
+    steady, ground = [each for each in leading if each.site.label not in free], None
     if steady:
         ground = leader if leader in steady else max(steady, key=lambda each: each.weight)
         # What is a simpler mechanism and hardly more has to take most of what that one leaves: a gain beside
@@ -648,7 +648,7 @@ def _next_rung(
     for site in suspects[:SUSPECTS]:
         attempt(site)
     contained, equal = set[str](), set[str]()
-    if leader.candidate.model.dimension == d:
+    if leader is ground:
         contained, equal = _containing(leader.horizons[0], sites, leader.candidate)
     else:  # a lag of what drives and one of what measures are the same to a linear system
         ours = leader.site.family[0], len(leader.candidate.new)

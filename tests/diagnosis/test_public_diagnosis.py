@@ -47,6 +47,22 @@ def diagnosis() -> siq.Diagnosis:
     return siq.diagnose(GROWTH, logistic())
 
 
+def test_the_end_of_a_range_is_named_though_nothing_is_compared_in_its_place() -> None:
+    t, noise = np.arange(0, 6, 0.2), np.random.default_rng(0)
+    filling = Dynamics(("n",), (1 - r * n,), siq.Diffusion.identity(1), parameters=(Parameter("r", 1.0),))
+    levels = {begin: 1.25 + (begin - 1.25) * np.exp(-0.8 * t) for begin in (0.0, 0.3, 2.0, 4.0)}
+    table = pd.concat(
+        pd.DataFrame({"recording": f"from {begin}", "t": t, "n": np.minimum(n, 1.1)})
+        for begin, n in levels.items()
+    )
+    table["n"] += 0.01 * noise.normal(size=len(table))
+    found = siq.diagnose(filling, table)
+    assert [each.label for each in found.mechanisms] == ["clipping from above in n"]
+    assert next(one.value for one in found.augmented.parameters if one.name == "r") == pytest.approx(
+        0.8, rel=0.05
+    )
+
+
 def test_what_is_found_is_a_dynamics_with_the_true_parameters(diagnosis: siq.Diagnosis) -> None:
     assert diagnosis.verdict == "missing physics"
     (found,) = diagnosis.mechanisms
