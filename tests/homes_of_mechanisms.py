@@ -405,6 +405,16 @@ HOMES: Mapping[str, Home] = {
         0.3,
         lambda rng: np.array([3.0, 1.5]) * np.exp(rng.normal(size=2) * 0.6),
     ),
+    "two populations": Home(
+        {
+            "time_unit": "a",
+            "states": states(n="1/km**2", p="1/km**2"),
+            "parameters": numbers(r=1.0, K=4.0, s=0.8, L=3.0),
+            "equations": {"n": "r*n*(1 - n/K)", "p": "s*p*(1 - p/L)"},
+        },
+        0.2,
+        lambda rng: np.exp(rng.normal(size=2)),
+    ),
     "fermenter": Home(
         {
             "time_unit": "h",
@@ -706,6 +716,9 @@ RESIDENTS: Sequence[Resident] = (
     Resident("nonlinear coupling", "two masses", {"c": 1.0, "d": 1.0}),
     Resident("nonlinear coupling", "prey and predator", {"c": -0.05}, "n*p**2"),
     Resident("nonlinear coupling", "prey with limits and predator", {"c": -0.05}, "n**2*p"),
+    Resident("competition", "two populations", {"c": 0.15, "d": 0.2}),
+    Resident("competition", "two populations", {"c": 0.15}, "in n"),
+    Resident("mutualism", "two populations", {"c": 0.1}, "in p"),
     Resident("self-limitation", "prey and predator", {"c": 0.05}),
     Resident("mortality", "crop of known growth", {"c": 0.3}),
     Resident("harvest", "crop", {"c": 1.0, "w": 0.8}),

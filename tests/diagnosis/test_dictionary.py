@@ -288,7 +288,7 @@ SCREENED = (
     "photoinhibition", "Gompertz growth", "second-order reaction", "asymmetric damping", "wind or current",
     "flow over a weir", "limiting resource", "Joule heating", "dependence on an input",
     "washout", "unbalance", "lever arm", "ground effect", "pull across a gap", "overpotential",
-    "sigmoid feedback",
+    "sigmoid feedback", "competition", "mutualism",
 )  # fmt: skip
 
 

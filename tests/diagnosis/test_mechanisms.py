@@ -23,7 +23,7 @@ NAMES = (
     "Coulomb and viscous friction", "rolling resistance and drag", "asymmetric friction",
     "asymmetric damping", "Stribeck friction", "eddy-current brake", "position-dependent damping",
     "constant bias", "wind or current", "linear coupling", "attached oscillator", "nonlinear coupling",
-    "self-limitation", "Gompertz growth", "mortality", "harvest", "Allee effect", "sigmoid feedback",
+    "competition", "mutualism", "self-limitation", "Gompertz growth", "mortality", "harvest", "Allee effect", "sigmoid feedback",
     "prey refuge", "sigmoid functional response", "predator interference", "inhibition", "limiting resource",
     "photoinhibition", "decay or leakage", "delayed response", "saturation", "rate limit",
     "magnetic saturation", "parametric drive", "parameter drift", "dependence on an input",
