@@ -54,8 +54,8 @@ QUARTERS, SAME_WAVE = 4, 0.5  # of a recording, in which a hum has one amplitude
 BY_CHANCE = 2.5  # standard errors of such an amplitude and phase: four in five records are within
 SLIGHT_HUM = 0.1  # of the variance of a state: what moves it more may be the state itself, which circulates
 SEASONS = {"day": 86_400.0, "year": 31_556_952.0}  # seconds: what the sun does to what stands outdoors
-DRIFT_DEGREE = 7  # of the mean step by the state, for wells and the hills between them
-HUM_ROUNDS = 4  # over a hum and the mean step, each in turn
+DRIFT_DEGREE, HUM_ROUNDS = 7, 4  # of the mean step by the state; rounds over that and a hum in turn
+HUM_ODDS = 2 * np.log(100)  # of a hum against a force that swings, twice their logarithm
 MAINS, MAINS_VARY = np.outer((50.0, 60.0), (1, 2, 3, 4)), 0.002  # hertz; relative, in most grids
 _SECONDS = {
     "[uµμ]s": 1e-6, "m(s|sec|illisec.*)": 1e-3, "s(ec.*)?": 1, "min.*": 60, "h.*": 3600, "d.*": 86_400,
@@ -469,8 +469,8 @@ def _hum_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, flo
     def moves(series: np.ndarray, *, back: bool) -> tuple[np.ndarray, np.ndarray]:
         """Steps from each value, less their mean where that is taken off, and the share that stays."""
         steps, stays = np.append(np.diff(series), 0.0), np.ones(len(series))
-        if back:
-            place = np.clip(series, *(domain := np.quantile(series, [0.001, 0.999])))
+        if back and np.ptp(domain := np.quantile(series, [0.001, 0.999])) > 0:
+            place = np.clip(series, *domain)
             known = np.delete(np.stack([place, steps]), last, axis=1)
             mean = np.polynomial.Legendre.fit(known[0], known[1], DRIFT_DEGREE, domain=domain)
             steps, stays = steps - mean(place), 1 + mean.deriv()(place)
@@ -491,34 +491,36 @@ def _hum_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, flo
         return nothing, 0.0
     steps, stays = moves(values, back=mains)
 
-    def of_wave(frequency: float, part: slice) -> np.ndarray:
-        """What ``exp(iωt)`` does to the steps of a part."""
+    def fitted(frequency: float, part: slice, stays: np.ndarray) -> tuple[complex, float, float]:
+        """Amplitude by the steps of a part, squares left of these, and what an amplitude of 1 does to one."""
         wave = np.exp(1j * frequency * recordings.t[part])
-        return np.asarray(wave[1:] - stays[part][:-1] * wave[:-1])
+        moved = np.asarray(wave[1:] - stays[part][:-1] * wave[:-1])
+        waves = moved[:, None].view(float) * [1, -1]
+        found, squares, *_ = np.linalg.lstsq(waves, steps[part][:-1], rcond=None)
+        return complex(*found), float(squares.sum()), float(np.abs(moved).mean())
 
-    def amplitude(frequency: float, part: slice) -> complex:
-        """That of the hum, by the steps of a part."""
-        columns = of_wave(frequency, part)[:, None].view(float) * [1, -1]
-        return complex(*np.linalg.lstsq(columns, steps[part][:-1], rcond=None)[0])
+    def left(frequency: float, stays: np.ndarray) -> float:
+        return sum(fitted(frequency, part, stays)[1] for part in parts)
 
-    def lost(frequency: float) -> float:
-        return -sum(abs(amplitude(frequency, part)) ** 2 * (part.stop - part.start) for part in parts)
-
-    bounds_of_line = (about - width, about + width)
-    frequency = float(optimize.minimize_scalar(lost, bounds=bounds_of_line, method="bounded").x)
+    around = (about - width, about + width)
+    frequency = float(optimize.minimize_scalar(left, args=(stays,), bounds=around, method="bounded").x)
     hum = nothing.copy()
-    for number in range(HUM_ROUNDS if mains else 1):  # a strong hum blurs the mean step at first
+    for _ in range(HUM_ROUNDS if mains else 1):  # a strong hum blurs the mean step at first
         steps, stays = moves(values - hum, back=mains)
+        steps += np.append(np.diff(hum), 0.0) + (1 - stays) * hum
         for part in parts:
-            whole, length = amplitude(frequency, part), part.stop - part.start
-            cuts = part.start + length * np.arange(QUARTERS + 1) // QUARTERS
-            each = [amplitude(frequency, slice(int(a), int(b))) for a, b in pairwise(cuts)]
-            moved = np.abs(of_wave(frequency, part)).mean()
-            error = steps[part].std() * np.sqrt(2 * QUARTERS / length) / moved
-            apart = max(abs(one - whole) for one in each)
-            if number == 0 and apart > SAME_WAVE * abs(whole) + BY_CHANCE * error:
-                return nothing, 0.0
-            hum[part] += (whole * np.exp(1j * frequency * recordings.t[part])).real
+            hum[part] = (fitted(frequency, part, stays)[0] * np.exp(1j * frequency * recordings.t[part])).real
+    # A force that swings moves all states alike, a hum those more that lead back. In one well both are one.
+    odds = (left(frequency, 0 * stays) - left(frequency, stays)) / steps.var()
+    if mains and odds < (HUM_ODDS if back else -HUM_ODDS):
+        return nothing, 0.0
+    for part in parts:
+        (whole, _, moved), length = fitted(frequency, part, stays), part.stop - part.start
+        cuts = part.start + length * np.arange(QUARTERS + 1) // QUARTERS
+        each = [fitted(frequency, slice(int(a), int(b)), stays)[0] for a, b in pairwise(cuts)]
+        error = steps[part].std() * np.sqrt(2 * QUARTERS / length) / moved
+        if max(abs(one - whole) for one in each) > SAME_WAVE * abs(whole) + BY_CHANCE * error:
+            return nothing, 0.0
     return (hum, 2 * np.pi / frequency) if hum.var() < SLIGHT_HUM * values.var() else (nothing, 0.0)
 
 

@@ -497,7 +497,6 @@ def _with_all_digits(rows: _Rows, numbers: np.ndarray, remarks: list[Remark]) ->
             continue
         (slope, begin), unit = np.polyfit(number, t, 1), float(np.diff(np.unique(t)).min())
         if slope < unit and np.abs(t - begin - slope * number).max() <= ROUNDED_TIME * unit:
-            # A step has fewer digits than its mean over all of a recording.
             numbers[0][own] = t[0] + float(f"{slope:.6g}") * number
             units.append(unit)
     if units:
