@@ -463,8 +463,7 @@ def _hum_of(recordings: Recordings, values: np.ndarray) -> tuple[np.ndarray, flo
     nothing, last = np.zeros(len(values)), bounds[1:] - 1
     if not parts:
         return nothing, 0.0
-    width = np.pi / max(float(np.ptp(recordings.t[part])) for part in parts)
-    seconds = _seconds_of(recordings)
+    width, seconds = np.pi / max(float(np.ptp(recordings.t[part])) for part in parts), _seconds_of(recordings)
 
     def moves(series: np.ndarray, *, back: bool) -> tuple[np.ndarray, np.ndarray]:
         """Steps from each value, less their mean where that is taken off, and the share that stays."""
