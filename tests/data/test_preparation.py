@@ -220,7 +220,7 @@ def test_a_slight_hum_is_taken_off_where_it_is_of_the_mains() -> None:
 
 @pytest.mark.parametrize(("hum", "force"), [(0.0, 0.0), (0.08, 0.0), (0.3, 0.0), (0.0, 120.0), (0.0, 480.0)])
 def test_hops_hide_no_hum_of_the_mains_and_a_force_is_none(hum: float, force: float) -> None:
-    """Steps of hops are twenty times those of a hum; less the mean step from each state they are not."""
+    """They have more power at its frequency, until the mean step from each state is taken off."""
     draw, step, x = np.random.default_rng(4), 2e-5, np.ones(100_000)
     t = step * np.arange(len(x))
     moved = step * force * np.cos(2 * np.pi * 50 * t) + np.sqrt(276 * step) * draw.normal(size=len(x))

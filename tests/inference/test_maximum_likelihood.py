@@ -326,8 +326,8 @@ def growths(noise: float) -> Measurements:
 
 
 @pytest.mark.parametrize("expected", [False, True])
-def test_steps_bend_with_a_valley_in_which_a_capacity_becomes_infinite(*, expected: bool) -> None:
-    # r, K and c do nearly the same: a straight step that is long enough to matter leaves the valley.
+def test_a_capacity_that_does_not_matter_becomes_infinite(*, expected: bool) -> None:
+    # r, K and c do nearly the same: a step that is straight in K, and long enough to matter, leads elsewhere.
     model, data = model_of(TUMOUR), growths(6.0)
     if expected:
         model = with_expectations(model.with_values(np.array([0.2, 800.0, 0.0])))
@@ -344,7 +344,7 @@ def test_steps_bend_with_a_valley_in_which_a_capacity_becomes_infinite(*, expect
 def test_a_capacity_and_a_loss_are_expected_alike() -> None:
     x, b, capacity = sympy.symbols("x b K", real=True)
     t = np.arange(0, 2, 0.25)
-    exact = np.exp(t) / (1 + np.expm1(t))  # of x' = x - x²
+    exact = np.exp(t) / (1 + np.exp(t))  # of x' = x - x²
     outputs = (exact + 0.1 * np.random.default_rng(2).normal(size=len(t)))[:, None]
     data = Measurements(labels=("a",), first=np.array([0, 8]), t=t, outputs=outputs, courses=((),))
     fits = []
