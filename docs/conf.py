@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 from docutils import nodes
+from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.config import Config
 from sphinx.domains.python import PyXRefRole
@@ -135,6 +136,13 @@ def what_is_not_offline(app: Sphinx, failure: Exception | None) -> None:
                 log.warning("%s asks another machine: %s", file.relative_to(app.outdir), found)
 
 
+def classes_without_members(app: Sphinx, domain: str, kind: str, content: nodes.Element) -> None:
+    """Keep the members of classes out of the contents: with them, each page costs twice the time."""
+    if kind in ("attribute", "method", "property"):
+        for signature in content.parent.findall(addnodes.desc_signature):
+            signature["_toc_name"] = ""
+
+
 class PublicNames(SphinxDirective):
     """A table of the names that `siq` itself offers, with the first sentence of each."""
 
@@ -162,4 +170,5 @@ def setup(app: Sphinx) -> None:
     app.add_directive("public-names", PublicNames)
     app.connect("config-inited", write_reference)
     app.connect("autodoc-process-docstring", equations, priority=400)  # before the sections are read
+    app.connect("object-description-transform", classes_without_members)
     app.connect("build-finished", what_is_not_offline)
