@@ -483,6 +483,33 @@ HOMES: Mapping[str, Home] = {
         lambda rng: rng.uniform(0.0, 4.0, size=1),
         lambda rng, t: np.abs(inflow(rng, t)),
     ),
+    "inducible gene with a rate": Home(
+        {
+            "time_unit": "h",
+            "states": states(s="nM"),
+            "inputs": {"u": {"unit": "1", "interpolation": "zero_order"}},
+            "parameters": {"b": {"value": 2.0, "unit": "nM/h"}, "d": {"value": 0.5, "unit": "1/h"}},
+            "equations": {"s": "b*u - d*s"},
+        },
+        0.3,
+        lambda rng: rng.uniform(0.0, 4.0, size=1),
+        lambda rng, t: np.abs(inflow(rng, t)),
+    ),
+    "gene and protein": Home(
+        {
+            "time_unit": "min",
+            "states": {"s": {"unit": "1", "domain": [0, 100]}, "r": {"unit": "1", "domain": [0, 100]}},
+            "inputs": {"u": {"unit": "1", "interpolation": "zero_order"}},
+            "parameters": {
+                name: {"value": value, "unit": "1/min"}
+                for name, value in {"b": 8.0, "d": 0.5, "k": 2.0, "g": 0.3}.items()
+            },
+            "equations": {"s": "b*u - d*s", "r": "k*s - g*r"},
+        },
+        0.4,
+        lambda rng: rng.uniform(0.0, 10.0, size=2),
+        lambda rng, t: np.abs(inflow(rng, t)),
+    ),
     "two substances": Home(
         {
             "time_unit": "min",
@@ -679,6 +706,7 @@ RESIDENTS: Sequence[Resident] = (
     Resident("backlash", "mass", {"a": 0.4}, "(u)"),
     Resident("backlash", "two masses", {"c": 1.5, "d": 1.5, "a": 0.4}),
     Resident("backlash", "mass", {"a": 0.1}, "of what is measured"),
+    Resident("backlash", "mass", {"a": 0.6, "tau": 0.15}, "in what u moves"),
     Resident("gravity", "arm", {"c": 3.0}),
     Resident("gravity", "arm", {"d": 2.0}),
     Resident("gravity", "arm", {"c": 2.0, "d": 1.5}),
@@ -702,6 +730,7 @@ RESIDENTS: Sequence[Resident] = (
     Resident("dry friction", "rotating frame", {"c": 0.03}),
     Resident("Coulomb and viscous friction", "mass without damping", {"c": 0.2, "d": 0.3}),
     Resident("rolling resistance and drag", "mass", {"c": 0.2, "d": 0.3}),
+    Resident("linear and quadratic drag", "mass without damping", {"c": 0.1, "d": 0.2}),
     Resident("asymmetric friction", "mass", {"c": 0.5, "d": 0.15}),
     Resident("asymmetric damping", "mass", {"c": 0.5}),
     Resident("asymmetric damping", "mass without damping", {"c": 0.5, "d": 0.15}),
@@ -726,7 +755,9 @@ RESIDENTS: Sequence[Resident] = (
     Resident("inhibition", "fermenter", {"w": 4.0}, "of m by q in"),
     Resident("inhibition", "fermenter", {"c": 0.05}, "in proportion"),
     Resident("inhibition", "chemostat", {"w": 5.0}, "of m by s in"),
-    Resident("inhibition", "enzyme", {"w": 3.0}, "by p"),
+    Resident("inhibition", "gene and protein", {"w": 8.0, "n": 1.0}, "of b by r"),
+    Resident("inhibition", "inducible gene with a rate", {"w": 1.5, "n": 3.0}, "by s itself"),
+    Resident("inhibition", "enzyme", {"w": 3.0}, "by p, competitive"),
     Resident("prey refuge", "prey and predator", {"m": 0.8}),
     Resident("sigmoid functional response", "prey with limits and predator", {"w": 1.5}, "with satiation"),
     Resident("sigmoid functional response", "prey and predator", {"w": 0.8}, "without satiation"),
@@ -795,6 +826,7 @@ RESIDENTS: Sequence[Resident] = (
     Resident("linear coupling", "basins", {"c": 0.3, "d": 0.3}),
     Resident("reverse reaction or backflow", "two bodies", {"c": 0.3}),
     Resident("adaptation", "heat", {"c": 0.5, "tau": 3.0}, "in s"),
+    Resident("adaptation", "heat", {"b": 0.5, "c": 0.5, "tau": 3.0}, "level in s"),
     Resident("waning immunity", "epidemic", {"c": 0.05, "N": 1.0}),
     Resident("recruitment", "epidemic", {"c": 0.05, "N": 1.0}),
     Resident("waning immunity", "epidemic with those who recovered", {"c": 0.05}),
@@ -804,6 +836,7 @@ RESIDENTS: Sequence[Resident] = (
     Resident("Allee effect", "crop", {"a": 1.5}, "threshold"),
     Resident("saturation", "laser", {"h": 0.5}, "of the gain"),
     Resident("Gompertz growth", "crop of known growth", {"c": 0.5}),
+    Resident("Richards growth", "crop of known growth", {"w": 4.0, "n": 3.0}),
     Resident("second-order reaction", "two substances", {"c": 0.3}, "in s"),
     Resident("second-order reaction", "two substances", {"c": 0.2}, "in s, r"),
     Resident("saturation", "inducible gene", {"w": 1.0}, "threshold"),

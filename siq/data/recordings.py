@@ -402,13 +402,10 @@ class SnapshotPairs:
         """The mean of ``|Xh - X0|²/h`` of each state, shape ``(d,)``."""
         return np.asarray(((self.xh - self.x0) ** 2 / self.h[:, None]).mean(axis=0))
 
-    def state_parts(self, parts: int) -> np.ndarray:
-        """Whether pairs begin in each of so many equal parts by a state but its first: ``(n, columns)``."""
-        return np.concatenate([_in_parts(state, parts) for state in self.x0.T], axis=1)
-
-    def step_parts(self, parts: int) -> np.ndarray:
-        """Whether steps are in each of so many equal parts by length but the first: ``(n, columns)``."""
-        return _in_parts(np.round(self.h / np.median(self.h), 2), parts)
+    def equal_parts(self, parts: int, *, of_steps: bool = False) -> np.ndarray:
+        """Whether pairs are in each of so many parts by states, or steps, but the first: ``(n, columns)``."""
+        sorted_by = [np.round(self.h / np.median(self.h), 2)] if of_steps else self.x0.T
+        return np.concatenate([_in_parts(each, parts) for each in sorted_by], axis=1)
 
     def take(self, rows: np.ndarray | slice) -> SnapshotPairs:
         """Some of the pairs, by their indices or by a mask."""

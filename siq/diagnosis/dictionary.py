@@ -62,18 +62,14 @@ class Shape(_Part):
     top_of: str | None = None
     #: The same below
     bottom_of: str | None = None
-    #: Multiples of the time between samples are tried
+    #: Multiples of the time between samples are tried; a single one is not fitted
     samples: bool = False
     #: So many angular frequencies that the recordings can resolve are tried
     frequencies: Annotated[int, Field(ge=2, le=2000)] | None = None
 
     @model_validator(mode="after")
     def _one(self) -> Shape:
-        given = (
-            self.scale_of, self.inverse_scale_of, self.quantiles_of, self.time_of, self.lattice_of,
-            self.top_of, self.bottom_of, self.frequencies,
-        )  # fmt: skip
-        if sum(each is not None for each in given) + self.samples != 1:
+        if sum(value not in (None, False) for name, value in self if name != "at") != 1:
             raise Fault("a shape is looked for in one way", "give one of scale_of, quantiles_of, ...")
         return self
 
@@ -153,9 +149,8 @@ class Form(_Part):
         ]  # fmt: skip
         if not changed:
             raise Fault("a form changes nothing", "give terms, replace, within, outputs or noise")
-        for name in changed:
-            if name not in self.roles:
-                raise Fault(f"'{name}' has no role", f"add 'roles: {{{name}: state}}' or another role")
+        for name in (each for each in changed if each not in self.roles):
+            raise Fault(f"'{name}' has no role", f"add 'roles: {{{name}: state}}' or another role")
         told = {role for _, role, *_ in string.Formatter().parse(self.variant) if role is not None}
         for name in sorted(told.difference(self.roles)):
             raise Fault(f"the variant names '{name}', which has no role", f"add 'roles: {{{name}: state}}'")
@@ -282,8 +277,8 @@ class Roles:
     #: second.
     levels: tuple[str, ...] = ()
     cascades: tuple[tuple[str, str], ...] = ()
-    #: All others that have a unit: a charge, a temperature, a concentration. Of a mere number nothing is
-    #: known that a mechanism could be written for.
+    #: All others that have a unit, or a domain from 0 on: a charge, a temperature, a concentration, a count.
+    #: Of other mere numbers nothing is known that a mechanism could be written for.
     stores: tuple[str, ...] = ()
     #: All that are not mere derivatives; only in their equations can physics be missing.
     states: tuple[str, ...] = ()
@@ -300,6 +295,7 @@ def roles_of(model: Dynamics) -> Roles:
     amplitudes = tuple(pair for pair in itertools.combinations(others, 2) if _turns(model, *pair))
     in_pairs = {name for pair in amplitudes for name in pair}
     units = dict(zip(model.states, model.units, strict=True))
+    known = {x for x, ends in zip(model.states, model.limits, strict=True) if units[x] != "1" or not ends[0]}
     speeds = tuple(name for name in others if name not in in_pairs and SPEED.fullmatch(units[name]))
     alone = [name for name in others if name not in in_pairs and name not in speeds]
     levels = tuple(name for name in alone if _has_root(equations[name], name))
@@ -330,7 +326,7 @@ def roles_of(model: Dynamics) -> Roles:
             for upper, lower in itertools.permutations(levels, 2)
             if _has_root(equations[lower], upper)
         ),
-        stores=tuple(name for name in alone if name not in (*levels, *populations) and units[name] != "1"),
+        stores=tuple(name for name in alone if name in known and name not in (*levels, *populations)),
         states=dynamic,
     )
 

@@ -142,7 +142,8 @@ def probability_by_chance(
         return _correlated_probability(fit, data, candidate, gained=gained)
     white, change, left = residuals(fit, data)
     names = [fit.model.parameters[place].name for place in fit.model.free]
-    tested = np.array([names.index(name) for name in (candidate.amplitudes or candidate.shapes)], dtype=int)
+    asked = candidate.amplitudes or candidate.shapes
+    tested = np.array([names.index(name) for name in asked if name in names], dtype=int)
     values = fit.model.values[[fit.model.free[place] for place in tested]] + change[tested]
     owner = _blocks_of(white.recording, left, least=blocks) if few else white.recording
     nuisance = orthonormal(np.delete(white.columns, tested, axis=1))

@@ -499,6 +499,13 @@ class _Leader:
         """Logarithm of its probability, up to a constant."""
         return self.gain + self.site.prior
 
+    def on_top(self, base: Dynamics, other: _Leader) -> _Site:
+        """Its site on top of another mechanism of the same base, whose parameters may have the same names."""
+        candidate, probe = self.candidate.rebased(base, other.candidate.model), self.site.terms[0]
+        assert isinstance(probe, Probe)
+        shapes = zip(candidate.shapes, (value for _, value in probe.shapes), strict=True)
+        return replace(self.site, terms=(Probe(candidate, tuple(shapes)),), candidate=candidate)
+
 
 def _fitted_at(
     horizons: Sequence[Horizon], site: _Site, budget: Budget, untried: dict[str, NotFitted]
@@ -612,7 +619,7 @@ def _next_rung(
             if (
                 len(each.candidate.new) < len(ground.candidate.new)
                 and each.gain >= NEARLY_ALL * ground.gain
-                and _containing(each.horizons[0], [ground.site], each.candidate)[0]
+                and _containing(each.horizons[0], [ground.on_top(base.model, each)], each.candidate)[0]
                 and not _takes_most(errors(each), errors(ground), ground.horizons[0].fit, context.data)
             ):
                 leader, ground = each if leader is ground else leader, each
@@ -692,6 +699,8 @@ def _next_rung(
     alike = {label for label, weight in members.items() if weight > leader.weight + np.log(PLAUSIBLE)}
     for label in alike.intersection(alone) - fitted.keys():
         attempt(alone[label])
+    # What is likelier, and hardly better with more parameters, explains the recordings as well.
+    alike |= {label for label in outdone & fitted.keys() if fitted[label].weight > leader.weight}
     known = {
         label: FittedCandidate.of(
             each.horizons[0].fit, base, horizons[0].data, each.candidate, blocks=options.blocks
@@ -751,7 +760,7 @@ def _needed(
     return _takes_most(before, after, without, context.data, surely=False)
 
 
-def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], tuple[NotFitted, ...]]:
+def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], list[NotFitted], list[_Rung]]:
     """Mechanisms one on top of the other, as long as the next is likelier than what has no name.
 
     A mechanism may take over a part of an error of the model, above all on top of others, and most causes
@@ -760,8 +769,8 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], tu
     before it is the last. One that those after it make needless stood for them: the climb is made again
     without it, and counts unless it has more names or foresees worse.
 
-    Returned are also the fits of the simulation alone, empty where it cannot be fitted, and what could not be
-    judged.
+    Returned are also the fits of the simulation alone, empty where it cannot be fitted, what could not be
+    judged, and what was taken back.
     """
     model, found, untried = context.model, list[_Rung](), dict[str, NotFitted]()
     alone, budget = list[Horizon](), context.budget
@@ -787,24 +796,25 @@ def climb(fit: Fit, context: FitContext) -> tuple[list[Horizon], list[_Rung], tu
     except (*NUMERICAL_ERRORS, BudgetSpent) as error:
         LOGGER.info("forecasts end: %s", error)
 
-    best = [each.accepted.best for each in found]
+    best, back = [each.accepted.best for each in found], list[_Rung]()
     fits = [*(each.fit for each in alone[:1]), *(each.fit for each in best)]
     own = [each.candidate for each in best]
     errors = cache(lambda count: _left_out(fits[count], own[:count], alone[0].fit.noise, context))
     while (last := len(found)) and not _takes_most(
         errors(last - 1), errors(last), fits[last], context.data, surely=False
     ):
-        LOGGER.info("%s makes no free run better", found.pop().accepted.best.candidate.label)
+        back.append(found.pop())
+        LOGGER.info("%s makes no free run better", own[last - 1].label)
     own, last = own[: len(found)], len(found)
     # So may a general form whose special case is enough beside what came after it.
     needless = {e.label for e in own[:-1] if e.generalises or not _needed(e, fits[last], own, context)}
     fewer = tuple(each for each in context.candidates if each.label not in needless)
     if needless and (before := errors(last)) is not None:
-        _, again, more = climb(fit, replace(context, candidates=fewer))
+        _, again, more, _ = climb(fit, replace(context, candidates=fewer))
         best = [each.accepted.best for each in again]
         added = [each.candidate for each in best]
         after = _left_out(best[-1].fit, added, alone[0].fit.noise, context) if best else None
         LOGGER.info("climbed once more, without what became needless: %s", [each.label for each in added])
         if after is not None and len(again) <= last and not typically_better(after, before):
-            return alone, again, more
-    return alone, found, tuple(untried.values())
+            return alone, again, more, back
+    return alone, found, list(untried.values()), back

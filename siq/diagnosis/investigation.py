@@ -88,7 +88,8 @@ def investigate(case: Comparison, *, budget: Budget | None = None) -> Investigat
         explained_by_quantisation(data, least_squares, roles, budget=budget) is None
     ):
         with budget.keeping(BUDGET_FOR_FUNCTIONS):
-            named, recalibrations = named_by_forecasts(recalibrated, least_squares, context)
+            named, recalibrations, leads = named_by_forecasts(recalibrated, least_squares, context)
+            context = replace(context, leads=tuple(leads))
     if named is None:
         result = _by_tests(recalibrated, least_squares, context, dictionary)
         result = replace(result, recalibrations=recalibrations)

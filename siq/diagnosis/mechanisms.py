@@ -344,9 +344,10 @@ def _build_candidate(
     known = units_of(model) | {entry.name: entry.unit for entry in model.parameters}
     units = {role: known.get(name, "1") for role, name in assignment.items()} | {"T": model.time_unit}
     shapes = {name: entry.shape for name, entry in form.parameters.items() if entry.shape is not None}
+    held = {name for name, each in shapes.items() if each.lattice_of or (each.samples and len(each.at) == 1)}
     values = {symbol(each.name): each.value for each in model.parameters}  # as they are to begin with
     parameters = tuple(
-        Parameter(fresh[name], 0.0, unit_of(entry.unit, units), bool(entry.shape and entry.shape.lattice_of))
+        Parameter(fresh[name], 0.0, unit_of(entry.unit, units), name in held)
         for name, entry in form.parameters.items()
     )
     further = tuple((fresh[name], parse(entry.equation)) for name, entry in form.states.items())

@@ -25,6 +25,7 @@ import scipy.special
 from siq.data.correlation import correlation_time_of
 from siq.diagnosis.evidence import (
     NUMERICAL_ERRORS,
+    FittedCandidate,
     averaged_evidence,
     evidence_of_function,
     log_evidences,
@@ -266,15 +267,15 @@ def _one_cause_or_two(decision: Investigation, context: FitContext) -> Investiga
 
 def named_by_forecasts(
     recalibrated: Fit, least_squares: Fit, context: FitContext
-) -> tuple[Investigation | None, tuple[Horizon, ...]]:
+) -> tuple[Investigation | None, tuple[Horizon, ...], list[FittedCandidate]]:
     """What is missing by what foresees recordings best, where the recalibrated fit needs forces at random.
 
-    Returned are what is named, None where nothing is, and the fits of the simulation alone at each horizon.
+    Returned are what is named, or None; fits of the simulation alone at each horizon; what was taken back.
     """
-    alone, rungs, untried = climb(recalibrated, context)
-    recalibrations = tuple(alone)
+    alone, rungs, untried, taken_back = climb(recalibrated, context)
+    recalibrations, leads = tuple(alone), [each.accepted.best for each in taken_back]
     if not rungs:
-        return None, recalibrations
+        return None, recalibrations, leads
     fit = rungs[-1].accepted.best.fit
     try:
         with context.budget.exempt():  # without forces, where they are not needed any more
@@ -284,7 +285,7 @@ def named_by_forecasts(
     except NUMERICAL_ERRORS as error:
         LOGGER.info("the fit at the shortest horizon stays: %s", error)
     left = Remainder.of(context.data, alone[0].fit, fit, context.roles)
-    search = Search(recalibrated, tuple(each.accepted for each in rungs), fit, (), untried=untried)
+    search = Search(recalibrated, tuple(each.accepted for each in rungs), fit, (), untried=tuple(untried))
     remarks = [
         Remark(
             "diagnosis.by_prior",
@@ -302,7 +303,7 @@ def named_by_forecasts(
         log_odds=tuple(each.log_odds for each in rungs), remarks=tuple(remarks),
         recalibrations=recalibrations, finals=rungs[-1].horizons,
     )  # fmt: skip
-    return _with_models(decision, search, context), recalibrations
+    return _with_models(decision, search, context), recalibrations, leads
 
 
 def _log_odds(search: Search, number: int, chosen: Sequence[int], context: FitContext) -> float:

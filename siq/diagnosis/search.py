@@ -54,6 +54,8 @@ class FitContext:
     study: MismatchStudy = field(default_factory=MismatchStudy)  #: what counts as found
     #: Charged for the work; what it does not reach is left undone.
     budget: Budget = field(default_factory=Budget)
+    #: Mechanisms fitted to something else than whole trajectories, from where those may be fitted, too.
+    leads: tuple[FittedCandidate, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -160,15 +162,15 @@ def _fit_most_promising(
     failed: dict[str, NotFitted] = {}
     begun: list[Ranked[Probe]] = []
 
-    def attempt(promised: Ranked[Probe], begin: Fit) -> None:
+    def attempt(promised: Ranked[Probe], begin: Fit, reached: Mapping[str, float] | None = None) -> None:
         """Fit and judge a candidate; one that leads away, or has a sign that it cannot have, has failed."""
         candidate = promised.term.candidate
         try:
             x = promised.term.states_along(current, data, begin.x[:, : current.model.dimension])
-            start = dict(promised.term.shapes)
+            start = dict(reached or promised.term.shapes)
             # Linearised amplitudes can be far off, and a fit that begins there may diverge: they are a start
             # only where shapes need one.
-            if candidate.amplitudes and candidate.shapes and promised.amplitudes.any():
+            if not reached and candidate.amplitudes and candidate.shapes and promised.amplitudes.any():
                 start |= dict(zip(candidate.amplitudes, map(float, promised.amplitudes), strict=True))
             model = candidate.begun(begin.model, start)
             fit = fit_with_process_noise_as_needed(
@@ -230,6 +232,11 @@ def _fit_most_promising(
                     shapes = tuple(zip(candidate.shapes, values, strict=True))
                     promised = replace(promised, term=Probe(candidate, shapes))
             attempt(promised, better.fit)
+    # From where forecasts led them: steps from the simulation alone may never come there.
+    probes = {(each.term.candidate.label, *each.term.candidate.model.arguments): each for each in screened}
+    for lead in context.leads:
+        if (probe := probes.get((lead.candidate.label, *lead.candidate.model.arguments))) is not None:
+            attempt(probe, lead.fit, {each.name: each.value for each in lead.fit.model.parameters})
     most_gained = max((each.delta_chi2 for each in trials.values()), default=0.0)
     for label, trial in trials.items():
         near = trial.delta_chi2 >= SHARPENED_GAIN * most_gained

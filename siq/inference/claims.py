@@ -99,7 +99,7 @@ class _Residuals:
         self.pairs, n = pairs, len(pairs.h)
         functions = np.unique(found.support[:, 1])
         columns = [
-            found.library.evaluate(pairs.x0)[:, functions], np.ones((n, 1)), pairs.state_parts(STATE_BINS),
+            found.library.evaluate(pairs.x0)[:, functions], np.ones((n, 1)), pairs.equal_parts(STATE_BINS),
         ]  # fmt: skip
         together = np.concatenate(columns, axis=1) * np.sqrt(pairs.h / pairs.h.mean())[:, None]
         self.basis = _orthonormal(together)
@@ -111,7 +111,7 @@ class _Residuals:
         self.noise = _orthonormal(self.noise) * np.sqrt(n)
         self.near = _orthonormal(self._standardised(self.past(self.noise, 0.0, delay=1)))
         # Long steps forget a part of their noise, and of short ones a filter knows less than all.
-        steps, power = _orthonormal(pairs.step_parts(STATE_BINS) * 1.0), self.noise**2 - 1
+        steps, power = _orthonormal(pairs.equal_parts(STATE_BINS, of_steps=True) * 1.0), self.noise**2 - 1
         self.power = self._standardised(power - steps @ (steps.T @ power))
 
     def _standardised(self, values: np.ndarray) -> np.ndarray:

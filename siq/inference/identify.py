@@ -696,11 +696,11 @@ class _Case:
         rest = np.einsum("nij,nj->ni", found.diffusion.whitening_at(found.on_the_way(pairs)), rest)
         weight, terms = np.sqrt(pairs.h)[:, None], np.unique(found.support[:, 1])
         known = np.column_stack([np.ones(len(rest)), found.library.evaluate(pairs.x0)[:, terms]])
-        asked = [(known * weight, pairs.state_parts(STATE_BINS) * weight, rest)]
+        asked = [(known * weight, pairs.equal_parts(STATE_BINS) * weight, rest)]
         if coarse:
             shapes = compile_formulas(() if found.noise is None else found.noise.terms, found.library.symbols)
             strength = np.column_stack([np.ones(len(rest)), *shapes(pairs.x0.T)])
-            asked.append((strength, pairs.state_parts(STATE_BINS) * 1.0, rest**2 / (rest**2).mean() - 1))
+            asked.append((strength, pairs.equal_parts(STATE_BINS) * 1.0, rest**2 / (rest**2).mean() - 1))
         chances = []
         for known, columns, values in asked:
             known = np.linalg.qr(known / positive(np.linalg.norm(known, axis=0)))[0]

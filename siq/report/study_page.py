@@ -286,7 +286,7 @@ def answer_data(page: ReportContent, study: Study, results: StudyResults) -> dic
     else:
         rrmse = results.tables["rrmse"]
         certified = int(rrmse[rrmse["method"] == Method.REFINED]["certified"].sum())
-        formulas = len(results.models.with_any_formula(Method.REFINED))
+        formulas = len(results.models.with_formula(Method.REFINED, "V", "wells"))
         failed = int(outcomes[outcomes["status"] == Status.FAILED]["run"].nunique())
     how = "none" if certified == 0 else "all" if certified >= study.runs else "some"
     return {

@@ -387,9 +387,6 @@ class _Cycles(_Equilibria):
         return np.array(kept)[:, : self.d].transpose(0, 2, 1)
 
 
-# Newton's method, and curves of one equation fewer than unknowns.
-
-
 def _solved(
     residual: Callable[[np.ndarray], np.ndarray], slope: Callable[[np.ndarray], np.ndarray], start: np.ndarray
 ) -> np.ndarray | None:
@@ -467,9 +464,6 @@ def _one_way(
             return [*points[:-1], start], True, {}
         length = min(1.5 * length, equations.longest)
     return points, False, {"most": MAX_POINTS}
-
-
-# Branches of equilibria, and what happens along them; curves of folds and of Hopf points.
 
 
 @dataclass(frozen=True, eq=False)

@@ -153,14 +153,10 @@ class ModelFiles:
     def _methods(self) -> list[dict[str, Any]]:
         return [json.loads(Path(path).read_text(encoding="utf-8"))["methods"] for path in self.paths]
 
-    def with_formula(self, method: Method) -> list[int]:
-        """The runs with one formula of V for the whole region."""
-        return [run for run, one in enumerate(self._methods) if one.get(method, {}).get("V")]
-
-    def with_any_formula(self, method: Method) -> list[int]:
-        """The runs with a formula of V, be it of the whole region or of single wells."""
+    def with_formula(self, method: Method, *scopes: str) -> list[int]:
+        """The runs with one formula of V for the whole region, or in some of ``V`` and ``wells``."""
         have = [one.get(method, {}) for one in self._methods]
-        return [run for run, one in enumerate(have) if one.get("V") or one.get("wells")]
+        return [run for run, one in enumerate(have) if any(one.get(scope) for scope in scopes or ("V",))]
 
     def representative(self, rrmse: pd.DataFrame) -> Shown:
         """The formula that is shown: refined where any run has one, otherwise as published.

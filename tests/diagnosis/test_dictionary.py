@@ -93,8 +93,11 @@ def test_who_feeds_on_whom_follows_from_the_meetings() -> None:
 
 def test_a_store_has_a_unit() -> None:
     assert roles_of(HOMES["heat"].model).stores == ("s", "r")
-    bare = model_of({"states": states(s="1", r="1"), "equations": {"s": "1 - s", "r": "0.2*(s - r) + 1"}})
-    assert roles_of(bare).stores == ()
+    equations = {"s": "1 - s", "r": "0.2*(s - r) + 1"}
+    assert roles_of(model_of({"states": states(s="1", r="1"), "equations": equations})).stores == ()
+    # A number that begins at 0 is one of molecules, or of calls that wait.
+    counted = {"s": {"unit": "1", "domain": [0, 20]}, "r": {"unit": "1", "domain": [-5, 5]}}
+    assert roles_of(model_of({"states": counted, "equations": equations})).stores == ("s",)
 
 
 @pytest.mark.parametrize(
@@ -288,7 +291,7 @@ SCREENED = (
     "photoinhibition", "Gompertz growth", "second-order reaction", "asymmetric damping", "wind or current",
     "flow over a weir", "limiting resource", "Joule heating", "dependence on an input",
     "washout", "unbalance", "lever arm", "ground effect", "pull across a gap", "overpotential",
-    "sigmoid feedback", "competition", "mutualism",
+    "sigmoid feedback", "competition", "mutualism", "linear and quadratic drag", "Richards growth",
 )  # fmt: skip
 
 
@@ -373,7 +376,7 @@ def test_a_cell_under_a_current_polarises_as_a_resistor_with_a_capacitor_does() 
 
 def test_what_an_enzyme_made_stays_with_it() -> None:
     # Cornish-Bowden (2012): v = V s / (K (1 + p / w) + s).
-    rate = the("inhibition", "enzyme", "by p").model.equations[-1]
+    rate = the("inhibition", "enzyme", "by p, competitive").model.equations[-1]
     at = {"V": 3.0, "K": 2.0, "s": 4.0, "p": 6.0, "w_1": 3.0}
     assert float(rate.subs({each: at[each.name] for each in rate.free_symbols})) == pytest.approx(
         3 * 4 / (2 * 3 + 4)
@@ -405,6 +408,45 @@ def test_what_coasts_has_a_resistance_that_is_constant_and_one_that_grows_with_t
         next(each for each in change.free_symbols if each.name == name) for name in ("c_1", "d_1", "v")
     )
     assert change.subs({c: 2, d: 3, v: 4}) == -(2 + 3 * 16) == -change.subs({c: 2, d: 3, v: -4})
+
+
+def test_a_pendulum_meets_a_drag_with_its_speed_and_one_with_the_square() -> None:
+    # Nelson and Olsson (1986): F = -(a |v| + b v²) sign(v).
+    change = dict(the("linear and quadratic drag", "mass without damping").changes)["v"]
+    for v in (4.0, -4.0):
+        at = {"c_1": 0.1, "c_2": 0.1, "d_1": 3.0, "v": v}
+        found = change.subs({each: at[each.name] for each in change.free_symbols})
+        assert float(found) == pytest.approx(-(0.1 * 4.0 + 3.0 * 16.0) * np.sign(v))
+
+
+def test_growth_ends_at_a_capacity_with_a_power() -> None:
+    # Richards (1959), as Gilpin and Ayala (1973) write it: r N (1 - (N / K)^θ).
+    rate = the("Richards growth", "crop").model.equations[0]
+    at = {"r": 0.5, "c": 0.0, "n": 3.0, "w_1": 5.0, "n_1": 2.5}
+    found = float(rate.subs({each: at[each.name] for each in rate.free_symbols}))
+    assert found == pytest.approx(0.5 * 3.0 * (1 - (3.0 / 5.0) ** 2.5))
+
+
+def test_a_protein_represses_its_gene() -> None:
+    # Becskei and Serrano (2000): a / (1 + k R), with a power as Hill (1910) has it.
+    rate = the("inhibition", "gene and protein", "of b by r").model.equations[0]
+    at = {"b": 8.0, "u": 0.5, "d": 0.0, "s": 1.0, "r": 6.0, "w_1": 2.0}
+    for power, left in ((1.0, 4.0), (2.0, 10.0)):
+        known = {**at, "n_1": power}
+        found = float(rate.subs({each: known[each.name] for each in rate.free_symbols}))
+        assert found == pytest.approx(8.0 * 0.5 / left)
+
+
+def test_what_a_gear_with_play_moves_follows_where_the_play_ends() -> None:
+    # Nordin and Gutman (2002): within the gap 2a what is moved rests; beyond, it is u - a or u + a.
+    model = the("backlash", "mass", "in what u moves").model
+    acceleration, follows = model.equations[-2:]
+    at = {"k": 0.0, "d": 0.0, "m": 1.0, "x": 0.0, "v": 0.0, "a_1": 0.5, "tau_1": 0.1, "z_1": 1.0}
+    for u, moved in ((2.0, 1.5), (1.3, 1.0), (0.7, 1.0), (-1.0, -0.5)):
+        known = {**at, "u": u}
+        for formula, expected in ((acceleration, moved), (follows, (moved - 1.0) / 0.1)):
+            found = formula.subs({each: known[each.name] for each in formula.free_symbols})
+            assert float(found) == pytest.approx(expected)
 
 
 def test_a_shock_absorber_resists_one_way_more_than_the_other() -> None:

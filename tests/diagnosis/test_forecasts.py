@@ -245,7 +245,7 @@ def test_the_density_does_not_depend_on_units_of_columns() -> None:
 def test_damping_is_named_beside_forces_that_last() -> None:
     model, data = pendulum(), recorded(0.15, 0.2)
     context = context_of(model, data)
-    alone, rungs, _ = climb(recalibrate(model, data)[0], context)
+    alone, rungs, *_ = climb(recalibrate(model, data)[0], context)
     (found,) = rungs
     best = found.accepted.best
     assert (best.candidate.name, best.candidate.family) == ("linear damping", "resistance to motion")
@@ -374,7 +374,7 @@ def test_odds_with_a_flat_prior_are_those_of_mechanisms_that_are_alike() -> None
 
 def test_forces_that_last_have_no_name_in_the_dictionary() -> None:
     model, data = pendulum(), recorded(0.0, 0.2)
-    alone, rungs, _ = climb(recalibrate(model, data)[0], context_of(model, data))
+    alone, rungs, *_ = climb(recalibrate(model, data)[0], context_of(model, data))
     assert len(alone) == 3 and rungs == []
 
 
