@@ -180,22 +180,22 @@ def by_states(recordings: Recordings) -> _Climbed | None:
 
 
 def by_ladder(recordings: Recordings) -> _Climbed | None:
-    """The answer of ``siq run``: visits as f and D foresee them from rung 4 on, else those of the states."""
+    """The answer of ``siq run``: residence times as f and D have them from rung 4 on, else the states' own.
+
+    What visits are foreseen to last (`siq.quasipotential.occupancy`) is another time: they end where the core
+    of another attractor begins, and true stays on its level.
+    """
     try:
         found = Landscape.from_recordings(recordings)
     except NoLandscape as error:
         return by_states(recordings) if error.rung else None
     if found.rung < 4:
         return by_states(recordings) if found.rung else None
+    times = found.dwell_times()
     order = np.argsort([one.position[0] for one in found.attractors])
-    visits = {one.well: one for one in found.visits}
-    stays = []
-    for well in order:
-        one = visits.get(int(well))
-        predicted, spread = (np.nan, np.inf) if one is None else (one.predicted, one.error)
-        factor = np.exp(DEVIATIONS * spread)
-        stays.append((predicted, predicted / factor, predicted * factor))
-    return _Climbed(found.rung, stays)
+    factor = np.exp(DEVIATIONS * np.hypot(times["data_error"], times["law_error"]))
+    stays = np.stack([times["mean_time"], times["mean_time"] / factor, times["mean_time"] * factor], axis=1)
+    return _Climbed(found.rung, [(float(a), float(b), float(c)) for a, b, c in stays[order]])
 
 
 def judged(laboratory: Laboratory, seed: int, climb: Callable[[Recordings], Any]) -> dict[str, Any]:

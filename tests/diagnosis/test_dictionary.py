@@ -441,6 +441,8 @@ def test_what_a_gear_with_play_moves_follows_where_the_play_ends() -> None:
     # Nordin and Gutman (2002): within the gap 2a what is moved rests; beyond, it is u - a or u + a.
     model = the("backlash", "mass", "in what u moves").model
     acceleration, follows = model.equations[-2:]
+    # A time that is fitted becomes shorter and shorter.
+    assert [each.name for each in model.parameters if each.fixed] == ["m", "tau_1"]
     at = {"k": 0.0, "d": 0.0, "m": 1.0, "x": 0.0, "v": 0.0, "a_1": 0.5, "tau_1": 0.1, "z_1": 1.0}
     for u, moved in ((2.0, 1.5), (1.3, 1.0), (0.7, 1.0), (-1.0, -0.5)):
         known = {**at, "u": u}

@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from homes_of_mechanisms import model_of, numbers, states
+from homes_of_mechanisms import HOMES, candidates, model_of, numbers, states
 
 from siq.data.recordings import Recordings
 from siq.diagnosis import forecasts, mechanisms
@@ -23,6 +23,7 @@ from siq.diagnosis.forecasts import (
     _gained,
     _gains,
     _horizons_of,
+    _Leader,
     _log_priors,
     _needed,
     _next_rung,
@@ -308,7 +309,8 @@ def test_a_last_mechanism_that_makes_no_free_run_better_is_taken_back(
     rungs = iter([damped(), damped(), None])  # the second changes nothing
     monkeypatch.setattr(forecasts, "_next_rung", lambda *_: next(rungs))
     fit, _ = recalibrate(context.model, context.data)
-    assert climb(fit, context)[1] == [damped()]
+    _, found, _, taken_back = climb(fit, context)
+    assert found == taken_back == [damped()]
     # One that makes free runs better stays, with those that it stands on.
     rungs = iter([damped(), damped(), None])
     monkeypatch.setattr(forecasts, "_takes_most", lambda *_, **__: True)
@@ -534,6 +536,52 @@ def test_what_follows_any_motion_is_no_rival_where_something_simple_does_as_much
         monkeypatch.setattr(forecasts, "_takes_most", lambda *_, most=takes_most, **__: most)
         rung = _next_rung(horizons, context.candidates, context, {})
         assert (rung is not None) == (on_top > 0 or not takes_most)
+
+
+@pytest.mark.parametrize("more", [3.0, -3.0])
+def test_what_is_likelier_and_hardly_better_explains_the_recordings_as_well(
+    more: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a protein that represses its gene, where being washed out by the input does nearly as much."""
+    context = context_of(pendulum(), recorded(0.15, 0.2), ("linear damping", "gravity", "sensor lag"))
+    fit, _ = recalibrate(context.model, context.data)
+    horizons = _horizons_of(fit, context)[:1]
+    weights = {"linear damping": 100.0, "sensor lag": 100.0 + more, "gravity": -50.0}
+
+    def fitted(horizons: list[Horizon], site: _Site, *_: object) -> tuple[list[Horizon], float]:
+        assert site.candidate is not None
+        return list(horizons), weights[site.candidate.name] - site.prior
+
+    def promised(_: object, sites: Sequence[_Site], leading: object, *__: object) -> tuple:
+        return list(sites), np.full(len(sites), 1.0 if leading is None else -50.0)
+
+    monkeypatch.setattr(forecasts, "_fitted_at", fitted)
+    monkeypatch.setattr(forecasts, "_gains", promised)
+    monkeypatch.setattr(forecasts, "_containing", lambda *_: (set(), set()))
+    monkeypatch.setattr(forecasts.FittedCandidate, "of", lambda *given, **_: given[3])
+    monkeypatch.setattr(forecasts, "_left_out", lambda *_: None)
+    monkeypatch.setattr(forecasts, "_takes_most", lambda *_, **__: False)
+    rung = _next_rung(horizons, context.candidates, context, {})
+    assert rung is not None and rung.accepted.best.name == "linear damping"
+    assert ("sensor lag" in {each.name for each in rung.accepted.others["same"]}) == (more > 0)
+
+
+def test_a_mechanism_on_top_of_another_has_parameters_of_its_own() -> None:
+    """Of one name they ended the diagnosis, where the one replaces what the other has changed."""
+    model = HOMES["inducible gene with a rate"].model
+    elimination, repression = (
+        next(each for each in candidates(model) if each.name == name and text in each.label)
+        for name, text in (("saturated elimination", ""), ("inhibition", "by s itself"))
+    )
+    probes = [Probe(each, tuple((name, 2.0) for name in each.shapes)) for each in (elimination, repression)]
+    leaders = [_Leader(_Site((each,), 0.0, 0.0, ("", ()), each.candidate), [], 0.0) for each in probes]
+    site = leaders[1].on_top(model, leaders[0])
+    assert site.candidate is not None and isinstance(probe := site.terms[0], Probe)
+    assert site.candidate.new == ("w_2", "n_1") and dict(probe.shapes) == {"w_2": 2.0, "n_1": 2.0}
+    both, first = site.candidate.model.equations[0], elimination.model.equations[0]
+    alone = repression.model.equations[0] - model.equations[0]
+    renamed = alone.subs(site.candidate.model.names["w_1"], site.candidate.model.names["w_2"])
+    assert (both - first - renamed).simplify() == 0
 
 
 @pytest.mark.parametrize(("settles", "named"), [(False, True), (True, False)])

@@ -410,3 +410,7 @@ def test_what_brings_a_state_is_fitted_from_every_shape(monkeypatch: pytest.Monk
     (trial,), _ = _fit_most_promising(context, fit, screened)
     assert len(set(begun)) == sum(each.gain > 0 for each in screened) > 1
     assert trial.fit.model.values[-1] == pytest.approx(2.0, rel=0.1)
+    # From where forecasts led it, too.
+    begun.clear()
+    _fit_most_promising(replace(context, leads=(trial,)), fit, screened[:1])
+    assert float(trial.fit.model.values[-1]) in begun
