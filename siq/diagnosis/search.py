@@ -54,7 +54,7 @@ class FitContext:
     study: MismatchStudy = field(default_factory=MismatchStudy)  #: what counts as found
     #: Charged for the work; what it does not reach is left undone.
     budget: Budget = field(default_factory=Budget)
-    #: Mechanisms fitted to something else than whole trajectories, from where those may be fitted, too.
+    #: What forecasts found and took back: fits of whole trajectories begin there, too.
     leads: tuple[FittedCandidate, ...] = ()
 
 
