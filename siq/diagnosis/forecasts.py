@@ -700,7 +700,7 @@ def _next_rung(
     for label in alike.intersection(alone) - fitted.keys():
         attempt(alone[label])
     # What is likelier, and hardly better with more parameters, explains the recordings as well.
-    alike |= {label for label in outdone & fitted.keys() if fitted[label].weight > leader.weight}
+    alike |= {label for label in (outdone & fitted.keys()) - free if fitted[label].weight > leader.weight}
     known = {
         label: FittedCandidate.of(
             each.horizons[0].fit, base, horizons[0].data, each.candidate, blocks=options.blocks
