@@ -137,7 +137,7 @@ def what_is_not_offline(app: Sphinx, failure: Exception | None) -> None:
 
 
 def classes_without_members(app: Sphinx, domain: str, kind: str, content: nodes.Element) -> None:
-    """Keep the members of classes out of the contents: with them, each page costs twice the time."""
+    """Keep the members of classes out of the contents, which every page carries whole."""
     if kind in ("attribute", "method", "property"):
         for signature in content.parent.findall(addnodes.desc_signature):
             signature["_toc_name"] = ""

@@ -403,7 +403,7 @@ class SnapshotPairs:
         return np.asarray(((self.xh - self.x0) ** 2 / self.h[:, None]).mean(axis=0))
 
     def equal_parts(self, parts: int, *, of_steps: bool = False) -> np.ndarray:
-        """Whether pairs are in each of so many parts by states, or steps, but the first: ``(n, columns)``."""
+        """Whether pairs are in each but the first of so many parts of states, or steps: ``(n, columns)``."""
         sorted_by = [np.round(self.h / np.median(self.h), 2)] if of_steps else self.x0.T
         return np.concatenate([_in_parts(each, parts) for each in sorted_by], axis=1)
 

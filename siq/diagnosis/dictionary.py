@@ -295,7 +295,7 @@ def roles_of(model: Dynamics) -> Roles:
     amplitudes = tuple(pair for pair in itertools.combinations(others, 2) if _turns(model, *pair))
     in_pairs = {name for pair in amplitudes for name in pair}
     units = dict(zip(model.states, model.units, strict=True))
-    known = {x for x, ends in zip(model.states, model.limits, strict=True) if units[x] != "1" or not ends[0]}
+    amounts = {x for x, at in zip(model.states, model.limits, strict=True) if units[x] != "1" or not at[0]}
     speeds = tuple(name for name in others if name not in in_pairs and SPEED.fullmatch(units[name]))
     alone = [name for name in others if name not in in_pairs and name not in speeds]
     levels = tuple(name for name in alone if _has_root(equations[name], name))
@@ -326,7 +326,7 @@ def roles_of(model: Dynamics) -> Roles:
             for upper, lower in itertools.permutations(levels, 2)
             if _has_root(equations[lower], upper)
         ),
-        stores=tuple(name for name in alone if name in known and name not in (*levels, *populations)),
+        stores=tuple(name for name in alone if name in amounts and name not in (*levels, *populations)),
         states=dynamic,
     )
 

@@ -141,9 +141,7 @@ def probability_by_chance(
         gained = 2 * (fit.log_likelihood - before.log_likelihood)
         return _correlated_probability(fit, data, candidate, gained=gained)
     white, change, left = residuals(fit, data)
-    names = [fit.model.parameters[place].name for place in fit.model.free]
-    asked = candidate.amplitudes or candidate.shapes
-    tested = np.array([names.index(name) for name in asked if name in names], dtype=int)
+    tested = np.array(candidate.places(fit, linear=True), dtype=int)
     values = fit.model.values[[fit.model.free[place] for place in tested]] + change[tested]
     owner = _blocks_of(white.recording, left, least=blocks) if few else white.recording
     nuisance = orthonormal(np.delete(white.columns, tested, axis=1))

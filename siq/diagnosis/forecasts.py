@@ -339,7 +339,7 @@ def _gained(
 ) -> np.ndarray:
     """What terms gain at a horizon over nothing, or over a leading mechanism in its place, ``(terms,)``."""
     fit, data = horizon.fit, horizon.data
-    fold, nothing, known = _fold_of(data), -np.inf, _places_of(leading, fit, linear=True)
+    fold, nothing, known = _fold_of(data), -np.inf, leading.places(fit, linear=True) if leading else []
     best, at = np.full(len(terms), -np.inf), 0
     for some in portions(fit, data, terms):
         work = evaluation(fit.model, data, columns=sum(each.width for each in some))
@@ -405,18 +405,11 @@ def _in_place_of(
 ) -> _Foreseen:
     """The problem of what is missing without a mechanism, along the trajectories of the fit with it."""
     own = white.columns[:, : len(fit.model.free)]
-    tested, linear = (_places_of(leading, fit, linear=each) for each in (False, True))
+    tested, linear = (leading.places(fit, linear=each) if leading else [] for each in (False, True))
     change = np.linalg.lstsq(own, white.innovations, rcond=1e-10)[0] if own.shape[1] else np.zeros(0)
     values = fit.model.values[list(fit.model.free)] + change
     target = white.innovations + own[:, linear] @ values[linear]
     return _Foreseen(white, target, np.delete(own, tested, axis=1), fold)
-
-
-def _places_of(leading: MechanismCandidate | None, fit: Fit, *, linear: bool) -> list[int]:
-    """Where the parameters of a mechanism stand among the free ones of a fit, all or the linear ones."""
-    names = [fit.model.parameters[place].name for place in fit.model.free]
-    chosen = () if leading is None else (leading.amplitudes or leading.shapes) if linear else leading.new
-    return [names.index(name) for name in chosen if name in names]
 
 
 def _containing(
@@ -432,7 +425,7 @@ def _containing(
     more, equal = set[str](), set[str]()
     counts = [np.inf if each.candidate is None else len(each.candidate.new) for each in sites]
     chosen = [(site, count) for site, count in zip(sites, counts, strict=True) if count >= size]
-    terms, without = [each.terms[0] for each, _ in chosen], _places_of(leading, fit, linear=True)
+    terms, without = [each.terms[0] for each, _ in chosen], leading.places(fit, linear=True)
     response, groups = linearised_with(fit, data, terms, without=without)
     white = whiten(response, data, fit.noise)
     problem = _in_place_of(leading, fit, white, _fold_of(data))
@@ -699,7 +692,7 @@ def _next_rung(
     alike = {label for label, weight in members.items() if weight > leader.weight + np.log(PLAUSIBLE)}
     for label in alike.intersection(alone) - fitted.keys():
         attempt(alone[label])
-    # What is likelier, and hardly better with more parameters, explains the recordings as well.
+    # What is likelier, and hardly better with more parameters, is as good, unless it follows any motion.
     alike |= {label for label in (outdone & fitted.keys()) - free if fitted[label].weight > leader.weight}
     known = {
         label: FittedCandidate.of(

@@ -248,6 +248,12 @@ class MechanismCandidate:
                 found += [(row, column, each) for column, each in enumerate(columns) if each != 0]
         return found
 
+    def places(self, fit: Fit, *, linear: bool) -> list[int]:
+        """Where its parameters stand among the free ones of a fit: all, or the linear ones if it has any."""
+        names = [fit.model.parameters[place].name for place in fit.model.free]
+        chosen = (self.amplitudes or self.shapes) if linear else self.new
+        return [names.index(name) for name in chosen if name in names]
+
     def admits(self, fit: Fit, data: Measurements) -> bool:
         """Whether a fit has signs that its parameters may have, within errors, and times that can be seen."""
         value_of, errors = {each.name: each.value for each in fit.model.parameters}, fit.error_of

@@ -154,9 +154,8 @@ class ModelFiles:
         return [json.loads(Path(path).read_text(encoding="utf-8"))["methods"] for path in self.paths]
 
     def with_formula(self, method: Method, *scopes: str) -> list[int]:
-        """The runs with one formula of V for the whole region, or in some of ``V`` and ``wells``."""
-        have = [one.get(method, {}) for one in self._methods]
-        return [run for run, one in enumerate(have) if any(one.get(scope) for scope in scopes or ("V",))]
+        """The runs with a formula in one of the scopes: ``V``, for the whole region, and ``wells``."""
+        return [run for run, one in enumerate(self._methods) if any(map(one.get(method, {}).get, scopes))]
 
     def representative(self, rrmse: pd.DataFrame) -> Shown:
         """The formula that is shown: refined where any run has one, otherwise as published.
@@ -164,7 +163,7 @@ class ModelFiles:
         Of the runs with such a formula it is the median by error where errors are known, otherwise the first.
         """
         for method in reversed(METHODS):
-            with_formula = self.with_formula(method)
+            with_formula = self.with_formula(method, "V")
             if with_formula:
                 mine = rrmse[(rrmse["method"] == method) & rrmse["run"].isin(with_formula)]
                 ranked = mine.dropna(subset="rrmse").sort_values("rrmse")

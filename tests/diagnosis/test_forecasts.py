@@ -569,7 +569,7 @@ def test_what_is_likelier_and_hardly_better_explains_the_recordings_as_well(
 
 def test_a_mechanism_on_top_of_another_has_parameters_of_its_own() -> None:
     """Of one name they ended the diagnosis, where the one replaces what the other has changed."""
-    model = HOMES["inducible gene with a rate"].model
+    model = HOMES["inducible gene"].model
     elimination, repression = (
         next(each for each in candidates(model) if each.name == name and text in each.label)
         for name, text in (("saturated elimination", ""), ("inhibition", "by s itself"))
