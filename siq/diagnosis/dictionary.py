@@ -251,7 +251,7 @@ def _unit_of(formula: str, units: tuple[tuple[str, str], ...]) -> str:
 
 FORMULA_TOLERANCE = 1e-9  # relative difference of values of formulas that are the same
 TRIAL_POINTS = 12
-SPEED = re.compile(r"([cdkmnuµμ]?m|m?rad|deg|°|rev|ft|in) ?/ ?([mnuµμ]?s|min|h)|rpm")  # units of speeds
+SPEED = re.compile(r"([cdkmnuµμ]?m|m?rad|deg|°|rev|ft|in|1) ?/ ?([mnuµμ]?s|min|h)|rpm")  # units of speeds
 ANYWHERE = (0.5, 1.5)  # where formulas of a state without a domain are compared, as those of inputs are
 
 
@@ -268,8 +268,8 @@ class Roles:
     #: the state.
     amplitudes: tuple[tuple[str, str], ...] = ()
     #: States that stay zero once they are, and that do not only decay if they have a unit; pairs of prey and
-    #: predator, whose meetings make the one fewer and the other more; and those of them in which the one
-    #: becomes the other, and is not born.
+    #: predator, whose meetings make the one fewer and the other more; and pairs in which the one becomes the
+    #: other, and is not born of its like.
     populations: tuple[str, ...] = ()
     feeding: tuple[tuple[str, str], ...] = ()
     contagion: tuple[tuple[str, str], ...] = ()
@@ -316,8 +316,9 @@ def roles_of(model: Dynamics) -> Roles:
         feeding=feeding,
         contagion=tuple(
             (one, other)
-            for one, other in feeding
-            if births(model, one) == 0
+            for one, other in itertools.product(alone, populations)
+            if not births(model, one).has(symbol(one))
+            and _feeds(model, one, other)
             and sympy.expand(sum(meetings(equations[name], one, other) for name in (one, other))) == 0
         ),
         levels=levels,

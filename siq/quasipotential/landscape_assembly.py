@@ -40,11 +40,7 @@ from siq.systems.cycles import Cycle
 from siq.systems.dynamics import Dynamics
 from siq.systems.equilibria import Equilibrium, spread_evenly, unreached_states
 from siq.systems.formulas import FormulaError, compile_formulas, formulas_in_time
-from siq.systems.phase_portrait import (
-    MOST_SEARCHED,
-    PhasePortrait,
-    phase_portrait,
-)
+from siq.systems.phase_portrait import MOST_SEARCHED, PhasePortrait, phase_portrait
 
 ATTRACTOR_MATCH_TOLERANCE = 1e-6  # of the recorded box: one attractor, from different starts
 TRIED_STATES = 400  # of the domain, at which equations must have a value

@@ -42,13 +42,7 @@ from scipy.spatial import cKDTree
 from siq.data.kinetics import continued_visits
 from siq.data.preparation import joined
 from siq.data.recordings import LONGEST_STEP, Recordings
-from siq.data.states import (
-    BINS,
-    SIGNIFICANCE,
-    DwellCount,
-    RecordStates,
-    switching,
-)
+from siq.data.states import BINS, SIGNIFICANCE, DwellCount, RecordStates, switching
 from siq.data.stationarity import correlated_samples, runs_of, usual_step
 from siq.errors import NumericalFailure
 from siq.inference.field_estimate import FieldEstimate, Verdict

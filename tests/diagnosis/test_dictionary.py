@@ -319,11 +319,11 @@ def the(name: str, home: str, label: str = "") -> MechanismCandidate:
 
 
 def test_a_speed_by_itself_is_known_by_its_unit() -> None:
-    for unit in ("m/s", "rad/s", "mm/s", "km/h", "rpm"):
+    for unit in ("m/s", "rad/s", "mm/s", "km/h", "rpm", "1/s"):  # of a tachometer
         card = {"states": states(v=unit), "parameters": numbers(k=1.0), "equations": {"v": "k - v"}}
         roles = roles_of(model_of(card))
         assert (roles.speeds, roles.stores) == (("v",), ()), unit
-    for unit in ("1/s", "K", "m/s**2", "mol/s"):
+    for unit in ("Hz", "K", "m/s**2", "mol/s"):
         card = {"states": states(v=unit), "parameters": numbers(k=1.0), "equations": {"v": "k - v"}}
         assert roles_of(model_of(card)).speeds == (), unit
     # A coasting cart stays at rest, as a population that is gone does; it is none.
@@ -686,6 +686,11 @@ def test_what_only_decays_is_no_population_where_it_has_a_unit() -> None:
     lost = {"equations": {"s": "-s*i", "i": "s*i - i"}, "states": states(s="1/km**2", i="1/km**2")}
     assert roles_of(model_of(lost)).contagion == (("s", "i"),)
     assert roles_of(HOMES["prey and predator"].model).contagion == ()  # prey are born
+    # Susceptibles who come from elsewhere, or are born of all, as Kermack and McKendrick have it in 1932.
+    vital = {"s": "mu - b*s*i - mu*s", "i": "b*s*i - (g + mu)*i"}
+    card = {"states": states(s="1", i="1"), "parameters": numbers(mu=0.02, b=0.5, g=0.2), "equations": vital}
+    assert roles_of(model_of(card)).contagion == (("s", "i"),)
+    assert {"waning immunity", "seasonality"} <= names(model_of(card))
 
 
 def test_the_gain_of_a_laser_saturates_and_its_losses_do_not() -> None:
@@ -712,6 +717,55 @@ def test_a_body_radiates_with_the_fourth_power_of_its_absolute_temperature() -> 
     c, s = sympy.Symbol("c_1", real=True), sympy.Symbol("s", real=True)
     assert in_kelvin == -c * s**4
     assert float(in_celsius.subs({c: 1, s: 20})) == pytest.approx(float(in_kelvin.subs({c: 1, s: 293.15})))
+
+
+def test_water_evaporates_by_the_pressure_of_its_vapour() -> None:
+    # Sonntag (1990), over water: 6.112 hPa at 0 °C, 23.4 hPa at 20 °C, 123.4 hPa at 50 °C. In air that is wet
+    # already nothing evaporates.
+    change = dict(the("cooling by evaporation", "pond").changes)["s"]
+    c, d, s = (next(e for e in change.free_symbols if e.name == k) for k in ("c_1", "d_1", "s"))
+    for celsius, pressure in ((0, 6.112), (20, 23.4), (50, 123.4)):
+        assert float(-change.subs({c: 6.112, d: 0, s: celsius})) == pytest.approx(pressure, rel=5e-3)
+    assert float(change.subs({c: 6.112, d: 23.4, s: 20})) == pytest.approx(0, abs=0.1)
+    card = {"states": states(s="K"), "parameters": numbers(r=1.0), "equations": {"s": "-r*s"}}
+    kelvin = next(each for each in candidates(model_of(card)) if each.name == "cooling by evaporation")
+    hot = dict(kelvin.changes)["s"].subs(s, s + 273.15)
+    assert sympy.lambdify((c, d, s), hot - change)(1.0, 0.5, 40.0) == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("variant", "at", "forces"),
+    [("from above", 2, [0, 0, -3]), ("from below", -2, [3, 0, 0]), ("on both sides", 2, [3, 0, -3])],
+)
+def test_a_stop_pushes_back_beyond_it_alone(variant: str, at: float, forces: list[float]) -> None:
+    # Shaw and Holmes (1983): a second spring is touched at x = a.
+    force = the("elastic stop", "mass", variant).model.equations[1] - HOMES["mass"].model.equations[1]
+    x, c, a = (next(e for e in force.free_symbols if e.name == name) for name in ("x", "c_1", "a_1"))
+    assert [force.subs({c: 3, a: at, x: where}) for where in (-3, 1, 3)] == forces
+
+
+def test_a_wall_stands_between_a_room_and_the_outside() -> None:
+    # Bacher and Madsen (2011): C T' = (T_i - T)/R_i + (T_a - T)/R_a; at rest as a voltage is divided.
+    truth = the("hidden capacity", "hut", "next to u")
+    (z,) = set(truth.model.symbols) - set(HOMES["hut"].model.symbols)
+    rate = truth.model.equations[truth.model.symbols.index(z)]
+    names = {each.name: each for each in rate.free_symbols}
+    s, u, tau, eta = (names[one] for one in ("s", "u", "tau_1", "eta_1"))
+    assert sympy.simplify(sympy.solve(rate, z)[0] - (eta * s + tau * u) / (eta + tau)) == 0
+
+
+def test_what_is_held_relaxes_as_a_spring_in_line_with_a_damper_does() -> None:
+    # Maxwell (1867): of a deflection a that is held, the force c a exp(-t/τ).
+    truth = the("viscoelastic relaxation", "mass")
+    by_name = {each.name: each for each in truth.model.equations[1].free_symbols}
+    x, c = by_name["x"], by_name["c_1"]
+    (z,) = set(truth.model.symbols) - set(HOMES["mass"].model.symbols)
+    tau, t = sympy.Symbol("tau_1", real=True), sympy.Symbol("t", positive=True)
+    force = truth.model.equations[1] - HOMES["mass"].model.equations[1]
+    held = x * (1 - sympy.exp(-t / tau))  # solves z' = (x - z)/τ from zero
+    rate = truth.model.equations[truth.model.symbols.index(z)].subs(z, held)
+    assert sympy.simplify(rate - held.diff(t)) == 0
+    assert sympy.simplify(force.subs(z, held) + c * x * sympy.exp(-t / tau)) == 0
 
 
 def test_forms_ask_for_units() -> None:

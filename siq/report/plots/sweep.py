@@ -178,10 +178,7 @@ def _map(
     figure = Figure(figsize=(COLUMN_WIDTH, 2.6 * PANEL))
     panels = figure.subplots(2, 1, sharex=True)
     for axes, values, label in zip(
-        panels,
-        (count, lowest),
-        ("number of stable states", "lowest barrier ΔU (unit of ε)"),
-        strict=True,
+        panels, (count, lowest), ("number of stable states", "lowest barrier ΔU (unit of ε)"), strict=True
     ):
         drawn = axes.pcolormesh(
             values.columns, values.index, values.to_numpy(float), shading="nearest", cmap="cividis"
