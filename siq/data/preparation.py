@@ -183,15 +183,17 @@ def _repeats_itself(x: np.ndarray, moves: np.ndarray, turn: float) -> bool:
 
 
 def in_stretches(recordings: Recordings, *, hidden_velocities: bool | Literal["auto"] = False) -> Recordings:
-    """Cut a recording that is the only one into stretches, of which some can be held out, or drawn again.
+    """Cut few recordings into stretches, of which some can be held out, or drawn again.
 
     Stretches are ten correlation times long, hops included, where this makes between ten and forty of them.
-    Several recordings come back as they are, and so does one of too few pairs, or without
-    process noise: a system that settles once is not seen again in another stretch. With hidden velocities
-    they are positions, which are smooth in any case; whether there is noise is found together with f.
+    Of few recordings the one that is held out may be the only one to have been in a well. Ten and more come
+    back as they are; so do several where the cuts would cost a hundredth of the pairs, one of too few pairs,
+    and those without process noise: a system that settles once is not seen again in another stretch. With
+    hidden velocities they are positions, which are smooth in any case; whether there is noise is found
+    together with f.
     """
-    count = len(recordings.t)
-    if len(recordings.labels) > 1 or count < 2 * FEWEST_STRETCHES:
+    count, several = len(recordings.t), len(recordings.labels)
+    if several >= FEWEST_STRETCHES or count < FEWEST_STRETCHES * (2 if several == 1 else 100):
         return recordings
     smooth = hidden_velocities is not True and _shows_no_process_noise(recordings)
     if smooth and not (hidden_velocities and turns_back(recordings)):
@@ -199,11 +201,18 @@ def in_stretches(recordings: Recordings, *, hidden_velocities: bool | Literal["a
     runs = runs_of(recordings, bridged=True)
     longest = max(correlated_samples(column, runs) for column in recordings.values.T)
     cut = int(np.clip(count / (STRETCH_LENGTH * longest), FEWEST_STRETCHES, min(MOST_STRETCHES, count // 2)))
-    label = recordings.labels[0]
-    remark = Remark("data.cut_recording", {"stretches": cut})
+    counts = np.bincount(recordings.recording)
+    parts = -(-cut * counts // count)  # rounded up
+    rows = [np.arange(n) * each // n for n, each in zip(counts, parts, strict=True)]
+    labels = [
+        label if each == 1 else f"{label} ({number} of {each})"
+        for label, each in zip(recordings.labels, parts, strict=True)
+        for number in range(1, each + 1)
+    ]
+    remark = Remark("data.cut_recording", {"stretches": int(parts.sum()), "of": several})
     return replace(
-        recordings, labels=tuple(f"{label} ({number} of {cut})" for number in range(1, cut + 1)),
-        recording=np.arange(count) * cut // count, remarks=(*recordings.remarks, remark),
+        recordings, labels=tuple(labels), remarks=(*recordings.remarks, remark),
+        recording=np.concatenate(rows) + np.repeat(np.cumsum(parts) - parts, counts),
     )  # fmt: skip
 
 

@@ -229,7 +229,8 @@ def check_claims(
     rest = _Residuals(found, pairs)
     if not rest.noisy.any():  # what settles, seen by a sensor, has no noise that claims are about
         return {}
-    slow = {"gaussian_force": _gaussian_force(found, states, false_alarms)} if found.slow_force else {}
+    forced = found.slow_force and found.noise_rate[1, 1]  # what follows the state alone has no noise
+    slow = {"gaussian_force": _gaussian_force(found, states, false_alarms)} if forced else {}
     return {
         "one_system": _one_system(rest, whole.labels, false_alarms),
         "unchanged": _unchanged(rest, false_alarms), "state_complete": _state_complete(rest, false_alarms),

@@ -113,7 +113,10 @@ def identify_by_likelihood(
             faults.append(error)
     if not wholes:
         raise faults[0]
-    whole = max(wholes, key=lambda one: one.restricted_likelihood(data))
+    price = np.log(len(data.t)) / 2  # Schwarz's, for each noise
+    whole = max(
+        wholes, key=lambda one: one.restricted_likelihood(data) - price * np.count_nonzero(one.noise.process)
+    )
     if slow:  # the state is hidden by what has a memory, and steps are small
         x, values = whole.linearised_at, whole.model.values
         observation = _with_time_of(whole, observation, data)
@@ -202,8 +205,9 @@ def _of_slow_noise(
     """Observation, coefficients ``(p,)``, states and noise to begin with, for some correlation times.
 
     The likelihood has a maximum where a slow force is white noise, and others. To begin with it moves the
-    state as much within its correlation time as the white noise does. Slow measurement noise moves what is
-    measured at most as much as the state does, and has a share of its variance.
+    state as much within its correlation time as the white noise does; one that follows the state may have no
+    noise at all, and is a fading mean of the past. Slow measurement noise moves what is measured at most as
+    much as the state does, and has a share of its variance.
     """
     moved, step = moved_by(data)
     rate, x = moved[0] / step, observation.states(data)
@@ -215,6 +219,8 @@ def _of_slow_noise(
         values, view = np.zeros(len(observation.everything)), observation
         if observation.slow_force:
             values[-1], process = -1 / time, np.array([rate, rate / time**2])
+            if observation.follows:
+                found.append((view, values, x, Noise(SENSOR_BEGIN * moved, process * [1, 0])))
         else:
             added = min(rate / 2, 2 * SLOW_SHARE * float(data.outputs.var()) / time)
             view, process = replace(observation, sensor_time=time), np.array([rate - added, added])
@@ -356,7 +362,7 @@ def held_out_innovations(
     observation = ObservationModel.of(found)
     support, values = observation.unknown(found)
     own, other = (observation.measured(each, pair_step) for each in (training, unseen))
-    begin = observation.states(own)
+    begin = observation.states(own, values)
     fit = observation.fitted(support, values, own, noise=observation.noise_of(found), x=begin)
     follow = observation.followed(other, fit.model, noise=fit.noise, substeps=fit.substeps)
     everything = observation.everything

@@ -250,8 +250,18 @@ class ObservationModel:
             return self.noise(Noise(sensor, np.ones(len(rate)), field=found.noise.diffusion(1.0)))
         return self.noise(Noise.of_rate(sensor, rate))
 
-    def states(self, data: Measurements) -> np.ndarray:
-        """States of the model to begin with, as they are measured next."""
+    def states(self, data: Measurements, values: np.ndarray | None = None) -> np.ndarray:
+        """States of the model to begin with, as they are measured next; a force follows with coefficients."""
+        if self.follows and values is not None:
+            from scipy.signal import lfilter  # which brings all of scipy.stats, half a second to import
+
+            x, (slope, rate) = data.outputs[:, 0], values[-2:]
+            kept = float(np.exp(rate * np.median(data.step[data.begins])))
+            means = [
+                lfilter([1 - kept], [1, -kept], one, zi=kept * one[:1])[0]
+                for one in np.split(x, data.first[1:-1])
+            ]
+            return np.column_stack([x, -slope / rate * np.concatenate(means)])
         if self.slow_force or self.sensor_time is not None:
             return np.column_stack([data.outputs, np.zeros(len(data.t))])
         if self.hidden:
@@ -278,8 +288,8 @@ class ObservationModel:
         """The filter along recordings, with f and both noises as they are."""
         still = replace(model, parameters=tuple(replace(each, fixed=True) for each in model.parameters))
         return fit_by_filter(
-            still, data, x=self.states(data), noise=noise, estimate_process=False, estimate_sensor=False,
-            substeps=substeps,
+            still, data, x=self.states(data, model.values), noise=noise, estimate_process=False,
+            estimate_sensor=False, substeps=substeps,
         )  # fmt: skip
 
     def gain(
@@ -303,7 +313,7 @@ class ObservationModel:
         moved, step = moved_by(data)
         # A search that begins with a quiet sensor may find no way up.
         quiet, noisy = Noise(noise.measurement, noise.process[:1]), Noise(moved / 3, moved / 3 / step)
-        whole = fit_by_filter(model, data, x=self.states(data), noise=noise)
+        whole = fit_by_filter(model, data, x=self.states(data, values), noise=noise)
         data = replace(data, stationary=())
         fits = [fit_by_filter(alone, data, x=data.outputs, noise=level) for level in (quiet, noisy)]
         best, price = max(one.restricted_likelihood(data) for one in fits), np.log(len(data.t)) / 2

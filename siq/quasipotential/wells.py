@@ -540,7 +540,7 @@ def _extend_well(
         most = MOST_PER_UNIT * well.basis.size if with_units else MAX_POINTS_TO_KNOWN_DEPTH
         if generator is not None and len(used) > most:
             used = np.sort(generator.choice(used, most, replace=False))
-        if path is not None and len(used) < 2 * well.basis.size:
+        if len(used) < (1 if path is None else 2 * well.basis.size):
             raise NumericalFailure(
                 f"V about the attractor near {well.attractor.round(4)} is told by {len(used)} states alone"
             )

@@ -15,7 +15,7 @@ import pytest
 from siq.data.correlation import decimals_of, noise_floors, resolution_step, rounding_error
 from siq.data.inspection import inspect as inspect_recordings
 from siq.data.layout import RESERVED, _is_error, is_unit, read_heading, usable_name
-from siq.data.preparation import FEWEST_STRETCHES, _checked_for_learning, in_stretches, read_pairs
+from siq.data.preparation import FEWEST_STRETCHES, _checked_for_learning, in_stretches, joined, read_pairs
 from siq.data.recordings import Recordings, read_recordings, write_recordings
 from siq.errors import InputError
 from siq.remarks import sentence
@@ -609,6 +609,16 @@ def test_one_relaxation_has_a_page_without_f_and_one_hopping_record_is_cut(tmp_p
     assert len(cut.labels) >= FEWEST_STRETCHES and f"cut into {len(cut.labels)} stretches" in cut.notes[-1]
     np.testing.assert_array_equal(cut.values, read.values)
     assert in_stretches(cut) is cut
+    # Of few recordings whole ones would be held out, which may be all that was in a well; ten are enough.
+    long = np.cumsum(np.random.default_rng(0).normal(size=(1500, 1)), axis=0)
+    times = [0.1 * np.arange(1500), 0.1 * np.arange(500)]
+    few = in_stretches(Recordings.from_arrays(times, [long, long[:500]], names=["x"]))
+    assert len(few.labels) >= FEWEST_STRETCHES and "there are 2 recordings; they were cut" in few.notes[-1]
+    lengths = np.bincount(few.recording)
+    assert lengths.sum() == 2000 and np.ptp(lengths) < 0.2 * lengths.mean()
+    assert len(joined(few).labels) == 2 and in_stretches(few) is few
+    ten = Recordings.from_arrays([times[1]] * 10, [long[:500]] * 10, names=["x"])
+    assert in_stretches(ten) is ten
     settling = read_recordings(path)
     assert in_stretches(settling) is settling
 

@@ -12,10 +12,12 @@ from benchmarks.hostile.records import relaxation, telegraph
 from benchmarks.slow_forces import STEP, WITHIN, _simulated
 from siq.data.preparation import in_stretches
 from siq.data.recordings import Recordings
-from siq.inference.claims import _gaussian_force
+from siq.inference.claims import _gaussian_force, check_claims
 from siq.inference.field_estimate import read_field, write_field
-from siq.inference.kalman_identification import filtered_recordings
-from siq.inference.library import IdentificationOptions
+from siq.inference.kalman_identification import filtered_recordings, identify_by_likelihood
+from siq.inference.library import IdentificationOptions, field_library
+from siq.inference.observation import ObservationModel
+from siq.systems.diffusion import Diffusion
 from siq.workflow.pipeline import PipelineSettings, identify_run
 
 TIME, SIZE, COUNT = 3.0, 0.3, 20_000
@@ -57,6 +59,32 @@ def test_a_position_that_is_the_whole_state_gets_none() -> None:
     settings = PipelineSettings(identification=IdentificationOptions(degree=3))
     found = identify_run(settings, in_stretches(recordings), number=0).result
     assert found is not None and found.library.states == ("x",) and not found.slow_force
+
+
+def test_what_only_remembers_the_state_has_no_noise() -> None:
+    """``dx = (x - x³ - c (x - z)) dt + √p dW`` and ``dz = (x - z)/τ dt``: a force that follows the state."""
+    count, step, within, strength, time, noise = 8_000, 0.1, 10, 1.0, 3.0, 0.5
+    draw = np.random.default_rng(5).standard_normal(count * within) * np.sqrt(noise * step / within)
+    path, x, z = np.empty((count, 2)), 1.0, 1.0
+    for place, kick in enumerate(draw):
+        if place % within == 0:
+            path[place // within] = x, z
+        force = x - x**3 - strength * (x - z)
+        x, z = x + step / within * force + kick, z + step / within * (x - z) / time
+    recordings = Recordings.from_arrays([step * np.arange(count)], [path[:, :1]], names=["x"])
+    library = field_library(("x", "force_x"), IdentificationOptions(degree=3))
+    follows = ObservationModel(library, Diffusion.identity(2), hidden=True, slow_force=1.0, follows=True)
+    found = identify_by_likelihood(follows, recordings, false_terms=0.01, generator=np.random.default_rng(1))
+    assert np.allclose(found.diffusion.matrix, np.diag([1.0, 0.0]))
+    assert found.noise_rate[0, 0] == pytest.approx(noise, rel=0.05) and found.noise_rate[1, 1] == 0
+    rate, error = -found.values[-1], np.sqrt(found.covariance[-1, -1])
+    assert abs(rate - 1 / time) < 3 * error < rate
+    # The force is c z, and in the unit of the estimate: its factor times what follows x at its rate.
+    assert found.slow_force * found.values[-2] / rate == pytest.approx(strength, rel=0.3)
+    states = filtered_recordings(found, recordings).values[200:]
+    assert np.corrcoef(states[:, 1], path[200:, 1])[0, 1] > 0.99
+    claims = check_claims(found, filtered_recordings(found, recordings), recordings, false_alarms=0.05)
+    assert claims["state_complete"].passed and "gaussian_force" not in claims
 
 
 def test_it_is_not_sought_where_hidden_states_are_switched_off() -> None:
