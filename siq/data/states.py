@@ -541,8 +541,7 @@ def switching(recordings: Recordings, *, rungs: bool = True) -> RecordStates | N
         tuple(map(float, places[:, column])), counts, edges, density, path, background[:, column],
         int(supported), columns=tuple(recordings.titles[one] for one in columns), places=places,
         exponential=exponential(path, runs, number, 0 if levels else int(np.ceil(relaxation))),
-        offset=float(np.ptp(baseline[:, column])),
-        baseline=baseline[:, column],
+        offset=float(np.ptp(baseline[:, column])), baseline=baseline[:, column],
         stays=tuple(step * one for one in lengths), hops=hops,
     )  # fmt: skip
     if not rungs or not supported:

@@ -123,8 +123,7 @@ class NoiseFormula:
                  "standard_error": float(error)}
                 for (i, j), term, value, error in numbers
             ],
-            "covariance": self.covariance.tolist(),
-            "probability": self.probability,
+            "covariance": self.covariance.tolist(), "probability": self.probability,
         }  # fmt: skip
 
     @classmethod
@@ -640,9 +639,7 @@ def write_field(path: str | Path, estimate: FieldEstimate, options: Identificati
     errors = estimate.standard_errors[estimate.support[:, 1], estimate.support[:, 0]]
     terms = zip(estimate.support, estimate.values, errors, shares, strict=True)
     data = {
-        "states": list(library.states),
-        "degree": options.degree,
-        "functions": list(options.functions),
+        "states": list(library.states), "degree": options.degree, "functions": list(options.functions),
         "angles": {name: limits for name, *limits in library.angles},
         "terms": [
             {"component": library.states[i], "term": library.names[k], "coefficient": float(value),
@@ -651,13 +648,10 @@ def write_field(path: str | Path, estimate: FieldEstimate, options: Identificati
         ],
         "covariance": estimate.covariance.tolist(),
         "alternatives": average and {"bias": average[0].tolist(), "spread": average[1].tolist()},
-        "noise_rate": estimate.noise_rate.tolist(),
-        "residual_ratio": estimate.residual_ratio,
-        "diffusion": estimate.diffusion.rows,
-        "noise_formula": estimate.noise and estimate.noise.as_data(),
+        "noise_rate": estimate.noise_rate.tolist(), "residual_ratio": estimate.residual_ratio,
+        "diffusion": estimate.diffusion.rows, "noise_formula": estimate.noise and estimate.noise.as_data(),
         "constant_noise": estimate.constant_noise and estimate.constant_noise.as_data(),
-        "flow": vars(estimate.flow),
-        "noise": estimate.diagnosis and estimate.diagnosis.as_data(),
+        "flow": vars(estimate.flow), "noise": estimate.diagnosis and estimate.diagnosis.as_data(),
         "prediction": estimate.prediction and estimate.prediction.as_data(),
     }  # fmt: skip
     with whole_file(path) as partial:

@@ -383,8 +383,7 @@ class _Objective:
             velocity, gradient, circulatory = field[:, :count], gradient[:, count:], circulatory[:, count:]
         else:
             velocity = mean_velocity(
-                lambda x: evaluate(networks, x)[-1],
-                x0, xh, h,
+                lambda x: evaluate(networks, x)[-1], x0, xh, h,
                 kind=options.matching, order=options.matching_order,
             )  # fmt: skip
             _, gradient, circulatory, _ = evaluate(networks, points)
@@ -533,8 +532,7 @@ class Block:
                 state, data, options=options, seeds=seeds, device=self.device,
                 log_every=max(options.steps // LOGGED_LOSSES, 1),
                 checkpoint_every=min(MOST_STEPS_BETWEEN_CHECKPOINTS, max(options.steps // 10, 1)),
-                checkpoint=lambda state: self._keep(attempt, state),
-                finished=finished,
+                checkpoint=lambda state: self._keep(attempt, state), finished=finished,
             )  # fmt: skip
         # Checkpoints until all attempts are over: a killed job must not train this one again.
         self._keep(attempt, state)

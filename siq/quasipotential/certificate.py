@@ -261,8 +261,7 @@ def _candidate_of_region(
     symbols, d = formulas.symbols, len(formulas.symbols)
     second = compile_formulas([one.diff(symbol) for one in formulas.gradient for symbol in symbols], symbols)
     return Candidate(
-        formulas.values,
-        lambda x: formulas.evaluate_gradient(np.ascontiguousarray(x.T)).T,
+        formulas.values, lambda x: formulas.evaluate_gradient(np.ascontiguousarray(x.T)).T,
         lambda x: second(np.ascontiguousarray(x.T)).T.reshape(-1, d, d),
         lambda x: formulas.evaluate(np.ascontiguousarray(x.T))[1 : d + 1].T,
         evidence.points, evidence.portrait.attractors, relative_error, evidence.pairs, evidence.references,

@@ -247,8 +247,7 @@ def _assembled(
         remarks.append(Remark("quasipotential.reason", {"reason": str(error)}))
         heights = np.full(len(settled), np.nan)
     return Landscape(
-        dynamics_of(found), portrait.equilibria, settled,
-        portrait.shares,
+        dynamics_of(found), portrait.equilibria, settled, portrait.shares,
         tuple(wells), tuple(ways), heights, tuple(remarks), certificate,
         np.array([position_standard_errors(found, one.position) for one in settled]),
         noise, None if isinstance(found, Dynamics) else found,

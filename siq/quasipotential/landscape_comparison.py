@@ -166,8 +166,7 @@ def reference_landscape(
     wide = box + BOX_MARGIN * np.ptp(box, axis=1)[:, None] * np.array([-1.0, 1.0])
     fans = [
         adapted_fan(
-            dynamics, one, level=level / 2, box=wide, generator=generator,
-            most=MOST_CURVES, gap=CURVE_GAP,
+            dynamics, one, level=level / 2, box=wide, generator=generator, most=MOST_CURVES, gap=CURVE_GAP,
         )
         for one, level in zip(attractors, levels, strict=True)
     ]  # fmt: skip

@@ -217,14 +217,9 @@ def landscape_from_data(data: Mapping[str, Any], dynamics: Dynamics) -> Landscap
         transitions.append(way)
     errors = [one["standard_errors"] for one in wells]
     return Landscape(
-        dynamics,
-        equilibria,
-        attractors,
-        np.array([one["basin"] for one in wells]),
-        tuple(_well_from_data(one, dynamics) for one in wells),
-        tuple(transitions),
-        np.array([NUMBER[1](one["height"]) for one in wells]),
-        REMARKS[1](data["remarks"]),
+        dynamics, equilibria, attractors, np.array([one["basin"] for one in wells]),
+        tuple(_well_from_data(one, dynamics) for one in wells), tuple(transitions),
+        np.array([NUMBER[1](one["height"]) for one in wells]), REMARKS[1](data["remarks"]),
         None if data.get("certificate") is None else Certificate.from_data(data["certificate"]),
         np.array(errors, dtype=float) if errors and None not in errors else None,
         None if data["noise"] is None else NoiseStrength(**data["noise"]),
@@ -235,8 +230,7 @@ def landscape_from_data(data: Mapping[str, Any], dynamics: Dynamics) -> Landscap
             )
             for one in data.get("visits", ())
         ),
-        given=bool(data.get("given")),
-        parting=parting,
+        given=bool(data.get("given")), parting=parting,
         checked_times=pd.DataFrame(data["checked_times"], dtype=float) if "checked_times" in data else None,
     )  # fmt: skip
 

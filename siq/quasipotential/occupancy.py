@@ -365,8 +365,7 @@ def _errors_along(
 
 def check_occupancy(
     found: FieldEstimate, portrait: PhasePortrait, noise: NoiseStrength | None, recordings: Recordings,
-    parts: Sequence[tuple[FieldEstimate, np.ndarray]], *, measured: Recordings | None = None,
-    seed: int = 0,
+    parts: Sequence[tuple[FieldEstimate, np.ndarray]], *, measured: Recordings | None = None, seed: int = 0,
 ) -> OccupancyCheck:  # fmt: skip
     """Hold what was identified against the record's own hops and histogram.
 

@@ -305,8 +305,7 @@ def _downhill(
     way = _arriving(
         lambda _, y: dynamics.drift((y * width)[None])[0] / width,
         states_on_both_sides(dynamics, over, width=width, place=place) / width,
-        LONGEST_PERIODS * period, [arrives],
-        rtol=1e-6, atol=1e-8, max_step=period / 40,
+        LONGEST_PERIODS * period, [arrives], rtol=1e-6, atol=1e-8, max_step=period / 40,
     )  # fmt: skip
     if way is None:
         raise NumericalFailure("f does not lead on to the attractor behind what parts the basins")
